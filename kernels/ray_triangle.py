@@ -1,0 +1,115 @@
+"""The triangle unit: where does a ray meet a triangle?
+
+`watertight` is Woop, Benthin and Wald 2013, "Watertight Ray/Triangle Intersection" (JCGT 2(1)): the triangle is moved and
+sheared so that the ray becomes the z axis, and three signed areas around the origin decide. Two triangles with a common
+edge compute the same area with opposite sign, so that no ray passes between them.
+"""
+
+import warp as wp
+
+from wrt.kernels.ray_aabb import FAR_PAD, BoxRay, slab_interval
+from wrt.kernels.structs import Hit, NO_HIT, Ray
+
+
+@wp.struct
+class TriangleRay:
+    """What the triangle unit needs of a ray: the axis order (kz: the direction's largest), and the shear."""
+
+    kx: int
+    ky: int
+    kz: int
+    shear_x: float
+    shear_y: float
+    shear_z: float
+
+
+@wp.func
+def triangle_ray(ray: Ray) -> TriangleRay:
+    """Set-up, once a ray."""
+    d = ray.direction
+    out = TriangleRay()
+    kz = int(0)
+    if wp.abs(d[1]) > wp.abs(d[kz]):
+        kz = int(1)
+    if wp.abs(d[2]) > wp.abs(d[kz]):
+        kz = int(2)
+    kx = wp.where(kz == 2, 0, kz + 1)
+    ky = wp.where(kx == 2, 0, kx + 1)
+    # Swapping x and y where the ray runs against the axis keeps the winding.
+    out.kx = wp.where(d[kz] < 0.0, ky, kx)
+    out.ky = wp.where(d[kz] < 0.0, kx, ky)
+    out.kz = kz
+    out.shear_x = d[out.kx] / d[kz]
+    out.shear_y = d[out.ky] / d[kz]
+    out.shear_z = 1.0 / d[kz]
+    return out
+
+
+@wp.func
+def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> Hit:
+    """Both sides count. The hit lies on the whole line: t may be negative. prim_id is 0 on a hit, else NO_HIT.
+
+    Products of two float32 are monotone, so an area's sign can only be wrong where it is 0; there it is taken again in
+    float64, where the products are exact. A triangle seen exactly edge-on (area 0) is missed. NaN coordinates miss.
+    """
+    hit = Hit()
+    hit.prim_id = NO_HIT
+    hit.t = float(wp.inf)
+    a = v0 - origin
+    b = v1 - origin
+    c = v2 - origin
+    a_z = a[shear.kz]
+    b_z = b[shear.kz]
+    c_z = c[shear.kz]
+    a_x = a[shear.kx] - shear.shear_x * a_z
+    a_y = a[shear.ky] - shear.shear_y * a_z
+    b_x = b[shear.kx] - shear.shear_x * b_z
+    b_y = b[shear.ky] - shear.shear_y * b_z
+    c_x = c[shear.kx] - shear.shear_x * c_z
+    c_y = c[shear.ky] - shear.shear_y * c_z
+
+    area_0 = c_x * b_y - c_y * b_x
+    area_1 = a_x * c_y - a_y * c_x
+    area_2 = b_x * a_y - b_y * a_x
+    if area_0 == 0.0 or area_1 == 0.0 or area_2 == 0.0:
+        area_0 = float(wp.float64(c_x) * wp.float64(b_y) - wp.float64(c_y) * wp.float64(b_x))
+        area_1 = float(wp.float64(a_x) * wp.float64(c_y) - wp.float64(a_y) * wp.float64(c_x))
+        area_2 = float(wp.float64(b_x) * wp.float64(a_y) - wp.float64(b_y) * wp.float64(a_x))
+    if (area_0 < 0.0 or area_1 < 0.0 or area_2 < 0.0) and (area_0 > 0.0 or area_1 > 0.0 or area_2 > 0.0):
+        return hit
+
+    area = area_0 + area_1 + area_2
+    if area == 0.0 or not wp.isfinite(area):
+        return hit
+    inv_area = 1.0 / area
+    hit.t = (area_0 * a_z + area_1 * b_z + area_2 * c_z) * shear.shear_z * inv_area
+    hit.u = area_1 * inv_area
+    hit.v = area_2 * inv_area
+    hit.prim_id = 0
+    return hit
+
+
+@wp.func
+def within_bounds(ray: BoxRay, t: float, lo: wp.vec3, hi: wp.vec3) -> float:
+    """t moved into the interval of the primitive's own box, or inf where the ray passes by that box.
+
+    Rounding can put t before the place where the ray enters the box around the triangle. A traversal that visits boxes front
+    to back would then drop some nodes or not, depending on the order. With t inside the box's own interval, and boxes
+    monotone (a node's contains its triangles'), every structure finds the same hits to the last bit.
+    """
+    interval = slab_interval(ray, lo, hi)
+    if not interval[0] <= interval[1] * FAR_PAD:
+        return float(wp.inf)
+    inside = wp.where(t > interval[1], interval[1], t)
+    return wp.where(inside < interval[0], interval[0], inside)
+
+
+@wp.func
+def ray_triangle(box: BoxRay, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> Hit:
+    """The default unit: watertight, with t held to the triangle's own box."""
+    hit = watertight(box.origin, shear, v0, v1, v2)
+    if hit.prim_id != NO_HIT:
+        hit.t = within_bounds(box, hit.t, wp.min(wp.min(v0, v1), v2), wp.max(wp.max(v0, v1), v2))
+        if not wp.isfinite(hit.t):
+            hit.prim_id = NO_HIT
+    return hit

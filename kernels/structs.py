@@ -1,0 +1,247 @@
+"""The records that the units hand to each other, on the device.
+
+Rays and hits are in world space. Every kernel of the project is made by `kernel`, so that all of them are compiled with
+the same options.
+"""
+
+import warp as wp
+
+if __name__ != "wrt.kernels.structs":  # a second copy of a struct type fails at launch, with a message that helps nobody
+    raise ImportError(f"import wrt.kernels.structs, not {__name__}")
+
+NO_HIT = wp.constant(0x7FFFFFFF)  # prim_id while nothing is hit: larger than any other, so that ties go to a real one
+INF = wp.constant(float("inf"))
+EPSILON = wp.constant(2.0**-24)  # the unit roundoff of float32
+
+# A fused multiply-add rounds once where its mirror image rounds twice: the edge tests of two neighbouring triangles would
+# no longer be exact negatives of each other, and a ray could slip between them.
+MODULE_OPTIONS = {"fuse_fp": False, "enable_backward": False}
+
+
+def kernel(function):
+    """A Warp kernel in a module of its own, without fused multiply-add and without the code for gradients."""
+    return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+
+
+@wp.func
+def gamma(n: float) -> float:
+    """n rounding errors in a row, relative: n u / (1 - n u) (Higham 2002, lemma 3.1)."""
+    return n * EPSILON / (1.0 - n * EPSILON)
+
+
+@wp.struct
+class Ray:
+    """The points origin + t * direction for t_min <= t <= t_max; direction need not be of unit length."""
+
+    origin: wp.vec3
+    direction: wp.vec3
+    t_min: float
+    t_max: float
+
+
+@wp.struct
+class Hit:
+    """point = (1 - u - v) v0 + u v1 + v v2 on triangle prim_id; prim_id = NO_HIT where there is none."""
+
+    t: float
+    u: float
+    v: float
+    prim_id: int
+
+
+@wp.struct
+class Primitive:
+    """A triangle, or a sphere (center in v0, radius in v1.x) where prim_id >= the number of triangles."""
+
+    v0: wp.vec3
+    v1: wp.vec3
+    v2: wp.vec3
+    prim_id: int
+
+
+@wp.struct
+class Camera:
+    """right, up, forward: an orthonormal frame; the picture spans forward +- tan_x right +- tan_y up."""
+
+    origin: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    forward: wp.vec3
+    tan_x: float
+    tan_y: float
+    focus_distance: float
+    aperture_radius: float
+    blades: int
+    blade_rotation: float
+
+
+@wp.struct
+class Texture:
+    """A picture in the shared array of texels (from `first`, rows of `width`), or a checkerboard (width = 0)."""
+
+    first: int
+    width: int
+    height: int
+    srgb: int
+    wrap_u: int
+    wrap_v: int
+    row_u: wp.vec3
+    row_v: wp.vec3
+    color_a: wp.vec3
+    color_b: wp.vec3
+
+
+@wp.struct
+class Material:
+    """As wrt.scene.Material; textures are indices, -1 for none."""
+
+    kind: int
+    albedo: wp.vec3
+    specular: wp.vec3
+    exponent: float
+    eta: wp.vec3
+    k: wp.vec3
+    ior: float
+    absorption: wp.vec3
+    thin: int
+    metallic: float
+    roughness: float
+    transmission: float
+    emission: wp.vec3
+    two_sided: int
+    alpha: float
+    alpha_mode: int
+    alpha_cutoff: float
+    normal_scale: float
+    albedo_texture: int
+    metallic_roughness_texture: int
+    transmission_texture: int
+    emission_texture: int
+    normal_texture: int
+
+
+@wp.struct
+class Surfaces:
+    """What there is to know about a primitive beyond where it is hit.
+
+    corners: one row a triangle, its indices into normals and uvs; n_triangles: primitives from here on are spheres.
+    materials and textures are shared by all.
+    """
+
+    n_triangles: int
+    vertices: wp.array(dtype=wp.vec3)
+    faces: wp.array(dtype=wp.vec3i)
+    normals: wp.array(dtype=wp.vec3)
+    uvs: wp.array(dtype=wp.vec2)
+    spheres: wp.array(dtype=wp.vec4)
+    prim_material: wp.array(dtype=wp.int32)
+    materials: wp.array(dtype=Material)
+    textures: wp.array(dtype=Texture)
+    texels: wp.array(dtype=wp.uint32)
+    srgb_to_linear: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Light:
+    """kind: one of the LIGHT_ constants of lights.py.
+
+    Point, spot: position, color = radiant intensity; directional: direction of travel, color = irradiance; sphere:
+    position, radius, color = radiance; mesh: emitters first .. first + count - 1, together of the given area-weighted power.
+    """
+
+    kind: int
+    position: wp.vec3
+    direction: wp.vec3
+    color: wp.vec3
+    cos_inner: float
+    cos_outer: float
+    radius: float
+    first: int
+    count: int
+
+
+@wp.struct
+class Emitter:
+    """A triangle that emits: prim_id, and the share of its light's power up to and with it."""
+
+    prim_id: int
+    cdf: float
+    pdf_area: float
+
+
+@wp.struct
+class Background:
+    """Radiance from outside: a constant (bottom = top), a gradient in y, or a picture with tables to sample it by."""
+
+    bottom: wp.vec3
+    top: wp.vec3
+    scale: float
+    rotation: float
+    width: int
+    height: int
+    pixels: wp.array(dtype=wp.vec3)
+    row_cdf: wp.array(dtype=wp.float32)
+    column_cdf: wp.array(dtype=wp.float32)
+    mean_weight: float
+
+
+@wp.struct
+class Lighting:
+    """Every source of light but the surfaces that are seen directly."""
+
+    count: int
+    lights: wp.array(dtype=Light)
+    emitters: wp.array(dtype=Emitter)
+    background: Background
+    ambient: wp.vec3
+
+
+@wp.struct
+class Limits:
+    """Where the tree of rays is cut, and how the picture is sampled."""
+
+    max_depth: int
+    min_throughput: float
+    seed: wp.uint32
+
+
+@wp.struct
+class Film:
+    """One entry a pixel, row by row: running mean and sum of squared deviations (Welford 1962), samples, and what it took.
+
+    rays: closest-hit and any-hit rays; cut_depth, cut_throughput: rays that were not followed, and lost: the throughput
+    (mean over the channels) that they would have carried.
+    """
+
+    width: int
+    height: int
+    mean: wp.array(dtype=wp.vec3)
+    m2: wp.array(dtype=wp.vec3)
+    samples: wp.array(dtype=wp.int32)
+    rays: wp.array(dtype=wp.int64)
+    cut_depth: wp.array(dtype=wp.int32)
+    cut_throughput: wp.array(dtype=wp.int32)
+    lost: wp.array(dtype=wp.float32)
+    filter_icdf: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class AovFilm:
+    """What the ray through a pixel's centre sees first."""
+
+    depth: wp.array(dtype=wp.float32)
+    normal: wp.array(dtype=wp.vec3)
+    albedo: wp.array(dtype=wp.vec3)
+    prim_id: wp.array(dtype=wp.int32)
+    material_id: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Tile:
+    """A rectangle of pixels, and which samples of them to take."""
+
+    x: int
+    y: int
+    width: int
+    first_sample: int
+    n_samples: int

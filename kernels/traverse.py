@@ -1,0 +1,75 @@
+"""What every traversal unit does with a primitive, whatever structure led to it."""
+
+import warp as wp
+
+from wrt.kernels.ray_aabb import BoxRay, box_ray
+from wrt.kernels.ray_sphere import ray_sphere
+from wrt.kernels.ray_triangle import TriangleRay, ray_triangle, triangle_ray
+from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, Surfaces
+
+
+@wp.struct
+class Probe:
+    """A ray with the set-up of both units: what the SM hands to the RT core."""
+
+    ray: Ray
+    box: BoxRay
+    triangle: TriangleRay
+
+
+@wp.func
+def make_probe(ray: Ray) -> Probe:
+    """Set-up of both units, once a ray."""
+    probe = Probe()
+    probe.ray = ray
+    probe.box = box_ray(ray)
+    probe.triangle = triangle_ray(ray)
+    return probe
+
+
+@wp.func
+def no_hit(ray: Ray) -> Hit:
+    """The best hit before anything is found: at the segment's end, so that a hit exactly there still counts."""
+    best = Hit()
+    best.t = ray.t_max
+    best.prim_id = NO_HIT
+    return best
+
+
+@wp.func
+def finished(best: Hit) -> Hit:
+    """The answer to the outside: a miss has t = inf and prim_id = -1."""
+    if best.prim_id == NO_HIT:
+        best.t = float(wp.inf)
+        best.prim_id = -1
+    return best
+
+
+def make_intersect(with_spheres: bool, accepts=None):
+    """The unit that tests one primitive and keeps the better hit.
+
+    accepts(surfaces, prim_id, u, v) -> bool may refuse a hit (cut-outs); None takes all.
+    """
+
+    @wp.func
+    def intersect(probe: Probe, surfaces: Surfaces, primitive: Primitive, best: Hit) -> Hit:
+        """The closer of `best` and this primitive's hit in [t_min, best.t]; at equal t the lower prim_id."""
+        hit = Hit()
+        if wp.static(with_spheres):
+            if primitive.prim_id >= surfaces.n_triangles:
+                hit = ray_sphere(probe.box, probe.ray, primitive.v0, primitive.v1[0])
+            else:
+                hit = ray_triangle(probe.box, probe.triangle, primitive.v0, primitive.v1, primitive.v2)
+        else:
+            hit = ray_triangle(probe.box, probe.triangle, primitive.v0, primitive.v1, primitive.v2)
+        if hit.prim_id == NO_HIT or not (hit.t >= probe.ray.t_min and hit.t <= best.t):
+            return best
+        if hit.t == best.t and primitive.prim_id > best.prim_id:
+            return best
+        if wp.static(accepts is not None):
+            if not accepts(surfaces, primitive.prim_id, hit.u, hit.v):
+                return best
+        hit.prim_id = primitive.prim_id
+        return hit
+
+    return intersect

@@ -1,0 +1,98 @@
+"""The traversal unit of the binary BVH: front to back, with a stack, and an early stop.
+
+A node holds the boxes of both its children, so that one fetch feeds two box tests. The nearer child is visited at once and
+the farther one pushed; a popped node that begins beyond the closest hit is dropped.
+"""
+
+import warp as wp
+
+from wrt.kernels.ray_aabb import ray_aabb
+from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, Surfaces
+from wrt.kernels.traverse import finished, make_intersect, make_probe, no_hit
+
+# Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
+STACK_SIZE = 64
+
+
+@wp.struct
+class Bvh2Node:
+    """Two children: box, and either a leaf's primitives first .. first + count - 1, or (count = 0) the inner node `first`.
+
+    A child that does not exist is an empty box (lo = inf, hi = -inf).
+    """
+
+    lo_0: wp.vec3
+    hi_0: wp.vec3
+    lo_1: wp.vec3
+    hi_1: wp.vec3
+    first_0: int
+    count_0: int
+    first_1: int
+    count_1: int
+
+
+@wp.struct
+class Bvh2:
+    """nodes[0] is the root; primitives are in the order of the leaves."""
+
+    nodes: wp.array(dtype=Bvh2Node)
+    primitives: wp.array(dtype=Primitive)
+
+
+def make_traversal(any_hit: bool, with_spheres: bool, accepts=None):
+    """The closest hit, or any (the first that is found)."""
+    intersect = make_intersect(with_spheres, accepts)
+
+    @wp.func
+    def traverse(accel: Bvh2, surfaces: Surfaces, ray: Ray) -> Hit:
+        probe = make_probe(ray)
+        best = no_hit(ray)
+        stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
+        stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
+        stack_t = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
+        size = int(0)
+        first = int(0)
+        count = int(0)
+        while True:
+            if count > 0:
+                for i in range(first, first + count):
+                    best = intersect(probe, surfaces, accel.primitives[i], best)
+                    if wp.static(any_hit):
+                        if best.prim_id != NO_HIT:
+                            return finished(best)
+            else:
+                node = accel.nodes[first]
+                t_0 = ray_aabb(probe.box, node.lo_0, node.hi_0, best.t)
+                t_1 = ray_aabb(probe.box, node.lo_1, node.hi_1, best.t)
+                hit_0 = t_0 < wp.inf
+                hit_1 = t_1 < wp.inf
+                if hit_0 and hit_1:
+                    swap = t_1 < t_0
+                    stack_first[size] = wp.where(swap, node.first_0, node.first_1)
+                    stack_count[size] = wp.where(swap, node.count_0, node.count_1)
+                    stack_t[size] = wp.where(swap, t_0, t_1)
+                    size = size + 1
+                    first = wp.where(swap, node.first_1, node.first_0)
+                    count = wp.where(swap, node.count_1, node.count_0)
+                    continue
+                if hit_0:
+                    first = node.first_0
+                    count = node.count_0
+                    continue
+                if hit_1:
+                    first = node.first_1
+                    count = node.count_1
+                    continue
+            # Pop; what begins beyond the closest hit is dropped. Equal stays: a tie may have a lower prim_id there.
+            found = bool(False)
+            while size > 0 and not found:
+                size = size - 1
+                if stack_t[size] <= best.t:
+                    first = stack_first[size]
+                    count = stack_count[size]
+                    found = True
+            if not found:
+                break
+        return finished(best)
+
+    return traverse

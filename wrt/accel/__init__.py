@@ -1,0 +1,31 @@
+"""Acceleration structures: the registry. Everything that offers a choice of structure reads it from here."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits
+from wrt.accel.brute_force import BruteForce
+from wrt.accel.bvh2 import Bvh2
+from wrt.errors import InputError
+from wrt.mesh import Mesh
+
+__all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "build"]
+
+ACCELERATORS: dict[str, type[Accelerator]] = {
+    "bvh": Bvh2,  # the default: the best one there is
+    "bvh2": Bvh2,
+    "brute_force": BruteForce,
+}
+
+
+def build(mesh: Mesh | Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None,
+          **options: Any) -> Accelerator:
+    """A structure over a mesh. accel: a name in ACCELERATORS; options: the structure's own (see its class).
+
+    Raises InputError for an unknown name or device.
+    """
+    if accel not in ACCELERATORS:
+        raise InputError(f"no structure {accel!r}; there is {', '.join(ACCELERATORS)}")
+    geometry = Geometry.of(mesh) if isinstance(mesh, Mesh) else mesh
+    return ACCELERATORS[accel](geometry, device=device, threads=threads, **options)

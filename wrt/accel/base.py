@@ -1,0 +1,228 @@
+"""The contract of an acceleration structure: what it is built from, what it answers, what it tells of itself."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cache
+from types import ModuleType
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from wrt.device import records, run_all, start, thread_count, upload
+from wrt.errors import InputError
+from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
+from wrt.kernels.structs import Primitive, Surfaces
+from wrt.mesh import Mesh
+
+RAYS_PER_LAUNCH = 16384
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """What is hit, in world space: vertices (V, 3) float32, faces (F, 3) int32, spheres (S, 4) float32 (center, radius).
+
+    prim_id counts the faces first, then the spheres.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    spheres: np.ndarray
+
+    @staticmethod
+    def of(mesh: Mesh) -> Geometry:
+        return Geometry(mesh.vertices, mesh.faces, np.zeros((0, 4), np.float32))
+
+    def __len__(self) -> int:
+        return len(self.faces) + len(self.spheres)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of every primitive, two (N, 3) float32; the device takes a sphere's the same way."""
+        lo = np.empty((len(self), 3), np.float32)
+        hi = np.empty((len(self), 3), np.float32)
+        n = len(self.faces)
+        corners = [self.vertices[self.faces[:, i]] for i in range(3)]
+        lo[:n] = np.minimum(np.minimum(corners[0], corners[1]), corners[2])
+        hi[:n] = np.maximum(np.maximum(corners[0], corners[1]), corners[2])
+        lo[n:] = self.spheres[:, :3] - self.spheres[:, 3:]
+        hi[n:] = self.spheres[:, :3] + self.spheres[:, 3:]
+        return lo, hi
+
+    def primitives(self, order: np.ndarray | None = None) -> np.ndarray:
+        """Device records (kernels.structs.Primitive) in the given order of prim_id, or in their own."""
+        prim_id = np.arange(len(self), dtype=np.int32) if order is None else order
+        out = records(Primitive, len(prim_id))
+        out["prim_id"] = prim_id
+        n = len(self.faces)
+        if not len(self.spheres):
+            for i in range(3):
+                out[f"v{i}"] = self.vertices[self.faces[prim_id, i]]
+            return out
+        triangle = prim_id < n
+        for i in range(3):
+            out[f"v{i}"][triangle] = self.vertices[self.faces[prim_id[triangle], i]]
+        sphere = self.spheres[prim_id[~triangle] - n]
+        out["v0"][~triangle] = sphere[:, :3]
+        out["v1"][~triangle, 0] = sphere[:, 3]
+        return out
+
+
+@dataclass(frozen=True)
+class AccelStats:
+    """build_seconds: wall clock; nodes, leaves, depth: 0 where there is no tree; bytes: on the device, triangles included;
+    sah_cost: expected cost of a random line through the root box, traversal and intersection costing 1 each."""
+
+    build_seconds: float
+    nodes: int
+    leaves: int
+    depth: int
+    bytes: int
+    sah_cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """t: (N,) float32, in units of |direction|, inf on a miss; prim_id: (N,) int32, -1 on a miss; u, v: (N,) float32:
+    the point is (1 - u - v) v0 + u v1 + v v2 (0 on a miss and on spheres). NumPy arrays, or Warp's if the rays were."""
+
+    t: Any
+    u: Any
+    v: Any
+    prim_id: Any
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __repr__(self) -> str:
+        return f"Hits({len(self)} rays)"
+
+
+class Accelerator(ABC):
+    """A structure over a geometry, on a device. Subclasses set `kernels` and implement `_build`."""
+
+    name: ClassVar[str]
+    kernels: ClassVar[ModuleType]  # has make_traversal(any_hit, with_spheres, accepts)
+    struct: ClassVar[Any]  # the Warp struct that the traversal takes
+
+    def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, **options: Any) -> None:
+        self.device = start(device)
+        self.geometry = geometry
+        self.threads = thread_count(threads)
+        begin = time.perf_counter()
+        self.data, self.stats = self._build(begin, **options)
+
+    @abstractmethod
+    def _build(self, begin: float, **options: Any) -> tuple[Any, AccelStats]:
+        """The device struct, and what there is to tell of it. `begin`: time.perf_counter() at the start of the build."""
+
+    def __repr__(self) -> str:
+        s = self.stats
+        return (f"{type(self).__name__}({len(self.geometry)} primitives, {s.nodes} nodes, depth {s.depth}, "
+                f"{s.bytes / 1e6:.1f} MB, SAH {s.sah_cost:.1f}, built in {s.build_seconds:.3f} s)")
+
+    @classmethod
+    def traversal(cls, *, any_hit: bool, with_spheres: bool, accepts: Any = None) -> Any:
+        """The traversal unit as a Warp function (accel, surfaces, ray) -> Hit."""
+        return cls.kernels.make_traversal(any_hit, with_spheres, accepts)
+
+    def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
+                    threads: int | None = None) -> Hits:
+        """The closest hit of each ray in the closed segment [t_min, t_max]; at equal t the lowest prim_id.
+
+        origins, directions: (N, 3) float32, finite, directions not zero and of any length; t_min (>= 0), t_max: scalars or
+        (N,). Raises InputError that names the argument, its shape and what was expected.
+        """
+        rays, as_warp = self._rays(origins, directions, t_min, t_max)
+        n = len(rays.t_min)
+        hits = HitArrays()
+        for field, dtype in (("t", wp.float32), ("u", wp.float32), ("v", wp.float32), ("prim_id", wp.int32)):
+            setattr(hits, field, wp.empty(n, dtype=dtype, device=self.device))
+        self._launch(_closest_hit_kernel(type(self), self._has_spheres), rays, hits, n, threads)
+        out = [hits.t, hits.u, hits.v, hits.prim_id]
+        return Hits(*(out if as_warp else [array.numpy() for array in out]))
+
+    def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
+                threads: int | None = None) -> Any:
+        """Whether each ray hits anything in its segment: (N,) bool. Arguments as in closest_hit."""
+        rays, as_warp = self._rays(origins, directions, t_min, t_max)
+        n = len(rays.t_min)
+        dark = wp.empty(n, dtype=wp.bool, device=self.device)
+        self._launch(_any_hit_kernel(type(self), self._has_spheres), rays, dark, n, threads)
+        return dark if as_warp else dark.numpy()
+
+    @property
+    def _has_spheres(self) -> bool:
+        return len(self.geometry.spheres) > 0
+
+    def _launch(self, kernel: Any, rays: RayArrays, out: Any, n: int, threads: int | None) -> None:
+        surfaces = Surfaces()
+        surfaces.n_triangles = len(self.geometry.faces)
+        if self.device.is_cuda:
+            wp.launch(kernel, dim=n, inputs=[self.data, surfaces, rays, out, 0], device=self.device)
+            return
+        kernel.module.load(self.device)  # once, before the threads start
+
+        def job(first: int) -> Any:
+            count = min(RAYS_PER_LAUNCH, n - first)
+            return lambda: wp.launch(kernel, dim=count, inputs=[self.data, surfaces, rays, out, first], device=self.device)
+
+        run_all([job(first) for first in range(0, n, RAYS_PER_LAUNCH)], thread_count(threads))
+
+    def _rays(self, origins: Any, directions: Any, t_min: Any, t_max: Any) -> tuple[RayArrays, bool]:
+        as_warp = isinstance(origins, wp.array)
+        rays = RayArrays()
+        if as_warp:
+            if not isinstance(directions, wp.array) or origins.dtype != wp.vec3 or directions.dtype != wp.vec3:
+                raise InputError("origins and directions must both be Warp arrays of vec3, or both NumPy arrays")
+            n = len(origins)
+            rays.origin, rays.direction = origins, directions
+        else:
+            origins, directions = _vectors(origins, "origins"), _vectors(directions, "directions")
+            n = len(origins)
+            if not directions.any(axis=1).all():
+                raise InputError(f"directions must not be zero; row {int(np.argmin(directions.any(axis=1)))} is")
+            rays.origin = upload(origins, wp.vec3, self.device)
+            rays.direction = upload(directions, wp.vec3, self.device)
+        if len(directions) != n:
+            raise InputError(f"directions must have as many rows as origins ({n}), got {len(directions)}")
+        rays.t_min = self._segment_end(t_min, n, "t_min", low=0.0)
+        rays.t_max = self._segment_end(t_max, n, "t_max", low=-np.inf)
+        return rays, as_warp
+
+    def _segment_end(self, value: Any, n: int, name: str, low: float) -> Any:
+        if isinstance(value, wp.array):
+            if value.dtype != wp.float32 or value.shape != (n,):
+                raise InputError(f"{name} must be ({n},) float32, got {value.shape} {value.dtype.__name__}")
+            return value
+        array = np.asarray(value, dtype=np.float32)
+        if array.ndim > 1 or (array.ndim == 1 and len(array) != n):
+            raise InputError(f"{name} must be a number or ({n},), got {array.shape}")
+        if np.isnan(array).any() or (array < low).any():
+            raise InputError(f"{name} must not be NaN" + (f" or below {low:g}" if low > -np.inf else ""))
+        return upload(np.broadcast_to(array, (n,)).copy(), wp.float32, self.device)
+
+
+def _vectors(value: Any, name: str) -> np.ndarray:
+    try:
+        array = np.ascontiguousarray(value, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be (N, 3) float32, got {type(value).__name__}") from error
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"{name} must be (N, 3), got {array.shape}")
+    finite = np.isfinite(array).all(axis=1)
+    if not finite.all():
+        raise InputError(f"{name} must be finite; row {int(np.argmin(finite))} is {array[np.argmin(finite)].tolist()}")
+    return array
+
+
+@cache
+def _closest_hit_kernel(cls: type[Accelerator], with_spheres: bool) -> Any:
+    return make_closest_hit_kernel(cls.struct, cls.traversal(any_hit=False, with_spheres=with_spheres))
+
+
+@cache
+def _any_hit_kernel(cls: type[Accelerator], with_spheres: bool) -> Any:
+    return make_any_hit_kernel(cls.struct, cls.traversal(any_hit=True, with_spheres=with_spheres))

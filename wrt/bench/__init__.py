@@ -1,0 +1,1 @@
+"""Rivals and measurements: speed is reported with the error beside it."""

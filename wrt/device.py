@@ -1,0 +1,63 @@
+"""The way to the device: Warp's start, threads, and the only place that uploads arrays."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.errors import InputError
+
+wp.config.log_level = wp.LOG_WARNING if hasattr(wp, "LOG_WARNING") else 30
+
+
+@cache
+def start(device: str) -> Any:
+    """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are."""
+    wp.init()
+    try:
+        return wp.get_device(device)
+    except Exception as error:  # Warp raises ValueError or RuntimeError, depending on what is wrong with the name
+        known = ", ".join(str(d) for d in wp.get_devices())
+        raise InputError(f"no device {device!r}; there is {known}") from error
+
+
+def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:
+    """A Warp array of `dtype` (a Warp type or struct) from rows of a NumPy array; on the CPU without a copy if it fits."""
+    if hasattr(dtype, "numpy_dtype"):  # a struct
+        return wp.array(np.ascontiguousarray(array), dtype=dtype, device=device)
+    scalar = wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype))
+    array = np.ascontiguousarray(array, dtype=scalar)
+    # A frozen NumPy array (a scene's) cannot be aliased: Warp wants to be able to write.
+    return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
+
+
+def records(struct: Any, count: int) -> np.ndarray:
+    """`count` zeroed records with the memory layout of a Warp struct, as a NumPy structured array."""
+    return np.zeros(count, dtype=struct.numpy_dtype())
+
+
+def thread_count(threads: int | None) -> int:
+    """The number of threads to use: as given, or one a core that this process may run on."""
+    if threads is not None:
+        if threads < 1:
+            raise InputError(f"threads must be 1 or more, got {threads}")
+        return threads
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
+    """Run all tasks on so many threads; the first error is raised after those that run have ended."""
+    jobs = list(tasks)
+    if threads == 1 or len(jobs) <= 1:
+        for job in jobs:
+            job()
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for future in [pool.submit(job) for job in jobs]:
+            future.result()

@@ -1,0 +1,20 @@
+"""The one error a user's mistake turns into: the command line prints its message and exits with 2."""
+
+from __future__ import annotations
+
+import os
+
+
+class InputError(ValueError):
+    """Input that cannot be used: a file, a scene, an option.
+
+    The message names the file and the place in it (`path: place: what is wrong`), so that it can be shown as it is.
+    """
+
+    def __init__(self, message: str, path: str | os.PathLike[str] | None = None, place: str | None = None) -> None:
+        parts = [os.fspath(path) if path is not None else None, place, message]
+        super().__init__(": ".join(part for part in parts if part))
+
+
+class SceneWarning(UserWarning):
+    """Something in a scene file that wrt leaves out or replaces; the picture may differ from the author's."""

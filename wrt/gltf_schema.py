@@ -1,0 +1,191 @@
+"""What a glTF document may hold: JSON values become typed objects, each checked against its declared type.
+
+The core's objects are pygltflib's dataclasses; those of the extensions that wrt reads stand here. pygltflib's own decoder
+is not used: it turns 1.5 and "1" into the index 1, and its errors do not say where in the file they are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import types
+import typing
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from wrt.errors import InputError
+
+
+@contextmanager
+def at(place: str) -> Iterator[None]:
+    """Put `place` (such as "nodes[3].scale") in front of any InputError raised inside."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error), None, place) from None
+
+
+# --- the extensions that wrt reads ------------------------------------------------------------------------------------
+
+
+@dataclass
+class TextureInfo:
+    index: int = dataclasses.MISSING  # type: ignore[assignment]  # required
+    texCoord: int = 0
+    extensions: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class TextureTransform:
+    offset: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    rotation: float = 0.0
+    scale: list[float] = field(default_factory=lambda: [1.0, 1.0])
+    texCoord: int | None = None
+
+
+@dataclass
+class TextureSource:
+    source: int = dataclasses.MISSING  # type: ignore[assignment]  # required
+
+
+@dataclass
+class Transmission:
+    transmissionFactor: float = 0.0
+    transmissionTexture: TextureInfo | None = None
+
+
+@dataclass
+class Volume:
+    thicknessFactor: float = 0.0
+    attenuationDistance: float = math.inf
+    attenuationColor: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
+
+
+@dataclass
+class Ior:
+    ior: float = 1.5
+
+
+@dataclass
+class EmissiveStrength:
+    emissiveStrength: float = 1.0
+
+
+@dataclass
+class Unlit:
+    pass
+
+
+@dataclass
+class SpotCone:
+    innerConeAngle: float = 0.0
+    outerConeAngle: float = math.pi / 4
+
+
+@dataclass
+class PunctualLight:
+    type: str = dataclasses.MISSING  # type: ignore[assignment]  # required
+    name: str | None = None
+    color: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
+    intensity: float = 1.0
+    range: float | None = None
+    spot: SpotCone | None = None
+
+
+@dataclass
+class PunctualLights:
+    lights: list[PunctualLight] = field(default_factory=list)
+
+
+@dataclass
+class PunctualLightOfNode:
+    light: int = dataclasses.MISSING  # type: ignore[assignment]  # required
+
+
+@dataclass
+class Instancing:
+    attributes: dict[str, int] = field(default_factory=dict)
+
+
+# --- checking -----------------------------------------------------------------------------------------------------------
+
+# pygltflib gives fields that the specification requires the default None.
+_REQUIRED = {
+    "Accessor": ("componentType", "count", "type"), "Sparse": ("count", "indices", "values"),
+    "AccessorSparseIndices": ("bufferView", "componentType"), "AccessorSparseValues": ("bufferView",),
+    "BufferView": ("buffer", "byteLength"), "Buffer": ("byteLength",), "Camera": ("type",), "Perspective": ("yfov",),
+    "TextureInfo": ("index",), "NormalMaterialTexture": ("index",), "TextureSource": ("source",),
+    "PunctualLight": ("type",), "PunctualLightOfNode": ("light",), "Asset": ("version",), "GLTF2": ("asset",),
+}
+_SCALARS: dict[Any, tuple[str, tuple[type, ...]]] = {
+    int: ("an integer", (int,)), float: ("a number", (int, float)), str: ("a string", (str,)), bool: ("true or false", (bool,)),
+}
+
+
+def read_as(hint: Any, raw: Any, place: str) -> Any:
+    """The JSON value `raw` as the type `hint`: a scalar, list, dict or dataclass (made of the same, and of pygltflib's).
+
+    Keys that the class does not have are left out, so are `extras`; null stands for a key that is not there. Raises
+    InputError that names the place where a value has another type, a number is not finite, or a required key is missing.
+    """
+    hint = _without_none(hint)
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint in _SCALARS:
+        return _scalar(hint, raw, place)
+    if origin is list:
+        if not isinstance(raw, list):
+            raise _wrong("an array", raw, place)
+        return [read_as(arguments[0], item, f"{place}[{i}]") for i, item in enumerate(raw)]
+    if not isinstance(raw, dict):
+        raise _wrong("an object", raw, place)
+    if origin is dict:
+        return raw if arguments[1] is Any else {k: read_as(arguments[1], v, f"{place}.{k}") for k, v in raw.items()}
+    if hint.__name__ == "Attributes":  # pygltflib's one class that is no dataclass: accessors by the attribute's name
+        return {k: read_as(int, v, f"{place}.{k}") for k, v in raw.items()}
+    return _object(hint, raw, place)
+
+
+def _object(cls: Any, raw: dict[str, Any], place: str) -> Any:
+    for name in _REQUIRED.get(cls.__name__, ()):
+        if raw.get(name) is None:
+            raise InputError("is required", None, _join(place, name))
+    values = {name: read_as(hint, raw[name], _join(place, name))
+              for name, hint in _fields(cls).items() if raw.get(name) is not None}
+    return cls(**values)
+
+
+@functools.cache
+def _fields(cls: Any) -> dict[str, Any]:
+    hints = typing.get_type_hints(cls)
+    return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.name != "extras"}
+
+
+def _scalar(hint: Any, raw: Any, place: str) -> Any:
+    expected, accepted = _SCALARS[hint]
+    if hint is int and isinstance(raw, float) and raw.is_integer():
+        raw = int(raw)  # JSON does not tell 1.0 from 1
+    if not isinstance(raw, accepted) or (isinstance(raw, bool) and hint is not bool):
+        raise _wrong(expected, raw, place)
+    if hint is float:
+        if not abs(raw) <= 1e300:  # an integer may be too long for a double
+            raise _wrong("a finite number", raw, place)
+        raw = float(raw)
+    return raw
+
+
+def _without_none(hint: Any) -> Any:
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return next(argument for argument in typing.get_args(hint) if argument is not type(None))
+    return hint
+
+
+def _join(place: str, name: str) -> str:
+    return f"{place}.{name}" if place else name
+
+
+def _wrong(expected: str, raw: Any, place: str) -> InputError:
+    text = repr(raw)
+    return InputError(f"must be {expected}, got {text if len(text) <= 60 else text[:57] + '...'}", None, place or None)

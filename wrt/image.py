@@ -1,0 +1,339 @@
+"""Image files: PNG (8 and 16 bit), OpenEXR and Radiance HDR, each written whole or not at all.
+
+Rows run from the top down. Colours in memory are linear Rec. 709; a PNG or JPEG file holds sRGB codes. OpenImageIO reads
+and writes EXR and HDR. PNG is encoded here: no library at hand writes both 16-bit RGB and text outside of ASCII.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import struct
+import uuid
+import warnings
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrt.errors import InputError, SceneWarning
+from wrt.tonemap import decode_srgb, to_codes
+
+PathLike = str | os.PathLike[str]
+
+# Bits a channel that each format can be written with; the first is the default.
+FORMATS: dict[str, tuple[int, ...]] = {".png": (8, 16), ".exr": (32, 16), ".hdr": (32,)}
+DISPLAY_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga")  # read as sRGB codes
+LINEAR_SUFFIXES = (".exr", ".hdr")
+METADATA_PREFIX = "wrt:"  # what a file's text entries of ours begin with
+HALF_MAX = 65504.0
+EXACT_IN_FLOAT = 1 << 24  # every integer up to here is a float32
+
+
+# --- before and around writing ----------------------------------------------------------------------------------------
+
+
+def output_format(path: PathLike, bits: int | None = None) -> tuple[str, int]:
+    """The suffix and bits a channel that `path` is to be written with; raises InputError where wrt cannot write that."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in FORMATS:
+        raise InputError(f"cannot write {suffix or 'a file without a suffix'}; use {', '.join(FORMATS)}", path)
+    if bits is not None and bits not in FORMATS[suffix]:
+        raise InputError(f"{suffix} is written with {' or '.join(map(str, FORMATS[suffix]))} bits, not {bits}", path)
+    return suffix, bits or FORMATS[suffix][0]
+
+
+def check_writable(path: PathLike, bits: int | None = None) -> None:
+    """Raise the InputError that writing an image to `path` would end in, before any work is done for it."""
+    output_format(path, bits)
+    with _replacing(path) as temporary:
+        temporary.touch()
+        temporary.unlink()
+
+
+@contextlib.contextmanager
+def _replacing(path: PathLike) -> Iterator[Path]:
+    """A new name in the folder of `path`, to write to; on success that file takes the place of `path`.
+
+    On any failure the new file is removed and an existing `path` stays as it was. A link is followed, not replaced.
+    Raises InputError where the system refuses.
+    """
+    target = Path(os.path.realpath(path))
+    if not target.parent.is_dir():
+        raise InputError("its folder does not exist", path)
+    if target.is_dir():
+        raise InputError("is a folder", path)
+    if target.exists() and not os.access(target, os.W_OK):
+        raise InputError("is write-protected", path)
+    # The suffix stays, since OpenImageIO takes the format from it.
+    temporary = target.parent / f".{uuid.uuid4().hex}{target.suffix}"
+    try:
+        yield temporary
+        if temporary.exists():
+            os.replace(temporary, target)
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror or error}", path) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, exposure: float = 0.0,
+                tonemap: str = "none", metadata: Mapping[str, Any] | None = None) -> None:
+    """Write one picture in the format that the suffix names.
+
+    pixels: (H, W, 3) linear. bits: a channel (FORMATS; default 8 for PNG, 32 for EXR and HDR; 16 in EXR is half). PNG gets
+    `exposure` stops and `tonemap`; EXR and HDR stay linear and get neither. metadata: goes in as text, a `wrt:key` each.
+    NaN and infinite values are kept in EXR; in PNG, NaN and -inf are black and +inf is white; HDR holds neither those nor
+    negative values (they become 0, or the format's brightest). What is replaced is counted in one SceneWarning.
+    Raises InputError where the file cannot be written; an existing file is then as it was.
+    """
+    pixels = _as_picture(pixels, path)
+    suffix, bits = output_format(path, bits)
+    WRITERS[suffix](path, pixels, bits, exposure, tonemap, metadata or {})
+
+
+def write_codes(path: PathLike, codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> None:
+    """Write display codes, (H, W, 3) uint8 or uint16, as they are to a PNG file. Raises InputError as write_image does."""
+    data = encode_png(codes, metadata or {})
+    with _replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapping[str, Any] | None = None) -> None:
+    """Write named channels to one OpenEXR part, ZIP-compressed.
+
+    channels: (H, W) each, all of one size; float16 is stored as half, everything else as float. Integers are exact up to
+    2^24 (OpenEXR has integer channels, but OpenImageIO's Python binding cannot mix them with float ones); beyond that a
+    SceneWarning says so. Raises InputError as write_image does.
+    """
+    import OpenImageIO as oiio
+
+    arrays = list(channels.values())
+    height, width = arrays[0].shape
+    spec = oiio.ImageSpec(width, height, len(arrays), "float")
+    spec.channelnames = tuple(channels)
+    spec.channelformats = tuple(oiio.TypeDesc("half" if a.dtype == np.float16 else "float") for a in arrays)
+    spec.attribute("compression", "zip")
+    for key, value in (metadata or {}).items():
+        spec.attribute(METADATA_PREFIX + key, str(value))
+    for name, array in channels.items():
+        if array.dtype.kind in "iu" and array.size and int(array.max()) > EXACT_IN_FLOAT:
+            warnings.warn(f"{os.fspath(path)}: {name} goes up to {array.max()}: rounded, as a float channel is exact only"
+                          f" to {EXACT_IN_FLOAT}", SceneWarning, stacklevel=2)
+    _write_oiio(path, spec, lambda y0, y1: np.stack([a[y0:y1].astype(np.float32) for a in arrays], axis=-1))
+
+
+def _write_oiio(path: PathLike, spec: Any, rows: Callable[[int, int], np.ndarray], header: bytes = b"") -> None:
+    """Write rows y0 to y1, (y1 - y0, W, C) float32, in bands; `header` is put in behind the file's first line."""
+    import OpenImageIO as oiio
+
+    with _replacing(path) as temporary:
+        out = oiio.ImageOutput.create(str(temporary))
+        if out is None:
+            raise InputError(f"cannot be written: {oiio.geterror()}", path)
+        try:
+            good = out.open(str(temporary), spec)
+            for y in range(0, spec.height if good else 0, 64):
+                band = np.ascontiguousarray(rows(y, min(y + 64, spec.height)), dtype=np.float32)
+                good = good and out.write_scanlines(y, y + len(band), 0, band)
+        finally:
+            closed = out.close()
+        # Some failures, such as a full disk, are told in the text only.
+        error = out.geterror()
+        if error or not (good and closed):
+            raise InputError(f"cannot be written: {' '.join(error.split()) or 'unknown error'}", path)
+        if header:
+            first, rest = temporary.read_bytes().split(b"\n", 1)
+            temporary.write_bytes(first + b"\n" + header + rest)
+
+
+def _write_png(path: PathLike, pixels: np.ndarray, bits: int, exposure: float, tonemap: str,
+               metadata: Mapping[str, Any]) -> None:
+    _warn_replaced(path, ~np.isfinite(pixels), "NaN or infinite, written as black or white")
+    write_codes(path, to_codes(pixels, exposure, tonemap, bits), metadata)
+
+
+def _write_exr(path: PathLike, pixels: np.ndarray, bits: int, exposure: float, tonemap: str,
+               metadata: Mapping[str, Any]) -> None:
+    write_exr(path, color_channels("", as_half(path, pixels) if bits == 16 else pixels), metadata)
+
+
+def _write_hdr(path: PathLike, pixels: np.ndarray, bits: int, exposure: float, tonemap: str,
+               metadata: Mapping[str, Any]) -> None:
+    import OpenImageIO as oiio
+
+    _warn_replaced(path, ~(np.isfinite(pixels) & (pixels >= 0.0)), "negative, NaN or infinite, which .hdr cannot hold")
+    held = np.clip(np.nan_to_num(pixels, nan=0.0, posinf=1e38, neginf=0.0), 0.0, 1e38)
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "float")
+    header = "".join(f"# {METADATA_PREFIX}{key}={' '.join(str(value).split())}\n" for key, value in metadata.items())
+    _write_oiio(path, spec, lambda y0, y1: held[y0:y1], header.encode())
+
+
+WRITERS = {".png": _write_png, ".exr": _write_exr, ".hdr": _write_hdr}
+
+
+def color_channels(layer: str, pixels: np.ndarray, names: str = "RGB") -> dict[str, np.ndarray]:
+    """(H, W, 3) as the EXR channels `layer.R`, `layer.G`, `layer.B` (or other letters); no dot where layer is empty."""
+    return {f"{layer}.{name}" if layer else name: pixels[..., i] for i, name in enumerate(names)}
+
+
+def as_half(path: PathLike, pixels: np.ndarray) -> np.ndarray:
+    """As float16; finite values beyond +-65504 are clipped to it and counted in one SceneWarning that names `path`."""
+    beyond = np.isfinite(pixels) & (np.abs(pixels) > HALF_MAX)
+    _warn_replaced(path, beyond, f"beyond {HALF_MAX:g}, the largest half, and clipped to it")
+    return np.where(beyond, np.copysign(np.float32(HALF_MAX), pixels), pixels).astype(np.float16)
+
+
+def _warn_replaced(path: PathLike, where: np.ndarray, what: str) -> None:
+    if where.any():
+        count = int(where.any(axis=-1).sum())
+        warnings.warn(f"{os.fspath(path)}: {count} pixel{'s' * (count != 1)} {what}", SceneWarning, stacklevel=5)
+
+
+def _as_picture(pixels: np.ndarray, path: PathLike) -> np.ndarray:
+    pixels = np.asarray(pixels, dtype=np.float32)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
+        raise InputError(f"pixels must be (H, W, 3), got {pixels.shape}", path)
+    return pixels
+
+
+def encode_png(codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> bytes:
+    """A PNG file of (H, W, 3) uint8 or uint16 sRGB codes; metadata as iTXt (UTF-8) entries named `wrt:key`.
+
+    Source: W3C, Portable Network Graphics Specification (third edition); every row has the filter "up".
+    """
+    if codes.ndim != 3 or codes.shape[2] != 3 or codes.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"codes must be (H, W, 3) uint8 or uint16, got {codes.shape} {codes.dtype}")
+    height, width = codes.shape[:2]
+    rows = np.frombuffer(codes.astype(codes.dtype.newbyteorder(">")).tobytes(), np.uint8).reshape(height, -1)
+    filtered = np.empty((height, rows.shape[1] + 1), np.uint8)
+    filtered[:, 0] = 2
+    filtered[0, 1:] = rows[0]
+    filtered[1:, 1:] = rows[1:] - rows[:-1]  # modulo 256, as the filter wants it
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8 * codes.dtype.itemsize, 2, 0, 0, 0)
+    texts = [chunk(b"iTXt", (METADATA_PREFIX + key).encode("latin-1", "replace")[:79] + bytes(5) + str(value).encode())
+             for key, value in (metadata or {}).items()]
+    return b"".join([b"\x89PNG\r\n\x1a\n", chunk(b"IHDR", header), chunk(b"sRGB", b"\0"), *texts,
+                     chunk(b"IDAT", zlib.compress(filtered.tobytes(), 6)), chunk(b"IEND", b"")])
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_image(path: PathLike) -> np.ndarray:
+    """The colours of an image file: (H, W, 3) float32, linear.
+
+    EXR: R, G, B, or one channel taken three times; HDR as it is; PNG, JPEG and the like decoded from sRGB, 16-bit PNG in
+    full. Alpha is left out, not applied. Raises InputError where the file is missing, truncated, or no picture.
+    """
+    _check_readable(path)
+    suffix = Path(path).suffix.lower()
+    if suffix in LINEAR_SUFFIXES:
+        return _pick_colors(read_channels(path), path)
+    if suffix not in DISPLAY_SUFFIXES:
+        raise InputError(f"not an image format that wrt reads ({', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)})", path)
+    # The whole file is decoded even where it has 16 bits: unlike OpenImageIO, Pillow refuses each truncated file.
+    codes = read_rgba8(path)[..., :3]
+    if _is_png16(path):
+        channels = read_channels(path)
+        codes = np.rint(_pick_colors(channels, path) * 65535.0).astype(np.uint16)
+    levels = np.iinfo(codes.dtype).max
+    return decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)[codes]
+
+
+def read_rgba8(source: PathLike | bytes, name: str = "") -> np.ndarray:
+    """A PNG, JPEG, ... file, or its bytes, as (H, W, 4) uint8 codes; alpha is 255 where the file has none.
+
+    16-bit channels keep their high byte. name: what an error calls the file (default: its path). Raises InputError where
+    the file is missing, truncated, or no picture.
+    """
+    from PIL import Image
+
+    name = name or ("image" if isinstance(source, bytes) else os.fspath(source))
+    if not isinstance(source, bytes):
+        _check_readable(source)
+    try:
+        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as image:
+            if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip to 255
+                return _grey_to_rgba(np.asarray(image).astype(np.uint32) >> 8)
+            return np.array(image.convert("RGBA"))
+    except Exception as error:  # decoders raise nearly anything on a broken file
+        raise InputError(f"cannot be read as an image: {error}", name) from error
+
+
+def read_channels(path: PathLike) -> dict[str, np.ndarray]:
+    """Every channel of the first part of an image file by name: (H, W) float32; integer codes are scaled to [0, 1].
+
+    Raises InputError where the file is missing, truncated, or no picture.
+    """
+    import OpenImageIO as oiio
+
+    _check_readable(path)
+    hints = oiio.ImageSpec()
+    hints.attribute("oiio:UnassociatedAlpha", 1)  # colours as the file has them
+    source = oiio.ImageInput.open(os.fspath(path), hints)
+    if source is None:
+        raise InputError(f"cannot be read as an image: {' '.join(oiio.geterror().split())}", path)
+    try:
+        pixels = source.read_image("float")
+        if pixels is None:
+            raise InputError(f"cannot be read as an image: {' '.join(source.geterror().split())}", path)
+        return {name: pixels[..., i] for i, name in enumerate(source.spec().channelnames)}
+    finally:
+        source.close()
+
+
+def read_metadata(path: PathLike) -> dict[str, str]:
+    """What wrt wrote about a picture into its PNG, EXR or HDR file, as text by key; empty where there is nothing."""
+    import OpenImageIO as oiio
+
+    _check_readable(path)
+    if Path(path).suffix.lower() == ".hdr":
+        head = Path(path).read_bytes().split(b"\n\n", 1)[0].decode(errors="replace")
+        pairs = [line[2:].split("=", 1) for line in head.splitlines() if line.startswith("# ") and "=" in line]
+    else:
+        source = oiio.ImageInput.open(os.fspath(path))
+        if source is None:
+            raise InputError(f"cannot be read as an image: {' '.join(oiio.geterror().split())}", path)
+        pairs = [[entry.name, str(entry.value)] for entry in source.spec().extra_attribs]
+        source.close()
+    return {key.removeprefix(METADATA_PREFIX): value for key, value in pairs if key.startswith(METADATA_PREFIX)}
+
+
+def _check_readable(path: PathLike) -> None:
+    try:
+        with open(path, "rb"):
+            pass
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path) from error
+
+
+def _pick_colors(channels: Mapping[str, np.ndarray], path: PathLike) -> np.ndarray:
+    upper = {name.upper(): array for name, array in channels.items()}
+    if {"R", "G", "B"} <= upper.keys():
+        return np.stack([upper["R"], upper["G"], upper["B"]], axis=-1)
+    single = [array for name, array in upper.items() if name != "A"]
+    if len(single) != 1:
+        raise InputError(f"has no channels R, G, B; it has {', '.join(channels)}", path)
+    return np.repeat(single[0][..., None], 3, axis=-1)
+
+
+def _is_png16(path: PathLike) -> bool:
+    with open(path, "rb") as file:
+        head = file.read(25)
+    return head[:8] == b"\x89PNG\r\n\x1a\n" and head[24] == 16
+
+
+def _grey_to_rgba(grey: np.ndarray) -> np.ndarray:
+    opaque = np.full(grey.shape, 255)
+    return np.stack([grey, grey, grey, opaque], axis=-1).astype(np.uint8)

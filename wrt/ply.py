@@ -1,0 +1,282 @@
+"""PLY files (Stanford polygon format), text and binary: positions, normals, texture coordinates, faces of any size.
+
+Why not trimesh: measured with 5.2, it refuses binary files that mix triangles with other polygons ("unexpected
+length"), puts the second halves of all quads behind the first ones, and computes normals anew where a file has
+texture coordinates.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+
+from wrt.errors import InputError
+from wrt.mesh import RawMesh
+from wrt.polygons import triangulate
+
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8",
+    "uint64": "u8", "float32": "f4", "float64": "f8",
+}
+_SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # what a list's length may be
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+_UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
+_INDEX_NAMES = ("vertex_indices", "vertex_index")
+
+
+class _Property(NamedTuple):
+    name: str
+    type: str  # NumPy's name without byte order
+    count_type: str | None = None  # of a list
+
+
+@dataclass
+class _Element:
+    """One `element` of the header; of each property all values in a row, and how many there are in each row."""
+
+    name: str
+    rows: int
+    properties: list[_Property] = field(default_factory=list)
+    values: dict[str, np.ndarray] = field(default_factory=dict)
+    counts: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def read_ply(path: str | os.PathLike[str]) -> RawMesh:
+    """Read a PLY file's vertices and faces in the order of the file; faces with more than three corners are
+    triangulated.
+
+    Vertex normals are nx, ny, nz; texture coordinates u, v (or s, t or texture_u, texture_v) of vertices, else
+    `texcoord` lists of faces, for which a vertex is split where its faces disagree. Colours and other properties are
+    not read. Raises InputError that names the header's line, or the element and row of what is truncated, not a
+    number, or out of range.
+    """
+    source = _Source(Path(path))
+    elements = {element.name: element for element in source.elements}
+    if "vertex" not in elements or not {"x", "y", "z"} <= elements["vertex"].values.keys():
+        source.fail(f"holds no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")
+    vertex = elements["vertex"].values
+    with np.errstate(over="ignore", invalid="ignore"):
+        vertices = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    corners, counts, texcoord = _faces(source, elements.get("face"), len(vertices))
+
+    referenced = np.zeros(len(vertices), dtype=bool)
+    referenced[corners] = True
+    bad = np.nonzero(referenced & ~np.isfinite(vertices).all(axis=1))[0]
+    if len(bad):
+        source.fail(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", f"vertex {bad[0]}")
+
+    normals = _columns(vertex, ("nx", "ny", "nz"))
+    uvs = next((uv for names in _UV_NAMES if (uv := _columns(vertex, names)) is not None), None)
+    triangles, _ = triangulate(corners, counts, vertices)
+    if uvs is None and texcoord is not None:
+        origin, corners, uvs = _split(corners, texcoord)
+        vertices, normals = vertices[origin], normals[origin] if normals is not None else None
+    return RawMesh(
+        vertices=vertices,
+        faces=corners[triangles],
+        normals=normals,
+        uvs=np.stack([uvs[:, 0], 1.0 - uvs[:, 1]], axis=1) if uvs is not None else None,
+        incomplete=int(np.count_nonzero(counts < 3)),
+        positions=len(vertices),
+    )
+
+
+def _columns(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray | None:
+    if not all(name in columns for name in names):
+        return None
+    return np.stack([columns[name] for name in names], axis=1).astype(np.float64)
+
+
+def _faces(source: _Source, face: _Element | None, vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Corners of all faces in a row (C,), the corners of each face (P,), and their texture coordinates (C, 2) or
+    None."""
+    if face is None or face.rows == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), None
+    name = next((name for name in _INDEX_NAMES if name in face.values), None)
+    if name is None:
+        source.fail(f"has no list {' or '.join(_INDEX_NAMES)}", "element face")
+    given, counts = face.values[name], face.counts[name]
+    with np.errstate(invalid="ignore"):
+        corners = given.astype(np.int64)
+    wrong = (corners < 0) | (corners >= vertices) | (corners != given)
+    if wrong.any():
+        where = int(np.argmax(wrong))
+        row = int(np.searchsorted(np.cumsum(counts), where, side="right"))
+        source.fail(f"index {given[where]:g}, but there are {vertices} vertices", f"face {row}")
+    texcoord = None
+    if "texcoord" in face.values and (face.counts["texcoord"] == 2 * counts).all():
+        texcoord = face.values["texcoord"].reshape(-1, 2).astype(np.float64)
+    return corners, counts, texcoord
+
+
+def _split(corners: np.ndarray, texcoord: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Make one vertex of each different (vertex, u, v): the vertex it comes from, the new corners, its uv."""
+    order = np.lexsort((texcoord[:, 1], texcoord[:, 0], corners))
+    rows = np.column_stack([corners, texcoord])[order]
+    first = np.ones(len(rows), dtype=bool)
+    first[1:] = (rows[1:] != rows[:-1]).any(axis=1)
+    renumbered = np.empty(len(order), dtype=np.int64)
+    renumbered[order] = np.cumsum(first) - 1
+    return rows[first, 0].astype(np.int64), renumbered, rows[first, 1:]
+
+
+class _Source:
+    """A PLY file: its header, then the elements read with it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.data = path.read_bytes()
+        form, self.elements, begin = self._header()
+        self.stream: _Text | _Binary = _Text(self, begin) if form == "ascii" else _Binary(self.data, begin, _ORDERS[form])
+        for element in self.elements:
+            if element.rows:
+                self._read(element)
+
+    def fail(self, message: str, place: str | None = None) -> NoReturn:
+        raise InputError(message, self.path, place)
+
+    def _header(self) -> tuple[str, list[_Element], int]:
+        """The format, the elements without their data, and where the data begin."""
+        if not self.data.startswith(b"ply"):
+            self.fail("is not a PLY file: it does not begin with 'ply'")
+        elements: list[_Element] = []
+        form, begin = "", 0
+        for number, line in enumerate(self.data[:1 << 20].splitlines(keepends=True), 1):
+            begin += len(line)
+            words = line.decode("latin-1").split()
+            match words:
+                case ["end_header"]:
+                    break
+                case [] | ["ply" | "comment" | "obj_info", *_]:
+                    pass
+                case ["format", name, *_] if name == "ascii" or name in _ORDERS:
+                    form = name
+                case ["element", name, rows] if rows.isdecimal():
+                    elements.append(_Element(name, int(rows)))
+                case ["property", "list", count, kind, name] if elements and count in _SIZES and kind in _TYPES:
+                    elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[count]))
+                case ["property", kind, name] if elements and kind in _TYPES:
+                    elements[-1].properties.append(_Property(name, _TYPES[kind]))
+                case _:
+                    self.fail(f"cannot read {line[:60].decode('latin-1').strip()!r} in the header", f"line {number}")
+        else:
+            self.fail("the header does not end: no end_header so far", f"line {number}")
+        if not form:
+            self.fail("the header names no format")
+        return form, elements, begin
+
+    def _read(self, element: _Element) -> None:
+        """Read all rows at once where their lists are as long as the first row's (nearly always), else row by row."""
+        begin = self.stream.at
+        sizes = [len(part) for part in self._row(element, 0)]
+        self.stream.at = begin
+        fields: list[tuple[str, int]] = []
+        for p, size in zip(element.properties, sizes, strict=True):
+            fields += [(p.count_type, 1), (p.type, size)] if p.count_type else [(p.type, 1)]
+        table = self.stream.table(fields, element.rows)
+        if table is None and not any(p.count_type for p in element.properties):
+            self._truncated(element)
+        if table is None or not self._take_table(element, table, sizes):
+            self.stream.at = begin
+            rows = [self._row(element, row) for row in range(element.rows)]
+            for i, p in enumerate(element.properties):
+                element.values[p.name] = np.concatenate([row[i] for row in rows])
+                element.counts[p.name] = np.array([len(row[i]) for row in rows], dtype=np.int64)
+
+    def _take_table(self, element: _Element, table: list[np.ndarray], sizes: list[int]) -> bool:
+        """Keep the columns of a table; False where a list is not as long as `sizes` says."""
+        columns = iter(table)
+        for p, size in zip(element.properties, sizes, strict=True):
+            if p.count_type and (next(columns) != size).any():
+                return False
+            element.values[p.name] = next(columns).reshape(-1)
+            element.counts[p.name] = np.full(element.rows, size, dtype=np.int64)
+        return True
+
+    def _row(self, element: _Element, row: int) -> list[np.ndarray]:
+        """The values of each property in the next row."""
+        parts = []
+        for p in element.properties:
+            size = 1
+            if p.count_type:
+                count = self.stream.take(p.count_type, 1)
+                if count is None:
+                    self._truncated(element, row)
+                if not (count[0] >= 0 and count[0] == int(count[0])):
+                    self.fail(f"a list of {count[0]:g} values", f"{element.name} {row}")
+                size = int(count[0])
+            values = self.stream.take(p.type, size)
+            if values is None:
+                self._truncated(element, row)
+            parts.append(values)
+        return parts
+
+    def _truncated(self, element: _Element, row: int | None = None) -> NoReturn:
+        ends = f"the file ends in number {row}" if row is not None else "the file ends before"
+        self.fail(f"truncated: the header promises {element.rows}, but {ends}", f"element {element.name}")
+
+
+class _Binary:
+    """Values from bytes; None where the file ends before."""
+
+    def __init__(self, data: bytes, at: int, order: str) -> None:
+        self.data, self.at, self.order = data, at, order
+
+    def take(self, kind: str, count: int) -> np.ndarray | None:
+        dtype = np.dtype(self.order + kind)
+        if self.at + count * dtype.itemsize > len(self.data):
+            return None
+        self.at += count * dtype.itemsize
+        return np.frombuffer(self.data, dtype, count, self.at - count * dtype.itemsize)
+
+    def table(self, fields: list[tuple[str, int]], rows: int) -> list[np.ndarray] | None:
+        """(rows, n) of each field (type, n), of records one behind the other."""
+        record = np.dtype([(f"f{i}", self.order + kind, (n,)) for i, (kind, n) in enumerate(fields)])
+        if self.at + rows * record.itemsize > len(self.data):
+            return None
+        table = np.frombuffer(self.data, record, rows, self.at) if record.itemsize else np.zeros(rows, record)
+        self.at += rows * record.itemsize
+        return [table[f"f{i}"] for i in range(len(fields))]
+
+
+class _Text:
+    """Values from words; None where the file ends before. All are float64, which holds every index exactly."""
+
+    def __init__(self, source: _Source, begin: int) -> None:
+        words = source.data[begin:].split()
+        self.at = 0
+        try:
+            self.numbers = np.fromiter(map(float, words), np.float64, len(words))
+        except ValueError:
+            line, word = _first_not_a_number(source.data, begin)
+            source.fail(f"{word!r} is not a number", f"line {line}")
+
+    def take(self, kind: str, count: int) -> np.ndarray | None:
+        if self.at + count > len(self.numbers):
+            return None
+        self.at += count
+        return self.numbers[self.at - count:self.at]
+
+    def table(self, fields: list[tuple[str, int]], rows: int) -> list[np.ndarray] | None:
+        widths = [n for _, n in fields]
+        if self.at + rows * sum(widths) > len(self.numbers):
+            return None
+        table = self.numbers[self.at:self.at + rows * sum(widths)].reshape(rows, sum(widths))
+        self.at += table.size
+        return np.split(table, np.cumsum(widths)[:-1], axis=1)
+
+
+def _first_not_a_number(data: bytes, begin: int) -> tuple[int, str]:
+    """The line and the word; there must be one."""
+    for number, line in enumerate(data[begin:].split(b"\n"), data.count(b"\n", 0, begin) + 1):
+        for word in line.split():
+            try:
+                float(word)
+            except ValueError:
+                return number, word.decode("latin-1")
+    raise AssertionError("every word is a number")

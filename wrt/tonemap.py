@@ -1,0 +1,146 @@
+"""From linear radiance to the codes a display shows: exposure, tone mapping, sRGB encoding.
+
+All colours are linear Rec. 709 until `encode_srgb`. "Display-linear" is the light that the display emits, in [0, 1].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from wrt.errors import InputError
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # of linear Rec. 709
+
+# Brighter than anything a curve tells apart from white, and small enough that its square fits in a float32.
+BRIGHTEST = np.float32(1e9)
+
+
+def encode_srgb(linear: np.ndarray) -> np.ndarray:
+    """The sRGB transfer function, exact and piecewise (IEC 61966-2-1): [0, 1] to [0, 1], any shape, NaN stays NaN."""
+    linear = np.asarray(linear)
+    low = linear <= 0.0031308
+    return np.where(low, linear * 12.92, 1.055 * np.power(np.where(low, 1.0, linear), 1.0 / 2.4) - 0.055)
+
+
+def decode_srgb(encoded: np.ndarray) -> np.ndarray:
+    """The inverse of `encode_srgb`: [0, 1] to [0, 1], any shape, NaN stays NaN."""
+    encoded = np.asarray(encoded)
+    low = encoded <= 0.04045
+    return np.where(low, encoded / 12.92, np.power((np.where(low, 1.0, encoded) + 0.055) / 1.055, 2.4))
+
+
+def luminance(linear: np.ndarray) -> np.ndarray:
+    """(..., 3) linear Rec. 709 to (...) relative luminance."""
+    return linear @ LUMINANCE.astype(linear.dtype)
+
+
+# --- curves: (..., 3) linear, finite and >= 0, to display-linear; `tone_map` clips what leaves [0, 1] ------------------
+
+
+def none(linear: np.ndarray) -> np.ndarray:
+    """No curve: what is brighter than 1 is clipped."""
+    return linear
+
+
+REINHARD_WHITE = 4.0  # two stops above 1
+
+
+def reinhard(linear: np.ndarray) -> np.ndarray:
+    """Reinhard's extended operator on luminance: L (1 + L / W^2) / (1 + L), with W = 4 the lowest luminance shown white.
+
+    Chromaticity is kept, so that a channel of a bright saturated colour can still clip.
+    Source: Reinhard, Stark, Shirley, Ferwerda, "Photographic Tone Reproduction for Digital Images" (2002), equation 4.
+    """
+    bright = luminance(linear)[..., None]
+    return linear * ((1.0 + bright / REINHARD_WHITE**2) / (1.0 + bright))
+
+
+# Rows act on a column of RGB. In: Rec. 709 to AP1 with the RRT's desaturation; out: the ODT's and back.
+ACES_IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
+ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
+
+
+def aces(linear: np.ndarray) -> np.ndarray:
+    """Stephen Hill's fit of the ACES reference rendering and sRGB output transforms, without extra exposure.
+
+    Source: S. Hill, ACES.hlsl in "Baking Lab" (M. Pettineo and D. Neubelt, 2016).
+    """
+    v = linear @ ACES_IN.T.astype(linear.dtype)
+    fitted = (v * (v + 0.0245786) - 0.000090537) / (v * (0.983729 * v + 0.4329510) + 0.238081)
+    return fitted @ ACES_OUT.T.astype(linear.dtype)
+
+
+# The inset of the primaries. The published rows sum to 1 only within 2e-4; scaled to 1, a grey stays exactly grey.
+AGX_INSET = np.array([
+    [0.842479062253094, 0.0784335999999992, 0.0792237451477643],
+    [0.0423282422610123, 0.878468636469772, 0.0791661274605434],
+    [0.0423756549057051, 0.0784336, 0.879142973793104],
+])
+AGX_INSET /= AGX_INSET.sum(axis=1, keepdims=True)
+AGX_OUTSET = np.linalg.inv(AGX_INSET)
+AGX_MIN_EV, AGX_MAX_EV = -10.0, 6.5  # stops about mid-grey, 0.18
+AGX_PIVOT = (AGX_MIN_EV / (AGX_MIN_EV - AGX_MAX_EV), 0.5)
+AGX_SLOPE, AGX_TOE_POWER, AGX_SHOULDER_POWER = 2.0, 3.0, 3.25
+
+
+def _agx_half(reach: np.ndarray, x_span: float, y_span: float, power: float) -> np.ndarray:
+    """One half of the sigmoid: from the pivot (0, 0) with the common slope to (x_span, y_span), where it ends."""
+    scale = (((AGX_SLOPE * x_span / y_span) ** power - 1.0) * (AGX_SLOPE * x_span) ** -power) ** (-1.0 / power)
+    term = AGX_SLOPE * reach / scale
+    return scale * term / (1.0 + term**power) ** (1.0 / power)
+
+
+def agx_contrast(x: np.ndarray) -> np.ndarray:
+    """AgX's default contrast: [0, 1] (log2 of exposure) to [0, 1] (display code); mid-grey is exactly 0.5.
+
+    The sigmoid itself: the polynomials fitted to it stray by up to 0.006 and end beside 0 and 1.
+    """
+    x_pivot, y_pivot = AGX_PIVOT
+    toe = y_pivot - _agx_half(np.maximum(x_pivot - x, 0.0), x_pivot, y_pivot, AGX_TOE_POWER)
+    shoulder = y_pivot + _agx_half(np.maximum(x - x_pivot, 0.0), 1.0 - x_pivot, 1.0 - y_pivot, AGX_SHOULDER_POWER)
+    return np.where(x < x_pivot, toe, shoulder)
+
+
+def agx(linear: np.ndarray) -> np.ndarray:
+    """Troy Sobotka's AgX, base look: inset, log2 between -10 and +6.5 stops, sigmoid, outset, 2.2 power to linear.
+
+    Sources: T. Sobotka, AgX-S2O3 (inset matrix, range, sigmoid) with the slope and powers of the AgX repository's NumPy
+    version; B. Wrensch, "Minimal AgX Implementation" (2023), for undoing the inset after the curve and for the 2.2 power
+    that the codes are meant for.
+    """
+    inset = linear @ AGX_INSET.T.astype(linear.dtype)
+    stops = np.log2(np.maximum(inset / 0.18, 2.0**AGX_MIN_EV))
+    x = np.clip((stops - AGX_MIN_EV) / (AGX_MAX_EV - AGX_MIN_EV), 0.0, 1.0)
+    codes = agx_contrast(x) @ AGX_OUTSET.T.astype(linear.dtype)
+    return np.clip(codes, 0.0, 1.0) ** 2.2
+
+
+TONEMAPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "none": none,
+    "reinhard": reinhard,
+    "aces": aces,
+    "agx": agx,
+}
+
+
+def tone_map(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none") -> np.ndarray:
+    """Linear radiance to display-linear light.
+
+    pixels: (..., 3) linear; exposure: stops; tonemap: a name in TONEMAPS. Returns (..., 3) float32 in [0, 1]. Negative
+    values, -inf and NaN become black, +inf becomes as bright as the curve gets. Raises InputError on an unknown name.
+    """
+    if tonemap not in TONEMAPS:
+        raise InputError(f"tonemap must be one of {', '.join(TONEMAPS)}; got {tonemap!r}")
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow is +inf and inf * 0 is NaN: both are dealt with here
+        exposed = np.asarray(pixels, dtype=np.float32) * np.float32(2.0**exposure)
+    linear = np.clip(np.nan_to_num(exposed, nan=0.0, posinf=BRIGHTEST, neginf=0.0), np.float32(0.0), BRIGHTEST)
+    return np.clip(TONEMAPS[tonemap](linear), 0.0, 1.0).astype(np.float32, copy=False)
+
+
+def to_codes(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none", bits: int = 8) -> np.ndarray:
+    """`tone_map`, sRGB-encoded and rounded to the nearest code: (..., 3) uint8 or, with bits=16, uint16."""
+    scale = 2.0**bits - 1.0
+    encoded = encode_srgb(tone_map(pixels, exposure, tonemap).astype(np.float64))
+    return np.rint(encoded * scale).astype(np.uint8 if bits == 8 else np.uint16)
