@@ -32,6 +32,7 @@ def load_ray(rays: RayArrays, i: int) -> Ray:
     ray.direction = rays.direction[i]
     ray.t_min = rays.t_min[i]
     ray.t_max = rays.t_max[i]
+    ray.exclude = -1
     return ray
 
 

@@ -31,12 +31,16 @@ def gamma(n: float) -> float:
 
 @wp.struct
 class Ray:
-    """The points origin + t * direction for t_min <= t <= t_max; direction need not be of unit length."""
+    """The points origin + t * direction for t_min <= t <= t_max; direction need not be of unit length.
+
+    exclude: a triangle that is not hit, because the ray starts on it (a plane is crossed once), or -1.
+    """
 
     origin: wp.vec3
     direction: wp.vec3
     t_min: float
     t_max: float
+    exclude: int
 
 
 @wp.struct
@@ -124,8 +128,8 @@ class Material:
 class Surfaces:
     """What there is to know about a primitive beyond where it is hit.
 
-    corners: one row a triangle, its indices into normals and uvs; n_triangles: primitives from here on are spheres.
-    materials and textures are shared by all.
+    normals and uvs are per vertex (length 1 and unread where the scene has none); n_triangles: primitives from here on are
+    spheres (center, radius).
     """
 
     n_triangles: int
@@ -182,7 +186,6 @@ class Background:
     pixels: wp.array(dtype=wp.vec3)
     row_cdf: wp.array(dtype=wp.float32)
     column_cdf: wp.array(dtype=wp.float32)
-    mean_weight: float
 
 
 @wp.struct
@@ -210,7 +213,7 @@ class Film:
     """One entry a pixel, row by row: running mean and sum of squared deviations (Welford 1962), samples, and what it took.
 
     rays: closest-hit and any-hit rays; cut_depth, cut_throughput: rays that were not followed, and lost: the throughput
-    (mean over the channels) that they would have carried.
+    (mean over the channels) that they would have carried. not_finite: samples that came out NaN or infinite and count as 0.
     """
 
     width: int
@@ -222,6 +225,7 @@ class Film:
     cut_depth: wp.array(dtype=wp.int32)
     cut_throughput: wp.array(dtype=wp.int32)
     lost: wp.array(dtype=wp.float32)
+    not_finite: wp.array(dtype=wp.int32)
     filter_icdf: wp.array(dtype=wp.float32)
 
 

@@ -66,6 +66,8 @@ def make_intersect(with_spheres: bool, accepts=None):
             return best
         if hit.t == best.t and primitive.prim_id > best.prim_id:
             return best
+        if primitive.prim_id == probe.ray.exclude:
+            return best
         if wp.static(accepts is not None):
             if not accepts(surfaces, primitive.prim_id, hit.u, hit.v):
                 return best

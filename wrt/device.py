@@ -27,6 +27,14 @@ def start(device: str) -> Any:
         raise InputError(f"no device {device!r}; there is {known}") from error
 
 
+def load_kernel(kernel: Any, device: Any) -> None:
+    """Compile a kernel, or take it from the cache, before threads launch it.
+
+    The CPU launches with blocks of one thread; the module's default block size would be compiled for nothing.
+    """
+    kernel.module.load(device, block_dim=1 if device.is_cpu else None)
+
+
 def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:
     """A Warp array of `dtype` (a Warp type or struct) from rows of a NumPy array; on the CPU without a copy if it fits."""
     if hasattr(dtype, "numpy_dtype"):  # a struct

@@ -1,7 +1,7 @@
 """What a glTF document may hold: JSON values become typed objects, each checked against its declared type.
 
-The core's objects are pygltflib's dataclasses; those of the extensions that wrt reads stand here. pygltflib's own decoder
-is not used: it turns 1.5 and "1" into the index 1, and its errors do not say where in the file they are.
+The core's objects are pygltflib's dataclasses; those of the extensions that wrt reads stand here. pygltflib's own
+decoder is not used: it turns 1.5 and "1" into the index 1, and its errors do not say where in the file they are.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def at(place: str) -> Iterator[None]:
 
 @dataclass
 class TextureInfo:
-    index: int = dataclasses.MISSING  # type: ignore[assignment]  # required
+    index: int
     texCoord: int = 0
     extensions: dict[str, Any] = field(default_factory=dict)
 
@@ -48,7 +48,7 @@ class TextureTransform:
 
 @dataclass
 class TextureSource:
-    source: int = dataclasses.MISSING  # type: ignore[assignment]  # required
+    source: int
 
 
 @dataclass
@@ -87,7 +87,7 @@ class SpotCone:
 
 @dataclass
 class PunctualLight:
-    type: str = dataclasses.MISSING  # type: ignore[assignment]  # required
+    type: str
     name: str | None = None
     color: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
     intensity: float = 1.0
@@ -102,7 +102,7 @@ class PunctualLights:
 
 @dataclass
 class PunctualLightOfNode:
-    light: int = dataclasses.MISSING  # type: ignore[assignment]  # required
+    light: int
 
 
 @dataclass
@@ -110,26 +110,27 @@ class Instancing:
     attributes: dict[str, int] = field(default_factory=dict)
 
 
-# --- checking -----------------------------------------------------------------------------------------------------------
+# --- checking ---------------------------------------------------------------------------------------------------------
 
 # pygltflib gives fields that the specification requires the default None.
 _REQUIRED = {
     "Accessor": ("componentType", "count", "type"), "Sparse": ("count", "indices", "values"),
     "AccessorSparseIndices": ("bufferView", "componentType"), "AccessorSparseValues": ("bufferView",),
     "BufferView": ("buffer", "byteLength"), "Buffer": ("byteLength",), "Camera": ("type",), "Perspective": ("yfov",),
-    "TextureInfo": ("index",), "NormalMaterialTexture": ("index",), "TextureSource": ("source",),
-    "PunctualLight": ("type",), "PunctualLightOfNode": ("light",), "Asset": ("version",), "GLTF2": ("asset",),
+    "TextureInfo": ("index",), "NormalMaterialTexture": ("index",), "Asset": ("version",), "GLTF2": ("asset",),
 }
 _SCALARS: dict[Any, tuple[str, tuple[type, ...]]] = {
-    int: ("an integer", (int,)), float: ("a number", (int, float)), str: ("a string", (str,)), bool: ("true or false", (bool,)),
+    int: ("an integer", (int,)), float: ("a number", (int, float)), str: ("a string", (str,)),
+    bool: ("true or false", (bool,)),
 }
 
 
 def read_as(hint: Any, raw: Any, place: str) -> Any:
-    """The JSON value `raw` as the type `hint`: a scalar, list, dict or dataclass (made of the same, and of pygltflib's).
+    """The JSON value `raw` as the type `hint`: a scalar, a list, a dict, or a dataclass (here or of pygltflib).
 
     Keys that the class does not have are left out, so are `extras`; null stands for a key that is not there. Raises
-    InputError that names the place where a value has another type, a number is not finite, or a required key is missing.
+    InputError that names the place where a value has another type, a number is not finite, or a required key is
+    missing.
     """
     hint = _without_none(hint)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
@@ -148,8 +149,15 @@ def read_as(hint: Any, raw: Any, place: str) -> Any:
     return _object(hint, raw, place)
 
 
+def exactly(values: list[float], count: int, place: str) -> list[float]:
+    """`values`; raises InputError at `place` where there are not `count` of them."""
+    if len(values) != count:
+        raise InputError(f"must hold {count} numbers, got {len(values)}", None, place)
+    return values
+
+
 def _object(cls: Any, raw: dict[str, Any], place: str) -> Any:
-    for name in _REQUIRED.get(cls.__name__, ()):
+    for name in _required(cls):
         if raw.get(name) is None:
             raise InputError("is required", None, _join(place, name))
     values = {name: read_as(hint, raw[name], _join(place, name))
@@ -163,16 +171,28 @@ def _fields(cls: Any) -> dict[str, Any]:
     return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.name != "extras"}
 
 
+@functools.cache
+def _required(cls: Any) -> tuple[str, ...]:
+    without_default = tuple(f.name for f in dataclasses.fields(cls)
+                            if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING)
+    return without_default + _REQUIRED.get(cls.__name__, ())
+
+
 def _scalar(hint: Any, raw: Any, place: str) -> Any:
     expected, accepted = _SCALARS[hint]
     if hint is int and isinstance(raw, float) and raw.is_integer():
         raw = int(raw)  # JSON does not tell 1.0 from 1
-    if not isinstance(raw, accepted) or (isinstance(raw, bool) and hint is not bool):
+    fits = isinstance(raw, accepted) and (hint is bool or not isinstance(raw, bool))
+    if not fits:
         raise _wrong(expected, raw, place)
     if hint is float:
-        if not abs(raw) <= 1e300:  # an integer may be too long for a double
+        try:
+            number = float(raw)
+        except OverflowError:  # an integer too long for a double
+            number = math.inf
+        if not math.isfinite(number):
             raise _wrong("a finite number", raw, place)
-        raw = float(raw)
+        return number
     return raw
 
 

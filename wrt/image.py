@@ -1,7 +1,8 @@
 """Image files: PNG (8 and 16 bit), OpenEXR and Radiance HDR, each written whole or not at all.
 
-Rows run from the top down. Colours in memory are linear Rec. 709; a PNG or JPEG file holds sRGB codes. OpenImageIO reads
-and writes EXR and HDR. PNG is encoded here: no library at hand writes both 16-bit RGB and text outside of ASCII.
+Rows run from the top down. Colours in memory are linear Rec. 709; a PNG or JPEG file holds sRGB codes. OpenImageIO
+reads and writes EXR and HDR, Pillow reads the rest. PNG is encoded here: Pillow writes no 16-bit RGB, and OpenImageIO's
+PNG writer spoils text outside of ASCII and reports success on a full disk.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ EXACT_IN_FLOAT = 1 << 24  # every integer up to here is a float32
 
 
 def output_format(path: PathLike, bits: int | None = None) -> tuple[str, int]:
-    """The suffix and bits a channel that `path` is to be written with; raises InputError where wrt cannot write that."""
+    """The suffix and bits a channel that `path` is to be written with; raises InputError where wrt has no such."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"cannot write {suffix or 'a file without a suffix'}; use {', '.join(FORMATS)}", path)
@@ -87,11 +88,11 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
                 tonemap: str = "none", metadata: Mapping[str, Any] | None = None) -> None:
     """Write one picture in the format that the suffix names.
 
-    pixels: (H, W, 3) linear. bits: a channel (FORMATS; default 8 for PNG, 32 for EXR and HDR; 16 in EXR is half). PNG gets
-    `exposure` stops and `tonemap`; EXR and HDR stay linear and get neither. metadata: goes in as text, a `wrt:key` each.
-    NaN and infinite values are kept in EXR; in PNG, NaN and -inf are black and +inf is white; HDR holds neither those nor
-    negative values (they become 0, or the format's brightest). What is replaced is counted in one SceneWarning.
-    Raises InputError where the file cannot be written; an existing file is then as it was.
+    pixels: (H, W, 3) linear. bits: a channel (FORMATS; default 8 for PNG, 32 for EXR and HDR; 16 in EXR is half). PNG
+    gets `exposure` stops and `tonemap`; EXR and HDR stay linear and get neither. metadata: goes in as text, a `wrt:key`
+    each. NaN and infinite values are kept in EXR; in PNG, NaN and -inf are black and +inf is white; HDR holds neither
+    those nor negative values (they become 0, or its brightest). What is replaced is counted in one SceneWarning. Raises
+    InputError where the file cannot be written; an existing file is then as it was.
     """
     pixels = _as_picture(pixels, path)
     suffix, bits = output_format(path, bits)
@@ -99,7 +100,7 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
 
 
 def write_codes(path: PathLike, codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> None:
-    """Write display codes, (H, W, 3) uint8 or uint16, as they are to a PNG file. Raises InputError as write_image does."""
+    """Write display codes, (H, W, 3) uint8 or uint16, to a PNG file as they are. Raises InputError as write_image."""
     data = encode_png(codes, metadata or {})
     with _replacing(path) as temporary:
         temporary.write_bytes(data)
@@ -108,24 +109,26 @@ def write_codes(path: PathLike, codes: np.ndarray, metadata: Mapping[str, Any] |
 def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapping[str, Any] | None = None) -> None:
     """Write named channels to one OpenEXR part, ZIP-compressed.
 
-    channels: (H, W) each, all of one size; float16 is stored as half, everything else as float. Integers are exact up to
-    2^24 (OpenEXR has integer channels, but OpenImageIO's Python binding cannot mix them with float ones); beyond that a
-    SceneWarning says so. Raises InputError as write_image does.
+    channels: (H, W) each, all of one size; float16 is stored as half, everything else as float. Integers are exact up
+    to 2^24 (OpenEXR has integer channels, but OpenImageIO's Python binding rounds them where others are float); beyond
+    that a SceneWarning says so. Raises InputError as write_image does.
     """
     import OpenImageIO as oiio
 
     arrays = list(channels.values())
     height, width = arrays[0].shape
-    spec = oiio.ImageSpec(width, height, len(arrays), "float")
+    types = ["half" if array.dtype == np.float16 else "float" for array in arrays]
+    # OpenImageIO takes the types of the channels only where they differ, else that of the whole.
+    spec = oiio.ImageSpec(width, height, len(arrays), types[0])
     spec.channelnames = tuple(channels)
-    spec.channelformats = tuple(oiio.TypeDesc("half" if a.dtype == np.float16 else "float") for a in arrays)
+    spec.channelformats = tuple(oiio.TypeDesc(name) for name in types)
     spec.attribute("compression", "zip")
     for key, value in (metadata or {}).items():
         spec.attribute(METADATA_PREFIX + key, str(value))
     for name, array in channels.items():
         if array.dtype.kind in "iu" and array.size and int(array.max()) > EXACT_IN_FLOAT:
-            warnings.warn(f"{os.fspath(path)}: {name} goes up to {array.max()}: rounded, as a float channel is exact only"
-                          f" to {EXACT_IN_FLOAT}", SceneWarning, stacklevel=2)
+            warnings.warn(f"{os.fspath(path)}: {name} goes up to {array.max()} and is rounded: its channel is exact to"
+                          f" {EXACT_IN_FLOAT}", SceneWarning, stacklevel=2)
     _write_oiio(path, spec, lambda y0, y1: np.stack([a[y0:y1].astype(np.float32) for a in arrays], axis=-1))
 
 
@@ -193,7 +196,7 @@ def as_half(path: PathLike, pixels: np.ndarray) -> np.ndarray:
 def _warn_replaced(path: PathLike, where: np.ndarray, what: str) -> None:
     if where.any():
         count = int(where.any(axis=-1).sum())
-        warnings.warn(f"{os.fspath(path)}: {count} pixel{'s' * (count != 1)} {what}", SceneWarning, stacklevel=5)
+        warnings.warn(f"{os.fspath(path)}: {count} pixel{'s' * (count != 1)} {what}", SceneWarning, stacklevel=2)
 
 
 def _as_picture(pixels: np.ndarray, path: PathLike) -> np.ndarray:
@@ -233,8 +236,8 @@ def encode_png(codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> 
 def read_image(path: PathLike) -> np.ndarray:
     """The colours of an image file: (H, W, 3) float32, linear.
 
-    EXR: R, G, B, or one channel taken three times; HDR as it is; PNG, JPEG and the like decoded from sRGB, 16-bit PNG in
-    full. Alpha is left out, not applied. Raises InputError where the file is missing, truncated, or no picture.
+    EXR: R, G, B, or one channel taken three times; HDR as it is; PNG, JPEG and the like decoded from sRGB, 16-bit PNG
+    in full. Alpha is left out, not applied. Raises InputError where the file is missing, truncated, or no picture.
     """
     _check_readable(path)
     suffix = Path(path).suffix.lower()
@@ -245,8 +248,7 @@ def read_image(path: PathLike) -> np.ndarray:
     # The whole file is decoded even where it has 16 bits: unlike OpenImageIO, Pillow refuses each truncated file.
     codes = read_rgba8(path)[..., :3]
     if _is_png16(path):
-        channels = read_channels(path)
-        codes = np.rint(_pick_colors(channels, path) * 65535.0).astype(np.uint16)
+        codes = np.rint(_pick_colors(read_channels(path), path) * 65535.0).astype(np.uint16)
     levels = np.iinfo(codes.dtype).max
     return decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)[codes]
 
@@ -254,8 +256,8 @@ def read_image(path: PathLike) -> np.ndarray:
 def read_rgba8(source: PathLike | bytes, name: str = "") -> np.ndarray:
     """A PNG, JPEG, ... file, or its bytes, as (H, W, 4) uint8 codes; alpha is 255 where the file has none.
 
-    16-bit channels keep their high byte. name: what an error calls the file (default: its path). Raises InputError where
-    the file is missing, truncated, or no picture.
+    16-bit channels keep their high byte. name: what an error calls the file (default: its path). Raises InputError
+    where the file is missing, truncated, or no picture.
     """
     from PIL import Image
 

@@ -48,7 +48,8 @@ class Mesh:
             if getattr(self, attribute) is not None:
                 array = self._array(attribute, np.float32, width)
                 if len(array) != len(vertices):
-                    raise InputError(f"{len(array)} {attribute} for {len(vertices)} vertices", self.name or None, attribute)
+                    raise InputError(f"{len(array)} {attribute} for {len(vertices)} vertices", self.name or None,
+                                     attribute)
                 _require_finite(array, self.name, attribute)
         if self.face_group is not None:
             group = np.ascontiguousarray(self.face_group, dtype=np.int32)
@@ -63,7 +64,7 @@ class Mesh:
         if dtype is np.int32 and raw.size and not np.issubdtype(raw.dtype, np.integer):
             raise InputError(f"must hold integers, got {raw.dtype}", self.name or None, attribute)
         with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, which the check for finite reports
-            array = np.ascontiguousarray(raw, dtype=dtype)
+            array: np.ndarray = np.ascontiguousarray(raw, dtype=dtype)
         object.__setattr__(self, attribute, array)
         return array
 
@@ -124,8 +125,8 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
     except (OSError, MemoryError) as error:
         raise InputError(f"cannot be read: {error}", path) from error
     if len(raw.faces) == 0:
-        raise InputError(f"holds no triangles ({raw.positions} positions, {raw.incomplete} faces of fewer than 3 corners)",
-                         path)
+        raise InputError(f"holds no triangles ({raw.positions} positions, {raw.incomplete} faces of fewer than 3 "
+                         "corners)", path)
     groups, face_group = raw.groups, raw.face_group
     if parts:
         groups, face_group = _part_groups(parts, len(raw.faces), path)
@@ -149,7 +150,8 @@ def _part_groups(parts: Sequence[tuple[int, int]], faces: int, path: Path) -> tu
     group = np.full(faces, len(parts), dtype=np.int32)
     for number, (first, count) in enumerate(parts):
         if first < 0 or count < 0 or first + count > faces:
-            raise InputError(f"triangles {first} to {first + count - 1}, but the file has {faces}", path, f"part {number}")
+            raise InputError(f"triangles {first} to {first + count - 1}, but the file has {faces}", path,
+                             f"part {number}")
         group[first:first + count] = number
     return (*(str(number) for number in range(len(parts))), "rest"), group
 
@@ -162,7 +164,8 @@ def _finite(array: np.ndarray | None, attribute: str, path: Path) -> np.ndarray 
         array = np.asarray(array, dtype=np.float32)
     bad = ~np.isfinite(array).all(axis=1)
     if bad.any():
-        warnings.warn(f"{path}: {int(bad.sum())} {attribute} are not finite and taken as zero", SceneWarning, stacklevel=3)
+        warnings.warn(f"{path}: {int(bad.sum())} {attribute} are not finite and taken as zero", SceneWarning,
+                      stacklevel=3)
         array = np.where(bad[:, None], np.float32(0.0), array)
     return array
 

@@ -25,9 +25,9 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     """Drop the faces whose area is exactly zero, then the vertices that no remaining face uses.
 
     vertices: (V, 3), taken as float32; faces: (F, 3) integers; normals (V, 3), uvs (V, 2) and face_group (F,) or None.
-    The order of what remains is kept. Area is the cross product of two edges, in float64 from the float32 positions: zero
-    for repeated indices, coincident corners and corners exactly on a line; it neither overflows nor underflows. A face with
-    a NaN or an infinite corner is kept, so that whoever makes the `Mesh` reports it.
+    The order of what remains is kept. Area is the cross product of two edges, in float64 from the float32 positions:
+    zero for repeated indices, coincident corners and corners exactly on a line; it neither overflows nor underflows. A
+    face with a NaN or an infinite corner is kept, so that whoever makes the `Mesh` reports it.
     Raises InputError that names the first face with an index outside of [0, V).
     """
     vertices = np.asarray(vertices, dtype=np.float32).reshape(-1, 3)
@@ -35,7 +35,8 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     outside = ((faces < 0) | (faces >= len(vertices))).any(axis=1)
     if outside.any():
         face = int(np.nonzero(outside)[0][0])
-        raise InputError(f"face {face} is {faces[face].tolist()}, but there are {len(vertices)} vertices", None, "faces")
+        corners = faces[face].tolist()
+        raise InputError(f"face {face} is {corners}, but there are {len(vertices)} vertices", None, "faces")
 
     has_area = _has_area(vertices, faces)
     dropped = len(faces) - int(np.count_nonzero(has_area))

@@ -1,6 +1,6 @@
 """Wavefront OBJ text: positions, normals, texture coordinates and named groups of faces.
 
-Why not trimesh, which reads the other formats: measured with 5.2, it fails with an IndexError on relative indices (`f
+Why not trimesh: measured with 5.2, it fails with an IndexError on relative indices (`f
 -4 -3 -2 -1`), loses the names of materials whose .mtl is missing, sorts the faces by material, and where positions
 and normals are indexed apart it keeps one normal for each position. A material's faces, and their order, are what a
 scene file refers to.
@@ -34,7 +34,7 @@ class _Text:
         self.corners: list[str] = []
         self.counts: list[int] = []
         self.face_lines: list[int] = []
-        # keyword -> names in order of first use, and (first polygon, name) of each span
+        # of each keyword: (number of the first polygon, name) of every span
         self.spans: dict[str, list[tuple[int, str]]] = {"usemtl": [], "g": [], "o": []}
 
     def fail(self, line: int, message: str) -> NoReturn:
@@ -84,7 +84,7 @@ class _Text:
                 count = len(self.lines[key])
                 index = self.integer(part, corner, line)
                 if not -count <= index < 0:
-                    self.fail(line, f"face corner {corner!r}: {key} index {index}, but only {count} {key} come before it")
+                    self.fail(line, f"face corner {corner!r}: {key} index {index}, but only {count} {key} stand before")
                 parts[i] = str(count + 1 + index)
         return "/".join(parts)
 
@@ -127,8 +127,8 @@ class _Text:
                 if part:
                     different[i, k] = int(part) if part.isdecimal() else 0
                     if not 1 <= different[i, k] <= len(self.lines[keys[k]]):
-                        self.fail(self._first_line(index, i), f"face corner {corner!r}: {keys[k]} index {part} is not in "
-                                                              f"1 to {len(self.lines[keys[k]])}")
+                        self.fail(self._first_line(index, i), f"face corner {corner!r}: {keys[k]} index {part} is not "
+                                                              f"in 1 to {len(self.lines[keys[k]])}")
         order = np.lexsort(different.T[::-1])
         rank = np.empty(len(order), dtype=np.int64)
         rank[order] = np.arange(len(order))

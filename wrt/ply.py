@@ -19,9 +19,9 @@ from wrt.mesh import RawMesh
 from wrt.polygons import triangulate
 
 _TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
-    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8",
-    "uint64": "u8", "float32": "f4", "float64": "f8",
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "int64": "i8", "uint64": "u8", "float": "f4", "double": "f8", "float32": "f4", "float64": "f8",
 }
 _SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # what a list's length may be
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
@@ -132,7 +132,8 @@ class _Source:
         self.path = path
         self.data = path.read_bytes()
         form, self.elements, begin = self._header()
-        self.stream: _Text | _Binary = _Text(self, begin) if form == "ascii" else _Binary(self.data, begin, _ORDERS[form])
+        binary = form != "ascii"
+        self.stream: _Text | _Binary = _Binary(self.data, begin, _ORDERS[form]) if binary else _Text(self, begin)
         for element in self.elements:
             if element.rows:
                 self._read(element)

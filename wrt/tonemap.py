@@ -14,7 +14,7 @@ from wrt.errors import InputError
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # of linear Rec. 709
 
 # Brighter than anything a curve tells apart from white, and small enough that its square fits in a float32.
-BRIGHTEST = np.float32(1e9)
+BRIGHTEST = 1e9
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
@@ -36,7 +36,7 @@ def luminance(linear: np.ndarray) -> np.ndarray:
     return linear @ LUMINANCE.astype(linear.dtype)
 
 
-# --- curves: (..., 3) linear, finite and >= 0, to display-linear; `tone_map` clips what leaves [0, 1] ------------------
+# --- curves: (..., 3) linear, finite and >= 0, to display-linear; `tone_map` clips what leaves [0, 1] -----------------
 
 
 def none(linear: np.ndarray) -> np.ndarray:
@@ -48,7 +48,7 @@ REINHARD_WHITE = 4.0  # two stops above 1
 
 
 def reinhard(linear: np.ndarray) -> np.ndarray:
-    """Reinhard's extended operator on luminance: L (1 + L / W^2) / (1 + L), with W = 4 the lowest luminance shown white.
+    """Reinhard's extended operator on luminance: L (1 + L / W^2) / (1 + L), where W = 4 is the lowest that shows white.
 
     Chromaticity is kept, so that a channel of a bright saturated colour can still clip.
     Source: Reinhard, Stark, Shirley, Ferwerda, "Photographic Tone Reproduction for Digital Images" (2002), equation 4.
@@ -106,9 +106,9 @@ def agx_contrast(x: np.ndarray) -> np.ndarray:
 def agx(linear: np.ndarray) -> np.ndarray:
     """Troy Sobotka's AgX, base look: inset, log2 between -10 and +6.5 stops, sigmoid, outset, 2.2 power to linear.
 
-    Sources: T. Sobotka, AgX-S2O3 (inset matrix, range, sigmoid) with the slope and powers of the AgX repository's NumPy
-    version; B. Wrensch, "Minimal AgX Implementation" (2023), for undoing the inset after the curve and for the 2.2 power
-    that the codes are meant for.
+    Sources: T. Sobotka, AgX-S2O3 (inset matrix, range, sigmoid), with the slope and powers of the NumPy version in his
+    AgX repository; B. Wrensch, "Minimal AgX Implementation" (2023), for undoing the inset after the curve and for the
+    2.2 power that the codes are meant for.
     """
     inset = linear @ AGX_INSET.T.astype(linear.dtype)
     stops = np.log2(np.maximum(inset / 0.18, 2.0**AGX_MIN_EV))
@@ -135,7 +135,7 @@ def tone_map(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none") -
         raise InputError(f"tonemap must be one of {', '.join(TONEMAPS)}; got {tonemap!r}")
     with np.errstate(over="ignore", invalid="ignore"):  # overflow is +inf and inf * 0 is NaN: both are dealt with here
         exposed = np.asarray(pixels, dtype=np.float32) * np.float32(2.0**exposure)
-    linear = np.clip(np.nan_to_num(exposed, nan=0.0, posinf=BRIGHTEST, neginf=0.0), np.float32(0.0), BRIGHTEST)
+    linear = np.clip(np.nan_to_num(exposed, nan=0.0, posinf=BRIGHTEST, neginf=0.0), 0.0, BRIGHTEST)
     return np.clip(TONEMAPS[tonemap](linear), 0.0, 1.0).astype(np.float32, copy=False)
 
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from wrt.device import records, run_all, start, thread_count, upload
+from wrt.device import load_kernel, records, run_all, start, thread_count, upload
 from wrt.errors import InputError
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
 from wrt.kernels.structs import Primitive, Surfaces
@@ -163,7 +163,7 @@ class Accelerator(ABC):
         if self.device.is_cuda:
             wp.launch(kernel, dim=n, inputs=[self.data, surfaces, rays, out, 0], device=self.device)
             return
-        kernel.module.load(self.device)  # once, before the threads start
+        load_kernel(kernel, self.device)
 
         def job(first: int) -> Any:
             count = min(RAYS_PER_LAUNCH, n - first)

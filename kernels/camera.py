@@ -1,0 +1,47 @@
+"""Cameras: from a point of the picture, and one of the lens, to a ray."""
+
+import warp as wp
+
+from wrt.kernels.sampling import disk, polygon
+from wrt.kernels.structs import Camera, Ray
+
+
+@wp.func
+def chief_ray(camera: Camera, film: wp.vec2) -> wp.vec3:
+    """The direction through the lens' centre, which no lens bends; its part along `forward` is 1.
+
+    film: (0, 0) is the picture's top left corner, (1, 1) the bottom right one.
+    """
+    x = (2.0 * film[0] - 1.0) * camera.tan_x
+    y = (1.0 - 2.0 * film[1]) * camera.tan_y
+    return camera.forward + x * camera.right + y * camera.up
+
+
+def make_camera_ray(lens: bool, blades: bool):
+    """Pinhole, or thin lens with a round or polygonal aperture; direction of unit length, world space."""
+
+    @wp.func
+    def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
+        """All rays of one film point cross at one point S of the plane in focus.
+
+        S is where two rays meet that are easy to draw: the chief ray through the lens' centre, and the one that arrives
+        parallel to the axis and leaves through the focal point. By the lens equation 1/s + 1/s' = 1/f this is the point of
+        the chief ray at distance s = focus_distance along the axis. The ray then goes from the lens sample L to S.
+        """
+        chief = chief_ray(camera, film)
+        ray = Ray()
+        ray.t_min = 0.0
+        ray.t_max = float(wp.inf)
+        ray.exclude = -1
+        ray.origin = camera.origin
+        ray.direction = wp.normalize(chief)
+        if wp.static(lens):
+            sample = disk(xi)
+            if wp.static(blades):
+                sample = polygon(xi, camera.blades, camera.blade_rotation)
+            offset = camera.aperture_radius * (sample[0] * camera.right + sample[1] * camera.up)
+            ray.origin = camera.origin + offset
+            ray.direction = wp.normalize(camera.focus_distance * chief - offset)
+        return ray
+
+    return camera_ray

@@ -1,0 +1,117 @@
+"""The kernels that make pictures: camera, integrator, film."""
+
+import warp as wp
+
+from wrt.kernels.camera import chief_ray, make_camera_ray
+from wrt.kernels.materials import make_cutout
+from wrt.kernels.sampling import hash_pair, sample_2d
+from wrt.kernels.structs import AovFilm, Camera, Film, Lighting, Limits, Ray, Surfaces, Tile, kernel
+from wrt.kernels.whitted import make_radiance, make_shade
+
+
+@wp.func
+def filter_offset(icdf: wp.array(dtype=wp.float32), x: float) -> float:
+    """Where a filter puts the sample x in [0, 1): its inverse distribution, in pixels from the pixel's centre."""
+    position = x * float(icdf.shape[0] - 1)
+    i = wp.min(int(position), icdf.shape[0] - 2)
+    return wp.lerp(icdf[i], icdf[i + 1], position - float(i))
+
+
+def make_traversals(features, accelerator):
+    """closest_hit and any_hit of a structure; with cut-outs both look at each hit's alpha."""
+    accepts = make_cutout(features) if features.cutout else None
+    closest_hit = accelerator.traversal(any_hit=False, with_spheres=features.spheres, accepts=accepts)
+    any_hit = accelerator.traversal(any_hit=True, with_spheres=features.spheres, accepts=accepts)
+    return closest_hit, any_hit
+
+
+def make_render_kernel(features, accelerator):
+    """A kernel that adds samples to the pixels of a tile; it holds only the code that `features` asks for."""
+    accel_struct = accelerator.struct
+    closest_hit, any_hit = make_traversals(features, accelerator)
+    camera_ray = make_camera_ray(features.lens, features.blades)
+    radiance = make_radiance(features, accel_struct, closest_hit, any_hit)
+
+    @kernel
+    def render(
+        accel: accel_struct,
+        surfaces: Surfaces,
+        lighting: Lighting,
+        camera: Camera,
+        limits: Limits,
+        film: Film,
+        tile: Tile,
+    ):
+        tid = wp.tid()
+        x = tile.x + tid % tile.width
+        y = tile.y + tid / tile.width
+        pixel = y * film.width + x
+        key = hash_pair(hash_pair(limits.seed, wp.uint32(x)), wp.uint32(y))
+        mean = film.mean[pixel]
+        m2 = film.m2[pixel]
+        n = film.samples[pixel]
+        for i in range(tile.n_samples):
+            index = wp.uint32(tile.first_sample + i)
+            # The filter is sampled by importance, so that each sample has weight 1 and belongs to this pixel alone.
+            xi = sample_2d(key, index, 0)
+            offset = wp.vec2(xi[0] - 0.5, xi[1] - 0.5)
+            if wp.static(features.filter):
+                offset = wp.vec2(filter_offset(film.filter_icdf, xi[0]), filter_offset(film.filter_icdf, xi[1]))
+            position = wp.vec2(
+                (float(x) + 0.5 + offset[0]) / float(film.width), (float(y) + 0.5 + offset[1]) / float(film.height)
+            )
+            lens_xi = wp.vec2(0.0, 0.0)
+            if wp.static(features.lens):
+                lens_xi = sample_2d(key, index, 1)
+            ray = camera_ray(camera, position, lens_xi)
+            sample = radiance(accel, surfaces, lighting, limits, ray, key, index)
+            color = sample.radiance
+            if not wp.isfinite(color[0] + color[1] + color[2]):
+                film.not_finite[pixel] += 1
+                color = wp.vec3(0.0, 0.0, 0.0)
+            n = n + 1
+            delta = color - mean
+            mean = mean + delta / float(n)
+            m2 = m2 + wp.cw_mul(delta, color - mean)
+            film.rays[pixel] += wp.int64(sample.rays)
+            film.cut_depth[pixel] += sample.cut_depth
+            film.cut_throughput[pixel] += sample.cut_throughput
+            film.lost[pixel] += sample.lost
+        film.mean[pixel] = mean
+        film.m2[pixel] = m2
+        film.samples[pixel] = n
+
+    return render
+
+
+def make_aov_kernel(features, accelerator):
+    """What the ray through each pixel's centre (and the lens' centre) meets first."""
+    accel_struct = accelerator.struct
+    closest_hit, any_hit = make_traversals(features, accelerator)
+    surface_at, resolve, shading_normal = make_shade(features, accel_struct, closest_hit)
+
+    @kernel
+    def aovs(accel: accel_struct, surfaces: Surfaces, camera: Camera, film: AovFilm, tile: Tile, width: int, height: int):
+        tid = wp.tid()
+        x = tile.x + tid % tile.width
+        y = tile.y + tid / tile.width
+        pixel = y * width + x
+        ray = Ray()
+        ray.origin = camera.origin
+        position = wp.vec2((float(x) + 0.5) / float(width), (float(y) + 0.5) / float(height))
+        ray.direction = wp.normalize(chief_ray(camera, position))
+        ray.t_min = 0.0
+        ray.t_max = float(wp.inf)
+        ray.exclude = -1
+        hit = closest_hit(accel, surfaces, ray)
+        film.depth[pixel] = hit.t
+        film.prim_id[pixel] = hit.prim_id
+        film.material_id[pixel] = -1
+        if hit.prim_id >= 0:
+            s = surface_at(surfaces, ray, hit)
+            m = resolve(surfaces, s)
+            film.normal[pixel] = shading_normal(surfaces, m, s, -ray.direction)
+            film.albedo[pixel] = m.albedo
+            film.material_id[pixel] = s.material
+
+    return aovs

@@ -1,0 +1,174 @@
+"""Samples: a counter-based low-discrepancy sequence, and the shapes that its points are mapped to.
+
+Every number is a function of (pixel, sample, dimension, seed) alone, so that pictures do not depend on tiles, threads or
+passes. Each pair of dimensions is the two-dimensional Sobol sequence, with its points in a shuffled order and Owen-scrambled,
+both by hashing (Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4)). The hash for the nested scramble has the
+constants of Vegdahl 2021 ("Building a Better LK Hash").
+"""
+
+import warp as wp
+
+TWO_PI = wp.constant(6.283185307179586)
+PI = wp.constant(3.141592653589793)
+
+
+@wp.func
+def hash_u32(x: wp.uint32) -> wp.uint32:
+    """A bijection of 32 bits without visible pattern (two rounds of xor-shift and multiplication; Wellons 2018)."""
+    x = x ^ (x >> wp.uint32(16))
+    x = x * wp.static(wp.uint32(0x21F0AAAD))
+    x = x ^ (x >> wp.uint32(15))
+    x = x * wp.static(wp.uint32(0xD35A2D97))
+    return x ^ (x >> wp.uint32(15))
+
+
+@wp.func
+def hash_pair(a: wp.uint32, b: wp.uint32) -> wp.uint32:
+    """One hash of two numbers; not symmetric."""
+    return hash_u32(a + wp.static(wp.uint32(0x9E3779B9)) * hash_u32(b + wp.static(wp.uint32(0x85EBCA6B))))
+
+
+@wp.func
+def reverse_bits(x: wp.uint32) -> wp.uint32:
+    x = ((x >> wp.uint32(1)) & wp.static(wp.uint32(0x55555555))) | ((x & wp.static(wp.uint32(0x55555555))) << wp.uint32(1))
+    x = ((x >> wp.uint32(2)) & wp.static(wp.uint32(0x33333333))) | ((x & wp.static(wp.uint32(0x33333333))) << wp.uint32(2))
+    x = ((x >> wp.uint32(4)) & wp.static(wp.uint32(0x0F0F0F0F))) | ((x & wp.static(wp.uint32(0x0F0F0F0F))) << wp.uint32(4))
+    x = ((x >> wp.uint32(8)) & wp.static(wp.uint32(0x00FF00FF))) | ((x & wp.static(wp.uint32(0x00FF00FF))) << wp.uint32(8))
+    return (x >> wp.uint32(16)) | (x << wp.uint32(16))
+
+
+@wp.func
+def laine_karras(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
+    """A permutation in which each bit depends only on itself and lower ones: on reversed bits, a nested scramble."""
+    x = x ^ (x * wp.static(wp.uint32(0x3D20ADEA)))
+    x = x + seed
+    x = x * ((seed >> wp.uint32(16)) | wp.uint32(1))
+    x = x ^ (x * wp.static(wp.uint32(0x05526C56)))
+    return x ^ (x * wp.static(wp.uint32(0x53A22864)))
+
+
+@wp.func
+def sobol_second(index: wp.uint32) -> wp.uint32:
+    """Bits of the second Sobol dimension, lowest bit first: the Pascal matrix modulo 2.
+
+    Entry (i, j) is odd exactly where j's bits are among i's (Lucas), so that the product is five folds.
+    """
+    x = index
+    x = x ^ ((x >> wp.uint32(1)) & wp.static(wp.uint32(0x55555555)))
+    x = x ^ ((x >> wp.uint32(2)) & wp.static(wp.uint32(0x33333333)))
+    x = x ^ ((x >> wp.uint32(4)) & wp.static(wp.uint32(0x0F0F0F0F)))
+    x = x ^ ((x >> wp.uint32(8)) & wp.static(wp.uint32(0x00FF00FF)))
+    return x ^ (x >> wp.uint32(16))
+
+
+@wp.func
+def unit_float(x: wp.uint32) -> float:
+    """The upper 24 bits as a number in [0, 1)."""
+    return float(x >> wp.uint32(8)) * wp.static(2.0**-24)
+
+
+@wp.func
+def sample_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
+    """Point `index` of the sequence that belongs to (key, dimension); any 2^k-aligned block of 2^k is a (0, k, 2)-net."""
+    seed = hash_pair(key, wp.uint32(dimension))
+    i = reverse_bits(laine_karras(reverse_bits(index), seed))
+    x = reverse_bits(laine_karras(i, hash_u32(seed ^ wp.static(wp.uint32(0xA511E9B3)))))
+    y = reverse_bits(laine_karras(sobol_second(i), hash_u32(seed ^ wp.static(wp.uint32(0x63D83595)))))
+    return wp.vec2(unit_float(x), unit_float(y))
+
+
+@wp.func
+def disk(xi: wp.vec2) -> wp.vec2:
+    """The unit disk, uniformly, by concentric squares (Shirley and Chiu 1997)."""
+    a = 2.0 * xi[0] - 1.0
+    b = 2.0 * xi[1] - 1.0
+    if a == 0.0 and b == 0.0:
+        return wp.vec2(0.0, 0.0)
+    if wp.abs(a) > wp.abs(b):
+        angle = PI / 4.0 * (b / a)
+        return wp.vec2(a * wp.cos(angle), a * wp.sin(angle))
+    angle = PI / 2.0 - PI / 4.0 * (a / b)
+    return wp.vec2(b * wp.cos(angle), b * wp.sin(angle))
+
+
+@wp.func
+def polygon(xi: wp.vec2, sides: int, rotation: float) -> wp.vec2:
+    """The regular polygon in the unit circle, uniformly: a sector by the first number, a point in its triangle by the rest."""
+    scaled = xi[0] * float(sides)
+    sector = wp.min(int(scaled), sides - 1)
+    r = wp.sqrt(scaled - float(sector))
+    step = TWO_PI / float(sides)
+    a = rotation + step * float(sector)
+    b = a + step
+    wa = r * (1.0 - xi[1])
+    wb = r * xi[1]
+    return wp.vec2(wa * wp.cos(a) + wb * wp.cos(b), wa * wp.sin(a) + wb * wp.sin(b))
+
+
+@wp.func
+def triangle(xi: wp.vec2) -> wp.vec2:
+    """Barycentrics (of v1, v2), uniform over a triangle, without folding or square root (Heitz 2019)."""
+    if xi[1] > xi[0]:
+        half = 0.5 * xi[0]
+        return wp.vec2(half, xi[1] - half)
+    half = 0.5 * xi[1]
+    return wp.vec2(xi[0] - half, half)
+
+
+@wp.func
+def frame_x(n: wp.vec3) -> wp.vec3:
+    """A unit vector at right angles to the unit vector n (Duff et al. 2017, "Building an Orthonormal Basis, Revisited")."""
+    sign = wp.where(n[2] < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + n[2])
+    return wp.vec3(1.0 + sign * n[0] * n[0] * a, sign * n[0] * n[1] * a, -sign * n[0])
+
+
+@wp.func
+def cosine_hemisphere(xi: wp.vec2, n: wp.vec3) -> wp.vec3:
+    """A direction around n with density cos / pi (Malley's method)."""
+    d = disk(xi)
+    z = wp.sqrt(wp.max(0.0, 1.0 - d[0] * d[0] - d[1] * d[1]))
+    x = frame_x(n)
+    return wp.normalize(d[0] * x + d[1] * wp.cross(n, x) + z * n)
+
+
+@wp.func
+def ggx_normal(xi: wp.vec2, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
+    """A microfacet normal among those of the GGX surface that wo sees (Dupuy and Benyoub 2023, spherical caps)."""
+    x = frame_x(n)
+    y = wp.cross(n, x)
+    w = wp.normalize(wp.vec3(alpha * wp.dot(wo, x), alpha * wp.dot(wo, y), wp.dot(wo, n)))
+    phi = TWO_PI * xi[0]
+    z = (1.0 - xi[1]) * (1.0 + w[2]) - w[2]
+    r = wp.sqrt(wp.max(0.0, 1.0 - z * z))
+    h = wp.vec3(r * wp.cos(phi), r * wp.sin(phi), z) + w
+    return wp.normalize(alpha * h[0] * x + alpha * h[1] * y + wp.max(h[2], 1.0e-6) * n)
+
+
+@wp.func
+def ggx_lambda(cos_theta: float, alpha: float) -> float:
+    """Smith's Lambda: hidden over visible microfacet area towards a direction at this angle (Heitz 2014, eq. 72)."""
+    c2 = cos_theta * cos_theta
+    tan2 = wp.max(0.0, 1.0 - c2) / wp.max(c2, 1.0e-12)
+    return 0.5 * (wp.sqrt(1.0 + alpha * alpha * tan2) - 1.0)
+
+
+@wp.func
+def ggx_visible_share(cos_o: float, cos_i: float, alpha: float) -> float:
+    """G2 / G1(wo), height-correlated: what a ray reflected from a visible microfacet is worth (Heitz 2018)."""
+    a = ggx_lambda(cos_o, alpha)
+    return (1.0 + a) / (1.0 + a + ggx_lambda(cos_i, alpha))
+
+
+@wp.func
+def search_cdf(cdf: wp.array(dtype=wp.float32), first: int, count: int, x: float) -> int:
+    """The lowest i with x < cdf[first + i]; cdf rises to 1."""
+    low = int(0)
+    high = int(count - 1)
+    while low < high:
+        middle = (low + high) / 2
+        if x < cdf[first + middle]:
+            high = middle
+        else:
+            low = middle + 1
+    return low

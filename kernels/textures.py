@@ -1,0 +1,81 @@
+"""Textures: 8-bit pictures sampled bilinearly, and the checkerboard."""
+
+import warp as wp
+
+from wrt.kernels.structs import Surfaces, Texture
+
+WRAP_REPEAT = 0
+WRAP_CLAMP = 1
+WRAP_MIRROR = 2
+
+
+@wp.func
+def wrapped(i: int, size: int, wrap: int) -> int:
+    """The column (or row) 0 .. size - 1 that stands for column i."""
+    if wrap == wp.static(WRAP_CLAMP):
+        return wp.clamp(i, 0, size - 1)
+    period = wp.where(wrap == wp.static(WRAP_MIRROR), 2 * size, size)
+    j = i % period
+    j = wp.where(j < 0, j + period, j)
+    return wp.where(j >= size, 2 * size - 1 - j, j)
+
+
+@wp.func
+def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec4:
+    """One texel, linear; alpha is never sRGB-encoded."""
+    x = wrapped(column, texture.width, texture.wrap_u)
+    y = wrapped(row, texture.height, texture.wrap_v)
+    packed = surfaces.texels[texture.first + y * texture.width + x]
+    r = int(packed & wp.uint32(255))
+    g = int((packed >> wp.uint32(8)) & wp.uint32(255))
+    b = int((packed >> wp.uint32(16)) & wp.uint32(255))
+    a = int(packed >> wp.uint32(24))
+    # The table's second half is the plain encoding, so that there is one look-up either way.
+    base = wp.where(texture.srgb != 0, 0, 256)
+    table = surfaces.srgb_to_linear
+    return wp.vec4(table[base + r], table[base + g], table[base + b], table[256 + a])
+
+
+@wp.func
+def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4:
+    """Bilinear; a texel's colour is at its centre."""
+    # Texture coordinates beyond 1e6 have no digits left for a position within the picture.
+    x = wp.clamp(u, -1.0e6, 1.0e6) * float(texture.width) - 0.5
+    y = wp.clamp(v, -1.0e6, 1.0e6) * float(texture.height) - 0.5
+    column = int(wp.floor(x))
+    row = int(wp.floor(y))
+    fx = x - wp.floor(x)
+    fy = y - wp.floor(y)
+    top = (1.0 - fx) * texel(surfaces, texture, column, row) + fx * texel(surfaces, texture, column + 1, row)
+    bottom = (1.0 - fx) * texel(surfaces, texture, column, row + 1) + fx * texel(surfaces, texture, column + 1, row + 1)
+    return (1.0 - fy) * top + fy * bottom
+
+
+@wp.func
+def checkerboard(texture: Texture, u: float, v: float) -> wp.vec4:
+    parity = (int(wp.floor(u)) + int(wp.floor(v))) & 1
+    color = wp.where(parity == 0, texture.color_a, texture.color_b)
+    return wp.vec4(color[0], color[1], color[2], 1.0)
+
+
+def make_sample_texture(pictures: bool, checkerboards: bool):
+    """The look-up, with only those kinds of texture that the scene has."""
+
+    @wp.func
+    def sample_texture(surfaces: Surfaces, index: int, uv: wp.vec2) -> wp.vec4:
+        """Linear RGBA of texture `index` at uv; white where there is no texture (index < 0)."""
+        if index < 0:
+            return wp.vec4(1.0, 1.0, 1.0, 1.0)
+        texture = surfaces.textures[index]
+        u = texture.row_u[0] * uv[0] + texture.row_u[1] * uv[1] + texture.row_u[2]
+        v = texture.row_v[0] * uv[0] + texture.row_v[1] * uv[1] + texture.row_v[2]
+        result = wp.vec4(1.0, 1.0, 1.0, 1.0)
+        if wp.static(checkerboards):
+            if texture.width == 0:
+                result = checkerboard(texture, u, v)
+        if wp.static(pictures):
+            if texture.width > 0:
+                result = picture(surfaces, texture, u, v)
+        return result
+
+    return sample_texture

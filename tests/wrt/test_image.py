@@ -1,0 +1,388 @@
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from PIL import Image
+
+from wrt.errors import InputError, SceneWarning
+from wrt.image import (
+    EXACT_IN_FLOAT,
+    FORMATS,
+    check_writable,
+    encode_png,
+    read_channels,
+    read_image,
+    read_metadata,
+    read_rgba8,
+    write_codes,
+    write_exr,
+    write_image,
+)
+from wrt.tonemap import decode_srgb, to_codes
+
+H, W = 70, 51  # more rows than are written at a time
+METADATA = {"scene": "scenes/öl auf 漢.toml", "spp": 64, "seed": 3, "seconds": 12.25, "version": "0.1.0"}
+EACH_SUFFIX = pytest.mark.parametrize("suffix", FORMATS)
+
+
+@pytest.fixture
+def pixels() -> np.ndarray:
+    return (np.random.default_rng(0).random((H, W, 3)) ** 4 * 50).astype(np.float32)
+
+
+def mitsuba_bitmap(path: Path) -> np.ndarray:
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    return np.array(mi.Bitmap(str(path)))
+
+
+def oiio_pixels(path: Path, format: str) -> np.ndarray:
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(str(path))
+    assert source is not None, oiio.geterror()
+    pixels = source.read_image(format)
+    source.close()
+    return pixels
+
+
+# --- PNG --------------------------------------------------------------------------------------------------------------
+
+
+def test_png8_holds_the_codes_and_pillow_agrees(pixels: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    write_image(path, pixels, exposure=-2.0, tonemap="aces", metadata=METADATA)
+    codes = to_codes(pixels, -2.0, "aces")
+    with Image.open(path) as image:
+        assert image.mode == "RGB"
+        assert np.array_equal(np.asarray(image), codes)
+        assert image.text == {f"wrt:{key}": str(value) for key, value in METADATA.items()}
+        assert "srgb" in image.info
+    assert np.array_equal(read_rgba8(path)[..., :3], codes)
+    assert np.array_equal(to_codes(read_image(path)), codes)
+
+
+def test_png16_holds_the_codes_and_openimageio_agrees(pixels: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    write_image(path, pixels, bits=16, tonemap="agx", metadata=METADATA)
+    codes = to_codes(pixels, 0.0, "agx", bits=16)
+    assert len(np.unique(codes & 255)) > 100
+    assert np.array_equal(oiio_pixels(path, "uint16"), codes)
+    assert np.array_equal(to_codes(read_image(path), bits=16), codes)
+    assert np.array_equal(read_rgba8(path)[..., :3], codes >> 8)
+
+
+@given(codes=arrays(st.sampled_from([np.uint8, np.uint16]),
+                    st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))))
+def test_any_codes_survive_a_png(codes: np.ndarray) -> None:
+    with Image.open(io.BytesIO(encode_png(codes))) as image:
+        image.verify()  # checks each CRC
+    with Image.open(io.BytesIO(encode_png(codes))) as image:
+        assert np.array_equal(np.asarray(image), codes if codes.dtype == np.uint8 else codes >> 8)
+
+
+def test_png_of_nonfinite_pixels_is_clipped_and_counted(pixels: np.ndarray, tmp_path: Path) -> None:
+    pixels[0, :3] = np.array([np.nan, np.inf, -np.inf])[:, None]
+    with pytest.warns(SceneWarning, match=r"a\.png: 3 pixels NaN or infinite"):
+        write_image(tmp_path / "a.png", pixels)
+    assert read_rgba8(tmp_path / "a.png")[0, :3, 0].tolist() == [0, 255, 0]
+
+
+def test_codes_of_a_wrong_type_are_refused() -> None:
+    with pytest.raises(ValueError, match="uint8 or uint16"):
+        encode_png(np.zeros((2, 2, 3)))
+
+
+# --- EXR --------------------------------------------------------------------------------------------------------------
+
+
+def test_exr_is_exact_and_mitsuba_agrees(pixels: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    pixels[0, 0] = (np.nan, np.inf, -np.inf)
+    pixels[0, 1] = (-1.0, 1e-42, 3e38)
+    write_image(path, pixels, exposure=3.0, tonemap="aces", metadata=METADATA)
+    assert np.array_equal(read_image(path), pixels, equal_nan=True)
+    assert np.array_equal(mitsuba_bitmap(path), pixels, equal_nan=True)
+    assert read_metadata(path) == {key: str(value) for key, value in METADATA.items()}
+
+
+def test_half_exr_is_rounded_to_half(pixels: np.ndarray, tmp_path: Path) -> None:
+    write_image(tmp_path / "a.exr", pixels, bits=16)
+    half = mitsuba_bitmap(tmp_path / "a.exr")
+    assert half.dtype == np.float16
+    assert np.array_equal(half, pixels.astype(np.float16))
+    assert np.array_equal(read_image(tmp_path / "a.exr"), half.astype(np.float32))
+
+
+def test_half_exr_clips_what_a_half_cannot_hold_and_counts_it(pixels: np.ndarray, tmp_path: Path) -> None:
+    pixels[0, 0] = (1e6, np.inf, np.nan)
+    pixels[0, 1] = -1e6
+    with pytest.warns(SceneWarning, match=r"a\.exr: 2 pixels beyond 65504"):
+        write_image(tmp_path / "a.exr", pixels, bits=16)
+    back = read_image(tmp_path / "a.exr")
+    assert np.array_equal(back[0, :2], [[65504, np.inf, np.nan], [-65504] * 3], equal_nan=True)
+
+
+def test_exr_keeps_each_channel_with_its_own_type(tmp_path: Path) -> None:
+    import OpenImageIO as oiio
+
+    rng = np.random.default_rng(0)
+    channels = {
+        "R": rng.random((H, W)).astype(np.float16),
+        "depth.Z": np.where(rng.random((H, W)) < 0.1, np.inf, rng.random((H, W))).astype(np.float32),
+        "prim_id": rng.integers(-1, EXACT_IN_FLOAT + 1, (H, W)).astype(np.int32),
+    }
+    write_exr(tmp_path / "a.exr", channels)
+    for name, array in read_channels(tmp_path / "a.exr").items():
+        assert np.array_equal(array, channels[name]), name
+    spec = oiio.ImageInput.open(str(tmp_path / "a.exr")).spec()
+    types = dict(zip(spec.channelnames, map(str, spec.channelformats), strict=True))
+    assert types == {"R": "half", "depth.Z": "float", "prim_id": "float"}
+
+
+def test_exr_warns_of_integers_that_a_float_rounds(tmp_path: Path) -> None:
+    ids = np.array([[EXACT_IN_FLOAT + 1]], dtype=np.int32)
+    with pytest.warns(SceneWarning, match="prim_id goes up to 16777217"):
+        write_exr(tmp_path / "a.exr", {"prim_id": ids})
+
+
+def test_exr_without_colours(tmp_path: Path) -> None:
+    grey = np.random.default_rng(0).random((H, W)).astype(np.float32)
+    write_exr(tmp_path / "grey.exr", {"Y": grey})
+    assert np.array_equal(read_image(tmp_path / "grey.exr"), np.repeat(grey[..., None], 3, axis=-1))
+    write_exr(tmp_path / "normal.exr", {"normal.X": grey, "normal.Y": grey, "normal.Z": grey})
+    with pytest.raises(InputError, match=r"normal\.exr: has no channels R, G, B; it has normal\.X, normal\.Y"):
+        read_image(tmp_path / "normal.exr")
+
+
+# --- HDR --------------------------------------------------------------------------------------------------------------
+
+
+def test_hdr_keeps_eight_bits_of_the_brightest_channel(pixels: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "a.hdr"
+    write_image(path, pixels, exposure=3.0, tonemap="aces", metadata=METADATA)
+    bound = pixels.max(axis=-1, keepdims=True) / 128
+    for back in (read_image(path), mitsuba_bitmap(path)):
+        assert (np.abs(back - pixels) <= bound).all()
+    assert read_metadata(path) == {key: str(value) for key, value in METADATA.items()}
+
+
+def test_hdr_replaces_what_it_cannot_hold_and_counts_it(pixels: np.ndarray, tmp_path: Path) -> None:
+    pixels[0, :3] = np.array([np.nan, np.inf, -2.0])[:, None]
+    with pytest.warns(SceneWarning, match=r"a\.hdr: 3 pixels negative, NaN or infinite"):
+        write_image(tmp_path / "a.hdr", pixels)
+    back = read_image(tmp_path / "a.hdr")
+    assert back[0, 0].max() == back[0, 2].max() == 0.0
+    assert back[0, 1].min() > 1e37
+
+
+def test_metadata_cannot_break_the_hdr_header(pixels: np.ndarray, tmp_path: Path) -> None:
+    write_image(tmp_path / "a.hdr", pixels, metadata={"scene": "two\n\nlines"})
+    assert read_image(tmp_path / "a.hdr").shape == pixels.shape
+    assert read_metadata(tmp_path / "a.hdr") == {"scene": "two lines"}
+
+
+# --- whole or not at all ----------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def disk_full_after(size: int) -> Iterator[None]:
+    """Writes beyond `size` bytes of any file fail, as on a full disk (Python ignores the signal that goes with it)."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@EACH_SUFFIX
+def test_a_full_disk_leaves_the_old_file_and_nothing_else(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"old")
+    noise = np.random.default_rng(0).random((H, 4 * W, 3)).astype(np.float32)
+    with disk_full_after(10_000), pytest.raises(InputError, match=rf"a{suffix}: cannot be written: "):
+        write_image(path, noise)
+    assert path.read_bytes() == b"old"
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+@EACH_SUFFIX
+@pytest.mark.parametrize("error", [OSError(errno.EIO, "Input/output error"), KeyboardInterrupt()])
+def test_a_failing_rename_leaves_the_old_file_and_nothing_else(
+    suffix: str, error: BaseException, pixels: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise error
+
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"old")
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(InputError if isinstance(error, OSError) else KeyboardInterrupt):
+        write_image(path, pixels)
+    assert path.read_bytes() == b"old"
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+@EACH_SUFFIX
+def test_an_existing_file_is_replaced_through_a_link(suffix: str, pixels: np.ndarray, tmp_path: Path) -> None:
+    (tmp_path / f"real{suffix}").write_bytes(b"old")
+    (tmp_path / f"link{suffix}").symlink_to(f"real{suffix}")
+    write_image(tmp_path / f"link{suffix}", pixels)
+    assert (tmp_path / f"link{suffix}").is_symlink()
+    assert read_image(tmp_path / f"real{suffix}").shape == pixels.shape
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_written_file_has_the_usual_permissions(pixels: np.ndarray, tmp_path: Path) -> None:
+    for suffix in FORMATS:
+        write_image(tmp_path / f"a{suffix}", pixels)
+    (tmp_path / "usual").write_bytes(b"")
+    assert len({entry.stat().st_mode for entry in tmp_path.iterdir()}) == 1
+
+
+# --- refused before the work ------------------------------------------------------------------------------------------
+
+
+def test_check_writable_leaves_no_trace(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"old")
+    for name in ("a.png", "b.exr", "c.HDR"):
+        check_writable(tmp_path / name)
+    assert (tmp_path / "a.png").read_bytes() == b"old"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "bits", "message"),
+    [
+        ("a.jpg", None, r"a\.jpg: cannot write \.jpg; use \.png, \.exr, \.hdr"),
+        ("a", None, "a file without a suffix"),
+        ("a.png", 32, r"\.png is written with 8 or 16 bits, not 32"),
+        ("a.hdr", 16, r"\.hdr is written with 32 bits, not 16"),
+        ("missing/a.png", None, r"missing/a\.png: its folder does not exist"),
+        ("file/a.png", None, "its folder does not exist"),
+        ("folder.png", None, "is a folder"),
+    ],
+)
+def test_unusable_outputs_are_refused(
+    name: str, bits: int | None, message: str, pixels: np.ndarray, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    (tmp_path / "folder.png").mkdir()
+    uses: tuple[Callable[[Path], None], ...] = (
+        lambda path: check_writable(path, bits), lambda path: write_image(path, pixels, bits=bits))
+    for use in uses:
+        with pytest.raises(InputError, match=message):
+            use(tmp_path / name)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "folder.png"]
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "touch", refuse)  # permissions do not bind the superuser, as which tests may run
+    with pytest.raises(InputError, match=r"a\.png: cannot be written: Permission denied"):
+        check_writable(tmp_path / "a.png")
+
+
+def test_a_write_protected_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.png").write_bytes(b"old")
+    (tmp_path / "a.png").chmod(0o444)
+    monkeypatch.setattr(os, "access", lambda path, mode: not (mode & os.W_OK and str(path).endswith("a.png")))
+    with pytest.raises(InputError, match="is write-protected"):
+        check_writable(tmp_path / "a.png")
+
+
+def test_pixels_of_a_wrong_shape_are_refused(tmp_path: Path) -> None:
+    for shape in ((4, 4), (4, 4, 4), (0, 4, 3)):
+        with pytest.raises(InputError, match=r"pixels must be \(H, W, 3\)"):
+            write_image(tmp_path / "a.png", np.zeros(shape))
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def test_pictures_of_every_pillow_mode_are_read(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (H, W, 3), dtype=np.uint8)
+    table = decode_srgb(np.arange(256) / 255).astype(np.float32)
+
+    alpha = rng.integers(0, 256, (H, W, 1), dtype=np.uint8)
+    Image.fromarray(np.dstack([rgb, alpha])).save(tmp_path / "alpha.png")
+    assert np.array_equal(read_image(tmp_path / "alpha.png"), table[rgb])
+    assert np.array_equal(read_rgba8(tmp_path / "alpha.png"), np.dstack([rgb, alpha]))
+
+    Image.fromarray(rgb[..., 0]).save(tmp_path / "grey.png")
+    assert np.array_equal(read_image(tmp_path / "grey.png"), table[np.repeat(rgb[..., :1], 3, axis=-1)])
+
+    palette = Image.fromarray(rgb).quantize(16)
+    palette.save(tmp_path / "palette.png")
+    assert np.array_equal(read_image(tmp_path / "palette.png"), table[np.asarray(palette.convert("RGB"))])
+
+    deep = rng.integers(0, 65536, (H, W), dtype=np.uint16)
+    Image.fromarray(deep).save(tmp_path / "deep.png")
+    assert np.array_equal(read_rgba8(tmp_path / "deep.png")[..., 1], deep >> 8)
+    assert np.array_equal(to_codes(read_image(tmp_path / "deep.png"), bits=16)[..., 2], deep)
+
+
+def test_jpeg_is_read_as_srgb(tmp_path: Path) -> None:
+    flat = np.full((16, 16, 3), 128, np.uint8)
+    Image.fromarray(flat).save(tmp_path / "a.jpg", quality=95)
+    assert read_image(tmp_path / "a.jpg") == pytest.approx(np.full((16, 16, 3), 0.2158605), abs=0.01)
+
+
+def test_bytes_are_read_like_a_file(tmp_path: Path) -> None:
+    codes = np.random.default_rng(0).integers(0, 256, (H, W, 3), dtype=np.uint8)
+    write_codes(tmp_path / "a.png", codes)
+    assert np.array_equal(read_rgba8((tmp_path / "a.png").read_bytes()), read_rgba8(tmp_path / "a.png"))
+    with pytest.raises(InputError, match=r"x\.glb: image 3: cannot be read as an image"):
+        read_rgba8(b"no image", "x.glb: image 3")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.99])
+@pytest.mark.parametrize("kind", ["a.png", "a16.png", "a.exr", "a.hdr", "a.jpg"])
+def test_truncated_files_are_refused(
+    kind: str, share: float, pixels: np.ndarray, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / kind
+    if path.suffix == ".jpg":
+        Image.fromarray(to_codes(pixels)).save(path)
+    else:
+        write_image(path, pixels, bits=16 if kind == "a16.png" else None)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(InputError, match=rf"{kind}: cannot be read as an image: \S") as caught:
+        read_image(path)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().err == ""  # no library talks beside the one message
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.exr", "a.hdr", "a.jpg"])
+def test_what_is_no_picture_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=rf"{name}: cannot be read: No such file"):
+        read_image(tmp_path / name)
+    (tmp_path / name).write_text("hello " * 50)
+    with pytest.raises(InputError, match=f"{name}: cannot be read as an image"):
+        read_image(tmp_path / name)
+    (tmp_path / name).unlink()
+    (tmp_path / name).mkdir()
+    with pytest.raises(InputError, match=f"{name}: cannot be read"):
+        read_image(tmp_path / name)
+
+
+def test_unknown_suffixes_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("hello")
+    with pytest.raises(InputError, match=r"a\.txt: not an image format that wrt reads \(\.exr, \.hdr, \.png"):
+        read_image(tmp_path / "a.txt")

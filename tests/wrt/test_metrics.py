@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wrt.errors import InputError
+from wrt.metrics import (
+    BAR_HEIGHT,
+    NONFINITE_COLOR,
+    PIXELS_PER_DEGREE,
+    RELMSE_EPS,
+    compare,
+    difference_image,
+    failures,
+    flip_map,
+    hdr_flip_map,
+)
+from wrt.tonemap import decode_srgb
+
+H, W = 48, 64
+MEASURES = ("mse", "relmse", "max_abs", "mean_ratio", "psnr", "flip")
+
+
+def scene_like(seed: int = 0) -> np.ndarray:
+    """Waves, a checkerboard and a little noise, display-linear in [0, 1]."""
+    y, x = np.mgrid[0:H, 0:W]
+    checks = 0.1 + 0.8 * ((x // 8 + y // 8) % 2)
+    image = np.stack([0.5 + 0.4 * np.sin(x / 7), 0.5 + 0.4 * np.cos(y / 5), checks], axis=-1)
+    return np.clip(image + np.random.default_rng(seed).normal(0, 0.02, image.shape), 0, 1).astype(np.float32)
+
+
+# --- compare ----------------------------------------------------------------------------------------------------------
+
+
+def test_identical_pictures() -> None:
+    a = scene_like()
+    result = compare(a, a.copy())
+    assert {name: result[name] for name in MEASURES} == {
+        "mse": 0, "relmse": 0, "max_abs": 0, "mean_ratio": 1, "psnr": math.inf, "flip": 0}
+    assert (result["pixels"], result["nonfinite_differ"]) == (H * W, 0)
+
+
+def test_measures_of_constants_in_closed_form() -> None:
+    b = decode_srgb(np.full((H, W, 3), 0.5))
+    a = decode_srgb(np.full((H, W, 3), 0.6))
+    result = compare(a, b)
+    error = float(a[0, 0, 0] - b[0, 0, 0])
+    assert result["mse"] == pytest.approx(error**2, rel=1e-5)
+    assert result["relmse"] == pytest.approx(error**2 / (b[0, 0, 0] ** 2 + RELMSE_EPS), rel=1e-5)
+    assert result["max_abs"] == pytest.approx(error, rel=1e-5)
+    assert result["mean_ratio"] == pytest.approx(a[0, 0, 0] / b[0, 0, 0], rel=1e-5)
+    assert result["psnr"] == pytest.approx(20.0, abs=1e-4)  # a difference of 0.1 between codes of peak 1
+
+
+def test_mse_of_noise_is_its_variance() -> None:
+    b = np.full((200, 200, 3), 10.0)
+    a = b + np.random.default_rng(0).normal(0.0, 0.5, b.shape)
+    assert compare(a, b)["mse"] == pytest.approx(0.25, rel=0.02)
+
+
+def test_display_measures_follow_exposure_and_tonemap_and_the_others_do_not() -> None:
+    b = scene_like() * 3.0
+    a = b * 1.1
+    plain, dark, agx = compare(a, b), compare(a, b, exposure=-3.0), compare(a, b, tonemap="agx")
+    for name in ("mse", "relmse", "max_abs", "mean_ratio"):
+        assert plain[name] == dark[name] == agx[name]
+    for name in ("psnr", "flip"):
+        assert len({plain[name], dark[name], agx[name]}) == 3
+
+
+def test_nonfinite_pixels_are_counted_and_left_out() -> None:
+    b = scene_like()
+    a = b * 1.05
+    clean = compare(a, b)
+    a[3, 4] = np.nan
+    a[5, 6, 1] = b[5, 6, 1] = np.inf
+    b[7, 8, 2] = -np.inf
+    result = compare(a, b)
+    assert (result["nonfinite_a"], result["nonfinite_b"], result["nonfinite_differ"]) == (2, 2, 3)
+    for name in MEASURES:
+        assert result[name] == pytest.approx(clean[name], rel=0.02), name
+
+
+def test_equal_nonfinite_pixels_do_not_differ() -> None:
+    a = scene_like()
+    a[0, 0] = np.nan
+    a[1, 1] = np.inf
+    result = compare(a, a.copy())
+    assert (result["nonfinite_a"], result["nonfinite_differ"], result["mse"]) == (2, 0, 0.0)
+
+
+def test_without_a_finite_pixel_nothing_is_averaged() -> None:
+    result = compare(np.full((4, 4, 3), np.nan), np.zeros((4, 4, 3)))
+    assert all(math.isnan(result[name]) for name in MEASURES)
+    assert failures(result, {"mse": 1e9})
+
+
+def test_mean_ratio_with_a_black_reference() -> None:
+    black, grey = np.zeros((4, 4, 3)), np.full((4, 4, 3), 0.5)
+    assert compare(black, black)["mean_ratio"] == 1.0
+    assert compare(grey, black)["mean_ratio"] == math.inf
+
+
+@pytest.mark.parametrize("measure", [compare, difference_image])
+def test_wrong_sizes_are_input_errors(measure: Any) -> None:
+    with pytest.raises(InputError, match="different sizes, 64x48 and 63x48"):
+        measure(scene_like(), scene_like()[:, 1:])
+    with pytest.raises(InputError, match=r"\(H, W, 3\)"):
+        measure(scene_like()[..., 0], scene_like()[..., 0])
+
+
+def test_failures_name_the_limits_that_are_broken() -> None:
+    b = scene_like()
+    result = compare(b * 1.1, b)
+    assert failures(result, {"mse": 1.0, "flip": None, "psnr": 10.0}) == []
+    told = failures(result, {"mse": 1e-9, "flip": 1e-9, "psnr": 90.0})
+    assert [sentence.split()[0] for sentence in told] == ["mse", "flip", "psnr"]
+    assert "below 90" in told[2] and "above 1e-09" in told[0]
+    result["nonfinite_differ"] = 2
+    assert len(failures(result, {"mse": 1.0})) == 1
+    assert failures(result, {}) == []
+
+
+# --- FLIP -------------------------------------------------------------------------------------------------------------
+
+
+def oiio_flip(a: np.ndarray, b: np.ndarray, **options: Any) -> np.ndarray:
+    oiio = pytest.importorskip("OpenImageIO")
+    if not hasattr(oiio.ImageBufAlgo, "FLIP_diff"):
+        pytest.skip("this OpenImageIO has no FLIP")
+    buffers = []
+    for image in (b, a):
+        buffer = oiio.ImageBuf(oiio.ImageSpec(image.shape[1], image.shape[0], 3, "float"))
+        buffer.set_pixels(oiio.ROI(), np.ascontiguousarray(image, dtype=np.float32))
+        buffers.append(buffer)
+    return oiio.ImageBufAlgo.FLIP_diff(*buffers, **options).get_pixels()[..., 0]
+
+
+@pytest.mark.parametrize("ppd", [PIXELS_PER_DEGREE, 30.0])
+def test_flip_agrees_with_openimageio(ppd: float) -> None:
+    b = scene_like()
+    rng = np.random.default_rng(3)
+    for a in (np.clip(b + rng.normal(0, 0.1, b.shape), 0, 1), np.roll(b, 1, axis=1), 0.9 * b, b[..., ::-1]):
+        ours, theirs = flip_map(a, b, ppd), oiio_flip(a, b, hdr=0, ppd=ppd)
+        assert ours.max() > 0.05
+        assert np.abs(ours - theirs).max() < 2e-4  # they take a fast cube root
+
+
+def test_hdr_flip_agrees_with_openimageio() -> None:
+    b = scene_like() * np.exp(2.0 * np.sin(np.arange(W) / 9))[None, :, None].astype(np.float32)
+    for a in (b * 1.05, np.roll(b, 1, axis=0)):
+        ours = hdr_flip_map(a, b)
+        theirs = oiio_flip(a, b, hdr=1, ppd=PIXELS_PER_DEGREE, maxluminance=0.0)
+        assert 0.02 < ours.mean() < 0.9
+        assert np.abs(ours - theirs).max() < 5e-4
+
+
+def test_hdr_flip_sees_what_is_clipped_on_a_display() -> None:
+    b = np.full((H, W, 3), 0.2, dtype=np.float32)
+    b[10:20, 10:20] = 20.0
+    a = b.copy()
+    a[10:20, 10:20] = 10.0
+    assert compare(a, b)["flip"] == 0.0
+    assert hdr_flip_map(a, b)[15, 15] > 0.1
+    assert hdr_flip_map(b, b).max() == 0.0
+    assert hdr_flip_map(np.zeros_like(b), np.zeros_like(b)).max() == 0.0
+
+
+def test_flip_is_symmetric_and_in_range() -> None:
+    a, b = scene_like(1), scene_like(2)[::-1]
+    forth, back = flip_map(a, b), flip_map(b, a)
+    assert np.allclose(forth, back, atol=1e-12)
+    assert forth.min() >= 0.0 and forth.max() <= 1.0
+
+
+def test_flip_grows_with_the_error() -> None:
+    b = scene_like()
+    noise = np.random.default_rng(5).normal(0, 1, b.shape)
+    means = [compare(np.clip(b + size * noise, 0, 1), b)["flip"] for size in (0.01, 0.03, 0.1, 0.3)]
+    assert all(low < high for low, high in itertools.pairwise(means))
+
+
+def test_flip_of_green_and_blue_is_one() -> None:
+    green, blue = np.zeros((2, H, W, 3))
+    green[..., 1] = blue[..., 2] = 1.0
+    assert flip_map(green, blue) == pytest.approx(np.ones((H, W)))
+
+
+def test_flip_forgives_fine_noise_from_far_away() -> None:
+    b = np.full((H, W, 3), 0.5)
+    a = b + 0.2 * ((np.indices((H, W)).sum(axis=0) % 2) * 2.0 - 1.0)[..., None]
+    assert flip_map(a, b, 120.0).mean() < 0.5 * flip_map(a, b, 10.0).mean()
+
+
+# --- difference image -------------------------------------------------------------------------------------------------
+
+
+def test_difference_image_tells_sign_and_size() -> None:
+    b = np.full((40, 200, 3), 0.5, dtype=np.float32)
+    a = b.copy()
+    a[:, 50:100, 1] += 0.1
+    a[:, 100:150, 2] -= 0.1
+    a[:, 150:] -= 0.4
+    picture = difference_image(a, b, limit=0.4)
+    assert picture.shape == (40 + BAR_HEIGHT, 200, 3) and picture.dtype == np.uint8
+    equal, brighter, darker, darkest = picture[5, [10, 60, 110, 160]].astype(int)
+    assert equal.max() == 0
+    assert brighter[0] > 2 * brighter[2] and darker[2] > 2 * darker[0]
+    assert darkest.min() == 255
+    assert picture[40, 0].min() == picture[40, -1].min() == 255 and picture[40, 100].max() < 20  # the scale below
+
+
+def test_difference_image_finds_its_own_limit() -> None:
+    b = scene_like()
+    a = b + np.random.default_rng(0).uniform(-1e-4, 1e-4, b.shape).astype(np.float32)
+    a[0, 0] += 100.0
+    picture = difference_image(a, b)[:H]
+    assert picture[0, 0].min() == 255
+    assert 60 < np.median(picture.max(axis=-1))  # one outlier does not turn the rest black
+    assert difference_image(b, b)[:H].max() == 0
+    single = b.copy()
+    single[0, 0] += 0.5
+    assert difference_image(single, b)[0, 0].min() == 255
+
+
+def test_difference_image_marks_what_is_not_finite() -> None:
+    a, b = scene_like(), scene_like()
+    a[2, 2] = np.nan
+    a[4, 4] = b[4, 4] = np.inf
+    b[6, 6] = np.inf
+    picture = difference_image(a, b)
+    assert tuple(picture[2, 2]) == tuple(picture[6, 6]) == NONFINITE_COLOR
+    assert picture[4, 4].max() == 0
+
+
+def test_narrow_difference_image_has_a_scale_without_numbers() -> None:
+    picture = difference_image(np.ones((4, 5, 3)), np.zeros((4, 5, 3)))
+    assert picture.shape == (4 + BAR_HEIGHT, 5, 3)
+    assert picture[-1].max() == 0

@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.data import data_path
+from wrt.errors import InputError
+from wrt.obj import read_obj
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "a.obj"
+    path.write_text(text)
+    return path
+
+
+def test_corners_become_vertices(tmp_path: Path) -> None:
+    raw = read_obj(write(tmp_path, SQUARE + "vt 0 0\nvt 1 0.25\nvn 0 0 1\nvn 0 0 -1\n"
+                                            "f 1/1/1 2/2/1 3/2/1\nf 1/1/2 3/2/2 4/1/2\n"))
+    assert raw.faces.shape == (2, 3) and len(raw.vertices) == 6  # 1 and 3 appear with two normals each
+    corners = raw.vertices[raw.faces]
+    assert corners[0].tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
+    assert corners[1].tolist() == [[0, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert raw.normals is not None and raw.uvs is not None
+    assert raw.normals[raw.faces][:, :, 2].tolist() == [[1, 1, 1], [-1, -1, -1]]
+    assert raw.uvs[raw.faces][0].tolist() == [[0.0, 1.0], [1.0, 0.75], [1.0, 0.75]]  # v is flipped
+
+
+def test_relative_indices_equal_absolute_ones(tmp_path: Path) -> None:
+    absolute = read_obj(write(tmp_path, SQUARE + "vn 0 0 1\nf 1//1 2//1 3//1\n" + SQUARE + "f 5 6 7 8\n"))
+    relative = read_obj(write(tmp_path, SQUARE + "vn 0 0 1\nf -4//-1 -3//-1 -2//-1\n" + SQUARE + "f -4 -3 -2 -1\n"))
+    for name in ("vertices", "faces", "normals"):
+        np.testing.assert_array_equal(getattr(absolute, name), getattr(relative, name))
+
+
+def test_odd_spelling(tmp_path: Path) -> None:
+    text = ("v\t0  0 0 # first\n v 1 0 0 1 0 0\r\nv 1 1 \\\n 0\n\n"
+            "f  1// 2//\t3//  # face\nf 1/ 2 3\nl 1 2\ns off\nfoo bar\n")
+    raw = read_obj(write(tmp_path, text))
+    assert raw.vertices[raw.faces[0]].tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
+    assert len(raw.faces) == 2 and raw.normals is None and raw.uvs is None
+
+
+def test_corners_without_normal_get_zero(tmp_path: Path) -> None:
+    raw = read_obj(write(tmp_path, SQUARE + "vn 0 0 2\nf 1//1 2//1 3//1\nf 1 3 4\n"))
+    assert raw.normals is not None
+    assert raw.normals[raw.faces][:, :, 2].tolist() == [[2, 2, 2], [0, 0, 0]]
+
+
+@pytest.mark.parametrize(("lines", "names", "index"), [
+    ("f 1 2 3\nf 1 3 4\n", (), None),
+    ("usemtl red\nf 1 2 3\nusemtl blue stone\nf 1 3 4 2\nusemtl red\nf 2 3 4\n", ("red", "blue stone"), [0, 1, 1, 0]),
+    ("f 1 2 3\ng a b\nf 1 3 4\n", ("", "a b"), [0, 1]),
+    ("o box\ng side\nusemtl m\nusemtl n\nf 1 2 3\n", ("n",), [0]),
+    ("o box\nf 1 2 3\no lid\nf 1 3 4\n", ("box", "lid"), [0, 1]),
+])
+def test_groups(tmp_path: Path, lines: str, names: tuple[str, ...], index: list[int] | None) -> None:
+    raw = read_obj(write(tmp_path, SQUARE + lines))
+    assert raw.groups == names
+    assert (raw.face_group.tolist() if raw.face_group is not None else None) == index
+
+
+@pytest.mark.parametrize(("lines", "line", "says"), [
+    ("f 1 2 5\n", 5, "index 5 is not in 1 to 4"),
+    ("f 1 2 0\n", 5, "index 0"),
+    ("\nf 1 2 -5\n", 6, "index -5"),
+    ("f 1/1 2/1 3/1\n", 5, "vt index 1"),
+    ("f 1//2 2//2 3//2\nvn 0 0 1\n", 5, "vn index 2"),
+    ("f 1 2 three\n", 5, "three"),
+    ("f 1/2/3/4 2 3\n", 5, "1/2/3/4"),
+    ("f /1 2 3\n", 5, "/1"),
+    ("f 1.5 2 3\n", 5, "1.5"),
+    ("v 1 2\nf 1 2 3\n", 5, "v needs 3 numbers, got 2"),
+    ("v 1 2 x\nf 1 2 3\n", 5, "'x'"),
+    ("vt\nf 1 2 3\n", 5, "vt needs 2"),
+    ("v nan 0 0\nf 1 2 5\n", 5, "not finite"),
+    ("v 0 0 1e39\nf 1 2 5\n", 5, "not finite"),
+])
+def test_errors_name_file_and_line(tmp_path: Path, lines: str, line: int, says: str) -> None:
+    path = write(tmp_path, SQUARE + lines)
+    with pytest.raises(InputError) as caught:
+        read_obj(path)
+    assert str(caught.value).startswith(f"{path}: line {line}: ") and says in str(caught.value)
+
+
+def test_a_bad_position_that_no_face_uses_does_no_harm(tmp_path: Path) -> None:
+    assert len(read_obj(write(tmp_path, "v nan 0 0\n" + SQUARE + "f 2 3 4\n")).faces) == 1
+
+
+def test_cornell_box_keeps_its_names_without_mtl() -> None:
+    raw = read_obj(data_path("scenes/cornell_box_obj/cornell_box.obj"))
+    assert raw.groups == ("floor", "ceiling", "backWall", "rightWall", "leftWall", "shortBox", "tallBox", "light")
+    assert raw.face_group is not None
+    assert np.bincount(raw.face_group).tolist() == [2, 2, 2, 2, 2, 12, 12, 2]
+    light = raw.vertices[raw.faces[raw.face_group == 7]]
+    assert np.ptp(light[..., 1]) == 0.0 and light[..., 1].max() > 1.9  # flat, under the ceiling
+
+
+@pytest.mark.parametrize("name", ["small/cow.obj", "small/suzanne.obj", "medium/rocker-arm.obj"])
+def test_same_triangles_as_trimesh(name: str) -> None:
+    import trimesh
+
+    path = data_path("meshes/" + name)
+    raw = read_obj(path)
+    other = trimesh.load(path, process=False, maintain_order=True)
+    # trimesh puts the second halves of quads last, so compare the sets of triangles.
+    def key(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        rows = np.asarray(vertices, dtype=np.float32)[faces].reshape(-1, 3, 3)
+        turn = np.argmin(rows[..., 0] + 1e-3 * rows[..., 1] + 1e-6 * rows[..., 2], axis=1)
+        rows = rows[np.arange(len(rows))[:, None], (turn[:, None] + np.arange(3)) % 3].reshape(-1, 9)
+        return rows[np.lexsort(rows.T)]
+    np.testing.assert_array_equal(key(raw.vertices, raw.faces), key(other.vertices, other.faces))

@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.data import data_path
+from wrt.errors import InputError
+from wrt.ply import read_ply
+
+FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
+POINTS = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0), (2, 1, 0)]
+
+
+def ply(form: str, points: list[tuple[float, ...]], faces: list[tuple[int, ...]], *, columns: str = "x y z",
+        uvs: list[tuple[float, ...]] | None = None) -> bytes:
+    """A PLY file with float columns; `uvs`: texcoord lists of the faces."""
+    order = ">" if form.endswith("big_endian") else "<"
+    header = ["ply", f"format {form} 1.0", "comment made by a test", f"element vertex {len(points)}"]
+    header += [f"property float {name}" for name in columns.split()]
+    header += ["element extra 1", "property uchar a", "property double b", f"element face {len(faces)}"]
+    header += ["property uchar flag", "property list uchar int vertex_indices"]
+    header += ["property list uchar float texcoord"] * (uvs is not None)
+    head = ("\n".join([*header, "end_header"]) + "\n").encode()
+    rows: list[list[tuple[str, float]]] = [[("f", value) for value in point] for point in points]
+    rows.append([("B", 7), ("d", 0.5)])
+    for i, face in enumerate(faces):
+        row = [("B", 1), ("B", len(face)), *(("i", corner) for corner in face)]
+        if uvs is not None:
+            row += [("B", len(uvs[i])), *(("f", value) for value in uvs[i])]
+        rows.append(row)
+    if form == "ascii":
+        return head + "".join(" ".join(str(value) for _, value in row) + "\n" for row in rows).encode()
+    return head + b"".join(struct.pack(order + "".join(kind for kind, _ in row), *(v for _, v in row)) for row in rows)
+
+
+def write(folder: Path, data: bytes) -> Path:
+    path = folder / "a.ply"
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize(("faces", "triangles"), [
+    ([(0, 1, 2), (1, 4, 5)], [[0, 1, 2], [1, 4, 5]]),
+    ([(0, 1, 2, 3), (1, 4, 5, 2)], [[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]]),
+    ([(0, 1, 2), (1, 4, 5, 2), (0, 2, 3)], [[0, 1, 2], [1, 4, 5], [1, 5, 2], [0, 2, 3]]),
+    ([(0, 1), (0, 1, 2), ()], [[0, 1, 2]]),
+])
+def test_faces_in_the_order_of_the_file(tmp_path: Path, form: str, faces: list, triangles: list) -> None:
+    raw = read_ply(write(tmp_path, ply(form, POINTS, faces)))
+    assert raw.faces.tolist() == triangles
+    assert raw.vertices.tolist() == [list(map(float, point)) for point in POINTS]
+    assert raw.normals is None and raw.uvs is None
+    assert raw.incomplete == sum(len(face) < 3 for face in faces)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_vertex_normals_and_uvs_stay_with_their_vertex(tmp_path: Path, form: str) -> None:
+    rng = np.random.default_rng(1)
+    rows = np.round(rng.random((6, 8)) * 64.0) / 64.0
+    raw = read_ply(write(tmp_path, ply(form, [tuple(r) for r in rows.tolist()], [(5, 4, 0), (3, 1, 0)],
+                                       columns="x y z nx ny nz s t")))
+    np.testing.assert_array_equal(raw.normals, rows[:, 3:6])
+    np.testing.assert_array_equal(raw.uvs, np.stack([rows[:, 6], 1.0 - rows[:, 7]], axis=1))
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_uvs_of_faces_split_vertices(tmp_path: Path, form: str) -> None:
+    uvs = [(0, 0, 1, 0, 1, 1), (0, 0, 1, 1, 0.25, 1)]  # vertices 0 and 2 agree in both faces
+    raw = read_ply(write(tmp_path, ply(form, POINTS, [(0, 1, 2), (0, 2, 3)], uvs=uvs)))
+    assert raw.uvs is not None and len(raw.vertices) == 4
+    seam = read_ply(write(tmp_path, ply(form, POINTS, [(0, 1, 2), (0, 2, 3)], uvs=[uvs[0], (0.5, 0, 1, 1, 0.25, 1)])))
+    assert seam.uvs is not None and len(seam.vertices) == 5
+    corner_uvs = np.array([uvs[0], (0.5, 0, 1, 1, 0.25, 1)]).reshape(2, 3, 2)
+    np.testing.assert_array_equal(seam.uvs[seam.faces], np.stack([corner_uvs[..., 0], 1 - corner_uvs[..., 1]], axis=-1))
+    np.testing.assert_array_equal(seam.vertices[seam.faces], np.array(POINTS, dtype=float)[[[0, 1, 2], [0, 2, 3]]])
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_every_truncation_is_refused(tmp_path: Path, form: str) -> None:
+    whole = ply(form, POINTS, [(0, 1, 2), (1, 4, 5, 2)])
+    # In text a number cut short is still a number; a whole word must go.
+    for end in range(0, len(whole) - 2, 1 if form != "ascii" else 3):
+        if form == "ascii" and not whole[end - 1:end + 1].strip() == b"":
+            cut = whole[:end].rpartition(b" ")[0]
+        else:
+            cut = whole[:end]
+        path = write(tmp_path, cut)
+        with pytest.raises(InputError, match=r"a\.ply"):
+            read_ply(path)
+
+
+@pytest.mark.parametrize(("old", "new", "place"), [
+    (b"3 1 4 5", b"3 1 4 6", "face 0: index 6"),
+    (b"3 1 4 5", b"3 1 -4 5", "face 0: index -4"),
+    (b"3 1 4 5", b"3 1 4.5 5", "face 0: index 4.5"),
+    (b"3 1 4 5", b"-3 1 4 5", "face 0: a list of -3"),
+    (b"2.0 1.0", b"nan 1.0", "vertex 5: position"),
+    (b"2.0 1.0", b"1e60 1.0", "vertex 5: position"),
+    (b"2.0 1.0", b"2.0 one", "line 20: 'one' is not a number"),
+    (b"float z", b"float w", "no vertices with x, y and z"),
+    (b"float z", b"vec3 z", "line 7: cannot read"),
+    (b"list uchar int v", b"list float int v", "cannot read"),
+    (b"vertex_indices", b"corners", "no list vertex_indices"),
+    (b"format ascii 1.0", b"format utf8", "line 2: cannot read"),
+    (b"format ascii 1.0\n", b"", "names no format"),
+    (b"vertex 6", b"vertex 99999999999999", "element vertex: truncated"),
+    (b"ply\n", b"PLY?\n", "is not a PLY file"),
+])
+def test_errors_name_the_place(tmp_path: Path, old: bytes, new: bytes, place: str) -> None:
+    data = ply("ascii", [tuple(map(float, point)) for point in POINTS], [(1, 4, 5)])
+    assert data.count(old) == 1
+    path = write(tmp_path, data.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        read_ply(path)
+    assert str(caught.value).startswith(f"{path}: ") and place in str(caught.value)
+
+
+def test_windows_line_ends(tmp_path: Path) -> None:
+    raw = read_ply(write(tmp_path, ply("ascii", POINTS, [(0, 1, 2)]).replace(b"\n", b"\r\n")))
+    assert raw.faces.tolist() == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize("name", ["medium/stanford_bunny.ply", "large/dragon_871k.ply"])
+def test_same_arrays_as_trimesh(name: str) -> None:
+    import trimesh
+
+    path = data_path("meshes/" + name)
+    raw = read_ply(path)
+    other = trimesh.load(path, process=False)
+    np.testing.assert_array_equal(raw.faces, other.faces)
+    np.testing.assert_array_equal(raw.vertices, np.asarray(other.vertices, dtype=np.float32))

@@ -1,0 +1,89 @@
+"""Lights and backgrounds for Mitsuba."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from wrt.errors import InputError
+from wrt.scene import (
+    Background,
+    ConstantBackground,
+    DirectionalLight,
+    EnvironmentBackground,
+    GradientBackground,
+    Light,
+    PointLight,
+    SpotLight,
+)
+
+# Rows of a gradient's picture: linear interpolation of a cosine over steps of pi / 1024 errs by at most 1.2e-6.
+GRADIENT_ROWS = 1025
+SPOT_TEXELS = 1024
+WIDEST_SPOT = math.radians(80.0)
+
+
+def light_emitter(mi: Any, light: Light, notes: Any) -> dict[str, Any]:
+    """A point, directional or spot light as a dictionary for `mitsuba.load_dict`."""
+    if isinstance(light, PointLight):
+        return {"type": "point", "position": list(light.position), "intensity": _rgb(light.intensity)}
+    if isinstance(light, DirectionalLight):
+        return {"type": "directional", "direction": list(light.direction), "irradiance": _rgb(light.irradiance)}
+    return _spot(mi, light, notes)
+
+
+def _rgb(color: Any) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(color)}
+
+
+def _spot(mi: Any, light: SpotLight, notes: Any) -> dict[str, Any]:
+    """Mitsuba's falloff is linear in the angle; wrt's is put into the texture that Mitsuba projects from the light."""
+    direction = np.array(light.direction)
+    up = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    cutoff = math.degrees(light.outer)
+    target = np.array(light.position) + direction
+    spot: dict[str, Any] = {
+        "type": "spot", "intensity": _rgb(light.intensity), "cutoff_angle": cutoff, "beam_width": cutoff * (1.0 - 1e-6),
+        "to_world": mi.ScalarTransform4f().look_at(list(light.position), target.tolist(), up.tolist()),
+    }
+    if light.inner >= light.outer:
+        return spot
+    if light.outer > WIDEST_SPOT:
+        notes.add(f"light {light.name!r}: a spot wider than 80 degrees (linear falloff in the angle)")
+        return spot | {"cutoff_angle": min(cutoff, 89.9), "beam_width": min(math.degrees(light.inner), 89.8)}
+    x = (2.0 * (np.arange(SPOT_TEXELS) + 0.5) / SPOT_TEXELS - 1.0) * math.tan(light.outer)
+    cosine = 1.0 / np.sqrt(1.0 + x[None, :] ** 2 + x[:, None] ** 2)
+    ramp = (cosine - math.cos(light.outer)) / (math.cos(light.inner) - math.cos(light.outer))
+    falloff = np.clip(ramp, 0.0, 1.0) ** 2
+    texels = np.ascontiguousarray(np.repeat(falloff[..., None], 3, axis=2), np.float32)
+    return spot | {"texture": {"type": "bitmap", "data": mi.TensorXf(texels), "raw": True, "wrap_mode": "clamp"}}
+
+
+def background_emitter(mi: Any, background: Background) -> dict[str, Any] | None:
+    """The background as an emitter, None where it is black. Raises InputError for a picture under 3 columns wide."""
+    if isinstance(background, ConstantBackground):
+        return {"type": "constant", "radiance": _rgb(background.color)} if max(background.color) > 0.0 else None
+    if isinstance(background, GradientBackground):
+        height = np.cos(np.linspace(0.0, math.pi, GRADIENT_ROWS))[:, None]
+        share = 0.5 * (height + 1.0)
+        rows = share * np.array(background.top) + (1.0 - share) * np.array(background.bottom)
+        picture = np.repeat(rows[:, None, :], 4, axis=1)
+        return {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(picture, np.float32))}
+    return _environment(mi, background)
+
+
+def _environment(mi: Any, background: EnvironmentBackground) -> dict[str, Any]:
+    image = background.image
+    if image.shape[1] < 3:
+        raise InputError(f"environment {background.name!r}: Mitsuba needs 3 columns or more, got {image.shape[1]}")
+    # Mitsuba's first and last row lie at the poles, wrt's half a row away from them. Between two rows both are linear, so
+    # that a picture with the rows and their midpoints in turn is the same function.
+    above, below = np.concatenate([image[:1], image]), np.concatenate([image, image[-1:]])
+    rows = np.empty((2 * len(image) + 1, *image.shape[1:]), np.float32)
+    rows[0::2] = 0.5 * (above + below)
+    rows[1::2] = image
+    # Mitsuba's left edge is at -z, wrt's middle: half a turn.
+    turn = mi.ScalarTransform4f().rotate([0.0, 1.0, 0.0], math.degrees(background.rotation) + 180.0)
+    return {"type": "envmap", "bitmap": mi.Bitmap(rows), "scale": background.scale, "to_world": turn}

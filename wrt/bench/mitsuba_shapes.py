@@ -1,0 +1,149 @@
+"""Shapes for Mitsuba: one mesh per material of an object, in world space, and exact spheres."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from wrt.bench.mitsuba_bsdf import bsdf, emission
+from wrt.mesh import Mesh
+from wrt.scene import Material, Object, Sphere
+
+# The back of a two-sided light is a second mesh, this share of the mesh's extent behind the first.
+BACK_OFFSET = 1e-5
+
+
+class Part(NamedTuple):
+    """What one Mitsuba shape holds. face_index: (F,) index of its faces in the object's mesh, None for a sphere."""
+
+    object_id: int
+    face_index: np.ndarray | None
+    material: Material
+
+
+class _Triangles(NamedTuple):
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None
+    uvs: np.ndarray | None
+
+
+def raw_mesh(mi: Any, mesh: Mesh) -> Any:
+    """The mesh as it is, for ray queries: vertices and faces only, in the same order."""
+    return _mesh(mi, "mesh", _Triangles(mesh.vertices, mesh.faces, None, None), {})
+
+
+def object_parts(mi: Any, thing: Object, object_id: int, notes: Any) -> Iterator[tuple[str, Any, Part]]:
+    """(shape id, `mitsuba.Mesh`, Part) for each material that some face of the object has."""
+    world = _to_world(thing)
+    of_face = np.zeros(len(world.faces), np.int32) if thing.face_material is None else thing.face_material
+    for index in np.unique(of_face).tolist():
+        material = thing.materials[index]
+        chosen = np.flatnonzero(of_face == index)
+        triangles = _select(world, chosen)
+        if material.textures and triangles.uvs is None:
+            triangles = triangles._replace(uvs=np.zeros((len(triangles.vertices), 2), np.float32))
+        name = f"object{object_id}_{index}"
+        part = Part(object_id, chosen, material)
+        yield name, _mesh(mi, name, triangles, _properties(mi, material, notes)), part
+        if material.is_emissive and material.two_sided:
+            notes.add(f"material {material.name!r}: two_sided emission (a second mesh close behind emits to the back)")
+            back = _mesh(mi, name + "_back", _behind(triangles), _properties(mi, material, notes))
+            yield name + "_back", back, part
+
+
+def sphere_shape(mi: Any, sphere: Sphere, notes: Any) -> Any:
+    """Mitsuba's sphere has u around its z from its x, v down from +z: z is turned to +y and x to -x."""
+    if sphere.material.is_emissive and sphere.material.two_sided:
+        notes.add(f"sphere {sphere.name!r}: two_sided emission (the inside does not emit)")
+    pose = np.eye(4)
+    pose[:3, :3] = sphere.radius * np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    pose[:3, 3] = sphere.center
+    return {"type": "sphere", "to_world": mi.ScalarTransform4f(pose), **_properties(mi, sphere.material, notes)}
+
+
+def _properties(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
+    """A shape's nested plugins: its BSDF, what it emits, the medium inside."""
+    nested: dict[str, Any] = {"bsdf": bsdf(mi, material, notes)}
+    if material.is_emissive:
+        nested["emitter"] = emission(mi, material, notes)
+    if max(material.absorption) > 0.0 and not material.thin:
+        strongest = max(material.absorption)  # colours above 1 are refused, hence the scale
+        ratio = [value / strongest for value in material.absorption]
+        nested["interior"] = {"type": "homogeneous", "albedo": 0.0, "scale": strongest,
+                              "sigma_t": {"type": "rgb", "value": ratio}}
+    return nested
+
+
+def _to_world(thing: Object) -> _Triangles:
+    """World-space triangles: float64 arithmetic, rounded to float32 once, as wrt does it."""
+    mesh, linear = thing.mesh, thing.transform[:3, :3]
+    vertices = mesh.vertices.astype(np.float64) @ linear.T + thing.transform[:3, 3]
+    # A mirroring transform turns the winding around; exchanging two corners keeps the outside outside.
+    faces = mesh.faces if np.linalg.det(linear) >= 0.0 else mesh.faces[:, [0, 2, 1]]
+    world = _Triangles(vertices.astype(np.float32), faces, None, mesh.uvs)
+    if mesh.normals is None:
+        return world
+    normals = mesh.normals.astype(np.float64) @ np.linalg.inv(linear)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    flat = length[:, 0] == 0.0
+    normals = (normals / np.where(length > 0.0, length, 1.0)).astype(np.float32)
+    if not flat[faces].any():
+        return world._replace(normals=normals)
+    # Zero means flat there: such corners get their face's own normal, so that no corner may be shared any more.
+    corners = _unshared(world._replace(normals=normals))
+    assert corners.normals is not None
+    own = np.repeat(_face_normals(corners), 3, axis=0)
+    return corners._replace(normals=np.where(np.any(corners.normals, axis=1, keepdims=True), corners.normals, own))
+
+
+def _select(triangles: _Triangles, chosen: np.ndarray) -> _Triangles:
+    """The chosen faces with the vertices that they use."""
+    if len(chosen) == len(triangles.faces):
+        return triangles
+    used, faces = np.unique(triangles.faces[chosen], return_inverse=True)
+    pick = lambda array: None if array is None else array[used]
+    return _Triangles(triangles.vertices[used], faces.reshape(-1, 3), pick(triangles.normals), pick(triangles.uvs))
+
+
+def _unshared(triangles: _Triangles) -> _Triangles:
+    corner = triangles.faces.reshape(-1)
+    pick = lambda array: None if array is None else array[corner]
+    faces = np.arange(len(corner)).reshape(-1, 3)
+    return _Triangles(triangles.vertices[corner], faces, pick(triangles.normals), pick(triangles.uvs))
+
+
+def _face_normals(triangles: _Triangles) -> np.ndarray:
+    """(F, 3) float32 unit normals; zero for a triangle without area."""
+    a, b, c = (triangles.vertices[triangles.faces[:, corner]].astype(np.float64) for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return (normals / np.where(length > 0.0, length, 1.0)).astype(np.float32)
+
+
+def _behind(triangles: _Triangles) -> _Triangles:
+    """The same triangles seen from the back, moved a little to the back."""
+    corners = _unshared(triangles)
+    extent = float(np.ptp(corners.vertices, axis=0).max())
+    moved = corners.vertices - BACK_OFFSET * extent * np.repeat(_face_normals(corners), 3, axis=0)
+    normals = None if corners.normals is None else -corners.normals
+    return _Triangles(moved.astype(np.float32), corners.faces[:, [0, 2, 1]], normals, corners.uvs)
+
+
+def _mesh(mi: Any, name: str, triangles: _Triangles, nested: dict[str, Any]) -> Any:
+    properties = mi.Properties()
+    for key, value in nested.items():
+        properties[key] = mi.load_dict(value)
+    mesh = mi.Mesh(name, len(triangles.vertices), len(triangles.faces), props=properties,
+                   has_vertex_normals=triangles.normals is not None, has_vertex_texcoords=triangles.uvs is not None)
+    arrays = mi.traverse(mesh)
+    arrays["vertex_positions"] = triangles.vertices.ravel()
+    arrays["faces"] = triangles.faces.astype(np.uint32).ravel()
+    if triangles.normals is not None:
+        arrays["vertex_normals"] = triangles.normals.ravel()
+    if triangles.uvs is not None:
+        arrays["vertex_texcoords"] = triangles.uvs.ravel()
+    arrays.update()
+    return mesh

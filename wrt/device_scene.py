@@ -1,0 +1,308 @@
+"""From a scene to the device's records: one world-space mesh, tables of materials, textures and lights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel import Geometry
+from wrt.device import records, upload
+from wrt.errors import InputError
+from wrt.kernels import lights, structs, textures
+from wrt.scene import (
+    ALPHA_MODES,
+    MATERIAL_KINDS,
+    Camera,
+    Checkerboard,
+    ConstantBackground,
+    DirectionalLight,
+    GradientBackground,
+    Material,
+    Object,
+    PointLight,
+    Scene,
+    SpotLight,
+    Texture,
+)
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+# More area lights than this are sampled as one, by power: a shadow ray to each would cost more than it tells.
+MAX_MESH_LIGHTS = 16
+WRAPS = {"repeat": textures.WRAP_REPEAT, "clamp": textures.WRAP_CLAMP, "mirror": textures.WRAP_MIRROR}
+
+
+@dataclass(frozen=True, eq=False)
+class WorldMesh:
+    """All objects in one, in world space; normals (V, 3) and uvs (V, 2) are zero where an object has none."""
+
+    geometry: Geometry
+    normals: np.ndarray | None
+    uvs: np.ndarray
+    prim_material: np.ndarray
+
+
+def world_mesh(scene: Scene) -> WorldMesh:
+    """Transform and join all objects. Positions are computed in float64 and rounded once."""
+    index = {id(material): i for i, material in enumerate(scene.materials)}
+    vertices: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
+    normals: list[np.ndarray] = []
+    uvs: list[np.ndarray] = []
+    material: list[np.ndarray] = []
+    first = 0
+    for thing in scene.objects:
+        v, f, n, t = _transformed(thing)
+        vertices.append(v)
+        faces.append(f + np.int32(first))
+        normals.append(n)
+        uvs.append(t)
+        table = np.array([index[id(m)] for m in thing.materials], np.int32)
+        material.append(np.full(len(f), table[0]) if thing.face_material is None else table[thing.face_material])
+        first += len(v)
+    spheres = np.array([(*s.center, s.radius) for s in scene.spheres], np.float32).reshape(-1, 4)
+    material.append(np.array([index[id(s.material)] for s in scene.spheres], np.int32))
+    if first > 2**31 - 1 or sum(len(f) for f in faces) > 2**31 - 2:
+        raise InputError("the scene has more than 2^31 vertices or faces")
+    smooth = any(thing.mesh.normals is not None for thing in scene.objects)
+
+    def join(parts: list[np.ndarray], width: int, dtype: Any) -> np.ndarray:
+        return np.concatenate(parts) if parts else np.zeros((0, width), dtype)
+
+    geometry = Geometry(join(vertices, 3, np.float32), join(faces, 3, np.int32), spheres)
+    return WorldMesh(geometry, join(normals, 3, np.float32) if smooth else None, join(uvs, 2, np.float32),
+                     np.concatenate(material).astype(np.int32))
+
+
+def _transformed(thing: Object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    mesh, matrix = thing.mesh, thing.transform
+    faces = mesh.faces
+    normals = np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals
+    uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
+    if np.array_equal(matrix, np.eye(4)):
+        return mesh.vertices, faces, normals, uvs
+    linear = matrix[:3, :3]
+    with np.errstate(over="ignore"):  # caught below, with the object's name
+        vertices = (mesh.vertices.astype(np.float64) @ linear.T + matrix[:3, 3]).astype(np.float32)
+    if not np.isfinite(vertices).all():
+        raise InputError(f"object {thing.name!r}: its transform moves vertices beyond float32")
+    # Normals go by the cofactors: the inverse transpose times the determinant, which exists for flat objects too. Its sign
+    # turns them inwards where the object is mirrored, and so it is taken out; the faces are turned round instead.
+    mirrored = np.linalg.det(linear) < 0.0
+    if mirrored:
+        faces = faces[:, [0, 2, 1]]
+    if mesh.normals is not None:
+        cofactors = np.stack([np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])])
+        turned = normals.astype(np.float64) @ cofactors.T * (-1.0 if mirrored else 1.0)
+        length = np.linalg.norm(turned, axis=1, keepdims=True)
+        normals = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0.0).astype(np.float32)
+    return vertices, faces, normals, uvs
+
+
+class TextureTable:
+    """Texels of all pictures one after another; a picture used twice is stored once."""
+
+    def __init__(self) -> None:
+        self.rows: list[Texture | Checkerboard] = []
+        self.texels: list[np.ndarray] = []
+        self.first: dict[int, int] = {}
+        self.size = 0
+
+    def index(self, texture: Texture | Checkerboard | None) -> int:
+        if texture is None:
+            return -1
+        for i, row in enumerate(self.rows):
+            if row is texture:
+                return i
+        if isinstance(texture, Texture) and id(texture.image) not in self.first:
+            self.first[id(texture.image)] = self.size
+            self.texels.append(texture.image.reshape(-1, 4).view(np.uint32).ravel())
+            self.size += self.texels[-1].size
+            if self.size > 2**31 - 1:
+                raise InputError(f"textures: more than 2^31 texels in all (at {texture.name!r})")
+        self.rows.append(texture)
+        return len(self.rows) - 1
+
+    def records(self) -> np.ndarray:
+        out = records(structs.Texture, max(len(self.rows), 1))
+        for i, texture in enumerate(self.rows):
+            row = out[i]
+            if isinstance(texture, Checkerboard):
+                row["row_u"], row["row_v"] = (texture.scale, 0.0, 0.0), (0.0, texture.scale, 0.0)
+                row["color_a"], row["color_b"] = texture.color_a, texture.color_b
+                continue
+            row["first"] = self.first[id(texture.image)]
+            row["height"], row["width"] = texture.image.shape[:2]
+            row["srgb"] = texture.srgb
+            row["wrap_u"], row["wrap_v"] = WRAPS[texture.wrap[0]], WRAPS[texture.wrap[1]]
+            row["row_u"], row["row_v"] = texture.uv_transform
+        return out
+
+
+@cache
+def srgb_table() -> np.ndarray:
+    """(512,) float32: linear values of the 256 sRGB codes (IEC 61966-2-1), then i / 255."""
+    code = np.arange(256) / 255.0
+    linear = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+    return np.concatenate([linear, code]).astype(np.float32)
+
+
+def material_records(materials: tuple[Material, ...], table: TextureTable) -> np.ndarray:
+    out = records(structs.Material, max(len(materials), 1))
+    for row, material in zip(out, materials, strict=False):
+        for name in out.dtype.names or ():
+            if name.endswith("_texture"):
+                row[name] = table.index(getattr(material, name))
+            elif name == "kind":
+                row[name] = MATERIAL_KINDS.index(material.kind)
+            elif name == "alpha_mode":
+                row[name] = ALPHA_MODES.index(material.alpha_mode)
+            else:
+                row[name] = getattr(material, name)
+    return out
+
+
+def light_records(scene: Scene, world: WorldMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Lights and emitters. Each object with emissive faces is one light; beyond MAX_MESH_LIGHTS all are one together."""
+    rows: list[dict[str, Any]] = []
+    for light in scene.lights:
+        if isinstance(light, PointLight):
+            rows.append({"kind": lights.LIGHT_POINT, "position": light.position, "color": light.intensity})
+        elif isinstance(light, DirectionalLight):
+            rows.append({"kind": lights.LIGHT_DIRECTIONAL, "direction": light.direction, "color": light.irradiance})
+        elif isinstance(light, SpotLight):
+            rows.append({"kind": lights.LIGHT_SPOT, "position": light.position, "color": light.intensity,
+                         "direction": light.direction, "cos_inner": np.cos(light.inner), "cos_outer": np.cos(light.outer)})
+    for sphere in scene.spheres:
+        if sphere.material.is_emissive and sphere.material.emits_light:
+            rows.append({"kind": lights.LIGHT_SPHERE, "position": sphere.center, "radius": sphere.radius,
+                         "color": sphere.material.emission})
+    groups = _emissive_groups(scene, world)
+    if len(groups) > MAX_MESH_LIGHTS:
+        groups = [np.concatenate(groups)]
+    parts = []
+    first = 0
+    for prim_id in groups:
+        part = _emitters(scene, world, prim_id)
+        if part is not None:
+            rows.append({"kind": lights.LIGHT_MESH, "first": first, "count": len(part)})
+            parts.append(part)
+            first += len(part)
+    out = records(structs.Light, max(len(rows), 1))
+    for i, values in enumerate(rows):
+        for name, value in values.items():
+            out[i][name] = value
+    return out[: len(rows)], np.concatenate(parts) if parts else records(structs.Emitter, 1)[:0]
+
+
+def _emissive_groups(scene: Scene, world: WorldMesh) -> list[np.ndarray]:
+    """prim_ids of the faces that light, object by object."""
+    lit = np.array([m.is_emissive and m.emits_light for m in scene.materials], bool)
+    groups = []
+    first = 0
+    for thing in scene.objects:
+        n = len(thing.mesh.faces)
+        prim_id = first + np.nonzero(lit[world.prim_material[first : first + n]])[0]
+        if len(prim_id):
+            groups.append(prim_id)
+        first += n
+    return groups
+
+
+def _emitters(scene: Scene, world: WorldMesh, prim_id: np.ndarray) -> np.ndarray | None:
+    corner = world.geometry.vertices[world.geometry.faces[prim_id]].astype(np.float64)
+    area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    power = np.array([LUMINANCE @ np.array(m.emission) for m in scene.materials])[world.prim_material[prim_id]] * area
+    total = power.sum()
+    if not total > 0.0:
+        return None
+    out = records(structs.Emitter, len(prim_id))
+    out["prim_id"] = prim_id
+    out["cdf"] = np.cumsum(power) / total
+    out["cdf"][np.nonzero(power)[0][-1] :] = 1.0
+    out["pdf_area"] = np.divide(power, area * total, out=np.zeros_like(area), where=area > 0.0)
+    return out
+
+
+def background_struct(scene: Scene, device: Any) -> Any:
+    """The background, with tables that choose a pixel by its brightness times its solid angle."""
+    b = structs.Background()
+    background = scene.background
+    if isinstance(background, ConstantBackground):
+        b.bottom = b.top = wp.vec3(*background.color)
+    elif isinstance(background, GradientBackground):
+        b.bottom, b.top = wp.vec3(*background.bottom), wp.vec3(*background.top)
+    else:
+        image = background.image
+        b.height, b.width = image.shape[:2]
+        b.scale, b.rotation = background.scale, background.rotation
+        # Bilinear look-up spreads a pixel into its neighbours: their chance must not be 0. A small share of the mean keeps
+        # dark places in reach of light that rounding leaves there.
+        brightness = image.astype(np.float64) @ LUMINANCE
+        spread = np.maximum(np.maximum(brightness, np.roll(brightness, 1, axis=1)), np.roll(brightness, -1, axis=1))
+        spread = np.maximum(spread, np.maximum(np.vstack([spread[:1], spread[:-1]]), np.vstack([spread[1:], spread[-1:]])))
+        weight = (spread + 1e-3 * spread.mean() + 1e-30) * np.sin(np.pi * (np.arange(b.height) + 0.5) / b.height)[:, None]
+        row = np.cumsum(weight.sum(axis=1))
+        column = np.cumsum(weight, axis=1)
+        b.pixels = upload(image.reshape(-1, 3), wp.vec3, device)
+        b.row_cdf = upload(row / row[-1], wp.float32, device)
+        b.column_cdf = upload((column / column[:, -1:]).ravel(), wp.float32, device)
+    return b
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceScene:
+    """What the kernels take: surfaces and lighting, and the world-space geometry to build a structure over."""
+
+    world: WorldMesh
+    surfaces: Any
+    lighting: Any
+
+
+def upload_scene(scene: Scene, device: Any) -> DeviceScene:
+    """Put a scene on a device (a Warp device). Raises InputError where the scene cannot be rendered."""
+    for sphere in scene.spheres:
+        if sphere.material.alpha_mode == "mask" and sphere.material.albedo_texture is not None:
+            raise InputError(f"sphere {sphere.name!r}: a cut-out texture needs a mesh; material {sphere.material.name!r}")
+    world = world_mesh(scene)
+    geometry = world.geometry
+    table = TextureTable()
+    materials = material_records(scene.materials, table)
+    s = structs.Surfaces()
+    s.n_triangles = len(geometry.faces)
+    s.vertices = upload(geometry.vertices, wp.vec3, device)
+    s.faces = upload(geometry.faces, wp.vec3i, device)
+    s.normals = upload(np.zeros((1, 3)) if world.normals is None else world.normals, wp.vec3, device)
+    s.uvs = upload(world.uvs, wp.vec2, device)
+    s.spheres = upload(geometry.spheres, wp.vec4, device)
+    s.prim_material = upload(world.prim_material, wp.int32, device)
+    s.materials = upload(materials, structs.Material, device)
+    s.textures = upload(table.records(), structs.Texture, device)
+    s.texels = upload(np.concatenate([np.zeros(1, np.uint32), *table.texels])[1:] if table.texels else np.zeros(1),
+                      wp.uint32, device)
+    s.srgb_to_linear = upload(srgb_table(), wp.float32, device)
+
+    lighting = structs.Lighting()
+    rows, emitters = light_records(scene, world)
+    lighting.count = len(rows)
+    lighting.lights = upload(rows, structs.Light, device)
+    lighting.emitters = upload(emitters, structs.Emitter, device)
+    lighting.background = background_struct(scene, device)
+    lighting.ambient = wp.vec3(*scene.ambient)
+    return DeviceScene(world, s, lighting)
+
+
+def camera_struct(camera: Camera, size: tuple[int, int]) -> Any:
+    """The camera for a picture of so many pixels."""
+    c = structs.Camera()
+    pose = camera.camera_to_world
+    c.origin = wp.vec3(*pose[:3, 3])
+    c.right, c.up, c.forward = wp.vec3(*pose[:3, 0]), wp.vec3(*pose[:3, 1]), wp.vec3(*(-pose[:3, 2]))
+    c.tan_y = float(np.tan(0.5 * camera.fov_y))
+    c.tan_x = c.tan_y * size[0] / size[1]
+    c.focus_distance, c.aperture_radius = camera.focus_distance, camera.aperture_radius
+    c.blades, c.blade_rotation = camera.blades, camera.blade_rotation
+    return c

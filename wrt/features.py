@@ -1,0 +1,161 @@
+"""What a scene needs: the switches that a render kernel is compiled from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from wrt.scene import (
+    Camera,
+    Checkerboard,
+    ConstantBackground,
+    DirectionalLight,
+    EnvironmentBackground,
+    GradientBackground,
+    Material,
+    PointLight,
+    Scene,
+    SpotLight,
+    Texture,
+)
+
+
+@dataclass(frozen=True)
+class Features:
+    """Everything that changes the code of a kernel; what is False leaves no trace in it.
+
+    lens, blades, filter: the camera's; spheres, smooth, textures, checkerboards, normal_maps, cutout, blend: the surfaces';
+    mirror .. rough: the materials'; lights .. tinted_shadows: the lighting; derived: reflection, refraction, transmission,
+    transparent_shadows, sky_light, highlight. stack_size: the most rays that can be pending.
+    """
+
+    lens: bool = False
+    blades: bool = False
+    filter: bool = False
+    spheres: bool = False
+    smooth: bool = False
+    textures: bool = False
+    checkerboards: bool = False
+    normal_maps: bool = False
+    cutout: bool = False
+    blend: bool = False
+    mirror: bool = False
+    conductor: bool = False
+    glass: bool = False
+    thin_glass: bool = False
+    absorption: bool = False
+    metallic_roughness: bool = False
+    transmission: bool = False
+    rough: bool = False
+    highlight: bool = False
+    schlick: bool = False
+    emission: bool = False
+    lights: bool = False
+    point_lights: bool = False
+    directional_lights: bool = False
+    spot_lights: bool = False
+    mesh_lights: bool = False
+    sphere_lights: bool = False
+    gradient: bool = False
+    environment: bool = False
+    sky_light: bool = False
+    ambient: bool = False
+    tinted_shadows: bool = False
+    transparent_shadows: bool = False
+    reflection: bool = False
+    refraction: bool = False
+    stack_size: int = 1
+
+    def switches(self) -> dict[str, bool]:
+        """Every on/off feature by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "stack_size"}
+
+
+def mesh_lights(scene: Scene) -> bool:
+    return any(m.is_emissive and m.emits_light for thing in scene.objects for m in thing.materials)
+
+
+def is_rough(material: Material) -> bool:
+    return material.roughness > 0.01 and material.kind in ("conductor", "glass", "metallic_roughness")
+
+
+def features_of(scene: Scene, camera: Camera) -> Features:
+    """The features that this scene needs through this camera, with its settings."""
+    settings, materials = scene.settings, scene.materials
+    textures = [texture for material in materials for texture in material.textures]
+    kinds = {material.kind for material in materials}
+    background = scene.background
+    black = isinstance(background, ConstantBackground) and max(background.color) == 0.0
+    black = black or (isinstance(background, GradientBackground) and max(*background.bottom, *background.top) == 0.0)
+    diffuse = bool(kinds & {"diffuse", "metallic_roughness"}) and any(
+        max(m.albedo) > 0.0 for m in materials if m.kind in ("diffuse", "metallic_roughness"))
+    lit = diffuse or any(max(m.specular) > 0.0 for m in materials) or any(is_rough(m) for m in materials)
+    lights = {
+        "point_lights": lit and any(isinstance(light, PointLight) for light in scene.lights),
+        "directional_lights": lit and any(isinstance(light, DirectionalLight) for light in scene.lights),
+        "spot_lights": lit and any(isinstance(light, SpotLight) for light in scene.lights),
+        "mesh_lights": lit and mesh_lights(scene),
+        "sphere_lights": lit and any(s.material.is_emissive and s.material.emits_light for s in scene.spheres),
+    }
+    transmission = any(m.kind == "metallic_roughness" and m.transmission > 0.0 for m in materials)
+    glass = "glass" in kinds
+    clear = [m for m in materials if m.kind == "glass" or (m.kind == "metallic_roughness" and m.transmission > 0.0)]
+    blend = any(m.alpha_mode == "blend" for m in materials)
+    tinted = settings.glass_shadows == "tinted" and any(not m.thin for m in clear)
+    reflection = bool(kinds - {"diffuse"})
+    refraction = bool(clear)
+    children = int(reflection) + int(refraction) + int(blend)
+    return Features(
+        lens=camera.aperture_radius > 0.0,
+        blades=camera.aperture_radius > 0.0 and camera.blades > 0,
+        filter=settings.filter != "box",
+        spheres=bool(scene.spheres),
+        smooth=any(thing.mesh.normals is not None for thing in scene.objects),
+        textures=any(isinstance(texture, Texture) for texture in textures),
+        checkerboards=any(isinstance(texture, Checkerboard) for texture in textures),
+        normal_maps=any(m.normal_texture is not None for m in materials),
+        cutout=any(m.alpha_mode == "mask" for m in materials),
+        blend=blend,
+        mirror="mirror" in kinds,
+        conductor="conductor" in kinds,
+        glass=glass,
+        thin_glass=any(m.thin for m in clear),
+        absorption=any(max(m.absorption) > 0.0 for m in clear),
+        metallic_roughness="metallic_roughness" in kinds,
+        transmission=transmission,
+        rough=any(is_rough(m) for m in materials),
+        highlight=any(max(m.specular) > 0.0 for m in materials) or any(is_rough(m) for m in materials),
+        schlick=settings.fresnel == "schlick" and (refraction or "metallic_roughness" in kinds),
+        emission=any(m.is_emissive for m in materials),
+        lights=any(lights.values()),
+        **lights,
+        gradient=isinstance(background, GradientBackground),
+        environment=isinstance(background, EnvironmentBackground),
+        sky_light=lit and not black,
+        ambient=max(scene.ambient) > 0.0,
+        tinted_shadows=tinted,
+        transparent_shadows=lit and (blend or tinted or any(m.thin for m in clear)),
+        reflection=reflection,
+        refraction=refraction,
+        # The ray at hand is popped before its children are pushed: each level adds one ray less than it has children.
+        stack_size=max(1, (children - 1) * (settings.max_depth + 1) + 1),
+    )
+
+
+def filter_icdf(name: str, size: int = 257) -> np.ndarray:
+    """The inverse distribution of a pixel filter along one axis, (size,) float32, in pixels from the centre.
+
+    gaussian: standard deviation 0.5, cut at 1.5 pixels; blackman-harris: its four-term window over 3 pixels (Harris 1978).
+    Separable: used for x and y alike. Tabulated by the trapezoidal rule over 20,000 points.
+    """
+    x = np.linspace(-1.5, 1.5, 20001)
+    if name == "gaussian":
+        density = np.exp(-2.0 * x * x) - np.exp(-2.0 * 1.5 * 1.5)
+    elif name == "blackman-harris":
+        phase = 2.0 * np.pi * (x / 3.0 + 0.5)
+        density = 0.35875 - 0.48829 * np.cos(phase) + 0.14128 * np.cos(2 * phase) - 0.01168 * np.cos(3 * phase)
+    else:
+        return np.zeros(2, np.float32)
+    cdf = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+    return np.interp(np.linspace(0.0, 1.0, size), cdf / cdf[-1], x).astype(np.float32)

@@ -1,0 +1,110 @@
+"""glTF accessors as NumPy arrays: typed, strided, sparse and normalised ones.
+
+Source: Khronos, glTF 2.0 specification, section 3.6.2 (accessors), and KHR_mesh_quantization for integer positions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from wrt.errors import InputError
+from wrt.gltf_document import Document
+from wrt.gltf_schema import at
+
+_DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_MAX_COUNT = 2**31 - 1
+_MAX_IMPLICIT_COUNT = 2**26  # zeros that no buffer stands behind: a file of a few bytes must not ask for all memory
+
+
+class Accessors:
+    """Reads accessors of a document, each once; the arrays are shared, and read-only."""
+
+    def __init__(self, document: Document) -> None:
+        self._document = document
+        self._arrays: dict[int, np.ndarray] = {}
+
+    def read(self, index: int, kind: str, place: str) -> np.ndarray:
+        """Accessor `index` as (count, width of `kind`), float32 or its own integer type where it is not normalised.
+
+        kind: "SCALAR", "VEC2", "VEC3" or "VEC4". Raises InputError at `place` where the accessor has another kind, does
+        not fit in its buffer view, or holds a float that is not finite.
+        """
+        accessor = self._document.item("accessors", index, place)
+        if accessor.type != kind:
+            raise InputError(f"must be of type {kind}, but accessors[{index}] is {accessor.type!r}", None, place)
+        if index not in self._arrays:
+            with at(place):
+                self._arrays[index] = self._decode(accessor, f"accessors[{index}]")
+        return self._arrays[index]
+
+    def _decode(self, accessor: Any, where: str) -> np.ndarray:
+        dtype, count = _dtype(accessor.componentType, where), accessor.count
+        most = _MAX_COUNT if accessor.bufferView is not None else _MAX_IMPLICIT_COUNT
+        if not 1 <= count <= most:
+            raise InputError(f"must be 1 to {most}, got {count}", None, f"{where}.count")
+        width = _WIDTHS[accessor.type]
+        if accessor.bufferView is not None:
+            array = self._elements(accessor.bufferView, accessor.byteOffset or 0, dtype, (count, width), where)
+        elif accessor.sparse is not None:
+            array = np.zeros((count, width), dtype)
+        else:
+            raise InputError("has no data: neither a bufferView nor sparse values", None, where)
+        if accessor.sparse is not None:
+            array = self._with_sparse(array, accessor.sparse, f"{where}.sparse")
+        if accessor.normalized:
+            array = _normalised(array, where)
+        if array.dtype.kind == "f":
+            bad = ~np.isfinite(array).all(axis=1)
+            if bad.any():
+                row = int(np.nonzero(bad)[0][0])
+                raise InputError(f"element {row} is {array[row].tolist()} ({int(bad.sum())} not finite in all)", None,
+                                 where)
+        array.flags.writeable = False
+        return array
+
+    def _elements(self, view: int, offset: int, dtype: np.dtype, shape: tuple[int, int], where: str) -> np.ndarray:
+        """`shape` elements from a buffer view, packed; they need not be aligned."""
+        data, stride = self._document.view(view, f"{where}.bufferView")
+        size = dtype.itemsize * shape[1]
+        stride = stride or size
+        if stride < size:
+            raise InputError(f"is {stride}, but an element has {size} bytes", None, f"bufferViews[{view}].byteStride")
+        end = offset + (shape[0] - 1) * stride + size
+        if offset < 0 or end > len(data):
+            raise InputError(f"{shape[0]} elements reach from byte {offset} to {end} of bufferViews[{view}], "
+                             f"which has {len(data)}", None, where)
+        elements = np.ndarray(shape, dtype, data.data, offset, (stride, dtype.itemsize))
+        return elements.astype(dtype.newbyteorder("="))
+
+    def _with_sparse(self, array: np.ndarray, sparse: Any, where: str) -> np.ndarray:
+        """`array` with the listed elements replaced."""
+        if not 1 <= sparse.count <= len(array):
+            raise InputError(f"must be 1 to {len(array)}, got {sparse.count}", None, f"{where}.count")
+        index_type = _dtype(sparse.indices.componentType, f"{where}.indices")
+        if index_type.kind != "u":
+            raise InputError("must be an unsigned integer type", None, f"{where}.indices.componentType")
+        rows = self._elements(sparse.indices.bufferView, sparse.indices.byteOffset or 0, index_type, (sparse.count, 1),
+                              f"{where}.indices")[:, 0]
+        if rows.max() >= len(array):
+            raise InputError(f"holds {int(rows.max())}, but there are {len(array)} elements", None, f"{where}.indices")
+        values = sparse.values
+        array[rows] = self._elements(values.bufferView, values.byteOffset or 0, array.dtype.newbyteorder("<"),
+                                     (sparse.count, array.shape[1]), f"{where}.values")
+        return array
+
+
+def _dtype(component_type: int, where: str) -> np.dtype:
+    if component_type not in _DTYPES:
+        raise InputError(f"must be one of {', '.join(map(str, _DTYPES))}, got {component_type}", None,
+                         f"{where}.componentType")
+    return np.dtype(_DTYPES[component_type])
+
+
+def _normalised(array: np.ndarray, where: str) -> np.ndarray:
+    """Integers to [0, 1] or [-1, 1], float32; the specification's table, with the clamp of the most negative value."""
+    if array.dtype.kind == "f" or array.dtype.itemsize > 2:
+        raise InputError("only 8- and 16-bit integers can be normalised", None, f"{where}.normalized")
+    return np.maximum(array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max), np.float32(-1.0))

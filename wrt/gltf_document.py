@@ -1,0 +1,257 @@
+"""A glTF 2.0 file on disk: the container (.gltf, .glb), its JSON, its buffers and the files it refers to.
+
+Source: Khronos, glTF 2.0 specification, sections 2 (concepts), 3.6 (buffers) and 4 (GLB).
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import os
+import re
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote_to_bytes
+
+import numpy as np
+
+from wrt.errors import InputError
+from wrt.gltf_schema import at, read_as
+
+GLB_MAGIC = b"glTF"
+_CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
+
+SUPPORTED_EXTENSIONS = frozenset({
+    "KHR_lights_punctual", "KHR_texture_transform", "KHR_mesh_quantization", "EXT_mesh_gpu_instancing",
+    "KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_ior", "KHR_materials_emissive_strength",
+    "KHR_materials_unlit", "EXT_texture_webp", "EXT_texture_avif",
+})
+# They describe the file, or what can be done with it, and change no pixel.
+METADATA_EXTENSIONS = frozenset({
+    "KHR_xmp", "KHR_xmp_json_ld", "KHR_animation_pointer", "KHR_interactivity", "KHR_node_selectability",
+    "KHR_node_hoverability", "KHR_audio_emitter", "EXT_structural_metadata", "EXT_mesh_features",
+    "EXT_instance_features", "AGI_articulations", "AGI_stk_metadata", "FB_geometry_metadata", "MSFT_audio_emitter",
+    "MSFT_lod",
+})
+_CODECS = frozenset({
+    "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_texture_basisu",
+    "MSFT_texture_dds",
+})
+
+
+class LeftOut:
+    """What a file holds and the picture does not show, each thing once with the places where it stands."""
+
+    def __init__(self) -> None:
+        self._places: dict[str, dict[str, list[str]]] = {}
+
+    def add(self, feature: str, kind: str, name: str) -> None:
+        """Note `feature` at the thing `name` of the kind `kind` ("material", "node", ...)."""
+        names = self._places.setdefault(feature, {}).setdefault(kind, [])
+        if name not in names:
+            names.append(name)
+
+    def add_extensions(self, extensions: dict[str, Any] | None, kind: str, name: str) -> None:
+        """Note each extension that wrt does not read and that could change the picture."""
+        for extension in extensions or ():
+            if extension not in SUPPORTED_EXTENSIONS and extension not in METADATA_EXTENSIONS:
+                self.add(extension, kind, name)
+
+    def __contains__(self, feature: str) -> bool:
+        return feature in self._places
+
+    def sentence(self) -> str:
+        """All of it on one line, or ""; long lists of names are cut."""
+        return ", ".join(f"{feature} ({self._where(kinds)})" for feature, kinds in self._places.items())
+
+    @staticmethod
+    def _where(kinds: dict[str, list[str]], most: int = 5) -> str:
+        parts = []
+        for kind, names in kinds.items():
+            more = f" and {len(names) - most} more" if len(names) > most else ""
+            plural = {"mesh": "meshes"}.get(kind, kind + "s") if len(names) > 1 else kind
+            parts.append(f"{plural} {', '.join(map(repr, names[:most]))}{more}")
+        return "; ".join(parts)
+
+
+class Document:
+    """The typed JSON of one file (`gltf`, a pygltflib.GLTF2) and the bytes it refers to.
+
+    Errors are InputErrors that name the place in the JSON; the caller adds the file.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        import pygltflib
+
+        self.path = Path(path)
+        raw, self._binary = _read_container(self.path)
+        if not isinstance(raw, dict):
+            raise InputError("is not a glTF file: the JSON holds no object")
+        _check_version(raw)
+        self.gltf: Any = read_as(pygltflib.GLTF2, raw, "")
+        _check_required_extensions(self.gltf.extensionsRequired)
+        self.left_out = LeftOut()
+        self._buffers: dict[int, np.ndarray] = {}
+
+    def item(self, array: str, index: int, place: str) -> Any:
+        """`gltf.<array>[index]`; raises InputError at `place` where there is none."""
+        items = getattr(self.gltf, array)
+        if not 0 <= index < len(items):
+            raise InputError(f"is {index}, but there are {len(items)} {array}", None, place)
+        return items[index]
+
+    def extension(self, holder: Any, name: str, cls: Any, place: str) -> Any:
+        """The extension `name` of a glTF object as an instance of `cls`, or None where the object has none."""
+        raw = (holder.extensions or {}).get(name)
+        return None if raw is None else read_as(cls, raw, f"{place}.extensions.{name}".removeprefix("."))
+
+    def view(self, index: int, place: str) -> tuple[np.ndarray, int | None]:
+        """The bytes of a buffer view (N,) uint8, and its stride."""
+        view = self.item("bufferViews", index, place)
+        where = f"bufferViews[{index}]"
+        data = self._buffer(view.buffer, f"{where}.buffer")
+        start, length = view.byteOffset or 0, view.byteLength
+        if length < 1:
+            raise InputError(f"must be at least 1, got {length}", None, f"{where}.byteLength")
+        if start < 0 or start + length > len(data):
+            raise InputError(f"bytes {start} to {start + length} reach outside of buffers[{view.buffer}], "
+                             f"which has {len(data)}", None, where)
+        return data[start:start + length], view.byteStride
+
+    def _buffer(self, index: int, place: str) -> np.ndarray:
+        if index not in self._buffers:
+            buffer = self.item("buffers", index, place)
+            where = f"buffers[{index}]"
+            if buffer.uri is not None:
+                data = self.resource(buffer.uri, f"{where}.uri")
+            elif index == 0 and self._binary is not None:
+                data = self._binary
+            else:
+                raise InputError("has no uri, and the file has no binary chunk for it", None, where)
+            if len(data) < buffer.byteLength:
+                raise InputError(f"is truncated: byteLength is {buffer.byteLength}, but there are {len(data)} bytes",
+                                 None, where)
+            self._buffers[index] = np.frombuffer(data, dtype=np.uint8)[:max(buffer.byteLength, 0)]
+        return self._buffers[index]
+
+    def resource(self, uri: str, place: str) -> bytes:
+        """The bytes behind a data: URI or a relative path; nothing outside of the glTF file's folder is read."""
+        if uri[:5].lower() == "data:":
+            with at(place):
+                return _decode_data_uri(uri)
+        name = _local_name(uri, place)
+        try:
+            return (self.path.parent / name).read_bytes()
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise InputError(f"cannot read {name!r}: {reason}", None, place) from None
+
+
+def _read_container(path: Path) -> tuple[Any, bytes | None]:
+    """The parsed JSON and the binary chunk of a .gltf or .glb file; the first bytes tell which it is."""
+    try:
+        data = path.read_bytes()
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read the file: {getattr(error, 'strerror', None) or error}") from None
+    if data[:4] == GLB_MAGIC:
+        return _read_glb(data)
+    if path.suffix.lower() == ".glb":
+        raise InputError(f"is not a .glb file: it starts with {data[:4]!r}, not {GLB_MAGIC!r}")
+    return _parse_json(data), None
+
+
+def _read_glb(data: bytes) -> tuple[Any, bytes | None]:
+    if len(data) < 20:
+        raise InputError(f"is truncated: a .glb file starts with 20 bytes, this one has {len(data)}", None, "header")
+    version, length = struct.unpack_from("<II", data, 4)
+    if version != 2:
+        raise InputError(f"is glTF {version}; wrt reads 2.0", None, "header.version")
+    if length > len(data):
+        raise InputError(f"is truncated: {length} bytes according to its header, but there are {len(data)}", None,
+                         "header.length")
+    chunks: list[tuple[int, bytes]] = []
+    offset = 12
+    while offset + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, offset)
+        if offset + 8 + size > length:
+            raise InputError(f"is truncated: it ends at byte {offset + 8 + size}, the file at {length}", None,
+                             f"chunk {len(chunks)}")
+        chunks.append((kind, data[offset + 8:offset + 8 + size]))
+        offset += 8 + size
+    if not chunks or chunks[0][0] != _CHUNK_JSON:
+        raise InputError("must be JSON", None, "chunk 0")
+    binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == _CHUNK_BIN else None
+    return _parse_json(chunks[0][1]), binary
+
+
+def _parse_json(data: bytes) -> Any:
+    def refuse(constant: str) -> None:
+        raise InputError(f"is not valid JSON: it holds {constant}")
+
+    try:
+        return json.loads(data.decode("utf-8-sig"), parse_constant=refuse)
+    except UnicodeDecodeError as error:
+        raise InputError(f"is not a glTF file: not UTF-8 at byte {error.start}") from None
+    except json.JSONDecodeError as error:
+        raise InputError(f"is not valid JSON: {error}") from None
+    except RecursionError:
+        raise InputError("is not valid JSON: nested too deeply") from None
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"is not valid JSON: {error}") from None  # an integer of thousands of digits
+
+
+def _check_version(raw: dict[str, Any]) -> None:
+    asset = raw.get("asset")
+    if not isinstance(asset, dict) or not isinstance(asset.get("version"), str):
+        raise InputError("must be a string such as '2.0'", None, "asset.version")
+    for key, readable in (("version", r"2\.\d+"), ("minVersion", r"2\.0")):  # a later 2.x may be read as 2.0
+        version = asset.get(key)
+        if version is not None and not re.fullmatch(readable, str(version)):
+            raise InputError(f"is {version!r}; wrt reads 2.0", None, f"asset.{key}")
+
+
+def _check_required_extensions(required: Iterable[str]) -> None:
+    unknown = sorted(set(required) - SUPPORTED_EXTENSIONS - METADATA_EXTENSIONS)
+    if unknown:
+        codecs = [name for name in unknown if name in _CODECS]
+        hint = f"; there is no decoder for {', '.join(codecs)}: save the file without compression" if codecs else ""
+        raise InputError(f"the file needs {', '.join(unknown)}, which wrt does not support{hint}", None,
+                         "extensionsRequired")
+
+
+def _decode_data_uri(uri: str) -> bytes:
+    header, comma, payload = uri[5:].partition(",")
+    if not comma:
+        raise InputError("is a data: URI without a comma")
+    data = unquote_to_bytes(payload)
+    if not header.lower().endswith(";base64"):
+        return data
+    try:
+        return base64.b64decode(data, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise InputError(f"is a data: URI that cannot be decoded: {error}") from None
+
+
+def _local_name(uri: str, place: str) -> str:
+    """The relative path that a URI stands for. A scene file is untrusted: it may name no path outside of its folder."""
+    try:
+        name = unquote_to_bytes(uri).decode("utf-8").replace("\\", "/")
+    except UnicodeError:
+        raise InputError(f"{uri[:80]!r} is not UTF-8", None, place) from None
+    problem = ""
+    if not name or any(ord(character) < 32 for character in name):
+        problem = "is empty or holds a control character"
+    elif re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name):
+        problem = "is an address; only files beside the glTF file are read"
+    elif name.startswith("/"):
+        problem = "is an absolute path; only files beside the glTF file are read"
+    elif ".." in name.split("/"):
+        problem = "leaves the folder of the glTF file; copy what it needs beside it"
+    if problem:
+        raise InputError(f"{uri[:80]!r} {problem}", None, place)
+    return name

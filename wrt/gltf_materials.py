@@ -1,0 +1,283 @@
+"""glTF images, textures and materials as those of a wrt scene.
+
+Occlusion textures are left out on purpose: they hold baked ambient shadow, and a ray tracer finds its own. So are the
+thickness textures of KHR_materials_volume: a ray meets the far side itself. Neither is warned about.
+Source: Khronos, glTF 2.0 specification, sections 3.8 (texture data) and 3.9 (materials), and each extension's own text.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+
+from wrt.errors import InputError
+from wrt.gltf_document import Document
+from wrt.gltf_schema import (
+    EmissiveStrength,
+    Ior,
+    TextureSource,
+    TextureTransform,
+    Transmission,
+    Unlit,
+    Volume,
+    at,
+    exactly,
+)
+from wrt.scene import BLACK, Color, Material, Texture, as_number, as_vector
+
+MAX_SIDE, MAX_PIXELS = 16384, 2**28
+# Only these formats are tried: pillow has others, such as EPS, that run programs or have no place in glTF.
+_FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF")
+_WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+_NEAREST = 9728
+_DARKEST = 1e-6  # of an attenuation colour: 0 would need infinite absorption
+_ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
+
+# Values with which an extension that wrt does not read changes nothing: then it need not be named.
+_NEUTRAL: dict[str, dict[str, Any]] = {
+    "KHR_materials_clearcoat": {"clearcoatFactor": 0},
+    "KHR_materials_sheen": {"sheenColorFactor": [0, 0, 0]},
+    "KHR_materials_iridescence": {"iridescenceFactor": 0},
+    "KHR_materials_anisotropy": {"anisotropyStrength": 0},
+    "KHR_materials_dispersion": {"dispersion": 0},
+    "KHR_materials_diffuse_transmission": {"diffuseTransmissionFactor": 0},
+    "KHR_materials_specular": {"specularFactor": 1, "specularColorFactor": [1, 1, 1], "specularTexture": None,
+                               "specularColorTexture": None},
+}
+
+
+class Textures:
+    """Makes textures; each image is decoded once, and equal settings on one image give the same Texture object."""
+
+    def __init__(self, document: Document) -> None:
+        self._document = document
+        self._images: dict[int, np.ndarray] = {}
+        self._textures: dict[tuple[Any, ...], Texture] = {}
+
+    def texture(self, info: Any, srgb: bool, material: str, place: str) -> Texture | None:
+        """The texture of a textureInfo, or None where there is none or it wants a second set of coordinates."""
+        if info is None:
+            return None
+        document = self._document
+        texture = document.item("textures", info.index, f"{place}.index")
+        document.left_out.add_extensions(info.extensions, "material", material)
+        transform = document.extension(info, "KHR_texture_transform", TextureTransform, place) or TextureTransform()
+        coordinates = transform.texCoord if transform.texCoord is not None else info.texCoord or 0
+        if coordinates != 0:
+            document.left_out.add(f"textures by TEXCOORD_{coordinates}", "material", material)
+            return None
+        wrap = self._wrap(texture, material, f"textures[{info.index}]")
+        matrix = _uv_transform(transform, f"{place}.extensions.KHR_texture_transform")
+        source = self._source(texture, f"textures[{info.index}]")
+        key = (source, srgb, wrap, matrix.tobytes())
+        if key not in self._textures:
+            image = document.gltf.images[source]
+            file = image.uri if image.uri and image.uri[:5] != "data:" else ""
+            name = texture.name or image.name or file or f"image {source}"
+            self._textures[key] = Texture(self._image(source), srgb=srgb, wrap=wrap, uv_transform=matrix, name=name)
+        return self._textures[key]
+
+    def _wrap(self, texture: Any, material: str, place: str) -> tuple[str, str]:
+        if texture.sampler is None:
+            return ("repeat", "repeat")
+        sampler = self._document.item("samplers", texture.sampler, f"{place}.sampler")
+        if sampler.magFilter == _NEAREST:
+            self._document.left_out.add("nearest-neighbour sampling", "material", material)
+        for axis in ("wrapS", "wrapT"):
+            if getattr(sampler, axis) not in _WRAPS:
+                raise InputError(f"must be one of {', '.join(map(str, _WRAPS))}, got {getattr(sampler, axis)}", None,
+                                 f"samplers[{texture.sampler}].{axis}")
+        return (_WRAPS[sampler.wrapS], _WRAPS[sampler.wrapT])
+
+    def _source(self, texture: Any, place: str) -> int:
+        """The image's index; the core's (PNG or JPEG) before the one of an extension."""
+        source = texture.source
+        for name in ("EXT_texture_webp", "EXT_texture_avif"):
+            if source is None:
+                extension = self._document.extension(texture, name, TextureSource, place)
+                source = extension.source if extension else None
+        if source is None:
+            others = ", ".join(texture.extensions or {})
+            but = f" but that of {others}, which wrt does not decode" if others else ""
+            raise InputError(f"has no image{but}", None, place)
+        self._document.item("images", source, f"{place}.source")
+        return source
+
+    def _image(self, index: int) -> np.ndarray:
+        if index not in self._images:
+            image = self._document.gltf.images[index]
+            place = f"images[{index}]"
+            if image.uri is not None:
+                data: Any = self._document.resource(image.uri, f"{place}.uri")
+                place = f"{place}.uri" if image.uri[:5] == "data:" else f"{place}.uri ({image.uri})"
+            elif image.bufferView is not None:
+                data = self._document.view(image.bufferView, f"{place}.bufferView")[0].tobytes()
+            else:
+                raise InputError("has neither a uri nor a bufferView", None, place)
+            with at(place):
+                self._images[index] = decode_image(data)
+        return self._images[index]
+
+
+def decode_image(data: bytes) -> np.ndarray:
+    """An encoded picture as (H, W, 4) uint8, row 0 on top; colour profiles are ignored, as glTF demands.
+
+    Raises InputError where it cannot be decoded, is truncated, or is larger than MAX_SIDE or MAX_PIXELS.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    Image.init()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is our own
+            with Image.open(io.BytesIO(data), formats=[name for name in _FORMATS if name in Image.OPEN]) as picture:
+                width, height = picture.size
+                if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
+                    raise InputError(f"is {width}x{height}; at most {MAX_SIDE} a side, {MAX_PIXELS} in all, are read")
+                if picture.mode.startswith("I"):  # 16-bit grey: pillow's own conversion clips at 255
+                    grey = (np.asarray(picture).astype(np.int64) // 257).clip(0, 255).astype(np.uint8)
+                    return np.dstack([grey, grey, grey, np.full_like(grey, 255)])
+                return np.array(picture.convert("RGBA"))
+    except InputError:
+        raise
+    except Exception as error:  # pillow's decoders raise many kinds, and a scene file is untrusted
+        unknown = isinstance(error, UnidentifiedImageError)
+        reason = f"it is none of {', '.join(_FORMATS)}" if unknown else str(error)
+        raise InputError(f"the image cannot be decoded: {reason}") from None
+
+
+def _uv_transform(transform: TextureTransform, place: str) -> np.ndarray:
+    """(2, 3): offset, then rotation, then scale act on (u, v, 1) from the right.
+
+    A positive rotation is counter-clockwise as the image is seen, with v downwards: the GLSL listing in the text of
+    KHR_texture_transform turns the other way, its prose, its example and the sample models turn this way.
+    """
+    offset_u, offset_v = exactly(transform.offset, 2, f"{place}.offset")
+    scale_u, scale_v = exactly(transform.scale, 2, f"{place}.scale")
+    cosine, sine = math.cos(transform.rotation), math.sin(transform.rotation)
+    return np.array([[cosine * scale_u, sine * scale_v, offset_u], [-sine * scale_u, cosine * scale_v, offset_v]])
+
+
+class Materials:
+    """Makes materials; each index gives one Material object."""
+
+    def __init__(self, document: Document) -> None:
+        self._document = document
+        self._textures = Textures(document)
+        self._materials: dict[int | None, Material] = {}
+
+    def material(self, index: int | None, place: str) -> Material:
+        """The material `index`, or the specification's default one (white, metallic, rough) for None."""
+        if index not in self._materials:
+            if index is None:
+                self._materials[None] = Material(kind="metallic_roughness", name="default", albedo=(1.0, 1.0, 1.0),
+                                                 metallic=1.0, roughness=1.0)
+            else:
+                source = self._document.item("materials", index, place)
+                self._materials[index] = self._make(source, source.name or f"material {index}", f"materials[{index}]")
+        return self._materials[index]
+
+    def _make(self, source: Any, name: str, place: str) -> Material:
+        import pygltflib
+
+        self._name_unread_extensions(source, name)
+        if source.pbrMetallicRoughness is None:
+            source.pbrMetallicRoughness = pygltflib.PbrMetallicRoughness()
+        fields = self._base(source, name, place)
+        if self._document.extension(source, "KHR_materials_unlit", Unlit, place) is not None:
+            fields = _unlit(fields)
+        else:
+            fields |= {"kind": "metallic_roughness"} | self._reflection(source, name, place)
+            fields |= self._transmission(source, name, place) | self._emission(source, name, place)
+        with at(place):
+            return Material(**fields)
+
+    def _name_unread_extensions(self, source: Any, name: str) -> None:
+        for extension, raw in (source.extensions or {}).items():
+            neutral = _NEUTRAL.get(extension) if isinstance(raw, dict) else None
+            if neutral is None or any(raw.get(key, value) != value for key, value in neutral.items()):
+                self._document.left_out.add_extensions({extension: raw}, "material", name)
+
+    def _base(self, source: Any, name: str, place: str) -> dict[str, Any]:
+        """Name, base colour, alpha and sides: what unlit materials have as well."""
+        pbr = source.pbrMetallicRoughness
+        factor = exactly(pbr.baseColorFactor, 4, f"{place}.pbrMetallicRoughness.baseColorFactor")
+        if source.alphaMode not in _ALPHA_MODES:
+            raise InputError(f"must be one of {', '.join(_ALPHA_MODES)}, got {source.alphaMode!r}", None,
+                             f"{place}.alphaMode")
+        alpha, cutoff = factor[3], 0.5 if source.alphaCutoff is None else source.alphaCutoff
+        if cutoff > 1.0:  # allowed, and means that nothing of it is seen
+            alpha, cutoff = 0.0, 1.0
+        return {
+            "name": name, "albedo": tuple(factor[:3]), "alpha": alpha, "alpha_mode": _ALPHA_MODES[source.alphaMode],
+            "alpha_cutoff": cutoff, "two_sided": source.doubleSided,
+            "albedo_texture": self._textures.texture(pbr.baseColorTexture, True, name,
+                                                     f"{place}.pbrMetallicRoughness.baseColorTexture"),
+        }
+
+    def _reflection(self, source: Any, name: str, place: str) -> dict[str, Any]:
+        pbr = source.pbrMetallicRoughness
+        fields: dict[str, Any] = {"metallic": pbr.metallicFactor, "roughness": pbr.roughnessFactor}
+        fields["metallic_roughness_texture"] = self._textures.texture(
+            pbr.metallicRoughnessTexture, False, name, f"{place}.pbrMetallicRoughness.metallicRoughnessTexture")
+        if (normal := source.normalTexture) is not None:
+            fields["normal_texture"] = self._textures.texture(normal, False, name, f"{place}.normalTexture")
+            fields["normal_scale"] = normal.scale
+        if (ior := self._document.extension(source, "KHR_materials_ior", Ior, place)) is not None:
+            if ior.ior == 0.0:  # stands for infinite, kept for an older workflow
+                self._document.left_out.add("KHR_materials_ior of 0", "material", name)
+            else:
+                fields["ior"] = ior.ior
+        return fields
+
+    def _transmission(self, source: Any, name: str, place: str) -> dict[str, Any]:
+        """Glass: a thin pane unless a volume of some thickness is declared."""
+        transmission = self._document.extension(source, "KHR_materials_transmission", Transmission, place)
+        if transmission is None or transmission.transmissionFactor == 0.0:
+            return {}
+        fields: dict[str, Any] = {"transmission": transmission.transmissionFactor, "thin": True}
+        fields["transmission_texture"] = self._textures.texture(
+            transmission.transmissionTexture, False, name,
+            f"{place}.extensions.KHR_materials_transmission.transmissionTexture")
+        volume = self._document.extension(source, "KHR_materials_volume", Volume, place)
+        if volume is not None and volume.thicknessFactor > 0.0:
+            with at(f"{place}.extensions.KHR_materials_volume"):
+                fields |= {"thin": False, "absorption": absorption(volume)}
+        return fields
+
+    def _emission(self, source: Any, name: str, place: str) -> dict[str, Any]:
+        factor = exactly(source.emissiveFactor, 3, f"{place}.emissiveFactor")
+        strength = self._document.extension(source, "KHR_materials_emissive_strength", EmissiveStrength, place)
+        emission = tuple(value * (strength.emissiveStrength if strength else 1.0) for value in factor)
+        if not any(emission):
+            return {}
+        if source.emissiveTexture is None:
+            return {"emission": emission}
+        texture = self._textures.texture(source.emissiveTexture, True, name, f"{place}.emissiveTexture")
+        if texture is None:  # it could not be read, and without it the whole surface would glow
+            return {}
+        return {"emission": emission, "emission_texture": texture, "emits_light": False}
+
+
+def absorption(volume: Volume) -> Color:
+    """Beer-Lambert's coefficient per unit of world length (KHR_materials_volume): exp(-a * distance) is the colour."""
+    color = as_vector(volume.attenuationColor, "attenuationColor", low=0.0, high=1.0)
+    if math.isinf(volume.attenuationDistance):
+        return BLACK
+    distance = as_number(volume.attenuationDistance, "attenuationDistance", low=1e-30)
+    red, green, blue = (-math.log(max(channel, _DARKEST)) / distance for channel in color)
+    return (red, green, blue)
+
+
+def _unlit(fields: dict[str, Any]) -> dict[str, Any]:
+    """A surface that shows its base colour whatever the light: emission that lights nothing else."""
+    base, texture = fields["albedo"], fields["albedo_texture"]
+    return fields | {
+        "kind": "diffuse", "albedo": BLACK, "emission": base, "emission_texture": texture, "two_sided": True,
+        "emits_light": False,
+        "albedo_texture": texture if fields["alpha_mode"] != "opaque" else None,  # its alpha still counts
+    }

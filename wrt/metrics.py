@@ -1,0 +1,286 @@
+"""How far one picture is from another: mean errors, FLIP, and a difference image.
+
+`a` is the picture to judge and `b` the reference; both are (H, W, 3) linear Rec. 709.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from wrt.errors import InputError
+from wrt.tonemap import encode_srgb, luminance, tone_map
+
+RELMSE_EPS = 0.01
+PIXELS_PER_DEGREE = 3840 * math.pi / 180  # FLIP's default: a screen 3840 pixels wide, seen from as far as it is wide
+HIGHER_IS_BETTER = ("psnr",)
+
+
+def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str = "none") -> dict[str, Any]:
+    """The error measures of `a` against the reference `b`, as plain numbers by name.
+
+    On linear values, over all pixels and channels: mse; relmse, the mean of (a - b)^2 / (b^2 + RELMSE_EPS) (Rousselle,
+    Knaus, Zwicker, "Adaptive Sampling and Reconstruction using Greedy Error Minimization", 2011); max_abs, the largest
+    |a - b|; mean_ratio, mean(a) / mean(b). On what a display shows after `exposure` stops and `tonemap`: psnr in dB
+    between sRGB-encoded values with peak 1 (inf where equal); flip, the mean of `flip_map`.
+
+    A pixel with a NaN or an infinity in a or b is left out of every mean and counted: nonfinite_a, nonfinite_b, and
+    nonfinite_differ, those where a and b are not the same there. All means are NaN where no pixel is left. Raises
+    InputError where the sizes differ.
+    """
+    a, b = _pair(a, b)
+    finite = np.isfinite(a).all(axis=-1) & np.isfinite(b).all(axis=-1)
+    same = ((a == b) | (np.isnan(a) & np.isnan(b))).all(axis=-1)
+    result: dict[str, Any] = {
+        "pixels": int(finite.size),
+        "nonfinite_a": int((~np.isfinite(a)).any(axis=-1).sum()),
+        "nonfinite_b": int((~np.isfinite(b)).any(axis=-1).sum()),
+        "nonfinite_differ": int((~finite & ~same).sum()),
+    }
+    if not finite.any():
+        return result | dict.fromkeys(("mse", "relmse", "max_abs", "mean_ratio", "psnr", "flip"), math.nan)
+    # Pixels that are left out become black in both: FLIP, which filters over neighbours, then sees no difference there.
+    a, b = (np.where(finite[..., None], image, np.float32(0.0)) for image in (a, b))
+    x, y = a[finite].astype(np.float64), b[finite].astype(np.float64)
+    shown_a, shown_b = (tone_map(image, exposure, tonemap) for image in (a, b))
+    shown_error = encode_srgb(shown_a[finite].astype(np.float64)) - encode_srgb(shown_b[finite].astype(np.float64))
+    shown_mse = float(np.mean(shown_error**2))
+    return result | {
+        "mse": float(np.mean((x - y) ** 2)),
+        "relmse": float(np.mean((x - y) ** 2 / (y**2 + RELMSE_EPS))),
+        "max_abs": float(np.abs(x - y).max()),
+        "mean_ratio": _ratio(float(x.mean()), float(y.mean())),
+        "psnr": -10.0 * math.log10(shown_mse) if shown_mse > 0.0 else math.inf,
+        "flip": float(flip_map(shown_a, shown_b)[finite].mean()),
+    }
+
+
+def failures(result: Mapping[str, Any], limits: Mapping[str, float | None]) -> list[str]:
+    """One sentence for each limit that the result of `compare` breaks; None is no limit.
+
+    psnr has a lower limit, every other measure an upper one. Where any limit is set, pixels that are not finite and not
+    the same in both pictures are a failure too, and so is a measure that is NaN.
+    """
+    active = {name: limit for name, limit in limits.items() if limit is not None}
+    told = []
+    for name, limit in active.items():
+        value = result[name]
+        if name in HIGHER_IS_BETTER and not value >= limit:
+            told.append(f"{name} {value:.6g} is below {limit:g}")
+        if name not in HIGHER_IS_BETTER and not value <= limit:
+            told.append(f"{name} {value:.6g} is above {limit:g}")
+    if active and result["nonfinite_differ"]:
+        told.append(f"{result['nonfinite_differ']} pixels are NaN or infinite in one picture and differ in the other")
+    return told
+
+
+def _ratio(a: float, b: float) -> float:
+    if b == 0.0:
+        return 1.0 if a == 0.0 else math.copysign(math.inf, a)
+    return a / b
+
+
+def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    a, b = np.asarray(a, dtype=np.float32), np.asarray(b, dtype=np.float32)
+    for image in (a, b):
+        if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+            raise InputError(f"a picture must be (H, W, 3), got {image.shape}")
+    if a.shape != b.shape:
+        sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in (a, b))
+        raise InputError(f"the pictures have different sizes, {sizes}")
+    return a, b
+
+
+# --- FLIP -------------------------------------------------------------------------------------------------------------
+# Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom, Fairchild: "FLIP: A Difference Evaluator for Alternating
+# Images", HPG 2020: a colour part, a part for edges and points, and their combination. The constants are the paper's.
+
+# Contrast sensitivity as Gaussians (weight a, width b) of YCxCz: achromatic, red-green, blue-yellow.
+CONTRAST_SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
+COLOR_EXPONENT, FEATURE_EXPONENT = 0.7, 0.5
+KNEE_AT, KNEE_VALUE = 0.4, 0.95  # the share of the largest colour distance that is mapped to the value
+FEATURE_WIDTH = 0.082  # degrees
+
+
+def _rgb_to_xyz() -> np.ndarray:
+    """Linear Rec. 709 to XYZ, from the chromaticities of the primaries and of D65 white (0.3127, 0.3290)."""
+    primaries = np.array([[x / y, 1.0, (1.0 - x - y) / y] for x, y in ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))]).T
+    white = np.array([0.3127 / 0.3290, 1.0, (1.0 - 0.3127 - 0.3290) / 0.3290])
+    return primaries * np.linalg.solve(primaries, white)
+
+
+RGB_TO_XYZ = _rgb_to_xyz()
+XYZ_WHITE = RGB_TO_XYZ.sum(axis=1)
+# YCxCz is linear in XYZ: rows of (X, Y, Z) / white, and the offset of the first row.
+XYZ_TO_OPPONENT = np.array([[0.0, 116.0, 0.0], [500.0, -500.0, 0.0], [0.0, 200.0, -200.0]])
+RGB_TO_OPPONENT = XYZ_TO_OPPONENT @ (RGB_TO_XYZ / XYZ_WHITE[:, None])
+OPPONENT_OFFSET = np.array([-16.0, 0.0, 0.0])
+
+
+def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
+    """LDR-FLIP: the difference seen when `a` and `b` alternate on a screen, (H, W) in [0, 1]; 0 is none.
+
+    a, b: (H, W, 3) display-linear in [0, 1] (`tone_map`, or a decoded PNG), finite; the order does not matter.
+    pixels_per_degree: of the visual angle. Source: Andersson et al. 2020 (see above).
+    """
+    opponent = [np.clip(image, 0.0, 1.0) @ RGB_TO_OPPONENT.T + OPPONENT_OFFSET for image in (a, b)]
+    color = _color_difference(*(_perceived_lab(image, pixels_per_degree) for image in opponent))
+    lightness = [(image[..., 0] + 16.0) / 116.0 for image in opponent]
+    edges, points = zip(*(_features(image, pixels_per_degree) for image in lightness), strict=True)
+    feature = np.maximum(np.abs(edges[0] - edges[1]), np.abs(points[0] - points[1])) / math.sqrt(2.0)
+    return color ** (1.0 - feature**FEATURE_EXPONENT)
+
+
+def _perceived_lab(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
+    """YCxCz blurred by the eye's contrast sensitivity, as L*a*b* with the Hunt adjustment (chroma times lightness)."""
+    blurred = np.stack([_blur(opponent[..., i], terms, pixels_per_degree)
+                        for i, terms in enumerate(CONTRAST_SENSITIVITY)], axis=-1)
+    rgb = np.clip((blurred - OPPONENT_OFFSET) @ np.linalg.inv(RGB_TO_OPPONENT).T, 0.0, 1.0)
+    return _hunt_lab(rgb)
+
+
+def _blur(image: np.ndarray, terms: tuple[tuple[float, float], ...], pixels_per_degree: float) -> np.ndarray:
+    """A sum of Gaussians a sqrt(pi / b) exp(-pi^2 r^2 / b), r in degrees, of total weight 1; edges are repeated."""
+    widest = max(b for terms in CONTRAST_SENSITIVITY for _, b in terms)
+    radius = math.ceil(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * pixels_per_degree)
+    degrees = np.arange(-radius, radius + 1) / pixels_per_degree
+    result, total = np.zeros(image.shape), 0.0
+    for a, b in terms:
+        kernel = np.exp(-(math.pi**2) * degrees**2 / b)
+        weight = a * math.sqrt(math.pi / b) * kernel.sum() ** 2  # of the two-dimensional Gaussian
+        kernel /= kernel.sum()
+        result += weight * _separable(image, kernel, kernel)
+        total += weight
+    return result / total
+
+
+def _separable(image: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
+    from scipy.ndimage import correlate1d
+
+    return correlate1d(correlate1d(image, along_x, axis=1, mode="nearest"), along_y, axis=0, mode="nearest")
+
+
+def _hunt_lab(rgb: np.ndarray) -> np.ndarray:
+    relative = rgb @ (RGB_TO_XYZ / XYZ_WHITE[:, None]).T
+    delta = 6.0 / 29.0
+    root = np.where(relative > delta**3, np.cbrt(relative), relative / (3.0 * delta**2) + 4.0 / 29.0)
+    light = 116.0 * root[..., 1] - 16.0
+    chroma = 0.01 * light
+    return np.stack([light, chroma * 500.0 * (root[..., 0] - root[..., 1]),
+                     chroma * 200.0 * (root[..., 1] - root[..., 2])], axis=-1)
+
+
+def _hyab(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    difference = a - b
+    return np.abs(difference[..., 0]) + np.hypot(difference[..., 1], difference[..., 2])
+
+
+def _color_difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """HyAB distance, compressed, and mapped to [0, 1] with a knee; the distance of pure green and blue becomes 1."""
+    green, blue = _hunt_lab(np.array([0.0, 1.0, 0.0])), _hunt_lab(np.array([0.0, 0.0, 1.0]))
+    largest = _hyab(green, blue) ** COLOR_EXPONENT
+    share = _hyab(a, b) ** COLOR_EXPONENT / largest
+    above = KNEE_VALUE + (share - KNEE_AT) / (1.0 - KNEE_AT) * (1.0 - KNEE_VALUE)
+    return np.where(share < KNEE_AT, share * KNEE_VALUE / KNEE_AT, above)
+
+
+def _features(lightness: np.ndarray, pixels_per_degree: float) -> tuple[np.ndarray, np.ndarray]:
+    """How much of an edge and of a point is at each pixel: the size of the first and second Gaussian derivatives."""
+    sigma = 0.5 * FEATURE_WIDTH * pixels_per_degree
+    x = np.arange(-math.ceil(3.0 * sigma), math.ceil(3.0 * sigma) + 1.0)
+    gauss = np.exp(-(x**2) / (2.0 * sigma**2))
+    edge, point = (_balance(kernel) for kernel in (-x * gauss, (x**2 / sigma**2 - 1.0) * gauss))
+    gauss /= gauss.sum()
+    return (np.hypot(_separable(lightness, edge, gauss), _separable(lightness, gauss, edge)),
+            np.hypot(_separable(lightness, point, gauss), _separable(lightness, gauss, point)))
+
+
+def _balance(kernel: np.ndarray) -> np.ndarray:
+    """Scaled so that the positive weights sum to 1 and the negative ones to -1."""
+    return np.where(kernel > 0.0, kernel / kernel[kernel > 0.0].sum(), -kernel / kernel[kernel < 0.0].sum())
+
+
+def hdr_flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
+    """HDR-FLIP: the largest FLIP over all exposures that the reference `b` asks for, (H, W) in [0, 1].
+
+    a, b: (H, W, 3) linear, finite. The exposures run in steps of about one stop from the one that shows b's brightest
+    pixel to the one that shows its median, both at 0.85 of a filmic curve (Narkowicz's fit of ACES). Source: Andersson,
+    Nilsson, Shirley, Akenine-Moller, "Visualizing Errors in Rendered High Dynamic Range Images", Eurographics 2021.
+    """
+    a, b = _pair(a, b)
+    bright = luminance(b)
+    tiny = float(np.finfo(np.float32).eps)
+    # (2.51 x^2 + 0.03 x) / (2.43 x^2 + 0.59 x + 0.14) = 0.85, for x = 0.6 times the exposed luminance
+    target = max(np.roots([2.51 - 0.85 * 2.43, 0.03 - 0.85 * 0.59, -0.85 * 0.14]).real) / 0.6
+    start, stop = (math.log2(target / max(level, tiny)) for level in (float(bright.max()), float(np.median(bright))))
+    result = np.zeros(bright.shape)
+    for exposure in np.linspace(start, stop, max(2, math.ceil(stop - start))):
+        shown_a, shown_b = (_narkowicz(image * np.float32(2.0**exposure)) for image in (a, b))
+        result = np.maximum(result, flip_map(shown_a, shown_b, pixels_per_degree))
+    return result
+
+
+def _narkowicz(linear: np.ndarray) -> np.ndarray:
+    """K. Narkowicz, "ACES Filmic Tone Mapping Curve" (2016), with its exposure of 0.6: [0, inf) to [0, 1]."""
+    x = np.clip(0.6 * linear, 0.0, 1e9)
+    return np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
+
+
+# --- difference image -------------------------------------------------------------------------------------------------
+
+# a brighter: black, red, yellow, white; a darker: black, blue, cyan, white
+BRIGHTER = np.array([[0, 0, 0], [220, 40, 20], [255, 210, 60], [255, 255, 255]], dtype=np.float64)
+DARKER = np.array([[0, 0, 0], [30, 70, 230], [70, 220, 255], [255, 255, 255]], dtype=np.float64)
+NONFINITE_COLOR = (0, 200, 0)
+BAR_HEIGHT = 24
+
+
+def difference_image(a: np.ndarray, b: np.ndarray, *, limit: float | None = None) -> np.ndarray:
+    """Where and which way `a` differs from `b`: (H + 24, W, 3) uint8, with the colour scale below the picture.
+
+    Each pixel shows the linear difference of the channel that differs most: black where equal, to red, yellow and white
+    where a is brighter, to blue, cyan and white where it is darker; green where a and b are not both finite and not the
+    same. limit: the difference at white (default: the 99.9th percentile of |a - b|; larger ones stay white).
+    Raises InputError where the sizes differ.
+    """
+    a, b = _pair(a, b)
+    with np.errstate(invalid="ignore"):  # inf - inf
+        difference = np.where((a == b) | (np.isnan(a) & np.isnan(b)), np.float32(0.0), a - b)
+    finite = np.all(np.isfinite(difference), axis=-1)
+    held = np.where(finite[..., None], difference, np.float32(0.0))
+    signed = np.take_along_axis(held, np.abs(held).argmax(axis=-1)[..., None], axis=-1)[..., 0]
+    if limit is None:
+        sizes = np.abs(signed[finite])
+        limit = float(np.quantile(sizes, 0.999) or sizes.max()) if sizes.size else 0.0
+    scale = limit if limit > 0.0 else 1.0
+    picture = _heat(signed / scale)
+    picture[~finite] = NONFINITE_COLOR
+    return np.concatenate([picture, _bar(picture.shape[1], scale)])
+
+
+def _heat(share: np.ndarray) -> np.ndarray:
+    """[-1, 1] to (..., 3) uint8; beyond is clipped."""
+    steps = np.linspace(0.0, 1.0, len(BRIGHTER))
+    size = np.clip(np.abs(share), 0.0, 1.0)
+    colors = [np.where(share >= 0.0, np.interp(size, steps, BRIGHTER[:, i]), np.interp(size, steps, DARKER[:, i]))
+              for i in range(3)]
+    return np.rint(np.stack(colors, axis=-1)).astype(np.uint8)
+
+
+def _bar(width: int, limit: float) -> np.ndarray:
+    """(BAR_HEIGHT, width, 3) uint8: the colours from -limit to limit over a line of numbers, where that has room."""
+    from PIL import Image, ImageDraw
+
+    colors = np.zeros((BAR_HEIGHT, width, 3), np.uint8)
+    colors[: BAR_HEIGHT // 2] = _heat(np.linspace(-1.0, 1.0, width))[None]
+    image = Image.fromarray(colors)
+    draw = ImageDraw.Draw(image)
+    labels = (f"{-limit:.3g}", "a - b", f"{limit:+.3g}")
+    widths = [draw.textlength(label) for label in labels]
+    if sum(widths) + 8 <= width:
+        for label, left in zip(labels, (1.0, 0.5 * (width - widths[1]), width - widths[2] - 1.0), strict=True):
+            draw.text((left, BAR_HEIGHT // 2), label, fill=(230, 230, 230))
+    return np.asarray(image)

@@ -1,0 +1,282 @@
+"""The driver: tiles over threads, passes over samples, into a film."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import wrt
+from wrt.accel import ACCELERATORS, Accelerator, build
+from wrt.device import load_kernel, start, thread_count, upload
+from wrt.device_scene import DeviceScene, camera_struct, upload_scene
+from wrt.errors import InputError
+from wrt.features import Features, features_of, filter_icdf
+from wrt.film import Film
+from wrt.kernels import render as kernels
+from wrt.kernels import structs
+from wrt.scene import Camera, Scene
+
+AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
+TILE_SIZE = 32
+MAX_PASS = 64  # samples a pixel in one launch: what Ctrl-C and a time limit have to wait for
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a render is: samples done and to do (summed over pixels), rays so far, seconds of tracing."""
+
+    done: int
+    total: int
+    rays: int
+    seconds: float
+
+    @property
+    def rays_per_second(self) -> float:
+        return self.rays / self.seconds if self.seconds > 0.0 else 0.0
+
+    @property
+    def seconds_left(self) -> float:
+        return self.seconds * (self.total - self.done) / self.done if self.done else float("inf")
+
+
+@dataclass
+class Options:
+    """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once; never change a
+    pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always taken."""
+
+    seed: int = 0
+    device: str = "cpu"
+    accel: str = "bvh"
+    threads: int | None = None
+    camera: str | int | Camera | None = None
+    crop: tuple[int, int, int, int] | None = None
+    aov: Sequence[str] = ()
+    time_limit: float | None = None
+    tile_size: int = TILE_SIZE
+    pass_size: int | None = None
+    progress: Callable[[Progress], None] | None = None
+    accel_options: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.accel not in ACCELERATORS:
+            raise InputError(f"no structure {self.accel!r}; there is {', '.join(ACCELERATORS)}")
+        unknown = sorted(set(self.aov) - set(AOVS))
+        if unknown:
+            raise InputError(f"no AOV {', '.join(unknown)}; there is {', '.join(AOVS)}")
+        if self.tile_size < 1 or (self.pass_size is not None and self.pass_size < 1):
+            raise InputError("tile_size and pass_size must be 1 or more")
+        if self.time_limit is not None and not self.time_limit > 0.0:
+            raise InputError(f"time_limit must be more than 0 seconds, got {self.time_limit}")
+        if not 0 <= self.seed < 2**32:
+            raise InputError(f"seed must be 0 to 2^32 - 1, got {self.seed}")
+
+
+def render(scene: Scene, *, spp: int | None = None, size: tuple[int, int] | None = None, max_depth: int | None = None,
+           min_throughput: float | None = None, settings: dict[str, Any] | None = None, **options: Any) -> Film:
+    """Render a scene; returns a Film (linear pixels, variance, AOVs, stats).
+
+    spp, size, max_depth, min_throughput, and any other of wrt.scene.Settings in `settings`, override the scene's own;
+    `options` are the fields of Options: seed, device, accel, threads, camera, crop, aov, time_limit, progress ...
+    The same arguments give the same pixels, bit for bit, for any threads, tile_size and pass_size. Interrupted by Ctrl-C, it
+    returns what it has, with stats["interrupted"] set. Raises InputError for anything that cannot be rendered.
+    """
+    scene = scene.with_settings(spp=spp, size=size, max_depth=max_depth, min_throughput=min_throughput, **(settings or {}))
+    return Renderer(scene, Options(**options)).run()
+
+
+@cache
+def render_kernel(features: Features, accel: type[Accelerator]) -> Any:
+    return kernels.make_render_kernel(features, accel)
+
+
+@cache
+def aov_kernel(features: Features, accel: type[Accelerator]) -> Any:
+    return kernels.make_aov_kernel(features, accel)
+
+
+class Renderer:
+    """One render of one scene: kernel, structure and film, made ready; `run` takes the samples."""
+
+    def __init__(self, scene: Scene, options: Options) -> None:
+        self.scene, self.options = scene, options
+        self.seconds: dict[str, float] = {}
+        self.threads = thread_count(options.threads)
+        self.device = start(options.device)
+        self.camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
+        self.features = features_of(scene, self.camera)
+        self.crop = self._crop()
+        accelerator = ACCELERATORS[options.accel]
+        self.kernels = [render_kernel(self.features, accelerator)]
+        if options.aov:
+            self.kernels.append(aov_kernel(self.features, accelerator))
+        with ThreadPoolExecutor(1) as pool:  # compiling takes longest: the structure is built meanwhile
+            compiled = pool.submit(self._compile)
+            self.device_scene, self.accel = self._build()
+            compiled.result()
+        self.film = _film_struct(scene.settings, self.device)
+        self.limits = structs.Limits()
+        self.limits.max_depth, self.limits.min_throughput = scene.settings.max_depth, scene.settings.min_throughput
+        self.limits.seed = options.seed
+        self.device_camera = camera_struct(self.camera, scene.settings.size)
+
+    def _crop(self) -> tuple[int, int, int, int]:
+        width, height = self.scene.settings.size
+        x0, y0, x1, y1 = self.options.crop or (0, 0, width, height)
+        if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
+            raise InputError(f"crop {x0},{y0},{x1},{y1} is not within the picture of {width}x{height}")
+        return x0, y0, x1, y1
+
+    def _compile(self) -> None:
+        begin = time.perf_counter()
+        for kernel in self.kernels:
+            load_kernel(kernel, self.device)
+        self.seconds["compile"] = time.perf_counter() - begin
+
+    def _build(self) -> tuple[DeviceScene, Accelerator]:
+        begin = time.perf_counter()
+        device_scene = upload_scene(self.scene, self.device)
+        self.seconds["upload"] = time.perf_counter() - begin
+        accel = build(device_scene.world.geometry, self.options.accel, self.options.device, self.threads,
+                      **self.options.accel_options)
+        self.seconds["build"] = accel.stats.build_seconds
+        return device_scene, accel
+
+    def run(self) -> Film:
+        """Take all samples (or as many as time allows) and return the film."""
+        begin = time.perf_counter()
+        interrupted, timed_out = False, False
+        try:
+            for first, count in self._passes():
+                elapsed = time.perf_counter() - begin
+                if first > 0 and self.options.time_limit is not None and elapsed >= self.options.time_limit:
+                    timed_out = True
+                    break
+                self._run_pass(first, count, begin)
+        except KeyboardInterrupt:
+            interrupted = True
+        self.seconds["trace"] = time.perf_counter() - begin
+        aov = self._aovs() if self.options.aov else {}
+        return self._result(aov, interrupted, timed_out)
+
+    def _passes(self) -> Iterator[tuple[int, int]]:
+        """First sample and number of samples of each pass: 1, 1, 2, 4 ... so that the first picture comes soon."""
+        spp, first, count = self.scene.settings.spp, 0, self.options.pass_size or 1
+        while first < spp:
+            count = min(count, spp - first)
+            yield first, count
+            first += count
+            if self.options.pass_size is None:
+                count = min(first, MAX_PASS)
+
+    def _tiles(self) -> Iterator[tuple[int, int, int, int]]:
+        x0, y0, x1, y1 = self.crop
+        step = max(x1 - x0, y1 - y0) if self.device.is_cuda else self.options.tile_size
+        for y in range(y0, y1, step):
+            for x in range(x0, x1, step):
+                yield x, y, min(step, x1 - x), min(step, y1 - y)
+
+    def _launch(self, kernel: Any, arguments: list[Any], rectangle: tuple[int, int, int, int], samples: tuple[int, int],
+                rest: Sequence[Any] = ()) -> None:
+        tile = structs.Tile()
+        tile.x, tile.y, tile.width = rectangle[:3]
+        tile.first_sample, tile.n_samples = samples
+        wp.launch(kernel, dim=rectangle[2] * rectangle[3], inputs=[*arguments, tile, *rest], device=self.device)
+
+    def _run_pass(self, first: int, count: int, begin: float) -> None:
+        arguments = [self.accel.data, self.device_scene.surfaces, self.device_scene.lighting, self.device_camera,
+                     self.limits, self.film]
+        tiles = list(self._tiles())
+        area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
+
+        def trace(rectangle: tuple[int, int, int, int]) -> int:
+            self._launch(self.kernels[0], arguments, rectangle, (first, count))
+            return rectangle[2] * rectangle[3]
+
+        if self.device.is_cuda:
+            done = sum(trace(tile) for tile in tiles)
+            wp.synchronize_device(self.device)
+            self._report(first * area + done * count, area, begin)
+            return
+        with ThreadPoolExecutor(self.threads) as pool:
+            pending: set[Future[int]] = {pool.submit(trace, tile) for tile in tiles}
+            done = 0
+            try:
+                while pending:
+                    finished, pending = wait(pending, timeout=0.1)
+                    done += sum(future.result() for future in finished)
+                    self._report(first * area + done * count, area, begin)
+            except BaseException:
+                for future in pending:
+                    future.cancel()  # those that run come to their end: a pixel is never half done
+                raise
+
+    def _report(self, done: int, area: int, begin: float) -> None:
+        if self.options.progress is None:
+            return
+        rays = int(self.film.rays.numpy().sum())
+        self.options.progress(Progress(done, area * self.scene.settings.spp, rays, time.perf_counter() - begin))
+
+    def _aovs(self) -> dict[str, np.ndarray]:
+        width, height = self.scene.settings.size
+        film = structs.AovFilm()
+        shapes = {"depth": wp.float32, "normal": wp.vec3, "albedo": wp.vec3, "prim_id": wp.int32, "material_id": wp.int32}
+        for name, dtype in shapes.items():
+            setattr(film, name, wp.zeros(width * height, dtype=dtype, device=self.device))
+        arguments = [self.accel.data, self.device_scene.surfaces, self.device_camera, film]
+        for rectangle in self._tiles():
+            self._launch(self.kernels[1], arguments, rectangle, (0, 1), [width, height])
+        return {name: self._picture(getattr(film, name)) for name in self.options.aov}
+
+    def _picture(self, array: Any) -> np.ndarray:
+        """A device array of one entry a pixel as (H, W) or (H, W, 3), cropped."""
+        width, height = self.scene.settings.size
+        x0, y0, x1, y1 = self.crop
+        pixels = array.numpy()
+        return pixels.reshape(height, width, *pixels.shape[1:])[y0:y1, x0:x1].copy()
+
+    def _result(self, aov: dict[str, np.ndarray], interrupted: bool, timed_out: bool) -> Film:
+        samples = self._picture(self.film.samples)
+        n = np.maximum(samples, 1)[..., None].astype(np.float32)
+        variance = self._picture(self.film.m2) / (n * np.maximum(n - 1.0, 1.0))
+        total = max(int(samples.sum()), 1)
+
+        def count(name: str) -> int:
+            return int(self._picture(getattr(self.film, name)).sum(dtype=np.int64))
+
+        rays = count("rays")
+        stats = {
+            "seconds": dict(self.seconds), "rays": rays, "rays_per_sample": rays / total,
+            "rays_per_second": rays / self.seconds["trace"] if self.seconds["trace"] > 0.0 else 0.0,
+            "cut_by_depth": count("cut_depth"), "cut_by_throughput": count("cut_throughput"),
+            "lost_throughput_per_sample": float(self._picture(self.film.lost).sum(dtype=np.float64)) / total,
+            "not_finite": count("not_finite"), "samples": int(samples.sum()),
+            "triangles": len(self.accel.geometry.faces), "spheres": len(self.accel.geometry.spheres),
+            "accel": repr(self.accel), "interrupted": interrupted, "timed_out": timed_out,
+        }
+        settings = self.scene.settings
+        metadata = {
+            "scene": self.scene.name, "camera": self.camera.name, "spp": int(samples.max()), "seed": self.options.seed,
+            "seconds": round(self.seconds["trace"], 3), "version": wrt.__version__, "max_depth": settings.max_depth,
+            "filter": settings.filter, "accel": self.options.accel, "device": self.options.device,
+        }
+        return Film(pixels=self._picture(self.film.mean), variance=variance, samples=samples, aov=aov, stats=stats,
+                    metadata=metadata, exposure=settings.exposure, tonemap=settings.tonemap)
+
+
+def _film_struct(settings: Any, device: Any) -> Any:
+    film = structs.Film()
+    film.width, film.height = settings.size
+    n = film.width * film.height
+    for name, dtype in (("mean", wp.vec3), ("m2", wp.vec3), ("samples", wp.int32), ("rays", wp.int64),
+                        ("cut_depth", wp.int32), ("cut_throughput", wp.int32), ("lost", wp.float32),
+                        ("not_finite", wp.int32)):
+        setattr(film, name, wp.zeros(n, dtype=dtype, device=device))
+    film.filter_icdf = upload(filter_icdf(settings.filter), wp.float32, device)
+    return film

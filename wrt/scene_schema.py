@@ -1,0 +1,485 @@
+"""What may stand in a TOML scene file: pydantic models, and the JSON Schema that comes from them.
+
+Names, bounds and defaults are those of `wrt.scene`. Angles are in degrees here and in radians there; lengths have the
+scene's own unit; colours are linear Rec. 709. Wherever a colour stands, one number is a grey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, model_validator
+
+from wrt import scene
+
+# --- values -----------------------------------------------------------------------------------------------------------
+
+
+def _repeated(count: int) -> Callable[[Any], Any]:
+    """A single value (but no bool and no text) stands for `count` of it."""
+    return lambda value: [value] * count if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+def _or_one(values: dict[str, Any], count: int) -> WithJsonSchema:
+    array = {"type": "array", "items": values, "minItems": count, "maxItems": count}
+    return WithJsonSchema({"anyOf": [values, array]})
+
+
+_Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+_NotNegative = Annotated[float, Field(ge=0.0)]
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Matrix = Annotated[list[float], Field(min_length=16, max_length=16)]
+Positive = Annotated[float, Field(gt=0.0)]
+Share = Annotated[  # a colour that reflects or transmits
+    list[_Unit], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
+    _or_one({"type": "number", "minimum": 0, "maximum": 1}, 3)]
+Radiance = Annotated[  # a colour without an upper bound
+    list[_NotNegative], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
+    _or_one({"type": "number", "minimum": 0}, 3)]
+Scale3 = Annotated[list[float], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
+                   _or_one({"type": "number"}, 3)]
+Scale2 = Annotated[list[float], Field(min_length=2, max_length=2), BeforeValidator(_repeated(2)),
+                   _or_one({"type": "number"}, 2)]
+WrapMode = Literal["repeat", "clamp", "mirror"]
+Wraps = Annotated[list[WrapMode], Field(min_length=2, max_length=2),
+                  BeforeValidator(lambda value: [value] * 2 if isinstance(value, str) else value),
+                  _or_one({"type": "string", "enum": list(scene.WRAPS)}, 2)]
+Subdivisions = Annotated[int, Field(ge=0, le=9)]
+Segments = Annotated[int, Field(ge=3, le=4096)]
+
+
+class Table(BaseModel):
+    """A table of the file: unknown keys, wrong types, NaN and infinity are errors."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _note_keys(cls, data: Any, info: ValidationInfo) -> Any:
+        """Leave the known keys where the report of an unknown one finds them."""
+        if isinstance(info.context, dict) and isinstance(data, dict):
+            info.context[id(data)] = list(cls.model_fields)
+        return data
+
+    def given(self, *leave_out: str) -> dict[str, Any]:
+        """The fields that the file gives, as plain values."""
+        return self.model_dump(exclude_unset=True, exclude=set(leave_out))
+
+
+def _require_one(table: Table, *choices: tuple[str, ...]) -> None:
+    """Raise ValueError unless exactly one of the groups of fields is given."""
+    given = [names for names in choices if any(getattr(table, name) is not None for name in names)]
+    if len(given) != 1:
+        raise ValueError("give exactly one of " + ", or ".join(" and ".join(names) for names in choices))
+
+
+# --- textures ---------------------------------------------------------------------------------------------------------
+
+_CHECKER = scene.Checkerboard()
+
+
+class CheckerboardTable(Table):
+    """Two colours in turn."""
+
+    color_a: Radiance = Field(list(_CHECKER.color_a), description="colour of the square at (u, v) = (0, 0)")
+    color_b: Radiance = Field(list(_CHECKER.color_b), description="colour of its neighbours")
+    scale: float = Field(_CHECKER.scale, ge=1e-6, description="squares to one unit of u and of v")
+
+
+class ImageTable(Table):
+    """An image file; (u, v) = (0, 0) is its top left."""
+
+    file: str | None = Field(None, description="image file, relative to the scene file")
+    srgb: bool | None = Field(None, description="RGB is sRGB-encoded (default: true for albedo and emission, else false)")
+    wrap: Wraps = Field(["repeat", "repeat"], description="beyond the image, in u and in v (one for both)")
+    scale: Scale2 = Field([1.0, 1.0], description="how often the image repeats in one unit of u and of v")
+    offset: Annotated[list[float], Field(min_length=2, max_length=2)] = Field([0.0, 0.0], description="added to u and v")
+    rotation: float = Field(0.0, description="turns the image counter-clockwise about uv (0, 0) (degrees)")
+
+    @model_validator(mode="after")
+    def _check(self) -> ImageTable:
+        _require_one(self, ("file",))
+        return self
+
+
+class ColorTextureTable(ImageTable):
+    """An image file, or a checkerboard."""
+
+    checkerboard: CheckerboardTable | None = Field(None, description="in place of an image file")
+
+    @model_validator(mode="after")
+    def _check(self) -> ColorTextureTable:
+        _require_one(self, ("file",), ("checkerboard",))
+        if self.checkerboard is not None and len(self.model_fields_set) > 1:
+            raise ValueError("a checkerboard takes no other fields beside it; its scale stands inside it")
+        return self
+
+
+# --- materials --------------------------------------------------------------------------------------------------------
+
+_MATERIAL = scene.Material()
+_KINDS_THAT_USE: dict[str, tuple[str, ...]] = {
+    "specular": ("diffuse",), "exponent": ("diffuse",),
+    "metal": ("conductor",), "eta": ("conductor",), "k": ("conductor",),
+    "ior": ("glass", "metallic_roughness"), "absorption": ("glass", "metallic_roughness"),
+    "thin": ("glass", "metallic_roughness"),
+    "roughness": ("conductor", "glass", "metallic_roughness"),
+    "metallic": ("metallic_roughness",), "transmission": ("metallic_roughness",),
+    "metallic_roughness_texture": ("metallic_roughness",), "transmission_texture": ("metallic_roughness",),
+}
+
+
+class MaterialTable(Table):
+    """How a surface answers light."""
+
+    kind: Literal["diffuse", "mirror", "conductor", "glass", "metallic_roughness"] = Field(
+        "diffuse", description="diffuse: Lambert, with an optional Blinn-Phong highlight; mirror: reflects albedo at every "
+        "angle; conductor: Fresnel reflection of a metal; glass: reflection and refraction; metallic_roughness: glTF's")
+    albedo: Share = Field(list(_MATERIAL.albedo), description="share of the light that is scattered, mirrored or (glass) "
+                          "transmitted")
+    specular: Share = Field(list(_MATERIAL.specular), description="colour of the highlight (diffuse)")
+    exponent: float = Field(_MATERIAL.exponent, ge=0.0, le=1e6, description="Blinn-Phong exponent (diffuse)")
+    metal: Literal["gold", "silver", "copper", "aluminium"] | None = Field(
+        None, description="a metal's eta and k (conductor)")
+    eta: Annotated[Radiance, Field(max_length=3)] = Field(
+        list(_MATERIAL.eta), description="real part of the index of refraction at red, green, blue (conductor)")
+    k: Radiance = Field(list(_MATERIAL.k), description="imaginary part of the index of refraction (conductor)")
+    ior: float = Field(_MATERIAL.ior, ge=1.0, le=10.0, description="index of refraction (glass, metallic_roughness)")
+    absorption: Radiance = Field(list(_MATERIAL.absorption), description="absorbed per unit length inside: what is left "
+                                 "after a length d is exp(-absorption d) (glass, metallic_roughness)")
+    thin: bool = Field(_MATERIAL.thin, description="an infinitely thin pane: nothing is bent (glass, metallic_roughness)")
+    metallic: _Unit = Field(_MATERIAL.metallic, description="0 dielectric, 1 metal (metallic_roughness)")
+    roughness: _Unit = Field(_MATERIAL.roughness, description="perceptual roughness, the GGX alpha is its square; 0 is a "
+                             "perfect mirror (conductor, glass, metallic_roughness)")
+    transmission: _Unit = Field(_MATERIAL.transmission, description="share that is transmitted (metallic_roughness)")
+    emission: Radiance = Field(list(_MATERIAL.emission), description="emitted radiance, of the front side")
+    two_sided: bool = Field(_MATERIAL.two_sided, description="both sides emit")
+    emits_light: bool = Field(_MATERIAL.emits_light, description="the emission lights other surfaces (false: it is only "
+                              "seen)")
+    alpha: _Unit = Field(_MATERIAL.alpha, description="opacity")
+    alpha_mode: Literal["opaque", "mask", "blend"] = Field(
+        "opaque", description="opaque: alpha is not used; mask: nothing where alpha < alpha_cutoff; blend: 1 - alpha of the "
+        "light goes straight through")
+    alpha_cutoff: _Unit = Field(_MATERIAL.alpha_cutoff, description="threshold of alpha_mode mask")
+    normal_scale: float = Field(_MATERIAL.normal_scale, ge=-1e3, le=1e3, description="strength of the normal map")
+    albedo_texture: ColorTextureTable | None = Field(None, description="multiplies albedo; its alpha multiplies alpha")
+    metallic_roughness_texture: ImageTable | None = Field(None, description="green multiplies roughness, blue metallic")
+    transmission_texture: ImageTable | None = Field(None, description="red multiplies transmission")
+    emission_texture: ColorTextureTable | None = Field(None, description="multiplies emission")
+    normal_texture: ImageTable | None = Field(None, description="tangent-space normal map")
+
+    @model_validator(mode="after")
+    def _check(self) -> MaterialTable:
+        idle = [name for name in _KINDS_THAT_USE if name in self.model_fields_set and self.kind not in _KINDS_THAT_USE[name]]
+        if idle:
+            uses = "; ".join(f"{name} is used by {' and '.join(_KINDS_THAT_USE[name])}" for name in idle)
+            raise ValueError(f"kind {self.kind!r} does not use {', '.join(idle)} ({uses})")
+        if self.metal is not None and {"eta", "k"} & self.model_fields_set:
+            raise ValueError("give either metal, or eta and k")
+        return self
+
+
+# --- cameras, background, settings ------------------------------------------------------------------------------------
+
+_CAMERA = scene.Camera()
+_SETTINGS = scene.Settings()
+
+
+class CameraTable(Table):
+    """A pinhole, or a thin lens where it has an aperture. Give position and target, or matrix; fov_y, or focal_length."""
+
+    position: Vector | None = Field(None, description="where the camera stands")
+    target: Vector | None = Field(None, description="the point in the middle of the picture")
+    up: Vector = Field([0.0, 1.0, 0.0], description="what is up in the picture")
+    matrix: Matrix | None = Field(None, description="camera to world, row by row; the camera looks along -z, +y is up")
+    fov_y: float | None = Field(None, gt=0.0, lt=179.9, description="full vertical angle of view (degrees; default 45)")
+    focal_length: Positive | None = Field(None, description="of a real lens, in place of fov_y (scene units)")
+    sensor_height: Positive | None = Field(None, description="of a real lens (scene units)")
+    f_number: Positive | None = Field(None, description="of a real lens: the aperture's radius is focal_length / (2 f_number)")
+    aperture_radius: float | None = Field(None, ge=0.0, description="0 is a pinhole (scene units)")
+    focus_distance: Positive | None = Field(
+        None, description="along the axis to what is sharp (scene units; default: the distance to target, else 1)")
+    blades: int = Field(_CAMERA.blades, ge=0, le=64, description="0: a round aperture; from 3 on its number of sides")
+    blade_rotation: float = Field(0.0, description="turns the aperture (degrees)")
+
+    @model_validator(mode="after")
+    def _check(self) -> CameraTable:
+        problems = []
+        if (self.matrix is None) == (self.position is None and self.target is None):
+            problems.append("give either position and target, or matrix")
+        elif self.matrix is None and (self.position is None or self.target is None):
+            problems.append("needs both position and target")
+        if self.focal_length is None and (self.sensor_height is not None or self.f_number is not None):
+            problems.append("sensor_height and f_number belong to a focal_length")
+        if self.focal_length is not None:
+            if self.fov_y is not None:
+                problems.append("give either fov_y or focal_length")
+            if self.sensor_height is None:
+                problems.append("focal_length needs a sensor_height")
+            if (self.f_number is None) == (self.aperture_radius is None):
+                problems.append("focal_length needs either f_number or aperture_radius")
+        if self.blades in (1, 2):
+            problems.append(f"blades must be 0 (round) or 3 to 64, not {self.blades}")
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+
+class ConstantTable(Table):
+    """The same radiance from everywhere."""
+
+    type: Literal["constant"]
+    color: Radiance = Field([0.0, 0.0, 0.0], description="radiance")
+
+
+class GradientTable(Table):
+    """Linear in the direction's y."""
+
+    type: Literal["gradient"]
+    bottom: Radiance = Field(list(scene.GradientBackground().bottom), description="radiance from straight below (-y)")
+    top: Radiance = Field(list(scene.GradientBackground().top), description="radiance from straight above (+y)")
+
+
+class EnvironmentTable(Table):
+    """An equirectangular picture: its middle column is seen along -z, its upper edge is +y."""
+
+    type: Literal["environment"]
+    file: str = Field(description="image (.exr, .hdr, or sRGB), relative to the scene file")
+    scale: _NotNegative = Field(1.0, description="multiplies the image")
+    rotation: float = Field(0.0, description="about +y, counter-clockwise seen from above (degrees)")
+
+
+class SettingsTable(Table):
+    """How the scene wants to be rendered; the command line can override all of it."""
+
+    size: Annotated[list[Annotated[int, Field(ge=1, le=32768)]], Field(min_length=2, max_length=2)] = Field(
+        list(_SETTINGS.size), description="width and height (pixels)")
+    spp: int = Field(_SETTINGS.spp, ge=1, le=1 << 24, description="samples per pixel")
+    max_depth: int = Field(_SETTINGS.max_depth, ge=0, le=64, description="bounces after the first hit")
+    min_throughput: _Unit = Field(_SETTINGS.min_throughput, description="a ray that carries less is cut")
+    filter: Literal["box", "gaussian", "blackman-harris"] = Field("blackman-harris", description="pixel filter")
+    fresnel: Literal["exact", "schlick"] = Field("exact", description="of dielectrics")
+    glass_shadows: Literal["opaque", "tinted"] = Field("opaque", description="tinted: shadow rays go straight through glass")
+    exposure: float = Field(_SETTINGS.exposure, ge=-100.0, le=100.0, description="stops")
+    tonemap: Literal["none", "reinhard", "aces", "agx"] = Field("none", description="curve from linear to display")
+
+
+# --- shapes -----------------------------------------------------------------------------------------------------------
+
+
+class TransformTable(Table):
+    """Scales first, then rotates, then translates; or a matrix."""
+
+    translate: Vector = Field([0.0, 0.0, 0.0], description="last")
+    rotate: Vector = Field([0.0, 0.0, 0.0], description="about x, then y, then z (degrees)")
+    axis: Vector | None = Field(None, description="axis of a rotation by `angle`, in place of rotate")
+    angle: float | None = Field(None, description="about axis, counter-clockwise for who looks against it (degrees)")
+    scale: Scale3 = Field([1.0, 1.0, 1.0], description="first; one number or one for each axis")
+    matrix: Matrix | None = Field(None, description="object to world, row by row, in place of everything else")
+
+    @model_validator(mode="after")
+    def _check(self) -> TransformTable:
+        if self.matrix is not None and len(self.model_fields_set) > 1:
+            raise ValueError("a matrix takes no other fields beside it")
+        if (self.axis is None) != (self.angle is None):
+            raise ValueError("axis and angle belong together")
+        if self.axis is not None and "rotate" in self.model_fields_set:
+            raise ValueError("give either rotate, or axis and angle")
+        if self.axis is not None and not any(self.axis):
+            raise ValueError("axis must not be zero")
+        if not all(self.scale):
+            raise ValueError("scale must not be zero in any axis")
+        return self
+
+
+class SphereTable(Table):
+    """An exact sphere."""
+
+    center: Vector = Field(description="its centre")
+    radius: Positive = Field(description="its radius")
+    material: str = Field(description="name of a material")
+    name: str = Field("", description="for messages")
+
+
+class QuadTable(Table):
+    """A parallelogram; its front is towards cross(edge_u, edge_v), uvs run from 0 to 1."""
+
+    corner: Vector = Field(description="lower left for who sees the front upright")
+    edge_u: Vector = Field(description="from the corner to the right")
+    edge_v: Vector = Field(description="from the corner up")
+    material: str = Field(description="name of a material")
+    name: str = Field("", description="for messages")
+
+
+class BoxTable(Table):
+    """A closed box along the axes, before its transform."""
+
+    low: Vector = Field(description="lowest corner")
+    high: Vector = Field(description="highest corner")
+    material: str = Field(description="name of a material")
+    transform: TransformTable | None = Field(None, description="object to world")
+    name: str = Field("", description="for messages")
+
+
+class IcosphereShape(Table):
+    """A ball of 20 * 4^subdivisions triangles around the origin."""
+
+    kind: Literal["icosphere"]
+    subdivisions: Subdivisions = Field(3, description="each makes four triangles of one")
+    radius: Positive = Field(1.0, description="of the ball")
+
+
+class TorusShape(Table):
+    """A ring around the y axis."""
+
+    kind: Literal["torus"]
+    radius: Positive = Field(1.0, description="from the axis to the middle of the tube")
+    tube_radius: Positive = Field(0.35, description="of the tube")
+    segments: Segments = Field(64, description="around the axis")
+    tube_segments: Segments = Field(32, description="around the tube")
+
+
+class LatheShape(Table):
+    """A profile turned around the y axis."""
+
+    kind: Literal["lathe"]
+    profile: Annotated[list[Annotated[list[float], Field(min_length=2, max_length=2)]], Field(min_length=2)] = Field(
+        description="points (radius, height), from the bottom up; one given twice makes a sharp edge")
+    segments: Segments = Field(64, description="around the axis")
+
+
+class PrismShape(Table):
+    """A regular polygon in the x-y plane, drawn out along z."""
+
+    kind: Literal["prism"]
+    sides: Segments = Field(3, description="of the polygon")
+    radius: Positive = Field(1.0, description="of the circle through its corners")
+    length: Positive = Field(2.0, description="along z")
+
+
+class TubeShape(Table):
+    """A round tube along a line of points, with flat ends."""
+
+    kind: Literal["tube"]
+    points: Annotated[list[Vector], Field(min_length=2)] = Field(description="the line")
+    radius: Positive | list[Positive] = Field(0.1, description="one, or one for each point")
+    segments: Segments = Field(24, description="around the tube")
+
+
+class TeapotShape(Table):
+    """A pot with lid, spout and handle, about 2 wide and 1 high, standing on y = 0."""
+
+    kind: Literal["teapot"]
+    segments: Segments = Field(64, description="around its axis")
+
+
+Shape = Annotated[IcosphereShape | TorusShape | LatheShape | PrismShape | TubeShape | TeapotShape,
+                  Field(discriminator="kind")]
+
+
+class PartTable(Table):
+    """A range of a mesh file's triangles, in the order of the file."""
+
+    first: int = Field(ge=0, description="number of the first triangle, from 0")
+    count: int = Field(ge=0, description="how many")
+    material: str = Field(description="name of a material")
+
+
+class MeshTable(Table):
+    """A mesh from a file (OBJ, PLY, STL) or made by a formula."""
+
+    file: str | None = Field(None, description="mesh file, relative to the scene file")
+    shape: Shape | None = Field(None, description="in place of a file")
+    material: str | None = Field(None, description="name of a material; beside materials or parts, that of the rest")
+    materials: dict[str, str] | None = Field(
+        None, description="group of the file (OBJ: usemtl, else g, else o; STL: solid) = name of a material")
+    parts: list[PartTable] | None = Field(None, description="materials by ranges of triangles; a later range wins")
+    smooth: bool | None = Field(None, description="true: make vertex normals where the mesh has none; false: flat, even "
+                                "where it has some (default: as it is)")
+    transform: TransformTable | None = Field(None, description="object to world")
+    name: str = Field("", description="for messages")
+
+    @model_validator(mode="after")
+    def _check(self) -> MeshTable:
+        _require_one(self, ("file",), ("shape",))
+        if self.materials is not None and self.parts is not None:
+            raise ValueError("give either materials or parts")
+        if self.material is None and not self.materials and not self.parts:
+            raise ValueError("needs a material (or materials, or parts)")
+        return self
+
+
+# --- lights -----------------------------------------------------------------------------------------------------------
+
+
+class PointLightTable(Table):
+    """A point that shines alike in all directions."""
+
+    type: Literal["point"]
+    position: Vector = Field(description="where it is")
+    intensity: Radiance = Field(description="radiant intensity; irradiance falls with the square of the distance")
+    name: str = Field("", description="for messages")
+
+
+class DirectionalLightTable(Table):
+    """A light at infinity."""
+
+    type: Literal["directional"]
+    direction: Vector = Field(description="the way the light travels (any length)")
+    irradiance: Radiance = Field(description="on a surface that faces it")
+    name: str = Field("", description="for messages")
+
+
+class SpotLightTable(Table):
+    """A point light in a cone."""
+
+    type: Literal["spot"]
+    position: Vector = Field(description="where it is")
+    direction: Vector = Field(description="axis of the cone (any length)")
+    intensity: Radiance = Field(description="radiant intensity on the axis")
+    inner: float = Field(0.0, ge=0.0, le=90.0, description="half angle of full light (degrees)")
+    outer: float = Field(45.0, gt=0.0, le=90.0, description="half angle without light beyond (degrees)")
+    name: str = Field("", description="for messages")
+
+    @model_validator(mode="after")
+    def _check(self) -> SpotLightTable:
+        if self.inner > self.outer:
+            raise ValueError(f"inner ({self.inner:g}) must not be larger than outer ({self.outer:g})")
+        return self
+
+
+class RectangleLightTable(Table):
+    """A parallelogram that shines; its front is towards cross(edge_u, edge_v)."""
+
+    type: Literal["rectangle"]
+    corner: Vector = Field(description="one corner")
+    edge_u: Vector = Field(description="from it along one side")
+    edge_v: Vector = Field(description="from it along the other")
+    radiance: Radiance = Field(description="emitted, the same in all directions")
+    two_sided: bool = Field(False, description="both sides shine")
+    name: str = Field("", description="for messages")
+
+
+LightTable = Annotated[PointLightTable | DirectionalLightTable | SpotLightTable | RectangleLightTable,
+                       Field(discriminator="type")]
+BackgroundTable = Annotated[ConstantTable | GradientTable | EnvironmentTable, Field(discriminator="type")]
+
+
+class SceneTable(Table):
+    """A wrt scene file. Angles are in degrees, lengths in the scene's own unit, colours linear Rec. 709 (one number: grey);
+    +y is up by convention."""
+
+    title: str = Field("", description="what the picture shows")
+    include: list[str] = Field([], description="glTF files whose shapes, cameras and lights are added behind this file's")
+    settings: SettingsTable = Field(SettingsTable(), description="how the scene wants to be rendered")
+    cameras: dict[str, CameraTable] = Field({}, description="by name; the first is the default")
+    background: BackgroundTable | None = Field(None, description="what rays that leave the scene see (default: black)")
+    ambient: Radiance = Field([0.0, 0.0, 0.0], description="radiance that every diffuse surface receives, unshadowed")
+    materials: dict[str, MaterialTable] = Field({}, description="by name")
+    override: dict[str, MaterialTable] = Field({}, description="replaces the included material of that name")
+    spheres: list[SphereTable] = Field([], description="exact spheres")
+    quads: list[QuadTable] = Field([], description="parallelograms")
+    boxes: list[BoxTable] = Field([], description="closed boxes")
+    meshes: list[MeshTable] = Field([], description="meshes from files or formulas")
+    lights: list[LightTable] = Field([], description="lights")

@@ -1,0 +1,48 @@
+"""Smooth vertex normals for meshes that come without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wrt.mesh import Mesh
+
+
+def smooth(mesh: Mesh) -> Mesh:
+    """The mesh with normals: of each position, the sum of its faces' unit normals weighted by their angle there.
+
+    Vertices at exactly the same position get the same normal, so that a seam of the texture does not show. The weight is
+    that of Thuermer and Wuethrich (Computing vertex normals from polygonal facets, 1998): the normal does not depend on
+    how a surface is cut into triangles. Where the faces cancel out, the normal is zero (flat there). A mesh that has
+    normals is given back as it is.
+    """
+    if mesh.normals is not None:
+        return mesh
+    points = mesh.vertices.astype(np.float64)[mesh.faces]
+    edges = np.roll(points, -1, axis=1) - points  # from each corner to the next
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    back = -np.roll(edges, 1, axis=1)
+    sine = np.linalg.norm(np.cross(edges, back), axis=2)
+    angle = np.arctan2(sine, (edges * back).sum(axis=2))
+
+    place = _places(mesh.vertices)
+    weighted = normal[:, None, :] * angle[:, :, None]
+    count = int(place.max()) + 1
+    where = place[mesh.faces].reshape(-1)
+    total = np.stack([np.bincount(where, weighted[..., axis].reshape(-1), count) for axis in range(3)], axis=1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    total = np.where(length > 1e-6, total / np.maximum(length, 1e-300), 0.0)
+    return replace(mesh, normals=total[place].astype(np.float32))
+
+
+def _places(vertices: np.ndarray) -> np.ndarray:
+    """(V,) a number for each vertex, equal for those at the same position."""
+    vertices = vertices + np.float32(0.0)  # -0 is 0
+    order = np.lexsort(vertices.T)
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = (vertices[order[1:]] != vertices[order[:-1]]).any(axis=1)
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.cumsum(new) - 1
+    return place
