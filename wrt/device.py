@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -16,15 +19,45 @@ from wrt.errors import InputError
 wp.config.log_level = wp.LOG_WARNING if hasattr(wp, "LOG_WARNING") else 30
 
 
+@contextmanager
+def _without_driver_notice() -> Iterator[None]:
+    """Hold stderr back while Warp starts: its C++ side says on every machine without a GPU that there is none.
+
+    Everything else that is written meanwhile comes out afterwards.
+    """
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as held:
+        stderr = os.dup(2)
+        os.dup2(held.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            held.seek(0)
+            lines = held.read().splitlines(keepends=True)
+            os.write(2, b"".join(line for line in lines if b"NVIDIA CUDA driver" not in line))
+
+
 @cache
 def start(device: str) -> Any:
     """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are."""
-    wp.init()
+    with _without_driver_notice():
+        wp.init()
     try:
         return wp.get_device(device)
     except Exception as error:  # Warp raises ValueError or RuntimeError, depending on what is wrong with the name
         known = ", ".join(str(d) for d in wp.get_devices())
         raise InputError(f"no device {device!r}; there is {known}") from error
+
+
+def describe_devices() -> list[str]:
+    """One line a device: its name for `--device`, and what it is."""
+    start("cpu")
+    lines = [f"cpu: {wp.get_device('cpu').name or 'CPU'}, {thread_count(None)} threads"]
+    for device in wp.get_cuda_devices():
+        lines.append(f"{device.alias}: {device.name}, {device.total_memory / 2**30:.0f} GiB, sm_{device.arch}")
+    return lines
 
 
 def load_kernel(kernel: Any, device: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -159,3 +160,26 @@ def filter_icdf(name: str, size: int = 257) -> np.ndarray:
         return np.zeros(2, np.float32)
     cdf = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
     return np.interp(np.linspace(0.0, 1.0, size), cdf / cdf[-1], x).astype(np.float32)
+
+
+def describe(scene: Scene, camera: str | int | None = None) -> dict[str, Any]:
+    """What `python -m wrt info` prints: counts, names, bounds, and the features on and off."""
+    low, high = scene.bounds()
+    return {
+        "name": scene.name,
+        "triangles": sum(len(thing.mesh.faces) for thing in scene.objects),
+        "unique_triangles": sum(len(mesh.faces) for mesh in {id(o.mesh): o.mesh for o in scene.objects}.values()),
+        "zero_area_triangles_left_out": sum(mesh.dropped for mesh in {id(o.mesh): o.mesh for o in scene.objects}.values()),
+        "objects": len(scene.objects),
+        "spheres": len(scene.spheres),
+        "materials": [f"{m.name or i} ({m.kind})" for i, m in enumerate(scene.materials)],
+        "lights": [f"{light.name or i} ({type(light).__name__})" for i, light in enumerate(scene.lights)],
+        "emissive_objects": sum(any(m.is_emissive and m.emits_light for m in o.materials) for o in scene.objects),
+        "background": type(scene.background).__name__,
+        "cameras": [c.name or str(i) for i, c in enumerate(scene.cameras)],
+        "size": "{}x{}".format(*scene.settings.size),
+        "spp": scene.settings.spp,
+        "bounds_low": low.tolist(),
+        "bounds_high": high.tolist(),
+        "features": features_of(scene, scene.camera(camera)).switches(),
+    }

@@ -2,8 +2,8 @@
 
 Positions, cameras and lights are in the file's own units; light intensities (candela, lux) are taken as radiometric
 ones, one for one, as most renderers do. A camera's aspect ratio and clipping planes do not count: the picture's size
-and the rays decide. Skinned and animated things stand in their rest pose. Where the file names no default scene, its first
-is shown, and where it has no scenes at all, every root node.
+and the rays decide. Skinned and animated things stand in their rest pose. Where the file names no default scene, its
+first is shown, and where it has no scenes at all, every root node.
 Source: Khronos, glTF 2.0 specification, section 3; KHR_lights_punctual, EXT_mesh_gpu_instancing, KHR_mesh_quantization.
 """
 
@@ -24,7 +24,7 @@ from wrt.gltf_materials import Materials
 from wrt.gltf_schema import Instancing, PunctualLightOfNode, PunctualLights, SpotCone, at, exactly
 from wrt.mesh import Mesh
 from wrt.mesh_clean import clean
-from wrt.scene import Camera, DirectionalLight, Light, Object, PointLight, Scene, SpotLight
+from wrt.scene import Camera, DirectionalLight, Light, Object, PointLight, Scene, SpotLight, as_transform
 from wrt.staging import stage
 
 # Attributes that are read, or named by who wants them (skins, textures), or are the application's own (underscore).
@@ -123,7 +123,8 @@ def _check_forest(document: Document) -> None:
 def local_matrix(node: Any, place: str) -> np.ndarray:
     """A node's own transform (4, 4) float64: its matrix, or translation * rotation * scale."""
     if node.matrix is not None:
-        return np.array(exactly(node.matrix, 16, f"{place}.matrix")).reshape(4, 4).T
+        with at(f"{place}.matrix"):
+            return as_transform(np.array(exactly(node.matrix, 16, "")).reshape(4, 4).T, "it")
     translation = exactly(node.translation or [0.0] * 3, 3, f"{place}.translation")
     scale = exactly(node.scale if node.scale is not None else [1.0] * 3, 3, f"{place}.scale")
     rotation = exactly(node.rotation or [0.0, 0.0, 0.0, 1.0], 4, f"{place}.rotation")

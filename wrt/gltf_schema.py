@@ -117,7 +117,8 @@ _REQUIRED = {
     "Accessor": ("componentType", "count", "type"), "Sparse": ("count", "indices", "values"),
     "AccessorSparseIndices": ("bufferView", "componentType"), "AccessorSparseValues": ("bufferView",),
     "BufferView": ("buffer", "byteLength"), "Buffer": ("byteLength",), "Camera": ("type",), "Perspective": ("yfov",),
-    "TextureInfo": ("index",), "NormalMaterialTexture": ("index",), "Asset": ("version",), "GLTF2": ("asset",),
+    "Primitive": ("attributes",), "TextureInfo": ("index",), "NormalMaterialTexture": ("index",), "Asset": ("version",),
+    "GLTF2": ("asset",),
 }
 _SCALARS: dict[Any, tuple[str, tuple[type, ...]]] = {
     int: ("an integer", (int,)), float: ("a number", (int, float)), str: ("a string", (str,)),

@@ -148,9 +148,9 @@ def _write_oiio(path: PathLike, spec: Any, rows: Callable[[int, int], np.ndarray
         finally:
             closed = out.close()
         # Some failures, such as a full disk, are told in the text only.
-        error = out.geterror()
+        error = " ".join(out.geterror().split()).replace(str(temporary), os.fspath(path))
         if error or not (good and closed):
-            raise InputError(f"cannot be written: {' '.join(error.split()) or 'unknown error'}", path)
+            raise InputError(f"cannot be written: {error or 'unknown error'}", path)
         if header:
             first, rest = temporary.read_bytes().split(b"\n", 1)
             temporary.write_bytes(first + b"\n" + header + rest)

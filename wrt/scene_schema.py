@@ -6,179 +6,25 @@ scene's own unit; colours are linear Rec. 709. Wherever a colour stands, one num
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, model_validator
+from pydantic import Field, model_validator
 
 from wrt import scene
-
-# --- values -----------------------------------------------------------------------------------------------------------
-
-
-def _repeated(count: int) -> Callable[[Any], Any]:
-    """A single value (but no bool and no text) stands for `count` of it."""
-    return lambda value: [value] * count if isinstance(value, int | float) and not isinstance(value, bool) else value
-
-
-def _or_one(values: dict[str, Any], count: int) -> WithJsonSchema:
-    array = {"type": "array", "items": values, "minItems": count, "maxItems": count}
-    return WithJsonSchema({"anyOf": [values, array]})
-
-
-_Unit = Annotated[float, Field(ge=0.0, le=1.0)]
-_NotNegative = Annotated[float, Field(ge=0.0)]
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Matrix = Annotated[list[float], Field(min_length=16, max_length=16)]
-Positive = Annotated[float, Field(gt=0.0)]
-Share = Annotated[  # a colour that reflects or transmits
-    list[_Unit], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
-    _or_one({"type": "number", "minimum": 0, "maximum": 1}, 3)]
-Radiance = Annotated[  # a colour without an upper bound
-    list[_NotNegative], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
-    _or_one({"type": "number", "minimum": 0}, 3)]
-Scale3 = Annotated[list[float], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
-                   _or_one({"type": "number"}, 3)]
-Scale2 = Annotated[list[float], Field(min_length=2, max_length=2), BeforeValidator(_repeated(2)),
-                   _or_one({"type": "number"}, 2)]
-WrapMode = Literal["repeat", "clamp", "mirror"]
-Wraps = Annotated[list[WrapMode], Field(min_length=2, max_length=2),
-                  BeforeValidator(lambda value: [value] * 2 if isinstance(value, str) else value),
-                  _or_one({"type": "string", "enum": list(scene.WRAPS)}, 2)]
-Subdivisions = Annotated[int, Field(ge=0, le=9)]
-Segments = Annotated[int, Field(ge=3, le=4096)]
-
-
-class Table(BaseModel):
-    """A table of the file: unknown keys, wrong types, NaN and infinity are errors."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _note_keys(cls, data: Any, info: ValidationInfo) -> Any:
-        """Leave the known keys where the report of an unknown one finds them."""
-        if isinstance(info.context, dict) and isinstance(data, dict):
-            info.context[id(data)] = list(cls.model_fields)
-        return data
-
-    def given(self, *leave_out: str) -> dict[str, Any]:
-        """The fields that the file gives, as plain values."""
-        return self.model_dump(exclude_unset=True, exclude=set(leave_out))
-
-
-def _require_one(table: Table, *choices: tuple[str, ...]) -> None:
-    """Raise ValueError unless exactly one of the groups of fields is given."""
-    given = [names for names in choices if any(getattr(table, name) is not None for name in names)]
-    if len(given) != 1:
-        raise ValueError("give exactly one of " + ", or ".join(" and ".join(names) for names in choices))
-
-
-# --- textures ---------------------------------------------------------------------------------------------------------
-
-_CHECKER = scene.Checkerboard()
-
-
-class CheckerboardTable(Table):
-    """Two colours in turn."""
-
-    color_a: Radiance = Field(list(_CHECKER.color_a), description="colour of the square at (u, v) = (0, 0)")
-    color_b: Radiance = Field(list(_CHECKER.color_b), description="colour of its neighbours")
-    scale: float = Field(_CHECKER.scale, ge=1e-6, description="squares to one unit of u and of v")
-
-
-class ImageTable(Table):
-    """An image file; (u, v) = (0, 0) is its top left."""
-
-    file: str | None = Field(None, description="image file, relative to the scene file")
-    srgb: bool | None = Field(None, description="RGB is sRGB-encoded (default: true for albedo and emission, else false)")
-    wrap: Wraps = Field(["repeat", "repeat"], description="beyond the image, in u and in v (one for both)")
-    scale: Scale2 = Field([1.0, 1.0], description="how often the image repeats in one unit of u and of v")
-    offset: Annotated[list[float], Field(min_length=2, max_length=2)] = Field([0.0, 0.0], description="added to u and v")
-    rotation: float = Field(0.0, description="turns the image counter-clockwise about uv (0, 0) (degrees)")
-
-    @model_validator(mode="after")
-    def _check(self) -> ImageTable:
-        _require_one(self, ("file",))
-        return self
-
-
-class ColorTextureTable(ImageTable):
-    """An image file, or a checkerboard."""
-
-    checkerboard: CheckerboardTable | None = Field(None, description="in place of an image file")
-
-    @model_validator(mode="after")
-    def _check(self) -> ColorTextureTable:
-        _require_one(self, ("file",), ("checkerboard",))
-        if self.checkerboard is not None and len(self.model_fields_set) > 1:
-            raise ValueError("a checkerboard takes no other fields beside it; its scale stands inside it")
-        return self
-
-
-# --- materials --------------------------------------------------------------------------------------------------------
-
-_MATERIAL = scene.Material()
-_KINDS_THAT_USE: dict[str, tuple[str, ...]] = {
-    "specular": ("diffuse",), "exponent": ("diffuse",),
-    "metal": ("conductor",), "eta": ("conductor",), "k": ("conductor",),
-    "ior": ("glass", "metallic_roughness"), "absorption": ("glass", "metallic_roughness"),
-    "thin": ("glass", "metallic_roughness"),
-    "roughness": ("conductor", "glass", "metallic_roughness"),
-    "metallic": ("metallic_roughness",), "transmission": ("metallic_roughness",),
-    "metallic_roughness_texture": ("metallic_roughness",), "transmission_texture": ("metallic_roughness",),
-}
-
-
-class MaterialTable(Table):
-    """How a surface answers light."""
-
-    kind: Literal["diffuse", "mirror", "conductor", "glass", "metallic_roughness"] = Field(
-        "diffuse", description="diffuse: Lambert, with an optional Blinn-Phong highlight; mirror: reflects albedo at every "
-        "angle; conductor: Fresnel reflection of a metal; glass: reflection and refraction; metallic_roughness: glTF's")
-    albedo: Share = Field(list(_MATERIAL.albedo), description="share of the light that is scattered, mirrored or (glass) "
-                          "transmitted")
-    specular: Share = Field(list(_MATERIAL.specular), description="colour of the highlight (diffuse)")
-    exponent: float = Field(_MATERIAL.exponent, ge=0.0, le=1e6, description="Blinn-Phong exponent (diffuse)")
-    metal: Literal["gold", "silver", "copper", "aluminium"] | None = Field(
-        None, description="a metal's eta and k (conductor)")
-    eta: Annotated[Radiance, Field(max_length=3)] = Field(
-        list(_MATERIAL.eta), description="real part of the index of refraction at red, green, blue (conductor)")
-    k: Radiance = Field(list(_MATERIAL.k), description="imaginary part of the index of refraction (conductor)")
-    ior: float = Field(_MATERIAL.ior, ge=1.0, le=10.0, description="index of refraction (glass, metallic_roughness)")
-    absorption: Radiance = Field(list(_MATERIAL.absorption), description="absorbed per unit length inside: what is left "
-                                 "after a length d is exp(-absorption d) (glass, metallic_roughness)")
-    thin: bool = Field(_MATERIAL.thin, description="an infinitely thin pane: nothing is bent (glass, metallic_roughness)")
-    metallic: _Unit = Field(_MATERIAL.metallic, description="0 dielectric, 1 metal (metallic_roughness)")
-    roughness: _Unit = Field(_MATERIAL.roughness, description="perceptual roughness, the GGX alpha is its square; 0 is a "
-                             "perfect mirror (conductor, glass, metallic_roughness)")
-    transmission: _Unit = Field(_MATERIAL.transmission, description="share that is transmitted (metallic_roughness)")
-    emission: Radiance = Field(list(_MATERIAL.emission), description="emitted radiance, of the front side")
-    two_sided: bool = Field(_MATERIAL.two_sided, description="both sides emit")
-    emits_light: bool = Field(_MATERIAL.emits_light, description="the emission lights other surfaces (false: it is only "
-                              "seen)")
-    alpha: _Unit = Field(_MATERIAL.alpha, description="opacity")
-    alpha_mode: Literal["opaque", "mask", "blend"] = Field(
-        "opaque", description="opaque: alpha is not used; mask: nothing where alpha < alpha_cutoff; blend: 1 - alpha of the "
-        "light goes straight through")
-    alpha_cutoff: _Unit = Field(_MATERIAL.alpha_cutoff, description="threshold of alpha_mode mask")
-    normal_scale: float = Field(_MATERIAL.normal_scale, ge=-1e3, le=1e3, description="strength of the normal map")
-    albedo_texture: ColorTextureTable | None = Field(None, description="multiplies albedo; its alpha multiplies alpha")
-    metallic_roughness_texture: ImageTable | None = Field(None, description="green multiplies roughness, blue metallic")
-    transmission_texture: ImageTable | None = Field(None, description="red multiplies transmission")
-    emission_texture: ColorTextureTable | None = Field(None, description="multiplies emission")
-    normal_texture: ImageTable | None = Field(None, description="tangent-space normal map")
-
-    @model_validator(mode="after")
-    def _check(self) -> MaterialTable:
-        idle = [name for name in _KINDS_THAT_USE if name in self.model_fields_set and self.kind not in _KINDS_THAT_USE[name]]
-        if idle:
-            uses = "; ".join(f"{name} is used by {' and '.join(_KINDS_THAT_USE[name])}" for name in idle)
-            raise ValueError(f"kind {self.kind!r} does not use {', '.join(idle)} ({uses})")
-        if self.metal is not None and {"eta", "k"} & self.model_fields_set:
-            raise ValueError("give either metal, or eta and k")
-        return self
-
+from wrt.material_schema import (
+    MaterialTable,
+    Matrix,
+    NotNegative,
+    Positive,
+    Radiance,
+    Scale3,
+    Segments,
+    Subdivisions,
+    Table,
+    Unit,
+    Vector,
+    require_one,
+)
 
 # --- cameras, background, settings ------------------------------------------------------------------------------------
 
@@ -187,7 +33,8 @@ _SETTINGS = scene.Settings()
 
 
 class CameraTable(Table):
-    """A pinhole, or a thin lens where it has an aperture. Give position and target, or matrix; fov_y, or focal_length."""
+    """A pinhole, or a thin lens where it has an aperture. Give position and target, or matrix; fov_y, or
+    focal_length."""
 
     position: Vector | None = Field(None, description="where the camera stands")
     target: Vector | None = Field(None, description="the point in the middle of the picture")
@@ -196,7 +43,8 @@ class CameraTable(Table):
     fov_y: float | None = Field(None, gt=0.0, lt=179.9, description="full vertical angle of view (degrees; default 45)")
     focal_length: Positive | None = Field(None, description="of a real lens, in place of fov_y (scene units)")
     sensor_height: Positive | None = Field(None, description="of a real lens (scene units)")
-    f_number: Positive | None = Field(None, description="of a real lens: the aperture's radius is focal_length / (2 f_number)")
+    f_number: Positive | None = Field(
+        None, description="of a real lens: the aperture's radius is focal_length / (2 f_number)")
     aperture_radius: float | None = Field(None, ge=0.0, description="0 is a pinhole (scene units)")
     focus_distance: Positive | None = Field(
         None, description="along the axis to what is sharp (scene units; default: the distance to target, else 1)")
@@ -246,7 +94,7 @@ class EnvironmentTable(Table):
 
     type: Literal["environment"]
     file: str = Field(description="image (.exr, .hdr, or sRGB), relative to the scene file")
-    scale: _NotNegative = Field(1.0, description="multiplies the image")
+    scale: NotNegative = Field(1.0, description="multiplies the image")
     rotation: float = Field(0.0, description="about +y, counter-clockwise seen from above (degrees)")
 
 
@@ -257,10 +105,11 @@ class SettingsTable(Table):
         list(_SETTINGS.size), description="width and height (pixels)")
     spp: int = Field(_SETTINGS.spp, ge=1, le=1 << 24, description="samples per pixel")
     max_depth: int = Field(_SETTINGS.max_depth, ge=0, le=64, description="bounces after the first hit")
-    min_throughput: _Unit = Field(_SETTINGS.min_throughput, description="a ray that carries less is cut")
+    min_throughput: Unit = Field(_SETTINGS.min_throughput, description="a ray that carries less is cut")
     filter: Literal["box", "gaussian", "blackman-harris"] = Field("blackman-harris", description="pixel filter")
     fresnel: Literal["exact", "schlick"] = Field("exact", description="of dielectrics")
-    glass_shadows: Literal["opaque", "tinted"] = Field("opaque", description="tinted: shadow rays go straight through glass")
+    glass_shadows: Literal["opaque", "tinted"] = Field(
+        "opaque", description="tinted: shadow rays go straight through solid glass")
     exposure: float = Field(_SETTINGS.exposure, ge=-100.0, le=100.0, description="stops")
     tonemap: Literal["none", "reinhard", "aces", "agx"] = Field("none", description="curve from linear to display")
 
@@ -393,16 +242,16 @@ class MeshTable(Table):
     shape: Shape | None = Field(None, description="in place of a file")
     material: str | None = Field(None, description="name of a material; beside materials or parts, that of the rest")
     materials: dict[str, str] | None = Field(
-        None, description="group of the file (OBJ: usemtl, else g, else o; STL: solid) = name of a material")
+        None, description="group of the file (OBJ: usemtl, else g, else o; STL: solid) = a material's name")
     parts: list[PartTable] | None = Field(None, description="materials by ranges of triangles; a later range wins")
-    smooth: bool | None = Field(None, description="true: make vertex normals where the mesh has none; false: flat, even "
-                                "where it has some (default: as it is)")
+    smooth: bool | None = Field(None, description="true: make vertex normals where the mesh has none; false: flat, "
+                                "even where it has some (default: as it is)")
     transform: TransformTable | None = Field(None, description="object to world")
     name: str = Field("", description="for messages")
 
     @model_validator(mode="after")
     def _check(self) -> MeshTable:
-        _require_one(self, ("file",), ("shape",))
+        require_one(self, ("file",), ("shape",))
         if self.materials is not None and self.parts is not None:
             raise ValueError("give either materials or parts")
         if self.material is None and not self.materials and not self.parts:
@@ -467,12 +316,13 @@ BackgroundTable = Annotated[ConstantTable | GradientTable | EnvironmentTable, Fi
 
 
 class SceneTable(Table):
-    """A wrt scene file. Angles are in degrees, lengths in the scene's own unit, colours linear Rec. 709 (one number: grey);
-    +y is up by convention."""
+    """A wrt scene file. Angles are in degrees, lengths in the scene's own unit, colours linear Rec. 709 (one number:
+    grey); +y is up by convention."""
 
     title: str = Field("", description="what the picture shows")
-    include: list[str] = Field([], description="glTF files whose shapes, cameras and lights are added behind this file's")
-    settings: SettingsTable = Field(SettingsTable(), description="how the scene wants to be rendered")
+    include: list[str] = Field([], description="glTF files; their shapes, cameras and lights come behind this file's")
+    settings: SettingsTable = Field(default_factory=lambda: SettingsTable.model_validate({}),
+                                    description="how the scene wants to be rendered")
     cameras: dict[str, CameraTable] = Field({}, description="by name; the first is the default")
     background: BackgroundTable | None = Field(None, description="what rays that leave the scene see (default: black)")
     ambient: Radiance = Field([0.0, 0.0, 0.0], description="radiance that every diffuse surface receives, unshadowed")

@@ -1,5 +1,5 @@
-"""Meshes made by a formula. The closed ones are wound so that their outside faces out; `SHAPES` names those that a scene
-file can ask for."""
+"""Meshes made by a formula. The closed ones are wound so that their outside faces out; `SHAPES` names those that a
+scene file can ask for."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from wrt.mesh import Mesh
 from wrt.mesh_clean import clean
 from wrt.scene import as_number, as_vector
 
-Point = Sequence[float]
+Point = Sequence[float] | np.ndarray
 
 
 def quad(corner: Point = (-0.5, -0.5, 0.0), edge_u: Point = (1.0, 0.0, 0.0), edge_v: Point = (0.0, 1.0, 0.0)) -> Mesh:
     """A parallelogram of two triangles whose front is towards cross(edge_u, edge_v).
 
-    A picture on it stands upright for who sees the front with edge_u to the right and edge_v up: uv is (0, 1) at `corner`,
-    (0, 0) at the end of edge_v. Raises InputError where the edges span no area.
+    A picture on it stands upright for who sees the front with edge_u to the right and edge_v up: uv is (0, 1) at
+    `corner`, (0, 0) at the end of edge_v. Raises InputError where the edges span no area.
     """
     origin, u, v = (np.array(as_vector(value, "quad " + name))
                     for value, name in ((corner, "corner"), (edge_u, "edge_u"), (edge_v, "edge_v")))
@@ -60,7 +60,8 @@ def icosphere(subdivisions: int = 3, radius: float = 1.0) -> Mesh:
     points = np.concatenate([np.roll(corner, turn, axis=1) for turn in range(3)])
     # The faces are the triples of corners that are 2 apart from each other.
     near = np.isclose(np.linalg.norm(points[:, None] - points[None], axis=2), 2.0)
-    faces = np.array([(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] & near[j, k] & near[k, i]])
+    faces = np.array([(i, j, k) for i in range(12) for j in range(i) for k in range(j)
+                      if near[i, j] and near[j, k] and near[k, i]])
     turned = np.linalg.det(points[faces]) < 0.0
     faces[turned] = faces[turned][:, ::-1]
     points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -90,16 +91,18 @@ def torus(radius: float = 1.0, tube_radius: float = 0.35, segments: int = 64, tu
     return _grid(points, normals, "torus")
 
 
-def lathe(profile: Sequence[Sequence[float]], segments: int = 64) -> Mesh:
+def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
     """A profile turned around the y axis.
 
-    profile: two or more points (radius, height). With the axis on the left of the way from point to point, the outside is
-    on its right: a profile from the bottom up faces outwards. It is closed where it begins and ends on the axis. A point
-    given twice makes a sharp edge, the others are smooth. u runs around the axis, v from the profile's end to its start.
+    profile: two or more points (radius, height). With the axis on the left of the way from point to point, the
+    outside is on its right: a profile from the bottom up faces outwards. It is closed where it begins and ends on the
+    axis. A point given twice makes a sharp edge, the others are smooth. u runs around the axis, v from the profile's
+    end to its start.
     """
     # In float32, as the vertices will be: points that coincide there must count as given twice.
     line = np.asarray(profile, dtype=np.float32).astype(np.float64)
-    if line.ndim != 2 or line.shape[1:] != (2,) or len(line) < 2 or not np.isfinite(line).all() or (line[:, 0] < 0.0).any():
+    well_formed = line.ndim == 2 and line.shape[1:] == (2,) and len(line) >= 2
+    if not well_formed or not np.isfinite(line).all() or (line[:, 0] < 0.0).any():
         raise InputError("lathe: profile must be two or more pairs (radius >= 0, height)")
     _require_segments("lathe", segments)
     step = np.diff(line, axis=0)
@@ -143,7 +146,7 @@ def prism(sides: int = 3, radius: float = 1.0, length: float = 2.0) -> Mesh:
     return Mesh(points, np.concatenate([walls, back, back[:, ::-1] + sides]), name="prism")
 
 
-def tube(points: Sequence[Point], radius: float | Sequence[float] = 0.1, segments: int = 24) -> Mesh:
+def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segments: int = 24) -> Mesh:
     """A round tube along a line of points, with flat ends; `radius` is one, or one for each point.
 
     Its rings are turned as little as possible from point to point (parallel transport). u runs around, v along.
@@ -181,7 +184,8 @@ def tube(points: Sequence[Point], radius: float | Sequence[float] = 0.1, segment
         rim = wall[:-1, end]
         fan = np.arange(1, segments - 1)
         faces = np.stack([np.zeros_like(fan), fan, fan + 1], axis=1)[:, ::int(outward)]
-        parts.append(Mesh(rim, faces, normals=np.tile(outward * tangent[end], (segments, 1)), uvs=np.zeros((segments, 2))))
+        flat = np.tile(outward * tangent[end], (segments, 1))
+        parts.append(Mesh(rim, faces, normals=flat, uvs=np.zeros((segments, 2))))
     return merged(parts, "tube")
 
 

@@ -12,10 +12,10 @@ from wrt.mesh import Mesh
 def smooth(mesh: Mesh) -> Mesh:
     """The mesh with normals: of each position, the sum of its faces' unit normals weighted by their angle there.
 
-    Vertices at exactly the same position get the same normal, so that a seam of the texture does not show. The weight is
-    that of Thuermer and Wuethrich (Computing vertex normals from polygonal facets, 1998): the normal does not depend on
-    how a surface is cut into triangles. Where the faces cancel out, the normal is zero (flat there). A mesh that has
-    normals is given back as it is.
+    Vertices at exactly the same position get the same normal, so that a seam of the texture does not show. The weight
+    is that of Thuermer and Wuethrich (Computing vertex normals from polygonal facets, 1998): the normal does not
+    depend on how a surface is cut into triangles. Where the faces cancel out, the normal is zero (flat there). A mesh
+    that has normals is given back as it is.
     """
     if mesh.normals is not None:
         return mesh

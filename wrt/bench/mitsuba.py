@@ -1,7 +1,7 @@
 """Mitsuba 3 as an independent oracle and a rival: the same scene, rays and camera, answered by someone else's code.
 
-The variant is always scalar_rgb, which traces with Embree, in its robust mode. `llvm_ad_rgb` would be faster, but with an
-LLVM library that is too old it ends the whole process instead of raising.
+The variant is always scalar_rgb, which traces with Embree, in its robust mode. `llvm_ad_rgb` would be faster, but with
+an LLVM library that is too old it ends the whole process instead of raising.
 
 What can be compared exactly (Mitsuba's estimate has the same expectation as wrt's picture):
 - integrator "whitted" (mitsuba_whitted.py): any scene of diffuse, mirror, conductor and glass surfaces;
@@ -237,7 +237,7 @@ def _film(scene: Scene, options: Options) -> dict[str, Any]:
 
 
 class Rendering(NamedTuple):
-    """pixels: (H, W, 3) float32 linear radiance; variance: (H, W, 3) float64, of each pixel's mean, or None; spp taken."""
+    """pixels: (H, W, 3) float32 linear radiance; variance of their means: (H, W, 3) float64 or None; spp taken."""
 
     pixels: np.ndarray
     variance: np.ndarray | None
@@ -307,10 +307,10 @@ def trace_mitsuba(mesh: Mesh, origins: np.ndarray, directions: np.ndarray, t_max
 class Aovs(NamedTuple):
     """What the rays through the pixel centres hit, (H, W, ...); alpha is ignored, normals point outside.
 
-    depth: float32 distance from the camera, inf on a miss; position, geometric_normal, shading_normal: (H, W, 3) float32
-    in world space, zero on a miss; uv: (H, W, 2); object_id: int32 index into scene.objects, then (from len(objects)) into
-    scene.spheres, -1 on a miss; prim_id: int32, counted through the faces of all objects in order, then the spheres, -1
-    on a miss.
+    depth: float32 distance from the camera, inf on a miss; position, geometric_normal, shading_normal: (H, W, 3)
+    float32 in world space, zero on a miss; uv: (H, W, 2); object_id: int32 index into scene.objects, then (from
+    len(objects)) into scene.spheres, -1 on a miss; prim_id: int32, counted through the faces of all objects in order,
+    then the spheres, -1 on a miss.
     """
 
     depth: np.ndarray

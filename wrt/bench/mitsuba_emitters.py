@@ -78,8 +78,8 @@ def _environment(mi: Any, background: EnvironmentBackground) -> dict[str, Any]:
     image = background.image
     if image.shape[1] < 3:
         raise InputError(f"environment {background.name!r}: Mitsuba needs 3 columns or more, got {image.shape[1]}")
-    # Mitsuba's first and last row lie at the poles, wrt's half a row away from them. Between two rows both are linear, so
-    # that a picture with the rows and their midpoints in turn is the same function.
+    # Mitsuba's first and last row lie at the poles, wrt's half a row away from them. Between two rows both are linear,
+    # so that a picture with the rows and their midpoints in turn is the same function.
     above, below = np.concatenate([image[:1], image]), np.concatenate([image, image[-1:]])
     rows = np.empty((2 * len(image) + 1, *image.shape[1:]), np.float32)
     rows[0::2] = 0.5 * (above + below)

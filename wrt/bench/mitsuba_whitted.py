@@ -14,8 +14,8 @@ def whitted_integrator(mi: Any, max_depth: int, ambient: Color, lights: bool, ab
     """An integrator whose expectation is wrt's picture: direct light and ambient at diffuse surfaces, where paths end.
 
     Reflection, refraction and transparency are followed, one of them by chance where wrt follows all. max_depth:
-    bounces after the first hit. lights: whether there is an emitter to sample. absorption: shape id -> coefficient inside
-    it. It is Python code in a scalar variant, some 10 microseconds a bounce: for small pictures.
+    bounces after the first hit. lights: whether there is an emitter to sample. absorption: shape id -> coefficient
+    inside it. It is Python code in a scalar variant, some 10 microseconds a bounce: for small pictures.
     """
     flags = mi.BSDFFlags
     diffuse, smooth = int(flags.Diffuse), int(flags.Smooth)

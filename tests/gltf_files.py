@@ -1,0 +1,102 @@
+"""Small glTF files, made on the spot: arrays become accessors, and the JSON is a plain dict that a test may change."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+COMPONENT = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
+KIND = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+
+
+class GltfFile:
+    """One buffer, and helpers that append to it and to the JSON's arrays; each returns the index of what it added."""
+
+    def __init__(self) -> None:
+        self.json: dict[str, Any] = {"asset": {"version": "2.0"}}
+        self.binary = bytearray()
+
+    def add(self, array: str, item: dict[str, Any]) -> int:
+        self.json.setdefault(array, []).append(item)
+        return len(self.json[array]) - 1
+
+    def view(self, data: bytes, **rest: Any) -> int:
+        self.binary += b"\0" * (-len(self.binary) % 4)
+        start = len(self.binary)
+        self.binary += data
+        return self.add("bufferViews", {"buffer": 0, "byteOffset": start, "byteLength": len(data), **rest})
+
+    def accessor(self, values: Any, dtype: str = "float32", **rest: Any) -> int:
+        array = np.ascontiguousarray(values, dtype=dtype)
+        width = array.shape[1] if array.ndim == 2 else 1
+        return self.add("accessors", {"bufferView": self.view(array.tobytes()), "componentType": COMPONENT[dtype],
+                                      "count": len(array), "type": KIND[width], **rest})
+
+    def primitive(self, vertices: Any = TRIANGLE, indices: Any = None, **rest: Any) -> dict[str, Any]:
+        item = {"attributes": {"POSITION": self.accessor(vertices)}, **rest}
+        return item if indices is None else {**item, "indices": self.accessor(indices, "uint32")}
+
+    def mesh(self, *primitives: dict[str, Any], **rest: Any) -> int:
+        return self.add("meshes", {"primitives": list(primitives), **rest})
+
+    def node(self, **fields: Any) -> int:
+        """A node of the default scene, unless some node calls it its child."""
+        return self.add("nodes", fields)
+
+    def image(self, pixels: np.ndarray, format: str = "PNG") -> int:
+        return self.add("images", {"bufferView": self.view(encode(pixels, format)), "mimeType": f"image/{format.lower()}"})
+
+    def write(self, folder: Path, name: str = "file.glb") -> Path:
+        """A .glb, or a .gltf with its buffer as a data: URI."""
+        document = dict(self.json)
+        if self.binary:
+            document.setdefault("buffers", [{"byteLength": len(self.binary)}])
+        path = folder / name
+        if path.suffix == ".glb":
+            path.write_bytes(pack_glb(json.dumps(document).encode(), bytes(self.binary)))
+            return path
+        if self.binary and "uri" not in document["buffers"][0]:
+            encoded = base64.b64encode(bytes(self.binary)).decode()
+            document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + encoded
+        path.write_text(json.dumps(document))
+        return path
+
+
+def pack_glb(text: bytes, binary: bytes = b"") -> bytes:
+    chunks = b""
+    for kind, data, pad in ((b"JSON", text, b" "), (b"BIN\0", binary, b"\0")):
+        data += pad * (-len(data) % 4)
+        chunks += struct.pack("<I", len(data)) + kind + data if data else b""
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+def encode(pixels: np.ndarray, format: str = "PNG") -> bytes:
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, format)
+    return stream.getvalue()
+
+
+def one_triangle(**primitive: Any) -> GltfFile:
+    """A file with one node that shows one triangle; keywords go into its primitive."""
+    file = GltfFile()
+    file.node(mesh=file.mesh(file.primitive(**primitive), name="thing"), name="place")
+    return file
+
+
+def one_material(material: dict[str, Any]) -> GltfFile:
+    """A textured quad of that material."""
+    file = GltfFile()
+    quad = file.primitive([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [0, 1, 2, 0, 2, 3],
+                          material=file.add("materials", material))
+    quad["attributes"]["TEXCOORD_0"] = file.accessor([[0, 1], [1, 1], [1, 0], [0, 0]])
+    file.node(mesh=file.mesh(quad))
+    return file

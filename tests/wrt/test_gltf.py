@@ -1,0 +1,659 @@
+"""glTF scenes: node graph, triangles, instances, cameras, lights; what is left out, and what is refused."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.data import DATA, data_path
+from tests.gltf_files import TRIANGLE, GltfFile, encode, one_triangle
+from wrt.errors import InputError, SceneWarning
+from wrt.gltf import load_gltf
+from wrt.scene import DirectionalLight, PointLight, Scene, SpotLight
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+
+
+def load(file: GltfFile, folder: Path) -> Scene:
+    """The scene as in the file; any warning fails the test."""
+    return load_gltf(file.write(folder), staged=False)
+
+
+def warned(path: Path, **options: Any) -> tuple[Scene, list[str]]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene = load_gltf(path, **options)
+    assert all(w.category is SceneWarning for w in caught)
+    return scene, [str(w.message) for w in caught]
+
+
+def matrix_of(node: dict[str, Any]) -> np.ndarray:
+    """A node's transform by SciPy's rotations: an oracle for the reader's own."""
+    matrix = np.eye(4)
+    rotation = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
+    matrix[:3, :3] = rotation @ np.diag(node.get("scale", [1, 1, 1]))
+    matrix[:3, 3] = node.get("translation", [0, 0, 0])
+    return matrix
+
+
+def random_trs(rng: np.random.Generator) -> dict[str, Any]:
+    return {"translation": rng.normal(size=3).tolist(), "rotation": rng.normal(size=4).tolist(),
+            "scale": (rng.uniform(0.2, 3, 3) * rng.choice([-1, 1], 3)).tolist()}
+
+
+def face_normals(mesh: Any) -> np.ndarray:
+    a, b, c = mesh.vertices[mesh.faces].astype(np.float64).transpose(1, 0, 2)
+    return np.cross(b - a, c - a)
+
+
+# --- the node graph ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_transforms_multiply_along_the_path(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    a, b, c = (random_trs(rng) for _ in range(3))
+    file = GltfFile()
+    mesh = file.mesh(file.primitive())
+    leaf = file.node(mesh=mesh, **c)
+    middle = file.node(children=[leaf], mesh=mesh, **b)
+    file.node(children=[middle], matrix=matrix_of(a).T.ravel().tolist())  # column by column
+    outer, inner = load(file, tmp_path).objects
+    assert outer.transform == pytest.approx(matrix_of(a) @ matrix_of(b))
+    assert inner.transform == pytest.approx(matrix_of(a) @ matrix_of(b) @ matrix_of(c))
+    assert np.sign(np.linalg.det(inner.transform)) == np.sign(np.prod([a["scale"], b["scale"], c["scale"]]))
+
+
+def test_a_quarter_turn_and_a_mirror_by_hand(tmp_path):
+    file = GltfFile()
+    half = math.sqrt(0.5)
+    file.node(mesh=file.mesh(file.primitive()), translation=[1, 2, 3], rotation=[0, half, 0, half], scale=[-2, 1, 1])
+    transform = load(file, tmp_path).objects[0].transform
+    assert transform @ [1, 0, 0, 1] == pytest.approx([1, 2, 5, 1])  # x, mirrored to -2, turns from -x to +z
+    assert transform @ [0, 0, 1, 1] == pytest.approx([2, 2, 3, 1])  # z turns to x
+
+
+def test_the_default_scene_is_shown(tmp_path):
+    file = GltfFile()
+    mesh = file.mesh(file.primitive())
+    for name in "abc":
+        file.node(mesh=mesh, name=name)
+    assert [o.name for o in load(file, tmp_path).objects] == ["a", "b", "c"]  # no scenes: every root
+    file.json["scenes"] = [{"nodes": [0]}, {"nodes": [2, 1]}]
+    assert [o.name for o in load(file, tmp_path).objects] == ["a"]
+    file.json["scene"] = 1
+    assert [o.name for o in load(file, tmp_path).objects] == ["c", "b"]
+    file.json["scene"] = 2
+    with pytest.raises(InputError, match="scene: is 2, but there are 2 scenes"):
+        load(file, tmp_path)
+
+
+def test_a_deep_chain_needs_no_recursion(tmp_path):
+    file = GltfFile()
+    file.node(mesh=file.mesh(file.primitive()))
+    for i in range(5000):
+        file.node(children=[i], translation=[1, 0, 0])
+    assert load(file, tmp_path).objects[0].transform[:3, 3] == pytest.approx([5000, 0, 0])
+
+
+@pytest.mark.parametrize("children, message", [
+    ({0: [1], 1: [2], 2: [0]}, r"nodes\[0\]: the node graph has a cycle"),
+    ({0: [1], 2: [2]}, r"nodes\[2\]: the node graph has a cycle"),
+    ({0: [2], 1: [2]}, r"nodes\[1\].children\[0\]: nodes\[2\] has two parents, the first is nodes\[0\]"),
+    ({0: [1, 1]}, r"nodes\[0\].children\[1\]: nodes\[1\] has two parents"),
+    ({0: [7]}, r"nodes\[0\].children\[0\]: is 7, but there are 3 nodes"),
+    ({0: [-1]}, r"nodes\[0\].children\[0\]: is -1"),
+    ({0: [0.5]}, r"nodes\[0\].children\[0\]: must be an integer, got 0.5"),
+    ({0: 1}, r"nodes\[0\].children: must be an array, got 1"),
+])
+def test_graphs_that_are_no_forest(tmp_path, children, message):
+    file = GltfFile()
+    for i in range(3):
+        file.node(children=children.get(i, []))
+    with pytest.raises(InputError, match=message):
+        load(file, tmp_path)
+
+
+def test_a_node_that_the_scene_reaches_twice(tmp_path):
+    file = one_triangle()
+    file.json["scenes"] = [{"nodes": [0, 0]}]
+    with pytest.raises(InputError, match=r"scenes\[0\].nodes\[1\]: nodes\[0\] is in the scene twice"):
+        load(file, tmp_path)
+
+
+@pytest.mark.parametrize("fields, message", [
+    ({"matrix": [1.0] * 15}, r"nodes\[0\].matrix: must hold 16 numbers, got 15"),
+    ({"matrix": [1.0] * 16}, r"nodes\[0\].matrix: it must be affine"),
+    ({"scale": [1, 1]}, r"nodes\[0\].scale: must hold 3 numbers, got 2"),
+    ({"scale": [1, "1", 1]}, r"nodes\[0\].scale\[1\]: must be a number, got '1'"),
+    ({"rotation": [0, 0, 0, 0]}, r"nodes\[0\].rotation: must be a unit quaternion"),
+    ({"translation": [1e400, 0, 0]}, r"Infinity|nodes\[0\].translation\[0\]: must be a finite number"),
+    ({"mesh": 3}, r"nodes\[0\].mesh: is 3, but there are 1 meshes"),
+    ({"mesh": True}, r"nodes\[0\].mesh: must be an integer, got True"),
+    ({"camera": 0}, r"nodes\[0\].camera: is 0, but there are 0 cameras"),
+    ({"extensions": []}, r"nodes\[0\].extensions: must be an object"),
+])
+def test_wrong_nodes(tmp_path, fields, message):
+    file = one_triangle()
+    file.json["nodes"][0].update(fields)
+    with pytest.raises(InputError, match=message):
+        load(file, tmp_path)
+
+
+def test_a_product_that_overflows(tmp_path):
+    file = one_triangle()
+    file.json["nodes"][0]["scale"] = [1e200] * 3
+    file.node(children=[0], scale=[1e200] * 3)
+    with pytest.raises(InputError, match=r"nodes\[0\]: .*finite"):
+        load(file, tmp_path)
+
+
+def test_a_mesh_scaled_to_nothing_is_named(tmp_path):
+    file = one_triangle()
+    file.json["nodes"][0]["scale"] = [1, 0, 1]
+    with pytest.raises(InputError, match=r"no triangles; .*meshes scaled to no volume \(node 'place'\)"):
+        load(file, tmp_path)
+
+
+# --- triangles --------------------------------------------------------------------------------------------------------
+
+
+def zigzag(count: int) -> np.ndarray:
+    i = np.arange(count)
+    return np.stack([i // 2, -(i % 2), 0 * i], axis=1).astype(np.float32)
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+@pytest.mark.parametrize("count", [3, 4, 9, 10])
+def test_strips_face_one_way(tmp_path, count, indexed):
+    """Points that alternate between two rails, so that each triangle has the area 1/2: all must face as the first does."""
+    vertices = zigzag(count)
+    order = np.random.default_rng(count).permutation(count) if indexed else np.arange(count)
+    shuffled = np.empty_like(vertices)
+    shuffled[order] = vertices
+    file = one_triangle(vertices=shuffled, indices=order if indexed else None, mode=5)
+    mesh = load(file, tmp_path).objects[0].mesh
+    normals = face_normals(mesh)
+    assert len(mesh.faces) == count - 2
+    assert normals == pytest.approx(np.tile(normals[0], (count - 2, 1)))
+    corners = mesh.vertices[mesh.faces]
+    for i in range(count - 2):  # triangle i holds the points i, i + 1, i + 2
+        assert sorted(map(tuple, corners[i])) == sorted(map(tuple, vertices[i:i + 3]))
+
+
+@pytest.mark.parametrize("count", [3, 5, 8])
+def test_fans_face_one_way(tmp_path, count):
+    angle = np.linspace(0, math.pi, count - 1)
+    rim = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    mesh = load(one_triangle(vertices=np.vstack([[0, 0, 0], rim]), mode=6), tmp_path).objects[0].mesh
+    assert len(mesh.faces) == count - 2 and (face_normals(mesh)[:, 2] > 0).all()
+    area = 0.5 * (count - 2) * math.sin(math.pi / (count - 2))  # of the polygon
+    assert 0.5 * face_normals(mesh)[:, 2].sum() == pytest.approx(area, abs=1e-6)
+
+
+@pytest.mark.parametrize("mode", [4, 5, 6])
+def test_too_few_points_make_no_triangle(tmp_path, mode):
+    with pytest.raises(InputError, match=r"no triangles; .*primitives without a triangle that has an area \(mesh 'thing'\)"):
+        load(one_triangle(vertices=TRIANGLE[:2], mode=mode), tmp_path)
+
+
+def test_points_and_lines_are_named_once(tmp_path):
+    file = GltfFile()
+    file.node(mesh=file.mesh(*(file.primitive(mode=mode) for mode in range(5)), name="mixed"))
+    scene, messages = warned(file.write(tmp_path), staged=False)
+    assert len(scene.objects) == 1
+    assert len(messages) == 1 and messages[0].endswith("left out: points (mesh 'mixed'), lines (mesh 'mixed')")
+
+
+def test_an_incomplete_last_triangle_is_named(tmp_path):
+    path = one_triangle(vertices=SQUARE, indices=[0, 1, 2, 0, 2]).write(tmp_path)
+    scene, messages = warned(path, staged=False)
+    assert len(scene.objects[0].mesh.faces) == 1 and "incomplete last triangles (mesh 'thing')" in messages[0]
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "uint32"])
+def test_index_types(tmp_path, dtype):
+    file = one_triangle(vertices=SQUARE)
+    file.json["meshes"][0]["primitives"][0]["indices"] = file.accessor([0, 1, 2, 0, 2, 3], dtype)
+    assert load(file, tmp_path).objects[0].mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+def test_degenerate_faces_and_unused_vertices_are_dropped_and_counted(tmp_path):
+    vertices = np.vstack([SQUARE, [[2, 0, 0], [9, 9, 9]]])
+    mesh = load(one_triangle(vertices=vertices, indices=[0, 1, 2, 0, 1, 1, 0, 1, 4, 0, 2, 3]), tmp_path).objects[0].mesh
+    assert mesh.dropped == 2 and np.array_equal(mesh.vertices, SQUARE)
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+def test_attributes(tmp_path):
+    file = one_triangle()
+    mesh = load(file, tmp_path).objects[0].mesh
+    assert mesh.normals is None and mesh.uvs is None  # flat, as the specification demands
+    attributes = file.json["meshes"][0]["primitives"][0]["attributes"]
+    attributes["NORMAL"] = file.accessor([[0, 0, 3], [0, 4, 0], [0, 0, 0]])
+    attributes["TEXCOORD_0"] = file.accessor([[0, 0], [255, 51], [0, 255]], "uint8", normalized=True)
+    mesh = load(file, tmp_path).objects[0].mesh
+    assert np.array_equal(mesh.normals, [[0, 0, 1], [0, 1, 0], [0, 0, 0]])
+    assert mesh.uvs == pytest.approx(np.array([[0, 0], [1, 0.2], [0, 1]]))
+
+
+def test_quantised_mesh(tmp_path):
+    """KHR_mesh_quantization: integer positions that the node's transform brings back; normalised normals in padded rows."""
+    file = GltfFile()
+    normals = np.array([[0, 0, 127, 0], [0, -128, 0, 0], [90, 90, 0, 0]], np.int8)
+    view = file.view(normals.tobytes(), byteStride=4)
+    normal = file.add("accessors", {"bufferView": view, "componentType": 5120, "normalized": True, "count": 3, "type": "VEC3"})
+    primitive = {"attributes": {"POSITION": file.accessor((TRIANGLE * 1000).astype(np.int16), "int16"), "NORMAL": normal}}
+    file.node(mesh=file.mesh(primitive), scale=[1e-3] * 3)
+    file.json["extensionsRequired"] = ["KHR_mesh_quantization"]
+    thing = load(file, tmp_path).objects[0]
+    assert (np.c_[thing.mesh.vertices, np.ones(3)] @ thing.transform.T)[:, :3] == pytest.approx(TRIANGLE)
+    half = math.sqrt(0.5)
+    assert thing.mesh.normals == pytest.approx(np.array([[0, 0, 1], [0, -1, 0], [half, half, 0]]))
+
+
+def test_what_is_shared_in_the_file_is_shared_in_the_scene(tmp_path):
+    file = GltfFile()
+    red, blue = (file.add("materials", {"name": name}) for name in ("red", "blue"))
+    first = file.primitive(SQUARE, [0, 1, 2], material=red)
+    same = {**first, "material": blue}
+    other = {**first, "indices": file.accessor([0, 2, 3], "uint16")}
+    mesh = file.mesh(first)
+    for index in (mesh, mesh, file.mesh(same), file.mesh(other)):
+        file.node(mesh=index)
+    a, b, c, d = load(file, tmp_path).objects
+    assert a.mesh is b.mesh is c.mesh and a.mesh is not d.mesh
+    assert a.materials[0] is b.materials[0] is d.materials[0] and c.materials[0].name == "blue"
+
+
+def test_instances_share_a_mesh_and_follow_their_node(tmp_path):
+    rng = np.random.default_rng(7)
+    parent, items = random_trs(rng), [random_trs(rng) for _ in range(6)]
+    file = one_triangle()
+    unit = [(np.array(i["rotation"]) / np.linalg.norm(i["rotation"])).tolist() for i in items]
+    attributes = {"TRANSLATION": file.accessor([i["translation"] for i in items]), "ROTATION": file.accessor(unit),
+                  "SCALE": file.accessor([i["scale"] for i in items]), "_ID": file.accessor(np.arange(6), "uint16")}
+    file.json["nodes"][0] |= {**parent, "extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}}}
+    objects = load(file, tmp_path).objects
+    assert len(objects) == 6 and len({id(o.mesh) for o in objects}) == 1
+    for thing, item in zip(objects, items, strict=True):
+        assert thing.transform == pytest.approx(matrix_of(parent) @ matrix_of(item), rel=1e-5, abs=1e-5)
+
+
+def test_instances_with_translations_alone_and_rotations_as_bytes(tmp_path):
+    file = one_triangle()
+    quarter = np.array([[0, 0, 90, 90], [0, 0, 0, 127]])
+    file.json["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {
+        "TRANSLATION": file.accessor([[1, 0, 0], [2, 0, 0]]), "ROTATION": file.accessor(quarter, "int8", normalized=True)}}}
+    first, second = load(file, tmp_path).objects
+    assert first.transform @ [1, 0, 0, 1] == pytest.approx([1, 1, 0, 1])
+    assert second.transform @ [1, 0, 0, 1] == pytest.approx([3, 0, 0, 1])
+
+
+@pytest.mark.parametrize("attributes, message", [
+    ({}, "must hold accessors of one length, got none"),
+    ({"TRANSLATION": 1, "SCALE": 2}, r"must hold accessors of one length, got \[2, 3\]"),
+    ({"TRANSLATION": 3}, r"attributes.TRANSLATION: must be of type VEC3, but accessors\[3\] is 'VEC4'"),
+    ({"ROTATION": 3}, "attributes.ROTATION.* quaternions, but one is zero"),
+    ({"SCALE": 9}, r"attributes.SCALE: is 9, but there are 4 accessors"),
+    ({"SCALE": "x"}, r"attributes.SCALE: must be an integer"),
+])
+def test_wrong_instances(tmp_path, attributes, message):
+    file = one_triangle()
+    for array in (np.zeros((2, 3)), np.zeros((3, 3)), np.zeros((2, 4))):
+        file.accessor(array)
+    file.json["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    with pytest.raises(InputError, match=message):
+        load(file, tmp_path)
+
+
+@pytest.mark.parametrize("change, message", [
+    (lambda f, p: p.update(indices=f.accessor([0, 1, 3], "uint16")),
+     r"meshes\[0\].primitives\[0\].indices: index 2 is 3, but there are 3 vertices"),
+    (lambda f, p: p.update(indices=f.accessor([0, 1, 2])), r"primitives\[0\].indices: must be of an unsigned integer type"),
+    (lambda f, p: p.update(indices=f.accessor([0, 1, 2], "int16")), r"primitives\[0\].indices: must be of an unsigned"),
+    (lambda f, p: p.update(indices=5), r"primitives\[0\].indices: is 5, but there are 1 accessors"),
+    (lambda f, p: p.update(mode=9), r"primitives\[0\].mode: must be 0 to 6, got 9"),
+    (lambda f, p: p.update(material=2), r"primitives\[0\].material: is 2, but there are 0 materials"),
+    (lambda f, p: p.update(attributes="POSITION"), r"primitives\[0\].attributes: must be an object, got 'POSITION'"),
+    (lambda f, p: p["attributes"].update(POSITION="0"), r"attributes.POSITION: must be an integer, got '0'"),
+    (lambda f, p: p["attributes"].update(POSITION=4), r"meshes\[0\].primitives\[0\].attributes.POSITION: is 4, but there"),
+    (lambda f, p: p["attributes"].update(NORMAL=f.accessor(SQUARE)), r"attributes.NORMAL: has 4 elements, POSITION has 3"),
+    (lambda f, p: p["attributes"].update(TEXCOORD_0=f.accessor(TRIANGLE)), r"attributes.TEXCOORD_0: must be of type VEC2"),
+    (lambda f, p: p["attributes"].update(POSITION=f.accessor([[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]])),
+     r"meshes\[0\].primitives\[0\].attributes.POSITION: accessors\[1\]: element 1 is \[nan, 0.0, 0.0\]"),
+    (lambda f, p: f.json["accessors"][0].update(count=4),
+     r"attributes.POSITION: accessors\[0\]: 4 elements reach from byte 0 to 48 of bufferViews\[0\], which has 36"),
+    (lambda f, p: f.json.update(meshes={}), "meshes: must be an array"),
+    (lambda f, p: f.json["meshes"].insert(0, None), r"meshes\[0\]: must be an object, got None"),
+])
+def test_wrong_primitives(tmp_path, change, message):
+    file = one_triangle()
+    change(file, file.json["meshes"][0]["primitives"][0])
+    path = file.write(tmp_path)
+    with pytest.raises(InputError, match=message) as error:
+        load_gltf(path)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+# --- cameras and lights -----------------------------------------------------------------------------------------------
+
+
+def test_cameras_have_the_pose_of_their_node(tmp_path):
+    file = one_triangle()
+    camera = file.add("cameras", {"type": "perspective", "name": "lens", "perspective": {"yfov": 0.7, "znear": 0.1}})
+    rng = np.random.default_rng(1)
+    outer, inner = random_trs(rng), random_trs(rng)
+    outer["scale"], inner["scale"] = [2, 2, 2], [5, 5, 5]  # a camera ignores scale
+    file.node(children=[file.node(camera=camera, name="left", **inner)], **outer)
+    file.node(camera=camera, translation=[0, 0, 9])
+    left, right = load(file, tmp_path).cameras
+    turn = [Rotation.from_quat(node["rotation"]).as_matrix() for node in (outer, inner)]
+    assert left.camera_to_world[:3, :3] == pytest.approx(turn[0] @ turn[1])
+    assert left.camera_to_world[:3, 3] == pytest.approx((matrix_of(outer) @ matrix_of(inner))[:3, 3])
+    assert (left.name, left.fov_y, right.name) == ("left", 0.7, "lens")
+    assert right.camera_to_world @ [0, 0, -9, 1] == pytest.approx([0, 0, 0, 1])  # it looks along -z
+
+
+def test_orthographic_cameras_are_named_and_replaced(tmp_path):
+    file = one_triangle()
+    plan = file.add("cameras", {"type": "orthographic", "orthographic": {"xmag": 1, "ymag": 1, "zfar": 9, "znear": 0}})
+    file.node(camera=plan, name="plan")
+    scene, messages = warned(file.write(tmp_path))
+    assert [camera.name for camera in scene.cameras] == ["framing"] and len(messages) == 1
+    assert "orthographic projection (camera 'plan')" in messages[0] and "no camera" in messages[0]
+
+
+@pytest.mark.parametrize("camera, message", [
+    ({"type": "perspective"}, r"cameras\[0\].type: must be 'perspective' or"),
+    ({"type": "fisheye"}, r"cameras\[0\].type: must be 'perspective' or"),
+    ({}, r"cameras\[0\].type: is required"),
+    ({"type": "perspective", "perspective": {}}, r"cameras\[0\].perspective.yfov: is required"),
+    ({"type": "perspective", "perspective": {"yfov": 4}}, r"nodes\[1\].camera: .*fov_y must be"),
+    ({"type": "perspective", "perspective": {"yfov": "wide"}}, r"perspective.yfov: must be a number"),
+])
+def test_wrong_cameras(tmp_path, camera, message):
+    file = one_triangle()
+    file.node(camera=file.add("cameras", camera))
+    with pytest.raises(InputError, match=message):
+        load(file, tmp_path)
+
+
+def with_light(light: Any, **node: Any) -> GltfFile:
+    file = one_triangle()
+    file.json["extensions"] = {"KHR_lights_punctual": {"lights": [light]}}
+    file.node(extensions={"KHR_lights_punctual": {"light": 0}}, **node)
+    return file
+
+
+def test_lights(tmp_path):
+    half = math.sqrt(0.5)
+    pose = {"translation": [1, 2, 3], "rotation": [-half, 0, 0, half], "scale": [7, 7, 7]}  # -z turns to -y
+    tint = {"color": [1, 0.5, 0.25], "intensity": 4}
+    point = load(with_light({"type": "point", "name": "lamp", **tint}, **pose), tmp_path).lights[0]
+    assert point == PointLight((1, 2, 3), (4, 2, 1), "lamp")
+    sun = load(with_light({"type": "directional", **tint}, name="sun", **pose), tmp_path).lights[0]
+    assert isinstance(sun, DirectionalLight) and sun.irradiance == (4, 2, 1) and sun.name == "sun"
+    assert sun.direction == pytest.approx((0, -1, 0))
+    cone = {"innerConeAngle": 0.2, "outerConeAngle": 0.5}
+    spot = load(with_light({"type": "spot", "spot": cone, **tint}, **pose), tmp_path).lights[0]
+    assert isinstance(spot, SpotLight) and spot.position == (1, 2, 3) and spot.intensity == (4, 2, 1)
+    assert spot.direction == pytest.approx((0, -1, 0)) and (spot.inner, spot.outer) == (0.2, 0.5)
+
+
+def test_light_defaults_and_range(tmp_path):
+    scene, messages = warned(with_light({"type": "spot", "range": 5}, name="torch").write(tmp_path), staged=False)
+    spot = scene.lights[0]
+    assert spot.intensity == (1, 1, 1) and spot.inner == 0 and spot.outer == pytest.approx(math.pi / 4)
+    assert len(messages) == 1 and "range (light 'torch')" in messages[0]
+
+
+@pytest.mark.parametrize("light, message", [
+    ({"type": "area"}, r"lights\[0\].type: must be one of point, directional, spot, got 'area'"),
+    ({}, r"extensions.KHR_lights_punctual.lights\[0\].type: is required"),
+    ({"type": "point", "color": [1, 1]}, r"lights\[0\].color: must hold 3 numbers, got 2"),
+    ({"type": "point", "intensity": -1}, r"lights\[0\]: .*intensity must lie in"),
+    ({"type": "spot", "spot": {"outerConeAngle": 2}}, r"lights\[0\]: .*outer must be"),
+    ({"type": "spot", "spot": {"innerConeAngle": 1, "outerConeAngle": 0.5}}, r"lights\[0\]: .*inner must be"),
+    (3, r"lights\[0\]: must be an object, got 3"),
+])
+def test_wrong_lights(tmp_path, light, message):
+    with pytest.raises(InputError, match=message):
+        load(with_light(light), tmp_path)
+
+
+def test_a_light_that_is_not_there(tmp_path):
+    file = with_light({"type": "point"})
+    del file.json["extensions"]
+    with pytest.raises(InputError, match=r"nodes\[1\].extensions.KHR_lights_punctual.light: is 0, but there are 0 lights"):
+        load(file, tmp_path)
+
+
+# --- what is left out, and what is added ------------------------------------------------------------------------------
+
+
+def test_one_warning_names_everything_once(tmp_path):
+    file = one_triangle(extensions={"KHR_materials_variants": {"mappings": []}})
+    primitive = file.json["meshes"][0]["primitives"][0]
+    primitive["attributes"] |= {"COLOR_0": file.accessor(TRIANGLE), "_TEMPERATURE": 0, "JOINTS_0": 0, "WEIGHTS_0": 0}
+    primitive["targets"] = [{"POSITION": 0}]
+    file.json["nodes"][0] |= {"skin": 0, "extensions": {"ACME_wind": {}, "MSFT_lod": {"ids": []}}}
+    file.node(mesh=0, name="again")
+    file.json |= {"skins": [{"joints": [0]}], "animations": [{"name": "walk", "channels": [], "samplers": []}],
+                  "extensionsUsed": ["ACME_wind", "KHR_materials_variants", "KHR_never_seen"],
+                  "extensions": {"KHR_materials_variants": {"variants": []}, "ACME_fog": {}, "KHR_xmp": {}}}
+    scene, messages = warned(file.write(tmp_path), staged=False)
+    assert len(scene.objects) == 2 and len(messages) == 1
+    things = ["ACME_wind (node 'place')", "skins (node 'place')", "KHR_materials_variants (mesh 'thing')",
+              "COLOR_0 (mesh 'thing')", "morph targets (mesh 'thing')", "motion (animation 'walk')",
+              "ACME_fog (file 'file.glb')"]
+    assert messages[0].endswith("not supported and left out: " + ", ".join(things))
+
+
+def test_staging_is_said_in_the_same_warning(tmp_path):
+    file = one_triangle()
+    scene, messages = warned(file.write(tmp_path))
+    assert len(messages) == 1 and "no camera" in messages[0] and "no lights" in messages[0]
+    assert len(scene.cameras) == 1 and len(scene.lights) == 1
+    bare = load(file, tmp_path)
+    assert not bare.cameras and not bare.lights
+
+
+def test_a_complete_file_is_loaded_without_a_word(tmp_path):
+    file = with_light({"type": "point"})
+    file.node(camera=file.add("cameras", {"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}))
+    scene = load_gltf(file.write(tmp_path))
+    assert len(scene.cameras) == len(scene.lights) == len(scene.objects) == 1 and scene.name == "file"
+
+
+def test_files_without_triangles(tmp_path):
+    file = GltfFile()
+    with pytest.raises(InputError, match="the scene has no triangles"):
+        load(file, tmp_path)
+    file.node(camera=file.add("cameras", {"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}))
+    assert len(load(file, tmp_path).cameras) == 1  # of use to a scene file that includes it
+    with pytest.raises(InputError, match="the scene has no triangles"):
+        load_gltf(file.write(tmp_path))
+
+
+# --- hostile input ----------------------------------------------------------------------------------------------------
+
+
+def rich_file() -> GltfFile:
+    """A small file that uses nearly all that the reader reads."""
+    file = with_light({"type": "spot", "spot": {"innerConeAngle": 0.1}}, translation=[0, 1, 0], rotation=[0, 0, 0, 1])
+    rows, values = file.view(bytes([1])), file.view(np.ones(3, np.float32).tobytes())
+    texture = {"index": file.add("textures", {"source": file.image(np.zeros((2, 2, 4), np.uint8)), "sampler": 0})}
+    file.add("samplers", {"wrapS": 33071})
+    material = file.add("materials", {
+        "pbrMetallicRoughness": {"baseColorTexture": {**texture, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}}},
+        "alphaMode": "MASK", "alphaCutoff": 0.4, "emissiveFactor": [1, 0, 0], "normalTexture": {**texture, "scale": 2},
+        "extensions": {"KHR_materials_transmission": {"transmissionFactor": 1}, "KHR_materials_ior": {"ior": 1.4},
+                       "KHR_materials_volume": {"thicknessFactor": 1, "attenuationDistance": 2}}})
+    primitive = file.primitive(SQUARE, [0, 1, 2, 3], mode=5, material=material)
+    file.json["accessors"][primitive["attributes"]["POSITION"]]["sparse"] = {
+        "count": 1, "indices": {"bufferView": rows, "componentType": 5121}, "values": {"bufferView": values}}
+    primitive["attributes"]["TEXCOORD_0"] = file.accessor([[0, 0], [9, 0], [0, 9], [9, 9]], "uint8", normalized=True)
+    instances = {"TRANSLATION": file.accessor(TRIANGLE)}
+    leaf = file.node(mesh=file.mesh(primitive), extensions={"EXT_mesh_gpu_instancing": {"attributes": instances}})
+    file.node(children=[leaf], matrix=np.eye(4).ravel().tolist())
+    file.node(camera=file.add("cameras", {"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}))
+    file.json |= {"scenes": [{"nodes": [0, 1, 3, 4]}], "scene": 0, "extensionsUsed": ["KHR_materials_ior"]}
+    return file
+
+
+def test_the_rich_file_is_sound(tmp_path):
+    scene = load_gltf(rich_file().write(tmp_path))
+    assert len(scene.objects) == 4 and len(scene.lights) == 1 and scene.objects[1].materials[0].absorption == (0, 0, 0)
+
+
+def places(value: Any) -> list[tuple[Any, Any]]:
+    """Every (container, key) in a JSON value."""
+    items = list(value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ())
+    return [(value, key) for key, _ in items] + [place for _, child in items for place in places(child)]
+
+
+JUNK = [None, True, -1, 0, 1, 3, 1.5, 2**31, 10**30, 1e300, -1e-300, "", "x", "VEC3", [], [0], [[]], {}, {"index": 0}]
+
+
+@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+def test_any_value_may_be_wrong(tmp_path):
+    """Each value of the JSON in turn becomes something else, or goes: a scene or an InputError, and nothing else."""
+    file = rich_file()
+    sound = file.json
+    rng = np.random.default_rng(0)
+    outcomes = {True: 0, False: 0}
+    for number in range(len(places(sound))):
+        for junk in [*(JUNK[i] for i in rng.choice(len(JUNK), 3, replace=False)), "remove"]:
+            file.json = copy.deepcopy(sound)
+            container, key = places(file.json)[number]
+            if junk == "remove":
+                del container[key]
+            else:
+                container[key] = copy.deepcopy(junk)
+            outcomes[is_loaded(file.write(tmp_path))] += 1
+    assert min(outcomes.values()) > 50
+
+
+@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+def test_any_byte_may_be_wrong(tmp_path):
+    path = rich_file().write(tmp_path)
+    data = path.read_bytes()
+    rng = np.random.default_rng(1)
+    outcomes = {True: 0, False: 0}
+    for _ in range(300):
+        damaged = bytearray(data)
+        for at in rng.integers(0, len(data), rng.integers(1, 3)):
+            damaged[at] = rng.integers(0, 256)
+        path.write_bytes(bytes(damaged))
+        outcomes[is_loaded(path)] += 1
+    for length in range(0, len(data), 37):
+        path.write_bytes(data[:length])
+        assert not is_loaded(path)
+    assert min(outcomes.values()) > 10
+
+
+def is_loaded(path: Path) -> bool:
+    try:
+        load_gltf(path)
+    except InputError as error:
+        assert str(error).startswith(f"{path}: ") and "\n" not in str(error)
+        return False
+    return True
+
+
+# --- files by others --------------------------------------------------------------------------------------------------
+
+FILES = sorted(path.relative_to(DATA).as_posix() for folder in ("scenes/gltf", "odd") for path in DATA.glob(f"{folder}/**/*.gl*"))
+REFUSED = {"odd/BoxMeshopt.glb": "no decoder for EXT_meshopt_compression", "odd/empty_nodes.glb": "no triangles"}
+
+
+def index_counts() -> dict[str, int]:
+    """Triangles with instances, by the data set's own index: "N" or "N (M inst)"."""
+    counts = {}
+    for line in data_path("INDEX.tsv").read_text().splitlines()[1:]:
+        name, count = line.split("\t")[:2]
+        text = count.split("(")[-1].split(" ")[0] if "inst" in count else count
+        if text.isdigit():
+            counts[name] = int(text)
+    # Counted by a tool that knows neither fans nor EXT_mesh_gpu_instancing: a list of 18 indices, a strip of 6, a fan of 8.
+    return counts | {"odd/MeshPrimitiveModes/MeshPrimitiveModes.gltf": 6 + 4 + 6, "odd/SimpleInstancing.glb": 125 * 12}
+
+
+@pytest.mark.parametrize("name", FILES or ["scenes/gltf"])
+@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+def test_every_file_loads_with_its_triangles_or_is_refused(name):
+    path = data_path(name)
+    if name in REFUSED:
+        with pytest.raises(InputError, match=REFUSED[name]):
+            load_gltf(path)
+        return
+    start = time.perf_counter()
+    scene = load_gltf(path)
+    assert time.perf_counter() - start < 10.0  # far above what it takes: a guard against loops over vertices
+    assert sum(len(thing.mesh.faces) + thing.mesh.dropped for thing in scene.objects) == index_counts()[name]
+    assert scene.cameras
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if name not in REFUSED and "Instancing" not in name
+                                  and "MeshPrimitiveModes" not in name] or ["scenes/gltf"])
+@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+def test_world_bounds_agree_with_trimesh(name):
+    trimesh = pytest.importorskip("trimesh")
+    theirs = trimesh.load(data_path(name), process=False).bounds
+    ours = load_gltf(data_path(name)).bounds()
+    assert np.array(ours) == pytest.approx(theirs, rel=1e-5, abs=1e-5 * np.ptp(theirs, axis=0).max())
+
+
+def test_shared_spheres_are_stored_once():
+    path = data_path("scenes/gltf/MetalRoughSpheresNoTextures.glb")
+    with pytest.warns(SceneWarning):
+        scene = load_gltf(path)
+    stored = {id(thing.mesh): len(thing.mesh.faces) for thing in scene.objects}
+    drawn = sum(len(thing.mesh.faces) for thing in scene.objects)
+    assert drawn > 50 * sum(stored.values()) and len(scene.materials) >= 98
+
+
+def test_toy_car_has_its_eight_cameras():
+    path = data_path("scenes/gltf/ToyCar/ToyCar.gltf")
+    scene, messages = warned(path)
+    assert "KHR_materials_clearcoat (material 'ToyCar'), KHR_materials_sheen (material 'Fabric')" in messages[0]
+    nodes = [node for node in json.loads(path.read_text())["nodes"] if "camera" in node]
+    assert len(scene.cameras) == len(nodes) == 8
+    for camera, node in zip(scene.cameras, nodes, strict=True):
+        assert camera.name == node["name"]
+        assert camera.camera_to_world[:3, 3] == pytest.approx(node["translation"])
+        assert camera.camera_to_world[:3, :3] == pytest.approx(Rotation.from_quat(node["rotation"]).as_matrix(), abs=1e-6)
+    fabric = next(material for material in scene.materials if material.name == "Fabric")
+    assert np.array_equal(fabric.albedo_texture.uv_transform, [[3, 0, 0], [0, 3, 0]])
+    glass = next(material for material in scene.materials if material.name == "Glass")
+    assert glass.transmission == 1 and glass.thin and glass.roughness == 0
+
+
+def test_dragon_absorbs_and_its_vendor_cousins_are_named():
+    scene, messages = warned(data_path("scenes/gltf/DragonAttenuation.glb"))
+    dragon = next(m for m in scene.materials if m.name == "Dragon with Attenuation")
+    assert not dragon.thin
+    assert np.exp(-0.155 * np.array(dragon.absorption)) == pytest.approx([0.921, 0.64, 0.064])
+    assert "KHR_materials_variants (mesh 'Dragon')" in messages[0]
+    assert "NV_materials_mdl" in warned(data_path("scenes/gltf/nvpro_cornellBox/cornellBox.gltf"))[1][0]
+
+
+def test_an_image_in_a_data_uri(tmp_path):
+    import base64
+
+    pixels = np.random.default_rng(0).integers(0, 255, (3, 5, 4), dtype=np.uint8)
+    file = one_triangle(material=0)
+    file.add("materials", {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}})
+    file.add("textures", {"source": 0})
+    file.add("images", {"uri": "data:image/png;base64," + base64.b64encode(encode(pixels)).decode()})
+    assert np.array_equal(load(file, tmp_path).materials[0].albedo_texture.image, pixels)

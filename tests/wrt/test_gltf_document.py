@@ -1,0 +1,189 @@
+"""Containers, JSON, URIs: what is not a sound glTF file is refused, with the place."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from tests.gltf_files import TRIANGLE, one_triangle, pack_glb
+from wrt.errors import InputError
+from wrt.gltf import load_gltf
+from wrt.gltf_document import LeftOut
+from wrt.gltf_schema import read_as
+
+GLB = pack_glb(b'{"asset":{"version":"2.0"}}')
+TEXT = GLB[20:]
+
+
+def patched(data: bytes, offset: int, value: int) -> bytes:
+    return data[:offset] + struct.pack("<I", value) + data[offset + 4:]
+
+
+@pytest.mark.parametrize("name, data, message", [
+    ("a.glb", b"", "is not a .glb file"),
+    ("a.glb", b"glTF", "header: is truncated"),
+    ("a.glb", b"GLTF" + GLB[4:], "is not a .glb file"),
+    ("a.glb", patched(GLB, 4, 1), "header.version: is glTF 1; wrt reads 2.0"),
+    ("a.glb", GLB[:-3], "header.length: is truncated: 48 bytes according to its header, but there are 45"),
+    ("a.glb", patched(GLB, 12, 1000), "chunk 0: is truncated"),
+    ("a.glb", patched(GLB, 16, 7), "chunk 0: must be JSON"),
+    ("a.glb", patched(GLB, 8, 12), "chunk 0: must be JSON"),
+    ("a.gltf", b"", "is not valid JSON"),
+    ("a.gltf", b"solid cube", "is not valid JSON: Expecting value: line 1 column 1"),
+    ("a.gltf", b'{"asset": {"version": "2.0"}', "is not valid JSON"),
+    ("a.gltf", b"\xff\xfe\x00", "is not a glTF file: not UTF-8"),
+    ("a.gltf", b"[" * 100000, "is not valid JSON: nested too deeply"),
+    ("a.gltf", b"[]", "holds no object"),
+    ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": NaN}', "holds NaN"),
+    ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": ' + b"9" * 5000 + b"}", "is not valid JSON"),
+    ("a.gltf", b"{}", "asset.version: must be a string"),
+    ("a.gltf", b'{"asset": {"version": "1.0"}}', "asset.version: is '1.0'; wrt reads 2.0"),
+    ("a.gltf", b'{"asset": {"version": "2.1", "minVersion": "2.1"}}', "asset.minVersion: is '2.1'"),
+])
+def test_broken_containers(tmp_path, name, data, message):
+    path = tmp_path / name
+    path.write_bytes(data)
+    with pytest.raises(InputError) as error:
+        load_gltf(path)
+    assert str(error.value).startswith(f"{path}: ") and message in str(error.value)
+
+
+def test_missing_file_and_folder(tmp_path):
+    for path in (tmp_path / "none.gltf", tmp_path):
+        with pytest.raises(InputError, match="cannot read the file"):
+            load_gltf(path)
+
+
+def test_both_containers_and_a_byte_order_mark_give_the_same(tmp_path):
+    file = one_triangle()
+    paths = [file.write(tmp_path, "a.glb"), file.write(tmp_path, "a.gltf")]
+    paths.append(tmp_path / "bom.gltf")
+    paths[2].write_bytes(b"\xef\xbb\xbf" + paths[1].read_bytes())
+    for path in paths:
+        assert np.array_equal(load_gltf(path, staged=False).objects[0].mesh.vertices, TRIANGLE)
+
+
+@pytest.mark.parametrize("name, uri", [("my buffer.bin", "my%20buffer.bin"), ("b.bin", "./b.bin"), ("sub/b.bin", "sub/b.bin"),
+                                       ("sub/b.bin", "sub\\b.bin"), ("é.bin", "%C3%A9.bin"), ("é.bin", "é.bin")])
+def test_external_buffers(tmp_path, name, uri):
+    file = one_triangle()
+    (tmp_path / "sub").mkdir()
+    (tmp_path / name).write_bytes(bytes(file.binary) + b"more than byteLength")
+    file.json["buffers"] = [{"byteLength": len(file.binary), "uri": uri}]
+    scene = load_gltf(file.write(tmp_path, "a.gltf"), staged=False)
+    assert np.array_equal(scene.objects[0].mesh.vertices, TRIANGLE)
+
+
+@pytest.mark.parametrize("uri, message", [
+    ("none.bin", "cannot read 'none.bin': No such file"),
+    ("http://example.org/b.bin", "is an address"),
+    ("file:///etc/hostname", "is an address"),
+    ("C:\\b.bin", "is an address"),
+    ("/etc/hostname", "is an absolute path"),
+    ("\\\\server\\share", "is an absolute path"),
+    ("../b.bin", "leaves the folder"),
+    ("a/%2e%2E/../../b.bin", "leaves the folder"),
+    ("a%00.bin", "control character"),
+    ("", "is empty"),
+    ("%ff", "is not UTF-8"),
+    (".", "cannot read '.'"),
+    ("x" * 5000, "cannot read"),
+    ("data:application/octet-stream;base64", "without a comma"),
+    ("data:;base64,abc", "cannot be decoded"),
+    ("data:;base64,ab!=", "cannot be decoded"),
+    ("data:,abc", "is truncated: byteLength is 36, but there are 3 bytes"),
+    (5, "must be a string, got 5"),
+])
+def test_bad_uris(tmp_path, uri, message):
+    file = one_triangle()
+    file.json["buffers"] = [{"byteLength": len(file.binary), "uri": uri}]
+    (tmp_path.parent / "b.bin").write_bytes(bytes(file.binary))
+    with pytest.raises(InputError, match=r"buffers\[0\]") as error:
+        load_gltf(file.write(tmp_path, "a.gltf"))
+    assert message in str(error.value)
+
+
+def test_data_uri_without_base64(tmp_path):
+    file = one_triangle()
+    escaped = "".join(f"%{byte:02x}" for byte in file.binary)
+    file.json["buffers"] = [{"byteLength": len(file.binary), "uri": f"data:application/octet-stream,{escaped}"}]
+    assert np.array_equal(load_gltf(file.write(tmp_path, "a.gltf"), staged=False).objects[0].mesh.vertices, TRIANGLE)
+
+
+def test_buffer_without_data(tmp_path):
+    file = one_triangle()
+    path = tmp_path / "a.glb"
+    document = {**file.json, "buffers": [{"byteLength": 36}]}
+    path.write_bytes(pack_glb(json.dumps(document).encode()))
+    with pytest.raises(InputError, match=r"buffers\[0\]: has no uri"):
+        load_gltf(path)
+    path.write_bytes(pack_glb(json.dumps(document).encode(), bytes(file.binary[:20])))
+    with pytest.raises(InputError, match=r"buffers\[0\]: is truncated: byteLength is 36, but there are 20 bytes"):
+        load_gltf(path)
+
+
+@pytest.mark.parametrize("required, message", [
+    (["KHR_draco_mesh_compression"], "needs KHR_draco_mesh_compression.*no decoder for KHR_draco_mesh_compression"),
+    (["EXT_meshopt_compression", "KHR_mesh_quantization"], "no decoder for EXT_meshopt_compression: save"),
+    (["KHR_texture_basisu"], "no decoder for KHR_texture_basisu"),
+    (["KHR_materials_clearcoat", "ACME_unheard_of"], "needs ACME_unheard_of, KHR_materials_clearcoat, which wrt does not"),
+])
+def test_required_extensions_that_are_not_supported(tmp_path, required, message):
+    file = one_triangle()
+    file.json["extensionsRequired"] = required
+    with pytest.raises(InputError, match=f"extensionsRequired: the file .*{message}"):
+        load_gltf(file.write(tmp_path))
+
+
+def test_required_extensions_that_are_supported(tmp_path):
+    file = one_triangle()
+    file.json["extensionsRequired"] = ["KHR_materials_transmission", "KHR_lights_punctual", "KHR_xmp_json_ld"]
+    assert len(load_gltf(file.write(tmp_path), staged=False).objects) == 1
+
+
+@pytest.mark.parametrize("hint, raw, message", [
+    (int, 1.5, "must be an integer, got 1.5"), (int, "1", "must be an integer, got '1'"), (int, True, "must be an integer"),
+    (int, 1e400, "must be an integer"), (float, "x", "must be a number"), (float, False, "must be a number"),
+    (float, 1e400, "must be a finite number"), (float, 10**400, "must be a finite number"), (str, 1, "must be a string"),
+    (bool, 1, "must be true or false"), (list[float], 3, "must be an array"), (list[int], [0, None], r"x\[1\]: must be an"),
+    (dict[str, int], [], "must be an object"), (dict[str, int], {"A": "0"}, "x.A: must be an integer"),
+])
+def test_wrong_types_are_named(hint, raw, message):
+    with pytest.raises(InputError, match=message):
+        read_as(hint, raw, "x")
+
+
+def test_integral_floats_are_integers():
+    assert read_as(int, 3.0, "x") == 3 and isinstance(read_as(int, 3.0, "x"), int)
+
+
+def test_extras_of_any_type_and_unknown_keys_are_passed_over(tmp_path):
+    file = one_triangle(extras=[1, "two"], unheardOf=3)
+    file.json["extras"] = 5
+    file.json["nodes"][0]["extras"] = "text"
+    assert len(load_gltf(file.write(tmp_path), staged=False).objects) == 1
+
+
+def test_base64_with_wrapped_lines_is_refused_not_misread(tmp_path):
+    file = one_triangle()
+    text = base64.encodebytes(bytes(file.binary)).decode()
+    file.json["buffers"] = [{"byteLength": len(file.binary), "uri": f"data:;base64,{text}\n=broken"}]
+    with pytest.raises(InputError, match="cannot be decoded"):
+        load_gltf(file.write(tmp_path, "a.gltf"))
+
+
+def test_left_out_names_each_thing_once_and_cuts_long_lists():
+    left_out = LeftOut()
+    for i in range(7):
+        left_out.add("sheen", "material", f"m{i}")
+        left_out.add("sheen", "material", "m0")
+    left_out.add("lines", "mesh", "a")
+    left_out.add("lines", "mesh", "b")
+    left_out.add_extensions({"KHR_lights_punctual": {}, "KHR_xmp": {}, "ACME_x": {}}, "node", "n")
+    assert left_out.sentence() == ("sheen (materials 'm0', 'm1', 'm2', 'm3', 'm4' and 2 more), lines (meshes 'a', 'b'), "
+                                   "ACME_x (node 'n')")
+    assert LeftOut().sentence() == ""

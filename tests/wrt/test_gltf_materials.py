@@ -1,0 +1,341 @@
+"""Images, textures and materials of glTF."""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import warnings
+import zlib
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.gltf_files import GltfFile, encode, one_material, one_triangle
+from wrt.errors import InputError, SceneWarning
+from wrt.gltf import load_gltf
+from wrt.gltf_materials import MAX_SIDE, decode_image
+from wrt.scene import BLACK, Material, Scene
+
+PIXELS = np.arange(4 * 6 * 4, dtype=np.uint8).reshape(4, 6, 4) * 2
+
+
+def load(file: GltfFile, folder: Any) -> Scene:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SceneWarning)
+        return load_gltf(file.write(folder), staged=False)
+
+
+def material_of(source: dict[str, Any], folder: Any) -> Material:
+    """The wrt material that a glTF material without textures becomes; any warning fails the test."""
+    return load_gltf(one_material(source).write(folder), staged=False).materials[0]
+
+
+def textured(source: dict[str, Any], pixels: np.ndarray = PIXELS, **sampler: Any) -> GltfFile:
+    """A quad whose material may name texture 0."""
+    file = one_material(source)
+    image = file.image(pixels)
+    file.add("textures", {"source": image, "sampler": file.add("samplers", sampler)})
+    return file
+
+
+def base(**info: Any) -> dict[str, Any]:
+    return {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, **info}}}
+
+
+# --- materials --------------------------------------------------------------------------------------------------------
+
+
+def test_defaults_are_those_of_the_specification(tmp_path):
+    for material in (material_of({}, tmp_path), load_gltf(one_triangle().write(tmp_path), staged=False).materials[0]):
+        assert material.kind == "metallic_roughness"
+        assert material.albedo == (1, 1, 1) and material.metallic == 1 and material.roughness == 1 and material.ior == 1.5
+        assert not material.is_emissive and material.alpha_mode == "opaque" and not material.textures
+        assert material.transmission == 0 and not material.two_sided
+
+
+def test_factors(tmp_path):
+    material = material_of({
+        "name": "m", "doubleSided": True, "alphaMode": "MASK", "alphaCutoff": 0.25, "emissiveFactor": [0.1, 0.2, 0.3],
+        "pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.25, 0.125, 0.75], "metallicFactor": 0.3, "roughnessFactor": 0.6},
+        "extensions": {"KHR_materials_ior": {"ior": 1.33}, "KHR_materials_emissive_strength": {"emissiveStrength": 10}},
+    }, tmp_path)
+    assert (material.name, material.two_sided, material.alpha_mode, material.alpha_cutoff) == ("m", True, "mask", 0.25)
+    assert material.albedo == (0.5, 0.25, 0.125) and material.alpha == 0.75
+    assert (material.metallic, material.roughness, material.ior) == (0.3, 0.6, 1.33)
+    assert material.emission == pytest.approx((1, 2, 3)) and material.emits_light
+
+
+@pytest.mark.parametrize("mode, expected", [("OPAQUE", "opaque"), ("MASK", "mask"), ("BLEND", "blend")])
+def test_alpha_modes(tmp_path, mode, expected):
+    assert material_of({"alphaMode": mode}, tmp_path).alpha_mode == expected
+
+
+def test_a_cutoff_above_one_hides_everything(tmp_path):
+    material = material_of({"alphaMode": "MASK", "alphaCutoff": 2}, tmp_path)
+    assert material.alpha < material.alpha_cutoff
+
+
+def test_transmission_is_thin_without_a_volume(tmp_path):
+    glass = {"KHR_materials_transmission": {"transmissionFactor": 0.9}}
+    material = material_of({"extensions": glass}, tmp_path)
+    assert material.transmission == 0.9 and material.thin and material.absorption == BLACK
+    material = material_of({"extensions": {**glass, "KHR_materials_volume": {"thicknessFactor": 0}}}, tmp_path)
+    assert material.thin
+
+
+def test_absorption_gives_the_attenuation_colour_at_its_distance(tmp_path):
+    color, distance = np.array([0.9, 0.5, 0.1]), 0.25
+    volume = {"thicknessFactor": 1, "attenuationColor": color.tolist(), "attenuationDistance": distance}
+    glass = {"KHR_materials_transmission": {"transmissionFactor": 1}, "KHR_materials_volume": volume}
+    material = material_of({"extensions": glass}, tmp_path)
+    assert not material.thin
+    assert np.exp(-np.array(material.absorption) * distance) == pytest.approx(color)
+    assert np.exp(-np.array(material.absorption) * 2 * distance) == pytest.approx(color**2)
+    volume["attenuationColor"] = [0, 0, 1]
+    material = material_of({"extensions": glass}, tmp_path)
+    assert math.isfinite(material.absorption[0]) and math.exp(-material.absorption[0] * distance) < 1e-5
+    assert material.absorption[2] == 0
+    del volume["attenuationDistance"]
+    assert material_of({"extensions": glass}, tmp_path).absorption == BLACK
+
+
+def test_unlit_shows_its_base_colour_and_lights_nothing(tmp_path):
+    source = {**base(), "alphaMode": "BLEND", "emissiveFactor": [1, 0, 0], "extensions": {"KHR_materials_unlit": {}}}
+    source["pbrMetallicRoughness"]["baseColorFactor"] = [0.2, 0.4, 0.6, 0.5]
+    material = load(textured(source), tmp_path).materials[0]
+    assert material.kind == "diffuse" and material.albedo == BLACK and material.emission == (0.2, 0.4, 0.6)
+    assert material.two_sided and not material.emits_light and material.alpha == 0.5
+    assert material.emission_texture is not None and material.emission_texture is material.albedo_texture
+    source["alphaMode"] = "OPAQUE"
+    assert load(textured(source), tmp_path).materials[0].albedo_texture is None
+
+
+def test_an_emission_texture_is_seen_but_lights_nothing(tmp_path):
+    material = load(textured({"emissiveTexture": {"index": 0}, "emissiveFactor": [1, 1, 1]}), tmp_path).materials[0]
+    assert material.is_emissive and not material.emits_light and material.emission_texture.srgb
+    assert not load(textured({"emissiveTexture": {"index": 0}}), tmp_path).materials[0].textures  # the factor is black
+
+
+def test_each_slot_has_its_encoding(tmp_path):
+    slot = {"index": 0}
+    material = load(textured({
+        "pbrMetallicRoughness": {"baseColorTexture": slot, "metallicRoughnessTexture": slot},
+        "normalTexture": {"index": 0, "scale": 0.5}, "occlusionTexture": slot, "emissiveTexture": slot,
+        "emissiveFactor": [1, 1, 1],
+        "extensions": {"KHR_materials_transmission": {"transmissionFactor": 1, "transmissionTexture": slot}},
+    }), tmp_path).materials[0]
+    assert material.albedo_texture.srgb and material.emission_texture.srgb
+    assert not material.metallic_roughness_texture.srgb and not material.normal_texture.srgb
+    assert not material.transmission_texture.srgb and material.normal_scale == 0.5
+    # The same image with the same settings is the same texture, and there is one decoded copy of the image.
+    assert material.albedo_texture is material.emission_texture
+    assert material.normal_texture is material.transmission_texture is material.metallic_roughness_texture
+    assert material.albedo_texture.image is material.normal_texture.image
+    assert np.array_equal(material.normal_texture.image, PIXELS)
+
+
+@pytest.mark.parametrize("source, message", [
+    ({"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1]}}, "baseColorFactor: must hold 4 numbers, got 3"),
+    ({"pbrMetallicRoughness": {"baseColorFactor": [2, 1, 1, 1]}}, r"materials\[0\]: .*albedo must lie in \[0, 1\]"),
+    ({"pbrMetallicRoughness": {"metallicFactor": "shiny"}}, "metallicFactor: must be a number, got 'shiny'"),
+    ({"pbrMetallicRoughness": {"roughnessFactor": -1}}, r"materials\[0\]: .*roughness must be finite and in \[0, 1\]"),
+    ({"pbrMetallicRoughness": {"baseColorTexture": {}}}, "baseColorTexture.index: is required"),
+    (base(), r"materials\[0\].pbrMetallicRoughness.baseColorTexture.index: is 0, but there are 0 textures"),
+    ({"alphaMode": "GLASS"}, r"materials\[0\].alphaMode: must be one of OPAQUE, MASK, BLEND, got 'GLASS'"),
+    ({"emissiveFactor": [-1, 0, 0]}, "emission must lie in"),
+    ({"extensions": {"KHR_materials_ior": {"ior": 0.5}}}, "ior must be finite and in"),
+    ({"extensions": {"KHR_materials_ior": 3}}, "extensions.KHR_materials_ior: must be an object, got 3"),
+    ({"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1}, "KHR_materials_volume": {
+        "thicknessFactor": 1, "attenuationDistance": 0}}}, "KHR_materials_volume: attenuationDistance must be"),
+])
+def test_wrong_materials_are_refused(tmp_path, source, message):
+    with pytest.raises(InputError, match=message):
+        material_of(source, tmp_path)
+
+
+@pytest.mark.parametrize("extension, value, named", [
+    ("KHR_materials_clearcoat", {"clearcoatFactor": 1}, True),
+    ("KHR_materials_clearcoat", {"clearcoatRoughnessFactor": 0.5}, False),
+    ("KHR_materials_sheen", {"sheenColorFactor": [0, 0, 0]}, False),
+    ("KHR_materials_specular", {"specularFactor": 1.0}, False),
+    ("KHR_materials_specular", {"specularFactor": 0.5}, True),
+    ("KHR_materials_specular", {"specularTexture": {"index": 0}}, True),
+    ("KHR_materials_dispersion", {"dispersion": 0.2}, True),
+    ("NV_materials_mdl", {}, True),
+    ("KHR_materials_pbrSpecularGlossiness", "no object", True),
+    ("KHR_xmp_json_ld", {"packet": 0}, False),
+])
+def test_extensions_are_named_where_they_change_the_picture(tmp_path, extension, value, named):
+    file = one_material({"name": "paint", "extensions": {extension: value}})
+    path = file.write(tmp_path)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load_gltf(path, staged=False)
+    assert [f"{extension} (material 'paint')" in str(w.message) for w in caught] == ([True] if named else [])
+
+
+# --- textures ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("code, wrap", [(10497, "repeat"), (33071, "clamp"), (33648, "mirror")])
+def test_wrap_modes(tmp_path, code, wrap):
+    texture = load_gltf(textured(base(), wrapS=code).write(tmp_path), staged=False).materials[0].albedo_texture
+    assert texture.wrap == (wrap, "repeat")
+    texture = load_gltf(textured(base(), wrapT=code).write(tmp_path), staged=False).materials[0].albedo_texture
+    assert texture.wrap == ("repeat", wrap)
+
+
+def test_unknown_wrap_mode(tmp_path):
+    with pytest.raises(InputError, match=r"samplers\[0\].wrapS: must be one of .*, got 1"):
+        load(textured(base(), wrapS=1), tmp_path)
+
+
+def uv_transform(folder: Any, **transform: Any) -> np.ndarray:
+    source = base(extensions={"KHR_texture_transform": transform})
+    return load(textured(source), folder).materials[0].albedo_texture.uv_transform
+
+
+def test_texture_transform_examples_of_the_specification(tmp_path):
+    """The extension's two examples: the lower left quadrant turned clockwise by 90 degrees, and T upside down."""
+    corners = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])  # u, v: top left, top right, bottom right, bottom left
+    quadrant = uv_transform(tmp_path, offset=[0, 1], rotation=1.57079632679, scale=[0.5, 0.5])
+    # Clockwise: the quadrant's lower left corner appears top left, its upper left corner top right.
+    assert corners @ quadrant.T == pytest.approx(np.array([[0, 1], [0, 0.5], [0.5, 0.5], [0.5, 1]]), abs=1e-9)
+    assert corners @ uv_transform(tmp_path, offset=[0, 1], scale=[1, -1]).T == pytest.approx(
+        np.array([[0, 1], [1, 1], [1, 0], [0, 0]]))
+
+
+def test_texture_transform_scales_before_it_turns_and_shifts(tmp_path):
+    matrix = uv_transform(tmp_path, offset=[0.1, 0.2], rotation=0.3, scale=[2, 3])
+    c, s = math.cos(0.3), math.sin(0.3)
+    assert matrix @ [0.5, 0.25, 1] == pytest.approx([c * 1.0 + s * 0.75 + 0.1, -s * 1.0 + c * 0.75 + 0.2])
+    assert np.array_equal(uv_transform(tmp_path), np.eye(2, 3))
+
+
+def test_second_set_of_coordinates_is_left_out_and_named(tmp_path):
+    for info in ({"texCoord": 1}, {"extensions": {"KHR_texture_transform": {"texCoord": 1}}}):
+        path = textured({"name": "m", **base(**info)}).write(tmp_path)
+        with pytest.warns(SceneWarning, match=r"textures by TEXCOORD_1 \(material 'm'\)"):
+            assert load_gltf(path, staged=False).materials[0].albedo_texture is None
+    info = {"texCoord": 1, "extensions": {"KHR_texture_transform": {"texCoord": 0}}}
+    assert load_gltf(textured(base(**info)).write(tmp_path), staged=False).materials[0].albedo_texture is not None
+
+
+def test_a_left_out_emission_texture_does_not_make_the_surface_glow(tmp_path):
+    source = {"emissiveTexture": {"index": 0, "texCoord": 1}, "emissiveFactor": [1, 1, 1]}
+    assert not load(textured(source), tmp_path).materials[0].is_emissive
+
+
+def test_occlusion_is_left_out_without_a_word(tmp_path):
+    path = textured({"occlusionTexture": {"index": 0, "texCoord": 1}}).write(tmp_path)
+    assert not load_gltf(path, staged=False).materials[0].textures
+
+
+def test_nearest_sampling_is_named(tmp_path):
+    with pytest.warns(SceneWarning, match="nearest-neighbour sampling"):
+        load_gltf(textured(base(), magFilter=9728).write(tmp_path), staged=False)
+
+
+def test_webp_by_its_extension(tmp_path):
+    file = one_material(base())
+    pixels = np.full((8, 8, 4), (200, 100, 50, 255), np.uint8)
+    file.add("textures", {"extensions": {"EXT_texture_webp": {"source": file.image(pixels, "WEBP")}}})
+    image = load_gltf(file.write(tmp_path), staged=False).materials[0].albedo_texture.image
+    assert np.abs(image.astype(int) - pixels).max() <= 8  # a lossy format
+
+
+@pytest.mark.parametrize("texture, message", [
+    ({"extensions": {"KHR_texture_basisu": {"source": 0}}}, r"textures\[0\]: has no image but that of KHR_texture_basisu"),
+    ({}, r"textures\[0\]: has no image$"),
+    ({"source": 4}, r"textures\[0\].source: is 4, but there are 0 images"),
+    ({"source": 0, "sampler": 1}, r"textures\[0\].sampler: is 1, but there are 0 samplers"),
+])
+def test_textures_without_an_image(tmp_path, texture, message):
+    file = one_material(base())
+    file.add("textures", texture)
+    with pytest.raises(InputError, match=message):
+        load(file, tmp_path)
+
+
+# --- images -----------------------------------------------------------------------------------------------------------
+
+
+def png_header(width: int, height: int) -> bytes:
+    """A PNG that says it is of that size, and holds a single row of pixels."""
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    row = zlib.compress(bytes(1 + min(width, MAX_SIDE)))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", row) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA", "P", "1"])
+def test_every_mode_becomes_rgba(mode):
+    picture = Image.fromarray(PIXELS).convert(mode)
+    stream = io.BytesIO()
+    picture.save(stream, "PNG")
+    assert np.array_equal(decode_image(stream.getvalue()), np.array(picture.convert("RGBA")))
+
+
+def test_sixteen_bit_grey_keeps_its_range():
+    grey = np.array([[0, 257, 32896, 65535]], np.uint16)
+    assert decode_image(encode(grey))[..., 0].tolist() == [[0, 1, 128, 255]]
+    assert decode_image(encode(grey)).shape == (1, 4, 4)
+
+
+@pytest.mark.parametrize("format", ["PNG", "JPEG", "WEBP"])
+def test_truncated_images(format):
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    data = encode(noise, format)
+    for length in (0, 5, 20, len(data) // 2):
+        with pytest.raises(InputError, match="cannot be decoded"):
+            decode_image(data[:length])
+
+
+def test_images_that_are_none():
+    eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n"
+    for data in (b"hello", eps):
+        with pytest.raises(InputError, match="none of PNG, JPEG"):
+            decode_image(data)
+
+
+@pytest.mark.parametrize("size", [(MAX_SIDE + 1, 1), (1, MAX_SIDE + 1)])
+def test_images_beyond_the_limit(size):
+    with pytest.raises(InputError, match=f"is {size[0]}x{size[1]}; at most {MAX_SIDE} a side"):
+        decode_image(png_header(*size))
+    assert decode_image(png_header(MAX_SIDE, 1)).shape == (1, MAX_SIDE, 4)
+
+
+def test_decompression_bombs():
+    with pytest.raises(InputError, match="decoded"):
+        decode_image(png_header(MAX_SIDE, MAX_SIDE))  # pillow's own limit comes before ours here
+    with pytest.raises(InputError):
+        decode_image(png_header(2**31 - 1, 2**31 - 1))
+
+
+def test_an_unsound_image_is_named(tmp_path):
+    file = one_material(base())
+    file.add("textures", {"source": file.add("images", {"uri": "picture.png"})})
+    path = file.write(tmp_path)
+    with pytest.raises(InputError, match=r"images\[0\].uri: cannot read 'picture.png'"):
+        load_gltf(path)
+    (tmp_path / "picture.png").write_bytes(encode(PIXELS)[:40])
+    with pytest.raises(InputError, match=r"images\[0\].uri \(picture.png\): the image cannot be decoded"):
+        load_gltf(path)
+    (tmp_path / "picture.png").write_bytes(encode(PIXELS))
+    assert load_gltf(path, staged=False).materials[0].albedo_texture.name == "picture.png"
+    file.json["images"] = [{"mimeType": "image/png"}]
+    with pytest.raises(InputError, match=r"images\[0\]: has neither a uri nor a bufferView"):
+        load_gltf(file.write(tmp_path))
+
+
+def test_materials_and_textures_that_nothing_shows_are_not_read(tmp_path):
+    file = one_triangle()
+    file.add("images", {"uri": "missing.png"})
+    file.add("textures", {"source": 0})
+    file.add("materials", {**base(), "extensions": {"KHR_materials_sheen": {"sheenColorFactor": [1, 1, 1]}}})
+    assert len(load_gltf(file.write(tmp_path), staged=False).materials) == 1

@@ -1,0 +1,607 @@
+"""The translation to Mitsuba against closed forms and float64 NumPy: wrt's own kernels play no part here."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wrt.errors import InputError, SceneWarning
+from wrt.mesh import Mesh
+from wrt.scene import (
+    Camera,
+    Checkerboard,
+    ConstantBackground,
+    DirectionalLight,
+    EnvironmentBackground,
+    GradientBackground,
+    Material,
+    Object,
+    PointLight,
+    Scene,
+    Settings,
+    Sphere,
+    SpotLight,
+    Texture,
+)
+
+pytest.importorskip("mitsuba", reason='needs Mitsuba 3 (pip install "wrt[peers]")')
+
+from wrt.bench.mitsuba import (
+    aov_mitsuba,
+    camera_rays,
+    mitsuba,
+    render_mitsuba,
+    to_mitsuba,
+    trace_mitsuba,
+)
+
+CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+TWO_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+CORNER_UVS = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)  # (0, 0) is the top left
+QUAD = Mesh(CORNERS, TWO_FACES, uvs=CORNER_UVS)
+FRONT = Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=math.radians(40))
+OBLIQUE = Camera.look_at((1.0, 0.7, 2.5), (0.2, 0.1, 0.0), up=(0.2, 1.0, 0.1), fov_y=math.radians(50))
+BLACK_MATERIAL = Material(albedo=(0, 0, 0))
+WHITE_SKY = ConstantBackground((1, 1, 1))
+
+
+def placed(x: float = 0.0, y: float = 0.0, z: float = 0.0, scale: float = 1.0) -> np.ndarray:
+    matrix = np.diag([scale, scale, scale, 1.0])
+    matrix[:3, 3] = x, y, z
+    return matrix
+
+
+def glowing(color, **rest) -> Material:
+    return Material(albedo=(0, 0, 0), emission=color, emits_light=False, **rest)
+
+
+def rotation(axis: int, angle: float) -> np.ndarray:
+    i, j = [(1, 2), (2, 0), (0, 1)][axis]
+    matrix = np.eye(4)
+    matrix[i, i] = matrix[j, j] = math.cos(angle)
+    matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
+    return matrix
+
+
+def plane_hit(camera: Camera, size) -> np.ndarray:
+    """Where the rays through the pixel centres meet the plane z = 0, (H, W, 3) float64."""
+    origin, directions = camera_rays(camera, size)
+    return origin + directions * (-origin[2] / directions[..., 2])[..., None]
+
+
+def center_pixel(scene: Scene, spp: int = 256, **options) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard error of a single pixel's worth of very narrow view."""
+    narrow = replace(FRONT, fov_y=1e-3)
+    result = render_mitsuba(scene, narrow, size=(1, 1), spp=spp, **options)
+    return result.pixels[0, 0], np.sqrt(result.variance[0, 0])
+
+
+# --- the module -------------------------------------------------------------------------------------------------------
+
+
+def test_missing_mitsuba_is_an_input_error(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    with pytest.raises(InputError, match="Mitsuba 3 is not usable"):
+        to_mitsuba(Scene(cameras=(FRONT,)))
+
+
+def test_the_callers_variant_is_given_back():
+    import mitsuba as mi
+
+    mi.set_variant("scalar_spectral")
+    with mitsuba() as inner:
+        assert inner.variant() == "scalar_rgb"
+    assert mi.variant() == "scalar_spectral"
+
+
+def test_unknown_option_values_are_refused():
+    scene = Scene(cameras=(FRONT,))
+    for options in ({"integrator": "bdpt"}, {"filter": "sinc"}, {"crop": (0, 0, 9, 9), "size": (8, 8)}):
+        with pytest.raises(InputError):
+            render_mitsuba(scene, spp=1, **options)
+
+
+# --- camera and film --------------------------------------------------------------------------------------------------
+
+
+def test_pixels_lie_where_the_camera_says():
+    spots = [((-0.7, 0.5), 0.12, (1, 0, 0)), ((0.55, 0.45), 0.2, (0, 2, 0)), ((0.3, -0.5), 0.15, (0, 0, 3))]
+    objects = tuple(Object(QUAD, (glowing(c),), transform=placed(x, y, 0, s)) for (x, y), s, c in spots)
+    scene = Scene(objects=objects, cameras=(OBLIQUE,))
+    size = (96, 54)
+    pixels = render_mitsuba(scene, size=size, spp=16, approximate=False, integrator="whitted").pixels
+    fine = plane_hit(OBLIQUE, (size[0] * 8, size[1] * 8))
+    expected = np.zeros((*fine.shape[:2], 3))
+    for (x, y), s, color in spots:
+        expected[(abs(fine[..., 0] - x) < s) & (abs(fine[..., 1] - y) < s)] = color
+    blocks = expected.reshape(size[1], 8, size[0], 8, 3)
+    certain = (blocks.min(axis=(1, 3)) == blocks.max(axis=(1, 3))).all(axis=-1)
+    # Cells of 1/8 pixel can miss a sliver of an edge: pixels that hold an edge, or touch one that does, are compared
+    # loosely.
+    border = ~certain
+    border[1:] |= ~certain[:-1]
+    border[:-1] |= ~certain[1:]
+    border[:, 1:] |= ~certain[:, :-1]
+    border[:, :-1] |= ~certain[:, 1:]
+    assert (~border).sum() > 0.6 * border.size and (expected[..., 2] > 0).any()
+    np.testing.assert_array_equal(pixels[~border], blocks.mean(axis=(1, 3))[~border].astype(np.float32))
+    assert abs(pixels - blocks.mean(axis=(1, 3))).mean() < 0.03
+
+
+def test_a_crop_is_a_part_of_the_whole():
+    scene = Scene(objects=(Object(QUAD, (glowing((1, 1, 1)),)),), cameras=(OBLIQUE,))
+    whole = render_mitsuba(scene, size=(40, 30), spp=64, integrator="whitted").pixels
+    part = render_mitsuba(scene, size=(40, 30), spp=64, integrator="whitted", crop=(5, 7, 20, 11)).pixels
+    assert part.shape == (11, 20, 3)
+    assert abs(part - whole[7:18, 5:25]).max() < 0.4 and abs(part - whole[7:18, 5:25]).mean() < 0.01
+
+
+def test_thin_lens_blurs_as_the_equation_says():
+    camera = replace(OBLIQUE, aperture_radius=0.4, focus_distance=1.6)
+    size, spp = (32, 18), 256
+    scene = Scene(objects=(Object(QUAD, (glowing((1, 1, 1)),), transform=placed(0.3, 0.1, 0, 0.3)),), cameras=(camera,))
+    result = render_mitsuba(scene, size=size, spp=spp, integrator="whitted")
+
+    rng = np.random.default_rng(1)
+    matrix = camera.camera_to_world
+    total = np.zeros((18, 32))
+    for _ in range(spp):
+        x = (2 * (np.arange(32) + rng.random((18, 32))) / 32 - 1) * math.tan(camera.fov_y / 2) * 32 / 18
+        y = (1 - 2 * (np.arange(18)[:, None] + rng.random((18, 32))) / 18) * math.tan(camera.fov_y / 2)
+        in_focus = camera.focus_distance * np.stack([x, y, -np.ones_like(x)], axis=-1)
+        radius, angle = np.sqrt(rng.random((18, 32))) * camera.aperture_radius, 2 * np.pi * rng.random((18, 32))
+        lens = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * radius], axis=-1)
+        origin = lens @ matrix[:3, :3].T + matrix[:3, 3]
+        direction = (in_focus - lens) @ matrix[:3, :3].T
+        point = origin + direction * (-origin[..., 2] / direction[..., 2])[..., None]
+        total += (abs(point[..., 0] - 0.3) < 0.3) & (abs(point[..., 1] - 0.1) < 0.3)
+    mean = total / spp
+    variance = mean * (1 - mean) / spp + result.variance[..., 0]
+    noisy = variance > 1e-4
+    z = (result.pixels[..., 0] - mean)[noisy] / np.sqrt(variance[noisy])
+    assert noisy.sum() > 40 and abs(z).max() < 5 and abs(z.std() - 1) < 0.4
+    # The same quad without a lens is sharp: the test would not see a lens that does nothing otherwise.
+    sharp = render_mitsuba(scene, replace(camera, aperture_radius=0.0), size=size, spp=16, integrator="whitted").pixels
+    assert abs(sharp[..., 0] - mean).max() > 0.3
+
+
+def test_the_variance_is_that_of_the_mean():
+    scene = Scene(objects=(Object(QUAD, (Material(),)),), cameras=(FRONT,), background=WHITE_SKY,
+                  spheres=(Sphere((0, 0, 1.2), 0.3, BLACK_MATERIAL),))
+    runs = [render_mitsuba(scene, size=(8, 8), spp=32, integrator="direct", seed=seed) for seed in range(1, 25)]
+    observed = np.var([run.pixels for run in runs], axis=0, ddof=1).mean()
+    predicted = np.mean([run.variance for run in runs])
+    assert 0.75 < observed / predicted < 1.33
+    again = render_mitsuba(scene, size=(8, 8), spp=32, integrator="direct", seed=1)
+    np.testing.assert_array_equal(again.pixels, runs[0].pixels)
+    assert render_mitsuba(scene, size=(8, 8), spp=4, integrator="direct", filter="gaussian").variance is None
+
+
+# --- rays and AOVs ----------------------------------------------------------------------------------------------------
+
+
+def nearest(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """t of every ray with every triangle, (N, F) float64, inf on a miss (Moeller and Trumbore 1997)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    p = np.cross(directions[:, None], (c - a)[None])
+    determinant = np.einsum("nfk,fk->nf", p, b - a)
+    s = origins[:, None] - a[None]
+    q = np.cross(s, (b - a)[None])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = np.einsum("nfk,nfk->nf", s, p) / determinant
+        v = np.einsum("nfk,nk->nf", q, directions) / determinant
+        t = np.einsum("nfk,fk->nf", q, c - a) / determinant
+    return np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0), t, np.inf)
+
+
+def test_closest_hits_of_a_mesh():
+    rng = np.random.default_rng(7)
+    soup = Mesh(rng.uniform(-1, 1, (300, 3)), np.arange(300).reshape(100, 3))
+    origins = (3 * rng.normal(size=(500, 3))).astype(np.float32)
+    directions = (rng.uniform(-1, 1, (500, 3)) - origins).astype(np.float32)
+    hits = trace_mitsuba(soup, origins, directions)
+    expected = nearest(soup, origins.astype(np.float64), directions.astype(np.float64))
+    best = expected.min(axis=1)
+    assert 100 < np.isfinite(best).sum() < 500
+    np.testing.assert_array_equal(np.isfinite(hits.t), np.isfinite(best))
+    hit = np.isfinite(best)
+    np.testing.assert_allclose(hits.t[hit], best[hit], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(expected[hit, hits.prim_id[hit]], best[hit], rtol=1e-6)
+    assert (hits.prim_id[~hit] == -1).all()
+    corner = soup.vertices[soup.faces[hits.prim_id[hit]]].astype(np.float64)
+    u, v = hits.u[hit, None], hits.v[hit, None]
+    point = (1 - u - v) * corner[:, 0] + u * corner[:, 1] + v * corner[:, 2]
+    np.testing.assert_allclose(point, (origins + best[:, None] * directions)[hit], atol=2e-5)
+
+    limit = float(np.sort(best)[200:202].mean())
+    np.testing.assert_array_equal(np.isfinite(trace_mitsuba(soup, origins, directions, t_max=limit).t), best < limit)
+
+
+def test_no_ray_slips_through_a_shared_edge():
+    rng = np.random.default_rng(3)
+    corners = CORNERS @ rotation(0, 0.5)[:3, :3].T @ rotation(1, 0.9)[:3, :3].T
+    mesh = Mesh(corners, TWO_FACES)
+    share = rng.uniform(0.05, 0.95, (2000, 1))
+    target = (1 - share) * mesh.vertices[0] + share * mesh.vertices[2]
+    origins = rng.normal(size=(2000, 3)) * 5
+    assert (trace_mitsuba(mesh, origins, target - origins).prim_id >= 0).all()
+
+
+def test_bad_ray_arrays_are_refused():
+    with pytest.raises(InputError, match=r"\(N, 3\)"):
+        trace_mitsuba(QUAD, np.zeros((4, 3)), np.zeros((3, 3)))
+    nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    assert np.isinf(trace_mitsuba(nothing, np.zeros((2, 3)), np.ones((2, 3))).t).all()
+
+
+def test_sphere_aovs_are_the_analytic_ones():
+    center, radius, size = np.array([0.3, -0.2, 0.4]), 0.7, (64, 48)
+    wall = Object(QUAD, (Material(),), transform=placed(z=-9))
+    scene = Scene(objects=(wall,), spheres=(Sphere(center, radius, Material()),), cameras=(OBLIQUE,))
+    aov = aov_mitsuba(scene, size=size)
+    origin, directions = camera_rays(OBLIQUE, size)
+    along = directions @ (center - origin)
+    squared = radius**2 - ((center - origin) @ (center - origin) - along**2)
+    seen = squared > 1e-4
+    depth = along - np.sqrt(np.maximum(squared, 0))
+    np.testing.assert_allclose(aov.depth[seen], depth[seen], rtol=2e-5)
+    assert (aov.object_id[seen] == 1).all() and (aov.prim_id[seen] == 2).all()
+    assert (aov.object_id[squared < -1e-4] != 1).all()
+    normal = (origin + depth[..., None] * directions - center) / radius
+    np.testing.assert_allclose(aov.geometric_normal[seen], normal[seen], atol=1e-4)
+    np.testing.assert_allclose(aov.position[seen], (origin + depth[..., None] * directions)[seen], atol=2e-5)
+    u = 0.5 + np.arctan2(-normal[..., 2], normal[..., 0]) / (2 * np.pi)  # from -x around +y
+    v = np.arccos(np.clip(normal[..., 1], -1, 1)) / np.pi
+    inner = seen & (u > 0.01) & (u < 0.99)
+    np.testing.assert_allclose(aov.uv[inner], np.stack([u, v], -1)[inner], atol=2e-3)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_objects_are_placed_and_keep_their_outside(mirrored):
+    matrix = rotation(1, 0.4) @ np.diag([-1.2 if mirrored else 1.2, 0.6, 0.9, 1.0]) @ rotation(0, 0.3)
+    matrix[:3, 3] = 0.1, 0.2, -0.3
+    normals = np.array([[0.3, 0, 1], [-0.3, 0.2, 1], [0, 0.4, 1], [0.1, 0, 1]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    mesh = Mesh(CORNERS, TWO_FACES, normals=normals, uvs=CORNER_UVS)
+    wall = Object(QUAD, (Material(),), transform=placed(z=-50))
+    scene = Scene(objects=(wall, Object(mesh, (Material(),), transform=matrix)), cameras=(FRONT,))
+    aov = aov_mitsuba(scene, size=(48, 32))
+    seen = aov.object_id == 1
+    assert seen.sum() > 200
+    # The inverse transform takes hits back onto the quad, where uv and normals are known.
+    local = (aov.position[seen] - matrix[:3, 3]) @ np.linalg.inv(matrix[:3, :3]).T
+    np.testing.assert_allclose(local[:, 2], 0, atol=1e-5)
+    np.testing.assert_allclose(aov.uv[seen], np.stack([(local[:, 0] + 1) / 2, (1 - local[:, 1]) / 2], -1), atol=1e-5)
+    outside = np.linalg.inv(matrix[:3, :3]).T @ [0, 0, 1]
+    np.testing.assert_allclose(aov.geometric_normal[seen], np.tile(outside / np.linalg.norm(outside), (seen.sum(), 1)),
+                               atol=1e-5)
+    face = aov.prim_id[seen] - 2
+    upper = local[:, 1] > local[:, 0]
+    clear = abs(local[:, 1] - local[:, 0]) > 1e-3
+    np.testing.assert_array_equal(face[clear], upper[clear].astype(int))
+    world_normals = normals @ np.linalg.inv(matrix[:3, :3])
+    world_normals /= np.linalg.norm(world_normals, axis=1, keepdims=True)
+    a, b, c = (world_normals[TWO_FACES[upper.astype(int), k]] for k in range(3))
+    x, y = (local[:, 0] + 1) / 2, (local[:, 1] + 1) / 2
+    mix = np.where(upper[:, None], (1 - y)[:, None] * a + x[:, None] * b + (y - x)[:, None] * c,
+                   (1 - x)[:, None] * a + (x - y)[:, None] * b + y[:, None] * c)
+    mix /= np.linalg.norm(mix, axis=1, keepdims=True)
+    np.testing.assert_allclose(aov.shading_normal[seen][clear], mix[clear], atol=1e-4)
+
+
+def test_a_zero_normal_is_flat_there():
+    tilted = np.tile(np.array([[0.6, 0, 0.8]], np.float32), (4, 1))
+    tilted[:3] = 0  # face 0 has no normals at all; face 1 has one at its last corner
+    scene = Scene(objects=(Object(Mesh(CORNERS, TWO_FACES, normals=tilted), (Material(),)),), cameras=(FRONT,))
+    aov = aov_mitsuba(scene, size=(33, 33))
+    first = aov.prim_id == 0
+    assert first.sum() > 50
+    np.testing.assert_allclose(aov.shading_normal[first], np.tile([0, 0, 1], (first.sum(), 1)), atol=1e-6)
+
+
+# --- materials --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("integrator", ["path", "whitted"])
+def test_furnace_of_mirrors_and_glass(integrator):
+    spheres = (
+        Sphere((-0.6, 0, 0), 0.5, Material("glass", albedo=(1, 1, 1))),
+        Sphere((0.6, 0, 0), 0.5, Material("mirror", albedo=(1, 1, 1))),
+        Sphere((0, 0.6, -1), 0.5, Material("glass", albedo=(1, 1, 1), thin=True)),
+    )
+    scene = Scene(spheres=spheres, cameras=(FRONT,), background=WHITE_SKY, settings=Settings(max_depth=64))
+    pixels = render_mitsuba(scene, size=(16, 9), spp=64, integrator=integrator).pixels
+    np.testing.assert_allclose(pixels, 1.0, atol=2e-3)
+
+
+def test_furnace_of_diffuse_surfaces():
+    scene = Scene(spheres=(Sphere((0, 0, 0), 0.8, Material(albedo=(1, 0.5, 0.25))),), cameras=(FRONT,),
+                  background=WHITE_SKY)
+    mean, error = center_pixel(scene, integrator="whitted")
+    np.testing.assert_allclose(mean, (1, 0.5, 0.25), atol=5 * error.max())
+    mean, error = center_pixel(replace(scene, background=ConstantBackground(), ambient=(1, 1, 2)), integrator="whitted")
+    np.testing.assert_allclose(mean, (1, 0.5, 0.5), rtol=1e-5)
+
+
+@pytest.mark.parametrize("integrator", ["volpath", "whitted"])
+def test_an_absorbing_slab(integrator):
+    sigma, thickness, ior = np.array([0.2, 1.0, 3.0]), 0.5, 1.6
+    glass = Material("glass", albedo=(1, 1, 1), ior=ior, absorption=tuple(sigma))
+    box = np.array([[x, y, z] for z in (0, -thickness) for y in (-1, 1) for x in (-1, 1)], np.float32)
+    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 7, 5], [4, 6, 7], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
+                      [0, 6, 4], [1, 5, 7], [1, 7, 3]], np.int32)
+    scene = Scene(objects=(Object(Mesh(box, faces), (glass,)),), cameras=(FRONT,), background=WHITE_SKY,
+                  settings=Settings(max_depth=32))
+    mean, error = center_pixel(scene, spp=65536 if integrator == "volpath" else 4096, integrator=integrator)
+    r, a = ((ior - 1) / (ior + 1)) ** 2, np.exp(-sigma * thickness)
+    inner = (1 - r) ** 2 * a / (1 - (r * a) ** 2)
+    expected = inner + r + r * a * inner
+    assert (abs(mean - expected) < 5 * error + 1e-4).all() and error.max() < 0.01
+
+
+def test_reflection_at_normal_incidence():
+    quad = lambda material: Scene(objects=(Object(QUAD, (material,)),), cameras=(FRONT,),
+                                  background=GradientBackground(bottom=(0, 0, 0), top=(0, 0, 0)), ambient=(0, 0, 0))
+    behind = Object(QUAD, (glowing((1, 1, 1), two_sided=False),), transform=rotation(1, math.pi) @ placed(z=-8))
+    gold = Material("conductor", eta=(0.183, 0.422, 1.373), k=(3.424, 2.346, 1.771))
+    eta, k = np.array(gold.eta), np.array(gold.k)
+    cases = [
+        (gold, ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)),
+        (replace(gold, roughness=0.005), ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)),
+        (Material("mirror", albedo=(0.9, 0.5, 0.1)), np.array([0.9, 0.5, 0.1])),
+        (Material("glass", ior=1.5, thin=True), np.full(3, 2 * 0.04 / 1.04)),
+    ]
+    for material, expected in cases:
+        scene = quad(material)
+        scene = replace(scene, objects=(*scene.objects, behind))
+        mean, error = center_pixel(scene, spp=4096, integrator="whitted")
+        assert (abs(mean - expected) < 5 * error + 1e-5).all(), (material.kind, mean, expected)
+
+
+def test_rough_conductor_keeps_the_furnace_below_one_and_tends_to_the_smooth_one():
+    silver = Material("conductor", roughness=0.3)
+    scene = lambda material: Scene(spheres=(Sphere((0, 0, 0), 0.8, material),), cameras=(FRONT,),
+                                   background=WHITE_SKY)
+    smooth = center_pixel(scene(replace(silver, roughness=0.0)), integrator="path")[0]
+    rough = center_pixel(scene(silver), integrator="path")[0]
+    np.testing.assert_allclose(rough, smooth, rtol=0.02)
+    rougher = center_pixel(scene(replace(silver, roughness=1.0)), spp=2048, integrator="path")[0]
+    assert (rougher < 0.95 * smooth).all()
+
+
+@pytest.mark.parametrize("wrap", ["repeat", "clamp", "mirror"])
+def test_textures_lie_as_in_gltf(wrap):
+    rng = np.random.default_rng(5)
+    image = rng.integers(0, 256, (4, 6, 4), dtype=np.uint8)
+    transform = np.array([[0.9, 0.4, -0.3], [-0.3, 1.7, 0.2]])
+    texture = Texture(image, srgb=True, wrap=(wrap, wrap), uv_transform=transform)
+    scene = Scene(objects=(Object(QUAD, (glowing((2, 1, 0.5), emission_texture=texture),)),), cameras=(FRONT,))
+    point = plane_hit(FRONT, (45, 45))
+    pixels = render_mitsuba(scene, size=(45, 45), spp=64, integrator="whitted").pixels
+
+    encoded = image[..., :3] / 255.0
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    uv = np.stack([(point[..., 0] + 1) / 2, (1 - point[..., 1]) / 2, np.ones(point.shape[:2])], -1) @ transform.T
+    xy = uv * (6, 4) - 0.5
+    low = np.floor(xy).astype(int)
+    share = xy - low
+
+    def texel(dx, dy):
+        index = []
+        for i, size in ((low[..., 0] + dx, 6), (low[..., 1] + dy, 4)):
+            if wrap == "clamp":
+                i = np.clip(i, 0, size - 1)
+            elif wrap == "repeat":
+                i = i % size
+            else:
+                i = np.where(i % (2 * size) < size, i % size, size - 1 - i % size)
+            index.append(i)
+        return linear[index[1], index[0]]
+
+    weight = lambda w: w[..., None]
+    upper = weight(1 - share[..., 0]) * texel(0, 0) + weight(share[..., 0]) * texel(1, 0)
+    lower = weight(1 - share[..., 0]) * texel(0, 1) + weight(share[..., 0]) * texel(1, 1)
+    expected = (weight(1 - share[..., 1]) * upper + weight(share[..., 1]) * lower) * (2, 1, 0.5)
+    inside = (abs(point[..., 0]) < 0.95) & (abs(point[..., 1]) < 0.95)
+    difference = abs(pixels - expected)[inside]
+    assert difference.mean() < 0.01 and np.quantile(difference, 0.99) < 0.12  # a pixel is an average around its centre
+
+
+def test_a_checkerboard_starts_with_its_first_color():
+    board = Checkerboard(color_a=(1, 0, 0), color_b=(0, 1, 0), scale=3)
+    scene = Scene(objects=(Object(QUAD, (glowing((1, 0.5, 1), emission_texture=board),)),), cameras=(FRONT,))
+    pixels = render_mitsuba(scene, size=(60, 60), spp=8, integrator="whitted").pixels
+    point = plane_hit(FRONT, (60, 60))
+    u, v = 3 * (point[..., 0] + 1) / 2, 3 * (1 - point[..., 1]) / 2
+    certain = (np.minimum(abs(u - np.round(u)), abs(v - np.round(v))) > 0.1) & (abs(point[..., :2]).max(axis=-1) < 1)
+    first = (np.floor(u) + np.floor(v)) % 2 == 0
+    np.testing.assert_allclose(pixels[certain & first], np.tile([1, 0, 0], ((certain & first).sum(), 1)), atol=1e-6)
+    np.testing.assert_allclose(pixels[certain & ~first], np.tile([0, 0.5, 0], ((certain & ~first).sum(), 1)), atol=1e-6)
+
+
+def test_each_face_has_its_material():
+    materials = (glowing((1, 0, 0)), glowing((0, 1, 0)), glowing((0, 0, 1)))
+    scene = Scene(objects=(Object(QUAD, materials, face_material=np.array([2, 0])),), cameras=(FRONT,))
+    pixels = render_mitsuba(scene, size=(30, 30), spp=4, integrator="whitted").pixels
+    np.testing.assert_array_equal(pixels[20, 22], (0, 0, 1))  # below the diagonal: face 0
+    np.testing.assert_array_equal(pixels[10, 8], (1, 0, 0))
+
+
+def test_blended_surfaces_let_light_through():
+    pane = Material(albedo=(0, 0, 0), alpha=0.3, alpha_mode="blend")
+    scene = Scene(objects=(Object(QUAD, (pane,)),), cameras=(FRONT,), background=ConstantBackground((1, 2, 3)))
+    for integrator in ("whitted", "volpath"):
+        mean, error = center_pixel(scene, spp=4096, integrator=integrator)
+        assert (abs(mean - 0.7 * np.array([1, 2, 3])) < 5 * error).all()
+    # A light behind the pane reaches the floor behind ours by the same share; a cut-out takes all or nothing.
+    floor = Object(QUAD, (Material(albedo=(1, 1, 1)),))
+    lit = lambda material: Scene(objects=(floor, Object(QUAD, (material,), transform=placed(0.7, 0, 1, 0.3))),
+                                 cameras=(FRONT,), lights=(PointLight((1.4, 0, 2), (5, 5, 5)),))
+    free = 5 * 2 / (1.4**2 + 2**2) ** 1.5 / math.pi
+    for material, share in ((pane, 0.7), (replace(pane, alpha_mode="mask"), 1.0),
+                            (replace(pane, alpha=0.6, alpha_mode="mask"), 0.0), (Material(), 0.0)):
+        mean, _ = center_pixel(lit(material), spp=64, integrator="whitted")
+        np.testing.assert_allclose(mean, share * free, rtol=2e-3)
+
+
+# --- lights and backgrounds -------------------------------------------------------------------------------------------
+
+
+def lit_quad(light, size=(31, 31), albedo=(0.8, 0.4, 0.2)) -> tuple[np.ndarray, np.ndarray]:
+    scene = Scene(objects=(Object(QUAD, (Material(albedo=albedo),), transform=placed(scale=4)),), cameras=(FRONT,),
+                  lights=(light,))
+    return render_mitsuba(scene, size=size, spp=64, integrator="whitted").pixels, plane_hit(FRONT, size)
+
+
+def test_a_point_light_falls_with_the_square():
+    pixels, point = lit_quad(PointLight((0.3, 0.2, 1.5), (3, 4, 5)))
+    way = np.array([0.3, 0.2, 1.5]) - point
+    distance = np.linalg.norm(way, axis=-1, keepdims=True)
+    expected = np.array([3, 4, 5]) * way[..., 2:] / distance**3 * np.array([0.8, 0.4, 0.2]) / np.pi
+    np.testing.assert_allclose(pixels, expected, rtol=0.01)
+
+
+def test_a_directional_light_is_the_same_everywhere():
+    pixels, _ = lit_quad(DirectionalLight((1, 2, -2), (3, 4, 5)))
+    expected = np.array([3, 4, 5]) * (2 / 3) * np.array([0.8, 0.4, 0.2]) / np.pi
+    np.testing.assert_allclose(pixels, np.broadcast_to(expected, pixels.shape), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("inner", "outer"), [(0.2, 0.5), (0.0, 1.2), (0.4, 0.4)])
+def test_a_spot_light_has_gltfs_falloff(inner, outer):
+    position, axis = np.array([0.4, 0.3, 1.5]), np.array([-0.3, -0.2, -1.5])
+    axis /= np.linalg.norm(axis)
+    floor = Object(QUAD, (Material(albedo=(1, 1, 1)),), transform=placed(scale=20))
+    scene = Scene(objects=(floor,), lights=(SpotLight(tuple(position), tuple(axis), (3, 4, 5), inner, outer),))
+    middle = position + axis * (1.5 / -axis[2])
+    for angle in [0.02, *np.linspace(inner, outer, 6)[1:-1], 0.98 * outer, 1.02 * outer]:
+        target = middle + math.tan(angle) * np.array([1.5, 0.3, 0])
+        camera = Camera.look_at((-1, 1, 3), target, fov_y=1e-4)
+        mean = render_mitsuba(scene, camera, size=(1, 1), spp=4, integrator="whitted").pixels[0, 0]
+        way = position - target
+        distance = np.linalg.norm(way)
+        cosine = -way @ axis / distance
+        ramp = (cosine - math.cos(outer)) / max(math.cos(inner) - math.cos(outer), 1e-9)
+        falloff = min(max(ramp, 0), 1) ** 2
+        unshaded = np.array([3, 4, 5]) * way[2] / distance**3 / np.pi
+        np.testing.assert_allclose(mean, falloff * unshaded, atol=1e-3 * unshaded.max())
+
+
+def environment_value(image: np.ndarray, directions: np.ndarray, turn: float) -> np.ndarray:
+    """Bilinear look-up as EnvironmentBackground's docstring says: middle at -z, rightwards to +x, row 0 up."""
+    height, width = image.shape[:2]
+    x, y, z = (directions @ rotation(1, -turn)[:3, :3].T).T  # into the picture's own frame
+    column = (np.arctan2(x, -z) / (2 * np.pi) + 0.5) * width - 0.5
+    row = np.arccos(np.clip(y, -1, 1)) / np.pi * height - 0.5
+    left, top = np.floor(column).astype(int), np.floor(row).astype(int)
+    fx, fy = (column - left)[:, None], (row - top)[:, None]
+    texel = lambda r, c: image[np.clip(r, 0, height - 1), c % width]
+    upper = (1 - fx) * texel(top, left) + fx * texel(top, left + 1)
+    lower = (1 - fx) * texel(top + 1, left) + fx * texel(top + 1, left + 1)
+    return (1 - fy) * upper + fy * lower
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7, -2.5])
+def test_an_environment_is_seen_where_it_should_be(turn):
+    rng = np.random.default_rng(11)
+    image = rng.uniform(0, 1, (5, 8, 3)).astype(np.float32)
+    background = EnvironmentBackground(image, scale=2.0, rotation=turn)
+    camera = Camera.look_at((0.3, 0.2, 0.1), (-1, 0.7, 0.4), fov_y=math.radians(100))
+    scene = Scene(cameras=(camera,), background=background)
+    with mitsuba() as mi:
+        emitter = to_mitsuba(scene).environment()
+        directions = rng.normal(size=(400, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        seen = []
+        for direction in directions.tolist():
+            si = mi.SurfaceInteraction3f()
+            si.wi = [-x for x in direction]
+            seen.append(np.array(emitter.eval(si)))
+    np.testing.assert_allclose(seen, 2 * environment_value(image, directions, turn), atol=1e-4)
+
+    pixels = render_mitsuba(scene, size=(24, 16), spp=64, integrator="path").pixels
+    _, rays = camera_rays(camera, (24 * 8, 16 * 8))
+    expected = 2 * environment_value(image, rays.reshape(-1, 3), turn).reshape(16, 8, 24, 8, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(pixels, expected, atol=0.05)
+
+
+def test_a_gradient_is_linear_in_the_height():
+    background = GradientBackground(bottom=(1, 0, 0.5), top=(0, 1, 2))
+    scene = Scene(cameras=(FRONT,), background=background)
+    rng = np.random.default_rng(2)
+    with mitsuba() as mi:
+        emitter = to_mitsuba(scene).environment()
+        for direction in rng.normal(size=(200, 3)):
+            direction /= np.linalg.norm(direction)
+            si = mi.SurfaceInteraction3f()
+            si.wi = (-direction).tolist()
+            share = 0.5 * (direction[1] + 1)
+            expected = (1 - share) * np.array(background.bottom) + share * np.array(background.top)
+            np.testing.assert_allclose(np.array(emitter.eval(si)), expected, atol=1e-5)
+
+
+def test_an_area_light_gives_the_form_factors_light():
+    """A disk-like small light at distance d: irradiance tends to L A cos cos / d^2."""
+    light = Object(QUAD, (Material(albedo=(0, 0, 0), emission=(100, 100, 100)),),
+                   transform=placed(0.5, 0, 2) @ rotation(1, math.pi) @ placed(scale=0.02))
+    floor = Object(QUAD, (Material(albedo=(1, 1, 1)),))
+    scene = Scene(objects=(floor, light), cameras=(FRONT,))
+    squared = 0.5**2 + 2**2
+    expected = 100 * 0.04**2 * (4 / squared) / squared / math.pi
+    for integrator in ("whitted", "direct"):
+        mean, _ = center_pixel(scene, spp=256, integrator=integrator)
+        np.testing.assert_allclose(mean, expected, rtol=2e-3)
+    unlit = replace(light.materials[0], emits_light=False)
+    dark = replace(scene, objects=(floor, replace(light, materials=(unlit,))))
+    assert (center_pixel(dark, spp=64, integrator="whitted")[0] == 0).all()
+
+
+def test_two_sided_emission_needs_leave_and_then_shines_on_both_sides():
+    material = glowing((1, 2, 3), two_sided=True)
+    back = Camera.look_at((0, 0, -3), (0, 0, 0), fov_y=math.radians(40))
+    scene = Scene(objects=(Object(QUAD, (material,)),), cameras=(FRONT, back))
+    with pytest.raises(InputError, match="two_sided"):
+        to_mitsuba(scene)
+    for camera in (0, 1):
+        with pytest.warns(SceneWarning, match="two_sided"):
+            pixels = render_mitsuba(scene, camera, size=(9, 9), spp=4, integrator="whitted", approximate=True).pixels
+        np.testing.assert_array_equal(pixels[4, 4], (1, 2, 3))
+
+
+# --- what cannot be translated ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("material", "message"), [
+    (Material(specular=(0.1, 0.1, 0.1)), "Blinn-Phong"),
+    (Material("metallic_roughness", metallic=1.0, roughness=0.4), "principled"),
+    (Material("glass", thin=True, roughness=0.3), "thin pane with roughness"),
+    (Material(albedo_texture=Texture(np.zeros((2, 2, 4), np.uint8), wrap=("clamp", "repeat"))), "wrap"),
+    (Material(normal_texture=Texture(np.full((2, 2, 4), 128, np.uint8), srgb=False)), "normal texture"),
+])
+def test_approximations_are_refused_or_named(material, message):
+    scene = Scene(objects=(Object(QUAD, (material,)),), cameras=(FRONT,), background=WHITE_SKY)
+    with pytest.raises(InputError, match=message):
+        to_mitsuba(scene)
+    with pytest.warns(SceneWarning, match=message):
+        pixels = render_mitsuba(scene, size=(9, 9), spp=16, approximate=True).pixels
+    assert np.isfinite(pixels).all() and pixels.max() <= 1.5
+
+
+def test_features_that_an_integrator_lacks_are_refused():
+    plain = Scene(objects=(Object(QUAD, (Material(),)),), cameras=(FRONT,))
+    clear = Material("glass", absorption=(1, 1, 1))
+    blades = replace(FRONT, aperture_radius=0.1, blades=6)
+    tinted = Scene(objects=(Object(QUAD, (clear,)),), cameras=(FRONT,), settings=Settings(glass_shadows="tinted"))
+    for scene, integrator, message in (
+        (replace(plain, ambient=(0.1, 0.1, 0.1)), "path", "ambient"),
+        (replace(plain, cameras=(blades,)), "path", "blades"),
+        (replace(plain, objects=(Object(QUAD, (clear,)),)), "path", "absorption"),
+        (replace(plain, objects=(Object(QUAD, (Material(alpha_mode="blend", alpha=0.5),)),)), "direct", "alpha"),
+        (tinted, "whitted", "glass_shadows"),
+    ):
+        with pytest.raises(InputError, match=message):
+            to_mitsuba(scene, integrator=integrator)

@@ -1,0 +1,487 @@
+from __future__ import annotations
+
+import base64
+import json
+import math
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.data import data_path
+from wrt.errors import InputError, SceneWarning
+from wrt.scene import (
+    CONDUCTORS,
+    Checkerboard,
+    DirectionalLight,
+    EnvironmentBackground,
+    GradientBackground,
+    PointLight,
+    Scene,
+    Settings,
+    SpotLight,
+    Texture,
+)
+from wrt.scene_file import load_scene, schema
+
+CAMERA = "[cameras.main]\nposition = [0, 0, 5]\ntarget = [0, 0, 0]\n"
+SUN = '[[lights]]\ntype = "directional"\ndirection = [0, -1, 0]\nirradiance = 1\n'
+TRIANGLES = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+
+
+def load(folder: Path, text: str) -> Scene:
+    path = folder / "scene.toml"
+    path.write_text(text)
+    return load_scene(path)
+
+
+def errors(folder: Path, text: str) -> list[str]:
+    """The lines of the one InputError that the text gives, without the file and the count."""
+    with pytest.raises(InputError) as caught:
+        load(folder, text)
+    message = str(caught.value)
+    path = str(folder / "scene.toml")
+    assert message.startswith(path + ": ")
+    lines = message[len(path) + 2:].split("\n  ")
+    if len(lines) > 1:
+        assert lines[0] == f"{len(lines) - 1} errors"
+    return lines[1:] or lines
+
+
+def png(path: Path, pixels: np.ndarray) -> None:
+    """Write (H, W, 4) uint8."""
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", *pixels.shape[1::-1], 8, 6, 0, 0, 0))
+                     + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b""))
+
+
+def gltf(path: Path) -> None:
+    """A triangle in z = 0 of a material "paint", a camera and a point light."""
+    data = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
+    path.write_text(json.dumps({
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1, 2]}],
+        "nodes": [{"mesh": 0}, {"camera": 0}, {"extensions": {"KHR_lights_punctual": {"light": 0}}}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": 0}]}],
+        "materials": [{"name": "paint"}],
+        "cameras": [{"name": "theirs", "type": "perspective", "perspective": {"yfov": 0.5, "znear": 0.1}}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", "min": [0, 0, 0],
+                       "max": [1, 1, 0]}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(data)}],
+        "buffers": [{"byteLength": len(data),
+                     "uri": "data:application/octet-stream;base64," + base64.b64encode(data).decode()}],
+        "extensionsUsed": ["KHR_lights_punctual"],
+        "extensions": {"KHR_lights_punctual": {"lights": [{"type": "point", "intensity": 3.0}]}},
+    }))
+
+
+# --- what a file says is what the scene holds -------------------------------------------------------------------------
+
+
+def test_settings_cameras_and_light(tmp_path: Path) -> None:
+    scene = load(tmp_path, """
+title = "a test"
+ambient = 0.25
+[settings]
+size = [320, 200]
+spp = 4
+filter = "gaussian"
+[cameras.near]
+position = [0, 1, 4]
+target = [0, 1, 0]
+fov_y = 30
+aperture_radius = 0.5
+blades = 6
+blade_rotation = 90
+[cameras.lens]
+position = [0, 0, 0]
+target = [0, 0, -3]
+focal_length = 0.05
+sensor_height = 0.024
+f_number = 2
+[cameras.matrix]
+matrix = [0, 0, 1, 7, 0, 1, 0, 8, -1, 0, 0, 9, 0, 0, 0, 1]
+[background]
+type = "gradient"
+top = [0, 0, 1]
+[[lights]]
+type = "point"
+position = [1, 2, 3]
+intensity = 5
+[[lights]]
+type = "spot"
+position = [0, 5, 0]
+direction = [0, -2, 0]
+intensity = [1, 2, 3]
+inner = 10
+outer = 20
+[[lights]]
+type = "directional"
+direction = [3, 0, 0]
+irradiance = 2
+[[lights]]
+type = "rectangle"
+corner = [0, 4, 0]
+edge_u = [1, 0, 0]
+edge_v = [0, 0, 1]
+radiance = [4, 3, 2]
+two_sided = true
+""")
+    assert scene.name == "a test" and scene.ambient == (0.25, 0.25, 0.25)
+    assert scene.settings == Settings(size=(320, 200), spp=4, filter="gaussian")
+    near, lens, matrix = scene.cameras
+    assert [camera.name for camera in scene.cameras] == ["near", "lens", "matrix"]
+    assert near.fov_y == pytest.approx(math.radians(30)) and near.focus_distance == pytest.approx(4)
+    assert (near.aperture_radius, near.blades) == (0.5, 6) and near.blade_rotation == pytest.approx(math.pi / 2)
+    assert lens.aperture_radius == pytest.approx(0.0125) and lens.focus_distance == 3.0
+    assert lens.fov_y == pytest.approx(2 * math.atan(0.012 / (0.05 * 3 / 2.95)))
+    assert matrix.camera_to_world[:3, 3].tolist() == [7, 8, 9] and matrix.camera_to_world[:3, 2].tolist() == [1, 0, 0]
+    assert isinstance(scene.background, GradientBackground) and scene.background.top == (0, 0, 1)
+    assert scene.background.bottom == GradientBackground().bottom
+    point, spot, sun = scene.lights
+    assert point == PointLight((1, 2, 3), (5, 5, 5))
+    assert sun == DirectionalLight((1, 0, 0), (2, 2, 2))
+    assert spot == SpotLight((0, 5, 0), (0, -1, 0), (1, 2, 3), inner=math.radians(10), outer=math.radians(20))
+    panel, = scene.objects
+    assert panel.materials[0].emission == (4, 3, 2) and panel.materials[0].two_sided
+    assert panel.materials[0].albedo == (0, 0, 0)
+    corners = panel.mesh.vertices[panel.mesh.faces]
+    assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 1] < 0).all()  # it shines down
+
+
+def test_materials_and_shapes(tmp_path: Path) -> None:
+    png(tmp_path / "t.png", np.arange(24, dtype=np.uint8).reshape(2, 3, 4))
+    scene = load(tmp_path, CAMERA + SUN + """
+[materials.gold]
+kind = "conductor"
+metal = "gold"
+roughness = 0.25
+[materials.window]
+kind = "glass"
+absorption = [1, 2, 3]
+ior = 1.25
+[materials.board]
+albedo_texture = { checkerboard = { color_a = 1, color_b = [0, 0.5, 0], scale = 8 } }
+[materials.print]
+albedo_texture = { file = "t.png", wrap = ["clamp", "repeat"], scale = [2, 3], offset = [0.5, 0], rotation = 90 }
+normal_texture = { file = "t.png" }
+alpha_mode = "mask"
+[materials.unused]
+[[spheres]]
+center = [1, 2, 3]
+radius = 2
+material = "gold"
+[[quads]]
+corner = [0, 0, 0]
+edge_u = [1, 0, 0]
+edge_v = [0, 2, 0]
+material = "board"
+[[boxes]]
+low = [0, 0, 0]
+high = [1, 1, 1]
+material = "window"
+transform = { translate = [5, 0, 0], rotate = [0, 90, 0], scale = 2 }
+[[meshes]]
+shape = { kind = "torus", radius = 2 }
+material = "print"
+""")
+    gold, = [sphere.material for sphere in scene.spheres]
+    assert (gold.eta, gold.k) == CONDUCTORS["gold"] and gold.roughness == 0.25 and gold.name == "gold"
+    board, window, painted = (thing.materials[0] for thing in scene.objects)
+    assert isinstance(board.albedo_texture, Checkerboard)
+    assert board.albedo_texture == Checkerboard((1, 1, 1), (0, 0.5, 0), 8)
+    assert (window.kind, window.ior, window.absorption) == ("glass", 1.25, (1, 2, 3))
+    texture, normal = painted.albedo_texture, painted.normal_texture
+    assert isinstance(texture, Texture) and isinstance(normal, Texture)
+    assert texture.srgb and not normal.srgb and texture.image is normal.image
+    assert texture.wrap == ("clamp", "repeat") and normal.wrap == ("repeat", "repeat")
+    assert texture.image.tolist() == np.arange(24).reshape(2, 3, 4).tolist()
+    np.testing.assert_array_equal(texture.uv_transform, [[0, 3, 0.5], [-2, 0, 0]])
+    # A corner (0, 0, 1) of the box: scaled to (0, 0, 2), turned to (2, 0, 0), moved to (7, 0, 0).
+    np.testing.assert_array_equal(scene.objects[1].transform @ [0, 0, 1, 1], [7, 0, 0, 1])
+    low, high = scene.objects[2].mesh.vertices.min(axis=0), scene.objects[2].mesh.vertices.max(axis=0)
+    np.testing.assert_allclose(high - low, [4.7, 0.7, 4.7], atol=1e-5)
+
+
+@pytest.mark.parametrize(("transform", "point", "image"), [
+    ("rotate = [90, 90, 0]", [0, 1, 0], [1, 0, 0]),  # x first: y goes to z; then about y: z goes to x
+    ("rotate = [0, 90, 90]", [0, 0, 1], [0, 1, 0]),  # about y: z goes to x; then about z: x goes to y
+    ("axis = [2, 2, 2], angle = 120", [1, 0, 0], [0, 1, 0]),
+    ("axis = [0, 0, 1], angle = 30", [2, 0, 0], [math.sqrt(3), 1, 0]),
+    ("scale = [1, 2, -3], translate = [1, 1, 1]", [1, 1, 1], [2, 3, -2]),
+    ("matrix = [1, 0, 0, 4, 0, 0, -1, 5, 0, 1, 0, 6, 0, 0, 0, 1]", [1, 2, 3], [5, 2, 8]),
+])
+def test_transforms(tmp_path: Path, transform: str, point: list[float], image: list[float]) -> None:
+    scene = load(tmp_path, CAMERA + SUN + '[materials.m]\n[[meshes]]\nshape = { kind = "prism" }\nmaterial = "m"\n'
+                 + f"transform = {{ {transform} }}\n")
+    np.testing.assert_allclose(scene.objects[0].transform @ [*point, 1], [*image, 1], atol=1e-12)
+
+
+def test_environment(tmp_path: Path) -> None:
+    from wrt.image import write_image
+
+    image = np.random.default_rng(0).random((4, 8, 3)).astype(np.float32)
+    write_image(tmp_path / "sky.exr", image)
+    scene = load(tmp_path, CAMERA + '[background]\ntype = "environment"\nfile = "sky.exr"\nscale = 2\nrotation = 45\n')
+    assert isinstance(scene.background, EnvironmentBackground)
+    np.testing.assert_array_equal(scene.background.image, image)
+    assert scene.background.scale == 2 and scene.background.rotation == pytest.approx(math.pi / 4)
+
+
+def test_mesh_materials(tmp_path: Path) -> None:
+    (tmp_path / "m.obj").write_text(TRIANGLES + "usemtl a\nf 1 2 3\nf 1 1 2\nusemtl b\nf 1 2 4\nusemtl c\nf 1 3 4\n")
+    scene = load(tmp_path, CAMERA + SUN + """
+[materials.red]
+[materials.green]
+[[meshes]]
+file = "m.obj"
+material = "red"
+[[meshes]]
+file = "m.obj"
+materials = { b = "green" }
+material = "red"
+smooth = true
+[[meshes]]
+file = "m.obj"
+parts = [{ first = 3, count = 1, material = "green" }, { first = 0, count = 3, material = "red" }]
+""")
+    def names(i: int) -> list[str]:
+        thing = scene.objects[i]
+        index = thing.face_material if thing.face_material is not None else np.zeros(len(thing.mesh.faces), int)
+        return [thing.materials[k].name for k in index]
+    assert names(0) == ["red", "red", "red"]
+    assert names(1) == ["red", "green", "red"]
+    assert names(2) == ["red", "red", "green"]  # triangle 1 of the file has no area, but is counted
+    assert scene.objects[0].mesh.normals is None and scene.objects[1].mesh.normals is not None
+    assert scene.objects[0].materials[0] is scene.objects[1].materials[0]
+
+
+def test_a_mesh_file_is_loaded_once(tmp_path: Path) -> None:
+    (tmp_path / "m.obj").write_text(TRIANGLES + "f 1 2 3\n")
+    scene = load(tmp_path, CAMERA + SUN + "[materials.m]\n" + 3 * '[[meshes]]\nfile = "m.obj"\nmaterial = "m"\n'
+                 + 2 * '[[meshes]]\nfile = "./m.obj"\nmaterial = "m"\nsmooth = true\n')
+    assert len({id(thing.mesh) for thing in scene.objects}) == 2
+
+
+def test_smooth_false_makes_flat(tmp_path: Path) -> None:
+    scene = load(tmp_path, CAMERA + SUN + "[materials.m]\n" + "".join(
+        f'[[meshes]]\nshape = {{ kind = "torus" }}\nmaterial = "m"\n{smooth}\n' for smooth in ("", "smooth = false")))
+    assert scene.objects[0].mesh.normals is not None and scene.objects[1].mesh.normals is None
+
+
+def test_include(tmp_path: Path) -> None:
+    gltf(tmp_path / "other.gltf")
+    scene = load(tmp_path, 'include = ["other.gltf"]\n' + CAMERA + """
+[materials.mine]
+[[spheres]]
+center = [0, 0, 0]
+radius = 1
+material = "paint"
+[[boxes]]
+low = [0, 0, 0]
+high = [1, 1, 1]
+material = "mine"
+""" + SUN)
+    assert [camera.name for camera in scene.cameras] == ["main", "theirs"]
+    assert isinstance(scene.lights[0], DirectionalLight) and isinstance(scene.lights[1], PointLight)
+    assert [len(thing.mesh.faces) for thing in scene.objects] == [12, 1]
+    assert scene.spheres[0].material is scene.objects[1].materials[0]
+
+    scene = load(tmp_path, 'include = ["other.gltf"]\n[override.paint]\nkind = "mirror"\nalbedo = 0.5\n')
+    material, = scene.objects[0].materials
+    assert (material.kind, material.albedo, material.name) == ("mirror", (0.5, 0.5, 0.5), "paint")
+
+
+# --- what is wrong ----------------------------------------------------------------------------------------------------
+
+
+def test_all_errors_at_once(tmp_path: Path) -> None:
+    lines = errors(tmp_path, """
+titel = "x"
+[settings]
+spp = 1.5
+filter = "gausian"
+[cameras.main]
+position = [0, 0, nan]
+target = [0, 0]
+[background]
+type = "gradiant"
+[materials.glass]
+kind = "glass"
+ior = 0.5
+rougness = 1
+[[spheres]]
+center = [0, 0, 0]
+radius = "1"
+material = "glas"
+[[meshes]]
+shape = { kind = "torus", radius = -1 }
+material = "glass"
+[[lights]]
+position = [0, 0, 0]
+""")
+    expected = {
+        "titel": "did you mean 'title'?", "settings.spp": "got 1.5, expected a whole number",
+        "settings.filter": "did you mean 'gaussian'?", "cameras.main.position[2]": "got nan, expected a finite number",
+        "cameras.main.target": "got [0, 0], expected at least 3 values", "background.type": "did you mean 'gradient'?",
+        "materials.glass.ior": "got 0.5, expected a number >= 1", "materials.glass.rougness": "did you mean 'roughness'?",
+        "spheres[0].radius": "got '1', expected a number", "spheres[0].material": "did you mean 'glass'?",
+        "meshes[0].shape.radius": "got -1, expected a number > 0", "lights[0].type": "is missing",
+    }
+    assert {line.partition(": ")[0] for line in lines} == expected.keys()
+    for line in lines:
+        assert expected[line.partition(": ")[0]] in line
+
+
+@pytest.mark.parametrize(("text", "place", "says"), [
+    ("[materials.m]\nior = 1.5", "materials.m", "'diffuse' does not use ior"),
+    ('[materials."a b"]\nalpha = 2', 'materials."a b".alpha', "expected a number <= 1"),
+    ('[materials.m]\nkind = "conductor"\nmetal = "gold"\nk = 3', "materials.m", "either metal, or eta and k"),
+    ("[materials.m]\nalbedo = true", "materials.m.albedo", "expected an array"),
+    ("[materials.m]\nalbedo = [0, 0, inf]", "materials.m.albedo[2]", "expected a"),
+    ("[materials.m]\nthin = 1", "materials.m.thin", "expected true or false"),
+    ("[materials.m]\nalbedo_texture = {}", "materials.m.albedo_texture", "exactly one of file, or checkerboard"),
+    ("[materials.m]\nnormal_texture = { checkerboard = {} }", "materials.m.normal_texture.checkerboard", "unknown key"),
+    ('[materials.m]\nalbedo_texture = { file = "no.png" }', "materials.m.albedo_texture", "no.png"),
+    ('[materials.m]\nalbedo_texture = { file = "scene.toml" }', "materials.m.albedo_texture", "scene.toml"),
+    ('materials = 5', "materials", "expected a table"),
+    ('spheres = 5', "spheres", "expected an array"),
+    ("[cameras.a]\nposition = [0, 0, 0]", "cameras.a", "needs both position and target"),
+    ("[cameras.a]\nfov_y = 180\nposition = [0, 0, 0]\ntarget = [0, 0, 1]", "cameras.a.fov_y", "< 179.9"),
+    ("[cameras.a]\nposition = [0, 0, 0]\ntarget = [0, 0, 0]", "cameras.a", "the same point"),
+    ("[cameras.a]\nposition = [0, 0, 0]\ntarget = [0, 1, 0]", "cameras.a", "parallel"),
+    ("[cameras.a]\nposition = [0, 0, 0]\ntarget = [0, 0, 1]\nfocal_length = 2", "cameras.a", "needs a sensor_height"),
+    ('include = ["m.obj"]', "include[0]", "[[meshes]]"),
+    ('include = ["none.glb"]', "include[0]", "none.glb"),
+    ("[override.m]", "override.m", "unknown included material"),
+    ('[background]\ntype = "environment"\nfile = "none.hdr"', "background", "none.hdr"),
+    ('[[meshes]]\nfile = "m.obj"', "meshes[0]", "needs a material"),
+    ('[materials.m]\n[[meshes]]\nmaterial = "m"', "meshes[0]", "exactly one of file, or shape"),
+    ('[materials.m]\n[[meshes]]\nmaterial = "m"\nfile = "none.ply"', "meshes[0]", "none.ply"),
+    ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterials = { wal = "m" }', "meshes[0]", "did you mean 'wall'?"),
+    ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterials = { wall = "m" }', "meshes[0]", "group 'roof' have no material"),
+    ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nparts = [{ first = 1, count = 2, material = "m" }]', "meshes[0]",
+     "triangles 1 to 2, but the file has 2"),
+    ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterials = { wall = "n" }\nmaterial = "m"',
+     "meshes[0].materials.wall", "unknown material 'n'"),
+    ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ntransform = { scale = [1, 0, 1] }',
+     "meshes[0].transform", "must not be zero"),
+    ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ntransform = { axis = [1, 0, 0] }',
+     "meshes[0].transform", "belong together"),
+    ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ntransform = { matrix = [0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,1] }',
+     "meshes[0]", "singular"),
+    ('[materials.m]\n[[boxes]]\nlow = [0, 0, 0]\nhigh = [0, 1, 1]\nmaterial = "m"', "boxes[0]", "must be above low"),
+    ('[[lights]]\ntype = "spot"\nposition = [0, 0, 0]\ndirection = [0, 1, 0]\nintensity = 1\ninner = 50', "lights[0]",
+     "must not be larger than outer"),
+    ('[[lights]]\ntype = "directional"\ndirection = [0, 0, 0]\nirradiance = 1', "lights[0]", "must not be zero"),
+])
+def test_errors_name_place_and_reason(tmp_path: Path, text: str, place: str, says: str) -> None:
+    (tmp_path / "m.obj").write_text(TRIANGLES + "usemtl wall\nf 1 2 3\nusemtl roof\nf 1 2 4\n")
+    line, = errors(tmp_path, text)
+    assert line.startswith(f"{place}: ") and says in line
+
+
+@pytest.mark.parametrize(("data", "says"), [
+    (b"a = 1\nb = [1,\n c]\n", "line 3, column 2: "), (b'a = """x', "end of document: "), (b"a = \n", "line 1, column "),
+    (b'a = "\xff"', "byte 5 is not UTF-8"), (b"a = " + b"[" * 5000 + b"]" * 5000, "nested too deeply"),
+    (b"a = 1\na = 2\n", "line 2, column "),
+])
+def test_files_that_are_not_toml(tmp_path: Path, data: bytes, says: str) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_bytes(data)
+    with pytest.raises(InputError) as caught:
+        load_scene(path)
+    assert str(caught.value).startswith(f"{path}: {says}")
+
+
+def test_paths_that_are_no_scene(tmp_path: Path) -> None:
+    (tmp_path / "folder.toml").mkdir()
+    (tmp_path / "a.blend").write_text("")
+    for name in ("none.toml", "folder.toml", "a.blend", "none"):
+        with pytest.raises(InputError) as caught:
+            load_scene(tmp_path / name)
+        assert name in str(caught.value) and ".toml, .gltf, .glb, .obj, .ply, .stl" in str(caught.value)
+
+
+# --- what is added ----------------------------------------------------------------------------------------------------
+
+
+def test_scene_without_camera_or_light_is_staged(tmp_path: Path) -> None:
+    ball = '[materials.m]\n[[spheres]]\ncenter = [3, 0, 0]\nradius = 1\nmaterial = "m"\n'
+    with pytest.warns(SceneWarning, match=r"scene\.toml: .*no camera.*no lights") as caught:
+        scene = load(tmp_path, ball)
+    assert len(caught) == 1 and len(scene.cameras) == 1 and scene.lights
+    with pytest.warns(SceneWarning, match="no camera") as caught:
+        scene = load(tmp_path, ball + SUN)
+    assert "no lights" not in str(caught[0].message) and len(scene.lights) == 1
+    with pytest.warns(SceneWarning, match="no lights"):
+        load(tmp_path, ball + CAMERA)
+    for light in (SUN, '[background]\ntype = "gradient"\n'):
+        load(tmp_path, ball + CAMERA + light)  # a warning would be an error here
+    assert errors(tmp_path, "") == ["the scene has no shapes"]
+
+
+def test_bare_mesh(tmp_path: Path) -> None:
+    path = tmp_path / "m.obj"
+    path.write_text(TRIANGLES + "f 1 2 3\n")
+    with pytest.warns(SceneWarning, match="no camera.*no lights"):
+        scene = load_scene(path)
+    assert len(scene.objects) == 1 and scene.cameras and scene.lights
+    assert scene.objects[0].materials[0].kind == "diffuse"
+
+
+@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+def test_gltf_goes_to_its_reader(tmp_path: Path) -> None:
+    gltf(tmp_path / "other.gltf")
+    assert load_scene(tmp_path / "other.gltf").cameras[0].name == "theirs"
+
+
+def test_kitchen_by_ranges_of_triangles(tmp_path: Path) -> None:
+    mesh = data_path("scenes/bitterli_kitchen/kitchen_1443k.ply")
+    rows = [row.split("\t") for row in data_path("scenes/bitterli_kitchen/kitchen_parts.tsv").read_text().splitlines()[1:]]
+    names = sorted({row[3] for row in rows})
+    parts = ", ".join(f'{{ first = {row[1]}, count = {row[2]}, material = "{row[3]}" }}' for row in rows)
+    scene = load(tmp_path, CAMERA + SUN + "".join(f'[materials."{name}"]\n' for name in names)
+                 + f'[[meshes]]\nfile = "{mesh}"\nparts = [{parts}]\n')
+    kitchen, = scene.objects
+    assert kitchen.face_material is not None
+    got = np.bincount(kitchen.face_material, minlength=len(kitchen.materials))
+    wanted = {name: sum(int(row[2]) for row in rows if row[3] == name) for name in names}
+    lost = {material.name: wanted[material.name] - count for material, count in zip(kitchen.materials, got, strict=True)}
+    assert sum(lost.values()) == kitchen.mesh.dropped and min(lost.values()) >= 0
+
+
+# --- the schema -------------------------------------------------------------------------------------------------------
+
+
+def test_schema_describes_every_field() -> None:
+    document = schema()
+    json.dumps(document)
+    tables: dict[str, Any] = {"": document, **document["$defs"]}
+    assert len(tables) > 20
+    for name, table in tables.items():
+        assert table["additionalProperties"] is False and table["description"], name
+        for field, described in table["properties"].items():
+            assert described.get("description") or "const" in described, f"{name}.{field}"
+
+
+def test_defaults_and_choices_are_those_of_the_scene() -> None:
+    from wrt import scene, scene_schema
+    from wrt.material_schema import MaterialTable
+
+    for table, made in ((MaterialTable(), scene.Material()), (scene_schema.SettingsTable(), scene.Settings())):
+        for name in type(table).model_fields:
+            if name != "metal":
+                value = getattr(table, name)
+                assert (tuple(value) if isinstance(value, list) else value) == getattr(made, name), name
+    definitions = schema()["$defs"]
+    material, settings = definitions["MaterialTable"]["properties"], definitions["SettingsTable"]["properties"]
+    assert tuple(material["kind"]["enum"]) == scene.MATERIAL_KINDS
+    assert tuple(material["alpha_mode"]["enum"]) == scene.ALPHA_MODES
+    assert set(material["metal"]["anyOf"][0]["enum"]) == set(scene.CONDUCTORS)
+    assert tuple(settings["filter"]["enum"]) == scene.FILTERS
+    assert tuple(settings["tonemap"]["enum"]) == scene.TONEMAPS

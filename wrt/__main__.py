@@ -1,0 +1,5 @@
+"""`python -m wrt`: the command line."""
+
+from wrt.cli import main
+
+main()

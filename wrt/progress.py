@@ -1,0 +1,60 @@
+"""How a render tells of itself on a terminal: a bar where there is one, a line now and then where there is none."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from wrt.render import Progress
+
+LINE_EVERY = 10.0  # seconds between lines where stderr is no terminal
+
+
+def describe(progress: Progress) -> str:
+    """Rays a second, and the time left."""
+    left = progress.seconds_left
+    time_left = f"{int(left // 60)}:{int(left % 60):02d} left" if left < 1e6 else "?"
+    return f"{progress.rays_per_second / 1e6:.1f} Mray/s, {time_left}"
+
+
+@contextmanager
+def progress_reporter(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
+    """A callback for `wrt.render(progress=...)` that writes to stderr; None where quiet."""
+    if quiet:
+        yield None
+    elif sys.stderr.isatty():
+        with _bar() as report:
+            yield report
+    else:
+        yield _lines()
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[Progress], None]]:
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn
+    from rich.progress import Progress as RichProgress
+
+    columns = (TextColumn("render"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
+    with RichProgress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("render", total=None, note="")
+
+        def report(progress: Progress) -> None:
+            bar.update(task, completed=progress.done, total=progress.total, note=describe(progress))
+
+        yield report
+
+
+def _lines() -> Callable[[Progress], None]:
+    due = LINE_EVERY
+
+    def report(progress: Progress) -> None:
+        nonlocal due
+        if progress.seconds >= due:
+            due = progress.seconds + LINE_EVERY
+            print(f"{100.0 * progress.done / progress.total:.0f} %, {describe(progress)}", file=sys.stderr, flush=True)
+
+    return report

@@ -1,0 +1,130 @@
+"""The tables of a TOML scene file checked against the schema, and everything that is wrong told in lines for a
+person."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from wrt.errors import InputError
+
+if TYPE_CHECKING:
+    from wrt.scene_schema import SceneTable
+
+# What was expected, by pydantic's type of error; {} is filled from the error's context.
+_EXPECTED = {
+    "float_type": "a number", "int_type": "a whole number", "string_type": "text", "bool_type": "true or false",
+    "list_type": "an array", "dict_type": "a table", "model_type": "a table", "model_attributes_type": "a table",
+    "finite_number": "a finite number", "greater_than": "a number > {gt}", "greater_than_equal": "a number >= {ge}",
+    "less_than": "a number < {lt}", "less_than_equal": "a number <= {le}",
+    "too_short": "at least {min_length} values", "too_long": "at most {max_length} values",
+}
+
+
+def check(data: dict[str, Any], path: Path) -> SceneTable:
+    """The file's tables as models. Raises one InputError that lists everything that is wrong."""
+    from pydantic import ValidationError
+
+    from wrt.scene_schema import SceneTable
+
+    known_keys: dict[int, list[str]] = {}
+    try:
+        return SceneTable.model_validate(data, context=known_keys)
+    except ValidationError as error:
+        problems = [_line(each, data, known_keys) for each in error.errors(include_url=False)]
+    if not data.get("include"):
+        materials = data.get("materials")
+        problems += unknown_materials(data, materials if isinstance(materials, dict) else {})
+    raise_all(problems, path)
+    raise AssertionError("unreachable: there is at least one problem")
+
+
+def raise_all(problems: Sequence[str], path: Path) -> None:
+    """Raise one InputError with all problems, each a line; nothing where there are none."""
+    problems = list(dict.fromkeys(problems))
+    if len(problems) == 1:
+        raise InputError(problems[0], path)
+    if problems:
+        raise InputError("\n  ".join([f"{len(problems)} errors", *problems]), path)
+
+
+def unknown_materials(data: dict[str, Any], known: Iterable[str]) -> list[str]:
+    """A line for each reference to a material that is not known; values of the wrong type are left to the schema."""
+    names = list(known)
+    found: list[tuple[str, Any]] = []
+    for kind in ("spheres", "quads", "boxes", "meshes"):
+        for i, table in enumerate(_tables(data.get(kind))):
+            at = f"{kind}[{i}]"
+            found.append((f"{at}.material", table.get("material")))
+            groups = table.get("materials")
+            if isinstance(groups, dict):
+                found += [(f"{at}.materials.{group}", name) for group, name in groups.items()]
+            found += [(f"{at}.parts[{j}].material", part.get("material"))
+                      for j, part in enumerate(_tables(table.get("parts")))]
+    return [f"{place}: {unknown(name, 'material', names)}" for place, name in found
+            if isinstance(name, str) and name not in names]
+
+
+def _tables(value: Any) -> list[dict[str, Any]]:
+    return [table if isinstance(table, dict) else {} for table in value] if isinstance(value, list) else []
+
+
+def unknown(name: str, what: str, known: Iterable[str]) -> str:
+    """A sentence on a name that is not known, with the nearest one that is, and all of them."""
+    names = [str(each) for each in known]
+    near = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return f"unknown {what} {name!r}; {hint}known are {', '.join(map(repr, names))}" if names else (
+        f"unknown {what} {name!r}; there are none")
+
+
+def _line(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> str:
+    kind, context = error["type"], error.get("ctx", {})
+    place, parent = _place(error["loc"], data, kind == "missing")
+    if kind == "extra_forbidden":
+        return f"{place}: {unknown(str(error['loc'][-1]), 'key', known_keys.get(id(parent), []))}"
+    if kind == "missing":
+        return f"{place}: is missing"
+    if kind == "value_error":
+        return f"{place or 'file'}: {context['error']}"
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        tag = context["discriminator"].strip("'")
+        if kind == "union_tag_not_found":
+            return f"{place}.{tag}: is missing"
+        choices = [name.strip("'") for name in context["expected_tags"].split(", ")]
+        return f"{place}.{tag}: {unknown(str(context['tag']), tag, choices)}"
+    if kind == "literal_error":
+        choices = re.findall("'([^']*)'", context["expected"])
+        return f"{place}: {unknown(str(error['input']), 'value', choices)}"
+    expected = _EXPECTED[kind].format(**context) if kind in _EXPECTED else error["msg"]
+    return f"{place}: got {_shown(error['input'])}, expected {expected}"
+
+
+def _shown(value: Any) -> str:
+    text = {True: "true", False: "false"}[value] if isinstance(value, bool) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _place(location: Sequence[str | int], data: Any, missing: bool) -> tuple[str, Any]:
+    """The path in the file, and the table the last key is in.
+
+    pydantic's location also names the members of unions, which are nowhere in the file: what leads to nothing is left
+    out, but for the last part where a key is missing.
+    """
+    place, parent = "", data
+    for i, part in enumerate(location):
+        if isinstance(part, str) and isinstance(data, dict) and (part in data or (missing and i == len(location) - 1)):
+            parent, data = data, data.get(part)
+            place += f".{_key(part)}" if place else _key(part)
+        elif isinstance(part, int) and isinstance(data, list) and part < len(data):
+            parent, data = data, data[part]
+            place += f"[{part}]"
+    return place, parent
+
+
+def _key(name: str) -> str:
+    """A key as TOML writes it."""
+    return name if name and name.replace("_", "").replace("-", "").isalnum() and name.isascii() else f'"{name}"'

@@ -1,0 +1,93 @@
+"""Scene files: TOML, glTF, or a bare mesh, each as a `Scene`."""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from wrt.errors import InputError, SceneWarning
+from wrt.mesh import READERS, load_mesh
+from wrt.scene import Material, Object, Scene
+from wrt.staging import stage
+
+
+def load_scene(path: str | os.PathLike[str]) -> Scene:
+    """Read a scene: TOML (.toml), glTF 2.0 (.gltf, .glb), or one mesh in light grey (.obj, .ply, .stl).
+
+    A scene without a camera gets one that frames it, one without any light gets lights; each such addition is named
+    in a SceneWarning. Raises InputError that names the file and the place; for TOML it lists all that is wrong at
+    once, each with its path in the file, its value and what was expected.
+    """
+    path = Path(path)
+    known = ", ".join(LOADERS)
+    if not path.exists():
+        raise InputError(f"no such file (a scene is one of {known})", path)
+    if path.is_dir():
+        raise InputError(f"is a directory, not a scene file ({known})", path)
+    if path.suffix.lower() not in LOADERS:
+        raise InputError(f"is no scene file: known are {known}", path)
+    return LOADERS[path.suffix.lower()](path)
+
+
+def schema() -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of TOML scene files."""
+    from wrt.scene_schema import SceneTable
+
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, **SceneTable.model_json_schema(), "title": "wrt scene"}
+
+
+def _load_toml(path: Path) -> Scene:
+    from wrt.scene_builder import build
+    from wrt.scene_check import check
+
+    data = _parse(path)
+    return _staged(build(check(data, path), path), path)
+
+
+def _load_gltf(path: Path) -> Scene:
+    from wrt.gltf import load_gltf
+
+    return load_gltf(path)
+
+
+def _load_bare_mesh(path: Path) -> Scene:
+    grey = Material(name="light grey", albedo=(0.75, 0.75, 0.75))
+    return _staged(Scene(objects=(Object(load_mesh(path), (grey,), name=path.stem),), name=path.stem), path)
+
+
+LOADERS: dict[str, Callable[[Path], Scene]] = {
+    ".toml": _load_toml, ".gltf": _load_gltf, ".glb": _load_gltf, **dict.fromkeys(READERS, _load_bare_mesh),
+}
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"byte {error.start} is not UTF-8 text", path) from error
+    except RecursionError:
+        raise InputError("is nested too deeply", path) from None
+    except tomllib.TOMLDecodeError as error:
+        message, place = str(error), None
+        if at := re.fullmatch(r"(.*) \(at (line \d+, column \d+|end of document)\)", message, re.DOTALL):
+            message, place = at.groups()
+        raise InputError(message, path, place) from error
+
+
+def _staged(scene: Scene, path: Path) -> Scene:
+    """The scene with a camera and light where it lacks them."""
+    try:
+        scene, added = stage(scene)
+    except InputError as error:
+        raise InputError(str(error), path) from error
+    if added:
+        warnings.warn(f"{path}: {'; '.join(added)}", SceneWarning, stacklevel=4)
+    return scene
