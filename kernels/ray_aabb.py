@@ -10,9 +10,13 @@ import warp as wp
 from wrt.kernels.structs import Ray
 
 # The far distance carries at most 3 rounding errors, and so does the near one of another axis: the interval is widened by
-# twice that (Ize 2013, "Robust BVH Ray Traversal", section 3). The two more on each side cover the rounding of the
-# vertices' sheared coordinates in the triangle unit, so that a hit which that unit accepts is never outside its box.
-FAR_PAD = wp.constant(1.0 + 2.0 * (5.0 * 2.0**-24) / (1.0 - 5.0 * 2.0**-24))
+# twice that (Ize 2013, "Robust BVH Ray Traversal", section 3). The four more on each side cover what the triangle unit's
+# rounding of sheared vertices adds in proportion to the distance; `padded` covers the rest.
+FAR_PAD = wp.constant(1.0 + 2.0 * (7.0 * 2.0**-24) / (1.0 - 7.0 * 2.0**-24))
+
+# Powers of two, so that the host computes the same box to the last bit (wrt.accel.base.Geometry.bounds).
+PAD_EXTENT = 2.0**-21
+PAD_COORDINATE = 2.0**-22
 
 
 @wp.struct
@@ -32,6 +36,29 @@ def box_ray(ray: Ray) -> BoxRay:
     out.inv_dir = wp.vec3(1.0 / ray.direction[0], 1.0 / ray.direction[1], 1.0 / ray.direction[2])
     out.t_min = ray.t_min
     return out
+
+
+@wp.func
+def box_pad(lo: wp.vec3, hi: wp.vec3) -> float:
+    """How far a primitive's box must stand off so that no hit that its unit accepts is outside.
+
+    The triangle unit's signed areas are those of a triangle whose vertices, seen along the ray, are off by up to 3 u of the
+    hit's distance (FAR_PAD covers it) and 5 u of the triangle's own extent, which may be far longer than the ray: a ray that
+    starts just above a floor 1000 wide. Without it, a ray through the edge of two triangles is given to the one whose box it
+    misses, and is lost. 8 u here, and 4 u of the coordinates in `padded` for the rounding of lo and hi themselves.
+    """
+    e = hi - lo
+    return wp.static(PAD_EXTENT) * wp.max(wp.max(e[0], e[1]), e[2])
+
+
+@wp.func
+def padded_lo(lo: wp.vec3, pad: float) -> wp.vec3:
+    return lo - (wp.vec3(pad, pad, pad) + wp.static(PAD_COORDINATE) * wp.abs(lo))
+
+
+@wp.func
+def padded_hi(hi: wp.vec3, pad: float) -> wp.vec3:
+    return hi + (wp.vec3(pad, pad, pad) + wp.static(PAD_COORDINATE) * wp.abs(hi))
 
 
 @wp.func

@@ -7,8 +7,8 @@ edge compute the same area with opposite sign, so that no ray passes between the
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import FAR_PAD, BoxRay, slab_interval
-from wrt.kernels.structs import Hit, NO_HIT, Ray
+from wrt.kernels.ray_aabb import FAR_PAD, BoxRay, box_pad, padded_hi, padded_lo, slab_interval
+from wrt.kernels.structs import NO_HIT, Hit, Ray
 
 
 @wp.struct
@@ -91,15 +91,18 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
 
 @wp.func
 def within_bounds(ray: BoxRay, t: float, lo: wp.vec3, hi: wp.vec3) -> float:
-    """t moved into the interval of the primitive's own box, or inf where the ray passes by that box.
+    """t moved into the interval of the primitive's own box, or inf where the ray passes by even the padded box.
 
     Rounding can put t before the place where the ray enters the box around the triangle. A traversal that visits boxes front
     to back would then drop some nodes or not, depending on the order. With t inside the box's own interval, and boxes
-    monotone (a node's contains its triangles'), every structure finds the same hits to the last bit.
+    monotone (a node's contains its triangles' padded ones), every structure finds the same hits to the last bit.
     """
     interval = slab_interval(ray, lo, hi)
-    if not interval[0] <= interval[1] * FAR_PAD:
-        return float(wp.inf)
+    if not interval[0] <= interval[1]:
+        pad = box_pad(lo, hi)
+        interval = slab_interval(ray, padded_lo(lo, pad), padded_hi(hi, pad))
+        if not interval[0] <= interval[1] * FAR_PAD:
+            return float(wp.inf)
     inside = wp.where(t > interval[1], interval[1], t)
     return wp.where(inside < interval[0], interval[0], inside)
 

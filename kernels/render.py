@@ -87,8 +87,8 @@ def make_render_kernel(features, accelerator):
 def make_aov_kernel(features, accelerator):
     """What the ray through each pixel's centre (and the lens' centre) meets first."""
     accel_struct = accelerator.struct
-    closest_hit, any_hit = make_traversals(features, accelerator)
-    surface_at, resolve, shading_normal = make_shade(features, accel_struct, closest_hit)
+    closest_hit, _ = make_traversals(features, accelerator)
+    surface_at, resolve, shading_normal = make_shade(features)
 
     @kernel
     def aovs(accel: accel_struct, surfaces: Surfaces, camera: Camera, film: AovFilm, tile: Tile, width: int, height: int):

@@ -8,11 +8,11 @@ cut at max_depth bounces or below min_throughput, and counted.
 import warp as wp
 
 from wrt.kernels.lights import (
+    light_xi,
     make_background,
     make_light_sample,
     make_reflected_light,
     make_sky_sample,
-    light_xi,
     shadow_ray,
 )
 from wrt.kernels.materials import BLEND, Scatter, make_bump, make_resolve, make_scatter
@@ -77,7 +77,7 @@ class Shadow:
     rays: int
 
 
-def make_shade(features, accel_struct, closest_hit):
+def make_shade(features):
     """Surface and material at a hit, and the scattering there: shared by the integrator, shadow rays and AOVs."""
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
     uvs = features.textures or features.checkerboards
@@ -102,7 +102,7 @@ def make_shade(features, accel_struct, closest_hit):
 
 def make_transmittance(features, accel_struct, closest_hit, any_hit):
     """Shadow rays: one any-hit query, or where a scene lets light through surfaces, one closest hit after another."""
-    surface_at, resolve, shading_normal = make_shade(features, accel_struct, closest_hit)
+    surface_at, resolve, shading_normal = make_shade(features)
     scatter = make_scatter(features)
 
     @wp.func
@@ -203,7 +203,7 @@ def make_direct_light(features, accel_struct, closest_hit, any_hit):
 
 def make_radiance(features, accel_struct, closest_hit, any_hit):
     """The whole tree of rays behind one camera ray. `features`: wrt.features.Features."""
-    surface_at, resolve, shading_normal = make_shade(features, accel_struct, closest_hit)
+    surface_at, resolve, shading_normal = make_shade(features)
     background_radiance = make_background(features)
     scatter_at = make_scatter(features)
     direct_light = make_direct_light(features, accel_struct, closest_hit, any_hit)

@@ -21,7 +21,7 @@ _PUBLIC = {
     "InputError": "wrt.errors",
     "SceneWarning": "wrt.errors",
     "load_scene": "wrt.scene_file",
-    "render": "wrt.render",
+    "render": "wrt.driver",
     "Film": "wrt.film",
     "Camera": "wrt.scene",
     "Checkerboard": "wrt.scene",
@@ -43,8 +43,6 @@ __all__ = ["__version__", *_PUBLIC]
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
-        # The module `wrt.render` and the function `wrt.render.render` share a name: the function is the public one, and
-        # importing the module would otherwise leave the module in its place.
         value = getattr(importlib.import_module(_PUBLIC[name]), name)
         globals()[name] = value
         return value

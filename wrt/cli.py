@@ -108,7 +108,7 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
     clock = {"import": time.perf_counter() - begin}
     loaded = _load(scene, quiet, clock)
     begin = time.perf_counter()
-    from wrt.render import render as render_scene
+    from wrt.driver import render as render_scene
 
     clock["import"] += time.perf_counter() - begin
     bits, aov = options.pop("bits"), options.pop("aov")

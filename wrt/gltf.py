@@ -30,6 +30,7 @@ from wrt.staging import stage
 # Attributes that are read, or named by who wants them (skins, textures), or are the application's own (underscore).
 # Tangents follow from the texture coordinates.
 _NAMED_ELSEWHERE = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_", "JOINTS_", "WEIGHTS_", "_")
+MAX_REACH = 1e18
 # What a node's instances may set, and what holds where they do not.
 _INSTANCE_ATTRIBUTES: dict[str, tuple[str, tuple[float, ...]]] = {
     "TRANSLATION": ("VEC3", (0.0, 0.0, 0.0)),
@@ -138,6 +139,7 @@ def compose(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) ->
 
     The rotations are quaternions x, y, z, w of any length but 0.
     """
+    rotation = rotation / np.abs(rotation).max(axis=1, keepdims=True)  # the square of the length must not vanish
     x, y, z, w = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
     columns = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w)],
@@ -263,6 +265,15 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return np.divide(vectors, length, out=np.zeros(vectors.shape), where=length > 0.0).astype(np.float32)
 
 
+def _require_reach(mesh: Mesh, transforms: np.ndarray) -> None:
+    """Raise InputError where a transform takes the mesh so far out that single precision cannot square the distance."""
+    size = float(np.abs(mesh.vertices).max())
+    with np.errstate(over="ignore", invalid="ignore"):
+        reach = (np.abs(transforms[:, :3, :3]).sum(axis=2) * size + np.abs(transforms[:, :3, 3])).max(initial=0.0)
+    if not reach <= MAX_REACH:
+        raise InputError(f"the mesh reaches {reach:.3g} units from the origin; at most {MAX_REACH:g} can be traced")
+
+
 # --- lights -----------------------------------------------------------------------------------------------------------
 
 
@@ -331,6 +342,7 @@ class _Reader:
             if mesh is not None:
                 material = self._materials.material(primitive.material, f"{where}.material")
                 with at(place):
+                    _require_reach(mesh, transforms)
                     self.objects += [Object(mesh, (material,), transform, name=name) for transform in transforms]
 
     def _placements(self, node: Any, world: np.ndarray, name: str, place: str) -> np.ndarray:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from wrt.render import Progress
+    from wrt.driver import Progress
 
 LINE_EVERY = 10.0  # seconds between lines where stderr is no terminal
 

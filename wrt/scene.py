@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -372,7 +372,7 @@ class Camera:
     camera_to_world: (4, 4), rotation and translation; it looks along its own -z, +y is up. fov_y: full vertical angle of
     view (radians). focus_distance: along the axis, from the lens to the plane that is sharp. blades: 0 for a round
     aperture, else the number of its straight sides (3 or more), turned by `blade_rotation` radians.
-    `from_lens` makes one from a focal length, an f-number and a sensor height.
+    `lens` gives fov_y, aperture_radius and focus_distance for a focal length, an f-number and a sensor height.
     """
 
     camera_to_world: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -411,7 +411,7 @@ class Camera:
             raise InputError("camera: position and target are the same point")
         z /= np.linalg.norm(z)
         x = np.cross(upward, z)
-        if np.linalg.norm(x) < 1e-9 * max(np.linalg.norm(upward), 1e-300):
+        if np.linalg.norm(x) < 1e-9 * max(float(np.linalg.norm(upward)), 1e-300):
             raise InputError("camera: up is parallel to the direction of view")
         x /= np.linalg.norm(x)
         matrix = np.eye(4)
@@ -433,10 +433,10 @@ class Camera:
             raise InputError(f"focus_distance ({s:g}) must be longer than focal_length ({f:g})")
         if (f_number is None) == (aperture_radius is None):
             raise InputError("give either f_number or aperture_radius")
-        radius = f / (2.0 * as_number(f_number, "f_number", low=1e-3)) if f_number is not None else aperture_radius
+        radius = aperture_radius if f_number is None else f / (2.0 * as_number(f_number, "f_number", low=1e-3))
         image_distance = f * s / (s - f)
-        return {"fov_y": 2.0 * math.atan(0.5 * h / image_distance), "aperture_radius": as_number(radius, "aperture_radius"),
-                "focus_distance": s}
+        return {"fov_y": 2.0 * math.atan(0.5 * h / image_distance), "focus_distance": s,
+                "aperture_radius": as_number(radius, "aperture_radius", low=0.0)}
 
 
 # --- scene ------------------------------------------------------------------------------------------------------------

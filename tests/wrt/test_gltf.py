@@ -153,8 +153,23 @@ def test_a_product_that_overflows(tmp_path):
     file = one_triangle()
     file.json["nodes"][0]["scale"] = [1e200] * 3
     file.node(children=[0], scale=[1e200] * 3)
-    with pytest.raises(InputError, match=r"nodes\[0\]: .*finite"):
+    with pytest.raises(InputError, match=r"nodes\[0\]: the mesh reaches (inf|nan) units"):
         load(file, tmp_path)
+
+
+@pytest.mark.parametrize("fields", [{"scale": [1e19, 1, 1]}, {"translation": [0, -2e18, 0]}])
+def test_a_mesh_out_of_reach(tmp_path, fields):
+    file = one_triangle()
+    file.json["nodes"][0].update(fields)
+    with pytest.raises(InputError, match=r"nodes\[0\]: the mesh reaches .* units from the origin; at most 1e\+18"):
+        load(file, tmp_path)
+
+
+def test_a_rotation_may_have_any_length(tmp_path):
+    for length in (1e-200, 1e-30, 1.0, 1e200):
+        file = one_triangle()
+        file.json["nodes"][0]["rotation"] = [0, 0, length, length]
+        assert load(file, tmp_path).objects[0].transform @ [1, 0, 0, 1] == pytest.approx([0, 1, 0, 1])
 
 
 def test_a_mesh_scaled_to_nothing_is_named(tmp_path):

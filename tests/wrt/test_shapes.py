@@ -98,7 +98,8 @@ def test_box_has_a_picture_on_each_side() -> None:
 @pytest.mark.parametrize("make", [
     lambda: shapes.quad((0, 0, 0), (1, 0, 0), (2, 0, 0)), lambda: shapes.box((0, 0, 0), (1, 0, 1)),
     lambda: shapes.icosphere(10), lambda: shapes.icosphere(-1), lambda: shapes.torus(1.0, 2.0),
-    lambda: shapes.torus(0.0), lambda: shapes.torus(segments=2), lambda: shapes.lathe([(1, 0)]), lambda: shapes.lathe([(-1, 0), (1, 1)]),
+    lambda: shapes.torus(0.0), lambda: shapes.torus(segments=2), lambda: shapes.lathe([(1, 0)]),
+    lambda: shapes.lathe([(-1, 0), (1, 1)]),
     lambda: shapes.lathe([(1, 0), (1, 0)]), lambda: shapes.lathe([(1, 0), (np.nan, 1)]), lambda: shapes.prism(2),
     lambda: shapes.prism(3, 0.0), lambda: shapes.tube([(0, 0, 0)]), lambda: shapes.tube([(0, 0, 0), (0, 0, 0)]),
     lambda: shapes.tube([(0, 0, 0), (0, 0, 1)], 0.0), lambda: shapes.tube([(0, 0, 0), (0, 0, 1)], [1, 2, 3]),

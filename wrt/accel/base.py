@@ -15,6 +15,7 @@ import warp as wp
 from wrt.device import load_kernel, records, run_all, start, thread_count, upload
 from wrt.errors import InputError
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
+from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT
 from wrt.kernels.structs import Primitive, Surfaces
 from wrt.mesh import Mesh
 
@@ -40,7 +41,10 @@ class Geometry:
         return len(self.faces) + len(self.spheres)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of every primitive, two (N, 3) float32; the device takes a sphere's the same way."""
+        """Lowest and highest corner of every primitive's padded box, two (N, 3) float32.
+
+        To the last bit what the units take (kernels.ray_triangle.within_bounds): a hit is never outside its box.
+        """
         lo = np.empty((len(self), 3), np.float32)
         hi = np.empty((len(self), 3), np.float32)
         n = len(self.faces)
@@ -49,7 +53,9 @@ class Geometry:
         hi[:n] = np.maximum(np.maximum(corners[0], corners[1]), corners[2])
         lo[n:] = self.spheres[:, :3] - self.spheres[:, 3:]
         hi[n:] = self.spheres[:, :3] + self.spheres[:, 3:]
-        return lo, hi
+        extent = hi - lo
+        pad = np.float32(PAD_EXTENT) * extent.max(axis=1, keepdims=True, initial=0.0)
+        return lo - (pad + np.float32(PAD_COORDINATE) * np.abs(lo)), hi + (pad + np.float32(PAD_COORDINATE) * np.abs(hi))
 
     def primitives(self, order: np.ndarray | None = None) -> np.ndarray:
         """Device records (kernels.structs.Primitive) in the given order of prim_id, or in their own."""

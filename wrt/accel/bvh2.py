@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ class Bvh2(Accelerator):
     kernels = kernels
     struct = kernels.Bvh2
 
-    def _build(self, begin: float, max_leaf: int = 4, cost_traversal: float = 1.0,
+    def _build(self, begin: float, max_leaf: int = 4, cost_traversal: float = 1.0,  # type: ignore[override]
                cost_intersection: float = 1.0) -> tuple[Any, AccelStats]:
         if not 1 <= max_leaf <= 64:
             raise InputError(f"max_leaf must be 1 to 64, got {max_leaf}")
@@ -78,7 +79,7 @@ def build_nodes(bounds: tuple[np.ndarray, np.ndarray], options: Any, threads: in
         tasks = tasks[np.argsort(tasks["begin"] - tasks["end"], kind="stable")].copy()
         depth = wp.zeros(len(tasks), dtype=wp.int32, device=cpu)
         device_tasks = upload(tasks, build_bvh2.BuildTask, cpu)
-        run_all([lambda i=i: launch(device_tasks, depth, i, 0) for i in range(len(tasks))], threads)
+        run_all([partial(launch, device_tasks, depth, i, 0) for i in range(len(tasks))], threads)
         max_depth = max(max_depth, int(depth.numpy().max()))
     return squeeze(device_nodes.numpy(), device_used.numpy() != 0), device_records.numpy()["prim_id"].copy(), max_depth + 1
 

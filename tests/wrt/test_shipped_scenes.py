@@ -1,0 +1,73 @@
+"""The scenes that ship: each loads and renders, and together they need every feature there is."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+
+import wrt
+from tests.data import ROOT
+from wrt.accel import ACCELERATORS
+from wrt.device import start
+from wrt.features import Features, features_of
+from wrt.driver import aov_kernel, render_kernel
+from wrt.scene import Scene
+
+SCENES = sorted((ROOT / "scenes").glob("*.toml"))
+
+
+@cache
+def load(path: Path) -> Scene:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # what ships loads without a word
+        return wrt.load_scene(path)
+
+
+def features(path: Path) -> set[Features]:
+    scene = load(path)
+    return {features_of(scene, camera) for camera in scene.cameras}
+
+
+@pytest.mark.parametrize("name", Features().switches())
+def test_every_feature_has_a_scene_that_needs_it(name: str) -> None:
+    assert any(getattr(f, name) for path in SCENES for f in features(path)), f"no scene in scenes/ needs {name}"
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_a_scene_says_what_it_is_for(path: Path) -> None:
+    assert path.read_text().startswith("# ")
+    assert load(path).settings.size == (640, 360)
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_a_scene_renders(path: Path) -> None:
+    film = wrt.render(load(path), spp=2, size=(64, 36))
+    assert film.stats["not_finite"] == 0
+    assert np.isfinite(film.pixels).all() and (film.pixels >= 0.0).all()
+    assert film.pixels.max() > 0.0
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_kernels_compile_for_turing_and_hopper(path: Path, tmp_path: Path) -> None:
+    start("cpu")
+    for variant in features(path):
+        binaries = wp.compile_aot_module(render_kernel(variant, ACCELERATORS["bvh"]).module, arch=[75, 90], module_dir=tmp_path)
+        assert [Path(binary).stat().st_size > 10_000 for binary in binaries] == [True, True]
+
+
+def test_the_other_kernels_compile_for_turing_and_hopper(tmp_path: Path) -> None:
+    from wrt.accel.base import _any_hit_kernel, _closest_hit_kernel
+
+    start("cpu")
+    variant = Features(spheres=True, textures=True, smooth=True, cutout=True)
+    kernels = [aov_kernel(variant, ACCELERATORS["bvh"])]
+    for name in ("bvh", "brute_force"):
+        kernels += [make(ACCELERATORS[name], True) for make in (_closest_hit_kernel, _any_hit_kernel)]
+    for kernel in kernels:
+        binaries = wp.compile_aot_module(kernel.module, arch=[75, 90], module_dir=tmp_path)
+        assert len(binaries) == 2
