@@ -28,7 +28,7 @@ def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
         return hit
     distance = wp.length(f)
     c = (distance - radius) * (distance + radius)
-    root = wp.sqrt(a * discriminant)
+    root = wp.sqrt(a) * wp.sqrt(discriminant)  # of the product, the root would overflow far sooner
     q = half_b + wp.where(half_b < 0.0, -root, root)
     if q == 0.0:
         return hit  # the origin is on the sphere and the line touches it there

@@ -49,8 +49,10 @@ def triangle_ray(ray: Ray) -> TriangleRay:
 def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> Hit:
     """Both sides count. The hit lies on the whole line: t may be negative. prim_id is 0 on a hit, else NO_HIT.
 
-    Products of two float32 are monotone, so an area's sign can only be wrong where it is 0; there it is taken again in
-    float64, where the products are exact. A triangle seen exactly edge-on (area 0) is missed. NaN coordinates miss.
+    Products of two float32 are monotone, so an area's sign can only be wrong where it is 0, under- or overflows: most
+    triangles are refused in float32. For the others the areas are taken again in float64, where the products are exact: that
+    decides those cases, and seen nearly edge-on, where the areas cancel, it keeps the digits of t, u and v. A triangle seen
+    exactly edge-on (area 0) is missed. NaN coordinates miss.
     """
     hit = Hit()
     hit.prim_id = NO_HIT
@@ -71,20 +73,21 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
     area_0 = c_x * b_y - c_y * b_x
     area_1 = a_x * c_y - a_y * c_x
     area_2 = b_x * a_y - b_y * a_x
-    if area_0 == 0.0 or area_1 == 0.0 or area_2 == 0.0:
-        area_0 = float(wp.float64(c_x) * wp.float64(b_y) - wp.float64(c_y) * wp.float64(b_x))
-        area_1 = float(wp.float64(a_x) * wp.float64(c_y) - wp.float64(a_y) * wp.float64(c_x))
-        area_2 = float(wp.float64(b_x) * wp.float64(a_y) - wp.float64(b_y) * wp.float64(a_x))
     if (area_0 < 0.0 or area_1 < 0.0 or area_2 < 0.0) and (area_0 > 0.0 or area_1 > 0.0 or area_2 > 0.0):
         return hit
 
-    area = area_0 + area_1 + area_2
-    if area == 0.0 or not wp.isfinite(area):
+    w_0 = wp.float64(c_x) * wp.float64(b_y) - wp.float64(c_y) * wp.float64(b_x)
+    w_1 = wp.float64(a_x) * wp.float64(c_y) - wp.float64(a_y) * wp.float64(c_x)
+    w_2 = wp.float64(b_x) * wp.float64(a_y) - wp.float64(b_y) * wp.float64(a_x)
+    zero = wp.float64(0.0)
+    if (w_0 < zero or w_1 < zero or w_2 < zero) and (w_0 > zero or w_1 > zero or w_2 > zero):
         return hit
-    inv_area = 1.0 / area
-    hit.t = (area_0 * a_z + area_1 * b_z + area_2 * c_z) * shear.shear_z * inv_area
-    hit.u = area_1 * inv_area
-    hit.v = area_2 * inv_area
+    area = w_0 + w_1 + w_2
+    if not (area < zero or area > zero):
+        return hit
+    hit.t = float((w_0 * wp.float64(a_z) + w_1 * wp.float64(b_z) + w_2 * wp.float64(c_z)) / area * wp.float64(shear.shear_z))
+    hit.u = float(w_1 / area)
+    hit.v = float(w_2 / area)
     hit.prim_id = 0
     return hit
 

@@ -29,9 +29,13 @@ def make_probe(ray: Ray) -> Probe:
 
 @wp.func
 def no_hit(ray: Ray) -> Hit:
-    """The best hit before anything is found: at the segment's end, so that a hit exactly there still counts."""
+    """The best hit before anything is found: at the segment's end, so that a hit exactly there still counts.
+
+    A ray that is not finite has an empty segment: comparisons with NaN would let it into every box, the empty ones too.
+    """
     best = Hit()
-    best.t = ray.t_max
+    s = ray.origin[0] + ray.origin[1] + ray.origin[2] + ray.direction[0] + ray.direction[1] + ray.direction[2]
+    best.t = wp.where(wp.isfinite(s), ray.t_max, float(-wp.inf))
     best.prim_id = NO_HIT
     return best
 

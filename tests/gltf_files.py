@@ -6,10 +6,14 @@ import base64
 import io
 import json
 import struct
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from wrt.errors import SceneWarning
+from wrt.gltf import load_gltf
 
 COMPONENT = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
 KIND = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -51,7 +55,8 @@ class GltfFile:
         return self.add("nodes", fields)
 
     def image(self, pixels: np.ndarray, format: str = "PNG") -> int:
-        return self.add("images", {"bufferView": self.view(encode(pixels, format)), "mimeType": f"image/{format.lower()}"})
+        view = self.view(encode(pixels, format))
+        return self.add("images", {"bufferView": view, "mimeType": f"image/{format.lower()}"})
 
     def write(self, folder: Path, name: str = "file.glb") -> Path:
         """A .glb, or a .gltf with its buffer as a data: URI."""
@@ -100,3 +105,20 @@ def one_material(material: dict[str, Any]) -> GltfFile:
     quad["attributes"]["TEXCOORD_0"] = file.accessor([[0, 1], [1, 1], [1, 0], [0, 0]])
     file.node(mesh=file.mesh(quad))
     return file
+
+
+def with_light(light: Any, **node: Any) -> GltfFile:
+    """A triangle, and a node with that punctual light; keywords go into the light's node."""
+    file = one_triangle()
+    file.json["extensions"] = {"KHR_lights_punctual": {"lights": [light]}}
+    file.node(extensions={"KHR_lights_punctual": {"light": 0}}, **node)
+    return file
+
+
+def load_warned(path: Path, **options: Any) -> tuple[Any, list[str]]:
+    """The scene of a glTF file and the text of each warning, all of which must be SceneWarnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene = load_gltf(path, **options)
+    assert all(w.category is SceneWarning for w in caught)
+    return scene, [str(w.message) for w in caught]

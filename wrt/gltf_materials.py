@@ -29,7 +29,7 @@ from wrt.gltf_schema import (
 )
 from wrt.scene import BLACK, Color, Material, Texture, as_number, as_vector
 
-MAX_SIDE, MAX_PIXELS = 16384, 2**28
+MAX_SIDE = 16384
 # Only these formats are tried: pillow has others, such as EPS, that run programs or have no place in glTF.
 _FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF")
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -126,18 +126,19 @@ class Textures:
 def decode_image(data: bytes) -> np.ndarray:
     """An encoded picture as (H, W, 4) uint8, row 0 on top; colour profiles are ignored, as glTF demands.
 
-    Raises InputError where it cannot be decoded, is truncated, or is larger than MAX_SIDE or MAX_PIXELS.
+    Raises InputError where it cannot be decoded, is truncated, has a side beyond MAX_SIDE, or is one of those that pillow
+    refuses as decompression bombs (above some 179 million pixels).
     """
     from PIL import Image, UnidentifiedImageError
 
     Image.init()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is our own
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # at half of that number
             with Image.open(io.BytesIO(data), formats=[name for name in _FORMATS if name in Image.OPEN]) as picture:
                 width, height = picture.size
-                if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
-                    raise InputError(f"is {width}x{height}; at most {MAX_SIDE} a side, {MAX_PIXELS} in all, are read")
+                if max(width, height) > MAX_SIDE:
+                    raise InputError(f"is {width}x{height}; at most {MAX_SIDE} a side are read")
                 if picture.mode.startswith("I"):  # 16-bit grey: pillow's own conversion clips at 255
                     grey = (np.asarray(picture).astype(np.int64) // 257).clip(0, 255).astype(np.uint8)
                     return np.dstack([grey, grey, grey, np.full_like(grey, 255)])

@@ -13,10 +13,9 @@ FOV_Y = math.radians(40.0)
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # from the scene to the camera: glTF's front is +z, its up +y
 _MARGIN = 1.05  # of the bounding sphere's radius
 
-# In units where a white surface that faces the key light has radiance near 1.
-_KEY_IRRADIANCE = 2.4
+# Together they give a white surface that faces both a radiance near 1: the sky lights surfaces too.
+_KEY_IRRADIANCE = 1.7
 _SKY = GradientBackground(bottom=(0.22, 0.21, 0.20), top=(0.50, 0.60, 0.75))
-_AMBIENT = (0.20, 0.22, 0.25)
 
 
 def bounding_sphere(scene: Scene) -> tuple[np.ndarray, float]:
@@ -59,8 +58,7 @@ def stage(scene: Scene) -> tuple[Scene, list[str]]:
     """The scene with what it lacks to be seen, and a sentence on each thing that was added.
 
     No camera: one that frames the scene. No light: a directional key light from above the first camera's right
-    shoulder, a pale sky as the background, and the ambient term that belongs to it. Raises InputError where a camera is
-    missing and the scene has no shapes.
+    shoulder, and a pale sky as the background. Raises InputError where a camera is missing and the scene has no shapes.
     """
     added = []
     if not scene.cameras:
@@ -70,6 +68,6 @@ def stage(scene: Scene) -> tuple[Scene, list[str]]:
         right, up, back = scene.cameras[0].camera_to_world[:3, :3].T
         direction = -(back + 0.6 * up + 0.4 * right)
         key = DirectionalLight(tuple(direction), (_KEY_IRRADIANCE,) * 3, name="key light")
-        scene = replace(scene, lights=(key,), background=_SKY, ambient=_AMBIENT)
+        scene = replace(scene, lights=(key,), background=_SKY)
         added.append("it has no lights: a key light from above the camera's shoulder and a pale sky were added")
     return scene, added

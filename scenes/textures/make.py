@@ -117,7 +117,7 @@ def sky(name: str, width: int = 256, height: int = 128) -> None:
     turn = ((np.arange(width) + 0.5) / width - 0.5) * 2.0 * np.pi
     polar, azimuth = np.meshgrid(angle, turn, indexing="ij")
     direction = np.stack([np.sin(polar) * np.sin(azimuth), np.cos(polar), -np.sin(polar) * np.cos(azimuth)], axis=-1)
-    up = direction[..., 1:]
+    up = direction[..., 1:2]
     zenith, haze, ground = np.array([0.16, 0.33, 0.85]), np.array([0.95, 0.92, 0.85]), np.array([0.20, 0.16, 0.12])
     pixels = haze + (zenith - haze) * np.clip(up, 0.0, 1.0) ** 0.45
     pixels = np.where(up < 0.0, ground + (haze - ground) * np.exp(18.0 * np.minimum(up, 0.0)), pixels)

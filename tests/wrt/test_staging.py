@@ -36,7 +36,8 @@ def world_points(scene: Scene) -> np.ndarray:
     thing, sphere = scene.objects[0], scene.spheres[0]
     points = np.c_[thing.mesh.vertices, np.ones(30)] @ thing.transform.T
     direction = np.random.default_rng(0).normal(size=(200, 3))
-    return np.vstack([points[:, :3], sphere.center + sphere.radius * direction / np.linalg.norm(direction, axis=1)[:, None]])
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    return np.vstack([points[:, :3], sphere.center + sphere.radius * direction])
 
 
 @pytest.mark.parametrize("aspect", [16 / 9, 1.0, 0.5])
@@ -82,7 +83,8 @@ def test_what_is_missing_is_added_and_said():
 
 
 @pytest.mark.parametrize("material, lit", [
-    (Material(emission=(1, 1, 1)), True), (Material(emission=(1, 1, 1), emits_light=False), False), (Material(), False)])
+    (Material(emission=(1, 1, 1)), True), (Material(emission=(1, 1, 1), emits_light=False), False),
+    (Material(), False)])
 def test_emissive_surfaces_count_as_light_where_they_light_others(material, lit):
     scene = Scene(spheres=(Sphere((0, 0, 0), 1.0, material),))
     assert is_lit(scene) is lit

@@ -62,8 +62,8 @@ def build_nodes(bounds: tuple[np.ndarray, np.ndarray], options: Any, threads: in
         upload(array, dtype, cpu) for array, dtype in
         ((build, build_bvh2.BuildRecord), (nodes, kernels.Bvh2Node), (used, wp.uint8)))
     stop_size = max(n // 64, 4096) if threads > 1 else 0
-    left_over = upload(records(build_bvh2.BuildTask, max(4 * n // max(stop_size, 1), 256) if stop_size else 1),
-                       build_bvh2.BuildTask, cpu)
+    # Ranges of two or more records that do not overlap: there can be no more of them than this.
+    left_over = upload(records(build_bvh2.BuildTask, n // 2 if stop_size else 1), build_bvh2.BuildTask, cpu)
     count = wp.zeros(1, dtype=wp.int32, device=cpu)
 
     def launch(tasks: Any, depth: Any, task: int, stop: int) -> None:

@@ -1,0 +1,62 @@
+"""Small launches on the CPU device, for tests that run device functions by themselves."""
+
+import numpy as np
+
+from wrt.device import start  # isort: skip (before warp: it silences Warp's banner)
+import warp as wp
+
+CPU = start("cpu")
+
+
+def vec3s(rows) -> wp.array:
+    """Rows of three numbers as a Warp array of vec3; one row or number is taken for all by `launch`'s caller."""
+    return wp.array(np.ascontiguousarray(rows, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device=CPU)
+
+
+def vec2s(rows) -> wp.array:
+    return wp.array(np.ascontiguousarray(rows, dtype=np.float32).reshape(-1, 2), dtype=wp.vec2, device=CPU)
+
+
+def floats(values) -> wp.array:
+    return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=wp.float32, device=CPU)
+
+
+def ints(values) -> wp.array:
+    return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=CPU)
+
+
+def uints(values) -> wp.array:
+    return wp.array(np.ascontiguousarray(values, dtype=np.uint32), dtype=wp.uint32, device=CPU)
+
+
+def zeros(n: int, dtype=wp.float32) -> wp.array:
+    return wp.zeros(n, dtype=dtype, device=CPU)
+
+
+def launch(kernel, n: int, *arguments) -> None:
+    """Run `kernel` over n threads; its last arguments are usually the arrays that it fills."""
+    wp.launch(kernel, dim=n, inputs=list(arguments), device=CPU)
+
+
+def unit(rows: np.ndarray) -> np.ndarray:
+    """Rows scaled to unit length, in float64."""
+    rows = np.asarray(rows, dtype=np.float64)
+    return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
+
+
+def rounded(rows: np.ndarray) -> np.ndarray:
+    """The float32 values that a device sees, back in float64: an oracle must start from the same numbers."""
+    return np.asarray(rows, dtype=np.float32).astype(np.float64)
+
+
+def directions(rng: np.random.Generator, n: int) -> np.ndarray:
+    """n unit vectors, uniform over the sphere, as float32 values in float64."""
+    return rounded(unit(rng.normal(size=(n, 3))))
+
+
+def sobol_like(n: int, rng: np.random.Generator) -> np.ndarray:
+    """n points of the unit square, evenly spread (a rotated rank-1 lattice): for integrals with little noise."""
+    i = np.arange(n)
+    golden = (np.sqrt(5.0) - 1.0) / 2.0
+    points = np.stack([(i + 0.5) / n, np.mod(i * golden, 1.0)], axis=1)
+    return np.minimum(np.mod(points + rng.random(2), 1.0), 1.0 - 2.0**-24)

@@ -1,0 +1,69 @@
+"""Every structure gives the same answer as brute force, to the last bit, on real meshes."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import wrt
+from tests.data import data_path
+from wrt.accel import ACCELERATORS, Hits, build
+
+SMALL = ["meshes/small/suzanne.obj", "meshes/small/cow.obj", "meshes/small/teapot.obj", "meshes/small/legocar.obj",
+         "odd/busted.STL", "odd/ADIS16480.STL", "odd/capsule.obj"]
+LARGE = ["meshes/medium/rocker-arm.obj", "meshes/medium/stanford_bunny.ply", "meshes/medium/sponza_dabrovic.obj"]
+STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()} - {"brute_force"})
+TESTS = 60_000_000  # ray-triangle tests that brute force may take in the quick run
+
+
+def mixed_rays(mesh: wrt.Mesh, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """From around the mesh into it, from inside in all directions, at vertices, and along the axes from vertices' planes."""
+    rng = np.random.default_rng(seed)
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    outside = rng.normal(size=(n, 3))
+    outside = (low + high) / 2 + outside / np.linalg.norm(outside, axis=1, keepdims=True) * np.linalg.norm(high - low)
+    inside = low + rng.random((n, 3)) * (high - low)
+    corner = mesh.vertices[rng.integers(len(mesh.vertices), size=n)]
+    kind = np.arange(n) % 4
+    origins = np.where((kind == 1)[:, None], inside, outside)
+    directions = np.where((kind == 2)[:, None], corner, low + rng.random((n, 3)) * (high - low)) - origins
+    axis = np.arange(n) % 3
+    along = np.zeros((n, 3))
+    along[np.arange(n), axis] = rng.choice([-1.0, 1.0], size=n)
+    aligned = corner - along * np.linalg.norm(high - low)
+    origins = np.where((kind == 3)[:, None], aligned, origins).astype(np.float32)
+    directions = np.where((kind == 3)[:, None], along, directions).astype(np.float32)
+    return origins, directions
+
+
+@cache
+def expected(name: str, n: int) -> tuple[wrt.Mesh, np.ndarray, np.ndarray, Hits]:
+    mesh = wrt.load_mesh(data_path(name))
+    origins, directions = mixed_rays(mesh, n, seed=n)
+    return mesh, origins, directions, build(mesh, "brute_force").closest_hit(origins, directions)
+
+
+def check(structure: str, name: str, n: int) -> None:
+    mesh, origins, directions, truth = expected(name, n)
+    accel = build(mesh, structure)
+    hits = accel.closest_hit(origins, directions)
+    assert 0.05 < (truth.prim_id >= 0).mean() < 1.0  # the rays test something
+    for field in ("prim_id", "t", "u", "v"):
+        np.testing.assert_array_equal(getattr(hits, field), getattr(truth, field), err_msg=f"{field} of {name}")
+    np.testing.assert_array_equal(accel.any_hit(origins, directions), truth.prim_id >= 0)
+
+
+@pytest.mark.parametrize("name", SMALL + LARGE)
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_same_hits_as_brute_force(structure: str, name: str) -> None:
+    triangles = len(wrt.load_mesh(data_path(name)).faces)
+    check(structure, name, min(100_000, TESTS // triangles))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMALL + LARGE)
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_same_hits_as_brute_force_on_100k_rays(structure: str, name: str) -> None:
+    check(structure, name, 100_000)
