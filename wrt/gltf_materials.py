@@ -1,7 +1,8 @@
 """glTF images, textures and materials as those of a wrt scene.
 
 Occlusion textures are left out on purpose: they hold baked ambient shadow, and a ray tracer finds its own. So are the
-thickness textures of KHR_materials_volume: a ray meets the far side itself. Neither is warned about.
+thickness textures of KHR_materials_volume: a ray meets the far side itself. Back faces are not culled, whatever
+`doubleSided` says: a ray tracer that let rays through them would leak light. None of this is warned about.
 Source: Khronos, glTF 2.0 specification, sections 3.8 (texture data) and 3.9 (materials), and each extension's own text.
 """
 

@@ -1,0 +1,305 @@
+"""The triangle unit against float64, and the properties that keep a mesh closed."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import directions, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
+import warp as wp
+
+from wrt.kernels.ray_aabb import box_ray
+from wrt.kernels.ray_triangle import ray_triangle, triangle_ray, watertight
+from wrt.kernels.structs import NO_HIT, Hit, Ray, kernel
+
+# pbrt-v4, shapes_test, Triangle.BadCases: three collinear points and a ray that must miss them (published numbers).
+BAD_TRIANGLE = [[-1113.45459, -79.049614, -56.2431908], [-1113.45459, -87.0922699, -56.2431908],
+                [-1113.45459, -79.2090149, -56.2431908]]
+BAD_ORIGIN, BAD_DIRECTION = [-1081.47925, 99.9999542, 87.7701111], [-32.1072998, -183.355865, -144.607635]
+
+
+@kernel
+def triangle_kernel(
+    origin: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    v0: wp.array(dtype=wp.vec3),
+    v1: wp.array(dtype=wp.vec3),
+    v2: wp.array(dtype=wp.vec3),
+    line: wp.array(dtype=Hit),
+    unit: wp.array(dtype=Hit),
+):
+    """The watertight test by itself, and the unit with t held to the triangle's box."""
+    i = wp.tid()
+    ray = Ray()
+    ray.origin = origin[i]
+    ray.direction = direction[i]
+    shear = triangle_ray(ray)
+    line[i] = watertight(ray.origin, shear, v0[i], v1[i], v2[i])
+    unit[i] = ray_triangle(box_ray(ray), shear, v0[i], v1[i], v2[i])
+
+
+def run(origin, direction, triangle, which="unit"):
+    """Hits as a structured array of t, u, v, prim_id; triangle: (N, 3, 3) or (3, 3)."""
+    origin, direction = (np.asarray(a, np.float32).reshape(-1, 3) for a in (origin, direction))
+    triangle = np.asarray(triangle, np.float32).reshape(-1, 3, 3)
+    n = max(len(origin), len(direction), len(triangle))
+    rows = [np.broadcast_to(a, (n, 3)) for a in (origin, direction, triangle[:, 0], triangle[:, 1], triangle[:, 2])]
+    line, unit = zeros(n, Hit), zeros(n, Hit)
+    launch(triangle_kernel, n, *(vec3s(a) for a in rows), line, unit)
+    return (unit if which == "unit" else line).numpy()
+
+
+def is_hit(hits):
+    return hits["prim_id"] != int(NO_HIT)
+
+
+def exact(origin, direction, triangle):
+    """t, u, v (N,) in float64 by Cramer's rule (Moeller and Trumbore 1997), wherever the plane is met."""
+    v0, v1, v2 = (np.asarray(triangle)[:, i] for i in range(3))
+    e1, e2, s = v1 - v0, v2 - v0, np.asarray(origin) - v0
+    p, q = np.cross(direction, e2), np.cross(s, e1)
+    det = (e1 * p).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (e2 * q).sum(axis=1) / det, (s * p).sum(axis=1) / det, (direction * q).sum(axis=1) / det
+
+
+def exact_fraction(origin, direction, triangle):
+    """The same in rational arithmetic for one ray; None where the ray is parallel to the plane."""
+    o, d = ([Fraction(float(x)) for x in row] for row in (origin, direction))
+    v0, v1, v2 = ([Fraction(float(x)) for x in row] for row in triangle)
+
+    def cross(a, b):
+        return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+    def minus(a, b):
+        return [x - y for x, y in zip(a, b, strict=True)]
+
+    def dot(a, b):
+        return sum(x * y for x, y in zip(a, b, strict=True))
+
+    e1, e2, s = minus(v1, v0), minus(v2, v0), minus(o, v0)
+    p, q = cross(d, e2), cross(s, e1)
+    det = dot(e1, p)
+    return None if det == 0 else (dot(e2, q) / det, dot(s, p) / det, dot(d, q) / det)
+
+
+def aimed_rays(rng, n, spread=0.4):
+    """Rays at points in and around triangles of size about 1, at least 0.2 off their planes."""
+    triangle = rounded(rng.normal(size=(n, 3, 3)) + 3.0 * rng.normal(size=(n, 1, 3)))
+    w = rng.normal(1.0 / 3.0, spread, (n, 2))
+    target = triangle[:, 0] + w[:, :1] * (triangle[:, 1] - triangle[:, 0]) + w[:, 1:] * (triangle[:, 2] - triangle[:, 0])
+    direction = rounded(rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(-1, 1, (n, 1)))
+    origin = rounded(target - direction * rng.uniform(0.5, 4.0, (n, 1)))
+    normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    slope = np.abs((normal * direction).sum(axis=1)) / (area * np.linalg.norm(direction, axis=1))
+    keep = (slope > 0.2) & (area > 0.3)
+    return origin[keep], direction[keep], triangle[keep]
+
+
+def test_t_and_barycentrics_against_float64():
+    origin, direction, triangle = aimed_rays(np.random.default_rng(1), 20_000)
+    hits = run(origin, direction, triangle)
+    t, u, v = exact(origin, direction, triangle)
+    margin = np.minimum(np.minimum(u, v), 1.0 - u - v)
+    assert is_hit(hits)[margin > 1e-4].all()
+    assert not is_hit(hits)[margin < -1e-4].any()
+    assert (margin > 1e-4).sum() > 2000 and (margin < -1e-4).sum() > 2000
+    on = is_hit(hits)
+    # Coordinates are some tens at most and slopes above 0.2: rounding of the ray's line, seen on the plane.
+    bound = 2.0**-24 * 40.0 * (1.0 + np.abs(origin).max(axis=1) + np.abs(triangle).max(axis=(1, 2)))[on]
+    assert (np.abs(hits["t"] - t)[on] * np.linalg.norm(direction, axis=1)[on] <= bound).all()
+    assert (np.abs(hits["u"] - u)[on] <= bound * 5.0).all() and (np.abs(hits["v"] - v)[on] <= bound * 5.0).all()
+    point = (1.0 - hits["u"] - hits["v"])[:, None] * triangle[:, 0] + hits["u"][:, None] * triangle[:, 1]
+    point += hits["v"][:, None] * triangle[:, 2]
+    assert np.abs(point - origin - t[:, None] * direction)[on].max() < 1e-4
+
+
+def test_both_sides_and_every_order_of_the_corners_agree():
+    rng = np.random.default_rng(2)
+    n = 40_000
+    triangle = rounded(rng.normal(size=(n, 3, 3)) * 10.0 ** rng.uniform(-3, 3, (n, 1, 3)))
+    w = rng.dirichlet([0.4, 0.4, 0.4], n)
+    w = np.where(rng.random((n, 3)) < 0.25, 0.0, w)  # many on edges and at corners
+    w = np.where(w.sum(axis=1, keepdims=True) > 0.0, w, [1.0, 0.0, 0.0])
+    target = np.einsum("ni,nij->nj", w / w.sum(axis=1, keepdims=True), triangle)
+    direction = directions(rng, n)
+    origin = rounded(target - direction * 10.0 ** rng.uniform(-2, 2, (n, 1)))
+    reference = run(origin, direction, triangle)
+    hit = is_hit(reference)
+    assert 0.2 * n < hit.sum() < 0.95 * n
+    for order in ([1, 2, 0], [2, 0, 1], [0, 2, 1], [1, 0, 2], [2, 1, 0]):
+        hits = run(origin, direction, triangle[:, order])
+        assert np.array_equal(is_hit(hits), hit), order
+        close = np.isclose(hits["t"][hit], reference["t"][hit], rtol=1e-6, atol=0.0)
+        assert close.all()
+
+
+def test_no_ray_between_two_triangles_with_a_common_edge():
+    rng = np.random.default_rng(3)
+    n = 200_000
+    scale = 10.0 ** rng.uniform(-2, 3, (n, 1, 3)) * np.where(rng.random((n, 1, 3)) < 0.2, 0.0, 1.0)
+    edge = rounded(rng.normal(size=(n, 2, 3)) * scale)
+    direction = rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(-4, 0, (n, 3))
+    direction = rounded(np.where(rng.random((n, 3)) < 0.1, 0.0, direction))
+    direction[~direction.any(axis=1), 2] = 1.0
+    along = rng.uniform(0.05, 0.95, (n, 1))
+    target = edge[:, 0] + along * (edge[:, 1] - edge[:, 0])
+    origin = rounded(target - direction * 10.0 ** rng.uniform(-3, 2, (n, 1)))
+    # The two other corners stand on opposite sides of the plane through ray and edge, far enough to cover the ray.
+    side = np.cross(edge[:, 1] - edge[:, 0], direction)
+    length = np.linalg.norm(side, axis=1, keepdims=True)
+    extent = np.linalg.norm(edge[:, 1] - edge[:, 0], axis=1, keepdims=True)
+    side = np.divide(side, length, out=np.zeros_like(side), where=length > 0.0)
+    wobble = 0.3 * rng.normal(size=(2, n, 3)) * extent
+    c, d = (rounded(edge.mean(axis=1) + sign * side * extent + w - (w * side).sum(axis=1, keepdims=True) * side)
+            for sign, w in zip((1.0, -1.0), wobble, strict=True))
+    ok = (length > 1e-3 * extent * np.linalg.norm(direction, axis=1, keepdims=True))[:, 0]
+    first = run(origin, direction, np.stack([edge[:, 0], edge[:, 1], c], axis=1))
+    second = run(origin, direction, np.stack([edge[:, 1], edge[:, 0], d], axis=1))
+    lost = ok & ~is_hit(first) & ~is_hit(second)
+    assert ok.sum() > 0.5 * n
+    assert not lost.any(), (origin[lost][0], direction[lost][0], edge[lost][0], c[lost][0], d[lost][0])
+
+
+def adversarial_hits(rng, n):
+    """Triangles of wild proportions, flat in some axes, and rays at their edges from very near to far."""
+    scale = 10.0 ** rng.uniform(-4, 4, (n, 1, 3)) * np.where(rng.random((n, 1, 3)) < 0.3, 0.0, 1.0)
+    triangle = rng.uniform(-1.0, 1.0, (n, 3, 3)) * scale
+    same = rng.random((n, 1, 3)) < 0.3
+    triangle[:, 1:2] = np.where(same, triangle[:, :1], triangle[:, 1:2])
+    triangle = np.where(rng.random((n, 1, 3)) < 0.3, np.round(triangle), triangle)
+    moved = 10.0 ** rng.uniform(-3, 5, (n, 1, 1)) * rng.normal(size=(n, 1, 3))
+    triangle = rounded(triangle + np.where(rng.random((n, 1, 1)) < 0.5, 0.0, moved))
+    w = np.where(rng.random((n, 3)) < 0.3, 0.0, rng.dirichlet([0.3, 0.3, 0.3], n))
+    w = np.where(w.sum(axis=1, keepdims=True) > 0.0, w, [1.0, 0.0, 0.0])
+    target = np.einsum("ni,nij->nj", w / w.sum(axis=1, keepdims=True), triangle)
+    extent = np.abs(triangle[:, 1:] - triangle[:, :1]).max(axis=(1, 2))[:, None]
+    target += rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(-9, -3, (n, 1)) * extent * (rng.random((n, 1)) < 0.7)
+    direction = rng.normal(size=(n, 3)) * 10.0 ** (rng.uniform(-6, 0, (n, 3)) * (rng.random((n, 3)) < 0.5))
+    direction = np.where(rng.random((n, 3)) < 0.1, 0.0, direction)
+    direction[~direction.any(axis=1), 0] = 1.0
+    origin = target - direction * extent * 10.0 ** rng.uniform(-6, 3, (n, 1))
+    return rounded(origin), rounded(direction), triangle
+
+
+def test_a_hit_is_never_outside_the_triangles_padded_box():
+    # Else a traversal that trusts boxes loses a ray that the triangle test had promised to this triangle alone.
+    for seed in range(4):
+        rays = adversarial_hits(np.random.default_rng(seed), 200_000)
+        line, unit = run(*rays, which="line"), run(*rays)
+        promised = is_hit(line) & (line["t"] >= 0.0)
+        assert promised.sum() > 20_000
+        assert is_hit(unit)[promised].all()
+        assert (is_hit(line) | ~is_hit(unit)).all()
+
+
+def test_t_when_seen_nearly_edge_on():
+    # A floor 2000 wide at a height of 1e-6: the areas cancel to a millionth, and t must keep its digits all the same.
+    rng = np.random.default_rng(4)
+    n = 20_000
+    floor = np.array([[-1000.0, 0.0, -1000.0], [1000.0, 0.0, -1000.0], [0.0, 0.0, 1000.0]])
+    direction = np.stack([rng.uniform(-0.5, 0.5, n), -(10.0 ** rng.uniform(-5, -1, n)), np.ones(n)], axis=1)
+    origin = np.stack([rng.uniform(-5, 5, n), 10.0 ** rng.uniform(-6, -1, n), rng.uniform(-5, 5, n)], axis=1)
+    origin, direction = rounded(origin), rounded(direction)
+    hits = run(origin, direction, floor)
+    t = -origin[:, 1] / direction[:, 1]
+    inside = np.abs(origin + t[:, None] * direction).max(axis=1) < 300.0
+    assert inside.sum() > 5000 and is_hit(hits)[inside].all()
+    assert np.abs(hits["t"][inside] / t[inside] - 1.0).max() < 1e-6
+    tilted = floor @ np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    o, d = (rounded(a @ np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])) for a in (origin, direction))
+    expected = exact(o, d, np.broadcast_to(rounded(tilted), (n, 3, 3)))[0]
+    line = run(o, d, tilted)
+    slope = np.abs(direction[:, 1])
+    seen = inside & is_hit(line) & (expected > 0.0)
+    # The rounding of sheared corners moves the plane by a few u of its size: 2000 u / slope along the ray.
+    assert (np.abs(line["t"] - expected)[seen] <= 16.0 * 2000.0 * 2.0**-24 / slope[seen]).all()
+
+
+@pytest.mark.parametrize("power", [-100, -60, -20, 20, 60, 100])
+def test_nothing_depends_on_the_scale(power):
+    origin, direction, triangle = aimed_rays(np.random.default_rng(5), 3000, spread=0.2)
+    scale = 2.0**power
+    reference = run(origin, direction, triangle)
+    scaled = run(origin * scale, direction, triangle * scale)
+    assert np.array_equal(is_hit(scaled), is_hit(reference))
+    hit = is_hit(reference)
+    assert np.array_equal(scaled["t"][hit], (reference["t"][hit] * np.float64(scale)).astype(np.float32))
+    assert np.array_equal(scaled["u"][hit], reference["u"][hit]) and np.array_equal(scaled["v"][hit], reference["v"][hit])
+    longer = run(origin, direction * scale, triangle)
+    assert np.array_equal(is_hit(longer), hit)
+    assert np.allclose(longer["t"][hit] * np.float64(scale), reference["t"][hit], rtol=1e-6, atol=0.0)
+
+
+def test_edge_on_is_a_miss():
+    triangle = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
+    rng = np.random.default_rng(6)
+    direction = rng.normal(size=(500, 3))
+    direction[:, 1] = 0.0
+    origin = np.array([0.5, 0.0, 0.5]) - 3.0 * direction
+    origin[:, 1] = 0.0
+    assert not is_hit(run(origin, direction, triangle)).any()
+
+
+def test_triangles_without_area_are_missed():
+    rng = np.random.default_rng(7)
+    n = 3000
+    a, b = rng.normal(size=(2, n, 3))
+    direction = rng.normal(size=(n, 3))
+    point = np.stack([a, a, a], axis=1)
+    assert not is_hit(run(a - direction, direction, point)).any()
+    for order in ([0, 0, 1], [0, 1, 0], [1, 0, 0]):  # two corners the same
+        needle = np.stack([a, b], axis=1)[:, order]
+        middle = 0.5 * (a + b)
+        assert not is_hit(run(middle - direction, direction, needle)).any()
+    for axis in range(3):  # three points on a line along an axis
+        line = np.repeat(a[:, None], 3, axis=1)
+        line[:, :, axis] = rng.normal(size=(n, 3))
+        target = line[:, 0] + rng.random((n, 1)) * (line[:, 1] - line[:, 0])
+        assert not is_hit(run(target - direction, direction, line)).any()
+
+
+def test_published_collinear_triangle_is_missed():
+    assert not is_hit(run(BAD_ORIGIN, BAD_DIRECTION, BAD_TRIANGLE)).any()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_coordinates_that_are_not_finite_miss(bad):
+    triangle = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+    origin, direction = np.array([0.0, 0.0, -1.0]), np.array([0.01, 0.02, 1.0])
+    assert is_hit(run(origin, direction, triangle)).all()
+    for corner in range(3):
+        for axis in range(3):
+            broken = triangle.copy()
+            broken[corner, axis] = bad
+            hit = run(origin, direction, broken)
+            assert not is_hit(hit).any() or np.isfinite(hit["t"]).all()
+            if np.isnan(bad):
+                assert not is_hit(hit).any()
+    if np.isnan(bad):
+        for axis in range(3):
+            o, d = origin.copy(), direction.copy()
+            o[axis], d[axis] = bad, bad
+            assert not is_hit(run(o, direction, triangle)).any()
+            assert not is_hit(run(origin, d, triangle)).any()
+
+
+def test_decisions_on_exact_coordinates_are_exact():
+    # Small integers and a direction along z: nothing is rounded, so even rays at edges and corners are decided exactly.
+    rng = np.random.default_rng(8)
+    n = 4000
+    triangle = rng.integers(-4, 5, (n, 3, 3)).astype(float)
+    origin = np.concatenate([rng.integers(-4, 5, (n, 2)), np.full((n, 1), -16.0)], axis=1).astype(float)
+    direction = np.array([0.0, 0.0, 1.0])
+    hits = run(origin, direction, triangle)
+    on_edge = 0
+    for i in range(n):
+        solution = exact_fraction(origin[i], direction, triangle[i])
+        expected = solution is not None and min(solution[1], solution[2], 1 - solution[1] - solution[2]) >= 0
+        assert is_hit(hits[i : i + 1])[0] == expected, (origin[i], triangle[i])
+        if expected:
+            on_edge += min(solution[1], solution[2], 1 - solution[1] - solution[2]) == 0
+            assert abs(hits["t"][i] - float(solution[0])) <= 2.0**-23 * 20.0
+            assert abs(hits["u"][i] - float(solution[1])) <= 2.0**-24
+    assert on_edge > 200
