@@ -2,7 +2,8 @@
 
 The form of Haines, Guenther and Akenine-Moeller 2019, "Precision Improvements for Ray/Sphere Intersection" (Ray Tracing
 Gems, chapter 7): the discriminant from the distance between the center and the line, and the root that would cancel from the
-product of the two.
+product of the two. It is taken in float64 all the same: above a sphere that serves as the ground, the distance to it is the
+difference of two numbers near its radius.
 """
 
 import warp as wp
@@ -18,22 +19,24 @@ def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
     hit = Hit()
     hit.prim_id = NO_HIT
     hit.t = float(wp.inf)
-    f = ray.origin - center
-    d = ray.direction
+    zero = wp.float64(0.0)
+    f = wp.vec3d(ray.origin) - wp.vec3d(center)
+    d = wp.vec3d(ray.direction)
+    r = wp.float64(radius)
     a = wp.dot(d, d)
     half_b = -wp.dot(f, d)
     nearest = f + (half_b / a) * d
-    discriminant = radius * radius - wp.dot(nearest, nearest)
-    if not discriminant >= 0.0:
+    discriminant = r * r - wp.dot(nearest, nearest)
+    if not discriminant >= zero:
         return hit
-    distance = wp.length(f)
-    c = (distance - radius) * (distance + radius)
-    root = wp.sqrt(a) * wp.sqrt(discriminant)  # of the product, the root would overflow far sooner
-    q = half_b + wp.where(half_b < 0.0, -root, root)
-    if q == 0.0:
+    root = wp.sqrt(a * discriminant)
+    q = half_b + wp.where(half_b < zero, -root, root)
+    if q == zero:
         return hit  # the origin is on the sphere and the line touches it there
-    t_0 = wp.min(c / q, q / a)
-    t_1 = wp.max(c / q, q / a)
+    far = float(q / a)
+    near = float((wp.dot(f, f) - r * r) / q)
+    t_0 = wp.min(near, far)
+    t_1 = wp.max(near, far)
     extent = wp.vec3(radius, radius, radius)
     t_0 = within_bounds(box, t_0, center - extent, center + extent)
     t_1 = within_bounds(box, t_1, center - extent, center + extent)

@@ -93,7 +93,7 @@ class _PlacedImage(Table):
     scale: Scale2 = Field([1.0, 1.0], description="how often the image repeats in one unit of u and of v")
     offset: Annotated[list[float], Field(min_length=2, max_length=2)] = Field(
         [0.0, 0.0], description="added to u and v")
-    rotation: float = Field(0.0, description="turns the image counter-clockwise about uv (0, 0) (degrees)")
+    rotation: float = Field(0.0, description="about uv (0, 0): turns the image clockwise (degrees)")
 
 
 class ImageTable(_PlacedImage):

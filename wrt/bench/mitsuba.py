@@ -8,6 +8,7 @@ What can be compared exactly (Mitsuba's estimate has the same expectation as wrt
 - "path" and "volpath": surfaces that are all specular, under a background and emissive shapes (glass with absorption:
   "volpath"); with diffuse surfaces they add the interreflection that a Whitted tracer leaves out;
 - "direct": diffuse surfaces, with mirrors or glass nowhere in view.
+Mitsuba never cuts rays by their throughput: compare with min_throughput = 0.
 Everything else is refused with an InputError, or with `approximate=True` replaced and named in one SceneWarning.
 """
 
@@ -26,6 +27,7 @@ import numpy as np
 from wrt.bench.mitsuba_emitters import background_emitter, light_emitter
 from wrt.bench.mitsuba_shapes import Part, object_parts, raw_mesh, sphere_shape
 from wrt.errors import InputError, SceneWarning
+from wrt.features import is_rough
 from wrt.mesh import Mesh
 from wrt.scene import Camera, Material, Scene
 
@@ -83,17 +85,23 @@ class Approximations:
 
     def __init__(self, allowed: bool) -> None:
         self.allowed = allowed
-        self.found: dict[str, None] = {}
+        self.found: dict[str, dict[str, None]] = {}
 
-    def add(self, what: str) -> None:
-        """Note `what`; raises InputError where approximations are not allowed."""
+    def add(self, what: str, where: str = "") -> None:
+        """Note what is approximated, and in which thing; raises InputError where approximations are not allowed."""
         if not self.allowed:
-            raise InputError(f"Mitsuba: not translatable exactly: {what}")
-        self.found[what] = None
+            raise InputError(f"not translatable exactly: {what}", None, f"Mitsuba: {where}" if where else "Mitsuba")
+        self.found.setdefault(what, {})[where] = None
 
     def warn(self) -> None:
-        if self.found:
-            warnings.warn("Mitsuba: approximated: " + "; ".join(self.found), SceneWarning, stacklevel=3)
+        """One SceneWarning for all, with the first three things that each is about."""
+        sentences = []
+        for what, places in self.found.items():
+            named = [where for where in places if where]
+            more = [f"{len(named) - 3} more"] if len(named) > 3 else []
+            sentences.append(what + (f" in {', '.join(named[:3] + more)}" if named else ""))
+        if sentences:
+            warnings.warn("Mitsuba: approximated: " + "; ".join(sentences), SceneWarning, stacklevel=4)
 
 
 class Translation(NamedTuple):
@@ -161,7 +169,14 @@ def _resolve_integrator(scene: Scene, integrator: str) -> str:
 def _check_light_transport(scene: Scene, integrator: str, notes: Approximations) -> None:
     """Features of wrt's light transport that only some integrators have."""
     materials = scene.materials
+    if scene.settings.fresnel == "schlick" and any(m.kind == "glass" for m in materials):
+        notes.add('fresnel = "schlick" (the exact one)')
+    if scene.lights and any(is_rough(m) for m in materials if m.kind != "metallic_roughness"):
+        notes.add("highlights of point lights on rough surfaces (GGX's, where wrt takes Blinn's or none)")
     if integrator == "whitted":
+        mixed = [m.name for m in materials if m.kind == "metallic_roughness"]
+        if mixed:  # Mitsuba's principled BSDF cannot sample its mirror-like part by itself
+            raise InputError(f'integrator "whitted" cannot render metallic_roughness (material {mixed[0]!r})', None, "Mitsuba")
         if scene.settings.glass_shadows == "tinted" and any(m.kind == "glass" and not m.thin for m in materials):
             notes.add('glass_shadows = "tinted" (shadows of glass are opaque)')
         return
@@ -194,7 +209,7 @@ def _integrator(mi: Any, name: str, scene: Scene, options: Options, lit: bool, p
 
 def _sensor(mi: Any, scene: Scene, camera: Camera, options: Options, notes: Approximations) -> dict[str, Any]:
     if camera.aperture_radius > 0.0 and camera.blades:
-        notes.add(f"camera {camera.name!r}: aperture blades (a round aperture of the same radius)")
+        notes.add("aperture blades (a round aperture of the same radius)", f"camera {camera.name!r}")
     far = _farthest(scene, camera)
     # Mitsuba's camera looks along +z with +x to the left: half a turn about y away from glTF's.
     pose = camera.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])

@@ -1,6 +1,6 @@
 """Materials and textures for Mitsuba: one function a kind of material, in the table BSDFS.
 
-`notes.add(what)` names an approximation; it raises InputError where these are not allowed.
+`notes.add(what, where)` names an approximation; it raises InputError where these are not allowed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def bsdf(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
     # Glass has two sides by nature; everything else answers light on its back as on its front.
     transmits = material.kind == "glass" or (material.kind == "metallic_roughness" and material.transmission > 0.0)
     if material.normal_texture is not None:
-        notes.add(f"material {material.name!r}: normal texture (Mitsuba's own tangents)")
+        notes.add("normal texture (Mitsuba's own tangents)", f"material {material.name!r}")
         result = {"type": "normalmap", "normalmap": _normal_map(mi, material, notes), "bsdf": result}
     if not transmits:
         result = {"type": "twosided", "bsdf": result}
@@ -31,14 +31,14 @@ def bsdf(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
 def emission(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
     """An area emitter; one that does not light other surfaces is never sampled."""
     if material.alpha_mode != "opaque":
-        notes.add(f"material {material.name!r}: emission of a surface that is partly transparent (emits as if opaque)")
+        notes.add("emission of a surface that is partly transparent (emits as if opaque)", f"material {material.name!r}")
     radiance = _color(mi, material.emission, material.emission_texture, notes)
     return {"type": "area", "radiance": radiance, "sampling_weight": 1.0 if material.emits_light else 0.0}
 
 
 def _diffuse(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
     if max(material.specular) > 0.0:
-        notes.add(f"material {material.name!r}: Blinn-Phong highlight (left out)")
+        notes.add("Blinn-Phong highlight (left out)", f"material {material.name!r}")
     return {"type": "diffuse", "reflectance": _color(mi, material.albedo, material.albedo_texture, notes)}
 
 
@@ -58,7 +58,7 @@ def _glass(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
                               "specular_transmittance": transmittance}
     if material.thin:
         if is_rough(material):
-            notes.add(f"material {material.name!r}: a thin pane with roughness (smooth)")
+            notes.add("a thin pane with roughness (smooth)", f"material {material.name!r}")
         return result | {"type": "thindielectric"}
     return result | _ggx("roughdielectric", material) if is_rough(material) else result
 
@@ -68,7 +68,7 @@ def _ggx(plugin: str, material: Material) -> dict[str, Any]:
 
 
 def _metallic_roughness(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
-    notes.add(f"material {material.name!r}: metallic_roughness (Mitsuba's principled BSDF)")
+    notes.add("metallic_roughness (Mitsuba's principled BSDF)", f"material {material.name!r}")
     result: dict[str, Any] = {
         "type": "principled", "base_color": _color(mi, material.albedo, material.albedo_texture, notes),
         "roughness": _channel(mi, material.metallic_roughness_texture, 1, material.roughness, notes),
@@ -129,7 +129,7 @@ def linear_rgb(texture: Texture) -> np.ndarray:
 def _bitmap(mi: Any, texture: Texture, values: np.ndarray, notes: Any, filter_type: str = "bilinear") -> dict[str, Any]:
     """Texel values (H, W, C) float32, looked up as the texture says; row 0 is at v = 0 in both programs."""
     if texture.wrap[0] != texture.wrap[1]:
-        notes.add(f"texture {texture.name!r}: wrap {texture.wrap} ({texture.wrap[0]} for both axes)")
+        notes.add("wrap that differs between the axes (that of u for both)", f"texture {texture.name!r}")
     to_uv = np.vstack([texture.uv_transform, (0.0, 0.0, 1.0)])
     return {"type": "bitmap", "data": mi.TensorXf(np.ascontiguousarray(values, np.float32)), "raw": True,
             "filter_type": filter_type, "wrap_mode": texture.wrap[0], "to_uv": mi.ScalarTransform3f(to_uv)}
@@ -154,6 +154,6 @@ def _opacity(mi: Any, material: Material, notes: Any) -> Any:
     alpha = texture.image[..., 3:4].astype(np.float32) / 255.0 * np.float32(material.alpha)
     if material.alpha_mode == "blend":
         return _bitmap(mi, texture, alpha, notes)
-    notes.add(f"material {material.name!r}: alpha mask (cut at whole texels)")
+    notes.add("alpha mask (cut at whole texels)", f"material {material.name!r}")
     return _bitmap(mi, texture, (alpha >= material.alpha_cutoff).astype(np.float32), notes, filter_type="nearest")
 

@@ -51,7 +51,7 @@ def _spot(mi: Any, light: SpotLight, notes: Any) -> dict[str, Any]:
     if light.inner >= light.outer:
         return spot
     if light.outer > WIDEST_SPOT:
-        notes.add(f"light {light.name!r}: a spot wider than 80 degrees (linear falloff in the angle)")
+        notes.add("a spot wider than 80 degrees (linear falloff in the angle)", f"light {light.name!r}")
         return spot | {"cutoff_angle": min(cutoff, 89.9), "beam_width": min(math.degrees(light.inner), 89.8)}
     x = (2.0 * (np.arange(SPOT_TEXELS) + 0.5) / SPOT_TEXELS - 1.0) * math.tan(light.outer)
     cosine = 1.0 / np.sqrt(1.0 + x[None, :] ** 2 + x[:, None] ** 2)

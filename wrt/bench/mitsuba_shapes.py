@@ -49,7 +49,7 @@ def object_parts(mi: Any, thing: Object, object_id: int, notes: Any) -> Iterator
         part = Part(object_id, chosen, material)
         yield name, _mesh(mi, name, triangles, _properties(mi, material, notes)), part
         if material.is_emissive and material.two_sided:
-            notes.add(f"material {material.name!r}: two_sided emission (a second mesh close behind emits to the back)")
+            notes.add("two_sided emission (a second mesh close behind emits to the back)", f"material {material.name!r}")
             back = _mesh(mi, name + "_back", _behind(triangles), _properties(mi, material, notes))
             yield name + "_back", back, part
 
@@ -57,7 +57,7 @@ def object_parts(mi: Any, thing: Object, object_id: int, notes: Any) -> Iterator
 def sphere_shape(mi: Any, sphere: Sphere, notes: Any) -> Any:
     """Mitsuba's sphere has u around its z from its x, v down from +z: z is turned to +y and x to -x."""
     if sphere.material.is_emissive and sphere.material.two_sided:
-        notes.add(f"sphere {sphere.name!r}: two_sided emission (the inside does not emit)")
+        notes.add("two_sided emission (the inside does not emit)", f"sphere {sphere.name!r}")
     pose = np.eye(4)
     pose[:3, :3] = sphere.radius * np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
     pose[:3, 3] = sphere.center

@@ -1,0 +1,208 @@
+"""The BVH's builder: what every tree must satisfy, whatever it was built over."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from tests.kernel_tools import rounded  # isort: skip (starts Warp)
+
+from wrt.accel import build
+from wrt.accel.base import Geometry
+from wrt.accel.bvh2 import build_nodes, sah_cost
+from wrt.errors import InputError
+from wrt.kernels.build_bvh2 import BuildOptions
+from wrt.kernels.traverse_bvh2 import STACK_SIZE
+from wrt.shapes import icosphere, torus
+
+
+def options(max_leaf=4, cost_traversal=1.0, cost_intersection=1.0):
+    out = BuildOptions()
+    out.max_leaf, out.cost_traversal, out.cost_intersection = max_leaf, cost_traversal, cost_intersection
+    return out
+
+
+def make(lo, hi, threads=1, **changes):
+    return build_nodes((np.asarray(lo, np.float32), np.asarray(hi, np.float32)), options(**changes), threads)
+
+
+def check_tree(lo, hi, nodes, order, depth, max_leaf=4):
+    """Every primitive in one leaf, boxes tight and nested, depth right and within the stack; number of leaves."""
+    lo, hi = np.asarray(lo, np.float32), np.asarray(hi, np.float32)
+    assert np.array_equal(np.sort(order), np.arange(len(lo)))
+    seen = np.zeros(len(lo), int)
+    visited = np.zeros(len(nodes), int)
+    deepest, leaves = 0, 0
+    todo = [(0, 1, np.full(3, -np.inf), np.full(3, np.inf))]
+    while todo:
+        index, level, outer_lo, outer_hi = todo.pop()
+        visited[index] += 1
+        deepest = max(deepest, level)
+        for side in "01":
+            node = nodes[index]
+            box_lo, box_hi = node["lo_" + side], node["hi_" + side]
+            first, count = int(node["first_" + side]), int(node["count_" + side])
+            if (box_lo > box_hi).any():
+                assert count == 0 and len(lo) < 2, "an empty child"
+                continue
+            assert (box_lo >= outer_lo).all() and (box_hi <= outer_hi).all()
+            if count == 0:
+                todo.append((first, level + 1, box_lo, box_hi))
+                continue
+            leaves += 1
+            assert count <= max_leaf
+            seen[first : first + count] += 1
+            members = order[first : first + count]
+            assert np.array_equal(box_lo, lo[members].min(axis=0)) and np.array_equal(box_hi, hi[members].max(axis=0))
+    assert (seen == 1).all() and (visited == 1).all()
+    assert deepest == depth <= STACK_SIZE
+    return leaves
+
+
+def boxes(rng, n):
+    center = rng.uniform(-1.0, 1.0, (n, 3))
+    size = 0.02 * rng.random((n, 3))
+    return rounded(center - size), rounded(center + size)
+
+
+def points(values):
+    values = np.asarray(values, np.float32)
+    return values, values
+
+
+def progression(rng):
+    """Ratio 16 and up: the bins can only ever take the largest one off."""
+    return points(16.0 ** np.arange(-29, 15)[:, None] * np.array([1.0, 0.0, 0.0]))
+
+
+def crowded_progression(rng):
+    """The same with a crowd at each step, in three axes: deeper than the stack if nothing were done."""
+    steps = [np.eye(3)[axis] * 4.0**k for axis in range(3) for k in range(-60, 31) for _ in range(3)]
+    return points(np.concatenate([steps, np.zeros((500, 3))]))
+
+
+CASES = {
+    "random": lambda rng: boxes(rng, 5000),
+    "clustered": lambda rng: points(rng.normal(size=(3000, 3)) ** 9),
+    "all_equal": lambda rng: points(np.ones((777, 3))),
+    "flat": lambda rng: points(rng.random((2000, 3)) * [1.0, 0.0, 1.0]),
+    "line": lambda rng: points(rng.random((1000, 3)) * [0.0, 1.0, 0.0]),
+    "grid": lambda rng: points(np.stack(np.meshgrid(*[np.arange(12.0)] * 3), axis=-1).reshape(-1, 3)),
+    "progression": progression,
+    "crowded_progression": crowded_progression,
+    "huge": lambda rng: points(rng.uniform(-3e38, 3e38, (500, 3))),
+    "subnormal": lambda rng: points(rng.uniform(-1e-40, 1e-40, (500, 3))),
+    "two": lambda rng: boxes(rng, 2),
+    "three": lambda rng: boxes(rng, 3),
+    "nested": lambda rng: (-np.arange(1.0, 300.0)[:, None] * np.ones(3), np.arange(1.0, 300.0)[:, None] * np.ones(3)),
+}
+
+
+@pytest.mark.parametrize("max_leaf", [1, 4, 64])
+@pytest.mark.parametrize("case", CASES)
+def test_every_primitive_in_one_leaf_and_boxes_nested(case, max_leaf):
+    lo, hi = CASES[case](np.random.default_rng(1))
+    nodes, order, depth = make(lo, hi, max_leaf=max_leaf)
+    leaves = check_tree(lo, hi, nodes, order, depth, max_leaf)
+    assert leaves == len(nodes) + 1  # a binary tree
+    assert leaves >= len(lo) / max_leaf
+
+
+coordinate = st.floats(-(2.0**100), 2.0**100, width=32) | st.sampled_from([0.0, 1.0, 1.0 + 2.0**-23, 2.0**-100, -2.0**127, -(2.0**127)])
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(2, 40).flatmap(lambda n: arrays(np.float32, (n, 3), elements=coordinate)), st.sampled_from([1, 3, 8]))
+def test_any_points_make_a_valid_tree(values, max_leaf):
+    nodes, order, depth = make(values, values, max_leaf=max_leaf)
+    check_tree(values, values, nodes, order, depth, max_leaf)
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_nothing_and_a_single_primitive(n):
+    lo, hi = boxes(np.random.default_rng(2), n)
+    nodes, order, depth = make(lo, hi)
+    assert len(nodes) == 1 and depth == 1
+    check_tree(lo, hi, nodes, order, depth)
+
+
+def test_one_and_two_threads_build_the_same_tree():
+    lo, hi = boxes(np.random.default_rng(3), 30_000)
+    one, two = make(lo, hi, threads=1), make(lo, hi, threads=2)
+    assert np.array_equal(one[0], two[0]) and np.array_equal(one[1], two[1]) and one[2] == two[2]
+    check_tree(lo, hi, *two)
+    again = make(lo, hi, threads=2)
+    assert np.array_equal(again[0], two[0]) and np.array_equal(again[1], two[1])
+
+
+def test_no_subtree_is_forgotten_however_many_are_left_to_the_threads():
+    # Crowds of more than a thread's share, each with shells around it that are split off one after the other: hundreds of
+    # small ranges are left over at the top, where a well-behaved scene leaves some dozens.
+    parts = []
+    for crowd in range(32):
+        base = np.full(3, (crowd + 1.0) * 2**19)
+        parts.append(np.tile(base, (4200, 1)))
+        for axis in range(3):
+            for k in range(0, 18, 3):
+                shell = np.tile(base, (6, 1))
+                shell[:, axis] += 2.0 ** (17 - k)
+                parts.append(shell)
+    lo, hi = points(np.concatenate(parts))
+    one, two = make(lo, hi, threads=1), make(lo, hi, threads=2)
+    assert np.array_equal(one[1], two[1]) and np.array_equal(one[0], two[0])
+
+
+def test_splits_follow_the_surface_area():
+    # Two far clusters: the root must separate them; the expected cost is far below that of a split in the middle by number.
+    rng = np.random.default_rng(4)
+    center = np.where(np.arange(1000)[:, None] < 100, [-50.0, 0.0, 0.0], [50.0, 0.0, 0.0]) + rng.random((1000, 3))
+    nodes, order, _ = make(center, center + 0.01)
+    sides = [nodes[0]["lo_0"][0], nodes[0]["lo_1"][0]]
+    assert min(sides) < -40.0 and max(sides) > 40.0
+    left = (center[order[: 100 if sides[0] < 0.0 else 900], 0] < 0.0).mean()
+    assert left in (0.0, 1.0)
+
+
+@pytest.mark.parametrize("mesh", [icosphere(4), torus()], ids=["icosphere", "torus"])
+def test_quality_and_statistics(mesh):
+    structure = build(mesh, "bvh2")
+    stats = structure.stats
+    nodes = structure.data.nodes.numpy()
+    assert stats.nodes == len(nodes) and stats.leaves == stats.nodes + 1
+    assert stats.bytes == nodes.nbytes + structure.data.primitives.numpy().nbytes
+    assert np.log2(stats.leaves) <= stats.depth <= STACK_SIZE
+    # A random line through a closed convex surface of n triangles must meet two of them and some log2(n) nodes.
+    assert 2.0 < stats.sah_cost < 4.0 * np.log2(len(mesh.faces))
+    assert build(mesh, "bvh2", max_leaf=64, cost_traversal=1e9).stats.sah_cost > stats.sah_cost
+
+
+def test_sah_cost_by_hand():
+    # Two unit cubes side by side, one primitive each: 1 node + each cube's share (6 of the root's 10) of one test.
+    nodes, _, _ = make([[0, 0, 0], [1, 0, 0]], [[1, 1, 1], [2, 1, 1]])
+    assert sah_cost(nodes) == pytest.approx(1.0 + 2.0 * 6.0 / 10.0)
+
+
+@pytest.mark.parametrize("max_leaf", [0, 65, -1])
+def test_leaf_sizes_that_are_refused(max_leaf):
+    with pytest.raises(InputError, match="max_leaf"):
+        build(icosphere(0), "bvh2", max_leaf=max_leaf)
+
+
+def test_the_deepest_tree_still_finds_everything():
+    lo, hi = CASES["crowded_progression"](None)
+    n = len(lo)
+    size = np.maximum(np.abs(lo).max(axis=1, keepdims=True) * 0.01, 1e-36)
+    corners = lo[:, None].astype(np.float64) + size[:, None] * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    geometry = Geometry(corners.reshape(-1, 3).astype(np.float32), np.arange(3 * n, dtype=np.int32).reshape(-1, 3),
+                        np.zeros((0, 4), np.float32))
+    tree = build(geometry, "bvh2", max_leaf=1)
+    assert 40 < tree.stats.depth <= STACK_SIZE
+    keep = np.abs(corners).max(axis=(1, 2)) > 1e-30
+    target = corners.mean(axis=1)[keep]
+    direction = np.broadcast_to([1.0, 1.0, 1.0], target.shape)
+    origin = rounded(target - 3.0 * size[keep] * direction)
+    found = tree.closest_hit(origin, direction)
+    expected = build(geometry, "brute_force").closest_hit(origin, direction)
+    assert np.array_equal(found.prim_id, expected.prim_id) and np.array_equal(found.t, expected.t)
+    assert (found.prim_id >= 0).all()

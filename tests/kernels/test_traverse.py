@@ -1,0 +1,385 @@
+"""The traversal units: every structure in the registry finds, to the last bit, what testing all primitives finds."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import CPU, directions, floats, ints, launch, rounded, unit, vec3s, zeros  # isort: skip
+import warp as wp
+
+from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.kernels.query import HitArrays, RayArrays, load_ray
+from wrt.kernels.structs import Surfaces, kernel
+from wrt.mesh import Mesh
+from wrt.shapes import icosphere
+
+STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
+TREES = [name for name in STRUCTURES if name != "brute_force"]
+NO_SPHERES = np.zeros((0, 4), np.float32)
+
+
+# --- geometry ---------------------------------------------------------------------------------------------------------
+
+
+def soup(rng, n, size=0.2):
+    """n random triangles as a Geometry, none of them connected."""
+    corners = rng.uniform(-1.0, 1.0, (n, 1, 3)) + size * rng.normal(size=(n, 3, 3))
+    return triangles(corners)
+
+
+def triangles(corners, spheres=NO_SPHERES):
+    corners = np.asarray(corners, np.float32).reshape(-1, 3)
+    return Geometry(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3), np.asarray(spheres, np.float32))
+
+
+def coincident(rng):
+    """60 triangles, each there five times, in a shuffled order."""
+    corners = rng.uniform(-1.0, 1.0, (60, 1, 3)) + 0.4 * rng.normal(size=(60, 3, 3))
+    return triangles(np.repeat(corners, 5, axis=0)[rng.permutation(300)])
+
+
+def flat(rng):
+    """Triangles that all lie in the plane y = 0.25, on a grid, and many overlap."""
+    corners = rng.integers(-8, 9, (400, 3, 3)) / 8.0
+    corners[:, :, 1] = 0.25
+    return triangles(corners)
+
+
+def all_equal(_rng):
+    return triangles(np.broadcast_to(np.array([[0.0, 0.0, 0.1], [1.0, 0.0, 0.0], [0.0, 1.0, 0.2]]), (200, 3, 3)))
+
+
+def progression(rng):
+    """Each triangle 3 times as large and as far away as the one before: no split by space is balanced."""
+    scale = 3.0 ** np.arange(-30, 30)[:, None, None]
+    return triangles(scale * (np.array([1.0, 0.3, 0.1]) + 0.2 * rng.normal(size=(60, 3, 3))))
+
+
+def tiny_and_huge(rng):
+    """A dense cluster of a thousandth in a room of a thousand."""
+    room = 1000.0 * rng.uniform(-1.0, 1.0, (30, 3, 3))
+    cluster = 0.5 + 1e-3 * (rng.uniform(-1.0, 1.0, (500, 1, 3)) + 0.1 * rng.normal(size=(500, 3, 3)))
+    return triangles(np.concatenate([room, cluster]))
+
+
+def mixed(rng):
+    """Triangles and spheres, some of the spheres inside each other, two of them the same."""
+    spheres = np.concatenate([rng.uniform(-1.0, 1.0, (60, 3)), rng.uniform(0.02, 0.4, (60, 1))], axis=1)
+    spheres[7] = spheres[3]
+    spheres[9, :3], spheres[9, 3] = spheres[4, :3], 0.5 * spheres[4, 3]
+    return triangles(soup(rng, 200).vertices, spheres)
+
+
+def only_spheres(rng):
+    return triangles(np.zeros((0, 3, 3)), mixed(rng).spheres)
+
+
+GEOMETRIES = {
+    "soup": lambda rng: soup(rng, 800),
+    "long_thin": lambda rng: triangles(rng.normal(size=(300, 3, 3)) * 10.0 ** rng.uniform(-3, 1, (300, 1, 3))),
+    "coincident": coincident, "flat": flat, "all_equal": all_equal, "progression": progression,
+    "tiny_and_huge": tiny_and_huge, "mixed": mixed, "only_spheres": only_spheres,
+    "none": lambda rng: soup(rng, 0), "one": lambda rng: soup(rng, 1, 1.0), "two": lambda rng: soup(rng, 2, 1.0),
+    "one_sphere": lambda rng: triangles(np.zeros((0, 3, 3)), [[0.1, 0.2, 0.3, 0.7]]),
+}
+
+
+def rays_for(geometry, rng, n=6000):
+    """Rays from in and around the geometry: at corners, at points on edges, anywhere, and along the axes."""
+    points = geometry.vertices.astype(np.float64)
+    if len(geometry.spheres):
+        points = np.concatenate([points, geometry.spheres[:, :3] + 0.9 * geometry.spheres[:, 3:]])
+    if not len(points):
+        points = np.zeros((3, 3))
+    a, b, c = points[rng.integers(0, len(points), (3, n))]
+    target = np.where(rng.random((n, 1)) < 0.3, a, a + rng.random((n, 1)) * (b - a))
+    extent = np.abs(points).max() + 1e-30
+    origin = np.where(rng.random((n, 1)) < 0.5, c + 0.1 * extent * rng.normal(size=(n, 3)), 3.0 * extent * rng.normal(size=(n, 3)))
+    direction = target - origin
+    axis = rng.random(n) < 0.25
+    direction[axis] = np.eye(3)[rng.integers(0, 3, axis.sum())] * rng.choice([-1.0, 1.0], (axis.sum(), 1))
+    origin[axis] = target[axis] - direction[axis] * extent * rng.integers(0, 3, (axis.sum(), 1))
+    origin, direction = rounded(origin), rounded(direction)
+    direction[~direction.any(axis=1), 0] = 1.0
+    return origin, direction
+
+
+def assert_same_hits(found, expected):
+    for name in ("prim_id", "t", "u", "v"):
+        a, b = getattr(found, name), getattr(expected, name)
+        differ = np.nonzero(a.view(np.int32) != b.view(np.int32))[0]
+        assert not len(differ), f"{name} of ray {differ[0]}: {a[differ[0]]!r}, not {b[differ[0]]!r} ({len(differ)} in all)"
+
+
+# --- every structure against brute force ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize("kind", GEOMETRIES)
+def test_same_bits_as_brute_force(kind, name):
+    rng = np.random.default_rng(1)
+    geometry = GEOMETRIES[kind](rng)
+    origin, direction = rays_for(geometry, rng)
+    reference, tree = build(geometry, "brute_force"), build(geometry, name)
+    expected = reference.closest_hit(origin, direction)
+    assert_same_hits(tree.closest_hit(origin, direction), expected)
+    if len(geometry):
+        assert 50 < (expected.prim_id >= 0).sum()
+
+    hit = expected.prim_id >= 0
+    lengths = np.where(hit, expected.t, np.float32(1.0)) * rng.choice([0.5, 0.999, 1.0, 1.5], len(origin)).astype(np.float32)
+    t_min = (lengths * rng.choice([0.0, 0.9, 1.0], len(origin))).astype(np.float32)
+    expected = reference.closest_hit(origin, direction, t_min, lengths)
+    assert_same_hits(tree.closest_hit(origin, direction, t_min, lengths), expected)
+    for structure in (reference, tree):
+        assert np.array_equal(structure.any_hit(origin, direction, t_min, lengths), expected.prim_id >= 0)
+
+
+@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize("max_leaf", [1, 2, 64])
+def test_leaf_size_does_not_matter(name, max_leaf):
+    rng = np.random.default_rng(2)
+    geometry = mixed(rng)
+    origin, direction = rays_for(geometry, rng)
+    expected = build(geometry, "brute_force").closest_hit(origin, direction)
+    assert_same_hits(build(geometry, name, max_leaf=max_leaf).closest_hit(origin, direction), expected)
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_ties_go_to_the_lower_prim_id(name):
+    rng = np.random.default_rng(3)
+    geometry = coincident(rng)
+    corners = geometry.vertices[geometry.faces].reshape(len(geometry), 9)
+    _, first, group = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    origin, direction = rays_for(geometry, rng)
+    prim_id = build(geometry, name).closest_hit(origin, direction).prim_id
+    hit = prim_id >= 0
+    assert hit.sum() > 1000
+    assert np.array_equal(prim_id[hit], first[group.ravel()[prim_id[hit]]])
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_the_segment_is_closed(name):
+    rng = np.random.default_rng(4)
+    geometry = mixed(rng)
+    structure = build(geometry, name)
+    origin, direction = rays_for(geometry, rng)
+    hits = structure.closest_hit(origin, direction)
+    on = hits.prim_id >= 0
+    origin, direction, t = origin[on], direction[on], hits.t[on]
+    again = structure.closest_hit(origin, direction, t, t)
+    assert np.array_equal(again.prim_id, hits.prim_id[on]) and np.array_equal(again.t, t)
+    assert structure.any_hit(origin, direction, 0.0, t).all()
+    before = np.nextafter(t, np.float32(0.0))
+    ahead = t > 0.0
+    assert not structure.any_hit(origin[ahead], direction[ahead], 0.0, before[ahead]).any()
+    beyond = structure.closest_hit(origin, direction, np.nextafter(t, np.float32(np.inf)))
+    assert (beyond.t > t).all()
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize("kind", ["none", "one", "two", "one_sphere", "soup"])
+def test_rays_that_are_not_finite_miss_and_end(kind, name):
+    # NaN compares false with everything: such a ray must not enter an empty box and go round for ever.
+    structure = build(GEOMETRIES[kind](np.random.default_rng(5)), name)
+    rows = []
+    for bad in (np.nan, np.inf, -np.inf):
+        for axis in range(6):
+            row = np.array([0.0, 0.0, -3.0, 0.0, 0.1, 1.0])
+            row[axis] = bad
+            rows.append(row)
+    rows = np.array(rows)
+    hits = structure.closest_hit(vec3s(rows[:, :3]), vec3s(rows[:, 3:]))
+    assert (hits.prim_id.numpy() == -1).all() and np.isinf(hits.t.numpy()).all()
+    assert not structure.any_hit(vec3s(rows[:, :3]), vec3s(rows[:, 3:])).numpy().any()
+
+
+# --- no ray is lost ---------------------------------------------------------------------------------------------------
+
+
+def edge_points(mesh, rng, per_edge):
+    """Points on the edges of a mesh, in float64."""
+    ends = np.unique(np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    a, b = (np.repeat(mesh.vertices[ends[:, i]].astype(np.float64), per_edge, axis=0) for i in range(2))
+    return a + rng.random((len(a), 1)) * (b - a)
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize("placed", ["unit", "stretched", "far", "tiny", "huge"])
+def test_a_closed_mesh_is_watertight(placed, name):
+    rng = np.random.default_rng(6)
+    ball = icosphere(4)
+    assert len(ball.faces) == 5120 and len(ball.vertices) == 2562
+    scale, move = {"unit": (1.0, 0.0), "stretched": ([3.0, 0.05, 100.0], 0.0), "far": (0.5, [1000.0, -300.0, 77.0]),
+                   "tiny": (1e-18, 0.0), "huge": (1e15, 0.0)}[placed]
+    mesh = Mesh(ball.vertices.astype(np.float64) * scale + move, ball.faces)
+    targets = np.concatenate([mesh.vertices.astype(np.float64), edge_points(mesh, rng, 1)])
+    origin = rounded(np.broadcast_to(0.2 * np.array([0.3, -0.2, 0.1]) * scale + move, targets.shape))
+    structure = build(mesh, name)
+    hits = structure.closest_hit(origin, targets - origin)
+    assert (hits.prim_id >= 0).all(), f"{(hits.prim_id < 0).sum()} of {len(targets)} rays left the ball"
+    assert structure.any_hit(origin, targets - origin).all()
+    # From the center, whose float32 directions point at the corners exactly.
+    center = rounded(np.broadcast_to(np.zeros(3) * scale + move, (2562, 3)))
+    hits = structure.closest_hit(center, mesh.vertices - center)
+    assert (hits.prim_id >= 0).all() and np.allclose(hits.t, 1.0, rtol=2e-5 if placed == "far" else 2e-6)
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_a_floor_of_long_triangles_is_watertight(name):
+    # The rounding of far corners moves the seams by more than the relative margin of a box test covers near the eye.
+    rng = np.random.default_rng(7)
+    x = np.linspace(-4.0, 4.0, 9)
+    vertices = np.array([[a, 0.0, z] for a in x for z in (-1000.0, 1000.0)])
+    strip = np.arange(8)[:, None] * 2
+    faces = np.concatenate([strip + [0, 1, 3], strip + [0, 3, 2]])
+    n = 100_000
+    aside = rng.choice([-1.0, 1.0], n) * 10.0 ** rng.uniform(-8, -4, n)
+    target = np.stack([rng.choice(x[1:-1], n) + aside, np.zeros(n), rng.uniform(-5.0, 5.0, n)], axis=1)
+    direction = np.stack([rng.uniform(-0.3, 0.3, n), -(10.0 ** rng.uniform(-4, -0.5, n)), rng.choice([-1.0, 1.0], n)], axis=1)
+    origin = rounded(target - direction * 10.0 ** rng.uniform(-2, 1, (n, 1)))
+    direction = rounded(target - origin)
+    for turn in range(3):  # the floor, and two walls
+        mesh = Mesh(np.roll(vertices, turn, axis=1), faces)
+        hits = build(mesh, name).closest_hit(np.roll(origin, turn, axis=1), np.roll(direction, turn, axis=1))
+        assert (hits.prim_id >= 0).all(), f"{(hits.prim_id < 0).sum()} of {n} rays fell through"
+        # The seams are off by a few u of the strips' length, and so is the place where the ray is said to meet them.
+        assert (np.abs(hits.t - 1.0) * np.linalg.norm(direction, axis=1)).max() < 4.0 * 2.0**-24 * 1000.0
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_rays_along_the_faces_of_a_grid(name):
+    # Axis-parallel rays exactly in the planes and through the corners of a grid of quads: 0 * inf in every box.
+    n = 12
+    i, j = np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0), indexing="ij")
+    first = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1, 1)
+    faces = np.concatenate([first + [0, n + 1, n + 2], first + [0, n + 2, 1]])
+    for axis in range(3):
+        flat_grid = np.stack([i, j], axis=-1).reshape(-1, 2)
+        vertices = np.insert(flat_grid, axis, 3.0, axis=1)
+        structure = build(Mesh(vertices, faces), name)
+        half = np.stack(np.meshgrid(np.arange(0.0, n + 0.5, 0.5), np.arange(0.0, n + 0.5, 0.5)), axis=-1).reshape(-1, 2)
+        for sign in (-1.0, 1.0):
+            for zero in (0.0, -0.0):
+                origin = np.insert(half, axis, 3.0 - 5.0 * sign, axis=1)
+                direction = np.full(3, zero)
+                direction[axis] = sign
+                hits = structure.closest_hit(origin, np.broadcast_to(direction, origin.shape))
+                assert (hits.prim_id >= 0).all() and (hits.t == 5.0).all()
+
+
+# --- what a ray may refuse --------------------------------------------------------------------------------------------
+
+
+@wp.func
+def accepts_even_near_edge(surfaces: Surfaces, prim_id: int, u: float, v: float) -> bool:
+    return prim_id % 2 == 0 and u < 0.75
+
+
+@cache
+def refusing_kernels(name):
+    """Kernels over rays with an `exclude` each, and over traversals that refuse hits."""
+    cls = next(cls for cls in ACCELERATORS.values() if cls.name == name)
+    struct = cls.struct
+    closest = cls.traversal(any_hit=False, with_spheres=False)
+    picky = cls.traversal(any_hit=False, with_spheres=False, accepts=accepts_even_near_edge)
+    picky_any = cls.traversal(any_hit=True, with_spheres=False, accepts=accepts_even_near_edge)
+
+    @kernel
+    def excluding(accel: struct, surfaces: Surfaces, rays: RayArrays, exclude: wp.array(dtype=wp.int32), hits: HitArrays):
+        i = wp.tid()
+        ray = load_ray(rays, i)
+        ray.exclude = exclude[i]
+        hit = closest(accel, surfaces, ray)
+        hits.t[i] = hit.t
+        hits.prim_id[i] = hit.prim_id
+
+    @kernel
+    def accepting(accel: struct, surfaces: Surfaces, rays: RayArrays, dark: wp.array(dtype=wp.int32), hits: HitArrays):
+        i = wp.tid()
+        hit = picky(accel, surfaces, load_ray(rays, i))
+        hits.t[i] = hit.t
+        hits.u[i] = hit.u
+        hits.prim_id[i] = hit.prim_id
+        blocker = picky_any(accel, surfaces, load_ray(rays, i))
+        dark[i] = blocker.prim_id
+
+    return excluding, accepting
+
+
+def run_refusing(which, name, geometry, origin, direction, third):
+    n = len(origin)
+    rays, hits = RayArrays(), HitArrays()
+    rays.origin, rays.direction = vec3s(origin), vec3s(direction)
+    rays.t_min, rays.t_max = floats(np.zeros(n)), floats(np.full(n, np.inf))
+    hits.t, hits.u, hits.v, hits.prim_id = zeros(n), zeros(n), zeros(n), zeros(n, wp.int32)
+    surfaces = Surfaces()
+    surfaces.n_triangles = len(geometry.faces)
+    launch(refusing_kernels(name)[which], n, build(geometry, name).data, surfaces, rays, third, hits)
+    return hits
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_the_excluded_triangle_is_not_hit(name):
+    rng = np.random.default_rng(8)
+    geometry = soup(rng, 12, 0.6)
+    origin, direction = rays_for(geometry, rng, 4000)
+    exclude = rng.integers(-1, 12, 4000)
+    hits = run_refusing(0, name, geometry, origin, direction, ints(exclude))
+    for left_out in range(-1, 12):
+        keep = np.delete(np.arange(12), left_out) if left_out >= 0 else np.arange(12)
+        rest = Geometry(geometry.vertices, geometry.faces[keep], NO_SPHERES)
+        chosen = exclude == left_out
+        expected = build(rest, "brute_force").closest_hit(origin[chosen], direction[chosen])
+        prim_id = np.where(expected.prim_id >= 0, keep[expected.prim_id], -1)
+        assert np.array_equal(hits.prim_id.numpy()[chosen], prim_id)
+        assert np.array_equal(hits.t.numpy()[chosen], expected.t)
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_refused_hits_let_the_ray_on(name):
+    rng = np.random.default_rng(9)
+    geometry = soup(rng, 40, 0.5)
+    origin, direction = rays_for(geometry, rng, 4000)
+    dark = zeros(4000, wp.int32)
+    hits = run_refusing(1, name, geometry, origin, direction, dark)
+    # Brute force by hand: each even triangle by itself, hits with u >= 0.75 left out, the closest of the rest.
+    best_t = np.full(4000, np.inf, np.float32)
+    best_id = np.full(4000, -1)
+    for prim_id in range(0, 40, 2):
+        single = Geometry(geometry.vertices, geometry.faces[prim_id : prim_id + 1], NO_SPHERES)
+        hit = build(single, "brute_force").closest_hit(origin, direction)
+        better = (hit.prim_id == 0) & (hit.u < 0.75) & (hit.t < best_t)
+        best_t[better], best_id[better] = hit.t[better], prim_id
+    assert np.array_equal(hits.prim_id.numpy(), best_id) and np.array_equal(hits.t.numpy(), best_t)
+    assert np.array_equal(dark.numpy() >= 0, best_id >= 0)
+    assert (best_id >= 0).sum() > 500
+
+
+def test_scaling_the_direction_scales_t():
+    rng = np.random.default_rng(10)
+    geometry = soup(rng, 300)
+    origin, direction = rays_for(geometry, rng, 3000)
+    structure = build(geometry, "bvh")
+    reference = structure.closest_hit(origin, direction)
+    for power in (-60, -10, 10, 60):
+        hits = structure.closest_hit(origin, direction * 2.0**power)
+        assert np.array_equal(hits.prim_id, reference.prim_id)
+        assert np.array_equal(hits.t, np.ldexp(reference.t, -power))
+
+
+def test_far_rays_find_a_small_ball():
+    # From 100,000 radii away: rays aimed inside the silhouette hit, rays aimed well outside miss.
+    rng = np.random.default_rng(11)
+    structure = build(icosphere(3), "bvh")
+    away = directions(rng, 2000)
+    side = unit(np.cross(away, directions(rng, 2000)))
+    origin = rounded(away * 1e5)
+    for offset, expected in ((0.9, True), (1.1, False)):
+        target = side * offset
+        assert (structure.any_hit(origin, target - origin) == expected).all()
+
+
+def test_the_device_is_the_cpu():
+    assert CPU.is_cpu
