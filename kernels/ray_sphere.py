@@ -8,8 +8,8 @@ difference of two numbers near its radius.
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import BoxRay
-from wrt.kernels.ray_triangle import within_bounds
+from wrt.kernels.ray_aabb import FAR_PAD, BoxRay
+from wrt.kernels.ray_triangle import held, padded_interval
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 
 
@@ -37,9 +37,13 @@ def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
     near = float((wp.dot(f, f) - r * r) / q)
     t_0 = wp.min(near, far)
     t_1 = wp.max(near, far)
+    # The corners of a small sphere's box are rounded by a good part of its radius: only the padded box surely contains it.
     extent = wp.vec3(radius, radius, radius)
-    t_0 = within_bounds(box, t_0, center - extent, center + extent)
-    t_1 = within_bounds(box, t_1, center - extent, center + extent)
+    interval = padded_interval(box, center - extent, center + extent)
+    if not interval[0] <= interval[1] * FAR_PAD:
+        return hit
+    t_0 = held(t_0, interval)
+    t_1 = held(t_1, interval)
     t = wp.where(t_0 >= ray.t_min, t_0, t_1)
     if t >= ray.t_min and wp.isfinite(t):
         hit.t = t

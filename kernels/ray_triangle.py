@@ -102,6 +102,20 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
 
 
 @wp.func
+def padded_interval(ray: BoxRay, lo: wp.vec3, hi: wp.vec3) -> wp.vec2:
+    """The slab interval of a primitive's padded box: the box that structures are built from."""
+    pad = box_pad(lo, hi)
+    return slab_interval(ray, padded_lo(lo, pad), padded_hi(hi, pad))
+
+
+@wp.func
+def held(t: float, interval: wp.vec2) -> float:
+    """t moved into the interval; its entry where the interval is empty."""
+    inside = wp.where(t > interval[1], interval[1], t)
+    return wp.where(inside < interval[0], interval[0], inside)
+
+
+@wp.func
 def within_bounds(ray: BoxRay, t: float, lo: wp.vec3, hi: wp.vec3) -> float:
     """t moved into the interval of the primitive's own box, or inf where the ray passes by even the padded box.
 
@@ -111,12 +125,10 @@ def within_bounds(ray: BoxRay, t: float, lo: wp.vec3, hi: wp.vec3) -> float:
     """
     interval = slab_interval(ray, lo, hi)
     if not interval[0] <= interval[1]:
-        pad = box_pad(lo, hi)
-        interval = slab_interval(ray, padded_lo(lo, pad), padded_hi(hi, pad))
+        interval = padded_interval(ray, lo, hi)
         if not interval[0] <= interval[1] * FAR_PAD:
             return float(wp.inf)
-    inside = wp.where(t > interval[1], interval[1], t)
-    return wp.where(inside < interval[0], interval[0], inside)
+    return held(t, interval)
 
 
 @wp.func

@@ -106,16 +106,18 @@ def make_transmittance(features, accel_struct, closest_hit, any_hit):
     scatter = make_scatter(features)
 
     @wp.func
-    def let_through(m: Material, s: Surface, wo: wp.vec3) -> wp.vec3:
-        """Share of light that goes straight on through a surface."""
-        share = scatter(m, s, wo, wp.vec2(0.0, 0.0))
+    def let_through(m: Material, from_outside: Surface, wo: wp.vec3) -> wp.vec3:
+        """Share of light that goes straight on through a surface.
+
+        An unbent ray meets both sides of solid glass at its angle outside: from_outside.front must be 1, or a ray on its way
+        out would be held for totally reflected.
+        """
+        share = scatter(m, from_outside, wo, wp.vec2(0.0, 0.0))
         through = wp.vec3(0.0, 0.0, 0.0)
         if share.bends == 0 or wp.static(features.tinted_shadows):
             through = share.transmitted
-            if wp.static(features.glass) and share.bends != 0:
-                # Straight through, the solid angle is not squeezed.
-                eta = wp.where(s.front != 0, m.ior, 1.0 / m.ior)
-                through = eta * eta * through
+            if share.bends != 0:
+                through = m.ior * m.ior * through  # straight through, the solid angle is not squeezed
         if wp.static(features.blend):
             through = m.alpha * through + wp.vec3(1.0 - m.alpha, 1.0 - m.alpha, 1.0 - m.alpha)
         return through
@@ -136,9 +138,11 @@ def make_transmittance(features, accel_struct, closest_hit, any_hit):
             m.roughness = 0.0
             d = wp.normalize(ray.direction)
             s.shading = shading_normal(surfaces, m, s, -d)
+            inward = s.front != 0
+            s.front = 1
             out.transmittance = wp.cw_mul(out.transmittance, let_through(m, s, -d))
             if wp.static(features.absorption):
-                if s.front == 0:
+                if not inward:
                     inside = attenuation(surfaces, s.material, hit.t * wp.length(ray.direction))
                     out.transmittance = wp.cw_mul(out.transmittance, inside)
             if wp.max(out.transmittance) <= 0.0:

@@ -7,18 +7,23 @@ with one message; 130 when interrupted. Whatever takes long to import is importe
 from __future__ import annotations
 
 import json
+import math
+import os
 import re
 import sys
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
 from wrt.errors import InputError, SceneWarning
 
 INTERRUPTED = 130
+DIGITS = "[0-9]{1,9}"  # more are no pixel, and Python refuses to read thousands
 
 
 class Size(click.ParamType):
@@ -27,7 +32,7 @@ class Size(click.ParamType):
     name = "WxH"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, int]:
-        match = re.fullmatch(r"(\d+)[xX](\d+)", str(value))
+        match = re.fullmatch(f"({DIGITS})[xX]({DIGITS})", str(value))
         if not match:
             self.fail(f"{value!r} is not a size; write 640x360", param, ctx)
         return int(match[1]), int(match[2])
@@ -39,8 +44,8 @@ class Crop(click.ParamType):
     name = "X0,Y0,X1,Y1"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
-        numbers = str(value).split(",")
-        if len(numbers) != 4 or not all(number.strip().isdigit() for number in numbers):
+        numbers = [number.strip() for number in str(value).split(",")]
+        if len(numbers) != 4 or not all(re.fullmatch(DIGITS, number) for number in numbers):
             self.fail(f"{value!r} is not a rectangle; write X0,Y0,X1,Y1 in pixels from the top left", param, ctx)
         return tuple(int(number) for number in numbers)
 
@@ -51,7 +56,7 @@ class Duration(click.ParamType):
     name = "TIME"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([smh]?)", str(value))
+        match = re.fullmatch(r"([0-9]+(?:\.[0-9]*)?)\s*([smh]?)", str(value))
         if not match:
             self.fail(f"{value!r} is not a time; write 30s, 5m or 1h", param, ctx)
         return float(match[1]) * {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}[match[2]]
@@ -101,27 +106,41 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
     """Render SCENE (.toml, .gltf, .glb, or a mesh: .obj, .ply, .stl) to a picture."""
     begin = time.perf_counter()
     from wrt.image import check_writable
-    from wrt.progress import progress_reporter
 
-    output = output or Path(scene.name).with_suffix(".png")
-    check_writable(output, options["bits"])
+    output = output or Path(f"{scene.stem or 'picture'}.png")
+    bits, aov = options.pop("bits"), options["aov"]
+    check_writable(output, bits)
+    from wrt.driver import Options, held_interrupts
+    from wrt.driver import render as render_scene
+    from wrt.film import aov_path
+    from wrt.progress import progress_reporter
+    from wrt.scene import Scene
+
+    # Whatever can be wrong with an option is told before a scene is read and a kernel compiled.
+    settings = {"filter": options.pop("filter_name")}
+    settings |= {name: options.pop(name) for name in (
+        "spp", "size", "max_depth", "min_throughput", "fresnel", "tonemap", "exposure")}
+    Scene().with_settings(**settings)
+    Options(**options)
+    layers = aov if output.suffix.lower() != ".exr" else None  # in an EXR file they are channels, all of them
+    for name in layers or ():
+        check_writable(aov_path(output, name))
     clock = {"import": time.perf_counter() - begin}
     loaded = _load(scene, quiet, clock)
-    begin = time.perf_counter()
-    from wrt.driver import render as render_scene
 
-    clock["import"] += time.perf_counter() - begin
-    bits, aov = options.pop("bits"), options.pop("aov")
-    settings = {"filter": options.pop("filter_name"), "fresnel": options.pop("fresnel"),
-                "tonemap": options.pop("tonemap"), "exposure": options.pop("exposure")}
-    with progress_reporter(quiet) as progress:
-        film = render_scene(loaded, settings=settings, aov=aov, progress=progress, **options)
-    begin = time.perf_counter()
-    film.metadata["scene"] = str(scene.name)
-    paths = film.save(output, bits=bits, aov=aov if output.suffix.lower() != ".exr" else None)
+    with _warnings_told(quiet), progress_reporter(quiet) as progress:
+        with _naming(scene):
+            film = render_scene(loaded.with_settings(**settings), progress=progress, **options)
+        if not film.stats["samples"]:
+            raise KeyboardInterrupt  # there is nothing to keep
+        begin = time.perf_counter()
+        film.metadata["scene"] = scene.name
+        with held_interrupts() as late:  # a picture that is there is written in any case
+            paths = film.save(output, bits=bits, aov=layers)
+    film.stats["interrupted"] = film.stats["interrupted"] or bool(late)
     film.stats["seconds"] = clock | film.stats["seconds"] | {"write": time.perf_counter() - begin}
     if as_json:
-        click.echo(json.dumps({"output": [str(path) for path in paths], **film.metadata, **film.stats}, default=str))
+        _say_json({"output": [str(path) for path in paths], **film.metadata, **film.stats})
     else:
         for path in paths:
             click.echo(path)
@@ -136,6 +155,8 @@ def _summary(film: Any) -> str:
     seconds = ", ".join(f"{name} {value:.2f}" for name, value in s["seconds"].items())
     cut = f"cut: {s['cut_by_depth']} rays by depth, {s['cut_by_throughput']} by throughput"
     note = " (interrupted)" if s["interrupted"] else " (time limit)" if s["timed_out"] else ""
+    if film.samples.min() == 0:
+        note = f" (interrupted: {(film.samples == 0).mean():.0%} of the pixels are still black)"
     lost = f"; {s['not_finite']} samples were not finite and count as black" if s["not_finite"] else ""
     return (f"{film.metadata['spp']} spp{note}, {s['rays'] / 1e6:.2f} M rays, {s['rays_per_second'] / 1e6:.2f} Mray/s; "
             f"{cut}, lost throughput {s['lost_throughput_per_sample']:.2g} a sample{lost}\nseconds: {seconds}")
@@ -146,15 +167,44 @@ def _load(path: Path, quiet: bool, clock: dict[str, float] | None = None) -> Any
     begin = time.perf_counter()
     from wrt.scene_file import load_scene
 
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", SceneWarning)
+    with _warnings_told(quiet):
         scene = load_scene(path)
-    for warning in caught:
-        if not (quiet and issubclass(warning.category, SceneWarning)):
-            _say(f"warning: {warning.message}")
     if clock is not None:
         clock["load"] = time.perf_counter() - begin
     return scene
+
+
+@contextmanager
+def _warnings_told(quiet: bool) -> Iterator[None]:
+    """Tell the block's warnings on stderr when it is over, a line each; none where it fails: one message is enough."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", SceneWarning)
+        yield
+    for warning in caught:
+        if not (quiet and issubclass(warning.category, SceneWarning)):
+            _say(f"warning: {warning.message}")
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """What is found wrong with a scene after it was read is told with its file."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error), path) from error
+
+
+def _say_json(value: Any) -> None:
+    """On stdout; JSON has no NaN and no infinity: they become null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {str(key): plain(each) for key, each in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(each) for each in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    click.echo(json.dumps(plain(value), default=str, allow_nan=False))
 
 
 def _say(text: str) -> None:
@@ -169,9 +219,11 @@ def info(scene: Path, camera: str | None, as_json: bool) -> None:
     """Tell what SCENE holds, and which features its kernel is compiled with."""
     from wrt.features import describe
 
-    facts = describe(_load(scene, quiet=False), camera)
+    loaded = _load(scene, quiet=False)
+    with _naming(scene):
+        facts = describe(loaded, camera)
     if as_json:
-        click.echo(json.dumps(facts))
+        _say_json(facts)
         return
     features = facts.pop("features")
     for name, value in facts.items():
@@ -220,15 +272,19 @@ def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float
     """Measure the error of picture A against the reference B."""
     from wrt import metrics
     from wrt.image import check_writable, read_image, write_codes
+    from wrt.scene import Settings
 
+    Settings(tonemap=tonemap, exposure=exposure)  # told before the pictures are read
     if output is not None:
-        check_writable(output, 8)
+        if output.suffix.lower() != ".png":
+            raise InputError("a picture of the difference is a .png", output)
+        check_writable(output)
     first, second = read_image(a), read_image(b)
     result = metrics.compare(first, second, exposure=exposure, tonemap=tonemap)
     if output is not None:
         write_codes(output, metrics.difference_image(first, second))
     if as_json:
-        click.echo(json.dumps(result))
+        _say_json(result)
     else:
         for name, value in result.items():
             click.echo(f"{name}: {value:.6g}")
@@ -258,10 +314,22 @@ def main() -> None:
     except click.ClickException as error:
         error.show()
         code = error.exit_code
+    except OSError as error:  # from outside of wrt: a path too long for the system, stdout on a full disk
+        _say(f"error: {error}")
+        code = 2
     except (click.Abort, KeyboardInterrupt):
         _say("interrupted")
         code = INTERRUPTED
-    except BrokenPipeError:  # `wrt info scene | head`
-        sys.stderr.close()
-        code = 0
+    except SystemExit as error:
+        code = error.code
+    if code == INTERRUPTED:
+        _leave(code)
     sys.exit(code)
+
+
+def _leave(code: int) -> NoReturn:
+    """Exit without waiting for a thread that compiles. Nothing is lost by it: files are whole or were never there."""
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:
+            stream.flush()
+    os._exit(code)

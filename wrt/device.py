@@ -20,11 +20,12 @@ wp.config.log_level = wp.LOG_WARNING if hasattr(wp, "LOG_WARNING") else 30
 
 
 @contextmanager
-def _without_driver_notice() -> Iterator[None]:
-    """Hold stderr back while Warp starts: its C++ side says on every machine without a GPU that there is none.
-
-    Everything else that is written meanwhile comes out afterwards.
-    """
+def _stderr_without(text: bytes) -> Iterator[None]:
+    """Hold stderr back during the block, and let it out again without the lines that have `text` in them: Warp's C++ side
+    writes past Python."""
+    if sys.stderr is None:  # closed by who started us
+        yield
+        return
     sys.stderr.flush()
     with tempfile.TemporaryFile() as held:
         stderr = os.dup(2)
@@ -35,17 +36,17 @@ def _without_driver_notice() -> Iterator[None]:
             os.dup2(stderr, 2)
             os.close(stderr)
             held.seek(0)
-            lines = held.read().splitlines(keepends=True)
-            os.write(2, b"".join(line for line in lines if b"NVIDIA CUDA driver" not in line))
+            os.write(2, b"".join(line for line in held.read().splitlines(keepends=True) if text not in line))
 
 
 @cache
 def start(device: str) -> Any:
     """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are."""
-    with _without_driver_notice():
+    with _stderr_without(b"NVIDIA CUDA driver"):  # where there is no GPU, it says so each time
         wp.init()
     try:
-        return wp.get_device(device)
+        with _stderr_without(b"Warp CUDA error"):  # told by the InputError below
+            return wp.get_device(device)
     except Exception as error:  # Warp raises ValueError or RuntimeError, depending on what is wrong with the name
         known = ", ".join(str(d) for d in wp.get_devices())
         raise InputError(f"no device {device!r}; there is {known}") from error

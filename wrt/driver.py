@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -15,10 +15,11 @@ import warp as wp
 import wrt
 from wrt.accel import ACCELERATORS, Accelerator, build
 from wrt.device import load_kernel, start, thread_count, upload
-from wrt.device_scene import DeviceScene, camera_struct, upload_scene
+from wrt.device_scene import camera_struct, upload_scene
 from wrt.errors import InputError
 from wrt.features import Features, features_of, filter_icdf
 from wrt.film import Film
+from wrt.interrupt import held_interrupts
 from wrt.kernels import render as kernels
 from wrt.kernels import structs
 from wrt.scene import Camera, Scene
@@ -76,6 +77,8 @@ class Options:
             raise InputError(f"time_limit must be more than 0 seconds, got {self.time_limit}")
         if not 0 <= self.seed < 2**32:
             raise InputError(f"seed must be 0 to 2^32 - 1, got {self.seed}")
+        thread_count(self.threads)
+        start(self.device)
 
 
 def render(scene: Scene, *, spp: int | None = None, size: tuple[int, int] | None = None, max_depth: int | None = None,
@@ -108,6 +111,7 @@ class Renderer:
         self.scene, self.options = scene, options
         self.seconds: dict[str, float] = {}
         self.threads = thread_count(options.threads)
+        self.interrupts: list[int] = []
         self.device = start(options.device)
         self.camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
         self.features = features_of(scene, self.camera)
@@ -116,10 +120,7 @@ class Renderer:
         self.kernels = [render_kernel(self.features, accelerator)]
         if options.aov:
             self.kernels.append(aov_kernel(self.features, accelerator))
-        with ThreadPoolExecutor(1) as pool:  # compiling takes longest: the structure is built meanwhile
-            compiled = pool.submit(self._compile)
-            self.device_scene, self.accel = self._build()
-            compiled.result()
+        self._prepare()
         self.film = _film_struct(scene.settings, self.device)
         self.limits = structs.Limits()
         self.limits.max_depth, self.limits.min_throughput = scene.settings.max_depth, scene.settings.min_throughput
@@ -133,47 +134,72 @@ class Renderer:
             raise InputError(f"crop {x0},{y0},{x1},{y1} is not within the picture of {width}x{height}")
         return x0, y0, x1, y1
 
+    def _prepare(self) -> None:
+        """Compile, which takes longest, and build the structure meanwhile. Neither Ctrl-C nor an error waits for the
+        compiler, and no wait is long: Python may hear of Ctrl-C only between two of them."""
+        pool = ThreadPoolExecutor(2)
+        jobs: set[Future[None]] = {pool.submit(self._compile), pool.submit(self._build)}
+        try:
+            while jobs:
+                finished, jobs = wait(jobs, timeout=0.1, return_when=FIRST_EXCEPTION)
+                for job in finished:
+                    job.result()
+        finally:
+            pool.shutdown(wait=False)
+
     def _compile(self) -> None:
         begin = time.perf_counter()
         for kernel in self.kernels:
             load_kernel(kernel, self.device)
         self.seconds["compile"] = time.perf_counter() - begin
 
-    def _build(self) -> tuple[DeviceScene, Accelerator]:
+    def _build(self) -> None:
         begin = time.perf_counter()
-        device_scene = upload_scene(self.scene, self.device)
+        self.device_scene = upload_scene(self.scene, self.device)
         self.seconds["upload"] = time.perf_counter() - begin
-        accel = build(device_scene.world.geometry, self.options.accel, self.options.device, self.threads,
-                      **self.options.accel_options)
-        self.seconds["build"] = accel.stats.build_seconds
-        return device_scene, accel
+        self.accel = build(self.device_scene.world.geometry, self.options.accel, self.options.device, self.threads,
+                           **self.options.accel_options)
+        self.seconds["build"] = self.accel.stats.build_seconds
 
     def run(self) -> Film:
         """Take all samples (or as many as time allows) and return the film."""
+        interrupted, taken = False, 0
+        aov: dict[str, np.ndarray] = {}
         begin = time.perf_counter()
-        interrupted, timed_out = False, False
-        try:
-            for first, count in self._passes():
-                elapsed = time.perf_counter() - begin
-                if first > 0 and self.options.time_limit is not None and elapsed >= self.options.time_limit:
-                    timed_out = True
-                    break
-                self._run_pass(first, count, begin)
-        except KeyboardInterrupt:
-            interrupted = True
-        self.seconds["trace"] = time.perf_counter() - begin
-        aov = self._aovs() if self.options.aov else {}
-        return self._result(aov, interrupted, timed_out)
+        with held_interrupts() as self.interrupts:
+            try:
+                if self.options.aov:
+                    aov = self._aovs()
+                    self.seconds["aov"] = time.perf_counter() - begin
+                begin = time.perf_counter()
+                for first, count in self._passes(begin):
+                    self._run_pass(first, count, begin)
+                    taken = first + count
+            except KeyboardInterrupt:  # from _each_tile, or from a progress callback that wants the end
+                interrupted = True
+            self.seconds["trace"] = time.perf_counter() - begin
+            interrupted = interrupted or bool(self.interrupts)
+            timed_out = not interrupted and taken < self.scene.settings.spp
+            return self._result(aov, interrupted, timed_out)
 
-    def _passes(self) -> Iterator[tuple[int, int]]:
-        """First sample and number of samples of each pass: 1, 1, 2, 4 ... so that the first picture comes soon."""
-        spp, first, count = self.scene.settings.spp, 0, self.options.pass_size or 1
+    def _passes(self, begin: float) -> Iterator[tuple[int, int]]:
+        """First sample and number of samples of each pass: 1, 1, 2, 4 ... so that the first picture comes soon.
+
+        A time limit counts from `begin`: a pass takes no more samples than are likely to be done by then, but for the
+        first of each pixel, which is always taken.
+        """
+        spp, limit = self.scene.settings.spp, self.options.time_limit
+        first, count = 0, self.options.pass_size or 1
         while first < spp:
             count = min(count, spp - first)
+            if first > 0 and limit is not None:
+                elapsed = time.perf_counter() - begin
+                if elapsed >= limit:
+                    return
+                count = max(1, min(count, int(min((limit - elapsed) / elapsed * first, spp))))
             yield first, count
             first += count
-            if self.options.pass_size is None:
-                count = min(first, MAX_PASS)
+            count = self.options.pass_size or min(first, MAX_PASS)
 
     def _tiles(self) -> Iterator[tuple[int, int, int, int]]:
         x0, y0, x1, y1 = self.crop
@@ -192,29 +218,37 @@ class Renderer:
     def _run_pass(self, first: int, count: int, begin: float) -> None:
         arguments = [self.accel.data, self.device_scene.surfaces, self.device_scene.lighting, self.device_camera,
                      self.limits, self.film]
-        tiles = list(self._tiles())
         area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
 
         def trace(rectangle: tuple[int, int, int, int]) -> int:
             self._launch(self.kernels[0], arguments, rectangle, (first, count))
             return rectangle[2] * rectangle[3]
 
+        self._each_tile(trace, lambda done: self._report(first * area + done * count, area, begin))
+
+    def _each_tile(self, trace: Callable[[tuple[int, int, int, int]], int], report: Callable[[int], None]) -> None:
+        """Trace every tile on all threads; `report` gets the number of pixels done, now and then. KeyboardInterrupt where
+        Ctrl-C came: tiles that run come to their end, so that a pixel is never half done."""
+        if self.interrupts:
+            raise KeyboardInterrupt
         if self.device.is_cuda:
-            done = sum(trace(tile) for tile in tiles)
+            done = sum(trace(tile) for tile in self._tiles())
             wp.synchronize_device(self.device)
-            self._report(first * area + done * count, area, begin)
+            report(done)
             return
         with ThreadPoolExecutor(self.threads) as pool:
-            pending: set[Future[int]] = {pool.submit(trace, tile) for tile in tiles}
+            pending: set[Future[int]] = {pool.submit(trace, tile) for tile in self._tiles()}
             done = 0
             try:
                 while pending:
                     finished, pending = wait(pending, timeout=0.1)
                     done += sum(future.result() for future in finished)
-                    self._report(first * area + done * count, area, begin)
+                    report(done)
+                    if self.interrupts and pending:
+                        raise KeyboardInterrupt
             except BaseException:
                 for future in pending:
-                    future.cancel()  # those that run come to their end: a pixel is never half done
+                    future.cancel()
                 raise
 
     def _report(self, done: int, area: int, begin: float) -> None:
@@ -230,8 +264,12 @@ class Renderer:
         for name, dtype in shapes.items():
             setattr(film, name, wp.zeros(width * height, dtype=dtype, device=self.device))
         arguments = [self.accel.data, self.device_scene.surfaces, self.device_camera, film]
-        for rectangle in self._tiles():
+
+        def trace(rectangle: tuple[int, int, int, int]) -> int:
             self._launch(self.kernels[1], arguments, rectangle, (0, 1), [width, height])
+            return rectangle[2] * rectangle[3]
+
+        self._each_tile(trace, lambda done: None)
         return {name: self._picture(getattr(film, name)) for name in self.options.aov}
 
     def _picture(self, array: Any) -> np.ndarray:

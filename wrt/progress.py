@@ -25,7 +25,7 @@ def progress_reporter(quiet: bool) -> Iterator[Callable[[Progress], None] | None
     """A callback for `wrt.render(progress=...)` that writes to stderr; None where quiet."""
     if quiet:
         yield None
-    elif sys.stderr.isatty():
+    elif sys.stderr is not None and sys.stderr.isatty():
         with _bar() as report:
             yield report
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import warnings
@@ -53,10 +54,15 @@ def _solids(path: Path) -> dict[str, np.ndarray]:
     """Positions (3 T, 3) of each solid by name, in the order of the file."""
     import trimesh
 
+    log = logging.getLogger("trimesh")
+    level = log.level
     try:
+        log.setLevel(logging.CRITICAL + 1)  # it prints a traceback for each facet normal that is not a number
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # NumPy's way of saying that a word is not a number
             loaded = trimesh.load_scene(path, file_type="stl", process=False)
     except Exception as error:
         raise InputError(f"cannot be read as STL: {error}", path) from error
+    finally:
+        log.setLevel(level)
     return {name: np.asarray(mesh.vertices)[mesh.faces.reshape(-1)] for name, mesh in loaded.geometry.items()}

@@ -47,6 +47,13 @@ def test_solids_become_groups(tmp_path: Path, triangles: np.ndarray) -> None:
     assert raw.face_group is not None and raw.face_group.tolist() == [0, 0, 1, 1, 1, 1, 1]
 
 
+def test_facet_normals_do_not_matter(tmp_path: Path, triangles: np.ndarray, capfd, caplog) -> None:
+    path = tmp_path / "a.stl"
+    path.write_bytes(text(triangles).replace(b"normal 0 0 0", b"normal -nan(ind) 0 x"))
+    np.testing.assert_array_equal(read_stl(path).vertices.astype(np.float32), triangles.reshape(-1, 3))
+    assert capfd.readouterr() == ("", "") and not caplog.records
+
+
 @pytest.mark.parametrize("broken", [
     lambda t: binary(t)[:-1], lambda t: binary(t) + b"x", lambda t: binary(t)[:90], lambda t: binary(t)[:50],
     lambda t: text(t)[:-20], lambda t: text(t)[:200], lambda t: text(t) + text(t)[:300],

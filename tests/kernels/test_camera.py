@@ -1,0 +1,141 @@
+"""Camera rays against the lecture's construction in float64: chief ray, parallel ray, and the point S where they meet."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import launch, unit, vec2s, zeros  # isort: skip (starts Warp)
+import warp as wp
+
+from wrt.device_scene import camera_struct
+from wrt.kernels.camera import make_camera_ray
+from wrt.kernels.structs import Camera as DeviceCamera
+from wrt.kernels.structs import Ray, kernel
+from wrt.scene import Camera
+
+
+@cache
+def camera_kernel(lens, blades):
+    camera_ray = make_camera_ray(lens, blades)
+
+    @kernel
+    def trace(camera: DeviceCamera, film: wp.array(dtype=wp.vec2), xi: wp.array(dtype=wp.vec2), out: wp.array(dtype=Ray)):
+        i = wp.tid()
+        out[i] = camera_ray(camera, film[i], xi[i])
+
+    return trace
+
+
+def rays(camera, size, film, xi=None):
+    """origins, directions (N, 3) float64 of a camera's rays at film points, with lens samples xi."""
+    film = np.asarray(film, float).reshape(-1, 2)
+    xi = np.zeros_like(film) if xi is None else xi
+    lens, blades = camera.aperture_radius > 0.0, camera.aperture_radius > 0.0 and camera.blades > 0
+    out = zeros(len(film), Ray)
+    launch(camera_kernel(lens, blades), len(film), camera_struct(camera, size), vec2s(film), vec2s(xi), out)
+    out = out.numpy()
+    assert (out["t_min"] == 0.0).all() and np.isinf(out["t_max"]).all() and (out["exclude"] == -1).all()
+    origin, direction = out["origin"].astype(np.float64), out["direction"].astype(np.float64)
+    assert np.abs(np.linalg.norm(direction, axis=1) - 1.0).max() < 1e-6
+    return origin, direction
+
+
+POSE = {"position": (3.0, -2.0, 5.0), "target": (-1.0, 0.5, 0.25), "up": (0.2, 1.0, -0.1)}
+
+
+def frame(camera):
+    m = camera.camera_to_world
+    return m[:3, 0], m[:3, 1], -m[:3, 2], m[:3, 3]
+
+
+@pytest.mark.parametrize("size", [(640, 360), (100, 300), (7, 7)])
+def test_pinhole_corners(size):
+    camera = Camera.look_at(**POSE, fov_y=1.1)
+    right, up, forward, eye = frame(camera)
+    height = np.tan(0.55)
+    width = height * size[0] / size[1]
+    for film, x, y in (((0.0, 0.0), -width, height), ((1.0, 0.0), width, height), ((0.0, 1.0), -width, -height),
+                       ((1.0, 1.0), width, -height), ((0.5, 0.5), 0.0, 0.0), ((0.25, 0.5), -0.5 * width, 0.0)):
+        origin, direction = rays(camera, size, [film])
+        assert np.allclose(origin[0], eye, atol=1e-6)
+        assert np.allclose(direction[0], unit(forward + x * right + y * up), atol=1e-6), film
+
+
+def test_default_camera_looks_along_minus_z_with_y_up():
+    _, direction = rays(Camera(fov_y=np.pi / 2), (10, 10), [(0.5, 0.5), (0.5, 0.0), (1.0, 0.5)])
+    assert np.allclose(direction, unit(np.array([[0, 0, -1], [0, 1, -1], [1, 0, -1]])), atol=1e-6)
+
+
+def meeting_point(point_a, direction_a, point_b, direction_b):
+    """Where two lines that lie in one plane cross, by least squares in float64; and how far apart they pass."""
+    a = np.stack([direction_a, -direction_b], axis=1)
+    (s, t), *_ = np.linalg.lstsq(a, point_b - point_a, rcond=None)
+    p, q = point_a + s * direction_a, point_b + t * direction_b
+    return 0.5 * (p + q), np.linalg.norm(p - q)
+
+
+@pytest.mark.parametrize(("blades", "f_number"), [(0, 1.4), (0, 8.0), (6, 2.0)])
+@pytest.mark.parametrize("focus", [0.6, 3.0, 40.0])
+def test_all_rays_of_a_film_point_cross_at_the_lectures_point(focus, blades, f_number):
+    # Lens equation and construction in the camera's own frame: lens at z = 0, scene at z > 0, sensor at z = -s'.
+    f, sensor = 0.05, 0.024
+    lens = Camera.lens(f, focus, sensor, f_number=f_number)
+    camera = Camera.look_at(**POSE, blades=blades, **lens)
+    right, up, forward, eye = frame(camera)
+    size = (36, 24)
+    sensor_distance = 1.0 / (1.0 / f - 1.0 / focus)
+    rng = np.random.default_rng(1)
+    for film in [(0.0, 0.0), (0.9, 0.2), (0.5, 0.49), *rng.random((4, 2))]:
+        # The sensor's picture is upside down: the film point (top left first) lies at (-x, -y) behind the lens.
+        x = (film[0] - 0.5) * sensor * size[0] / size[1]
+        y = (0.5 - film[1]) * sensor
+        on_sensor = np.array([-x, -y, -sensor_distance])
+        chief = -on_sensor  # through the lens' center, not deflected
+        hits_lens = np.array([-x, -y, 0.0])  # comes parallel to the axis, leaves through the focal point
+        point, gap = meeting_point(np.zeros(3), chief, hits_lens, np.array([0.0, 0.0, f]) - hits_lens)
+        assert gap < 1e-9 * focus and point[2] == pytest.approx(focus, rel=1e-9)
+        s = eye + point[0] * right + point[1] * up + point[2] * forward
+
+        xi = rng.random((200, 2))
+        origin, direction = rays(camera, size, np.broadcast_to(film, (200, 2)), xi)
+        along = ((s - origin) * direction).sum(axis=1)
+        miss = np.linalg.norm(origin + along[:, None] * direction - s, axis=1)
+        assert miss.max() < 2e-6 * (focus + np.abs(eye).max())
+        # The rays start all over the lens: in its plane, within its radius, and not all from one place.
+        local = (origin - eye) @ np.stack([right, up, forward], axis=1)
+        assert np.abs(local[:, 2]).max() < 1e-6
+        radius = np.linalg.norm(local[:, :2], axis=1)
+        assert radius.max() <= lens["aperture_radius"] + 2e-6
+        if f_number < 4.0:
+            assert radius.max() > 0.85 * lens["aperture_radius"]
+
+
+def test_lens_is_covered_evenly():
+    camera = Camera(aperture_radius=0.5, focus_distance=4.0)
+    xi = np.random.default_rng(2).random((20_000, 2))
+    origin, _ = rays(camera, (4, 4), np.full((20_000, 2), 0.3), xi)
+    assert abs((origin[:, 0] ** 2 + origin[:, 1] ** 2).mean() - 0.5 * 0.25) < 2e-3
+    assert np.abs(origin.mean(axis=0)).max() < 0.01
+
+
+@pytest.mark.parametrize("blades", [3, 5, 8])
+@pytest.mark.parametrize("rotation", [0.0, 0.4])
+def test_blades_bound_the_aperture(blades, rotation):
+    camera = Camera(aperture_radius=2.0, focus_distance=10.0, blades=blades, blade_rotation=rotation)
+    xi = np.random.default_rng(3).random((20_000, 2))
+    origin, _ = rays(camera, (4, 4), np.full((20_000, 2), 0.5), xi)
+    angle = rotation + np.pi / blades * (2.0 * np.arange(blades) + 1.0)
+    across = origin[:, :2] @ np.array([np.cos(angle), np.sin(angle)])
+    inner = 2.0 * np.cos(np.pi / blades)
+    assert across.max() <= inner + 1e-5  # inside every blade, and so inside the circle
+    assert (across.max(axis=0) > 0.98 * inner).all()  # and up to each of them
+    corner = rotation + 2.0 * np.pi / blades * np.arange(blades)
+    assert ((origin[:, :2] @ np.array([np.cos(corner), np.sin(corner)])).max(axis=0) > 1.9).all()
+
+
+def test_a_closed_aperture_is_a_pinhole():
+    film = np.random.default_rng(4).random((50, 2))
+    pinhole = rays(Camera.look_at(**POSE), (16, 9), film)
+    stopped = rays(Camera.look_at(**POSE, aperture_radius=1e-9, focus_distance=3.0), (16, 9), film)
+    assert np.allclose(pinhole[1], stopped[1], atol=1e-6)

@@ -1,0 +1,158 @@
+"""Texture look-ups against a slow float64 oracle."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import CPU, ints, launch, vec2s, zeros  # isort: skip (starts Warp)
+import warp as wp
+
+from wrt.device import upload
+from wrt.device_scene import TextureTable, srgb_table
+from wrt.kernels import structs
+from wrt.kernels.structs import Surfaces, kernel
+from wrt.kernels.textures import make_sample_texture
+from wrt.scene import Checkerboard, Texture
+
+
+@cache
+def texture_kernel(pictures, checkerboards):
+    sample_texture = make_sample_texture(pictures, checkerboards)
+
+    @kernel
+    def look_up(surfaces: Surfaces, index: wp.array(dtype=wp.int32), uv: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.vec4)):
+        i = wp.tid()
+        out[i] = sample_texture(surfaces, index[i], uv[i])
+
+    return look_up
+
+
+def look_up(textures, index, uv):
+    table = TextureTable()
+    assert [table.index(texture) for texture in textures] == list(range(len(textures)))
+    surfaces = Surfaces()
+    surfaces.textures = upload(table.records(), structs.Texture, CPU)
+    surfaces.texels = upload(np.concatenate([*table.texels, np.zeros(1, np.uint32)]), wp.uint32, CPU)
+    surfaces.srgb_to_linear = upload(srgb_table(), wp.float32, CPU)
+    uv = np.asarray(uv, np.float32).reshape(-1, 2)
+    out = zeros(len(uv), wp.vec4)
+    launch(texture_kernel(True, True), len(uv), surfaces, ints(np.broadcast_to(index, (len(uv),))), vec2s(uv), out)
+    return out.numpy().astype(np.float64)
+
+
+def picture(rng, height=5, width=7):
+    return rng.integers(0, 256, (height, width, 4), dtype=np.uint8)
+
+
+def linear(image, srgb):
+    x = image / 255.0
+    if srgb:
+        c = x[..., :3]
+        x[..., :3] = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return x
+
+
+def place(i, size, wrap):
+    if wrap == "clamp":
+        return min(max(i, 0), size - 1)
+    if wrap == "mirror":
+        j = i % (2 * size)
+        return j if j < size else 2 * size - 1 - j
+    return i % size
+
+
+def bilinear(texture, u, v):
+    """The definition: texel centers at (i + 0.5) / size, weights by distance."""
+    image = linear(texture.image.astype(np.float64), texture.srgb)
+    u, v = texture.uv_transform @ [u, v, 1.0]
+    height, width = image.shape[:2]
+    x, y = u * width - 0.5, v * height - 0.5
+    total = np.zeros(4)
+    for column in (int(np.floor(x)), int(np.floor(x)) + 1):
+        for row in (int(np.floor(y)), int(np.floor(y)) + 1):
+            weight = (1.0 - abs(x - column)) * (1.0 - abs(y - row))
+            total += weight * image[place(row, height, texture.wrap[1]), place(column, width, texture.wrap[0])]
+    return total
+
+
+@pytest.mark.parametrize("srgb", [True, False])
+@pytest.mark.parametrize("wrap", [("repeat", "repeat"), ("clamp", "repeat"), ("mirror", "clamp"), ("repeat", "mirror")])
+def test_bilinear_against_the_definition(wrap, srgb):
+    rng = np.random.default_rng(1)
+    texture = Texture(picture(rng), srgb=srgb, wrap=wrap)
+    uv = rng.uniform(-3.0, 3.0, (800, 2)).astype(np.float32)
+    found = look_up([texture], 0, uv)
+    expected = np.array([bilinear(texture, *row) for row in uv.astype(np.float64)])
+    assert np.abs(found - expected).max() < 2e-5
+
+
+def test_texel_centers_and_halfway_points():
+    image = picture(np.random.default_rng(2), 4, 8)
+    texture = Texture(image, srgb=False)
+    column, row = np.meshgrid(np.arange(8), np.arange(4))
+    uv = np.stack([(column + 0.5) / 8.0, (row + 0.5) / 4.0], axis=-1).reshape(-1, 2)
+    assert np.array_equal(look_up([texture], 0, uv).astype(np.float32), (image.reshape(-1, 4) / np.float64(255)).astype(np.float32))
+    between = look_up([texture], 0, [[1.0 / 8.0, 0.5 / 4.0]])[0]
+    assert np.allclose(between, 0.5 * (image[0, 0] / 255.0 + image[0, 1] / 255.0), atol=1e-6)
+    seam = look_up([texture], 0, [[0.0, 0.5 / 4.0]])[0]  # repeat: between the last column and the first
+    assert np.allclose(seam, 0.5 * (image[0, 0] / 255.0 + image[0, 7] / 255.0), atol=1e-6)
+
+
+def test_decoding_comes_before_filtering_and_spares_alpha():
+    image = np.array([[[0, 0, 0, 0], [255, 255, 255, 255]]], np.uint8)
+    middle = look_up([Texture(image, srgb=True, wrap=("clamp", "clamp"))], 0, [[0.5, 0.5]])[0]
+    assert np.allclose(middle, 0.5)  # halfway between decoded black and white, not the decoded middle grey
+    grey = np.full((1, 1, 4), 128, np.uint8)
+    assert look_up([Texture(grey, srgb=True)], 0, [[0.2, 0.9]])[0] == pytest.approx(
+        [0.215861, 0.215861, 0.215861, 128 / 255.0], abs=1e-6)
+
+
+def test_uv_transform_and_several_textures():
+    rng = np.random.default_rng(3)
+    first = Texture(picture(rng), srgb=False)
+    turned = Texture(picture(rng, 6, 3), srgb=True, wrap=("mirror", "repeat"),
+                     uv_transform=np.array([[0.0, 2.0, 0.25], [-1.5, 0.5, -0.125]]))
+    same_image = Texture(first.image, srgb=True)
+    board = Checkerboard((0.9, 0.1, 0.2), (0.0, 0.3, 0.4), 4.0)
+    textures = [first, board, turned, same_image]
+    uv = rng.uniform(-2.0, 2.0, (200, 2)).astype(np.float32)
+    for index in (0, 2, 3):
+        expected = np.array([bilinear(textures[index], *row) for row in uv.astype(np.float64)])
+        assert np.abs(look_up(textures, index, uv) - expected).max() < 2e-5
+    table = TextureTable()
+    for texture in textures:
+        table.index(texture)
+    assert table.size == first.image[..., 0].size + turned.image[..., 0].size  # a picture used twice is stored once
+
+
+def test_no_texture_is_white():
+    assert (look_up([Checkerboard()], -1, np.random.default_rng(4).random((9, 2))) == 1.0).all()
+
+
+def test_checkerboard():
+    board = Checkerboard((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), 2.0)
+    uv = np.random.default_rng(5).uniform(-4.0, 4.0, (2000, 2)).astype(np.float32)
+    first = (np.floor(2.0 * uv[:, 0]) + np.floor(2.0 * uv[:, 1])) % 2 == 0
+    expected = np.where(first[:, None], [1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 1.0])
+    assert np.array_equal(look_up([board], 0, uv), expected)
+    corner = look_up([board], 0, [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5], [-1e-6, 0.0]])
+    assert corner[:, 0].tolist() == [1.0, 0.0, 1.0, 0.0]
+
+
+@pytest.mark.parametrize("wrap", ["repeat", "clamp", "mirror"])
+def test_coordinates_far_out_stay_within_the_picture(wrap):
+    # The index must stay inside the picture, whatever the coordinate: texels of other pictures lie right beside it.
+    inside = np.full((64, 4096, 4), 200, np.uint8)
+    guard = np.zeros((1, 4096, 4), np.uint8)
+    textures = [Texture(guard, srgb=False), Texture(inside, srgb=False, wrap=(wrap, wrap)), Texture(guard.copy(), srgb=False)]
+    far = np.array([1e3, 1e5, 1e6, 1e7, 1e12, 3e38, 5.3e5, 123456.78])
+    uv = np.concatenate([np.stack([far, -far], axis=1), np.stack([-far, far], axis=1), np.stack([far, far], axis=1)])
+    assert np.allclose(look_up(textures, 1, uv), 200 / 255.0, atol=1e-5)
+
+
+def test_one_texel_picture():
+    for wrap in ("repeat", "clamp", "mirror"):
+        one = Texture(np.array([[[10, 20, 30, 40]]], np.uint8), srgb=False, wrap=(wrap, wrap))
+        found = look_up([one], 0, np.random.default_rng(6).uniform(-5.0, 5.0, (50, 2)))
+        assert np.allclose(found, np.array([10, 20, 30, 40]) / 255.0, atol=1e-6)
