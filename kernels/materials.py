@@ -48,6 +48,12 @@ def fresnel_schlick(cos_i: float, eta: float) -> float:
 
 
 @wp.func
+def contrast(a: float, b: float) -> float:
+    """(a - b) / (a + b); 1 where both are 0, its limit where they vanish here: at grazing incidence, or without any metal."""
+    return wp.where(a + b > 0.0, (a - b) / (a + b), 1.0)
+
+
+@wp.func
 def fresnel_conductor(cos_i: float, eta: float, k: float) -> float:
     """Share that a metal of index eta + i k reflects, unpolarised (Born and Wolf, section 14.2)."""
     c2 = cos_i * cos_i
@@ -57,10 +63,10 @@ def fresnel_conductor(cos_i: float, eta: float, k: float) -> float:
     a = wp.sqrt(wp.max(0.0, 0.5 * (a2_b2 + t0)))
     t1 = a2_b2 + c2
     t2 = 2.0 * a * cos_i
-    perpendicular = (t1 - t2) / (t1 + t2)
+    perpendicular = contrast(t1, t2)
     t3 = c2 * a2_b2 + s2 * s2
     t4 = t2 * s2
-    parallel = perpendicular * (t3 - t4) / (t3 + t4)
+    parallel = perpendicular * contrast(t3, t4)
     return 0.5 * (perpendicular + parallel)
 
 

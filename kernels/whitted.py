@@ -142,14 +142,14 @@ def make_transmittance(features, accel_struct, closest_hit, any_hit):
             s.front = 1
             out.transmittance = wp.cw_mul(out.transmittance, let_through(m, s, -d))
             if wp.static(features.absorption):
-                if not inward:
+                if not inward and m.thin == 0:
                     inside = attenuation(surfaces, s.material, hit.t * wp.length(ray.direction))
                     out.transmittance = wp.cw_mul(out.transmittance, inside)
             if wp.max(out.transmittance) <= 0.0:
                 return out
             ray.origin = spawn_point(s.point, s.error, s.geometric, d)
             ray.exclude = s.exclude
-            if ray.t_max == 1.0:
+            if ray.t_max <= 1.0:
                 ray.direction = end - ray.origin
                 if wp.dot(ray.direction, d) <= 0.0:
                     return out  # the light is within the surface's rounding error

@@ -317,6 +317,9 @@ def main() -> None:
     except OSError as error:  # from outside of wrt: a path too long for the system, stdout on a full disk
         _say(f"error: {error}")
         code = 2
+    except MemoryError as error:
+        _say(f"error: not enough memory: {error}")
+        code = 2
     except (click.Abort, KeyboardInterrupt):
         _say("interrupted")
         code = INTERRUPTED

@@ -61,6 +61,16 @@ def describe_devices() -> list[str]:
     return lines
 
 
+def memory_size(device: Any) -> float:
+    """Bytes of memory of a device, free or not; infinite where the system does not tell."""
+    if device.is_cuda:
+        return float(device.total_memory)
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
+
+
 def load_kernel(kernel: Any, device: Any) -> None:
     """Compile a kernel, or take it from the cache, before threads launch it.
 

@@ -14,7 +14,7 @@ import warp as wp
 
 import wrt
 from wrt.accel import ACCELERATORS, Accelerator, build
-from wrt.device import load_kernel, start, thread_count, upload
+from wrt.device import load_kernel, memory_size, start, thread_count, upload
 from wrt.device_scene import camera_struct, upload_scene
 from wrt.errors import InputError
 from wrt.features import Features, features_of, filter_icdf
@@ -26,6 +26,7 @@ from wrt.scene import Camera, Scene
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 TILE_SIZE = 32
+BYTES_OF_FILM, BYTES_OF_AOVS, BYTES_OF_RESULT = 52, 36, 80  # a pixel; of the result: measured, with writing it to a file
 MAX_PASS = 64  # samples a pixel in one launch: what Ctrl-C and a time limit have to wait for
 
 
@@ -116,6 +117,7 @@ class Renderer:
         self.camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
         self.features = features_of(scene, self.camera)
         self.crop = self._crop()
+        self._check_memory()
         accelerator = ACCELERATORS[options.accel]
         self.kernels = [render_kernel(self.features, accelerator)]
         if options.aov:
@@ -129,10 +131,20 @@ class Renderer:
 
     def _crop(self) -> tuple[int, int, int, int]:
         width, height = self.scene.settings.size
-        x0, y0, x1, y1 = self.options.crop or (0, 0, width, height)
+        x0, y0, x1, y1 = (0, 0, width, height) if self.options.crop is None else self.options.crop
         if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
             raise InputError(f"crop {x0},{y0},{x1},{y1} is not within the picture of {width}x{height}")
         return x0, y0, x1, y1
+
+    def _check_memory(self) -> None:
+        """Better told now than by the system after an hour, which ends whoever takes too much."""
+        width, height = self.scene.settings.size
+        x0, y0, x1, y1 = self.crop
+        film = BYTES_OF_FILM + (BYTES_OF_AOVS if self.options.aov else 0)
+        needed, there = width * height * film + (x1 - x0) * (y1 - y0) * BYTES_OF_RESULT, memory_size(self.device)
+        if needed > there:
+            raise InputError(f"a picture of {width}x{height} takes {needed / 2**30:.1f} GiB of memory;"
+                             f" {self.options.device} has {there / 2**30:.1f}")
 
     def _prepare(self) -> None:
         """Compile, which takes longest, and build the structure meanwhile. Neither Ctrl-C nor an error waits for the

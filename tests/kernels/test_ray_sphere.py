@@ -94,6 +94,23 @@ def test_a_sphere_as_the_ground(radius):
     assert np.allclose(t[hit], expected[hit, 0], rtol=8.0 * 2.0**-24, atol=0.0)
 
 
+def test_a_small_sphere_far_from_the_origin_is_whole():
+    # The corners of its box are rounded by some percent of the radius: that must not cut a slice off.
+    rng = np.random.default_rng(7)
+    n = 20_000
+    center = rounded(1000.0 * rng.normal(size=(n, 3)))
+    radius = rounded(10.0 ** rng.uniform(-3, -1, n))
+    direction = directions(rng, n)
+    target = center + directions(rng, n) * (radius * rng.uniform(0.8, 1.2, n))[:, None]
+    origin = rounded(target - direction * 10.0 ** rng.uniform(-1, 1, (n, 1)))
+    expected, inside = exact(origin, direction, center, radius)
+    ahead = expected[:, 0] > 0.0
+    t = run(origin, direction, center, radius)
+    assert np.isfinite(t)[ahead & (inside > 1e-9)].all()
+    assert not np.isfinite(t)[inside < -1e-9].any()
+    assert (inside > 0.0).sum() > 2000
+
+
 def test_seen_from_very_far():
     # 1e6 radii away, straight at the center and exactly representable: the near side, not a lost digit.
     for scale in (1.0, 1e-6, 1e6):

@@ -1,0 +1,65 @@
+"""Area lights from near and very far: their own surface never shades them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import wrt
+from wrt.scene import Camera, Material, Object, Scene, Settings, Sphere
+from wrt.shapes import icosphere, quad
+
+EMITTER = Material(albedo=(0, 0, 0), emission=(1, 1, 1))
+
+
+def irradiance(light: dict, distance: float, shift: tuple[float, float, float]) -> float:
+    """At a white floor that faces +y, with the light `distance` above it; the whole scene moved by `shift`."""
+    x, y, z = shift
+    floor = Object(quad((x - 1, y, z + 1), (2, 0, 0), (0, 0, -2)), (Material(albedo=(1, 1, 1)),))
+    camera = Camera.look_at((x + 0.5, y + 0.5, z + 0.5), (x, y, z), fov_y=0.02)
+    scene = Scene(objects=(floor, *light.get("objects", ())), spheres=light.get("spheres", ()), cameras=(camera,),
+                  settings=Settings(filter="box"))
+    return math.pi * float(wrt.render(scene, spp=256, size=(4, 4), max_depth=0).pixels.mean())
+
+
+def place(distance: float, shift: tuple[float, float, float]) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = shift[0], shift[1] + distance, shift[2]
+    return matrix
+
+
+# Where the floor is; 1: the light is at the origin, where its own coordinates round finely and the floor's do not.
+SHIFTS = [(0.0, 0.0, 0.0), (100.0, -300.0, 50.0), 1]
+
+
+def resolved(shift: tuple[float, float, float] | int, distance: float) -> tuple[float, float, float]:
+    return shift if isinstance(shift, tuple) else (0.0, -distance, 0.0)
+
+
+@pytest.mark.parametrize("shift", SHIFTS, ids=["origin", "away", "light-at-origin"])
+@pytest.mark.parametrize("distance", [1.0, 10.0, 100.0, 10_000.0])
+def test_sphere_light(distance: float, shift: tuple[float, float, float] | int) -> None:
+    shift = resolved(shift, distance)
+    radius = 0.4
+    light = {"spheres": (Sphere((shift[0], shift[1] + distance, shift[2]), radius, EMITTER),)}
+    assert irradiance(light, distance, shift) == pytest.approx(math.pi * (radius / distance) ** 2, rel=0.02)
+
+
+@pytest.mark.parametrize("shift", SHIFTS, ids=["origin", "away", "light-at-origin"])
+@pytest.mark.parametrize("distance", [1.0, 10.0, 100.0, 10_000.0])
+def test_square_light(distance: float, shift: tuple[float, float, float] | int) -> None:
+    shift = resolved(shift, distance)
+    half = 0.4  # the form factor of a square above a point is four times that of a quarter with the point below its corner
+    side = half / math.hypot(half, distance)
+    expected = 4.0 * 0.5 * 2.0 * side * math.atan(side)
+    square = Object(quad((-half, 0, -half), (2 * half, 0, 0), (0, 0, 2 * half)), (EMITTER,), transform=place(distance, shift))
+    assert irradiance({"objects": (square,)}, distance, shift) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("distance", [10.0, 1000.0])
+def test_mesh_light(distance: float) -> None:
+    # A ball of triangles: half of its emitters face away, and the others are seen edge-on too.
+    ball = Object(icosphere(4, 0.4), (EMITTER,), transform=place(distance, (0, 0, 0)))
+    assert irradiance({"objects": (ball,)}, distance, (0, 0, 0)) == pytest.approx(math.pi * (0.4 / distance) ** 2, rel=0.04)
