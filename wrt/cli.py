@@ -6,6 +6,7 @@ with one message; 130 when interrupted. Whatever takes long to import is importe
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -110,9 +111,10 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
     output = output or Path(f"{scene.stem or 'picture'}.png")
     bits, aov = options.pop("bits"), options["aov"]
     check_writable(output, bits)
-    from wrt.driver import Options, held_interrupts
+    from wrt.driver import Options, plain_text
     from wrt.driver import render as render_scene
     from wrt.film import aov_path
+    from wrt.interrupt import held_interrupts
     from wrt.progress import progress_reporter
     from wrt.scene import Scene
 
@@ -134,7 +136,7 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
         if not film.stats["samples"]:
             raise KeyboardInterrupt  # there is nothing to keep
         begin = time.perf_counter()
-        film.metadata["scene"] = scene.name
+        film.metadata["scene"] = plain_text(scene.name)
         with held_interrupts() as late:  # a picture that is there is written in any case
             paths = film.save(output, bits=bits, aov=layers)
     film.stats["interrupted"] = film.stats["interrupted"] or bool(late)
@@ -227,7 +229,8 @@ def info(scene: Path, camera: str | None, as_json: bool) -> None:
         return
     features = facts.pop("features")
     for name, value in facts.items():
-        click.echo(f"{name}: {', '.join(map(str, value)) if isinstance(value, list) else value}")
+        shown = "none" if value in (None, []) else ", ".join(map(str, value)) if isinstance(value, list) else value
+        click.echo(f"{name}: {shown}")
     for state in (True, False):
         names = [name for name, on in features.items() if on is state]
         click.echo(f"features {'on' if state else 'off'}: {', '.join(names) or 'none'}")
@@ -306,6 +309,8 @@ def devices() -> None:
 
 def main() -> None:
     """Entry point: one clear message for a user's mistake, and no traceback for Ctrl-C."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a name that stdout cannot encode is no reason to fail
     try:
         code = cli(standalone_mode=False)
     except InputError as error:

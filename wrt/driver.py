@@ -312,12 +312,18 @@ class Renderer:
         }
         settings = self.scene.settings
         metadata = {
-            "scene": self.scene.name, "camera": self.camera.name, "spp": int(samples.max()), "seed": self.options.seed,
-            "seconds": round(self.seconds["trace"], 3), "version": wrt.__version__, "max_depth": settings.max_depth,
-            "filter": settings.filter, "accel": self.options.accel, "device": self.options.device,
+            "scene": plain_text(self.scene.name), "camera": plain_text(self.camera.name), "spp": int(samples.max()),
+            "seed": self.options.seed, "seconds": round(self.seconds["trace"], 3), "version": wrt.__version__,
+            "max_depth": settings.max_depth, "filter": settings.filter, "accel": self.options.accel,
+            "device": self.options.device,
         }
         return Film(pixels=self._picture(self.film.mean), variance=variance, samples=samples, aov=aov, stats=stats,
                     metadata=metadata, exposure=settings.exposure, tonemap=settings.tonemap)
+
+
+def plain_text(name: str) -> str:
+    """A name that a file can hold: names out of glTF files and of the system may have lone surrogates, which become "?"."""
+    return name.encode("utf-8", "replace").decode()
 
 
 def _film_struct(settings: Any, device: Any) -> Any:

@@ -144,11 +144,12 @@ def features_of(scene: Scene, camera: Camera) -> Features:
     )
 
 
-def filter_icdf(name: str, size: int = 257) -> np.ndarray:
+def filter_icdf(name: str, size: int = 4097) -> np.ndarray:
     """The inverse distribution of a pixel filter along one axis, (size,) float32, in pixels from the centre.
 
     gaussian: standard deviation 0.5, cut at 1.5 pixels; blackman-harris: its four-term window over 3 pixels (Harris 1978).
-    Separable: used for x and y alike. Tabulated by the trapezoidal rule over 20,000 points.
+    Separable: used for x and y alike. Tabulated by the trapezoidal rule over 20,000 points. Between entries the device takes
+    a straight line, which widens the thin tails: with 4097 entries the standard deviation is off by 2e-4, with 257 by 8e-3.
     """
     x = np.linspace(-1.5, 1.5, 20001)
     if name == "gaussian":
@@ -163,8 +164,9 @@ def filter_icdf(name: str, size: int = 257) -> np.ndarray:
 
 
 def describe(scene: Scene, camera: str | int | None = None) -> dict[str, Any]:
-    """What `python -m wrt info` prints: counts, names, bounds, and the features on and off."""
-    low, high = scene.bounds()
+    """What `python -m wrt info` prints: counts, names, bounds (None without shapes), and the features on and off."""
+    has_shapes = scene.spheres or any(len(thing.mesh.faces) for thing in scene.objects)
+    low, high = (corner.tolist() for corner in scene.bounds()) if has_shapes else (None, None)
     return {
         "name": scene.name,
         "triangles": sum(len(thing.mesh.faces) for thing in scene.objects),
@@ -179,7 +181,7 @@ def describe(scene: Scene, camera: str | int | None = None) -> dict[str, Any]:
         "cameras": [c.name or str(i) for i, c in enumerate(scene.cameras)],
         "size": "{}x{}".format(*scene.settings.size),
         "spp": scene.settings.spp,
-        "bounds_low": low.tolist(),
-        "bounds_high": high.tolist(),
+        "bounds_low": low,
+        "bounds_high": high,
         "features": features_of(scene, scene.camera(camera)).switches(),
     }

@@ -191,7 +191,7 @@ def test_leaf_sizes_that_are_refused(max_leaf):
 
 
 def test_the_deepest_tree_still_finds_everything():
-    lo, hi = CASES["crowded_progression"](None)
+    lo, _ = CASES["crowded_progression"](None)
     n = len(lo)
     size = np.maximum(np.abs(lo).max(axis=1, keepdims=True) * 0.01, 1e-36)
     corners = lo[:, None].astype(np.float64) + size[:, None] * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]])

@@ -28,7 +28,8 @@ from wrt.kernels.structs import kernel
 
 
 @kernel
-def sample_kernel(key: wp.array(dtype=wp.uint32), index: wp.array(dtype=wp.uint32), dimension: int, out: wp.array(dtype=wp.vec2)):
+def sample_kernel(key: wp.array(dtype=wp.uint32), index: wp.array(dtype=wp.uint32), dimension: int,
+                  out: wp.array(dtype=wp.vec2)):
     i = wp.tid()
     out[i] = sample_2d(key[i], index[i], dimension)
 
@@ -264,7 +265,8 @@ def test_cosine_hemisphere_moments(n):
 
 def test_frames_are_orthonormal():
     rng = np.random.default_rng(8)
-    n = np.concatenate([unit(rng.normal(size=(5000, 3))), NORMALS, unit(np.array([[1e-20, 0, -1], [-1e-8, 1e-8, -1], [0, 1e-4, 1]]))])
+    near_poles = np.array([[1e-20, 0, -1], [-1e-8, 1e-8, -1], [0, 1e-4, 1]])
+    n = np.concatenate([unit(rng.normal(size=(5000, 3))), NORMALS, unit(near_poles)])
     n = n.astype(np.float32).astype(np.float64)
     count = len(n)
     outs = [zeros(count, wp.vec2) for _ in range(3)] + [zeros(count, wp.vec3) for _ in range(2)]

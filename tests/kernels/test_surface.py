@@ -9,11 +9,11 @@ from tests.kernel_tools import CPU, directions, floats, ints, launch, rounded, u
 import warp as wp
 
 from wrt.accel import build
-from wrt.device_scene import upload_scene
+from wrt.device_scene import upload_scene, world_mesh
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 from wrt.kernels.surface import Surface, make_surface_at, next_away, spawn_point
 from wrt.mesh import Mesh
-from wrt.scene import Checkerboard, Material, Object, Scene, Sphere
+from wrt.scene import Material, Object, Scene, Sphere
 from wrt.shapes import icosphere
 
 
@@ -74,13 +74,9 @@ def scene_of(mesh=None, spheres=()):
 
 def hit_rays(scene, rng, n, target, scale=1.0):
     """Rays at `target`s that hit, with their hits."""
-    from wrt.accel import Geometry
-    from wrt.device_scene import world_mesh
-
-    geometry: Geometry = world_mesh(scene).geometry
     direction = rounded(rng.normal(size=(n, 3)))
     origin = rounded(target - direction * scale * 10.0 ** rng.uniform(-0.5, 2, (n, 1)))
-    structure = build(geometry, "bvh")
+    structure = build(world_mesh(scene).geometry, "bvh")
     hits = structure.closest_hit(origin, direction)
     on = hits.prim_id >= 0
     hits = type(hits)(hits.t[on], hits.u[on], hits.v[on], hits.prim_id[on])
@@ -252,7 +248,8 @@ def test_sphere_coordinates():
 
 def test_next_away_moves_every_float():
     rng = np.random.default_rng(8)
-    x = np.concatenate([rng.normal(size=500) * 10.0 ** rng.uniform(-44, 37, 500), [0.0, -0.0, 1.0, -1.0, 2.0**-126, 1e-45, 3e38]])
+    special = [0.0, -0.0, 1.0, -1.0, 2.0**-126, 1e-45, 3e38]
+    x = np.concatenate([rng.normal(size=500) * 10.0 ** rng.uniform(-44, 37, 500), special])
     x = x.astype(np.float32)
     for side in (1.0, -1.0):
         out = zeros(len(x))
@@ -298,7 +295,7 @@ def test_a_new_ray_does_not_meet_its_neighbours_in_a_plane(scale, offset, tilt):
     i, j = np.meshgrid(np.arange(-4.0, 5.0), np.arange(-4.0, 5.0), indexing="ij")
     vertices = np.stack([i, j, tilt[0] * i + tilt[1] * j], axis=-1).reshape(-1, 3) * scale + offset
     first = (np.arange(8)[:, None] * 9 + np.arange(8)).reshape(-1, 1)
-    mesh = Mesh(vertices, np.concatenate([first + [0, 9, 10], first + [0, 10, 1]]))
+    mesh = Mesh(vertices, np.concatenate([first + np.array([0, 9, 10]), first + np.array([0, 10, 1])]))
     assert np.array_equal(mesh.vertices, vertices)
     scene = scene_of(mesh)
     rng = np.random.default_rng(10)

@@ -92,7 +92,8 @@ def test_texel_centers_and_halfway_points():
     texture = Texture(image, srgb=False)
     column, row = np.meshgrid(np.arange(8), np.arange(4))
     uv = np.stack([(column + 0.5) / 8.0, (row + 0.5) / 4.0], axis=-1).reshape(-1, 2)
-    assert np.array_equal(look_up([texture], 0, uv).astype(np.float32), (image.reshape(-1, 4) / np.float64(255)).astype(np.float32))
+    expected = (image.reshape(-1, 4) / np.float64(255)).astype(np.float32)
+    assert np.array_equal(look_up([texture], 0, uv).astype(np.float32), expected)
     between = look_up([texture], 0, [[1.0 / 8.0, 0.5 / 4.0]])[0]
     assert np.allclose(between, 0.5 * (image[0, 0] / 255.0 + image[0, 1] / 255.0), atol=1e-6)
     seam = look_up([texture], 0, [[0.0, 0.5 / 4.0]])[0]  # repeat: between the last column and the first

@@ -95,7 +95,8 @@ def rays_for(geometry, rng, n=6000):
     a, b, c = points[rng.integers(0, len(points), (3, n))]
     target = np.where(rng.random((n, 1)) < 0.3, a, a + rng.random((n, 1)) * (b - a))
     extent = np.abs(points).max() + 1e-30
-    origin = np.where(rng.random((n, 1)) < 0.5, c + 0.1 * extent * rng.normal(size=(n, 3)), 3.0 * extent * rng.normal(size=(n, 3)))
+    near, far = c + 0.1 * extent * rng.normal(size=(n, 3)), 3.0 * extent * rng.normal(size=(n, 3))
+    origin = np.where(rng.random((n, 1)) < 0.5, near, far)
     direction = target - origin
     axis = rng.random(n) < 0.25
     direction[axis] = np.eye(3)[rng.integers(0, 3, axis.sum())] * rng.choice([-1.0, 1.0], (axis.sum(), 1))
@@ -233,7 +234,7 @@ def test_a_floor_of_long_triangles_is_watertight(name):
     x = np.linspace(-4.0, 4.0, 9)
     vertices = np.array([[a, 0.0, z] for a in x for z in (-1000.0, 1000.0)])
     strip = np.arange(8)[:, None] * 2
-    faces = np.concatenate([strip + [0, 1, 3], strip + [0, 3, 2]])
+    faces = np.concatenate([strip + np.array([0, 1, 3]), strip + np.array([0, 3, 2])])
     n = 100_000
     aside = rng.choice([-1.0, 1.0], n) * 10.0 ** rng.uniform(-8, -4, n)
     target = np.stack([rng.choice(x[1:-1], n) + aside, np.zeros(n), rng.uniform(-5.0, 5.0, n)], axis=1)
@@ -254,7 +255,7 @@ def test_rays_along_the_faces_of_a_grid(name):
     n = 12
     i, j = np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0), indexing="ij")
     first = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1, 1)
-    faces = np.concatenate([first + [0, n + 1, n + 2], first + [0, n + 2, 1]])
+    faces = np.concatenate([first + np.array([0, n + 1, n + 2]), first + np.array([0, n + 2, 1])])
     for axis in range(3):
         flat_grid = np.stack([i, j], axis=-1).reshape(-1, 2)
         vertices = np.insert(flat_grid, axis, 3.0, axis=1)

@@ -53,9 +53,10 @@ class Geometry:
         hi[:n] = np.maximum(np.maximum(corners[0], corners[1]), corners[2])
         lo[n:] = self.spheres[:, :3] - self.spheres[:, 3:]
         hi[n:] = self.spheres[:, :3] + self.spheres[:, 3:]
-        extent = hi - lo
-        pad = np.float32(PAD_EXTENT) * extent.max(axis=1, keepdims=True, initial=0.0)
-        return lo - (pad + np.float32(PAD_COORDINATE) * np.abs(lo)), hi + (pad + np.float32(PAD_COORDINATE) * np.abs(hi))
+        with np.errstate(over="ignore"):  # near the end of float32 the padded box is all of space
+            extent = hi - lo
+            pad = np.float32(PAD_EXTENT) * extent.max(axis=1, keepdims=True, initial=0.0)
+            return lo - (pad + np.float32(PAD_COORDINATE) * np.abs(lo)), hi + (pad + np.float32(PAD_COORDINATE) * np.abs(hi))
 
     def primitives(self, order: np.ndarray | None = None) -> np.ndarray:
         """Device records (kernels.structs.Primitive) in the given order of prim_id, or in their own."""
@@ -178,10 +179,10 @@ class Accelerator(ABC):
         run_all([job(first) for first in range(0, n, RAYS_PER_LAUNCH)], thread_count(threads))
 
     def _rays(self, origins: Any, directions: Any, t_min: Any, t_max: Any) -> tuple[RayArrays, bool]:
-        as_warp = isinstance(origins, wp.array)
+        as_warp = isinstance(origins, wp.array) or isinstance(directions, wp.array)
         rays = RayArrays()
         if as_warp:
-            if not isinstance(directions, wp.array) or origins.dtype != wp.vec3 or directions.dtype != wp.vec3:
+            if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in (origins, directions)):
                 raise InputError("origins and directions must both be Warp arrays of vec3, or both NumPy arrays")
             n = len(origins)
             rays.origin, rays.direction = origins, directions
@@ -203,7 +204,10 @@ class Accelerator(ABC):
             if value.dtype != wp.float32 or value.shape != (n,):
                 raise InputError(f"{name} must be ({n},) float32, got {value.shape} {value.dtype.__name__}")
             return value
-        array = np.asarray(value, dtype=np.float32)
+        try:
+            array = np.asarray(value, dtype=np.float32)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name} must be a number or ({n},), got {value!r}") from error
         if array.ndim > 1 or (array.ndim == 1 and len(array) != n):
             raise InputError(f"{name} must be a number or ({n},), got {array.shape}")
         if np.isnan(array).any() or (array < low).any():

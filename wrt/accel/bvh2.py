@@ -97,7 +97,7 @@ def squeeze(nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
 def sah_cost(nodes: np.ndarray) -> float:
     """Expected node visits plus triangle tests of a random line that meets the root box (both costing 1)."""
     def area(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-        e = np.maximum(hi.astype(np.float64) - lo.astype(np.float64), 0.0)
+        e = np.clip(hi.astype(np.float64) - lo.astype(np.float64), 0.0, 1e39)
         return e[:, 0] * e[:, 1] + e[:, 1] * e[:, 2] + e[:, 2] * e[:, 0]
 
     root = area(np.minimum(nodes["lo_0"][:1], nodes["lo_1"][:1]), np.maximum(nodes["hi_0"][:1], nodes["hi_1"][:1]))[0]

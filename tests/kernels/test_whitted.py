@@ -1,0 +1,341 @@
+"""The integrator through whole renders of scenes whose answer is known.
+
+Kernels are compiled from a scene's features: scenes that share a set of features share `extra` materials, hidden far away.
+"""
+
+import numpy as np
+import pytest
+
+from wrt.driver import Options, Renderer, render
+from wrt.mesh import Mesh
+from wrt.scene import (
+    Camera,
+    Checkerboard,
+    ConstantBackground,
+    DirectionalLight,
+    GradientBackground,
+    Material,
+    Object,
+    PointLight,
+    Scene,
+    Settings,
+    Sphere,
+    SpotLight,
+)
+from wrt.shapes import box, icosphere, quad
+
+ONE = (1.0, 1.0, 1.0)
+WHITE_SKY = ConstantBackground(ONE)
+SETTINGS = Settings(size=(8, 8), spp=4, max_depth=30, min_throughput=0.0, filter="box")
+
+
+def moved(mesh, scale=1.0, by=(0.0, 0.0, 0.0)):
+    """The mesh without normals, scaled and moved."""
+    return Mesh(mesh.vertices.astype(np.float64) * scale + by, mesh.faces)
+
+
+def hidden(*materials):
+    """Tiny triangles far behind every camera here, one a material."""
+    return tuple(Object(Mesh([[0, i, 1e4], [1e-3, i, 1e4], [0, i + 1e-3, 1e4]], [[0, 1, 2]]), (material,))
+                 for i, material in enumerate(materials))
+
+
+def glow(radiance=1.0):
+    """A surface that is only seen: it lights nothing and reflects nothing."""
+    return Material(albedo=(0.0,) * 3, emission=(radiance,) * 3, emits_light=False)
+
+
+def toward(target=(0.0, 0.0, 0.0), position=(0.0, 0.0, 5.0), fov=0.01, **rest):
+    return Camera.look_at(position, target, fov_y=fov, **rest)
+
+
+# --- mirrors ----------------------------------------------------------------------------------------------------------
+
+HALF_MIRROR = Material("mirror", albedo=(0.5,) * 3, emission=(0.5,) * 3, two_sided=True)
+MIRROR_BOX = Scene(objects=(Object(box((-1, -1, -1), (1, 1, 1)), (HALF_MIRROR,)),), settings=SETTINGS,
+                   cameras=(Camera.look_at((0.3, 0.2, 0.1), (1.0, 0.4, 0.3), fov_y=1.5),))
+
+
+@pytest.mark.parametrize("depth", [0, 1, 2, 5, 20])
+def test_a_box_of_glowing_half_mirrors(depth):
+    film = render(MIRROR_BOX, max_depth=depth)
+    assert np.allclose(film.pixels, 1.0 - 0.5 ** (depth + 1), rtol=1e-6)
+    assert film.stats["cut_by_depth"] == film.stats["samples"] == 8 * 8 * 4
+    assert film.stats["rays"] == (depth + 1) * 8 * 8 * 4
+    assert film.stats["lost_throughput_per_sample"] == pytest.approx(0.5 ** (depth + 1), rel=1e-5)
+    assert film.stats["cut_by_throughput"] == 0 and film.stats["not_finite"] == 0
+
+
+def test_cut_by_throughput():
+    film = render(MIRROR_BOX, min_throughput=0.1)
+    assert np.allclose(film.pixels, 1.0 - 0.5**4)  # the fourth reflection would carry 1/16
+    assert film.stats["cut_by_throughput"] == film.stats["samples"] and film.stats["cut_by_depth"] == 0
+    assert film.stats["lost_throughput_per_sample"] == pytest.approx(1.0 / 16.0)
+
+
+def test_white_mirrors_vanish_in_a_white_room():
+    mirror = Material("mirror", albedo=ONE)
+    ball = Object(moved(icosphere(2)), (mirror,))
+    scene = Scene(objects=(ball, *hidden(HALF_MIRROR)), background=WHITE_SKY, cameras=(toward(fov=0.6),), settings=SETTINGS)
+    film = render(scene)
+    assert np.allclose(film.pixels, 1.0, atol=1e-6) and film.stats["rays_per_sample"] > 1.3
+
+
+# --- glass ------------------------------------------------------------------------------------------------------------
+
+CLEAR = Material("glass", albedo=ONE, ior=1.5)
+GLASS_EXTRA = (Material("glass", absorption=(1e-3, 1e-3, 1e-3)), glow())
+
+
+def glass_scene(*objects, camera, background=None, spheres=()):
+    far = Sphere((0.0, 100.0, 1e4), 1e-3, glow())
+    return Scene(objects=(*objects, *hidden(*GLASS_EXTRA)), spheres=(*spheres, far), cameras=(camera,), settings=SETTINGS,
+                 background=background or ConstantBackground())
+
+
+def test_clear_glass_vanishes_in_a_white_room():
+    # What goes in comes out: reflected and refracted parts sum to 1 but for the rays that were cut, which are counted.
+    balls = (Object(moved(icosphere(2), 0.9, (-1.2, 0.0, 0.0)), (CLEAR,)), Object(moved(box(), 1.0, (0.0, 1.4, 0.0)), (CLEAR,)))
+    scene = glass_scene(*balls, spheres=(Sphere((1.2, 0.0, 0.0), 0.9, CLEAR),), background=WHITE_SKY, camera=toward(fov=0.9))
+    film = render(scene, size=(12, 12))
+    lost = film.stats["lost_throughput_per_sample"]
+    assert film.stats["rays_per_sample"] > 3.0
+    assert lost < 0.02 and (film.pixels <= 1.0 + 1e-5).all()
+    # A ray that is cut inside has its radiance squeezed, and would have come out eta^2 as bright.
+    assert 1.0 - 2.25 * lost - 1e-5 <= film.pixels.mean() <= 1.0 - lost + 1e-5
+    flat = render(scene, max_depth=30, camera=toward((0.0, 1.4, 0.0), (0.0, 1.4, 5.0)))
+    assert np.allclose(flat.pixels, 1.0, atol=1e-4)
+
+
+def slab_scene(thickness=1.0, degrees=0.0, material=CLEAR, camera=None):
+    """A slab before a glowing wall; behind the camera it is dark, so that only what goes through is seen."""
+    slab = box((-50.0, -50.0, -0.5 * thickness), (50.0, 50.0, 0.5 * thickness))
+    angle = np.radians(degrees)
+    turn = np.eye(4)
+    turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)
+    # Small enough that what the slab's face reflects, backwards for a steep slab, does not meet it.
+    wall = Object(quad((-20.0, -20.0, -60.0), (40.0, 0.0, 0.0), (0.0, 40.0, 0.0)), (glow(),))
+    return glass_scene(Object(slab, (material,), turn), wall, camera=camera or toward())
+
+
+def slab_transmittance(cosine, n, inside=1.0):
+    """Of a slab, all inner reflections summed: (1 - R)^2 a / (1 - R^2 a^2), a being what its glass leaves on one way."""
+    inner = np.sqrt(1.0 - (1.0 - cosine**2) / n**2)
+    s, p = (cosine - n * inner) / (cosine + n * inner), (n * cosine - inner) / (n * cosine + inner)
+    r = 0.5 * (s * s + p * p)
+    return (1.0 - r) ** 2 * inside / (1.0 - (r * inside) ** 2)
+
+
+def test_a_slab_transmits_twelve_thirteenths():
+    assert slab_transmittance(1.0, 1.5) == pytest.approx(12.0 / 13.0)
+    film = render(slab_scene())
+    assert np.allclose(film.pixels, 12.0 / 13.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("degrees", [30.0, 60.0])
+def test_a_slanted_slab(degrees):
+    # A Whitted tracer follows unpolarised light at every boundary: the series is that of the mean reflectance.
+    film = render(slab_scene(degrees=degrees))
+    assert film.pixels.mean() == pytest.approx(slab_transmittance(np.cos(np.radians(degrees)), 1.5), abs=2e-4)
+
+
+def test_absorption_follows_beer_and_lambert():
+    sigma = np.array([0.3, 1.0, 2.0])
+    material = Material("glass", albedo=ONE, absorption=tuple(sigma))
+    for thickness, degrees in ((1.0, 0.0), (0.25, 0.0), (1.0, 45.0)):
+        film = render(slab_scene(thickness, degrees, material))
+        cosine = np.cos(np.radians(degrees))
+        way = thickness / np.sqrt(1.0 - (1.0 - cosine**2) / 2.25)
+        expected = slab_transmittance(cosine, 1.5, np.exp(-sigma * way))
+        assert np.allclose(film.pixels.mean(axis=(0, 1)), expected, atol=2e-4), (thickness, degrees)
+
+
+def test_a_slanted_slab_shifts_the_picture():
+    # d = t sin(a) (1 - cos(a) / sqrt(n^2 - sin^2 a)): 0.329142 at 45 degrees. A wall that glows for x > 0 shows it.
+    angle, n = np.radians(45.0), 1.5
+    shift = np.sin(angle) * (1.0 - np.cos(angle) / np.sqrt(n * n - np.sin(angle) ** 2))
+    assert shift == pytest.approx(0.329142, abs=1e-6)
+    wall = Object(quad((0.0, -500.0, -60.0), (500.0, 0.0, 0.0), (0.0, 1000.0, 0.0)), (glow(),))
+    # From 2000 away, a strip of 2048 pixels that is one unit wide at the wall: all but parallel rays.
+    camera = toward(position=(0.0, 0.0, 2000.0), fov=2.0 * np.arctan(0.5 / 2060.0 * 64.0 / 2048.0))
+    edges = []
+    for degrees in (0.0, 45.0, -45.0):
+        slab = slab_scene(degrees=degrees)
+        scene = glass_scene(slab.objects[0], wall, camera=camera)
+        film = render(scene, size=(2048, 64), crop=(0, 32, 2048, 33), spp=1)
+        lit = film.pixels[0, :, 0] > 0.3
+        edges.append(0.5 - lit.sum() / 2048.0)
+        assert np.abs(np.diff(lit.astype(int))).sum() <= 3  # one edge, but for a pixel whose sample falls on it
+    assert edges[0] == pytest.approx(0.0, abs=1e-3)
+    assert abs(edges[1]) == pytest.approx(shift, abs=2e-3)
+    assert edges[1] == pytest.approx(-edges[2], abs=2e-3)
+    # The slab's normal leans to +x, so that inside the rays are bent to -x: the glow begins farther to the right.
+    assert edges[1] > 0.0
+
+
+def test_a_ball_turns_the_world_upside_down():
+    # Through the upper half of a glass ball the lower half of the world is seen.
+    scene = glass_scene(spheres=(Sphere((0.0, 0.0, 0.0), 1.0, CLEAR),), camera=toward(fov=0.2),
+                        background=GradientBackground((0.0, 0.0, 0.0), (2.0, 2.0, 2.0)))
+    film = render(scene, spp=16)
+    column = film.pixels[:, 3:5, 0].mean(axis=1)
+    assert column[:4].mean() < column[4:].mean() - 0.02
+
+
+# --- diffuse surfaces and lights --------------------------------------------------------------------------------------
+
+LIGHT_EXTRA = (PointLight((0.0, 2e4, 0.0), (0.0,) * 3), DirectionalLight((1.0, 0.0, 0.0), (0.0,) * 3),
+               SpotLight((0.0, 2e4, 0.0), (0.0, 1.0, 0.0), (0.0,) * 3))
+
+
+def lit_scene(*objects, lights=(), background=WHITE_SKY, spheres=(), ambient=(1e-9,) * 3):
+    return Scene(objects=tuple(objects), lights=(*lights, *LIGHT_EXTRA), background=background, ambient=ambient,
+                 spheres=(*spheres, Sphere((0.0, 100.0, 1e4), 1e-3, Material())), settings=SETTINGS, cameras=(toward(),))
+
+
+def floor(albedo=0.5, size=1000.0):
+    mesh = quad((-0.5 * size, 0.0, 0.5 * size), (size, 0.0, 0.0), (0.0, 0.0, -size))
+    return Object(moved(mesh), (Material(albedo=(albedo,) * 3),))
+
+
+def test_a_grey_ball_in_a_white_room_shows_its_albedo():
+    ball = Sphere((0.0, 0.0, 0.0), 1.0, Material(albedo=(0.5, 0.25, 1.0)))
+    # Far from each other: a convex thing by itself shades no part of its own sky.
+    mesh = Object(moved(icosphere(3), 1.0, (3000.0, 0.0, 0.0)), (ball.material,))
+    scene = lit_scene(mesh, spheres=(ball,))
+    for x, target in ((0.0, (0.0, 0.0, 0.0)), (0.0, (0.7, 0.5, 0.0)), (3000.0, (3000.0, 0.2, 0.0))):
+        film = render(scene, camera=toward(target, (x, 0.5, 6.0)))
+        assert np.allclose(film.pixels, [0.5, 0.25, 1.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("height", [0.5, 2.0, 10.0])
+def test_a_point_light_over_a_floor(height):
+    # L = albedo (sky + I cos / (pi d^2)): inverse square and cosine law at once.
+    scene = lit_scene(floor(), lights=(PointLight((0.0, height, 0.0), (3.0, 6.0, 9.0)),))
+    for x in (0.0, 1.0, 7.0):
+        film = render(scene, camera=toward((x, 0.0, 0.0), (x, 30.0, 20.0), fov=1e-3))
+        d2 = x * x + height**2
+        expected = 0.5 * (1.0 + np.array([3.0, 6.0, 9.0]) * height / np.sqrt(d2) / (np.pi * d2))
+        assert np.allclose(film.pixels.mean(axis=(0, 1)), expected, rtol=2e-3), x
+
+
+def test_directional_and_spot_lights_over_a_floor():
+    sun = DirectionalLight((0.0, -0.6, -0.8), (2.0,) * 3)
+    spot = SpotLight((0.0, 4.0, 0.0), (0.0, -1.0, 0.0), (16.0,) * 3, inner=0.2, outer=0.5)
+    scene = lit_scene(floor(), lights=(sun, spot), background=WHITE_SKY)
+    for x in (0.0, 0.5, 1.5, 5.0):
+        angle = np.arctan(x / 4.0)
+        ramp = np.clip((np.cos(angle) - np.cos(0.5)) / (np.cos(0.2) - np.cos(0.5)), 0.0, 1.0) ** 2
+        expected = 0.5 * (1.0 + (2.0 * 0.6 + 16.0 * ramp * np.cos(angle) ** 3 / 16.0) / np.pi)
+        film = render(scene, camera=toward((x, 0.0, 0.0), (x, 30.0, 20.0), fov=1e-3))
+        assert film.pixels.mean() == pytest.approx(expected, rel=2e-3), x
+
+
+def test_shadows_and_the_ambient_term():
+    lid = Object(moved(quad((-1.0, 1.0, 1.0), (2.0, 0.0, 0.0), (0.0, 0.0, -2.0))), (Material(albedo=(0.0,) * 3),))
+    scene = lit_scene(floor(), lid, lights=(PointLight((0.0, 2.0, 0.0), (50.0,) * 3),), ambient=(0.3, 0.2, 0.1))
+    under = render(scene, camera=toward((0.5, 0.0, 0.0), (9.0, 0.5, 0.0), fov=1e-3), spp=256)
+    # Under the lid the point light is hidden and the sky is what shows past a 2 x 2 square at height 1: its form factor.
+    corner = [(1.5, 1.0), (0.5, 1.0)]
+    factor = 0.0
+    for x, y in corner:
+        p, q = np.sqrt(1.0 + x * x), np.sqrt(1.0 + y * y)
+        factor += 2.0 * (x / p * np.arctan(y / p) + y / q * np.arctan(x / q)) / (2.0 * np.pi)
+    expected = 0.5 * (1.0 - factor + np.array([0.3, 0.2, 0.1]))
+    assert np.allclose(under.pixels.mean(axis=(0, 1)), expected, atol=5e-3)
+    outside = render(scene, camera=toward((6.0, 0.0, 0.0), (9.0, 5.0, 0.0), fov=1e-3))
+    assert outside.pixels.mean() > 0.5  # light passes the lid's edge
+
+
+# --- mixtures ---------------------------------------------------------------------------------------------------------
+
+
+def test_blending_is_a_weighted_mean():
+    def pane(z, alpha, radiance):
+        material = Material(albedo=(0.0,) * 3, emission=radiance, emits_light=False, alpha=alpha, alpha_mode="blend")
+        return Object(moved(quad((-5.0, -5.0, z), (10.0, 0.0, 0.0), (0.0, 10.0, 0.0))), (material,))
+
+    scene = Scene(objects=(pane(1.0, 0.25, (8.0, 0.0, 0.0)), pane(0.0, 0.5, (0.0, 8.0, 0.0)), pane(-1.0, 1.0, (0.0, 0.0, 8.0))),
+                  cameras=(toward(),), settings=SETTINGS, background=WHITE_SKY)
+    film = render(scene, max_depth=8)
+    assert np.allclose(film.pixels, [8.0 * 0.25, 8.0 * 0.75 * 0.5, 8.0 * 0.75 * 0.5], rtol=1e-6)
+    shallow = render(scene, max_depth=1)
+    assert np.allclose(shallow.pixels, [2.0, 3.0, 0.0], rtol=1e-6)  # the third pane is two steps behind the first
+
+
+def test_nothing_but_background():
+    sky = GradientBackground((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    film = render(Scene(background=sky, cameras=(Camera(fov_y=1.0),), settings=SETTINGS), aov=["depth", "prim_id", "normal"])
+    assert (film.pixels[0, :, 0] > film.pixels[-1, :, 0]).all() and np.allclose(film.pixels.sum(axis=2), 1.0)
+    assert np.isinf(film.aov["depth"]).all() and (film.aov["prim_id"] == -1).all() and not film.aov["normal"].any()
+    assert film.stats["rays_per_sample"] == 1.0
+
+
+# --- the same pixels, whatever the way there --------------------------------------------------------------------------
+
+
+def busy_scene():
+    """Lens, filter, glass, rough metal, texture, area light, point light and sky at once."""
+    board = Material(albedo=ONE, albedo_texture=Checkerboard(scale=4.0))
+    ground = quad((-4, -1, 4), (8, 0, 0), (0, 0, -8))
+    camera = Camera.look_at((1.0, 1.0, 5.0), (0.2, -0.3, 0.0), fov_y=0.7, aperture_radius=0.1, focus_distance=5.0, blades=6)
+    lamp = Material(emission=(6.0, 5.0, 4.0))
+    return Scene(
+        objects=(Object(ground, (board,)), Object(icosphere(2, 0.6), (CLEAR,)),
+                 Object(quad((-1.0, 3.0, -1.0), (2.0, 0.0, 0.0), (0.0, 0.0, 2.0)), (lamp,))),
+        spheres=(Sphere((1.2, -0.3, -0.5), 0.7, Material("conductor", roughness=0.3)),),
+        lights=(PointLight((3.0, 4.0, 3.0), (20.0, 20.0, 20.0)),), background=GradientBackground(), cameras=(camera,),
+        settings=Settings(size=(36, 20), spp=20, max_depth=5))
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return render(busy_scene(), threads=1, tile_size=1000, pass_size=20)
+
+
+@pytest.mark.parametrize("how", [
+    {"threads": 2, "tile_size": 16}, {"threads": 2, "tile_size": 64}, {"threads": 1, "tile_size": 16},
+    {"threads": 2, "tile_size": 7, "pass_size": 1}, {"threads": 2, "pass_size": 10}, {"threads": 2, "pass_size": None},
+    {"threads": 2, "tile_size": 1, "pass_size": 3},
+])
+def test_same_pixels_for_any_tiles_threads_and_passes(reference, how):
+    film = render(busy_scene(), **how)
+    for name in ("pixels", "variance", "samples"):
+        assert np.array_equal(getattr(film, name), getattr(reference, name)), name
+    for name in ("rays", "cut_by_depth", "cut_by_throughput", "lost_throughput_per_sample", "not_finite"):
+        assert film.stats[name] == reference.stats[name]
+    assert film.stats["not_finite"] == 0 and film.pixels.std() > 0.05
+
+
+def test_same_pixels_for_any_structure(reference):
+    film = render(busy_scene(), accel="brute_force", threads=2)
+    assert np.array_equal(film.pixels, reference.pixels) and film.stats["rays"] == reference.stats["rays"]
+
+
+def test_a_crop_is_a_part_of_the_picture(reference):
+    film = render(busy_scene(), crop=(5, 3, 30, 18), threads=2)
+    assert np.array_equal(film.pixels, reference.pixels[3:18, 5:30])
+
+
+def test_fewer_samples_are_the_first_ones_and_the_seed_matters(reference):
+    few, again = (render(busy_scene(), spp=5, threads=2, pass_size=size) for size in (5, 2))
+    assert np.array_equal(few.pixels, again.pixels) and not np.array_equal(few.pixels, reference.pixels)
+    other = render(busy_scene(), seed=1, threads=2)
+    assert not np.array_equal(other.pixels, reference.pixels)
+    z = (other.pixels - reference.pixels) / np.sqrt(other.variance + reference.variance + 1e-12)
+    noisy = (other.variance + reference.variance).max(axis=2) > 1e-8
+    assert abs(np.median(z[noisy])) < 0.2 and np.abs(z[noisy]).mean() < 2.0
+
+
+def test_variance_is_that_of_the_mean(reference):
+    # Of many renders with other seeds, the spread of the pixels must be what one render says of itself, or less: samples of
+    # one pixel are spread more evenly than chance would.
+    films = [render(busy_scene(), seed=seed, threads=2) for seed in range(2, 14)]
+    spread = np.var([film.pixels for film in films], axis=0, ddof=1).mean()
+    claimed = np.mean([film.variance for film in films])
+    assert 0.02 * claimed < spread < 1.2 * claimed
+
+
+def test_the_kernel_holds_only_what_the_scene_needs():
+    bare = Renderer(MIRROR_BOX, Options()).features
+    assert {name for name, on in bare.switches().items() if on} == {"mirror", "reflection", "emission"}

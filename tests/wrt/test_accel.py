@@ -1,0 +1,223 @@
+"""What every acceleration structure promises, over the whole registry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import CPU, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
+import warp as wp
+
+import wrt
+from tests.kernels.test_ray_aabb import pad_kernel
+from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.accel.base import RAYS_PER_LAUNCH
+from wrt.device import records
+from wrt.errors import InputError
+from wrt.kernels.structs import Primitive
+from wrt.mesh import Mesh
+from wrt.shapes import icosphere, torus
+
+NAMES = sorted({cls.name for cls in ACCELERATORS.values()})
+BALL = icosphere(2)
+
+
+def some_rays(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    origin = rounded(3.0 * rng.normal(size=(n, 3)))
+    return origin, rounded(rng.normal(size=(n, 3)) * 0.5 - origin)
+
+
+def test_the_registry_names_what_it_holds() -> None:
+    assert ACCELERATORS["bvh"] is ACCELERATORS["bvh2"]  # the default is the best one there is
+    for name in NAMES:
+        assert ACCELERATORS[name].name == name
+        assert type(build(BALL, name)) is ACCELERATORS[name]
+    assert wrt.ACCELERATORS is ACCELERATORS and wrt.build is build
+
+
+def test_unknown_names_and_devices_are_refused() -> None:
+    with pytest.raises(InputError, match=r"no structure 'octree'.*bvh2"):
+        build(BALL, "octree")
+    with pytest.raises(InputError, match=r"no device 'tpu'.*cpu"):
+        build(BALL, device="tpu")
+    with pytest.raises(TypeError):
+        build(BALL, "brute_force", max_leaf=3)
+    with pytest.raises(InputError, match="threads"):
+        build(BALL, threads=0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_hits_of_a_ball_seen_from_its_center(name: str) -> None:
+    rng = np.random.default_rng(1)
+    direction = rounded(rng.normal(size=(2000, 3)))
+    hits = build(BALL, name).closest_hit(np.zeros((2000, 3)), direction)
+    assert hits.t.dtype == np.float32 and hits.prim_id.dtype == np.int32 and hits.u.shape == hits.v.shape == (2000,)
+    distance = hits.t * np.linalg.norm(direction, axis=1)  # t is in units of |direction|
+    assert (distance > 0.95).all() and (distance <= 1.0 + 1e-6).all()
+    corner = BALL.vertices[BALL.faces[hits.prim_id]].astype(np.float64)
+    w = np.stack([1.0 - hits.u.astype(np.float64) - hits.v, hits.u, hits.v], axis=1)
+    assert np.abs(np.einsum("ni,nij->nj", w, corner) - hits.t[:, None] * direction).max() < 1e-6
+    assert w.min() > -1e-6
+    assert len(hits) == 2000 and "2000" in repr(hits)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_miss_is_a_state(name: str) -> None:
+    structure = build(BALL, name)
+    hits = structure.closest_hit([[5.0, 5.0, 5.0]], [[1.0, 0.0, 0.0]])
+    assert np.isinf(hits.t[0]) and hits.prim_id[0] == -1 and hits.u[0] == hits.v[0] == 0.0
+    assert not structure.any_hit([[5.0, 5.0, 5.0]], [[1.0, 0.0, 0.0]])[0]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("n", [0, 1, RAYS_PER_LAUNCH - 1, RAYS_PER_LAUNCH, 2 * RAYS_PER_LAUNCH + 3])
+def test_any_number_of_rays_on_any_number_of_threads(n: int, name: str) -> None:
+    structure = build(icosphere(0), name)
+    origin, direction = some_rays(n)
+    one, two = (structure.closest_hit(origin, direction, threads=threads) for threads in (1, 2))
+    for field in ("t", "u", "v", "prim_id"):
+        assert np.array_equal(getattr(one, field), getattr(two, field)) and len(getattr(one, field)) == n
+    dark = structure.any_hit(origin, direction, threads=2)
+    assert dark.dtype == np.bool_ and np.array_equal(dark, one.prim_id >= 0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_segments_as_scalars_and_arrays(name: str) -> None:
+    structure = build(BALL, name)
+    origin, direction = some_rays(500)
+    everything = structure.closest_hit(origin, direction)
+    ends = np.full(500, 0.5)
+    assert np.array_equal(structure.closest_hit(origin, direction, 0.1, 0.5).t,
+                          structure.closest_hit(origin, direction, np.full(500, 0.1), ends).t)
+    assert np.array_equal(structure.any_hit(origin, direction, t_max=ends), everything.t <= 0.5)
+    assert not structure.any_hit(origin, direction, 2.0, 1.0).any()  # an empty segment
+    assert not structure.any_hit(origin, direction, 0.0, -1.0).any()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_warp_arrays_come_back_as_warp_arrays(name: str) -> None:
+    structure = build(BALL, name)
+    origin, direction = some_rays(300)
+    expected = structure.closest_hit(origin, direction)
+    hits = structure.closest_hit(vec3s(origin), vec3s(direction))
+    assert all(isinstance(array, wp.array) for array in (hits.t, hits.u, hits.v, hits.prim_id))
+    assert np.array_equal(hits.t.numpy(), expected.t) and np.array_equal(hits.prim_id.numpy(), expected.prim_id)
+    ends = wp.array(np.full(300, 0.5, np.float32), dtype=wp.float32, device=CPU)
+    dark = structure.any_hit(vec3s(origin), vec3s(direction), t_max=ends)
+    assert isinstance(dark, wp.array) and np.array_equal(dark.numpy(), expected.t <= 0.5)
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (([[0, 0]], [[1, 0, 0]]), r"origins must be \(N, 3\), got \(1, 2\)"),
+    (([0, 0, 0], [[1, 0, 0]]), r"origins must be \(N, 3\)"),
+    (([[0, 0, 0]], [[1, 0, 0], [0, 1, 0]]), r"directions must have as many rows as origins \(1\), got 2"),
+    (([[0, 0, 0]], [[0, 0, 0]]), "directions must not be zero; row 0"),
+    (([[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [-0.0, 0, 0]]), "row 1"),
+    (([[0, np.nan, 0]], [[1, 0, 0]]), "origins must be finite; row 0"),
+    (([[0, 0, 0]], [[1, np.inf, 0]]), "directions must be finite"),
+    (([["a", "b", "c"]], [[1, 0, 0]]), "origins must be"),
+    (([[0, 0, 0]], [[1, 0, 0]], -1.0), "t_min must not be NaN or below 0"),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, np.nan), "t_max must not be NaN"),
+    (([[0, 0, 0]], [[1, 0, 0]], [0.0, 0.0]), r"t_min must be a number or \(1,\), got \(2,\)"),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, [[1.0]]), r"t_max must be a number or \(1,\)"),
+    (([[0, 0, 0]], [[1, 0, 0]], "near"), "t_min must be"),
+])
+def test_bad_arguments_are_named(arguments: tuple, message: str) -> None:
+    structure = build(BALL, "brute_force")
+    for query in (structure.closest_hit, structure.any_hit):
+        with pytest.raises(InputError, match=message):
+            query(*arguments)
+
+
+def test_bad_warp_arrays_are_named() -> None:
+    structure = build(BALL, "brute_force")
+    good = vec3s([[1.0, 0.0, 0.0]])
+    with pytest.raises(InputError, match="both be Warp arrays of vec3"):
+        structure.closest_hit(good, np.ones((1, 3)))
+    with pytest.raises(InputError, match="both be Warp arrays of vec3"):
+        structure.closest_hit(np.ones((1, 3)), good)
+    with pytest.raises(InputError, match="both be Warp arrays of vec3"):
+        structure.closest_hit(wp.zeros(1, dtype=wp.vec2, device=CPU), good)
+    with pytest.raises(InputError, match="as many rows"):
+        structure.closest_hit(good, vec3s(np.ones((2, 3))))
+    with pytest.raises(InputError, match="t_max must be"):
+        structure.closest_hit(good, good, t_max=wp.zeros(3, dtype=wp.float32, device=CPU))
+
+
+def test_threads_must_be_positive() -> None:
+    with pytest.raises(InputError, match="threads must be 1 or more"):
+        build(BALL).closest_hit([[0, 0, 0]], [[1, 0, 0]], threads=0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_caller_may_change_arrays_afterwards(name: str) -> None:
+    mesh = Mesh(BALL.vertices.copy(), BALL.faces.copy())
+    structure = build(mesh, name)
+    origin, direction = some_rays(200)
+    before = structure.closest_hit(origin, direction)
+    kept = before.t.copy()
+    mesh.vertices[:] = 100.0
+    mesh.faces[:] = 0
+    again = structure.closest_hit(origin, direction)
+    assert np.array_equal(again.t, kept) and np.array_equal(before.t, kept)
+
+
+def test_geometry_counts_triangles_then_spheres() -> None:
+    spheres = np.array([[4.0, 0.0, 0.0, 0.5], [-4.0, 0.0, 0.0, 0.25]], np.float32)
+    geometry = Geometry(BALL.vertices, BALL.faces, spheres)
+    n = len(BALL.faces)
+    assert len(geometry) == n + 2
+    for name in NAMES:
+        hits = build(geometry, name).closest_hit([[4, 5, 0], [-4, 5, 0], [0, 5, 0]], [[0, -1, 0]] * 3)
+        assert hits.prim_id[:2].tolist() == [n, n + 1] and 0 <= hits.prim_id[2] < n
+        assert hits.t[:2].tolist() == [4.5, 4.75] and not hits.u[:2].any() and not hits.v[:2].any()
+
+
+def test_primitive_records_in_any_order() -> None:
+    spheres = np.array([[1.0, 2.0, 3.0, 0.5]], np.float32)
+    geometry = Geometry(BALL.vertices, BALL.faces, spheres)
+    order = np.random.default_rng(2).permutation(len(geometry)).astype(np.int32)
+    out = geometry.primitives(order)
+    assert out.dtype == records(Primitive, 0).dtype and np.array_equal(out["prim_id"], order)
+    for row in out[::7]:
+        if row["prim_id"] < len(BALL.faces):
+            corners = BALL.vertices[BALL.faces[row["prim_id"]]]
+            assert np.array_equal([row["v0"], row["v1"], row["v2"]], corners)
+        else:
+            assert row["v0"].tolist() == [1.0, 2.0, 3.0] and row["v1"][0] == 0.5
+    plain = Geometry.of(BALL).primitives()
+    assert np.array_equal(plain["v1"], BALL.vertices[BALL.faces[:, 1]])
+
+
+def test_bounds_are_those_of_the_units_to_the_last_bit() -> None:
+    # The host pads the boxes that structures are built from, the device those that a hit is held to: the same, or a hit
+    # could lie outside the box that leads to it.
+    rng = np.random.default_rng(3)
+    corners = rng.normal(size=(4000, 3, 3)) * 10.0 ** rng.uniform(-8, 8, (4000, 1, 1))
+    corners += 10.0 ** rng.uniform(-8, 8, (4000, 1, 3))
+    spheres = np.concatenate([rng.normal(size=(500, 3)) * 100.0, 10.0 ** rng.uniform(-6, 4, (500, 1))], axis=1)
+    geometry = Geometry(corners.reshape(-1, 3).astype(np.float32), np.arange(12000, dtype=np.int32).reshape(-1, 3),
+                        spheres.astype(np.float32))
+    lo, hi = geometry.bounds()
+    corner = geometry.vertices[geometry.faces]
+    center, radius = geometry.spheres[:, :3], geometry.spheres[:, 3:]
+    tight_lo = np.concatenate([corner.min(axis=1), center - radius])
+    tight_hi = np.concatenate([corner.max(axis=1), center + radius])
+    out_lo, out_hi = zeros(4500, wp.vec3), zeros(4500, wp.vec3)
+    launch(pad_kernel, 4500, vec3s(tight_lo), vec3s(tight_hi), out_lo, out_hi)
+    assert np.array_equal(out_lo.numpy(), lo) and np.array_equal(out_hi.numpy(), hi)
+    assert (lo <= tight_lo).all() and (hi >= tight_hi).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_statistics(name: str) -> None:
+    mesh = torus()
+    structure = build(mesh, name)
+    stats = structure.stats
+    assert stats.build_seconds > 0.0 and stats.bytes >= records(Primitive, len(mesh.faces)).nbytes
+    if name == "brute_force":
+        assert (stats.nodes, stats.leaves, stats.depth, stats.sah_cost) == (0, 0, 0, len(mesh.faces))
+    else:
+        assert stats.nodes > 0 and stats.leaves > 0 and stats.depth > 1 and 1.0 < stats.sah_cost < len(mesh.faces) / 4
+    assert str(len(mesh.faces)) in repr(structure)

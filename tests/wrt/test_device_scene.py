@@ -1,0 +1,254 @@
+"""From a scene to the device's tables: nothing is lost, turned inside out or counted twice on the way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import CPU, unit  # isort: skip (starts Warp)
+
+from wrt.device_scene import (
+    LUMINANCE,
+    MAX_MESH_LIGHTS,
+    TextureTable,
+    camera_struct,
+    light_records,
+    material_records,
+    srgb_table,
+    upload_scene,
+    world_mesh,
+)
+from wrt.errors import InputError
+from wrt.kernels import lights
+from wrt.mesh import Mesh
+from wrt.scene import (
+    ALPHA_MODES,
+    MATERIAL_KINDS,
+    Camera,
+    Checkerboard,
+    ConstantBackground,
+    DirectionalLight,
+    EnvironmentBackground,
+    GradientBackground,
+    Material,
+    Object,
+    PointLight,
+    Scene,
+    Sphere,
+    SpotLight,
+    Texture,
+)
+from wrt.shapes import box, icosphere, quad
+
+GREY = Material()
+
+
+def transform(matrix: list[list[float]], move: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = matrix, move
+    return out
+
+
+def outward_share(mesh: Mesh) -> np.ndarray:
+    """For each face of a mesh around its center: the cosine between its counter-clockwise normal and the way out."""
+    corner = mesh.vertices[mesh.faces].astype(np.float64)
+    normal = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    return (normal * unit(corner.mean(axis=1) - mesh.vertices.mean(axis=0))).sum(axis=1)
+
+
+TRANSFORMS = {
+    "turned": transform([[0, 0, 1], [1, 0, 0], [0, 1, 0]], (5, -3, 2)),
+    "mirrored": transform([[-1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+    "mirrored_in_three": transform([[-2, 0, 0], [0, -2, 0], [0, 0, -2]]),
+    "stretched": transform([[3, 0, 0], [0, 0.1, 0], [0, 0, 1]]),
+    "sheared": transform([[1, 0.7, 0], [0, 1, 0.2], [0, 0, 1]], (100, 0, 0)),
+    "sheared_and_mirrored": transform([[1, 0.7, 0], [0, -1, 0.2], [0, 0, 1]]),
+    "tiny": transform(np.diag([1e-12, 1e-12, 1e-12]).tolist()),
+}
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_outside_stays_outside_and_normals_stay_normal(name: str) -> None:
+    ball, matrix = icosphere(2), TRANSFORMS[name]
+    world = world_mesh(Scene(objects=(Object(ball, (GREY,), matrix),)))
+    exact = ball.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    assert np.array_equal(world.geometry.vertices, exact.astype(np.float32))  # rounded once
+    placed = Mesh(world.geometry.vertices, world.geometry.faces)
+    assert (outward_share(placed) > 0.0).all()
+    # A sphere's normals go by the inverse transpose; they stay at right angles to the surface and point outwards.
+    expected = unit(ball.vertices.astype(np.float64) @ np.linalg.inv(matrix[:3, :3]))
+    assert np.abs(world.normals - expected).max() < 1e-5
+    assert (np.sort(placed.faces, axis=1) == np.sort(ball.faces, axis=1)).all()
+
+
+def test_the_identity_changes_nothing() -> None:
+    ball = icosphere(1)
+    world = world_mesh(Scene(objects=(Object(ball, (GREY,)),)))
+    assert np.array_equal(world.geometry.vertices, ball.vertices) and np.array_equal(world.geometry.faces, ball.faces)
+    assert np.array_equal(world.normals, ball.normals) and world.uvs.shape == (len(ball.vertices), 2)
+
+
+def test_a_flattened_object_has_finite_normals() -> None:
+    flat = transform([[1, 0, 0], [0, 0, 0], [0, 0, 1]])
+    world = world_mesh(Scene(objects=(Object(icosphere(1), (GREY,), flat),)))
+    assert np.isfinite(world.normals).all()
+    length = np.linalg.norm(world.normals, axis=1)
+    assert ((length < 1e-6) | (np.abs(length - 1.0) < 1e-5)).all()
+
+
+def test_a_transform_beyond_float32_is_refused() -> None:
+    big = transform(np.diag([1e39, 1.0, 1.0]).tolist())
+    with pytest.raises(InputError, match=r"object 'planet'.*beyond float32"):
+        world_mesh(Scene(objects=(Object(box(), (GREY,), big, name="planet"),)))
+
+
+def test_objects_are_joined_with_their_materials() -> None:
+    red, blue, green = (Material(name=name) for name in ("red", "blue", "green"))
+    which = np.array([0, 1] * 6, np.int32)
+    scene = Scene(objects=(Object(box(), (red, blue), face_material=which), Object(quad(), (green,)), Object(quad(), (blue,))),
+                  spheres=(Sphere((1, 2, 3), 4.0, green), Sphere((0, 0, 0), 1.0, red)))
+    assert [m.name for m in scene.materials] == ["red", "blue", "green"]
+    world = world_mesh(scene)
+    geometry = world.geometry
+    assert world.prim_material.tolist() == [*which.tolist(), 2, 2, 1, 1, 2, 0]
+    assert len(geometry) == 12 + 2 + 2 + 2 and geometry.faces.max() == len(geometry.vertices) - 1
+    assert np.array_equal(geometry.vertices[geometry.faces[12:14]], quad().vertices[quad().faces])
+    assert geometry.spheres.tolist() == [[1, 2, 3, 4], [0, 0, 0, 1]]
+    assert world.normals is None and np.array_equal(world.uvs[-4:], quad().uvs)
+    smooth = world_mesh(Scene(objects=(Object(quad(), (red,)), Object(icosphere(0), (red,)))))
+    assert smooth.normals is not None and not smooth.normals[:4].any() and smooth.normals[4:].any()
+
+
+def test_an_empty_scene_uploads() -> None:
+    device = upload_scene(Scene(), CPU)
+    assert len(device.world.geometry) == 0 and device.surfaces.n_triangles == 0 and device.lighting.count == 0
+
+
+def test_material_records_keep_every_value() -> None:
+    picture, board = Texture(np.zeros((2, 3, 4), np.uint8)), Checkerboard()
+    a = Material("glass", albedo=(0.1, 0.2, 0.3), ior=1.7, absorption=(4, 5, 6), thin=True, roughness=0.25, alpha=0.5,
+                 alpha_mode="blend", albedo_texture=picture, normal_texture=picture, emission_texture=board, normal_scale=-2.0)
+    b = Material("metallic_roughness", metallic=0.7, transmission=0.2, emission=(7, 8, 9), two_sided=True,
+                 metallic_roughness_texture=Texture(picture.image), alpha_cutoff=0.9)
+    table = TextureTable()
+    out = material_records((a, b), table)
+    assert out["kind"].tolist() == [MATERIAL_KINDS.index("glass"), MATERIAL_KINDS.index("metallic_roughness")]
+    assert out["alpha_mode"].tolist() == [ALPHA_MODES.index("blend"), ALPHA_MODES.index("opaque")]
+    for row, material in zip(out, (a, b), strict=True):
+        for name in ("albedo", "specular", "exponent", "eta", "k", "ior", "absorption", "thin", "metallic", "roughness",
+                     "transmission", "emission", "two_sided", "alpha", "alpha_cutoff", "normal_scale"):
+            assert np.allclose(row[name], getattr(material, name)), name
+    assert out["albedo_texture"].tolist() == [0, -1] and out["normal_texture"].tolist() == [0, -1]
+    assert out["emission_texture"][0] == 1 and out["metallic_roughness_texture"].tolist() == [-1, 2]
+    assert len(table.rows) == 3 and table.size == 6  # the picture that two textures share is stored once
+    first = table.records()["first"]
+    assert first[0] == first[2] == 0 and table.records()["width"].tolist() == [3, 0, 3]
+
+
+def test_srgb_table() -> None:
+    table = srgb_table()
+    assert table.shape == (512,) and table[0] == table[256] == 0.0 and table[255] == table[511] == 1.0
+    assert table[188] == pytest.approx(0.5029, abs=1e-4) and (np.diff(table[:256]) > 0).all()
+    assert np.allclose(table[256:], np.arange(256) / 255.0)
+
+
+def test_lights_without_area() -> None:
+    scene = Scene(lights=(PointLight((1, 2, 3), (4, 5, 6)), DirectionalLight((0, -3, 0), (7, 8, 9)),
+                          SpotLight((1, 1, 1), (0, 0, -2), (1, 2, 3), 0.25, 0.5)))
+    rows, emitters = light_records(scene, world_mesh(scene))
+    assert rows["kind"].tolist() == [lights.LIGHT_POINT, lights.LIGHT_DIRECTIONAL, lights.LIGHT_SPOT] and len(emitters) == 0
+    assert rows["position"][0].tolist() == [1, 2, 3] and rows["color"][1].tolist() == [7, 8, 9]
+    assert np.allclose(rows["direction"][1:], [[0, -1, 0], [0, 0, -1]])
+    assert rows["cos_inner"][2] == np.float32(np.cos(0.25)) and rows["cos_outer"][2] == np.float32(np.cos(0.5))
+
+
+def lamps(count: int, **rest: float) -> Scene:
+    """`count` glowing quads of growing size in their own materials, and one dark thing."""
+    objects = [Object(quad((3.0 * i, 0, 0), (1 + i, 0, 0), (0, 1, 0)), (Material(emission=(1.0 + i, 2.0, 0.5), **rest),))
+               for i in range(count)]
+    return Scene(objects=(Object(box(), (GREY,)), *objects))
+
+
+def test_each_glowing_object_is_a_light() -> None:
+    scene = lamps(3)
+    rows, emitters = light_records(scene, world_mesh(scene))
+    assert (rows["kind"] == lights.LIGHT_MESH).all()
+    assert rows["count"].tolist() == [2, 2, 2] and rows["first"].tolist() == [0, 2, 4]
+    assert emitters["prim_id"].tolist() == list(range(12, 18))
+    assert np.allclose(emitters["cdf"], [0.5, 1.0] * 3)
+    assert np.allclose(emitters["pdf_area"], 1.0 / np.repeat([1.0, 2.0, 3.0], 2))  # uniform over each quad
+    dark = lamps(3, emits_light=False)
+    assert len(light_records(dark, world_mesh(dark))[0]) == 0
+
+
+def test_beyond_some_number_all_are_one_light_by_power() -> None:
+    count = MAX_MESH_LIGHTS + 4
+    scene = lamps(count)
+    rows, emitters = light_records(scene, world_mesh(scene))
+    assert len(rows) == 1 and rows["count"][0] == 2 * count == len(emitters)
+    area = 0.5 * (1.0 + np.repeat(np.arange(count), 2))
+    power = area * np.repeat([LUMINANCE @ [1.0 + i, 2.0, 0.5] for i in range(count)], 2)
+    assert np.allclose(np.diff(emitters["cdf"], prepend=0.0), power / power.sum(), atol=1e-6)
+    assert emitters["cdf"][-1] == 1.0
+    # Density over all: chance of the triangle, uniform over its area; in all it is 1.
+    assert np.allclose(emitters["pdf_area"], power / power.sum() / area, rtol=1e-5)
+    assert (emitters["pdf_area"] * area).sum() == pytest.approx(1.0, rel=1e-5)
+
+
+def test_emitters_without_area_or_light_are_never_chosen() -> None:
+    mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], [[0, 1, 1], [0, 1, 2], [0, 1, 3]])
+    scene = Scene(objects=(Object(mesh, (Material(emission=(1, 1, 1)),)),))
+    rows, emitters = light_records(scene, world_mesh(scene))
+    assert rows["count"][0] == 3 and emitters["cdf"].tolist() == [0.0, 1.0, 1.0]
+    flat = Scene(objects=(Object(Mesh(mesh.vertices, mesh.faces[[0, 2]]), (Material(emission=(1, 1, 1)),)),))
+    assert len(light_records(flat, world_mesh(flat))[0]) == 0
+
+
+def test_glowing_spheres() -> None:
+    scene = Scene(spheres=(Sphere((0, 1, 0), 0.5, Material(emission=(1, 2, 3))), Sphere((5, 1, 0), 0.5, GREY)))
+    rows, _ = light_records(scene, world_mesh(scene))
+    assert len(rows) == 1 and rows["kind"][0] == lights.LIGHT_SPHERE and rows["radius"][0] == 0.5
+    assert rows["position"][0].tolist() == [0, 1, 0] and rows["color"][0].tolist() == [1, 2, 3]
+
+
+def test_backgrounds() -> None:
+    flat = upload_scene(Scene(background=ConstantBackground((1, 2, 3))), CPU).lighting.background
+    assert list(flat.bottom) == list(flat.top) == [1, 2, 3]
+    gradient = upload_scene(Scene(background=GradientBackground((0, 0, 1), (1, 0, 0))), CPU).lighting.background
+    assert list(gradient.bottom) == [0, 0, 1] and list(gradient.top) == [1, 0, 0]
+
+
+@pytest.mark.parametrize("black", [False, True])
+def test_environment_tables_cover_every_pixel(black: bool) -> None:
+    rng = np.random.default_rng(1)
+    image = np.zeros((7, 9, 3), np.float32) if black else (rng.random((7, 9, 3)) ** 8).astype(np.float32)
+    b = upload_scene(Scene(background=EnvironmentBackground(image, 2.0, 0.5)), CPU).lighting.background
+    rows, columns = b.row_cdf.numpy(), b.column_cdf.numpy().reshape(7, 9)
+    assert (b.height, b.width, b.scale, b.rotation) == (7, 9, 2.0, 0.5)
+    assert rows[-1] == 1.0 and (columns[:, -1] == 1.0).all()
+    assert (np.diff(rows, prepend=0.0) > 0.0).all() and (np.diff(columns, axis=1, prepend=0.0) > 0.0).all()
+    assert np.array_equal(b.pixels.numpy().reshape(7, 9, 3), image)
+
+
+def test_a_cut_out_texture_on_a_sphere_is_refused() -> None:
+    leaf = Material(alpha_mode="mask", albedo_texture=Checkerboard(), name="leaf")
+    with pytest.raises(InputError, match=r"sphere 'ball'.*needs a mesh.*leaf"):
+        upload_scene(Scene(spheres=(Sphere((0, 0, 0), 1.0, leaf, name="ball"),)), CPU)
+
+
+@pytest.mark.parametrize("size", [(640, 360), (10, 30)])
+def test_camera_struct(size: tuple[int, int]) -> None:
+    camera = Camera.look_at((1, 2, 3), (4, 6, 3), fov_y=0.8, aperture_radius=0.2, focus_distance=7.0, blades=5)
+    c = camera_struct(camera, size)
+    assert np.allclose(c.origin, [1, 2, 3]) and np.allclose(c.forward, [0.6, 0.8, 0.0], atol=1e-6)
+    frame = np.array([c.right, c.up, c.forward])
+    assert np.allclose(frame @ frame.T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(frame) == pytest.approx(-1.0, abs=1e-6)  # right, up and backwards are right-handed
+    assert c.tan_y == pytest.approx(np.tan(0.4)) and c.tan_x == pytest.approx(np.tan(0.4) * size[0] / size[1])
+    assert (c.blades, c.focus_distance) == (5, 7.0) and c.aperture_radius == pytest.approx(0.2)
+
+
+def test_a_mirrored_or_scaled_camera_pose_is_only_a_pose() -> None:
+    scaled = Camera(camera_to_world=np.diag([5.0, 2.0, 3.0, 1.0]))
+    c = camera_struct(scaled, (4, 4))
+    assert np.allclose([c.right, c.up, c.forward], [[1, 0, 0], [0, 1, 0], [0, 0, -1]])

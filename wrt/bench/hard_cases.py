@@ -1,0 +1,77 @@
+"""The hard cases: geometry and rays that lose rays, seeded, at any number; and what the answers must be.
+
+Names begin with the letter of their group: A dense spheres near and far from 0; B a jittered sphere; C re-intersection;
+D bad triangles; E along the axes; F slivers, edge-on and grazing; G sheets, coincident triangles, a shared vertex; H scale
+and the segment's ends; I lengths, underflow, and what is not finite.
+
+"Aimed at" a vertex or a point p on an edge means the direction fl32(p - o): through p exactly only where p - o is a float32
+value, and else beside it by at most 2^-24 of its distance per axis.
+
+>>> for case in chunks("A_far_vertices", 1_000_000, seed=0):
+...     verdict += judge(case, accel.closest_hit(case.origins, case.directions, case.t_min, case.t_max))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+
+from wrt.bench import hard_cases_closed as inside
+from wrt.bench import hard_cases_open as outside
+from wrt.bench.hard_cases_common import AIMS, ASK, HIT, MISS, HardCase, Seed
+from wrt.bench.hard_cases_judge import Verdict, judge, judge_all_hits, judge_next
+from wrt.errors import InputError
+
+__all__ = ["ASK", "HARD_CASES", "HIT", "MISS", "HardCase", "Verdict", "chunks", "generate", "judge", "judge_all_hits",
+           "judge_next"]
+
+HARD_CASES: dict[str, Callable[[Seed, int], HardCase]] = {
+    **{f"A_{place}_{aim}": partial(inside.dense_sphere, position=place, aim=aim)
+       for place in inside.POSITIONS for aim in AIMS},
+    "B_jittered_uniform": partial(inside.jittered_sphere, aim="uniform"),
+    "B_jittered_vertices": partial(inside.jittered_sphere, aim="vertices"),
+    "C_triangles": outside.respawned_triangles,
+    "C_spheres": outside.respawned_spheres,
+    "D_without_area": outside.without_area,
+    "D_among_bad": outside.among_bad,
+    "D_published": outside.published_bad,
+    "D_huge": outside.huge,
+    "D_tiny": outside.tiny,
+    "E_grid": inside.axis_parallel,
+    "E_beside": outside.beside_boxes,
+    **{f"F_needles_{aim}": partial(inside.needles, aim=aim) for aim in AIMS},
+    "F_slivers": outside.slivers,
+    "F_edge_on": outside.edge_on,
+    "F_grazing": partial(outside.grazing, turned=False),
+    "F_grazing_turned": partial(outside.grazing, turned=True),
+    **{f"G_sheets_{aim}": partial(inside.two_sheets, aim=aim) for aim in AIMS},
+    "G_coincident_uniform": partial(inside.coincident, aim="uniform"),
+    "G_coincident_vertices": partial(inside.coincident, aim="vertices"),
+    **{f"G_fan_{aim}": partial(inside.shared_vertex, aim=aim) for aim in AIMS},
+    **{f"H_scale_{name}_{aim}": partial(inside.scaled, scale=scale, aim=aim)
+       for name, scale in (("1e-6", 1e-6), ("1", 1.0), ("1e6", 1e6)) for aim in ("uniform", "vertices")},
+    "H_stadium": inside.stadium,
+    "H_exact_ends": outside.exact_ends,
+    "I_lengths": inside.lengths,
+    "I_underflow": inside.underflowing,
+    "I_denormal": inside.denormal,
+    "I_rays_not_finite": outside.rays_not_finite,
+    "I_mesh_not_finite": outside.mesh_not_finite,
+}
+
+
+def generate(name: str, n: int, seed: Seed = 0) -> HardCase:
+    """n rays of one case. Raises InputError for an unknown name."""
+    if name not in HARD_CASES:
+        raise InputError(f"no hard case {name!r}; there is {', '.join(HARD_CASES)}")
+    make = HARD_CASES[name]
+    notes = (make.func if isinstance(make, partial) else make).__doc__ or ""
+    return replace(make(seed, n), name=name, notes=" ".join(notes.split()))
+
+
+def chunks(name: str, n: int, seed: int = 0, chunk: int = 2**18) -> Iterator[HardCase]:
+    """n rays in parts of at most `chunk`, each with a seed of its own: some cases have another geometry in each part, the
+    others the same object."""
+    for first in range(0, n, chunk):
+        yield generate(name, min(chunk, n - first), (seed, first // chunk))

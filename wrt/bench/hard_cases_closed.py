@@ -1,0 +1,198 @@
+"""Rays that start inside a closed surface: every one of them must hit.
+
+Why that is a theorem. Let the origin have winding number other than 0 with respect to the surface, as it is stored, rounded
+to float32. Then any ray meets the surface, also where triangles have lost their area. And it meets a triangle that is not
+parallel to it: shift the ray sideways by ever less, in a direction that is in none of the planes which contain it. The
+shifted rays start inside too; they are parallel to those planes and off them, so each hits some other triangle; one of the
+finitely many is hit infinitely often, and, being closed, by the ray itself. So HIT needs only an origin inside: rounding
+moves each vertex by less than the origin's distance to the surface, and a surface that never passes over the origin on the
+way keeps its winding number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from wrt.accel.base import Geometry
+from wrt.bench.hard_cases_common import (
+    HIT,
+    HardCase,
+    Seed,
+    aimed,
+    cube,
+    hard_case,
+    in_ball,
+    joined,
+    lat_long,
+    sphere,
+    surface,
+    unit_vectors,
+)
+from wrt.shapes import teapot
+
+POSITIONS = {"origin": (0.0, 0.0, 0.0), "1e4": (1e4, 1e4, 1e4), "far": (148376.0, 1234.0, -223423.0)}
+APEX_FACES = 10_000
+SHEET_GAP = 4e-5
+
+
+def inside(geometry: Geometry, origins: np.ndarray, rng: np.random.Generator, aim: str, notes: str = "") -> HardCase:
+    origins = origins.astype(np.float32)
+    return hard_case(geometry, origins, aimed(geometry, rng, origins, aim), HIT, closed=True, notes=notes)
+
+
+def dense_sphere(seed: Seed, n: int, *, position: str, aim: str) -> HardCase:
+    """A: a sphere of radius 2 with 159,200 triangles. The origins are in the cube of side 2 around its centre, whose corners
+    are 0.26 from the surface; float32 moves a point 2e5 from 0 by 0.012 at most."""
+    rng = np.random.default_rng(seed)
+    center = POSITIONS[position]
+    return inside(sphere(400, 200, 2.0, center), np.array(center) + rng.uniform(-1.0, 1.0, (n, 3)), rng, aim)
+
+
+def jittered_sphere(seed: Seed, n: int, *, aim: str) -> HardCase:
+    """B (pbrt-v4, shapes_test, Triangle.Watertight): 16 x 16, each vertex at a radius of 1 + 5 U, the origins in a ball of
+    0.5. Corners of a face are at most 26 degrees apart, so that no face comes closer to the centre than cos 26 = 0.89."""
+    rng = np.random.default_rng(seed)
+    vertices, faces = lat_long(16, 16, 1.0 + 5.0 * rng.random(2 + 16 * 15))
+    return inside(surface(vertices, faces), in_ball(rng, n, 0.5), rng, aim)
+
+
+def needles(seed: Seed, n: int, *, aim: str) -> HardCase:
+    """F: a sphere squeezed by 10^-U(1.5, 4) in two axes, each its own: triangles of aspect 1e3 to 1e8 around the rays.
+
+    Coordinates are rounded relative to themselves, which squeezing does not change: origins of half the radius are inside.
+    """
+    rng = np.random.default_rng(seed)
+    squeeze = np.ones(3)
+    axes = rng.permutation(3)
+    squeeze[axes[0]] = 10.0 ** -rng.uniform(1.5, 4.0)
+    squeeze[axes[1]] = squeeze[axes[0]] * 10.0 ** -rng.uniform(0.0, 4.0)
+    vertices, faces = lat_long(32, 32)
+    geometry = surface(vertices * squeeze, faces)
+    case = inside(geometry, in_ball(rng, n, 0.5) * squeeze, rng, aim)
+    if aim == "uniform":  # half of them uniform in the squeezed space, so that they meet the flat sides too
+        half = (unit_vectors(rng, n) * np.where(rng.random((n, 1)) < 0.5, squeeze, 1.0)).astype(np.float32)
+        return replace(case, directions=half)
+    return case
+
+
+@cache
+def _sheets() -> Geometry:
+    return joined(sphere(64, 32, 1.0), sphere(64, 32, 1.0 + SHEET_GAP))
+
+
+def two_sheets(seed: Seed, n: int, *, aim: str) -> HardCase:
+    """G: glass in glass: two spheres with the same corners but for 4e-5 of the radius; the inner one comes first."""
+    rng = np.random.default_rng(seed)
+    return inside(_sheets(), in_ball(rng, n, 0.9), rng, aim)
+
+
+@cache
+def _coincident() -> Geometry:
+    rng = np.random.default_rng(0)
+    once = sphere(32, 16)
+    faces = np.repeat(once.faces, 3, axis=0)
+    return surface(once.vertices, faces[rng.permutation(len(faces))])
+
+
+def coincident(seed: Seed, n: int, *, aim: str) -> HardCase:
+    """G: a sphere that is there three times, in a shuffled order: of each tie the lowest prim_id."""
+    rng = np.random.default_rng(seed)
+    return inside(_coincident(), in_ball(rng, n, 0.9), rng, aim)
+
+
+@cache
+def _fan() -> Geometry:
+    angle = 2.0 * np.pi * np.arange(APEX_FACES) / APEX_FACES
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(APEX_FACES)], axis=1)
+    i = np.arange(APEX_FACES)
+    j = (i + 1) % APEX_FACES
+    top = np.stack([np.zeros_like(i), 2 + i, 2 + j], axis=1)
+    bottom = np.stack([np.ones_like(i), 2 + j, 2 + i], axis=1)
+    return surface(np.concatenate([[[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], ring]), np.concatenate([top, bottom]))
+
+
+def shared_vertex(seed: Seed, n: int, *, aim: str) -> HardCase:
+    """G: a double cone whose apex 10,000 triangles share (as the other apex); "vertices": aimed at the two."""
+    rng = np.random.default_rng(seed)
+    geometry = _fan()
+    origins = in_ball(rng, n, 0.5).astype(np.float32)
+    directions = aimed(geometry, rng, origins, aim)
+    if aim == "vertices":
+        directions = geometry.vertices[rng.integers(2, size=n)].astype(np.float64) - origins
+    return replace(hard_case(geometry, origins, directions, HIT, closed=True), asked=100)
+
+
+def scaled(seed: Seed, n: int, *, scale: float, aim: str) -> HardCase:
+    """H: the same sphere and the same rays, times 1e-6, 1 and 1e6."""
+    rng = np.random.default_rng(seed)
+    return inside(sphere(64, 32, scale), in_ball(rng, n, 0.9 * scale), rng, aim)
+
+
+@cache
+def _stadium() -> tuple[Geometry, Geometry]:
+    mesh = teapot(24)
+    pot = surface(mesh.vertices, mesh.faces)
+    return pot, joined(pot, sphere(64, 32, 1e5))
+
+
+def stadium(seed: Seed, n: int) -> HardCase:
+    """H: a teapot in a stadium 1e5 larger; rays from near the pot and from far away, at its corners and past it."""
+    rng = np.random.default_rng(seed)
+    pot, both = _stadium()
+    origins = (in_ball(rng, n) * np.where(rng.random((n, 1)) < 0.5, 3.0, 5e4)).astype(np.float32)
+    at_pot = aimed(pot, rng, origins, "vertices")
+    directions = np.where(rng.random((n, 1)) < 0.5, at_pot, unit_vectors(rng, n))
+    return hard_case(both, origins, directions, HIT)
+
+
+def lengths(seed: Seed, n: int) -> HardCase:
+    """I: directions of length 1e-20 to 1e20."""
+    rng = np.random.default_rng(seed)
+    case = inside(sphere(32, 16), in_ball(rng, n, 0.9), rng, "uniform")
+    directions = case.directions.astype(np.float64) * 10.0 ** rng.uniform(-20.0, 20.0, (n, 1))
+    return replace(case, directions=directions.astype(np.float32))
+
+
+def underflowing(seed: Seed, n: int) -> HardCase:
+    """I: one or two components of the direction are denormal or underflow to 0 (of either sign)."""
+    rng = np.random.default_rng(seed)
+    case = inside(sphere(32, 16), in_ball(rng, n, 0.9), rng, "uniform")
+    small = rng.random((n, 3)) < 0.5
+    small[np.arange(n), rng.integers(3, size=n)] = False
+    factor = np.where(small, 10.0 ** -rng.uniform(36.0, 50.0, (n, 3)), 1.0)
+    return replace(case, directions=(case.directions.astype(np.float64) * factor).astype(np.float32))
+
+
+def denormal(seed: Seed, n: int) -> HardCase:
+    """I: all of the direction is denormal, 1e-41 to 1e-38 long; the sphere is so small that t is at most 4e37."""
+    rng = np.random.default_rng(seed)
+    case = inside(sphere(32, 16, 1e-4), in_ball(rng, n, 0.9e-4), rng, "uniform")
+    directions = case.directions.astype(np.float64) * 10.0 ** rng.uniform(-41.0, -38.0, (n, 1))
+    directions = directions.astype(np.float32)
+    directions[np.abs(directions).max(axis=1) < 5e-42] = np.float32(5e-42)
+    return replace(case, directions=directions)
+
+
+@cache
+def _grid() -> Geometry:
+    cells = np.stack(np.meshgrid(*[np.arange(4.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    return joined(*(surface(*cube(cell, cell + 1.0)) for cell in cells))
+
+
+def axis_parallel(seed: Seed, n: int) -> HardCase:
+    """E: along the axes, both ways, zeros of both signs, through a block of 4 x 4 x 4 unit cubes whose faces coincide: in
+    faces, along edges and through corners. They start inside or before the block, so that a face is always ahead; on the
+    block's outer faces the weight of the edge there is exactly 0, also in float32: a closed triangle is hit."""
+    rng = np.random.default_rng(seed)
+    row, axis = np.arange(n), rng.integers(3, size=n)
+    origins = np.where(rng.random((n, 3)) < 0.7, rng.integers(0, 9, (n, 3)) / 2.0,
+                       rng.uniform(0.0, 4.0, (n, 3)).astype(np.float32))
+    sign = rng.choice([-1.0, 1.0], n)
+    before = rng.random(n) < 0.5
+    origins[row, axis] = np.where(before, 2.0 - sign * rng.integers(2, 9, n), rng.integers(0, 9, n) / 2.0)
+    directions = np.where(rng.random((n, 3)) < 0.5, 0.0, -0.0)
+    directions[row, axis] = sign * 2.0 ** rng.integers(-3, 4, n)
+    return hard_case(_grid(), origins, directions, HIT, closed=True)

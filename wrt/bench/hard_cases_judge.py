@@ -1,0 +1,332 @@
+"""The verdict on what a unit says of a hard case, ray by ray, against the oracle.
+
+Three things can be wrong whatever is meant to be allowed: a *miss* (a hit that must be found is not), a *false hit* (the
+ray passes the triangle by more than the unit's rounding, or lies outside of the segment), a *wrong prim_id* (a nearer one had
+to be found). Where the derived error bound (wrt.reference_bounds) cannot tell, nothing is wrong, but it is counted apart:
+borderline misses and hits, ties (exactly equal t) and near ties (within the bound).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from wrt.bench.hard_cases_common import ASK, HIT, MISS, HardCase
+from wrt.reference import AllHits, Place, Reference, reference_of, sure
+
+RAYS_AT_ONCE = 1 << 16
+EXAMPLES = 8
+BINS_PER_OCTAVE, LOWEST_OCTAVE, N_BINS = 8, -12, 8 * 160
+
+
+@dataclass
+class Errors:
+    """Errors of one quantity: the largest, a histogram for percentiles (merging it loses nothing), the largest ratio to the
+    derived bound, and how many are above it. Units: float32 ulp of the exact t; 2^-24 for u and v, which are parts of 1."""
+
+    largest: float = 0.0
+    largest_ratio: float = 0.0
+    over: int = 0
+    histogram: np.ndarray = field(default_factory=lambda: np.zeros(N_BINS, np.int64))
+
+    def add(self, error: np.ndarray, unit: np.ndarray | float, bound: np.ndarray) -> np.ndarray:
+        """Count absolute errors; returns where they are above the bound."""
+        if not len(error):
+            return np.zeros(0, bool)
+        scaled = error / unit
+        self.largest = max(self.largest, float(scaled.max()))
+        octave = np.log2(np.maximum(scaled, 2.0**LOWEST_OCTAVE)) - LOWEST_OCTAVE
+        index = np.minimum(np.ceil(octave * BINS_PER_OCTAVE), N_BINS - 1).astype(np.int64)
+        self.histogram += np.bincount(index, minlength=N_BINS)
+        over = error > bound
+        self.largest_ratio = max(self.largest_ratio, float((error / bound).max()))
+        self.over += int(over.sum())
+        return over
+
+    def percentile(self, q: float) -> float:
+        """An upper bound, within a ninth, on the q-th percentile; NaN where nothing was counted."""
+        total = int(self.histogram.sum())
+        if not total:
+            return float("nan")
+        index = int(np.searchsorted(np.cumsum(self.histogram), q / 100.0 * total))
+        return min(2.0 ** (LOWEST_OCTAVE + index / BINS_PER_OCTAVE), self.largest)
+
+    def __add__(self, other: Errors) -> Errors:
+        return Errors(max(self.largest, other.largest), max(self.largest_ratio, other.largest_ratio),
+                      self.over + other.over, self.histogram + other.histogram)
+
+    def as_dict(self) -> dict[str, float]:
+        return {"max": self.largest, "p999": self.percentile(99.9), "bound_ratio": self.largest_ratio, "over_bound": self.over}
+
+
+@dataclass
+class Verdict:
+    """Counts over rays; verdicts of parts of a case can be added. asked: claimed hits whose closeness the oracle checked;
+    self_hits and duplicate_hits come from judge_next and judge_all_hits; examples: the first few rays that are wrong."""
+
+    rays: int = 0
+    hits: int = 0
+    misses: int = 0
+    false_hits: int = 0
+    wrong_prim: int = 0
+    self_hits: int = 0
+    duplicate_hits: int = 0
+    borderline_misses: int = 0
+    borderline_hits: int = 0
+    ties: int = 0
+    near_ties: int = 0
+    asked: int = 0
+    t: Errors = field(default_factory=Errors)
+    u: Errors = field(default_factory=Errors)
+    v: Errors = field(default_factory=Errors)
+    examples: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """No ray lost, invented or given to the wrong primitive, and every error within its bound."""
+        wrong = self.misses + self.false_hits + self.wrong_prim + self.self_hits + self.duplicate_hits
+        return wrong + self.t.over + self.u.over + self.v.over == 0
+
+    def __add__(self, other: Verdict) -> Verdict:
+        out = Verdict(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(Verdict)})
+        del out.examples[EXAMPLES:]
+        return out
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        return {f.name: value.as_dict() if isinstance(value := getattr(self, f.name), Errors) else value
+                for f in fields(Verdict)}
+
+    def wrong(self, count: str, case: HardCase, rows: np.ndarray, why: str, prim_id: np.ndarray | None = None) -> None:
+        """Count these rays under the name `count`, and keep some of them."""
+        if count:
+            setattr(self, count, getattr(self, count) + len(rows))
+        for row in rows[: EXAMPLES - len(self.examples)].tolist():
+            self.examples.append({
+                "case": case.name, "row": row, "why": why, "prim_id": -1 if prim_id is None else int(prim_id[row]),
+                "origin": case.origins[row].tolist(), "direction": case.directions[row].tolist(),
+                "t_min": float(case.t_min[row]), "t_max": float(case.t_max[row])})
+
+
+@dataclass(frozen=True, eq=False)
+class _Claims:
+    """What the unit says of rays `row`, and what is exact for the primitive that it names."""
+
+    row: np.ndarray
+    t: np.ndarray
+    prim_id: np.ndarray
+    t_bound: np.ndarray
+    sound: np.ndarray
+    hit: np.ndarray
+
+
+def judge(case: HardCase, hits: Any, asked: int | None = None) -> Verdict:
+    """The verdict on closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.Hits).
+
+    Every claimed hit is held against its own primitive, exactly. The oracle is asked about every ray that claims to miss
+    where it is not known to have to hit, and, whether something nearer was left out, about `asked` claimed hits (case.asked
+    if None), chosen at random, the same ones each time.
+    """
+    reference = reference_of(case.geometry)
+    t, u, v, prim_id = (np.asarray(getattr(hits, name)) for name in ("t", "u", "v", "prim_id"))
+    reported = prim_id >= 0
+    verdict = Verdict(rays=len(case), hits=int(reported.sum()))
+    verdict.wrong("misses", case, np.flatnonzero(~reported & (case.expected == HIT)), "must hit, is said to miss")
+    verdict.wrong("false_hits", case, np.flatnonzero(reported & (case.expected == MISS)), "must miss", prim_id)
+    possible = reported & (prim_id < len(case.geometry.faces) + len(case.geometry.spheres)) & np.isfinite(t)
+    possible &= (t >= case.t_min) & (t <= case.t_max)
+    verdict.wrong("false_hits", case, np.flatnonzero(reported & ~possible & (case.expected != MISS)),
+                  "t outside of the segment, or no such prim_id", prim_id)
+
+    rows = np.flatnonzero(possible & (case.expected != MISS))
+    parts = [_claims(case, reference, rows[i:i + RAYS_AT_ONCE], (t, u, v, prim_id), verdict)
+             for i in range(0, len(rows), RAYS_AT_ONCE)]
+    if parts:
+        claims = _Claims(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(_Claims)))
+        asked = case.asked if asked is None else asked
+        chosen = np.flatnonzero(claims.sound)
+        if len(chosen) > asked:
+            chosen = np.sort(np.random.default_rng(0).choice(chosen, asked, replace=False))
+        _judge_closeness(case, reference, _Claims(*(getattr(claims, f.name)[chosen] for f in fields(_Claims))), verdict)
+    _judge_misses(case, reference, np.flatnonzero(~reported & (case.expected == ASK)), verdict)
+    return verdict
+
+
+def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[np.ndarray, ...],
+            verdict: Verdict) -> _Claims:
+    """Hold claimed hits against the primitives that they name: false hits, and the errors of t, u and v."""
+    t, u, v = (x[rows].astype(np.float64) for x in said[:3])
+    prim_id = said[3][rows]
+    exact_t, exact_u, exact_v = np.empty((3, len(rows)))
+    bound = np.full((3, len(rows)), np.inf)
+    sound, hit = np.zeros((2, len(rows)), bool)
+    triangle = prim_id < reference.n_triangles
+    i = np.flatnonzero(triangle)
+    if len(i):
+        exact, limit = reference.against(case.origins[rows[i]], case.directions[rows[i]], prim_id[i])
+        exact_t[i], exact_u[i], exact_v[i], hit[i] = exact.t, exact.u, exact.v, exact.hit
+        bound[:, i] = limit.t, limit.u, limit.v
+        sound[i] = limit.touches & (exact.place != Place.DEGENERATE)
+    i = np.flatnonzero(~triangle)
+    if len(i):
+        ball, t_bound, allowed = reference.against_sphere(case.origins[rows[i]], case.directions[rows[i]], prim_id[i])
+        ends = np.abs(ball.t - t[i]) / t_bound
+        end = np.where(ends[0] <= ends[1], 0, 1)
+        exact_t[i] = np.take_along_axis(ball.t, end[None], axis=0)[0]
+        bound[0, i] = np.take_along_axis(t_bound, end[None], axis=0)[0]
+        exact_u[i], exact_v[i], bound[1:, i] = 0.0, 0.0, 1e-30
+        sound[i], hit[i] = ball.hit | allowed, ball.hit
+    verdict.wrong("false_hits", case, rows[~sound], "passes the primitive by more than rounding", said[3])
+    verdict.borderline_hits += int((sound & ~hit).sum())
+
+    known = sound & np.isfinite(exact_t)
+    ulp = np.spacing(np.minimum(np.abs(exact_t[known]), 3e38).astype(np.float32)).astype(np.float64)
+    over = np.zeros(len(rows), bool)
+    over[known] |= verdict.t.add(np.abs(t - exact_t)[known], ulp, bound[0, known])
+    over[known] |= verdict.u.add(np.abs(u - exact_u)[known], 2.0**-24, bound[1, known])
+    over[known] |= verdict.v.add(np.abs(v - exact_v)[known], 2.0**-24, bound[2, known])
+    verdict.wrong("", case, rows[over], "t, u or v is off by more than the derived bound", said[3])
+    return _Claims(rows, t, prim_id, bound[0], sound, hit)
+
+
+def _judge_closeness(case: HardCase, reference: Reference, claims: _Claims, verdict: Verdict) -> None:
+    """Whether anything nearer than the claimed hits had to be found, and which of them are ties."""
+    n = len(claims.row)
+    verdict.asked += n
+    o, d = case.origins[claims.row], case.directions[claims.row]
+    end = np.minimum(claims.t + claims.t_bound, case.t_max[claims.row])
+    found = reference.all_hits(o, d, case.t_min[claims.row], np.maximum(end, claims.t))
+    answer = reference.closest_of(found, o, d)
+    certain, bound = _certain(case, reference, found, claims.row, o, d)
+
+    passed = claims.t[found.ray] > found.t + bound  # exact hits that the claimed one is clearly behind
+    other = found.prim_id != claims.prim_id[found.ray]
+    wrong = np.zeros(n, bool)
+    wrong[found.ray[passed & certain & other]] = True
+    if case.closed:
+        skipped = passed & ~certain & other & (claims.t[found.ray] > found.t + bound + claims.t_bound[found.ray])
+        wrong |= _leaks(case, found.chosen(np.flatnonzero(skipped)), claims.t, o, d)
+    same = claims.prim_id == answer.prim_id
+    for ray, tied in answer.ties.items():
+        same[ray] |= claims.prim_id[ray] in tied
+        wrong[ray] |= same[ray] and _lower_twin(case, int(claims.prim_id[ray]), tied)
+    verdict.ties += int((answer.tie & same & ~wrong).sum())
+    verdict.near_ties += int((~same & claims.hit & ~wrong).sum())
+    rows = claims.row[wrong]
+    prim_id = np.full(len(case), -1)
+    prim_id[claims.row] = claims.prim_id
+    verdict.wrong("wrong_prim", case, rows, "something nearer had to be found", prim_id)
+
+
+def _certain(case: HardCase, reference: Reference, found: AllHits, row: np.ndarray, o: np.ndarray,
+             d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which exact hits a unit within its bounds must report, and the bounds on their t."""
+    certain, bound = np.zeros(len(found), bool), np.full(len(found), np.inf)
+    i = np.flatnonzero(found.prim_id < reference.n_triangles)
+    if len(i):
+        exact, limit = reference.against(o[found.ray[i]], d[found.ray[i]], found.prim_id[i])
+        certain[i], bound[i] = sure(exact, limit), limit.t
+    i = np.flatnonzero(found.prim_id >= reference.n_triangles)
+    if len(i):
+        ball, t_bound, _ = reference.against_sphere(o[found.ray[i]], d[found.ray[i]], found.prim_id[i])
+        end = np.argmin(np.abs(ball.t - found.t[i]), axis=0)
+        bound[i] = np.take_along_axis(t_bound, end[None], axis=0)[0]
+        certain[i] = ball.t[1] - ball.t[0] > 4.0 * bound[i]
+    ray = row[found.ray]
+    certain &= (found.t - bound >= case.t_min[ray]) & (found.t + bound <= case.t_max[ray]) & (found.t + bound < 3.4e38)
+    return certain, bound
+
+
+def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdict: Verdict) -> None:
+    """Rays that are said to miss, and nothing is known of: is there a hit that had to be found?"""
+    for first in range(0, len(rows), RAYS_AT_ONCE):
+        part = rows[first:first + RAYS_AT_ONCE]
+        o, d = case.origins[part], case.directions[part]
+        found = reference.all_hits(o, d, case.t_min[part], case.t_max[part])
+        certain, _ = _certain(case, reference, found, part, o, d)
+        missed, border = np.zeros((2, len(part)), bool)
+        missed[found.ray[certain]] = True
+        border[found.ray] = True
+        if case.closed:
+            missed |= _leaks(case, found.chosen(np.flatnonzero(~missed[found.ray])), np.full(len(part), np.inf), o, d)
+        verdict.borderline_misses += int((border & ~missed).sum())
+        verdict.wrong("misses", case, part[missed], "has a hit that had to be found")
+
+
+def _leaks(case: HardCase, skipped: AllHits, end: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """(n,) bool: rays that pass through a closed surface by the crossings that were left out: the winding number behind one
+    of them, before the next or before end[ray], is not that of the ray's start."""
+    leaks = np.zeros(len(o), bool)
+    for ray in np.unique(skipped.ray):
+        t = np.append(skipped.t[skipped.ray == ray], end[ray] if np.isfinite(end[ray]) else skipped.t.max() * 2.0 + 1.0)
+        wide = np.flatnonzero(np.diff(t) > 1e-6 * np.abs(t[1:]))
+        at = [float(case.t_min[0]) + 0.0, *(0.5 * (t[wide] + t[wide + 1]))]
+        points = o[ray].astype(np.float64) + np.array(at)[:, None] * d[ray].astype(np.float64)
+        winding = np.round(winding_number(case, points))
+        leaks[ray] = bool((winding[1:] != winding[0]).any())
+    return leaks
+
+
+def winding_number(case: HardCase, points: np.ndarray) -> np.ndarray:
+    """How often the surface goes round each point: the signed solid angle over 4 pi (van Oosterom and Strackee 1983)."""
+    corners = case.geometry.vertices[case.geometry.faces].astype(np.float64)
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any(axis=1)
+    out = np.empty(len(points))
+    for i, point in enumerate(points):
+        a, b, c = np.moveaxis(corners[area] - point, 1, 0)
+        la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+        below = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+        out[i] = 2.0 * np.arctan2((a * np.cross(b, c)).sum(axis=1), below).sum() / (4.0 * np.pi)
+    return out
+
+
+def _lower_twin(case: HardCase, prim_id: int, tied: np.ndarray) -> bool:
+    """Whether a lower prim_id of the tie has the same corners in the same order: then any unit finds the same t, and the
+    lower one wins."""
+    faces, vertices = case.geometry.faces, case.geometry.vertices
+    lower = tied[tied < min(prim_id, len(faces))]
+    if prim_id >= len(faces) or not len(lower):
+        return False
+    return bool((vertices[faces[lower]] == vertices[faces[prim_id]]).all(axis=(1, 2)).any())
+
+
+def judge_next(case: HardCase, first_prim_id: np.ndarray, next_prim_id: np.ndarray) -> Verdict:
+    """Case C: rays that were spawned at the hits of the first (on a sphere: to its outside) must not hit the same primitive.
+
+    prim_id (N,) each, -1 on a miss; where the first misses, the next is not looked at.
+    """
+    verdict = Verdict(rays=int((first_prim_id >= 0).sum()))
+    again = np.flatnonzero((first_prim_id >= 0) & (next_prim_id == first_prim_id))
+    verdict.wrong("self_hits", case, again, "hits the primitive that it starts on", next_prim_id)
+    return verdict
+
+
+def judge_all_hits(case: HardCase, ray: np.ndarray, prim_id: np.ndarray, t: np.ndarray) -> Verdict:
+    """The verdict on all-hits queries over triangles: one row a reported hit, in any order.
+
+    Duplicates: a primitive twice on a ray; and on a closed surface, whose crossings go in and out by turns, two in a row in
+    the same direction that are no farther apart than the bounds: one crossing of an edge, told twice.
+    """
+    reference = reference_of(case.geometry)
+    order = np.lexsort((prim_id, t, ray))
+    ray, prim_id, t = ray[order], prim_id[order], t[order].astype(np.float64)
+    verdict = Verdict(rays=len(case), hits=len(ray))
+    exact, limit = reference.against(case.origins[ray], case.directions[ray], prim_id)
+    sound = limit.touches & (exact.place != Place.DEGENERATE)
+    verdict.wrong("false_hits", case, ray[~sound], "passes the primitive by more than rounding")
+    _, first = np.unique(np.stack([ray, prim_id]), axis=1, return_index=True)
+    twice = np.ones(len(ray), bool)
+    twice[first] = False
+    if case.closed and len(ray) > 1:
+        pair = (ray[1:] == ray[:-1]) & (np.diff(t) <= limit.t[1:] + limit.t[:-1])
+        twice[1:] |= pair & (np.sign(exact.slope[1:]) == np.sign(exact.slope[:-1]))
+    verdict.wrong("duplicate_hits", case, ray[twice], "one crossing, told twice")
+
+    found = reference.all_hits(case.origins, case.directions, case.t_min, case.t_max)
+    certain, _ = _certain(case, reference, found, np.arange(len(case)), case.origins, case.directions)
+    told = set(zip(ray.tolist(), prim_id.tolist(), strict=True))
+    lost = [r for r, p in zip(found.ray[certain].tolist(), found.prim_id[certain].tolist(), strict=True) if (r, p) not in told]
+    verdict.wrong("misses", case, np.array(lost, dtype=np.int64), "has a hit that had to be found")
+    return verdict

@@ -1,0 +1,277 @@
+"""Rays at surfaces that are not closed, at triangles that are bad, and at spheres: mostly, the oracle knows the answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from wrt.accel.base import Geometry
+from wrt.bench.hard_cases_common import (
+    ASK,
+    HIT,
+    MISS,
+    HardCase,
+    Seed,
+    cube,
+    hard_case,
+    in_ball,
+    joined,
+    soup,
+    sphere,
+    surface,
+    unit_vectors,
+)
+
+# pbrt-v4, shapes_test, Triangle.BadCases: three collinear points and a ray that must miss them (published numbers).
+BAD_TRIANGLE = ((-1113.45459, -79.049614, -56.2431908), (-1113.45459, -87.0922699, -56.2431908),
+                (-1113.45459, -79.2090149, -56.2431908))
+BAD_ORIGIN, BAD_DIRECTION, BAD_T_MAX = (-1081.47925, 99.9999542, 87.7701111), (-32.1072998, -183.355865, -144.607635), 0.9999
+
+
+def _signed_powers(rng: np.random.Generator, shape: tuple[int, ...], low: float, high: float) -> np.ndarray:
+    """+-10^U(low, high)."""
+    return rng.choice([-1.0, 1.0], shape) * 10.0 ** rng.uniform(low, high, shape)
+
+
+def _points(geometry: Geometry, rng: np.random.Generator, n: int, spread: float = 1.0) -> np.ndarray:
+    """(n, 3) float64 points inside random triangles; spread < 1 draws them towards the corners and edges."""
+    corners = geometry.vertices[geometry.faces[rng.integers(len(geometry.faces), size=n)]].astype(np.float64)
+    return np.einsum("ni,nij->nj", rng.dirichlet([spread] * 3, n), corners)
+
+
+def _towards(geometry: Geometry, rng: np.random.Generator, origins: np.ndarray, points: np.ndarray) -> HardCase:
+    origins = origins.astype(np.float32)
+    return hard_case(geometry, origins, points - origins.astype(np.float64), ASK)
+
+
+def respawned_triangles(seed: Seed, n: int) -> HardCase:
+    """C (pbrt-v4, Triangle.Reintersect): 8 triangles with coordinates +-10^U(-8, 8), and rays at them from such places. A
+    ray from the hit along next_directions must not hit the same triangle, on whichever side of it it starts."""
+    rng = np.random.default_rng(seed)
+    geometry = soup(_signed_powers(rng, (8, 3, 3), -8.0, 8.0))
+    case = _towards(geometry, rng, _signed_powers(rng, (n, 3), -8.0, 8.0), _points(geometry, rng, n))
+    return replace(case, next_directions=unit_vectors(rng, n).astype(np.float32))
+
+
+def respawned_spheres(seed: Seed, n: int) -> HardCase:
+    """C: 8 spheres of radius 10^U(-4, 4), moved by up to 10^U(-4, 4); rays at them from outside and from inside. A ray from
+    the hit, turned to the outside of the sphere, must not hit it again."""
+    rng = np.random.default_rng(seed)
+    radius = 10.0 ** rng.uniform(-4.0, 4.0, (8, 1))
+    spheres = np.concatenate([unit_vectors(rng, 8) * 10.0 ** rng.uniform(-4.0, 4.0, (8, 1)), radius], axis=1)
+    geometry = surface(np.zeros((0, 3)), np.zeros((0, 3)), spheres)
+    chosen = geometry.spheres[rng.integers(8, size=n)].astype(np.float64)
+    away = np.where(rng.random((n, 1)) < 0.25, 0.5, 10.0 ** rng.uniform(0.0, 3.0, (n, 1)))
+    origins = chosen[:, :3] + chosen[:, 3:] * away * unit_vectors(rng, n)
+    case = _towards(geometry, rng, origins, chosen[:, :3] + chosen[:, 3:] * in_ball(rng, n, 0.98))
+    return replace(case, next_directions=unit_vectors(rng, n).astype(np.float32))
+
+
+@cache
+def _without_area() -> Geometry:
+    """Three corners on a line (small whole numbers, so that they are exactly on it), two or three the same."""
+    rng = np.random.default_rng(0)
+    start, step = rng.integers(-8, 9, (2, 96, 1, 3)) / 8.0
+    along = np.stack([rng.permutation(4)[:3] for _ in range(96)])[:, :, None]
+    along[32:64, 1] = along[32:64, 0]
+    along[64:] = along[64:, :1]
+    return soup(start + along * step)
+
+
+def without_area(seed: Seed, n: int) -> HardCase:
+    """D: collinear and repeated corners are never hit, whatever rounding says."""
+    rng = np.random.default_rng(seed)
+    geometry = _without_area()
+    origins = in_ball(rng, n, 4.0)
+    origins[::2] = (origins[::2] * 8.0).round() / 8.0
+    return replace(_towards(geometry, rng, origins, _points(geometry, rng, n)), expected=np.full(n, MISS, np.int8))
+
+
+def among_bad(seed: Seed, n: int) -> HardCase:
+    """D: a closed sphere with such triangles inside: the sphere must be hit, through them."""
+    rng = np.random.default_rng(seed)
+    bad = _without_area()
+    geometry = _sphere_with_bad()
+    origins = in_ball(rng, n, 0.5).astype(np.float32)
+    directions = _points(bad, rng, n) - origins.astype(np.float64)
+    return hard_case(geometry, origins, directions, HIT, closed=True)
+
+
+@cache
+def _sphere_with_bad() -> Geometry:
+    return joined(sphere(32, 16, 8.0), _without_area())
+
+
+def published_bad(seed: Seed, n: int) -> HardCase:
+    """D: pbrt's three collinear points. The first ray is the published one; the others start some float32 steps beside it."""
+    rng = np.random.default_rng(seed)
+    steps = rng.integers(-8, 9, (2, n, 3)) * 2.0**-24
+    steps[:, :1] = 0.0
+    origins, directions = (np.array(x) * (1.0 + s) for x, s in zip((BAD_ORIGIN, BAD_DIRECTION), steps, strict=True))
+    return hard_case(soup(np.array([BAD_TRIANGLE])), origins, directions, MISS, t_max=BAD_T_MAX)
+
+
+def huge(seed: Seed, n: int) -> HardCase:
+    """D: triangles and origins at 1e30: areas are beyond float32."""
+    rng = np.random.default_rng(seed)
+    geometry = soup(1e30 * rng.uniform(-1.0, 1.0, (32, 3, 3)))
+    origins = 1e30 * rng.uniform(-1.0, 1.0, (n, 3)) * 10.0 ** (-30.0 * (rng.random((n, 1)) < 0.3))
+    case = _towards(geometry, rng, origins, _points(geometry, rng, n))
+    wide = case.directions.astype(np.float64)
+    shorter = wide / np.where(rng.random((n, 1)) < 0.5, np.linalg.norm(wide, axis=1, keepdims=True), 1.0)
+    return replace(case, directions=shorter.astype(np.float32))
+
+
+def tiny(seed: Seed, n: int) -> HardCase:
+    """D: triangles of 1e-42 to 1e-36, mostly denormal, from as near and from 1e-30 away."""
+    rng = np.random.default_rng(seed)
+    size = 10.0 ** rng.uniform(-42.0, -36.0, (32, 1, 1))
+    geometry = soup(size * rng.uniform(-1.0, 1.0, (32, 3, 3)))
+    origins = in_ball(rng, n) * 10.0 ** rng.uniform(-42.0, -30.0, (n, 1))
+    origins = origins.astype(np.float32)
+    directions = _points(geometry, rng, n) - origins.astype(np.float64)
+    length = np.linalg.norm(directions, axis=1, keepdims=True)
+    return hard_case(geometry, origins, directions / np.where(length > 0.0, length, 1.0), ASK)
+
+
+def slivers(seed: Seed, n: int) -> HardCase:
+    """F: single triangles of aspect 1e3 to 1e8, some along the axes, where float32 resolves their width, and some turned."""
+    rng = np.random.default_rng(seed)
+    width = 10.0 ** -rng.uniform(3.0, 8.0, 32)
+    corners = np.zeros((32, 3, 3))
+    corners[:, 0, 0], corners[:, 1, 0], corners[:, 2, 0] = -1.0, 1.0, rng.uniform(-1.0, 1.0, 32)
+    corners[:, 2, 1] = width
+    turn = np.linalg.qr(rng.normal(size=(32, 3, 3)))[0]
+    turn[:16] = np.eye(3)[np.stack([rng.permutation(3) for _ in range(16)])]
+    geometry = soup(np.einsum("nij,nkj->nki", turn, corners) + np.where(np.arange(32)[:, None, None] % 4 == 3, 1.0, 0.0))
+    points = _points(geometry, rng, n)
+    return _towards(geometry, rng, points + unit_vectors(rng, n) * 10.0 ** rng.uniform(-2.0, 2.0, (n, 1)), points)
+
+
+def edge_on(seed: Seed, n: int) -> HardCase:
+    """F: rays in the plane of a triangle (half of them exactly: never hit), or out of it by 10^-U(3, 12) rad. All planes are
+    parallel, so that a ray in one of them hits none of the others."""
+    rng = np.random.default_rng(seed)
+    axis = rng.integers(3)
+    corners = rng.uniform(-1.0, 1.0, (24, 3, 3))
+    corners[:, :, axis] = rng.integers(-4, 5, (24, 1)) / 4.0
+    geometry = soup(corners)
+    points = _points(geometry, rng, n)
+    points[:, axis] = (points[:, axis] * 4.0).round() / 4.0
+    origins = points + unit_vectors(rng, n) * 10.0 ** rng.uniform(-1.0, 1.0, (n, 1))
+    exactly = rng.random(n) < 0.5
+    tilt = np.where(exactly, 0.0, 10.0 ** -rng.uniform(3.0, 12.0, n))
+    origins[:, axis] = points[:, axis] + tilt * np.linalg.norm(origins - points, axis=1)
+    case = _towards(geometry, rng, origins, points)
+    flat = case.directions[:, axis] == 0.0
+    return replace(case, expected=np.where(flat, MISS, ASK).astype(np.int8))
+
+
+@cache
+def _floor(turned: bool) -> Geometry:
+    x = np.linspace(-100.0, 100.0, 33)
+    i, j = np.meshgrid(x, x, indexing="ij")
+    first = (np.arange(32)[:, None] * 33 + np.arange(32)).reshape(-1, 1)
+    faces = np.concatenate([first + [0, 33, 34], first + [0, 34, 1]])
+    points = np.stack([i.reshape(-1), np.zeros(i.size), j.reshape(-1)], axis=1)
+    c, s = np.cos(0.4), np.sin(0.4)
+    return surface(points @ (np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) if turned else np.eye(3)), faces)
+
+
+def grazing(seed: Seed, n: int, *, turned: bool) -> HardCase:
+    """F: a floor of 2048 triangles, met at 10^U(-7, 0) rad. On the level one, at y = 0, the exact hit is o - d o_y / d_y:
+    where that is 1 % inside the border, the ray must hit, because all edges there have a triangle on both sides."""
+    rng = np.random.default_rng(seed)
+    points = np.stack([rng.uniform(-90.0, 90.0, n), np.zeros(n), rng.uniform(-90.0, 90.0, n)], axis=1)
+    angle, heading = 10.0 ** rng.uniform(-7.0, 0.0, n), rng.uniform(0.0, 2.0 * np.pi, n)
+    away = np.stack([np.cos(heading) * np.cos(angle), np.sin(angle), np.sin(heading) * np.cos(angle)], axis=1)
+    origins = points + away * 10.0 ** rng.uniform(-2.0, 1.5, (n, 1))
+    if turned:
+        c, s = np.cos(0.4), np.sin(0.4)
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        points, origins = points @ turn, origins @ turn
+    case = _towards(_floor(turned), rng, origins, points)
+    if turned:
+        return case
+    o, d = case.origins.astype(np.float64), case.directions.astype(np.float64)
+    met = o - d * (o[:, 1:2] / np.where(d[:, 1:2] < 0.0, d[:, 1:2], np.inf))
+    surely = (o[:, 1] > 0.0) & (d[:, 1] < 0.0) & (np.abs(met) < 99.0).all(axis=1)
+    return replace(case, expected=np.where(surely, HIT, ASK).astype(np.int8))
+
+
+@cache
+def _plates() -> Geometry:
+    """Four plates of 8 x 8 quads over [-1, 1]^2, at z = 1, 2, 4 and 8."""
+    x = np.linspace(-1.0, 1.0, 9)
+    i, j = np.meshgrid(x, x, indexing="ij")
+    first = (np.arange(8)[:, None] * 9 + np.arange(8)).reshape(-1, 1)
+    faces = np.concatenate([first + [0, 9, 10], first + [0, 10, 1]])
+    return joined(*(surface(np.stack([i.reshape(-1), j.reshape(-1), np.full(81, z)], axis=1), faces) for z in (1, 2, 4, 8)))
+
+
+def exact_ends(seed: Seed, n: int) -> HardCase:
+    """H: t_min and t_max exactly at the hit, which still counts, and one float32 step past it, which does not. All numbers
+    are powers of two and sixteenths: no unit has anything to round."""
+    rng = np.random.default_rng(seed)
+    origins = np.concatenate([rng.integers(-15, 16, (n, 2)) / 16.0, np.zeros((n, 1))], axis=1)
+    length = 2.0 ** rng.integers(-20, 21, n)
+    plate = rng.integers(3, size=n)
+    t = (2.0**plate / length).astype(np.float32)
+    after, before = np.nextafter(t, np.float32(np.inf)), np.nextafter(2.0 * t, np.float32(0.0))
+    kind = rng.integers(5, size=n)
+    ends = [(t, t, HIT), (0.0 * t, t, HIT), (t, np.full_like(t, np.inf), HIT), (after, before, MISS), (after, 2.0 * t, HIT)]
+    t_min, t_max, expected = (np.choose(kind, [end[i] for end in ends]) for i in range(3))
+    directions = np.stack([np.zeros(n), np.zeros(n), length], axis=1)
+    turn = rng.integers(3)
+    geometry = _plates()
+    geometry = surface(np.roll(geometry.vertices, turn, axis=1), geometry.faces)
+    return hard_case(geometry, np.roll(origins, turn, axis=1), np.roll(directions, turn, axis=1), expected,
+                     t_min=t_min, t_max=t_max)
+
+
+@cache
+def _cube() -> Geometry:
+    return surface(*cube(np.full(3, -1.0), np.full(3, 1.0)))
+
+
+def beside_boxes(seed: Seed, n: int) -> HardCase:
+    """E: along the axes, one float32 step inside and outside of a cube's faces, and in them."""
+    rng = np.random.default_rng(seed)
+    row, axis = np.arange(n), rng.integers(3, size=n)
+    side = np.float32(1.0)
+    places = np.array([np.nextafter(side, np.float32(2.0)), np.nextafter(side, np.float32(0.0)), 1.0, 0.5])
+    origins = rng.choice([-1.0, 1.0], (n, 3)) * rng.choice(places, (n, 3))
+    sign = rng.choice([-1.0, 1.0], n)
+    origins[row, axis] = -3.0 * sign
+    directions = np.where(rng.random((n, 3)) < 0.5, 0.0, -0.0)
+    directions[row, axis] = sign
+    return hard_case(_cube(), origins, directions, ASK, closed=True)
+
+
+def rays_not_finite(seed: Seed, n: int) -> HardCase:
+    """I: half of the rays have a NaN or an infinity somewhere; the others must hit all the same."""
+    rng = np.random.default_rng(seed)
+    rows = np.concatenate([in_ball(rng, n, 0.9), unit_vectors(rng, n)], axis=1).astype(np.float32)
+    bad = rng.random(n) < 0.5
+    bad[:1] = True
+    rows[bad, rng.integers(6, size=int(bad.sum()))] = rng.choice([np.nan, np.inf, -np.inf], int(bad.sum()))
+    case = hard_case(sphere(32, 16), rows[:, :3], rows[:, 3:], np.where(bad, MISS, HIT), closed=True)
+    return replace(case, refused=True)
+
+
+@cache
+def _sphere_not_finite() -> Geometry:
+    good = sphere(32, 16)
+    rng = np.random.default_rng(0)
+    corners = rng.uniform(-1.0, 1.0, (30, 3, 3))
+    corners[np.arange(30), rng.integers(3, size=30), rng.integers(3, size=30)] = rng.choice([np.nan, np.inf, -np.inf], 30)
+    return joined(good, soup(corners))
+
+
+def mesh_not_finite(seed: Seed, n: int) -> HardCase:
+    """I: a closed sphere, and 30 triangles more with a NaN or an infinity, which are never hit."""
+    rng = np.random.default_rng(seed)
+    case = hard_case(_sphere_not_finite(), in_ball(rng, n, 0.9), unit_vectors(rng, n), HIT)
+    return replace(case, refused=True)

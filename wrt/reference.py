@@ -1,0 +1,374 @@
+"""The oracle: what rays hit, exactly, in NumPy. Slow, clear, and independent of Warp and of every unit under test.
+
+What counts as a hit: the ray o + t d, t in the closed segment [t_min, t_max], meets the closed triangle and is not parallel
+to its plane. So a ray that lies in the plane does not hit, and a triangle without area, or with a coordinate that is not
+finite, never does. A sphere is hit where the ray enters and where it leaves it, and where it only touches it, once.
+Both sides count. Coordinates are float32 values, taken as exact; see `wrt.reference_exact` for how signs are decided and
+`wrt.reference_bounds` for how far a float32 unit may be off.
+
+>>> answer = closest(mesh, origins, directions)         # mesh: anything with vertices, faces and perhaps spheres
+>>> answer.prim_id[answer.tie]                          # rays that meet several triangles at exactly the same t
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from wrt.reference_bounds import Bounds, sphere_bounds, sure, triangle_bounds
+from wrt.reference_exact import (
+    UNIT,
+    Crossings,
+    Place,
+    SphereCrossings,
+    exact_plane,
+    sphere_crossings,
+    triangle_crossings,
+)
+
+__all__ = ["AllHits", "Answer", "Bounds", "Crossings", "Place", "Reference", "all_hits", "classify", "closest", "cross",
+           "reference_of", "sure", "t_bound"]
+
+WIDTH = 4  # children of a node
+RAYS_AT_ONCE = 8192
+PAIRS_AT_ONCE = 1_000_000
+SLAB = 8.0 * UNIT  # a slab's distance carries three roundings in float64
+
+
+@dataclass(frozen=True, eq=False)
+class AllHits:
+    """Every hit, ordered by ray, then t, then prim_id: ray (M,) int64, prim_id (M,) int32, place (M,) int8 (of Place);
+    t, u, v (M,) float64, t to 1e-14 relative; t_error: bound on |t - exact t|. u = v = 0 on spheres."""
+
+    ray: np.ndarray
+    prim_id: np.ndarray
+    t: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    t_error: np.ndarray
+    place: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.ray)
+
+    def chosen(self, rows: np.ndarray) -> AllHits:
+        return AllHits(*(getattr(self, name)[rows] for name in AllHits.__dataclass_fields__))
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The closest hit of each ray: t (N,) float64, inf on a miss; prim_id (N,) int32, -1 on a miss, the lowest of an exact
+    tie; u, v; place (N,) int8: where on prim_id; tie (N,) bool: several primitives are hit at exactly this t, and ties has
+    all of them, ascending, by ray."""
+
+    t: np.ndarray
+    prim_id: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    place: np.ndarray
+    tie: np.ndarray
+    ties: dict[int, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """origin, direction: (3, N) float64; the reciprocal direction, and which of a box's rows is the near plane per axis."""
+
+    origin: np.ndarray
+    direction: np.ndarray
+    t_min: np.ndarray
+    t_max: np.ndarray
+    inverse: np.ndarray
+    near: np.ndarray
+
+    @staticmethod
+    def of(origins: Any, directions: Any, t_min: Any, t_max: Any) -> _Rays:
+        o, d = (np.ascontiguousarray(np.asarray(x, dtype=np.float32).astype(np.float64).T) for x in (origins, directions))
+        n = o.shape[1]
+        ends = [np.broadcast_to(np.asarray(x, dtype=np.float64), (n,)) for x in (t_min, t_max)]
+        with np.errstate(divide="ignore"):
+            inverse = 1.0 / d
+        return _Rays(o, d, ends[0], ends[1], inverse, np.arange(3)[:, None] + 3 * np.signbit(d))
+
+    def chosen(self, rows: np.ndarray) -> _Rays:
+        return _Rays(self.origin[:, rows], self.direction[:, rows], self.t_min[rows], self.t_max[rows],
+                     self.inverse[:, rows], self.near[:, rows])
+
+
+class Reference:
+    """A geometry made ready to be asked: its primitives in a tree of boxes that only ever err on the safe side.
+
+    geometry: vertices (V, 3), faces (F, 3) and, if it has them, spheres (S, 4) of center and radius; float32 values.
+    prim_id counts the faces first, then the spheres.
+    """
+
+    def __init__(self, geometry: Any) -> None:
+        vertices = np.asarray(geometry.vertices, dtype=np.float32).astype(np.float64)
+        faces = np.asarray(geometry.faces, dtype=np.int64)
+        spheres = np.asarray(getattr(geometry, "spheres", np.zeros((0, 4))), dtype=np.float32).astype(np.float64)
+        self.n_triangles = len(faces)
+        self.corners = tuple(np.ascontiguousarray(vertices[faces[:, i]].T) for i in range(3))
+        self.center, self.radius = np.ascontiguousarray(spheres[:, :3].T), spheres[:, 3]
+        lo = np.concatenate([np.minimum(np.minimum(*self.corners[:2]), self.corners[2]), self.center - self.radius], axis=1)
+        hi = np.concatenate([np.maximum(np.maximum(*self.corners[:2]), self.corners[2]), self.center + self.radius], axis=1)
+        self.leaf_prim, self.levels = _tree(*_widened(lo, hi, self.n_triangles))
+
+    def triangles(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The corners of these triangles, three (3, N) float64."""
+        a, b, c = (np.take(corner, prim_id, axis=1) for corner in self.corners)
+        return a, b, c
+
+    def candidates(self, rays: _Rays) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Pairs (ray, prim_id) that may hit, in parts; a ray is in one part only."""
+        n = len(rays.t_min)
+        usable = np.isfinite(rays.origin).all(axis=0) & np.isfinite(rays.direction).all(axis=0) & rays.direction.any(axis=0)
+        stack = [np.flatnonzero(usable[i:i + RAYS_AT_ONCE]) + i for i in reversed(range(0, n, RAYS_AT_ONCE))]
+        while stack:
+            rows = stack.pop()
+            pairs = self._descend(rays.chosen(rows), len(rows))
+            if pairs is None:
+                stack += [rows[len(rows) // 2:], rows[:len(rows) // 2]]
+            elif len(pairs[0]):
+                yield rows[pairs[0]], pairs[1]
+
+    def _descend(self, rays: _Rays, n: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """All rays down the tree, level by level; None where that takes too many pairs at once."""
+        ray, node = np.arange(n), np.zeros(n, np.int64)
+        for boxes in self.levels:
+            keep = _meets(boxes, node, rays, ray)
+            ray, node = ray[keep], node[keep]
+            if boxes is self.levels[-1]:
+                break
+            if len(ray) * WIDTH > PAIRS_AT_ONCE and n > 1:
+                return None
+            ray = np.repeat(ray, WIDTH)
+            node = (node[:, None] * WIDTH + np.arange(WIDTH)).reshape(-1)
+        return ray, self.leaf_prim[node]
+
+    def all_hits(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> AllHits:
+        """Every hit of each ray in its closed segment. origins, directions: (N, 3), taken as float32; t_min, t_max: numbers
+        or (N,). Rays that are not finite, or have no direction, hit nothing."""
+        rays = _Rays.of(origins, directions, t_min, t_max)
+        found = [self._tested(rays, ray, prim_id) for ray, prim_id in self.candidates(rays)]
+        empty = AllHits(np.zeros(0, np.int64), np.zeros(0, np.int32), *(np.zeros(0) for _ in range(4)), np.zeros(0, np.int8))
+        hits = AllHits(*(np.concatenate([getattr(part, name) for part in [empty, *found]])
+                         for name in AllHits.__dataclass_fields__))
+        return hits.chosen(np.lexsort((hits.prim_id, hits.t, hits.ray)))
+
+    def _tested(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> AllHits:
+        """The hits among these pairs."""
+        triangle = prim_id < self.n_triangles
+        parts = [self._tested_triangles(rays, ray[triangle], prim_id[triangle])]
+        if not triangle.all():
+            r, p = ray[~triangle], prim_id[~triangle]
+            found = sphere_crossings(*self._sphere_columns(rays, r, p))
+            for end in range(2):
+                t, t_error = found.t[end], found.t_error[end]
+                keep = np.flatnonzero(found.hit & (t >= rays.t_min[r]) & (t <= rays.t_max[r])
+                                      & ((end == 0) | ~found.touching))
+                place = np.where(found.touching[keep], Place.EDGE, Place.INSIDE).astype(np.int8)
+                zero = np.zeros(len(keep))
+                parts.append(AllHits(r[keep], p[keep], t[keep], zero, zero, t_error[keep], place))
+        return AllHits(*(np.concatenate([getattr(part, name) for part in parts]) for name in AllHits.__dataclass_fields__))
+
+    def _tested_triangles(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> AllHits:
+        o, d = rays.origin[:, ray], rays.direction[:, ray]
+        found = triangle_crossings(o, d, self.triangles(prim_id))
+        keep = np.flatnonzero(found.hit)
+        t, error = found.t[keep], found.t_error[keep]
+        low, high = rays.t_min[ray[keep]], rays.t_max[ray[keep]]
+        inside = (t - error >= low) & (t + error <= high)
+        # Too close to an end of the segment for float64 to say: whole numbers do.
+        close = np.flatnonzero(~inside & (t + error >= low) & (t - error <= high))
+        if len(close):
+            rows = keep[close]
+            for row, exact in zip(close, _fractions(o[:, rows], d[:, rows], self.triangles(prim_id[rows])), strict=True):
+                inside[row] = low[row] <= exact <= high[row]
+        keep = keep[inside]
+        return AllHits(ray[keep], prim_id[keep], found.t[keep], found.u[keep], found.v[keep], found.t_error[keep],
+                       found.place[keep])
+
+    def _sphere_columns(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> tuple[np.ndarray, ...]:
+        sphere = prim_id - self.n_triangles
+        return rays.origin[:, ray], rays.direction[:, ray], self.center[:, sphere], self.radius[sphere]
+
+    def closest(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Answer:
+        """The closest hit of each ray in its closed segment; arguments as for all_hits."""
+        return self.closest_of(self.all_hits(origins, directions, t_min, t_max), origins, directions)
+
+    def closest_of(self, hits: AllHits, origins: Any, directions: Any) -> Answer:
+        """The closest of each ray's hits, which all_hits found for these rays."""
+        n = len(origins)
+        answer = Answer(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n),
+                        np.zeros(n, np.int8), np.zeros(n, bool))
+        if not len(hits):
+            return answer
+        ray, first, group = np.unique(hits.ray, return_index=True, return_inverse=True)
+        reach = np.minimum.reduceat(hits.t + hits.t_error, first)
+        close = np.flatnonzero(hits.t - hits.t_error <= reach[group])
+        winner = first.copy()
+        crowd = np.flatnonzero(np.bincount(group[close], minlength=len(ray)) > 1)
+        for k, tied in self._first_exactly(hits, close[np.isin(group[close], crowd)], group, origins, directions):
+            winner[k] = tied[0]
+            if len(np.unique(hits.prim_id[tied])) > 1:
+                answer.tie[ray[k]] = True
+                answer.ties[int(ray[k])] = np.sort(hits.prim_id[tied])
+        for name in ("t", "prim_id", "u", "v", "place"):
+            getattr(answer, name)[ray] = getattr(hits, name)[winner]
+        return answer
+
+    def _first_exactly(self, hits: AllHits, rows: np.ndarray, group: np.ndarray, origins: Any,
+                       directions: Any) -> Iterator[tuple[int, list[int]]]:
+        """For each group among the rows: those with exactly the lowest t, by prim_id. Spheres are compared in float64."""
+        rays = _Rays.of(origins, directions, 0.0, np.inf)
+        triangle = hits.prim_id[rows] < self.n_triangles
+        exact: dict[int, Any] = {int(row): Fraction(float(hits.t[row])) for row in rows[~triangle]}
+        r = rows[triangle]
+        if len(r):
+            o, d = rays.origin[:, hits.ray[r]], rays.direction[:, hits.ray[r]]
+            exact |= dict(zip(r.tolist(), _fractions(o, d, self.triangles(hits.prim_id[r])), strict=True))
+        for part in np.split(rows, np.flatnonzero(np.diff(group[rows])) + 1) if len(rows) else []:
+            lowest = min(exact[int(row)] for row in part)
+            tied = [int(row) for row in part if exact[int(row)] == lowest]
+            yield int(group[part[0]]), sorted(tied, key=lambda row: int(hits.prim_id[row]))
+
+    def against(self, origins: Any, directions: Any, prim_id: np.ndarray) -> tuple[Crossings, Bounds]:
+        """Ray i against primitive prim_id[i] alone, anywhere on the ray's line: the exact crossing (of a sphere the one
+        that is entered), and how far off a float32 unit may be."""
+        rays = _Rays.of(origins, directions, 0.0, np.inf)
+        if (prim_id < self.n_triangles).all():
+            corners = self.triangles(prim_id)
+            found = triangle_crossings(rays.origin, rays.direction, corners, all_rows=True)
+            return found, triangle_bounds(rays.origin, rays.direction, corners, found)
+        raise ValueError("prim_id has spheres: see against_sphere")
+
+    def against_sphere(self, origins: Any, directions: Any, prim_id: np.ndarray) -> tuple[SphereCrossings, np.ndarray, np.ndarray]:
+        """Ray i against sphere prim_id[i]: the crossings, bounds on the two t's (2, N), and whether a hit may be told."""
+        rays = _Rays.of(origins, directions, 0.0, np.inf)
+        columns = self._sphere_columns(rays, np.arange(len(prim_id)), prim_id)
+        found = sphere_crossings(*columns)
+        bounds = [sphere_bounds(*columns, found.t[end]) for end in range(2)]
+        return found, np.stack([bounds[0][0], bounds[1][0]]), bounds[0][1]
+
+
+def _fractions(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...]) -> list[Fraction]:
+    """The exact t of hits, one a column."""
+    if not o.shape[1]:
+        return []
+    _, (numerator, slope, _), _, power = exact_plane(o, d, v)
+    scale = Fraction(2) ** power
+    return [Fraction(p, q) * scale for p, q in zip(numerator.tolist(), slope.tolist(), strict=True)]
+
+
+def _widened(lo: np.ndarray, hi: np.ndarray, n_triangles: int) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (3, N) that surely contain the primitive: a sphere's are rounded; what is not finite gets an empty one."""
+    bad = ~(np.isfinite(lo).all(axis=0) & np.isfinite(hi).all(axis=0))
+    with np.errstate(invalid="ignore"):
+        lo[:, n_triangles:] -= 4.0 * UNIT * np.abs(lo[:, n_triangles:])
+        hi[:, n_triangles:] += 4.0 * UNIT * np.abs(hi[:, n_triangles:])
+    lo[:, bad], hi[:, bad] = np.inf, -np.inf
+    return lo, hi
+
+
+def _tree(lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """A complete tree with WIDTH children a node: the primitive of each leaf, and the boxes (6, nodes) of each level.
+
+    Ranges are halved at the median of the centroids' longest axis, all ranges of a level at once.
+    """
+    n = lo.shape[1]
+    depth = 0
+    while WIDTH**depth < n:
+        depth += 1
+    size = WIDTH**depth
+    prim = np.concatenate([np.arange(n), np.full(size - n, -1)])
+    with np.errstate(invalid="ignore"):
+        middle = np.where(np.isfinite(lo), 0.5 * lo + 0.5 * hi, 0.0)
+    center = np.concatenate([middle, np.repeat(middle[:, -1:] if n else np.zeros((3, 1)), size - n, axis=1)], axis=1)
+    order = np.arange(size)
+    length = size
+    while length > 1:
+        ranges = center[:, order].reshape(3, -1, length)
+        axis = np.argmax(ranges.max(axis=2) - ranges.min(axis=2), axis=0)
+        key = np.take_along_axis(ranges, axis[None, :, None], axis=0)[0]
+        order = np.take_along_axis(order.reshape(-1, length), np.argsort(key, axis=1, kind="stable"), axis=1).reshape(-1)
+        length //= 2
+    prim = prim[order]
+    boxes = np.empty((6, size))
+    boxes[:3], boxes[3:] = np.inf, -np.inf
+    boxes[:3, prim >= 0], boxes[3:, prim >= 0] = lo[:, prim[prim >= 0]], hi[:, prim[prim >= 0]]
+    levels = [boxes]
+    while levels[0].shape[1] > 1:
+        below = levels[0].reshape(6, -1, WIDTH)
+        levels.insert(0, np.concatenate([below[:3].min(axis=2), below[3:].max(axis=2)]))
+    return prim.astype(np.int32), levels
+
+
+def _meets(boxes: np.ndarray, node: np.ndarray, rays: _Rays, ray: np.ndarray) -> np.ndarray:
+    """Whether each ray's segment may meet the box; only ever wrong on the safe side.
+
+    In a plane of the box and along it, 0 * inf is NaN and says nothing (fmin and fmax pass over it).
+    """
+    enter, leave = np.full(len(ray), -np.inf), np.full(len(ray), np.inf)
+    flat = boxes.reshape(-1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        for axis in range(3):
+            near = rays.near[axis][ray]
+            far = 2 * axis + 3 - near
+            o, inverse = rays.origin[axis][ray], rays.inverse[axis][ray]
+            enter = np.fmax(enter, (flat[near * boxes.shape[1] + node] - o) * inverse)
+            leave = np.fmin(leave, (flat[far * boxes.shape[1] + node] - o) * inverse)
+    enter = enter * np.where(enter > 0.0, 1.0 - SLAB, 1.0 + SLAB)
+    leave = leave * np.where(leave > 0.0, 1.0 + SLAB, 1.0 - SLAB)
+    empty = flat[node] > flat[3 * boxes.shape[1] + node]
+    return (np.maximum(enter, rays.t_min[ray]) <= np.minimum(leave, rays.t_max[ray])) & ~empty
+
+
+@lru_cache(maxsize=4)
+def reference_of(geometry: Any) -> Reference:
+    """The same Reference for the same object, so that asking again does not build it again."""
+    return Reference(geometry)
+
+
+def closest(geometry: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Answer:
+    """The closest hit of each ray in the closed segment [t_min, t_max]; at exactly equal t the lowest prim_id.
+
+    geometry: as for `Reference`; origins, directions: (N, 3), taken as float32; t_min, t_max: numbers or (N,). t is good to
+    1e-14 relative, u and v to 1e-14. A ray that is not finite misses.
+    """
+    return reference_of(geometry).closest(origins, directions, t_min, t_max)
+
+
+def all_hits(geometry: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> AllHits:
+    """Every hit of each ray in the closed segment [t_min, t_max]; arguments as for `closest`."""
+    return reference_of(geometry).all_hits(origins, directions, t_min, t_max)
+
+
+def cross(origins: Any, directions: Any, triangles: Any) -> Crossings:
+    """Ray i's line against triangle i: the exact place, and t, u, v of the plane. triangles: (N, 3, 3), taken as float32."""
+    rays = _Rays.of(origins, directions, 0.0, np.inf)
+    return triangle_crossings(rays.origin, rays.direction, _columns(triangles), all_rows=True)
+
+
+def classify(origins: Any, directions: Any, triangles: Any) -> np.ndarray:
+    """Where ray i's line (t may be negative) meets triangle i, exactly: (N,) int8 of `Place`. triangles: (N, 3, 3)."""
+    return cross(origins, directions, triangles).place
+
+
+def t_bound(origins: Any, directions: Any, triangles: Any) -> np.ndarray:
+    """How far the t that the watertight test reports for ray i and triangle i may be from the exact one: (N,) float64, inf
+    where it may be anything. See `wrt.reference_bounds`."""
+    rays = _Rays.of(origins, directions, 0.0, np.inf)
+    corners = _columns(triangles)
+    return triangle_bounds(rays.origin, rays.direction, corners,
+                           triangle_crossings(rays.origin, rays.direction, corners, all_rows=True)).t
+
+
+def _columns(triangles: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    corners = np.asarray(triangles, dtype=np.float32).astype(np.float64)
+    a, b, c = (np.ascontiguousarray(corners[:, i].T) for i in range(3))
+    return a, b, c

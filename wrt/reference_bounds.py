@@ -1,0 +1,139 @@
+"""How far a float32 unit may be off: forward error bounds of the watertight triangle test and of the sphere test.
+
+u = 2^-24 is float32's unit roundoff and gamma(n) = n u / (1 - n u) bounds n roundings in a row (Higham 2002, lemma 3.1).
+
+*The triangle test* (Woop, Benthin and Wald 2013). Let z be the axis of the direction's largest component, x and y the others,
+and X, Y, Z a corner minus the origin, exact. The test shears: x' = X - S Z with S = d_x / d_z. Rounded, X carries one error
+and the last subtraction another; S, Z, their product and the subtraction make four:
+    |fl(x') - x'| <= e_x = gamma(2) |X| + gamma(4) |S Z| + eta,
+eta = 2^-149 (1 + |Z|) for what underflows. The signs of the areas are those of the rounded corners, exactly (they are taken
+in float64, where the products are exact). So a reported hit has weights l_i >= 0, sum 1, with sum l_i fl(x'_i) = 0, and the
+point P = sum l_i v_i *of the triangle* passes the ray at (x, y) with |x| <= delta_x = max e_x, |y| <= delta_y.
+- `touches`: no hit may be reported unless the rectangle +-delta meets the exact sheared triangle (separating axes).
+- Weights: l is also the exact barycentric of the point (x, y), so with E the sheared edge opposite of corner i
+      |l_i - exact| <= (|E_y| delta_x + |E_x| delta_y) / |twice the sheared area|,   the area being d.N / d_z / 2.
+  A hit whose three exact weights all exceed this is found: as the corners move to their rounded places no weight can reach 0.
+- t: P lies at t_P = sum l_i Z_i / d_z, and the plane's slope makes |t_P - exact| <= (|N_x| delta_x + |N_y| delta_y) / |d.N|.
+  The sum itself carries three errors (Z, 1 / d_z, the result), and holding t to the triangle's box, whose slabs carry three
+  and whose planes P can only leave by errors of its own, moves it by at most 7 more: gamma(10) T, where T = |t_P| if
+  all Z have one sign and max |Z| / |d_z| if not.
+
+*The sphere test* is taken in float64 and rounded once; the box it is held to contains the sphere, so that only the slabs' own
+rounding counts: gamma(5) |t|. Seen at a grazing angle, float64's own error grows: see `sphere_bounds`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wrt.reference_exact import Crossings
+
+UNIT_32 = 2.0**-24
+TINY_32 = 2.0**-149
+LARGEST_32 = float(np.finfo(np.float32).max)
+SLACK = 1.0 + 1e-9  # for the rounding of the bounds' own float64 arithmetic
+
+
+def gamma(n: int) -> float:
+    """n float32 roundings in a row, relative."""
+    return n * UNIT_32 / (1.0 - n * UNIT_32)
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """(N,) float64 each: t, u, v: how far the unit's answer may be from the exact one (inf: it may be anything); w: (3, N),
+    the same for the weights of v0, v1, v2 before they are rounded; touches: whether a hit may be reported at all."""
+
+    t: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    w: np.ndarray
+    touches: np.ndarray
+
+
+def sure(crossings: Crossings, bounds: Bounds) -> np.ndarray:
+    """(N,) bool: hits that the watertight test must report, because the ray is farther inside than the bound."""
+    weights = np.stack([1.0 - crossings.u - crossings.v, crossings.u, crossings.v])
+    return crossings.hit & (weights > bounds.w + 1e-13).all(axis=0)
+
+
+def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray],
+                    crossings: Crossings) -> Bounds:
+    """Bounds for one ray against one triangle a column; arguments as for `triangle_crossings`, and what it returned."""
+    column = np.arange(d.shape[1])
+    kz = np.argmax(np.abs(d), axis=0)
+    kx, ky = (kz + 1) % 3, (kz + 2) % 3
+    d_z = d[kz, column]
+    shear = d[kx, column] / d_z, d[ky, column] / d_z
+    local = [corner - o for corner in v]
+    z = np.stack([p[kz, column] for p in local])
+    flat, delta = [], []  # the sheared corners (3, N) along x and along y, and how far off they may be
+    for axis, s in ((kx, shear[0]), (ky, shear[1])):
+        across = np.stack([p[axis, column] for p in local])
+        error = gamma(2) * np.abs(across) + gamma(4) * np.abs(s * z) + TINY_32 * (1.0 + np.abs(z))
+        flat.append(across - s * z)
+        delta.append(SLACK * error.max(axis=0))
+
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        area = np.abs(crossings.slope / d_z)
+        w = np.stack([(np.abs(flat[1][i] - flat[1][j]) * delta[0] + np.abs(flat[0][i] - flat[0][j]) * delta[1]) / area
+                      for i, j in ((1, 2), (2, 0), (0, 1))]) * SLACK
+        normal, rounding = _normal(v)
+        lean = (normal[kx, column] + rounding[kx, column]) * delta[0] + (normal[ky, column] + rounding[ky, column]) * delta[1]
+        lean *= SLACK / np.abs(crossings.slope)
+        one_sided = (z >= 0.0).all(axis=0) | (z <= 0.0).all(axis=0)
+        reach = np.where(one_sided, np.abs(crossings.t) + lean, np.abs(z).max(axis=0) / np.abs(d_z))
+        t = SLACK * (lean + gamma(10) * reach) + 2.0 * TINY_32
+    # 1 / d_z overflows, or a difference does: nothing is promised.
+    lost = (np.abs(d_z) * LARGEST_32 < 1.0) | (np.abs(np.stack(local)).max(axis=(0, 1)) > LARGEST_32)
+    unknown = lost | ~(np.abs(crossings.slope) > 0.0)
+    t, w = np.where(unknown, np.inf, t), np.where(unknown, np.inf, w)
+    u_and_v = w[1:] + UNIT_32 * (np.abs([crossings.u, crossings.v]) + w[1:]) + TINY_32
+    return Bounds(t, *np.where(unknown, np.inf, u_and_v), w, _meets_rectangle(flat, delta) | lost)
+
+
+def _normal(v: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """|N| per component, and a bound on its rounding in float64."""
+    e1, e2 = v[1] - v[0], v[2] - v[0]
+    left = np.stack([e1[j] * e2[k] for j, k in ((1, 2), (2, 0), (0, 1))])
+    right = np.stack([e1[k] * e2[j] for j, k in ((1, 2), (2, 0), (0, 1))])
+    return np.abs(left - right), 8.0 * 2.0**-53 * (np.abs(left) + np.abs(right))
+
+
+def _meets_rectangle(flat: list[np.ndarray], delta: list[np.ndarray]) -> np.ndarray:
+    """Whether triangles (x, y of three corners) meet the rectangles |x| <= delta[0], |y| <= delta[1]: no axis parts them."""
+    x, y = flat
+    axes = [(np.ones_like(delta[0]), np.zeros_like(delta[0])), (np.zeros_like(delta[0]), np.ones_like(delta[0]))]
+    axes += [(y[j] - y[i], x[i] - x[j]) for i, j in ((0, 1), (1, 2), (2, 0))]
+    meets = np.ones(len(delta[0]), dtype=bool)
+    for a_x, a_y in axes:
+        along = a_x * x + a_y * y
+        rounding = 8.0 * 2.0**-53 * (np.abs(a_x * x) + np.abs(a_y * y)).max(axis=0)
+        reach = np.abs(a_x) * delta[0] + np.abs(a_y) * delta[1] + rounding
+        meets &= (along.min(axis=0) <= reach) & (along.max(axis=0) >= -reach)
+    return meets
+
+
+def sphere_bounds(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray,
+                  t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bounds on the t that the sphere unit reports for the crossing at t, and whether a hit may be reported at all.
+
+    With f = o - center and n the point of the line nearest to the center, the unit's float64 discriminant r^2 - |n|^2 is off
+    by at most D = 2^-53 (32 |f| (r + 2^-48 |f|) + 8 r^2): by min(D / s, sqrt(D)) / |d| in t, s being half the chord; near a
+    root 0, |f|^2 - r^2 is off by 2^-50 (|f|^2 + r^2). Arguments as for `sphere_crossings`; t may be NaN on a miss.
+    """
+    unit = 2.0**-53
+    a, ff, rr = (d * d).sum(axis=0), ((o - center) ** 2).sum(axis=0), radius * radius
+    f = o - center
+    b = (d * f).sum(axis=0)
+    cross = np.stack([d[j] * f[k] - d[k] * f[j] for j, k in ((1, 2), (2, 0), (0, 1))])
+    chord = rr - (cross * cross).sum(axis=0) / a
+    wrong = unit * (32.0 * np.sqrt(ff) * (radius + 2.0**-48 * np.sqrt(ff)) + 8.0 * rr)
+    half = np.sqrt(np.maximum(chord, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        grazing = np.minimum(np.where(half > 0.0, wrong / half, np.inf), np.sqrt(wrong)) / np.sqrt(a)
+        start = 8.0 * unit * (ff + rr) / np.maximum(np.abs(b), np.sqrt(a) * half)
+        bound = SLACK * (gamma(5) * np.abs(t) + 2.0 * grazing + start + 8.0 * unit * np.abs(b) / a) + 2.0 * TINY_32
+    return np.where(np.isnan(bound), np.inf, bound), chord >= -wrong

@@ -1,0 +1,227 @@
+"""Where a ray's line crosses a triangle or a sphere, decided exactly.
+
+Every number that goes in is a float32 value held in float64, so that it is a whole number times a power of two. A sign is
+taken in float64 first and believed where it is larger than a bound on its error (a static filter: Shewchuk 1997, "Adaptive
+Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates"); the few others are taken again in Python's whole
+numbers, where nothing is rounded. Nothing over- or underflows on the way: a product of three float32 is far inside float64.
+
+With a, b, c = v0 - o, v1 - o, v2 - o and N = (v1 - v0) x (v2 - v0), the line o + t d meets the plane at t = a.N / d.N, with
+barycentrics w0 = d.(b x c) / d.N for v0 and so on (the scalar triple products; their sum is d.N).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+UNIT = 2.0**-53  # unit roundoff of float64
+ACCURATE = 1e-14  # errors above this, relative in t and absolute in u and v, are worth whole numbers
+
+# A triple product of differences carries 8 roundings in a row, and the sum of magnitudes it is compared with loses as many.
+TRIPLE = 10.0 * UNIT
+
+
+class Place(IntEnum):
+    """Where the ray's line meets the plane of a triangle. COPLANAR: the line lies in the plane; a line that is parallel to
+    it is OUTSIDE. DEGENERATE: the triangle has no area. Only INSIDE, EDGE and VERTEX are hits."""
+
+    OUTSIDE = 0
+    INSIDE = 1
+    EDGE = 2
+    VERTEX = 3
+    COPLANAR = 4
+    DEGENERATE = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """One (N,) entry a pair of line and primitive: place (int8, of Place); t, u, v (float64; inf or NaN where the line is
+    parallel or the sphere is missed); t_error: bound on |t - exact t|; slope: d.N (float64; 1 for spheres)."""
+
+    place: np.ndarray
+    t: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    t_error: np.ndarray
+    slope: np.ndarray
+
+    @property
+    def hit(self) -> np.ndarray:
+        return (self.place >= Place.INSIDE) & (self.place <= Place.VERTEX)
+
+
+def _triple(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """a . (b x c) of (3, N) arrays whose entries carry at most one rounding, and a bound on its error."""
+    value = np.zeros(a.shape[1])
+    size = np.zeros(a.shape[1])
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        left, right = b[j] * c[k], b[k] * c[j]
+        value += a[i] * (left - right)
+        size += np.abs(a[i]) * (np.abs(left) + np.abs(right))
+    return value, TRIPLE * size
+
+
+def _triple_exact(a: list[Any], b: list[Any], c: list[Any]) -> Any:
+    return (a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2])
+            + a[2] * (b[0] * c[1] - b[1] * c[0]))
+
+
+def whole_numbers(*arrays: np.ndarray) -> tuple[list[list[Any]], int]:
+    """Rows of (3, N) float32 values as object arrays of Python ints, and k: value = int * 2^k, the same for all."""
+    parts = [np.frexp(array) for array in arrays]
+    used = [exponent[mantissa != 0.0] for mantissa, exponent in parts]
+    k = min((int(e.min()) for e in used if e.size), default=0) - 24
+    out = []
+    for mantissa, exponent in parts:
+        whole = (mantissa * 2.0**24).astype(np.int64).astype(object)
+        shift = np.where(mantissa != 0.0, exponent - 24 - k, 0).astype(object)
+        out.append(list(whole << shift))
+    return out, k
+
+
+def exact_plane(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...]) -> tuple[Any, Any, Any, int]:
+    """(w0, w1, w2) and (numerator, slope) as object arrays of ints, N as three of them, and s: t = numerator / slope * 2^s."""
+    (origin, *corners), k = whole_numbers(o, *v)
+    (direction,), k_d = whole_numbers(d)
+    a, b, c = ([p - q for p, q in zip(corner, origin, strict=True)] for corner in corners)
+    e1, e2 = ([p - q for p, q in zip(edge, a, strict=True)] for edge in (b, c))
+    weights = [_triple_exact(direction, *pair) for pair in ((b, c), (c, a), (a, b))]
+    normal = [e1[1] * e2[2] - e1[2] * e2[1], e1[2] * e2[0] - e1[0] * e2[2], e1[0] * e2[1] - e1[1] * e2[0]]
+    numerator = a[0] * normal[0] + a[1] * normal[1] + a[2] * normal[2]
+    slope = weights[0] + weights[1] + weights[2]
+    return weights, (numerator, slope, 2 * k + k_d), normal, k - k_d
+
+
+def _sign(x: Any) -> np.ndarray:
+    return (x > 0).astype(np.int8) - (x < 0).astype(np.int8)
+
+
+def _resolve(rows: np.ndarray, o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...], out: Crossings) -> None:
+    """Overwrite these rows of `out` with what whole numbers say; t, u, v are then correctly rounded."""
+    weights, (numerator, slope, slope_power), normal, power = exact_plane(
+        o[:, rows], d[:, rows], tuple(corner[:, rows] for corner in v))
+    w_sign = np.stack([_sign(w) for w in weights])
+    slope_sign = _sign(slope)
+    zeros = (w_sign == 0).sum(axis=0)
+    inside = (slope_sign != 0) & (w_sign * slope_sign >= 0).all(axis=0)
+    flat = slope_sign == 0
+    degenerate = np.stack([_sign(x) == 0 for x in normal]).all(axis=0)
+    place = np.where(inside, Place.INSIDE + zeros, Place.OUTSIDE)
+    place = np.where(flat & (_sign(numerator) == 0), Place.COPLANAR, place)
+    out.place[rows] = np.where(degenerate, Place.DEGENERATE, place)
+
+    safe = np.where(flat, 1, slope)
+    t, u, v_weight = ((x / safe).astype(np.float64) for x in (numerator, weights[1], weights[2]))
+    out.t[rows] = np.where(flat, np.inf, np.ldexp(t, power))
+    out.u[rows] = np.where(flat, np.nan, u)
+    out.v[rows] = np.where(flat, np.nan, v_weight)
+    out.t_error[rows] = UNIT * np.abs(out.t[rows])
+    out.slope[rows] = np.ldexp(slope.astype(np.float64), slope_power)
+
+
+def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], *,
+                       all_rows: bool = False) -> Crossings:
+    """One line against one triangle a column. o, d and the corners in v: (3, N) float64 that hold finite float32 values.
+
+    Exact: place is never wrong. On hits t is good to ACCURATE relative (its bound is t_error), u and v to ACCURATE. all_rows:
+    as good where the line passes by the triangle, COPLANAR and DEGENERATE told from OUTSIDE; without, such rows are OUTSIDE.
+    """
+    a, b, c = (corner - o for corner in v)
+    weights = np.empty((3, o.shape[1]))
+    bounds = np.empty_like(weights)
+    # b x c = b x (v2 - v1): the edge is short where the triangle is far, so that less cancels.
+    for i, (p, e) in enumerate(((b, v[2] - v[1]), (c, v[0] - v[2]), (a, v[1] - v[0]))):
+        weights[i], bounds[i] = _triple(d, p, e)
+    outside = (weights > bounds).any(axis=0) & (weights < -bounds).any(axis=0)
+    unknown = ~outside & (np.abs(weights) <= bounds).any(axis=0)
+    place = np.where(outside, np.int8(Place.OUTSIDE), np.int8(Place.INSIDE))
+    out = Crossings(place, *(np.full(o.shape[1], np.nan) for _ in range(5)))
+
+    rows = np.arange(len(place)) if all_rows else np.flatnonzero(~outside)
+    rough = np.zeros_like(unknown)
+    if len(rows):
+        edges = (v[1][:, rows] - v[0][:, rows], v[2][:, rows] - v[0][:, rows])
+        slope, slope_error = _triple(d[:, rows], *edges)
+        numerator, numerator_error = _triple(a[:, rows], *edges)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            t = numerator / slope
+            u, w = weights[1, rows] / slope, weights[2, rows] / slope
+            clear = np.abs(slope) - slope_error
+            t_error = (numerator_error + np.abs(t) * slope_error) / clear + 2.0 * UNIT * np.abs(t)
+            uv_error = (bounds[1:, rows] + np.abs([u, w]) * slope_error) / clear + 2.0 * UNIT
+            good = (clear > 0.0) & (t_error <= ACCURATE * np.abs(t))
+            good &= (uv_error <= ACCURATE * np.maximum(1.0, np.abs([u, w]))).all(axis=0)
+        out.t[rows], out.u[rows], out.v[rows], out.t_error[rows], out.slope[rows] = t, u, w, t_error, slope
+        rough[rows] = ~good
+    exact = np.flatnonzero(unknown | rough)
+    if len(exact):
+        _resolve(exact, o, d, v, out)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class SphereCrossings:
+    """The line enters at t[0] and leaves at t[1] (float64 (2, N), NaN on a miss; equal where it only touches);
+    t_error: bounds on both; hit, touching: (N,) bool."""
+
+    hit: np.ndarray
+    touching: np.ndarray
+    t: np.ndarray
+    t_error: np.ndarray
+
+
+def sphere_crossings(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray) -> SphereCrossings:
+    """One line against one sphere a column; o, d, center: (3, N), radius: (N,) > 0, float64 that hold float32 values.
+
+    The discriminant's sign is exact: a line that touches the sphere hits it. t is good to ACCURATE relative.
+    """
+    f = o - center
+    a, b, ff, rr = (d * d).sum(axis=0), (d * f).sum(axis=0), (f * f).sum(axis=0), radius * radius
+    cross = np.stack([d[j] * f[k] - d[k] * f[j] for j, k in ((1, 2), (2, 0), (0, 1))])
+    size = np.stack([np.abs(d[j] * f[k]) + np.abs(d[k] * f[j]) for j, k in ((1, 2), (2, 0), (0, 1))])
+    discriminant = a * rr - (cross * cross).sum(axis=0)
+    error = 20.0 * UNIT * (a * rr + (size * size).sum(axis=0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.sqrt(np.maximum(discriminant, 0.0))
+        root_error = error / root
+        q = -b + np.where(b > 0.0, -root, root)
+        q_error = root_error + 8.0 * UNIT * ((np.abs(d * f)).sum(axis=0) + root)
+        t = np.stack([q / a, (ff - rr) / q])
+        t_error = np.abs(t) * (2.0 * q_error / np.abs(q) + 8.0 * UNIT)
+        t_error[1] += 8.0 * UNIT * (ff + rr) / np.abs(q)
+        good = (q_error < 0.5 * np.abs(q)) & (t_error <= ACCURATE * np.abs(t)).all(axis=0)
+    order = np.argsort(t, axis=0)
+    t, t_error = np.take_along_axis(t, order, axis=0), np.take_along_axis(t_error, order, axis=0)
+    hit = discriminant >= 0.0
+    touching = np.zeros_like(hit)
+    decided = (discriminant < -error) | ((discriminant > error) & good)
+    for i in np.flatnonzero(~decided):
+        sign, roots = _sphere_exact(o[:, i], d[:, i], center[:, i], float(radius[i]))
+        hit[i], touching[i] = sign >= 0, sign == 0
+        t[:, i], t_error[:, i] = roots, 2.0 * UNIT * np.abs(roots)
+    t[:, ~hit] = np.nan
+    return SphereCrossings(hit, touching, t, t_error)
+
+
+def _sphere_exact(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: float) -> tuple[int, np.ndarray]:
+    """The discriminant's sign, and both roots to float64."""
+    columns = [np.array(x, dtype=np.float64).reshape(-1, 1) for x in (o, center, [radius, 0.0, 0.0])]
+    (origin, middle, extent), k = whole_numbers(*columns)
+    (direction,), k_d = whole_numbers(d.reshape(3, 1))
+    f = [int(p[0]) - int(q[0]) for p, q in zip(origin, middle, strict=True)]
+    w, r = [int(x[0]) for x in direction], int(extent[0][0])
+    a, b, c = (sum(p * q for p, q in zip(x, y, strict=True)) for x, y in ((w, w), (w, f), (f, f)))
+    discriminant = b * b - a * (c - r * r)
+    if discriminant < 0:
+        return -1, np.full(2, np.nan)
+    if discriminant == 0 and b == 0:
+        return 0, np.zeros(2)
+    # q adds two numbers of one sign, so that 128 binary digits behind the point are plenty; the other root is the product's.
+    root = math.isqrt(discriminant << 256)
+    q = -(b << 128) - (root if b >= 0 else -root)
+    roots = sorted((q / (a << 128), ((c - r * r) << 128) / q))
+    return (1 if discriminant else 0), np.array([math.ldexp(t, k - k_d) for t in roots])
