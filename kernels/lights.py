@@ -3,7 +3,7 @@
 import warp as wp
 
 from wrt.kernels.materials import DIFFUSE, Scatter, blinn_phong
-from wrt.kernels.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, hash_pair, sample_2d, search_cdf, triangle
+from wrt.kernels.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, hash_pair, make_sample_2d, search_cdf, triangle
 from wrt.kernels.structs import Background, Light, Lighting, Material, Ray, Surfaces, gamma
 from wrt.kernels.surface import (
     Surface,
@@ -287,7 +287,13 @@ def make_reflected_light(features, light_sample, sky_sample):
     return choose, reflected
 
 
-@wp.func
-def light_xi(key: wp.uint32, index: wp.uint32, i: int) -> wp.vec2:
-    """Two numbers for light i at the path vertex `key`."""
-    return sample_2d(hash_pair(key, wp.static(wp.uint32(0x4C49))), index, i)
+def make_light_xi(features):
+    """The numbers that place a sample on a light."""
+    sample_2d = make_sample_2d(features)
+
+    @wp.func
+    def light_xi(key: wp.uint32, index: wp.uint32, i: int) -> wp.vec2:
+        """Two numbers for light i at the path vertex `key`."""
+        return sample_2d(hash_pair(key, wp.static(wp.uint32(0x4C49))), index, i)
+
+    return light_xi

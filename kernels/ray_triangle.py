@@ -2,13 +2,16 @@
 
 `watertight` is Woop, Benthin and Wald 2013, "Watertight Ray/Triangle Intersection" (JCGT 2(1)): the triangle is moved and
 sheared so that the ray becomes the z axis, and three signed areas around the origin decide. Two triangles with a common
-edge compute the same area with opposite sign, so that no ray passes between them.
+edge compute the same area with opposite sign, so that no ray passes between them. The other tests are here to be compared with
+it: RAY_TRIANGLE is the table of all. A test takes the ray's set-up and one record, and gives a `Hit` on the whole line.
 """
+
+from typing import Any, NamedTuple
 
 import warp as wp
 
 from wrt.kernels.ray_aabb import FAR_PAD, BoxRay, box_pad, padded_hi, padded_lo, slab_interval
-from wrt.kernels.structs import NO_HIT, Hit, Ray
+from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray
 
 
 @wp.struct
@@ -140,3 +143,107 @@ def ray_triangle(box: BoxRay, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: 
         if not wp.isfinite(hit.t):
             hit.prim_id = NO_HIT
     return hit
+
+
+@wp.func
+def no_triangle() -> Hit:
+    hit = Hit()
+    hit.t = float(wp.inf)
+    hit.prim_id = NO_HIT
+    return hit
+
+
+@wp.func
+def watertight_triangle(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: Primitive) -> Hit:
+    return ray_triangle(box, shear, triangle.v0, triangle.v1, triangle.v2)
+
+
+@wp.func
+def moeller_trumbore(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: Primitive) -> Hit:
+    """Moeller and Trumbore 1997, "Fast, Minimum Storage Ray/Triangle Intersection": Cramer's rule on two edges (v1, v2 here).
+
+    Each triangle rounds its edges by itself: a ray can pass between two neighbours, or hit both.
+    """
+    p = wp.cross(ray.direction, triangle.v2)
+    determinant = wp.dot(triangle.v1, p)
+    if determinant == 0.0:
+        return no_triangle()
+    inverse = 1.0 / determinant
+    s = ray.origin - triangle.v0
+    q = wp.cross(s, triangle.v1)
+    hit = Hit()
+    hit.u = wp.dot(s, p) * inverse
+    hit.v = wp.dot(ray.direction, q) * inverse
+    hit.t = wp.dot(triangle.v2, q) * inverse
+    if not (hit.u >= 0.0 and hit.v >= 0.0 and hit.u + hit.v <= 1.0):
+        return no_triangle()
+    return hit
+
+
+@wp.func
+def on_plane(plane: wp.vec4, point: wp.vec3) -> float:
+    return plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] + plane[3]
+
+
+@wp.func
+def along(plane: wp.vec4, direction: wp.vec3) -> float:
+    return plane[0] * direction[0] + plane[1] * direction[1] + plane[2] * direction[2]
+
+
+@wp.func
+def plane_equation(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: PlanePrimitive) -> Hit:
+    """The plane equation A x + B y + C z = X, solved for t, and the point there in barycentric coordinates.
+
+    Three caveats: a ray parallel to the plane (the divisor is 0) is out before the division; a t outside the segment is out
+    (the caller looks at t_min and t_max); and the point counts only within the triangle, u, v >= 0 and u + v <= 1. c is the
+    plane with its unit normal; a and b give u and v of a point on it.
+    """
+    slope = along(triangle.c, ray.direction)
+    if slope == 0.0:
+        return no_triangle()
+    hit = Hit()
+    hit.t = -on_plane(triangle.c, ray.origin) / slope
+    point = ray.origin + hit.t * ray.direction
+    hit.u = on_plane(triangle.a, point)
+    hit.v = on_plane(triangle.b, point)
+    if not (hit.u >= 0.0 and hit.v >= 0.0 and hit.u + hit.v <= 1.0):
+        return no_triangle()
+    return hit
+
+
+@wp.func
+def baldwin_weber(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: PlanePrimitive) -> Hit:
+    """Baldwin and Weber 2016, "Fast Ray-Triangle Intersections by Coordinate Transformation" (JCGT 5(3)).
+
+    The rows a, b, c are the affine map that takes the triangle to (0,0,0), (1,0,0), (0,1,0); the ray is mapped, and meets
+    z = 0. The paper saves three of the twelve numbers by fixing one coordinate of the free direction; here all are kept.
+    """
+    slope = along(triangle.c, ray.direction)
+    if slope == 0.0:
+        return no_triangle()
+    hit = Hit()
+    hit.t = -on_plane(triangle.c, ray.origin) / slope
+    hit.u = on_plane(triangle.a, ray.origin) + hit.t * along(triangle.a, ray.direction)
+    hit.v = on_plane(triangle.b, ray.origin) + hit.t * along(triangle.b, ray.direction)
+    if not (hit.u >= 0.0 and hit.v >= 0.0 and hit.u + hit.v <= 1.0):
+        return no_triangle()
+    return hit
+
+
+class TriangleTest(NamedTuple):
+    """One way to test a triangle: the unit, the record it reads, and whether it needs the watertight test's set-up.
+
+    How corners become records is told by wrt.accel.triangle_data, under the same name.
+    """
+
+    intersect: Any
+    record: Any
+    uses_shear: bool = False
+
+
+RAY_TRIANGLE = {
+    "watertight": TriangleTest(watertight_triangle, Primitive, uses_shear=True),
+    "moeller_trumbore": TriangleTest(moeller_trumbore, Primitive),
+    "baldwin_weber": TriangleTest(baldwin_weber, PlanePrimitive),
+    "plane": TriangleTest(plane_equation, PlanePrimitive),
+}

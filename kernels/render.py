@@ -4,7 +4,7 @@ import warp as wp
 
 from wrt.kernels.camera import chief_ray, make_camera_ray
 from wrt.kernels.materials import make_cutout
-from wrt.kernels.sampling import hash_pair, sample_2d
+from wrt.kernels.sampling import hash_pair, make_sample_2d
 from wrt.kernels.structs import AovFilm, Camera, Film, Lighting, Limits, Ray, Surfaces, Tile, kernel
 from wrt.kernels.whitted import make_radiance, make_shade
 
@@ -17,18 +17,17 @@ def filter_offset(icdf: wp.array(dtype=wp.float32), x: float) -> float:
     return wp.lerp(icdf[i], icdf[i + 1], position - float(i))
 
 
-def make_traversals(features, accelerator):
-    """closest_hit and any_hit of a structure; with cut-outs both look at each hit's alpha."""
+def make_traversals(features, structure):
+    """closest_hit and any_hit of a structure (wrt.accel.base.Structure); with cut-outs both look at each hit's alpha."""
     accepts = make_cutout(features) if features.cutout else None
-    closest_hit = accelerator.traversal(any_hit=False, with_spheres=features.spheres, accepts=accepts)
-    any_hit = accelerator.traversal(any_hit=True, with_spheres=features.spheres, accepts=accepts)
-    return closest_hit, any_hit
+    return structure.traversal(any_hit=False, accepts=accepts), structure.traversal(any_hit=True, accepts=accepts)
 
 
-def make_render_kernel(features, accelerator):
+def make_render_kernel(features, structure):
     """A kernel that adds samples to the pixels of a tile; it holds only the code that `features` asks for."""
-    accel_struct = accelerator.struct
-    closest_hit, any_hit = make_traversals(features, accelerator)
+    accel_struct = structure.struct
+    closest_hit, any_hit = make_traversals(features, structure)
+    sample_2d = make_sample_2d(features)
     camera_ray = make_camera_ray(features.lens, features.blades)
     radiance = make_radiance(features, accel_struct, closest_hit, any_hit)
 
@@ -84,10 +83,10 @@ def make_render_kernel(features, accelerator):
     return render
 
 
-def make_aov_kernel(features, accelerator):
+def make_aov_kernel(features, structure):
     """What the ray through each pixel's centre (and the lens' centre) meets first."""
-    accel_struct = accelerator.struct
-    closest_hit, _ = make_traversals(features, accelerator)
+    accel_struct = structure.struct
+    closest_hit, _ = make_traversals(features, structure)
     surface_at, resolve, shading_normal = make_shade(features)
 
     @kernel

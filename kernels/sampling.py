@@ -3,7 +3,7 @@
 Every number is a function of (pixel, sample, dimension, seed) alone, so that pictures do not depend on tiles, threads or
 passes. Each pair of dimensions is the two-dimensional Sobol sequence, with its points in a shuffled order and Owen-scrambled,
 both by hashing (Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4)). The hash for the nested scramble has the
-constants of Vegdahl 2021 ("Building a Better LK Hash").
+constants of Vegdahl 2021 ("Building a Better LK Hash"). Independent random numbers are there to be compared with it.
 """
 
 import warp as wp
@@ -75,6 +75,20 @@ def sample_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
     x = reverse_bits(laine_karras(i, hash_u32(seed ^ wp.static(wp.uint32(0xA511E9B3)))))
     y = reverse_bits(laine_karras(sobol_second(i), hash_u32(seed ^ wp.static(wp.uint32(0x63D83595)))))
     return wp.vec2(unit_float(x), unit_float(y))
+
+
+@wp.func
+def independent_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
+    """As sample_2d, but each point is drawn by itself: the plain Monte Carlo that an even sequence is measured against."""
+    seed = hash_pair(key, wp.uint32(dimension))
+    x = hash_pair(seed, index)
+    y = hash_pair(seed ^ wp.static(wp.uint32(0x63D83595)), index)
+    return wp.vec2(unit_float(x), unit_float(y))
+
+
+def make_sample_2d(features):
+    """The sampler that the scene's settings ask for."""
+    return independent_2d if features.independent else sample_2d
 
 
 @wp.func

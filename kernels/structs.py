@@ -55,11 +55,24 @@ class Hit:
 
 @wp.struct
 class Primitive:
-    """A triangle, or a sphere (center in v0, radius in v1.x) where prim_id >= the number of triangles."""
+    """A triangle by its corners, or by one corner and two edges (v1, v2); 40 bytes.
+
+    Where prim_id >= the number of triangles, it is sphere prim_id - n_triangles, and the rest is not read.
+    """
 
     v0: wp.vec3
     v1: wp.vec3
     v2: wp.vec3
+    prim_id: int
+
+
+@wp.struct
+class PlanePrimitive:
+    """A triangle by three planes (x, y, z: normal, w: offset), for the tests that precompute; 52 bytes. Spheres as above."""
+
+    a: wp.vec4
+    b: wp.vec4
+    c: wp.vec4
     prim_id: int
 
 

@@ -1,11 +1,29 @@
 """What every traversal unit does with a primitive, whatever structure led to it."""
 
+from typing import Any, NamedTuple
+
 import warp as wp
 
-from wrt.kernels.ray_aabb import BoxRay, box_ray
+from wrt.kernels.ray_aabb import RAY_AABB, BoxRay, box_ray
 from wrt.kernels.ray_sphere import ray_sphere
-from wrt.kernels.ray_triangle import TriangleRay, ray_triangle, triangle_ray
-from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, Surfaces
+from wrt.kernels.ray_triangle import RAY_TRIANGLE, TriangleRay, triangle_ray
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+
+
+class Units(NamedTuple):
+    """What a traversal unit is made of: names in RAY_TRIANGLE and RAY_AABB, and whether there are spheres."""
+
+    triangle: str = "watertight"
+    box: str = "conservative"
+    spheres: bool = False
+
+    @property
+    def triangle_test(self) -> Any:
+        return RAY_TRIANGLE[self.triangle]
+
+    @property
+    def box_test(self) -> Any:
+        return RAY_AABB[self.box]
 
 
 @wp.struct
@@ -15,16 +33,6 @@ class Probe:
     ray: Ray
     box: BoxRay
     triangle: TriangleRay
-
-
-@wp.func
-def make_probe(ray: Ray) -> Probe:
-    """Set-up of both units, once a ray."""
-    probe = Probe()
-    probe.ray = ray
-    probe.box = box_ray(ray)
-    probe.triangle = triangle_ray(ray)
-    return probe
 
 
 @wp.func
@@ -49,23 +57,41 @@ def finished(best: Hit) -> Hit:
     return best
 
 
-def make_intersect(with_spheres: bool, accepts=None):
+def make_probe(units: Units):
+    """The set-up of both units, once a ray."""
+
+    @wp.func
+    def probe_of(ray: Ray) -> Probe:
+        probe = Probe()
+        probe.ray = ray
+        probe.box = box_ray(ray)
+        if wp.static(units.triangle_test.uses_shear):
+            probe.triangle = triangle_ray(ray)
+        return probe
+
+    return probe_of
+
+
+def make_intersect(units: Units, accepts=None):
     """The unit that tests one primitive and keeps the better hit.
 
     accepts(surfaces, prim_id, u, v) -> bool may refuse a hit (cut-outs); None takes all.
     """
+    record = units.triangle_test.record
+    ray_triangle = units.triangle_test.intersect
 
     @wp.func
-    def intersect(probe: Probe, surfaces: Surfaces, primitive: Primitive, best: Hit) -> Hit:
+    def intersect(probe: Probe, surfaces: Surfaces, primitive: record, best: Hit) -> Hit:
         """The closer of `best` and this primitive's hit in [t_min, best.t]; at equal t the lower prim_id."""
         hit = Hit()
-        if wp.static(with_spheres):
+        if wp.static(units.spheres):
             if primitive.prim_id >= surfaces.n_triangles:
-                hit = ray_sphere(probe.box, probe.ray, primitive.v0, primitive.v1[0])
+                sphere = surfaces.spheres[primitive.prim_id - surfaces.n_triangles]
+                hit = ray_sphere(probe.box, probe.ray, wp.vec3(sphere[0], sphere[1], sphere[2]), sphere[3])
             else:
-                hit = ray_triangle(probe.box, probe.triangle, primitive.v0, primitive.v1, primitive.v2)
+                hit = ray_triangle(probe.box, probe.triangle, probe.ray, primitive)
         else:
-            hit = ray_triangle(probe.box, probe.triangle, primitive.v0, primitive.v1, primitive.v2)
+            hit = ray_triangle(probe.box, probe.triangle, probe.ray, primitive)
         if hit.prim_id == NO_HIT or not (hit.t >= probe.ray.t_min and hit.t <= best.t):
             return best
         if hit.t == best.t and primitive.prim_id > best.prim_id:

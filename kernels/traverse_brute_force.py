@@ -1,25 +1,33 @@
 """The traversal unit without a structure: every primitive is tested. The yardstick for all others."""
 
+from functools import cache
+
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, Surfaces
-from wrt.kernels.traverse import finished, make_intersect, make_probe, no_hit
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.traverse import Units, finished, make_intersect, make_probe, no_hit
 
 
-@wp.struct
-class BruteForce:
-    """All primitives, in the order of prim_id."""
+@cache
+def make_struct(record):
+    """The structure over records of this kind: all primitives, in the order of prim_id."""
 
-    primitives: wp.array(dtype=Primitive)
+    @wp.struct
+    class BruteForce:
+        primitives: wp.array(dtype=record)
+
+    return BruteForce
 
 
-def make_traversal(any_hit: bool, with_spheres: bool, accepts=None):
+def make_traversal(units: Units, any_hit: bool, accepts=None):
     """The closest hit, or any (the first that is found), among all primitives."""
-    intersect = make_intersect(with_spheres, accepts)
+    probe_of = make_probe(units)
+    intersect = make_intersect(units, accepts)
+    struct = make_struct(units.triangle_test.record)
 
     @wp.func
-    def traverse(accel: BruteForce, surfaces: Surfaces, ray: Ray) -> Hit:
-        probe = make_probe(ray)
+    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+        probe = probe_of(ray)
         best = no_hit(ray)
         for i in range(accel.primitives.shape[0]):
             best = intersect(probe, surfaces, accel.primitives[i], best)

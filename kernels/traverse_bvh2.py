@@ -4,11 +4,12 @@ A node holds the boxes of both its children, so that one fetch feeds two box tes
 the farther one pushed; a popped node that begins beyond the closest hit is dropped.
 """
 
+from functools import cache
+
 import warp as wp
 
-from wrt.kernels.ray_aabb import ray_aabb
-from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, Surfaces
-from wrt.kernels.traverse import finished, make_intersect, make_probe, no_hit
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.traverse import Units, finished, make_intersect, make_probe, no_hit
 
 # Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
 STACK_SIZE = 64
@@ -31,21 +32,28 @@ class Bvh2Node:
     count_1: int
 
 
-@wp.struct
-class Bvh2:
-    """nodes[0] is the root; primitives are in the order of the leaves."""
+@cache
+def make_struct(record):
+    """The structure over records of this kind: nodes[0] is the root; primitives are in the order of the leaves."""
 
-    nodes: wp.array(dtype=Bvh2Node)
-    primitives: wp.array(dtype=Primitive)
+    @wp.struct
+    class Bvh2:
+        nodes: wp.array(dtype=Bvh2Node)
+        primitives: wp.array(dtype=record)
+
+    return Bvh2
 
 
-def make_traversal(any_hit: bool, with_spheres: bool, accepts=None):
+def make_traversal(units: Units, any_hit: bool, accepts=None):
     """The closest hit, or any (the first that is found)."""
-    intersect = make_intersect(with_spheres, accepts)
+    probe_of = make_probe(units)
+    intersect = make_intersect(units, accepts)
+    ray_aabb = units.box_test
+    struct = make_struct(units.triangle_test.record)
 
     @wp.func
-    def traverse(accel: Bvh2, surfaces: Surfaces, ray: Ray) -> Hit:
-        probe = make_probe(ray)
+    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+        probe = probe_of(ray)
         best = no_hit(ray)
         stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)

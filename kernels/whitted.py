@@ -8,15 +8,15 @@ cut at max_depth bounces or below min_throughput, and counted.
 import warp as wp
 
 from wrt.kernels.lights import (
-    light_xi,
     make_background,
     make_light_sample,
+    make_light_xi,
     make_reflected_light,
     make_sky_sample,
     shadow_ray,
 )
 from wrt.kernels.materials import BLEND, Scatter, make_bump, make_resolve, make_scatter
-from wrt.kernels.sampling import hash_pair, sample_2d
+from wrt.kernels.sampling import hash_pair, make_sample_2d
 from wrt.kernels.structs import Lighting, Limits, Material, Ray, Surfaces
 from wrt.kernels.surface import Surface, make_surface_at, spawn_point
 from wrt.kernels.textures import make_sample_texture
@@ -175,6 +175,7 @@ def make_direct_light(features, accel_struct, closest_hit, any_hit):
     """Light straight from every light (and the background) by one shadow ray each."""
     light_sample = make_light_sample(features)
     sky_sample = make_sky_sample(features, make_background(features))
+    light_xi = make_light_xi(features)
     choose, reflected = make_reflected_light(features, light_sample, sky_sample)
     transmittance = make_transmittance(features, accel_struct, closest_hit, any_hit)
     extra = 1 if features.sky_light else 0
@@ -207,6 +208,7 @@ def make_direct_light(features, accel_struct, closest_hit, any_hit):
 
 def make_radiance(features, accel_struct, closest_hit, any_hit):
     """The whole tree of rays behind one camera ray. `features`: wrt.features.Features."""
+    sample_2d = make_sample_2d(features)
     surface_at, resolve, shading_normal = make_shade(features)
     background_radiance = make_background(features)
     scatter_at = make_scatter(features)

@@ -13,7 +13,8 @@ import numpy as np
 import warp as wp
 
 import wrt
-from wrt.accel import ACCELERATORS, Accelerator, build
+from wrt.accel import ACCELERATORS, Structure, build
+from wrt.accel.base import check_units
 from wrt.device import load_kernel, memory_size, start, thread_count, upload
 from wrt.device_scene import camera_struct, upload_scene
 from wrt.errors import InputError
@@ -22,6 +23,7 @@ from wrt.film import Film
 from wrt.interrupt import held_interrupts
 from wrt.kernels import render as kernels
 from wrt.kernels import structs
+from wrt.kernels.traverse import Units
 from wrt.scene import Camera, Scene
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
@@ -64,11 +66,14 @@ class Options:
     tile_size: int = TILE_SIZE
     pass_size: int | None = None
     progress: Callable[[Progress], None] | None = None
+    triangle: str = "watertight"
+    box: str = "conservative"
     accel_options: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.accel not in ACCELERATORS:
             raise InputError(f"no structure {self.accel!r}; there is {', '.join(ACCELERATORS)}")
+        check_units(self.triangle, self.box)
         unknown = sorted(set(self.aov) - set(AOVS))
         if unknown:
             raise InputError(f"no AOV {', '.join(unknown)}; there is {', '.join(AOVS)}")
@@ -96,13 +101,13 @@ def render(scene: Scene, *, spp: int | None = None, size: tuple[int, int] | None
 
 
 @cache
-def render_kernel(features: Features, accel: type[Accelerator]) -> Any:
-    return kernels.make_render_kernel(features, accel)
+def render_kernel(features: Features, structure: Structure) -> Any:
+    return kernels.make_render_kernel(features, structure)
 
 
 @cache
-def aov_kernel(features: Features, accel: type[Accelerator]) -> Any:
-    return kernels.make_aov_kernel(features, accel)
+def aov_kernel(features: Features, structure: Structure) -> Any:
+    return kernels.make_aov_kernel(features, structure)
 
 
 class Renderer:
@@ -118,10 +123,11 @@ class Renderer:
         self.features = features_of(scene, self.camera)
         self.crop = self._crop()
         self._check_memory()
-        accelerator = ACCELERATORS[options.accel]
-        self.kernels = [render_kernel(self.features, accelerator)]
+        units = Units(options.triangle, options.box, self.features.spheres)
+        structure = Structure(ACCELERATORS[options.accel], units)
+        self.kernels = [render_kernel(self.features, structure)]
         if options.aov:
-            self.kernels.append(aov_kernel(self.features, accelerator))
+            self.kernels.append(aov_kernel(self.features, structure))
         self._prepare()
         self.film = _film_struct(scene.settings, self.device)
         self.limits = structs.Limits()
@@ -170,7 +176,7 @@ class Renderer:
         self.device_scene = upload_scene(self.scene, self.device)
         self.seconds["upload"] = time.perf_counter() - begin
         self.accel = build(self.device_scene.world.geometry, self.options.accel, self.options.device, self.threads,
-                           **self.options.accel_options)
+                           triangle=self.options.triangle, box=self.options.box, **self.options.accel_options)
         self.seconds["build"] = self.accel.stats.build_seconds
 
     def run(self) -> Film:

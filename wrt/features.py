@@ -26,14 +26,15 @@ from wrt.scene import (
 class Features:
     """Everything that changes the code of a kernel; what is False leaves no trace in it.
 
-    lens, blades, filter: the camera's; spheres, smooth, textures, checkerboards, normal_maps, cutout, blend: the surfaces';
-    mirror .. rough: the materials'; lights .. tinted_shadows: the lighting; derived: reflection, refraction, transmission,
+    lens, blades, filter: the camera's; independent: the samples are random numbers; spheres, smooth, textures, checkerboards,
+    normal_maps, cutout, blend: the surfaces'; mirror .. rough: the materials'; lights .. tinted_shadows: the lighting; derived: reflection, refraction, transmission,
     transparent_shadows, sky_light, highlight. stack_size: the most rays that can be pending.
     """
 
     lens: bool = False
     blades: bool = False
     filter: bool = False
+    independent: bool = False
     spheres: bool = False
     smooth: bool = False
     textures: bool = False
@@ -111,6 +112,7 @@ def features_of(scene: Scene, camera: Camera) -> Features:
         lens=camera.aperture_radius > 0.0,
         blades=camera.aperture_radius > 0.0 and camera.blades > 0,
         filter=settings.filter != "box",
+        independent=settings.sampler == "independent",
         spheres=bool(scene.spheres),
         smooth=any(thing.mesh.normals is not None for thing in scene.objects),
         textures=any(isinstance(texture, Texture) for texture in textures),

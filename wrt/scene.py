@@ -442,6 +442,7 @@ class Camera:
 # --- scene ------------------------------------------------------------------------------------------------------------
 
 FILTERS = ("box", "gaussian", "blackman-harris")
+SAMPLERS = ("sobol", "independent")
 TONEMAPS = ("none", "reinhard", "aces", "agx")
 
 
@@ -452,7 +453,8 @@ class Settings:
     max_depth: bounces after the first hit (0: only direct light). min_throughput: a ray that would carry less than this
     share (largest channel) is cut. fresnel: "exact", or "schlick" (cheaper, approximate). glass_shadows: solid glass
     "opaque" to shadow rays (right but for caustics, which a Whitted tracer does not see), or "tinted": shadow rays go
-    straight through it. exposure in stops.
+    straight through it. sampler: "sobol" (Owen-scrambled, evenly spread), or "independent" random numbers, whose noise falls
+    more slowly. exposure in stops.
     """
 
     size: tuple[int, int] = (640, 360)
@@ -462,6 +464,7 @@ class Settings:
     filter: str = "blackman-harris"
     fresnel: str = "exact"
     glass_shadows: str = "opaque"
+    sampler: str = "sobol"
     exposure: float = 0.0
     tonemap: str = "none"
 
@@ -478,6 +481,7 @@ class Settings:
         _choice(self.filter, FILTERS, "filter")
         _choice(self.fresnel, ("exact", "schlick"), "fresnel")
         _choice(self.glass_shadows, ("opaque", "tinted"), "glass_shadows")
+        _choice(self.sampler, SAMPLERS, "sampler")
         _choice(self.tonemap, TONEMAPS, "tonemap")
 
 

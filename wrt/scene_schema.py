@@ -110,6 +110,8 @@ class SettingsTable(Table):
     fresnel: Literal["exact", "schlick"] = Field("exact", description="of dielectrics")
     glass_shadows: Literal["opaque", "tinted"] = Field(
         "opaque", description="tinted: shadow rays go straight through solid glass")
+    sampler: Literal["sobol", "independent"] = Field(
+        "sobol", description="how a pixel's samples are spread: evenly, or by independent random numbers")
     exposure: float = Field(_SETTINGS.exposure, ge=-100.0, le=100.0, description="stops")
     tonemap: Literal["none", "reinhard", "aces", "agx"] = Field("none", description="curve from linear to display")
 

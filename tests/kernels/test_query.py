@@ -6,7 +6,7 @@ import pytest
 from tests.kernel_tools import CPU, floats, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel import ACCELERATORS, build
+from wrt.accel import ACCELERATORS, Structure, build
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
 from wrt.kernels.structs import Surfaces
 from wrt.mesh import Mesh
@@ -37,8 +37,9 @@ def surfaces():
 
 @pytest.mark.parametrize(("name", "cls"), STRUCTURES)
 def test_only_the_rows_asked_for_are_written(name, cls):
-    closest = make_closest_hit_kernel(cls.struct, cls.traversal(any_hit=False, with_spheres=False))
-    anything = make_any_hit_kernel(cls.struct, cls.traversal(any_hit=True, with_spheres=False))
+    structure = Structure(cls)
+    closest = make_closest_hit_kernel(structure.struct, structure.traversal(any_hit=False))
+    anything = make_any_hit_kernel(structure.struct, structure.traversal(any_hit=True))
     data = build(TRIANGLE, name).data
     hits = HitArrays()
     hits.t, hits.u, hits.v = (floats(np.full(10, -7.0)) for _ in range(3))

@@ -303,3 +303,22 @@ def test_decisions_on_exact_coordinates_are_exact():
             assert abs(hits["t"][i] - float(solution[0])) <= 2.0**-23 * 20.0
             assert abs(hits["u"][i] - float(solution[1])) <= 2.0**-24
     assert on_edge > 200
+
+
+@kernel
+def products_kernel(m: wp.array(dtype=wp.vec4), forth: wp.array(dtype=wp.float32), back: wp.array(dtype=wp.float32)):
+    i = wp.tid()
+    forth[i] = m[i][0] * m[i][1] - m[i][2] * m[i][3]
+    back[i] = m[i][2] * m[i][3] - m[i][0] * m[i][1]
+
+
+def test_kernels_are_compiled_without_fused_multiply_add():
+    # Each product must be rounded by itself: two triangles see a common edge from opposite sides, and their areas must be
+    # exact negatives. Products that are nearly equal show it.
+    rng = np.random.default_rng(9)
+    m = rng.normal(size=(20_000, 4)).astype(np.float32)
+    m[:, 3] = m[:, 0] * m[:, 1] / m[:, 2]
+    forth, back = zeros(len(m)), zeros(len(m))
+    launch(products_kernel, len(m), wp.array(m, dtype=wp.vec4, device="cpu"), forth, back)
+    assert np.array_equal(forth.numpy(), -back.numpy())
+    assert np.array_equal(forth.numpy(), m[:, 0] * m[:, 1] - m[:, 2] * m[:, 3])

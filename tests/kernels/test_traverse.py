@@ -8,7 +8,7 @@ import pytest
 from tests.kernel_tools import CPU, directions, floats, ints, launch, rounded, unit, vec3s, zeros  # isort: skip
 import warp as wp
 
-from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.accel import ACCELERATORS, Geometry, Structure, build
 from wrt.kernels.query import HitArrays, RayArrays, load_ray
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.mesh import Mesh
@@ -281,11 +281,11 @@ def accepts_even_near_edge(surfaces: Surfaces, prim_id: int, u: float, v: float)
 @cache
 def refusing_kernels(name):
     """Kernels over rays with an `exclude` each, and over traversals that refuse hits."""
-    cls = next(cls for cls in ACCELERATORS.values() if cls.name == name)
-    struct = cls.struct
-    closest = cls.traversal(any_hit=False, with_spheres=False)
-    picky = cls.traversal(any_hit=False, with_spheres=False, accepts=accepts_even_near_edge)
-    picky_any = cls.traversal(any_hit=True, with_spheres=False, accepts=accepts_even_near_edge)
+    structure = Structure(next(cls for cls in ACCELERATORS.values() if cls.name == name))
+    struct = structure.struct
+    closest = structure.traversal(any_hit=False)
+    picky = structure.traversal(any_hit=False, accepts=accepts_even_near_edge)
+    picky_any = structure.traversal(any_hit=True, accepts=accepts_even_near_edge)
 
     @kernel
     def excluding(accel: struct, surfaces: Surfaces, rays: RayArrays, exclude: wp.array(dtype=wp.int32), hits: HitArrays):

@@ -15,6 +15,7 @@ from wrt.accel.base import RAYS_PER_LAUNCH
 from wrt.device import records
 from wrt.errors import InputError
 from wrt.kernels.structs import Primitive
+from wrt.kernels.traverse import Units
 from wrt.mesh import Mesh
 from wrt.shapes import icosphere, torus
 
@@ -178,15 +179,15 @@ def test_primitive_records_in_any_order() -> None:
     spheres = np.array([[1.0, 2.0, 3.0, 0.5]], np.float32)
     geometry = Geometry(BALL.vertices, BALL.faces, spheres)
     order = np.random.default_rng(2).permutation(len(geometry)).astype(np.int32)
-    out = geometry.primitives(order)
+    out = geometry.primitives(Units(spheres=True), order)
     assert out.dtype == records(Primitive, 0).dtype and np.array_equal(out["prim_id"], order)
     for row in out[::7]:
         if row["prim_id"] < len(BALL.faces):
             corners = BALL.vertices[BALL.faces[row["prim_id"]]]
             assert np.array_equal([row["v0"], row["v1"], row["v2"]], corners)
-        else:
-            assert row["v0"].tolist() == [1.0, 2.0, 3.0] and row["v1"][0] == 0.5
-    plain = Geometry.of(BALL).primitives()
+        else:  # a sphere is read from the surfaces
+            assert row["prim_id"] == len(BALL.faces)
+    plain = Geometry.of(BALL).primitives(Units())
     assert np.array_equal(plain["v1"], BALL.vertices[BALL.faces[:, 1]])
 
 

@@ -83,7 +83,7 @@ def test_normals_agree_at_every_pixel_but_edges(name: str) -> None:
     assert (ours["prim_id"] != theirs.prim_id).mean() < 2e-3  # rays through an edge, where either triangle is right
 
 
-def placed(mesh: wrt.Mesh, material: Material, *, at: tuple[float, float, float], scale: float = 1.0, turn: float = 0.0) -> Object:
+def placed(mesh: wrt.Mesh, material: Material, *, at: tuple[float, ...], scale: float = 1.0, turn: float = 0.0) -> Object:
     """A mesh turned about x (radians), scaled, and moved."""
     c, s = math.cos(turn), math.sin(turn)
     matrix = np.eye(4)
@@ -102,7 +102,8 @@ def specular_scene() -> Scene:
     """Glass, mirror, gold, absorption and a thin pane under a picture of surroundings; nothing diffuse."""
     image = np.random.default_rng(0).uniform(0.0, 1.0, (8, 16, 3)) ** 3
     gold = dict(zip(("eta", "k"), CONDUCTORS["gold"], strict=True))
-    pane = placed(quad((-1, -1, 0), (2, 0, 0), (0, 2, 0)), Material("glass", thin=True, albedo=(1, 1, 1)), at=(0.2, 1.0, 0.3), scale=0.4)
+    thin = Material("glass", thin=True, albedo=(1, 1, 1))
+    pane = placed(quad((-1, -1, 0), (2, 0, 0), (0, 2, 0)), thin, at=(0.2, 1.0, 0.3), scale=0.4)
     ring = placed(torus(), GLASS, at=(-1.1, -0.3, 1.0), scale=0.35, turn=0.4)
     return Scene(
         spheres=(Sphere((-1, 0.2, -0.5), 0.7, GLASS), Sphere((0.6, 0, -0.5), 0.7, Material("mirror", albedo=(0.9, 0.8, 0.7))),
@@ -121,7 +122,8 @@ def thin_lens_scene() -> Scene:
     crate = placed(box(), Material(albedo=(0.6, 0.6, 0.2)), at=(-1.6, -0.3, 0.8), scale=0.6)
     return Scene(
         objects=(FLOOR, lamp, crate), lights=lights,
-        spheres=(Sphere((-0.8, 0, 0), 0.6, Material(albedo=(0.8, 0.2, 0.2))), Sphere((0.9, 0, -1.5), 0.6, Material(albedo=(0.2, 0.8, 0.2))),
+        spheres=(Sphere((-0.8, 0, 0), 0.6, Material(albedo=(0.8, 0.2, 0.2))),
+                 Sphere((0.9, 0, -1.5), 0.6, Material(albedo=(0.2, 0.8, 0.2))),
                  Sphere((0.3, -0.2, 1.2), 0.4, Material(albedo=(0.2, 0.2, 0.8)))),
         cameras=(Camera(CAMERA.camera_to_world, CAMERA.fov_y, aperture_radius=0.12, focus_distance=3.6),),
         settings=Settings(max_depth=6, filter="box"))
@@ -131,8 +133,8 @@ def whitted_scene() -> Scene:
     """Both together, with an emissive sphere, ambient light and a rough metal."""
     specular, diffuse = specular_scene(), thin_lens_scene()
     lamp = Sphere((0.2, -0.4, 1.5), 0.25, Material(emission=(2, 3, 4), albedo=(0.1, 0.1, 0.1)))
-    return replace(specular, objects=diffuse.objects + specular.objects, spheres=(*specular.spheres, lamp), lights=diffuse.lights,
-                   ambient=(0.05, 0.06, 0.07), settings=Settings(max_depth=12, min_throughput=0.0, filter="box"))
+    return replace(specular, objects=diffuse.objects + specular.objects, spheres=(*specular.spheres, lamp),
+                   lights=diffuse.lights, ambient=(0.05, 0.06, 0.07), settings=Settings(max_depth=12, min_throughput=0.0, filter="box"))
 
 
 @pytest.mark.parametrize(("make", "integrator", "spp"), [

@@ -12,10 +12,14 @@ import warp as wp
 
 import wrt
 from tests.data import ROOT
-from wrt.accel import ACCELERATORS
+from wrt.accel import ACCELERATORS, Structure
+from wrt.accel.base import any_hit_kernel, closest_hit_kernel
 from wrt.device import start
-from wrt.features import Features, features_of
 from wrt.driver import aov_kernel, render_kernel
+from wrt.features import Features, features_of
+from wrt.kernels.ray_aabb import RAY_AABB
+from wrt.kernels.ray_triangle import RAY_TRIANGLE
+from wrt.kernels.traverse import Units
 from wrt.scene import Scene
 
 SCENES = sorted((ROOT / "scenes").glob("*.toml"))
@@ -56,18 +60,19 @@ def test_a_scene_renders(path: Path) -> None:
 def test_kernels_compile_for_turing_and_hopper(path: Path, tmp_path: Path) -> None:
     start("cpu")
     for variant in features(path):
-        binaries = wp.compile_aot_module(render_kernel(variant, ACCELERATORS["bvh"]).module, arch=[75, 90], module_dir=tmp_path)
+        kernel = render_kernel(variant, Structure(ACCELERATORS["bvh"], Units(spheres=variant.spheres)))
+        binaries = wp.compile_aot_module(kernel.module, arch=[75, 90], module_dir=tmp_path)
         assert [Path(binary).stat().st_size > 10_000 for binary in binaries] == [True, True]
 
 
 def test_the_other_kernels_compile_for_turing_and_hopper(tmp_path: Path) -> None:
-    from wrt.accel.base import _any_hit_kernel, _closest_hit_kernel
-
     start("cpu")
     variant = Features(spheres=True, textures=True, smooth=True, cutout=True)
-    kernels = [aov_kernel(variant, ACCELERATORS["bvh"])]
-    for name in ("bvh", "brute_force"):
-        kernels += [make(ACCELERATORS[name], True) for make in (_closest_hit_kernel, _any_hit_kernel)]
+    kernels = [aov_kernel(variant, Structure(ACCELERATORS["bvh"], Units(spheres=True)))]
+    kernels += [make(Structure(ACCELERATORS[name], Units(spheres=True)))
+                for name in ("bvh", "brute_force") for make in (closest_hit_kernel, any_hit_kernel)]
+    kernels += [closest_hit_kernel(Structure(ACCELERATORS["bvh"], Units(triangle=name))) for name in RAY_TRIANGLE]
+    kernels += [closest_hit_kernel(Structure(ACCELERATORS["bvh"], Units(box=name))) for name in RAY_AABB]
     for kernel in kernels:
         binaries = wp.compile_aot_module(kernel.module, arch=[75, 90], module_dir=tmp_path)
         assert len(binaries) == 2

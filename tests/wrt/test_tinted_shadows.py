@@ -30,7 +30,8 @@ def floor_below(glass: Material, angle: float, shadows: str, thickness: float = 
     camera = Camera.look_at((0, 0.5, 0.8), (0, 0, 0), fov_y=0.01)
 
     def render(objects: tuple[Object, ...]) -> float:
-        scene = Scene(objects=objects, lights=(light,), cameras=(camera,), settings=Settings(filter="box", glass_shadows=shadows))
+        settings = Settings(filter="box", glass_shadows=shadows)
+        scene = Scene(objects=objects, lights=(light,), cameras=(camera,), settings=settings)
         return float(wrt.render(scene, spp=1, size=(2, 2), max_depth=0).pixels[..., 1].mean())
 
     return render((floor, Object(pane, (glass,)))) / render((floor,))

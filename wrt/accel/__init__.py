@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits
+from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
 from wrt.accel.brute_force import BruteForce
 from wrt.accel.bvh2 import Bvh2
 from wrt.errors import InputError
 from wrt.mesh import Mesh
 
-__all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "build"]
+__all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "Structure", "build"]
 
 ACCELERATORS: dict[str, type[Accelerator]] = {
     "bvh": Bvh2,  # the default: the best one there is
@@ -21,7 +21,8 @@ ACCELERATORS: dict[str, type[Accelerator]] = {
 
 def build(mesh: Mesh | Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None,
           **options: Any) -> Accelerator:
-    """A structure over a mesh. accel: a name in ACCELERATORS; options: the structure's own (see its class).
+    """A structure over a mesh. accel: a name in ACCELERATORS; options: `triangle` and `box`, the intersection tests (names in
+    kernels.ray_triangle.RAY_TRIANGLE and kernels.ray_aabb.RAY_AABB), and the structure's own (see its class).
 
     Raises InputError for an unknown name or device.
     """

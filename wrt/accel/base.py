@@ -7,16 +7,19 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import warp as wp
 
+from wrt.accel.triangle_data import TRIANGLE_DATA
 from wrt.device import load_kernel, records, run_all, start, thread_count, upload
 from wrt.errors import InputError
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
-from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT
-from wrt.kernels.structs import Primitive, Surfaces
+from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT, RAY_AABB
+from wrt.kernels.ray_triangle import RAY_TRIANGLE
+from wrt.kernels.structs import Surfaces
+from wrt.kernels.traverse import Units
 from wrt.mesh import Mesh
 
 RAYS_PER_LAUNCH = 16384
@@ -58,22 +61,15 @@ class Geometry:
             pad = np.float32(PAD_EXTENT) * extent.max(axis=1, keepdims=True, initial=0.0)
             return lo - (pad + np.float32(PAD_COORDINATE) * np.abs(lo)), hi + (pad + np.float32(PAD_COORDINATE) * np.abs(hi))
 
-    def primitives(self, order: np.ndarray | None = None) -> np.ndarray:
-        """Device records (kernels.structs.Primitive) in the given order of prim_id, or in their own."""
+    def primitives(self, units: Units, order: np.ndarray | None = None) -> np.ndarray:
+        """What the triangle test of `units` reads, in the given order of prim_id, or in their own."""
         prim_id = np.arange(len(self), dtype=np.int32) if order is None else order
-        out = records(Primitive, len(prim_id))
+        out = records(units.triangle_test.record, len(prim_id))
         out["prim_id"] = prim_id
-        n = len(self.faces)
-        if not len(self.spheres):
-            for i in range(3):
-                out[f"v{i}"] = self.vertices[self.faces[prim_id, i]]
-            return out
-        triangle = prim_id < n
-        for i in range(3):
-            out[f"v{i}"][triangle] = self.vertices[self.faces[prim_id[triangle], i]]
-        sphere = self.spheres[prim_id[~triangle] - n]
-        out["v0"][~triangle] = sphere[:, :3]
-        out["v1"][~triangle, 0] = sphere[:, 3]
+        triangle = prim_id < len(self.faces) if units.spheres else slice(None)
+        part = out[triangle]
+        TRIANGLE_DATA[units.triangle](part, *(self.vertices[self.faces[prim_id[triangle], i]] for i in range(3)))
+        out[triangle] = part
         return out
 
 
@@ -107,17 +103,48 @@ class Hits:
         return f"Hits({len(self)} rays)"
 
 
+def check_units(triangle: str, box: str) -> None:
+    """Raise InputError where there is no triangle test or box test of that name."""
+    for choice, table, what in ((triangle, RAY_TRIANGLE, "triangle test"), (box, RAY_AABB, "box test")):
+        if choice not in table:
+            raise InputError(f"no {what} {choice!r}; there is {', '.join(table)}")
+
+
+class Structure(NamedTuple):
+    """A kind of structure together with the units that walk it: what a kernel is made from. Hashable."""
+
+    accel: type[Accelerator]
+    units: Units = Units()
+
+    @property
+    def struct(self) -> Any:
+        """The Warp struct of the structure's arrays."""
+        return self.accel.kernels.make_struct(self.units.triangle_test.record)
+
+    def traversal(self, *, any_hit: bool, accepts: Any = None) -> Any:
+        """The traversal unit as a Warp function (accel, surfaces, ray) -> Hit."""
+        return self.accel.kernels.make_traversal(self.units, any_hit, accepts)
+
+
 class Accelerator(ABC):
-    """A structure over a geometry, on a device. Subclasses set `kernels` and implement `_build`."""
+    """A structure over a geometry, on a device. Subclasses set `name` and `kernels`, and implement `_build`.
+
+    kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts).
+    """
 
     name: ClassVar[str]
-    kernels: ClassVar[ModuleType]  # has make_traversal(any_hit, with_spheres, accepts)
-    struct: ClassVar[Any]  # the Warp struct that the traversal takes
+    kernels: ClassVar[ModuleType]
 
-    def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, **options: Any) -> None:
+    def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
+                 box: str = "conservative", **options: Any) -> None:
+        check_units(triangle, box)
         self.device = start(device)
         self.geometry = geometry
         self.threads = thread_count(threads)
+        self.structure = Structure(type(self), Units(triangle, box, len(geometry.spheres) > 0))
+        self._surfaces = Surfaces()
+        self._surfaces.n_triangles = len(geometry.faces)
+        self._surfaces.spheres = upload(geometry.spheres, wp.vec4, self.device)
         begin = time.perf_counter()
         self.data, self.stats = self._build(begin, **options)
 
@@ -129,11 +156,6 @@ class Accelerator(ABC):
         s = self.stats
         return (f"{type(self).__name__}({len(self.geometry)} primitives, {s.nodes} nodes, depth {s.depth}, "
                 f"{s.bytes / 1e6:.1f} MB, SAH {s.sah_cost:.1f}, built in {s.build_seconds:.3f} s)")
-
-    @classmethod
-    def traversal(cls, *, any_hit: bool, with_spheres: bool, accepts: Any = None) -> Any:
-        """The traversal unit as a Warp function (accel, surfaces, ray) -> Hit."""
-        return cls.kernels.make_traversal(any_hit, with_spheres, accepts)
 
     def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                     threads: int | None = None) -> Hits:
@@ -147,7 +169,7 @@ class Accelerator(ABC):
         hits = HitArrays()
         for field, dtype in (("t", wp.float32), ("u", wp.float32), ("v", wp.float32), ("prim_id", wp.int32)):
             setattr(hits, field, wp.empty(n, dtype=dtype, device=self.device))
-        self._launch(_closest_hit_kernel(type(self), self._has_spheres), rays, hits, n, threads)
+        self._launch(closest_hit_kernel(self.structure), rays, hits, n, threads)
         out = [hits.t, hits.u, hits.v, hits.prim_id]
         return Hits(*(out if as_warp else [array.numpy() for array in out]))
 
@@ -157,16 +179,11 @@ class Accelerator(ABC):
         rays, as_warp = self._rays(origins, directions, t_min, t_max)
         n = len(rays.t_min)
         dark = wp.empty(n, dtype=wp.bool, device=self.device)
-        self._launch(_any_hit_kernel(type(self), self._has_spheres), rays, dark, n, threads)
+        self._launch(any_hit_kernel(self.structure), rays, dark, n, threads)
         return dark if as_warp else dark.numpy()
 
-    @property
-    def _has_spheres(self) -> bool:
-        return len(self.geometry.spheres) > 0
-
     def _launch(self, kernel: Any, rays: RayArrays, out: Any, n: int, threads: int | None) -> None:
-        surfaces = Surfaces()
-        surfaces.n_triangles = len(self.geometry.faces)
+        surfaces = self._surfaces
         if self.device.is_cuda:
             wp.launch(kernel, dim=n, inputs=[self.data, surfaces, rays, out, 0], device=self.device)
             return
@@ -229,10 +246,10 @@ def _vectors(value: Any, name: str) -> np.ndarray:
 
 
 @cache
-def _closest_hit_kernel(cls: type[Accelerator], with_spheres: bool) -> Any:
-    return make_closest_hit_kernel(cls.struct, cls.traversal(any_hit=False, with_spheres=with_spheres))
+def closest_hit_kernel(structure: Structure) -> Any:
+    return make_closest_hit_kernel(structure.struct, structure.traversal(any_hit=False))
 
 
 @cache
-def _any_hit_kernel(cls: type[Accelerator], with_spheres: bool) -> Any:
-    return make_any_hit_kernel(cls.struct, cls.traversal(any_hit=True, with_spheres=with_spheres))
+def any_hit_kernel(structure: Structure) -> Any:
+    return make_any_hit_kernel(structure.struct, structure.traversal(any_hit=True))

@@ -8,19 +8,17 @@ from typing import Any
 from wrt.accel.base import Accelerator, AccelStats
 from wrt.device import upload
 from wrt.kernels import traverse_brute_force as kernels
-from wrt.kernels.structs import Primitive
 
 
 class BruteForce(Accelerator):
     name = "brute_force"
     kernels = kernels
-    struct = kernels.BruteForce
 
     def _build(self, begin: float, **options: Any) -> tuple[Any, AccelStats]:
         if options:
             raise TypeError(f"brute_force takes no options, got {', '.join(options)}")
-        data = kernels.BruteForce()
-        primitives = self.geometry.primitives()
-        data.primitives = upload(primitives, Primitive, self.device)
+        data = self.structure.struct()
+        primitives = self.geometry.primitives(self.structure.units)
+        data.primitives = upload(primitives, self.structure.units.triangle_test.record, self.device)
         stats = AccelStats(time.perf_counter() - begin, 0, 0, 0, primitives.nbytes, float(len(self.geometry)))
         return data, stats

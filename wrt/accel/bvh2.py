@@ -14,7 +14,6 @@ from wrt.device import records, run_all, start, upload
 from wrt.errors import InputError
 from wrt.kernels import build_bvh2
 from wrt.kernels import traverse_bvh2 as kernels
-from wrt.kernels.structs import Primitive
 
 
 class Bvh2(Accelerator):
@@ -22,7 +21,6 @@ class Bvh2(Accelerator):
 
     name = "bvh2"
     kernels = kernels
-    struct = kernels.Bvh2
 
     def _build(self, begin: float, max_leaf: int = 4, cost_traversal: float = 1.0,  # type: ignore[override]
                cost_intersection: float = 1.0) -> tuple[Any, AccelStats]:
@@ -31,10 +29,10 @@ class Bvh2(Accelerator):
         options = build_bvh2.BuildOptions()
         options.max_leaf, options.cost_traversal, options.cost_intersection = max_leaf, cost_traversal, cost_intersection
         nodes, order, depth = build_nodes(self.geometry.bounds(), options, self.threads)
-        primitives = self.geometry.primitives(order)
-        data = kernels.Bvh2()
+        primitives = self.geometry.primitives(self.structure.units, order)
+        data = self.structure.struct()
         data.nodes = upload(nodes, kernels.Bvh2Node, self.device)
-        data.primitives = upload(primitives, Primitive, self.device)
+        data.primitives = upload(primitives, self.structure.units.triangle_test.record, self.device)
         leaves = int((nodes["count_0"] > 0).sum() + (nodes["count_1"] > 0).sum())
         stats = AccelStats(time.perf_counter() - begin, len(nodes), leaves, depth, nodes.nbytes + primitives.nbytes,
                            sah_cost(nodes))

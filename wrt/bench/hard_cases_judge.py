@@ -35,13 +35,15 @@ class Errors:
         """Count absolute errors; returns where they are above the bound."""
         if not len(error):
             return np.zeros(0, bool)
+        error = np.where(np.isnan(error), np.inf, error)
         scaled = error / unit
         self.largest = max(self.largest, float(scaled.max()))
         octave = np.log2(np.maximum(scaled, 2.0**LOWEST_OCTAVE)) - LOWEST_OCTAVE
         index = np.minimum(np.ceil(octave * BINS_PER_OCTAVE), N_BINS - 1).astype(np.int64)
         self.histogram += np.bincount(index, minlength=N_BINS)
-        over = error > bound
-        self.largest_ratio = max(self.largest_ratio, float((error / bound).max()))
+        over = (error > bound) | np.isinf(error)
+        self.largest_ratio = max(self.largest_ratio, float((error[~over] / bound[~over]).max(initial=0.0)),
+                                 float(np.where(np.isinf(error), np.inf, error / bound)[over].max(initial=0.0)))
         self.over += int(over.sum())
         return over
 
@@ -207,7 +209,7 @@ def _judge_closeness(case: HardCase, reference: Reference, claims: _Claims, verd
     wrong[found.ray[passed & certain & other]] = True
     if case.closed:
         skipped = passed & ~certain & other & (claims.t[found.ray] > found.t + bound + claims.t_bound[found.ray])
-        wrong |= _leaks(case, found.chosen(np.flatnonzero(skipped)), claims.t, o, d)
+        wrong |= _leaks(case, found.chosen(np.flatnonzero(skipped)), claims.row, claims.t)
     same = claims.prim_id == answer.prim_id
     for ray, tied in answer.ties.items():
         same[ray] |= claims.prim_id[ray] in tied
@@ -250,22 +252,23 @@ def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdic
         missed[found.ray[certain]] = True
         border[found.ray] = True
         if case.closed:
-            missed |= _leaks(case, found.chosen(np.flatnonzero(~missed[found.ray])), np.full(len(part), np.inf), o, d)
+            missed |= _leaks(case, found.chosen(np.flatnonzero(~missed[found.ray])), part, np.full(len(part), np.inf))
         verdict.borderline_misses += int((border & ~missed).sum())
         verdict.wrong("misses", case, part[missed], "has a hit that had to be found")
 
 
-def _leaks(case: HardCase, skipped: AllHits, end: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """(n,) bool: rays that pass through a closed surface by the crossings that were left out: the winding number behind one
-    of them, before the next or before end[ray], is not that of the ray's start."""
-    leaks = np.zeros(len(o), bool)
-    for ray in np.unique(skipped.ray):
-        t = np.append(skipped.t[skipped.ray == ray], end[ray] if np.isfinite(end[ray]) else skipped.t.max() * 2.0 + 1.0)
+def _leaks(case: HardCase, skipped: AllHits, row: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """(n,) bool for the case's rays `row`: those that pass through a closed surface by crossings that were left out. The
+    winding number behind one of them, before the next or before end[i], is not that of the segment's start."""
+    leaks = np.zeros(len(row), bool)
+    for i in np.unique(skipped.ray):
+        t = skipped.t[skipped.ray == i]
+        t = np.append(t, end[i] if np.isfinite(end[i]) else 2.0 * t.max() + 1.0)
         wide = np.flatnonzero(np.diff(t) > 1e-6 * np.abs(t[1:]))
-        at = [float(case.t_min[0]) + 0.0, *(0.5 * (t[wide] + t[wide + 1]))]
-        points = o[ray].astype(np.float64) + np.array(at)[:, None] * d[ray].astype(np.float64)
-        winding = np.round(winding_number(case, points))
-        leaks[ray] = bool((winding[1:] != winding[0]).any())
+        at = np.array([float(case.t_min[row[i]]), *(0.5 * (t[wide] + t[wide + 1]))])
+        o, d = (x[row[i]].astype(np.float64) for x in (case.origins, case.directions))
+        winding = np.round(winding_number(case, o + at[:, None] * d))
+        leaks[i] = bool((winding[1:] != winding[0]).any())
     return leaks
 
 

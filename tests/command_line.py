@@ -1,0 +1,56 @@
+"""The command line called in this process, as a shell would see it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import sys
+from typing import NamedTuple
+from unittest import mock
+
+from wrt import cli
+
+BOX_OBJ = """\
+v -1 -1 -1
+v 1 -1 -1
+v 1 1 -1
+v -1 1 -1
+v -1 -1 1
+v 1 -1 1
+v 1 1 1
+v -1 1 1
+f 1 4 3 2
+f 5 6 7 8
+f 1 2 6 5
+f 3 4 8 7
+f 2 3 7 6
+f 1 5 8 4
+"""
+
+
+class Result(NamedTuple):
+    """What is left of a command: exit code, stdout, stderr."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def errors(self) -> list[str]:
+        """The lines of stderr that tell an error."""
+        return [line for line in self.err.splitlines() if line.lower().startswith("error:")]
+
+
+def wrt(*arguments: object) -> Result:
+    """`python -m wrt arguments` without a new process. An exception that main() lets through goes on: it is a traceback."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(mock.patch.object(sys, "argv", ["wrt", *map(str, arguments)]))
+        stack.enter_context(mock.patch.object(cli, "_leave", sys.exit))  # os._exit would end the tests
+        stack.enter_context(contextlib.redirect_stdout(out))
+        stack.enter_context(contextlib.redirect_stderr(err))
+        try:
+            cli.main()
+        except SystemExit as error:
+            code = error.code
+    return Result(code if isinstance(code, int) else 0, out.getvalue(), err.getvalue())

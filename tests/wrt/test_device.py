@@ -1,0 +1,107 @@
+"""Warp's start, uploads, threads."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+from wrt.device import _stderr_without, describe_devices, memory_size, records, run_all, start, thread_count, upload
+
+import warp as wp  # isort: skip (after wrt.device, which silences Warp's banner)
+
+from wrt.errors import InputError
+
+
+@pytest.mark.parametrize("name", ["nope", "", "cuda:999", "cpu:1", "CPU"])
+def test_an_unknown_device_is_refused_with_those_there_are(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError, match=r"no device .*; there is cpu"):
+        start(name)
+    assert capfd.readouterr().err == ""  # and Warp's C++ side keeps quiet about it
+
+
+def test_the_cpu_is_there() -> None:
+    assert start("cpu").is_cpu and start("cpu") is start("cpu")
+    assert describe_devices()[0].startswith("cpu: ") and len(describe_devices()) == 1 + len(wp.get_cuda_devices())
+    assert memory_size(start("cpu")) > 2**28
+
+
+def test_stderr_loses_only_the_lines_that_are_not_wanted(capfd: pytest.CaptureFixture[str]) -> None:
+    with _stderr_without(b"unwanted"):
+        os.write(2, b"first\nan unwanted line\n")  # as C++ does, past Python
+        os.write(2, b"last, without an end")
+    assert capfd.readouterr().err == "first\nlast, without an end"
+    with pytest.raises(KeyError), _stderr_without(b"unwanted"):
+        os.write(2, b"before the error\n")
+        raise KeyError
+    os.write(2, b"after it\n")
+    assert capfd.readouterr().err == "before the error\nafter it\n"
+
+
+def test_a_process_without_stderr_can_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", None)
+    with _stderr_without(b"x"):
+        pass
+
+
+def test_threads() -> None:
+    assert thread_count(3) == 3 and 1 <= thread_count(None) <= (os.cpu_count() or 1)
+    for wrong in (0, -1):
+        with pytest.raises(InputError, match="threads must be 1 or more"):
+            thread_count(wrong)
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+def test_run_all_runs_each_task_once_and_raises_the_first_error(threads: int) -> None:
+    done: list[int] = []
+    lock = threading.Lock()
+
+    def task(i: int) -> None:
+        if i in (5, 7):
+            raise RuntimeError(f"task {i}")
+        with lock:
+            done.append(i)
+
+    run_all([lambda i=i: task(i) for i in range(5)], threads)
+    assert sorted(done) == list(range(5))
+    with pytest.raises(RuntimeError, match="task 5"):
+        run_all([lambda i=i: task(i) for i in range(5, 10)], threads)
+    run_all([], threads)
+
+
+@pytest.mark.parametrize(("array", "dtype", "shape"), [
+    (np.arange(12, dtype=np.float64).reshape(4, 3), wp.vec3, (4, 3)),
+    (np.arange(12, dtype=np.float32).reshape(3, 4).T, wp.vec3, (4, 3)),  # not contiguous
+    (np.arange(5), wp.int32, (5,)),
+    (np.zeros((0, 3)), wp.vec3, (0, 3)),
+    (np.arange(4, dtype=np.uint8), wp.uint8, (4,)),
+])
+def test_upload_keeps_the_values(array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
+    back = upload(array, dtype, start("cpu")).numpy()
+    assert back.shape == shape and np.array_equal(back, array)
+
+
+def test_upload_never_lets_a_device_write_into_a_frozen_array() -> None:
+    open_array, frozen = np.zeros(4, np.float32), np.zeros(4, np.float32)
+    frozen.setflags(write=False)
+    for array in (open_array, frozen):
+        upload(array, wp.float32, start("cpu")).fill_(1.0)
+    assert open_array.tolist() == [1.0] * 4  # no copy where none is needed
+    assert frozen.tolist() == [0.0] * 4
+
+
+@wp.struct
+class Pair:
+    number: wp.int32
+    vector: wp.vec3
+
+
+def test_records_go_up_and_come_back() -> None:
+    rows = records(Pair, 3)
+    assert rows.shape == (3,) and not rows["number"].any() and not rows["vector"].any()
+    rows["number"], rows["vector"][1] = (7, 8, 9), (1, 2, 3)
+    back = upload(rows, Pair, start("cpu")).numpy()
+    assert back["number"].tolist() == [7, 8, 9] and back["vector"][1].tolist() == [1, 2, 3]

@@ -1,0 +1,90 @@
+"""What a render tells of itself while it runs."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from tests.command_line import BOX_OBJ, wrt
+from wrt.driver import Progress
+from wrt.progress import LINE_EVERY, describe, progress_reporter
+
+
+def at(seconds: float, done: int = 50) -> Progress:
+    return Progress(done=done, total=200, rays=int(4e6 * seconds), seconds=seconds)
+
+
+@pytest.mark.parametrize(("progress", "expected"), [
+    (at(10.0), "4.0 Mray/s, 0:30 left"),
+    (at(1000.0), "4.0 Mray/s, 50:00 left"),
+    (at(3.0, done=200), "4.0 Mray/s, 0:00 left"),
+    (at(3.0, done=0), "4.0 Mray/s, ?"),
+    (at(0.0, done=0), "0.0 Mray/s, ?"),
+])
+def test_rays_a_second_and_time_left(progress: Progress, expected: str) -> None:
+    assert describe(progress) == expected
+
+
+def test_quiet_is_silent() -> None:
+    with progress_reporter(True) as report:
+        assert report is None
+
+
+def test_without_a_terminal_there_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    stderr = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stderr)
+    with progress_reporter(False) as report:
+        assert report is not None
+        told = []
+        for second in range(35):
+            report(at(float(second)))
+            told.append(stderr.getvalue().count("\n"))
+    assert told == [int(second // LINE_EVERY) for second in range(35)]
+    assert set(stderr.getvalue().splitlines()[0]) & set("\x1b\r") == set()
+    assert stderr.getvalue().startswith("25 %, 4.0 Mray/s, 0:30 left\n")
+
+
+def test_a_process_without_stderr_can_render(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", None)
+    with progress_reporter(False) as report:
+        assert report is not None
+        report(at(1.0))
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
+def test_on_a_terminal_there_is_a_bar_that_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    main, terminal = os.openpty()
+    seen: list[bytes] = []
+
+    def read() -> None:
+        try:
+            while data := os.read(main, 65536):
+                seen.append(data)
+        except OSError:  # how Linux tells that the other side is closed
+            pass
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    with open(terminal, "w") as stderr:
+        monkeypatch.setattr(sys, "stderr", stderr)
+        with progress_reporter(False) as report:
+            assert report is not None
+            report(at(10.0))
+    reader.join()
+    os.close(main)
+    text = b"".join(seen).decode()
+    assert "render" in text and "25%" in text and "4.0 Mray/s, 0:30 left" in text
+    assert "\x1b[?25h" in text and text.rindex("\x1b[?25h") > text.rindex("25%")  # the cursor is back
+    assert text.endswith("\x1b[2K")  # and the line is empty again
+
+
+def test_a_short_render_shows_no_bar_where_stderr_is_no_terminal(tmp_path: Path) -> None:
+    (tmp_path / "box.obj").write_text(BOX_OBJ)
+    result = wrt("render", tmp_path / "box.obj", "-o", tmp_path / "a.png", "--size", "16x9", "--spp", 2)
+    assert result.code == 0 and "━" not in result.err and "left" not in result.err
