@@ -2,7 +2,9 @@
 
 import warp as wp
 
-from wrt.kernels.structs import Ray, Surfaces, kernel
+from wrt.kernels.structs import NO_HIT, Ray, Surfaces, kernel
+from wrt.kernels.surface import spawn_point
+from wrt.kernels.traverse import make_intersect, make_probe, no_hit
 
 
 @wp.struct
@@ -61,3 +63,77 @@ def make_any_hit_kernel(accel_struct, traverse):
         dark[i] = hit.prim_id >= 0
 
     return any_hit
+
+
+@wp.struct
+class Respawn:
+    """Where rays go on from their hits; exclude: 1 to leave out the triangle that they start on, as the integrator does."""
+
+    direction: wp.array(dtype=wp.vec3)
+    exclude: int
+    first_prim_id: wp.array(dtype=wp.int32)
+    next_prim_id: wp.array(dtype=wp.int32)
+
+
+def make_respawn_kernel(accel_struct, traverse, surface_at):
+    """The hit of each ray, and the hit of a second one that leaves from there as the integrator's do; -1 on a miss.
+
+    On a sphere the second direction is turned to the outside: towards the inside it would hit the far wall, rightly.
+    """
+
+    @kernel
+    def respawn(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, out: Respawn, first: int):
+        i = first + wp.tid()
+        ray = load_ray(rays, i)
+        hit = traverse(accel, surfaces, ray)
+        out.first_prim_id[i] = hit.prim_id
+        out.next_prim_id[i] = -1
+        if hit.prim_id >= 0:
+            s = surface_at(surfaces, ray, hit)
+            outward = wp.where(s.front != 0, 1.0, -1.0) * s.geometric
+            d = out.direction[i]
+            if hit.prim_id >= surfaces.n_triangles and wp.dot(d, outward) < 0.0:
+                d = -d
+            next = Ray()
+            next.origin = spawn_point(s.point, s.error, s.geometric, d)
+            next.direction = d
+            next.t_min = 0.0
+            next.t_max = float(wp.inf)
+            next.exclude = wp.where(out.exclude != 0, s.exclude, -1)
+            out.next_prim_id[i] = traverse(accel, surfaces, next).prim_id
+
+    return respawn
+
+
+@wp.struct
+class HitList:
+    """Up to `capacity` hits a ray, in the order of prim_id; count may be larger than capacity."""
+
+    capacity: int
+    count: wp.array(dtype=wp.int32)
+    prim_id: wp.array(dtype=wp.int32)
+    t: wp.array(dtype=wp.float32)
+
+
+def make_all_hits_kernel(units):
+    """Every primitive that each ray hits in its segment, by testing all of them: what the units say, without a structure."""
+    probe_of = make_probe(units)
+    intersect = make_intersect(units)
+    record = units.triangle_test.record
+
+    @kernel
+    def all_hits(primitives: wp.array(dtype=record), surfaces: Surfaces, rays: RayArrays, out: HitList, first: int):
+        i = first + wp.tid()
+        ray = load_ray(rays, i)
+        probe = probe_of(ray)
+        n = int(0)
+        for j in range(primitives.shape[0]):
+            hit = intersect(probe, surfaces, primitives[j], no_hit(ray))
+            if hit.prim_id != NO_HIT:
+                if n < out.capacity:
+                    out.prim_id[i * out.capacity + n] = hit.prim_id
+                    out.t[i * out.capacity + n] = hit.t
+                n = n + 1
+        out.count[i] = n
+
+    return all_hits

@@ -115,6 +115,8 @@ def ray_aabb_plain(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, t_max: float) -> float
 
     As in ray_aabb, but nothing is widened, and 0 * inf = NaN (a ray within a face) goes wherever the comparisons send it.
     """
+    if lo[0] > hi[0]:
+        return float(wp.inf)  # sorted, the distances of an empty box would be those of all space
     enter = float(ray.t_min)
     leave = float(t_max)
     for axis in range(3):

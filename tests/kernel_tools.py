@@ -9,7 +9,7 @@ CPU = start("cpu")
 
 
 def vec3s(rows) -> wp.array:
-    """Rows of three numbers as a Warp array of vec3; one row or number is taken for all by `launch`'s caller."""
+    """Rows of three numbers as a Warp array of vec3."""
     return wp.array(np.ascontiguousarray(rows, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device=CPU)
 
 

@@ -95,12 +95,16 @@ def cli() -> None:
 @click.option("--min-throughput", type=float, help="Cut rays that carry less than this share  [default: 0.001]")
 @click.option("--filter", "filter_name", help="Pixel filter: box, gaussian or blackman-harris")
 @click.option("--fresnel", help="exact, or schlick (cheaper, approximate)")
+@click.option("--sampler", help="sobol (evenly spread), or independent (random)")
 @click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
 @click.option("--aov", type=Names(), default=(), help="Also depth, normal, albedo, prim_id, material_id")
 @click.option("--bits", type=int, help="PNG: 8 or 16; EXR: 16 or 32")
 @click.option("--tonemap", help="none, reinhard, aces or agx  [default: the scene's]")
 @click.option("--exposure", type=float, help="Stops  [default: the scene's, 0]")
 @click.option("--time-limit", type=Duration(), help="Stop after 30s, 5m, 1h of tracing, with what there is")
+@click.option("--target-error", type=float,
+              help="Stop when the estimated error of the picture is no larger: the root mean square, over pixels and channels, of"
+                   " the standard error in linear radiance (noise alone); --spp is then the most to take  [default: 65536]")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print the statistics as JSON")
 def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
@@ -121,7 +125,7 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
     # Whatever can be wrong with an option is told before a scene is read and a kernel compiled.
     settings = {"filter": options.pop("filter_name")}
     settings |= {name: options.pop(name) for name in (
-        "spp", "size", "max_depth", "min_throughput", "fresnel", "tonemap", "exposure")}
+        "spp", "size", "max_depth", "min_throughput", "fresnel", "sampler", "tonemap", "exposure")}
     Scene().with_settings(**settings)
     Options(**options)
     layers = aov if output.suffix.lower() != ".exr" else None  # in an EXR file they are channels, all of them
@@ -132,7 +136,7 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
 
     with _warnings_told(quiet), progress_reporter(quiet) as progress:
         with _naming(scene):
-            film = render_scene(loaded.with_settings(**settings), progress=progress, **options)
+            film = render_scene(loaded.with_settings(**settings), spp=settings["spp"], progress=progress, **options)
         if not film.stats["samples"]:
             raise KeyboardInterrupt  # there is nothing to keep
         begin = time.perf_counter()
@@ -160,6 +164,9 @@ def _summary(film: Any) -> str:
     if film.samples.min() == 0:
         note = f" (interrupted: {(film.samples == 0).mean():.0%} of the pixels are still black)"
     lost = f"; {s['not_finite']} samples were not finite and count as black" if s["not_finite"] else ""
+    if s.get("target_error") is not None:
+        note += f", estimated error {s['estimated_error']:.3g}"
+        note += "" if s["target_reached"] else f" (above the target of {s['target_error']:g})"
     return (f"{film.metadata['spp']} spp{note}, {s['rays'] / 1e6:.2f} M rays, {s['rays_per_second'] / 1e6:.2f} Mray/s; "
             f"{cut}, lost throughput {s['lost_throughput_per_sample']:.2g} a sample{lost}\nseconds: {seconds}")
 
@@ -296,6 +303,52 @@ def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float
         _say(sentence)
     if broken:
         raise SystemExit(1)
+
+
+@cli.group()
+def bench() -> None:
+    """Measure: speed against error, and one method against another."""
+
+
+@bench.command()
+@click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--size", type=int, default=512, show_default=True, help="Pixels a side as triangles grow")
+@click.option("--max-size", type=int, default=1024, show_default=True, help="Pixels a side at the end of the sweep from 64 on")
+@click.option("--max-triangles", type=int, default=1_500_000, show_default=True, help="Meshes are cut finer up to this many")
+@click.option("--runs", type=int, default=7, show_default=True, help="Runs of each kind, alternating")
+@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
+@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
+@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for a report with plots")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def visibility(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+    """Rasterising against ray casting, as triangles and pixels grow: the cost of both, and where they differ.
+
+    MESHES: .obj, .ply or .stl files; without any, a sphere and a terrain.
+    """
+    from wrt.bench import visibility as bench_visibility
+    from wrt.bench import visibility_report as report
+
+    plan = bench_visibility.Plan(meshes, **options)
+    if output is not None:
+        report.check_folder(output)
+    told = report.machine(plan)
+
+    def progress(row: Any) -> None:
+        if not quiet:
+            _say("  ".join(report.cells(row)[:7]))
+
+    with _warnings_told(quiet):
+        rows = bench_visibility.run(plan, progress)
+    paths = [] if output is None else report.write_report(rows, plan, output, told)
+    if as_json:
+        _say_json({"machine": told, "rows": [row.as_dict() for row in rows], "exponents": bench_visibility.fits(rows),
+                   "crossings": bench_visibility.crossings(rows), "output": paths})
+        return
+    click.echo(f"{told}\n\n{report.markdown(rows)}\n{report.LEGEND}")
+    for path in paths:
+        click.echo(path)
 
 
 @cli.command()

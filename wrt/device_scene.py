@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -11,7 +12,7 @@ import warp as wp
 
 from wrt.accel import Geometry
 from wrt.device import records, upload
-from wrt.errors import InputError
+from wrt.errors import InputError, SceneWarning
 from wrt.kernels import lights, structs, textures
 from wrt.scene import (
     ALPHA_MODES,
@@ -177,7 +178,7 @@ def light_records(scene: Scene, world: WorldMesh) -> tuple[np.ndarray, np.ndarra
             rows.append({"kind": lights.LIGHT_SPOT, "position": light.position, "color": light.intensity,
                          "direction": light.direction, "cos_inner": np.cos(light.inner), "cos_outer": np.cos(light.outer)})
     for sphere in scene.spheres:
-        if sphere.material.is_emissive and sphere.material.emits_light:
+        if sphere.material.lights_others:
             rows.append({"kind": lights.LIGHT_SPHERE, "position": sphere.center, "radius": sphere.radius,
                          "color": sphere.material.emission})
     groups = _emissive_groups(scene, world)
@@ -200,7 +201,7 @@ def light_records(scene: Scene, world: WorldMesh) -> tuple[np.ndarray, np.ndarra
 
 def _emissive_groups(scene: Scene, world: WorldMesh) -> list[np.ndarray]:
     """prim_ids of the faces that light, object by object."""
-    lit = np.array([m.is_emissive and m.emits_light for m in scene.materials], bool)
+    lit = np.array([m.lights_others for m in scene.materials], bool)
     groups = []
     first = 0
     for thing in scene.objects:
@@ -267,6 +268,11 @@ def upload_scene(scene: Scene, device: Any) -> DeviceScene:
     for sphere in scene.spheres:
         if sphere.material.alpha_mode == "mask" and sphere.material.albedo_texture is not None:
             raise InputError(f"sphere {sphere.name!r}: a cut-out texture needs a mesh; material {sphere.material.name!r}")
+    bare = [thing.name or str(i) for i, thing in enumerate(scene.objects)
+            if thing.mesh.uvs is None and any(m.textures for m in thing.materials)]
+    if bare:
+        warnings.warn(f"no texture coordinates, so that a texture's first texel is everywhere: objects {', '.join(bare)}",
+                      SceneWarning, stacklevel=2)
     world = world_mesh(scene)
     geometry = world.geometry
     table = TextureTable()

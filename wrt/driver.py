@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
@@ -15,10 +16,11 @@ import warp as wp
 import wrt
 from wrt.accel import ACCELERATORS, Structure, build
 from wrt.accel.base import check_units
-from wrt.device import load_kernel, memory_size, start, thread_count, upload
+from wrt.device import load_kernel, memory_size, start, thread_count
+from wrt.device_film import BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS, DeviceFilm
 from wrt.device_scene import camera_struct, upload_scene
 from wrt.errors import InputError
-from wrt.features import Features, features_of, filter_icdf
+from wrt.features import Features, features_of
 from wrt.film import Film
 from wrt.interrupt import held_interrupts
 from wrt.kernels import render as kernels
@@ -28,8 +30,9 @@ from wrt.scene import Camera, Scene
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 TILE_SIZE = 32
-BYTES_OF_FILM, BYTES_OF_AOVS, BYTES_OF_RESULT = 52, 36, 80  # a pixel; of the result: measured, with writing it to a file
-MAX_PASS = 64  # samples a pixel in one launch: what Ctrl-C and a time limit have to wait for
+BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
+MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
+MAX_SPP = 1 << 16  # where a target error asks for more than anybody said
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,13 @@ class Progress:
 @dataclass
 class Options:
     """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once; never change a
-    pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always taken."""
+    pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always taken.
+
+    target_error: stop when the estimated error of the picture is no larger: the root mean square, over its pixels and
+    channels, of the standard error in linear radiance. It is noise alone: what max_depth and min_throughput cut off is not
+    in it. A pixel's samples are then split over GROUPS independent sequences (wrt.device_film), and spp is the most to take
+    (rounded down to a multiple of GROUPS; one a group at least). The estimate is looked at when a group has 1, 2, 4, 8 ...
+    samples: only then is its sequence as even as it can be."""
 
     seed: int = 0
     device: str = "cpu"
@@ -63,6 +72,7 @@ class Options:
     crop: tuple[int, int, int, int] | None = None
     aov: Sequence[str] = ()
     time_limit: float | None = None
+    target_error: float | None = None
     tile_size: int = TILE_SIZE
     pass_size: int | None = None
     progress: Callable[[Progress], None] | None = None
@@ -81,6 +91,8 @@ class Options:
             raise InputError("tile_size and pass_size must be 1 or more")
         if self.time_limit is not None and not self.time_limit > 0.0:
             raise InputError(f"time_limit must be more than 0 seconds, got {self.time_limit}")
+        if self.target_error is not None and not 0.0 < self.target_error < math.inf:
+            raise InputError(f"target_error must be more than 0 and finite, got {self.target_error}")
         if not 0 <= self.seed < 2**32:
             raise InputError(f"seed must be 0 to 2^32 - 1, got {self.seed}")
         thread_count(self.threads)
@@ -92,10 +104,13 @@ def render(scene: Scene, *, spp: int | None = None, size: tuple[int, int] | None
     """Render a scene; returns a Film (linear pixels, variance, AOVs, stats).
 
     spp, size, max_depth, min_throughput, and any other of wrt.scene.Settings in `settings`, override the scene's own;
-    `options` are the fields of Options: seed, device, accel, threads, camera, crop, aov, time_limit, progress ...
+    `options` are the fields of Options: seed, device, accel, threads, camera, crop, aov, time_limit, target_error, progress ...
+    With target_error the scene's own spp is no limit, but MAX_SPP is, unless spp is given.
     The same arguments give the same pixels, bit for bit, for any threads, tile_size and pass_size. Interrupted by Ctrl-C, it
     returns what it has, with stats["interrupted"] set. Raises InputError for anything that cannot be rendered.
     """
+    if options.get("target_error") is not None and spp is None:
+        spp = MAX_SPP
     scene = scene.with_settings(spp=spp, size=size, max_depth=max_depth, min_throughput=min_throughput, **(settings or {}))
     return Renderer(scene, Options(**options)).run()
 
@@ -111,7 +126,7 @@ def aov_kernel(features: Features, structure: Structure) -> Any:
 
 
 class Renderer:
-    """One render of one scene: kernel, structure and film, made ready; `run` takes the samples."""
+    """One scene made ready to render: kernel and structure. `run` takes the samples, and can do so again with another seed."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         self.scene, self.options = scene, options
@@ -121,6 +136,7 @@ class Renderer:
         self.device = start(options.device)
         self.camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
         self.features = features_of(scene, self.camera)
+        self.groups = 1 if options.target_error is None else GROUPS
         self.crop = self._crop()
         self._check_memory()
         units = Units(options.triangle, options.box, self.features.spheres)
@@ -129,10 +145,6 @@ class Renderer:
         if options.aov:
             self.kernels.append(aov_kernel(self.features, structure))
         self._prepare()
-        self.film = _film_struct(scene.settings, self.device)
-        self.limits = structs.Limits()
-        self.limits.max_depth, self.limits.min_throughput = scene.settings.max_depth, scene.settings.min_throughput
-        self.limits.seed = options.seed
         self.device_camera = camera_struct(self.camera, scene.settings.size)
 
     def _crop(self) -> tuple[int, int, int, int]:
@@ -146,7 +158,7 @@ class Renderer:
         """Better told now than by the system after an hour, which ends whoever takes too much."""
         width, height = self.scene.settings.size
         x0, y0, x1, y1 = self.crop
-        film = BYTES_OF_FILM + (BYTES_OF_AOVS if self.options.aov else 0)
+        film = BYTES_OF_FILM + BYTES_OF_GROUP * (self.groups - 1) + (BYTES_OF_AOVS if self.options.aov else 0)
         needed, there = width * height * film + (x1 - x0) * (y1 - y0) * BYTES_OF_RESULT, memory_size(self.device)
         if needed > there:
             raise InputError(f"a picture of {width}x{height} takes {needed / 2**30:.1f} GiB of memory;"
@@ -179,9 +191,15 @@ class Renderer:
                            triangle=self.options.triangle, box=self.options.box, **self.options.accel_options)
         self.seconds["build"] = self.accel.stats.build_seconds
 
-    def run(self) -> Film:
-        """Take all samples (or as many as time allows) and return the film."""
-        interrupted, taken = False, 0
+    def run(self, *, seed: int | None = None, spp: int | None = None) -> Film:
+        """Take all samples (or as many as time allows, or as the target error needs) and return the film.
+
+        seed, spp: in place of the options' and the scene's.
+        """
+        self.seed = self.options.seed if seed is None else seed
+        self.spp = max(1, (spp or self.scene.settings.spp) // self.groups)  # a group
+        self.film = DeviceFilm(self.scene.settings, self.crop, self.device, self.seed, self.groups)
+        self.expected_spp, self.timed_out, interrupted = self.spp, False, False
         aov: dict[str, np.ndarray] = {}
         begin = time.perf_counter()
         with held_interrupts() as self.interrupts:
@@ -192,32 +210,43 @@ class Renderer:
                 begin = time.perf_counter()
                 for first, count in self._passes(begin):
                     self._run_pass(first, count, begin)
-                    taken = first + count
             except KeyboardInterrupt:  # from _each_tile, or from a progress callback that wants the end
                 interrupted = True
             self.seconds["trace"] = time.perf_counter() - begin
-            interrupted = interrupted or bool(self.interrupts)
-            timed_out = not interrupted and taken < self.scene.settings.spp
-            return self._result(aov, interrupted, timed_out)
+            return self._result(aov, interrupted or bool(self.interrupts))
 
     def _passes(self, begin: float) -> Iterator[tuple[int, int]]:
-        """First sample and number of samples of each pass: 1, 1, 2, 4 ... so that the first picture comes soon.
+        """First sample and number of samples (of each group) of each pass: 1, 1, 2, 4 ..., so that a first picture comes soon.
 
         A time limit counts from `begin`: a pass takes no more samples than are likely to be done by then, but for the
         first of each pixel, which is always taken.
         """
-        spp, limit = self.scene.settings.spp, self.options.time_limit
+        spp, limit = self.spp, self.options.time_limit
         first, count = 0, self.options.pass_size or 1
-        while first < spp:
+        while first < spp and not self._precise_enough(first):
             count = min(count, spp - first)
+            if self.options.target_error is not None:
+                count = min(count, (1 << first.bit_length()) - first)  # no farther than to the next power of 2
             if first > 0 and limit is not None:
                 elapsed = time.perf_counter() - begin
                 if elapsed >= limit:
+                    self.timed_out = True
                     return
                 count = max(1, min(count, int(min((limit - elapsed) / elapsed * first, spp))))
             yield first, count
             first += count
-            count = self.options.pass_size or min(first, MAX_PASS)
+            count = self.options.pass_size or min(first, MAX_PASS // self.groups)
+
+    def _precise_enough(self, taken: int) -> bool:
+        """Whether the target error is reached after so many samples of each group; looked at when they are a power of 2."""
+        target = self.options.target_error
+        if target is None or taken == 0 or taken & (taken - 1):
+            return False
+        error = self.film.error()
+        if error > target:  # at worst the variance falls as 1 / n
+            steps = math.ceil(min(2.0 * math.log2(error / target), 24.0))
+            self.expected_spp = min(self.spp, taken << steps)
+        return error <= target
 
     def _tiles(self) -> Iterator[tuple[int, int, int, int]]:
         x0, y0, x1, y1 = self.crop
@@ -234,15 +263,22 @@ class Renderer:
         wp.launch(kernel, dim=rectangle[2] * rectangle[3], inputs=[*arguments, tile, *rest], device=self.device)
 
     def _run_pass(self, first: int, count: int, begin: float) -> None:
-        arguments = [self.accel.data, self.device_scene.surfaces, self.device_scene.lighting, self.device_camera,
-                     self.limits, self.film]
+        world = [self.accel.data, self.device_scene.surfaces, self.device_scene.lighting, self.device_camera]
+        groups = [[*world, self._limits(seed), film] for seed, film in zip(self.film.seeds, self.film.groups, strict=True)]
         area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
 
         def trace(rectangle: tuple[int, int, int, int]) -> int:
-            self._launch(self.kernels[0], arguments, rectangle, (first, count))
+            for arguments in groups:
+                self._launch(self.kernels[0], arguments, rectangle, (first, count))
             return rectangle[2] * rectangle[3]
 
         self._each_tile(trace, lambda done: self._report(first * area + done * count, area, begin))
+
+    def _limits(self, seed: int) -> Any:
+        limits = structs.Limits()
+        limits.max_depth, limits.min_throughput = self.scene.settings.max_depth, self.scene.settings.min_throughput
+        limits.seed = seed
+        return limits
 
     def _each_tile(self, trace: Callable[[tuple[int, int, int, int]], int], report: Callable[[int], None]) -> None:
         """Trace every tile on all threads; `report` gets the number of pixels done, now and then. KeyboardInterrupt where
@@ -272,8 +308,8 @@ class Renderer:
     def _report(self, done: int, area: int, begin: float) -> None:
         if self.options.progress is None:
             return
-        rays = int(self.film.rays.numpy().sum())
-        self.options.progress(Progress(done, area * self.scene.settings.spp, rays, time.perf_counter() - begin))
+        total = area * self.expected_spp * self.groups
+        self.options.progress(Progress(done * self.groups, total, self.film.rays, time.perf_counter() - begin))
 
     def _aovs(self) -> dict[str, np.ndarray]:
         width, height = self.scene.settings.size
@@ -288,57 +324,38 @@ class Renderer:
             return rectangle[2] * rectangle[3]
 
         self._each_tile(trace, lambda done: None)
-        return {name: self._picture(getattr(film, name)) for name in self.options.aov}
+        return {name: self.film.picture(getattr(film, name)) for name in self.options.aov}
 
-    def _picture(self, array: Any) -> np.ndarray:
-        """A device array of one entry a pixel as (H, W) or (H, W, 3), cropped."""
-        width, height = self.scene.settings.size
-        x0, y0, x1, y1 = self.crop
-        pixels = array.numpy()
-        return pixels.reshape(height, width, *pixels.shape[1:])[y0:y1, x0:x1].copy()
-
-    def _result(self, aov: dict[str, np.ndarray], interrupted: bool, timed_out: bool) -> Film:
-        samples = self._picture(self.film.samples)
-        n = np.maximum(samples, 1)[..., None].astype(np.float32)
-        variance = self._picture(self.film.m2) / (n * np.maximum(n - 1.0, 1.0))
+    def _result(self, aov: dict[str, np.ndarray], interrupted: bool) -> Film:
+        film, samples = self.film, self.film.samples()
+        pixels, variance = film.pixels_and_variance()
         total = max(int(samples.sum()), 1)
-
-        def count(name: str) -> int:
-            return int(self._picture(getattr(self.film, name)).sum(dtype=np.int64))
-
-        rays = count("rays")
-        stats = {
+        rays = film.count("rays")
+        stats: dict[str, Any] = {
             "seconds": dict(self.seconds), "rays": rays, "rays_per_sample": rays / total,
             "rays_per_second": rays / self.seconds["trace"] if self.seconds["trace"] > 0.0 else 0.0,
-            "cut_by_depth": count("cut_depth"), "cut_by_throughput": count("cut_throughput"),
-            "lost_throughput_per_sample": float(self._picture(self.film.lost).sum(dtype=np.float64)) / total,
-            "not_finite": count("not_finite"), "samples": int(samples.sum()),
+            "cut_by_depth": film.count("cut_depth"), "cut_by_throughput": film.count("cut_throughput"),
+            "lost_throughput_per_sample": film.lost() / total,
+            "not_finite": film.count("not_finite"), "samples": int(samples.sum()),
             "triangles": len(self.accel.geometry.faces), "spheres": len(self.accel.geometry.spheres),
-            "accel": repr(self.accel), "interrupted": interrupted, "timed_out": timed_out,
+            "accel": repr(self.accel), "interrupted": interrupted,
+            "timed_out": self.timed_out and not interrupted,
         }
+        if self.options.target_error is not None:
+            error = film.error()
+            stats |= {"estimated_error": error, "target_error": self.options.target_error,
+                      "target_reached": error <= self.options.target_error and int(samples.min()) > 0}
         settings = self.scene.settings
         metadata = {
             "scene": plain_text(self.scene.name), "camera": plain_text(self.camera.name), "spp": int(samples.max()),
-            "seed": self.options.seed, "seconds": round(self.seconds["trace"], 3), "version": wrt.__version__,
+            "seed": self.seed, "seconds": round(self.seconds["trace"], 3), "version": wrt.__version__,
             "max_depth": settings.max_depth, "filter": settings.filter, "accel": self.options.accel,
             "device": self.options.device,
         }
-        return Film(pixels=self._picture(self.film.mean), variance=variance, samples=samples, aov=aov, stats=stats,
+        return Film(pixels=pixels, variance=variance, samples=samples, aov=aov, stats=stats,
                     metadata=metadata, exposure=settings.exposure, tonemap=settings.tonemap)
 
 
 def plain_text(name: str) -> str:
     """A name that a file can hold: names out of glTF files and of the system may have lone surrogates, which become "?"."""
     return name.encode("utf-8", "replace").decode()
-
-
-def _film_struct(settings: Any, device: Any) -> Any:
-    film = structs.Film()
-    film.width, film.height = settings.size
-    n = film.width * film.height
-    for name, dtype in (("mean", wp.vec3), ("m2", wp.vec3), ("samples", wp.int32), ("rays", wp.int64),
-                        ("cut_depth", wp.int32), ("cut_throughput", wp.int32), ("lost", wp.float32),
-                        ("not_finite", wp.int32)):
-        setattr(film, name, wp.zeros(n, dtype=dtype, device=device))
-    film.filter_icdf = upload(filter_icdf(settings.filter), wp.float32, device)
-    return film

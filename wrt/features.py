@@ -27,8 +27,9 @@ class Features:
     """Everything that changes the code of a kernel; what is False leaves no trace in it.
 
     lens, blades, filter: the camera's; independent: the samples are random numbers; spheres, smooth, textures, checkerboards,
-    normal_maps, cutout, blend: the surfaces'; mirror .. rough: the materials'; lights .. tinted_shadows: the lighting; derived: reflection, refraction, transmission,
-    transparent_shadows, sky_light, highlight. stack_size: the most rays that can be pending.
+    normal_maps, cutout, blend: the surfaces'; mirror .. rough: the materials'; lights .. tinted_shadows: the lighting;
+    derived: reflection, refraction, transmission, transparent_shadows, sky_light, highlight. stack_size: the most rays that
+    can be pending.
     """
 
     lens: bool = False
@@ -75,7 +76,7 @@ class Features:
 
 
 def mesh_lights(scene: Scene) -> bool:
-    return any(m.is_emissive and m.emits_light for thing in scene.objects for m in thing.materials)
+    return any(m.lights_others for thing in scene.objects for m in thing.materials)
 
 
 def is_rough(material: Material) -> bool:
@@ -98,7 +99,7 @@ def features_of(scene: Scene, camera: Camera) -> Features:
         "directional_lights": lit and any(isinstance(light, DirectionalLight) for light in scene.lights),
         "spot_lights": lit and any(isinstance(light, SpotLight) for light in scene.lights),
         "mesh_lights": lit and mesh_lights(scene),
-        "sphere_lights": lit and any(s.material.is_emissive and s.material.emits_light for s in scene.spheres),
+        "sphere_lights": lit and any(s.material.lights_others for s in scene.spheres),
     }
     transmission = any(m.kind == "metallic_roughness" and m.transmission > 0.0 for m in materials)
     glass = "glass" in kinds
@@ -178,7 +179,7 @@ def describe(scene: Scene, camera: str | int | None = None) -> dict[str, Any]:
         "spheres": len(scene.spheres),
         "materials": [f"{m.name or i} ({m.kind})" for i, m in enumerate(scene.materials)],
         "lights": [f"{light.name or i} ({type(light).__name__})" for i, light in enumerate(scene.lights)],
-        "emissive_objects": sum(any(m.is_emissive and m.emits_light for m in o.materials) for o in scene.objects),
+        "emissive_objects": sum(any(m.lights_others for m in o.materials) for o in scene.objects),
         "background": type(scene.background).__name__,
         "cameras": [c.name or str(i) for i, c in enumerate(scene.cameras)],
         "size": "{}x{}".format(*scene.settings.size),

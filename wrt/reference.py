@@ -104,7 +104,7 @@ class Reference:
     """A geometry made ready to be asked: its primitives in a tree of boxes that only ever err on the safe side.
 
     geometry: vertices (V, 3), faces (F, 3) and, if it has them, spheres (S, 4) of center and radius; float32 values.
-    prim_id counts the faces first, then the spheres.
+    prim_id counts the faces first, then the spheres. finite: (N,) bool, which primitives can be hit at all.
     """
 
     def __init__(self, geometry: Any) -> None:
@@ -116,7 +116,8 @@ class Reference:
         self.center, self.radius = np.ascontiguousarray(spheres[:, :3].T), spheres[:, 3]
         lo = np.concatenate([np.minimum(np.minimum(*self.corners[:2]), self.corners[2]), self.center - self.radius], axis=1)
         hi = np.concatenate([np.maximum(np.maximum(*self.corners[:2]), self.corners[2]), self.center + self.radius], axis=1)
-        self.leaf_prim, self.levels = _tree(*_widened(lo, hi, self.n_triangles))
+        self.finite = np.isfinite(lo).all(axis=0) & np.isfinite(hi).all(axis=0)
+        self.leaf_prim, self.levels = _tree(*_widened(lo, hi, self.n_triangles, self.finite))
 
     def triangles(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The corners of these triangles, three (3, N) float64."""
@@ -238,16 +239,15 @@ class Reference:
             yield int(group[part[0]]), sorted(tied, key=lambda row: int(hits.prim_id[row]))
 
     def against(self, origins: Any, directions: Any, prim_id: np.ndarray) -> tuple[Crossings, Bounds]:
-        """Ray i against primitive prim_id[i] alone, anywhere on the ray's line: the exact crossing (of a sphere the one
-        that is entered), and how far off a float32 unit may be."""
+        """Ray i against triangle prim_id[i] alone, anywhere on the ray's line: the exact crossing, and how far off a
+        float32 unit may be. Rays and triangles must be finite."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
-        if (prim_id < self.n_triangles).all():
-            corners = self.triangles(prim_id)
-            found = triangle_crossings(rays.origin, rays.direction, corners, all_rows=True)
-            return found, triangle_bounds(rays.origin, rays.direction, corners, found)
-        raise ValueError("prim_id has spheres: see against_sphere")
+        corners = self.triangles(prim_id)
+        found = triangle_crossings(rays.origin, rays.direction, corners, all_rows=True)
+        return found, triangle_bounds(rays.origin, rays.direction, corners, found)
 
-    def against_sphere(self, origins: Any, directions: Any, prim_id: np.ndarray) -> tuple[SphereCrossings, np.ndarray, np.ndarray]:
+    def against_sphere(self, origins: Any, directions: Any,
+                       prim_id: np.ndarray) -> tuple[SphereCrossings, np.ndarray, np.ndarray]:
         """Ray i against sphere prim_id[i]: the crossings, bounds on the two t's (2, N), and whether a hit may be told."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         columns = self._sphere_columns(rays, np.arange(len(prim_id)), prim_id)
@@ -265,13 +265,12 @@ def _fractions(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...]) -> list[
     return [Fraction(p, q) * scale for p, q in zip(numerator.tolist(), slope.tolist(), strict=True)]
 
 
-def _widened(lo: np.ndarray, hi: np.ndarray, n_triangles: int) -> tuple[np.ndarray, np.ndarray]:
+def _widened(lo: np.ndarray, hi: np.ndarray, n_triangles: int, finite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Boxes (3, N) that surely contain the primitive: a sphere's are rounded; what is not finite gets an empty one."""
-    bad = ~(np.isfinite(lo).all(axis=0) & np.isfinite(hi).all(axis=0))
     with np.errstate(invalid="ignore"):
         lo[:, n_triangles:] -= 4.0 * UNIT * np.abs(lo[:, n_triangles:])
         hi[:, n_triangles:] += 4.0 * UNIT * np.abs(hi[:, n_triangles:])
-    lo[:, bad], hi[:, bad] = np.inf, -np.inf
+    lo[:, ~finite], hi[:, ~finite] = np.inf, -np.inf
     return lo, hi
 
 

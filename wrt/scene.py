@@ -141,8 +141,8 @@ class Material:
         tangent-space normal map scaled by `normal_scale`.
     roughness: glTF's perceptual one in [0, 1]; the GGX alpha is its square. 0 is a perfect mirror.
     emission: radiance, linear. The front side (counter-clockwise) emits, both where `two_sided`.
-    emits_light: emissive triangles of this material light other surfaces (False: they are only seen, as with glTF's
-        unlit surfaces and emission textures).
+    emits_light: emissive surfaces of this material light others (False: they are only seen, as glTF's unlit ones are). With
+        an emission_texture, or alpha, they are only seen in any case: `lights_others`.
     alpha_mode: opaque; mask (a hit with alpha < `alpha_cutoff` is no hit); blend (the ray goes on with 1 - alpha).
     """
 
@@ -192,6 +192,13 @@ class Material:
     @property
     def is_emissive(self) -> bool:
         return max(self.emission) > 0.0
+
+    @property
+    def lights_others(self) -> bool:
+        """Whether its emission is sampled as a light: not where a texture or its alpha says where it emits, since lights are
+        chosen by power, not by picture."""
+        plain = self.emission_texture is None and self.alpha_mode == "opaque"
+        return self.is_emissive and self.emits_light and plain
 
     @property
     def textures(self) -> tuple[Texture | Checkerboard, ...]:

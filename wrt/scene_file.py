@@ -6,7 +6,7 @@ import os
 import re
 import tomllib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,9 @@ def _load_gltf(path: Path) -> Scene:
 
 def _load_bare_mesh(path: Path) -> Scene:
     grey = Material(name="light grey", albedo=(0.75, 0.75, 0.75))
-    return _staged(Scene(objects=(Object(load_mesh(path), (grey,), name=path.stem),), name=path.stem), path)
+    mesh = load_mesh(path)
+    notes = [f"its {len(mesh.groups)} parts are all light grey: a TOML scene can give each a material"] if len(mesh.groups) > 1 else []
+    return _staged(Scene(objects=(Object(mesh, (grey,), name=path.stem),), name=path.stem), path, notes)
 
 
 LOADERS: dict[str, Callable[[Path], Scene]] = {
@@ -82,12 +84,12 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError(message, path, place) from error
 
 
-def _staged(scene: Scene, path: Path) -> Scene:
-    """The scene with a camera and light where it lacks them."""
+def _staged(scene: Scene, path: Path, notes: Sequence[str] = ()) -> Scene:
+    """The scene with a camera and light where it lacks them; what was added is told, after `notes`."""
     try:
         scene, added = stage(scene)
     except InputError as error:
         raise InputError(str(error), path) from error
-    if added:
-        warnings.warn(f"{path}: {'; '.join(added)}", SceneWarning, stacklevel=4)
+    if notes or added:
+        warnings.warn(f"{path}: {'; '.join([*notes, *added])}", SceneWarning, stacklevel=4)
     return scene

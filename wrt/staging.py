@@ -51,7 +51,7 @@ def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
 def is_lit(scene: Scene) -> bool:
     """Whether anything in the scene gives light: a light, an emissive surface that lights others, a background."""
     return bool(scene.lights) or scene.background != ConstantBackground(BLACK) or scene.ambient != BLACK or any(
-        material.is_emissive and material.emits_light for material in scene.materials)
+        material.lights_others for material in scene.materials)
 
 
 def stage(scene: Scene) -> tuple[Scene, list[str]]:

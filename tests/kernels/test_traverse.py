@@ -10,6 +10,7 @@ import warp as wp
 
 from wrt.accel import ACCELERATORS, Geometry, Structure, build
 from wrt.kernels.query import HitArrays, RayArrays, load_ray
+from wrt.kernels.ray_aabb import RAY_AABB
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.mesh import Mesh
 from wrt.shapes import icosphere
@@ -145,6 +146,23 @@ def test_leaf_size_does_not_matter(name, max_leaf):
     origin, direction = rays_for(geometry, rng)
     expected = build(geometry, "brute_force").closest_hit(origin, direction)
     assert_same_hits(build(geometry, name, max_leaf=max_leaf).closest_hit(origin, direction), expected)
+
+
+@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize("box", RAY_AABB)
+@pytest.mark.parametrize("kind", ["none", "one", "two", "one_sphere", "mixed"])
+def test_any_box_test_ends_and_hardly_loses_a_ray(kind, box, name):
+    # A small tree has empty boxes, which no test may enter; the looser tests may lose a ray in an edge, and no more.
+    rng = np.random.default_rng(12)
+    geometry = GEOMETRIES[kind](rng)
+    origin, direction = rays_for(geometry, rng)
+    slanted = (direction != 0.0).all(axis=1)
+    origin, direction = origin[slanted], direction[slanted]
+    expected = build(geometry, "brute_force").closest_hit(origin, direction)
+    found = build(geometry, name, box=box).closest_hit(origin, direction)
+    differ = found.t != expected.t
+    assert differ.mean() <= (0.0 if box == "conservative" else 2e-3)
+    assert (found.t[differ] > expected.t[differ]).all()
 
 
 @pytest.mark.parametrize("name", STRUCTURES)

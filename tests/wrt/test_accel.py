@@ -16,7 +16,6 @@ from wrt.device import records
 from wrt.errors import InputError
 from wrt.kernels.structs import Primitive
 from wrt.kernels.traverse import Units
-from wrt.mesh import Mesh
 from wrt.shapes import icosphere, torus
 
 NAMES = sorted({cls.name for cls in ACCELERATORS.values()})
@@ -153,15 +152,17 @@ def test_threads_must_be_positive() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_caller_may_change_arrays_afterwards(name: str) -> None:
-    mesh = Mesh(BALL.vertices.copy(), BALL.faces.copy())
-    structure = build(mesh, name)
+    geometry = Geometry(BALL.vertices.copy(), BALL.faces.copy(), np.array([[0.0, 0.0, 2.0, 0.5]], np.float32))
+    structure = build(geometry, name)
     origin, direction = some_rays(200)
     before = structure.closest_hit(origin, direction)
     kept = before.t.copy()
-    mesh.vertices[:] = 100.0
-    mesh.faces[:] = 0
+    geometry.vertices[:] = 100.0
+    geometry.faces[:] = 0
+    geometry.spheres[:] = 50.0
     again = structure.closest_hit(origin, direction)
     assert np.array_equal(again.t, kept) and np.array_equal(before.t, kept)
+    assert (before.prim_id == len(BALL.faces)).any()
 
 
 def test_geometry_counts_triangles_then_spheres() -> None:

@@ -91,6 +91,7 @@ def test_a_black_opaque_scene_needs_nothing() -> None:
     (scene_of(Material(albedo_texture=Checkerboard())), {"checkerboards"}),
     (scene_of(Material(normal_texture=PICTURE)), {"textures", "normal_maps"}),
     (scene_of(BLACK, settings=Settings(filter="gaussian")), {"filter"}),
+    (scene_of(BLACK, settings=Settings(filter="box", sampler="independent")), {"independent"}),
     (scene_of(BLACK, settings=Settings(filter="box", fresnel="schlick", glass_shadows="tinted")), set()),
 ])
 def test_each_thing_turns_on_its_switches_and_no_other(scene: Scene, expected: set[str]) -> None:
@@ -166,3 +167,12 @@ def test_describe_counts_and_names() -> None:
     assert found["materials"] == ["bottle (glass)", "1 (diffuse)"] and found["cameras"] == ["front", "1"]
     assert np.allclose(found["bounds_high"], [2.0, 6.0, 2.0], atol=0.1)
     assert found["features"] == features_of(scene, scene.camera()).switches()
+
+
+def test_emission_by_texture_or_alpha_is_seen_but_does_not_light() -> None:
+    # A lamp whose picture is black lit the floor at full strength: what is sampled must be what is seen.
+    black = Texture(np.zeros((1, 1, 4), np.uint8))
+    lamp = Material(emission=(3, 3, 3))
+    assert lamp.lights_others
+    for hidden in ({"emission_texture": black}, {"alpha_mode": "mask"}, {"alpha_mode": "blend", "alpha": 0.0}, {"emits_light": False}):
+        assert not replace(lamp, **hidden).lights_others

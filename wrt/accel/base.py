@@ -144,7 +144,7 @@ class Accelerator(ABC):
         self.structure = Structure(type(self), Units(triangle, box, len(geometry.spheres) > 0))
         self._surfaces = Surfaces()
         self._surfaces.n_triangles = len(geometry.faces)
-        self._surfaces.spheres = upload(geometry.spheres, wp.vec4, self.device)
+        self._surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # the caller may change his
         begin = time.perf_counter()
         self.data, self.stats = self._build(begin, **options)
 

@@ -1,0 +1,27 @@
+"""Warp's own ray query as a kernel: a rival to measure, not a part of wrt."""
+
+import warp as wp
+
+from wrt.kernels.structs import kernel
+
+
+@kernel
+def warp_mesh_query(
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    t: wp.array(dtype=wp.float32),
+    u: wp.array(dtype=wp.float32),
+    v: wp.array(dtype=wp.float32),
+    prim_id: wp.array(dtype=wp.int32),
+):
+    """directions must be of unit length; -1 on a miss."""
+    i = wp.tid()
+    query = wp.mesh_query_ray(mesh, origins[i], directions[i], 1.0e38)
+    prim_id[i] = -1
+    t[i] = float(wp.inf)
+    if query.result:
+        prim_id[i] = query.face
+        t[i] = query.t
+        u[i] = query.u
+        v[i] = query.v

@@ -1,0 +1,283 @@
+"""Visibility the other way round: for each triangle, the pixels that it covers (a z-buffer).
+
+It answers what the rays through the pixels' centres answer, by other means and in float64, so that each can check the other;
+nothing here is shared with the ray units. Triangles are taken in homogeneous pixel coordinates (Olano and Greer 1997,
+"Triangle scan conversion using 2D homogeneous coordinates"), so that one that passes through the plane of the camera needs no
+clipping. A pixel's key is (depth, prim_id): the smallest one wins, in whatever order triangles come.
+"""
+
+import warp as wp
+
+from wrt.kernels.structs import kernel
+
+ROUNDOFF = wp.constant(wp.float64(2.0**-53))
+SPLITTER = wp.constant(wp.float64(2.0**27 + 1.0))
+CENTRE_PAD = wp.constant(wp.float64(1e-9))  # pixels: the rounding of a vertex' place in the picture, generously
+ZERO = wp.constant(wp.float64(0.0))
+HALF = wp.constant(wp.float64(0.5))
+
+
+@wp.struct
+class View:
+    """A pinhole camera and its picture.
+
+    from_pixels: (x, y, 1), in pixels from the top left corner, to the direction through that point, of length 1 along the
+    axis of view; to_pixels: its inverse, from a point's offset from `origin` to homogeneous pixels (x w, y w, w).
+    """
+
+    origin: wp.vec3d
+    from_pixels: wp.mat33d
+    to_pixels: wp.mat33d
+    width: int
+    height: int
+
+
+@wp.struct
+class Edge:
+    """normal . (x, y, 1) is positive on one side, zero on the edge; no rounding error there is above `slack`."""
+
+    normal: wp.vec3d
+    slack: wp.float64
+
+
+@kernel
+def project(view: View, vertices: wp.array(dtype=wp.vec3), first: int, projected: wp.array(dtype=wp.vec3d)):
+    """Vertices to homogeneous pixels. A vertex that two triangles share is rounded once, for both."""
+    i = first + wp.tid()
+    projected[i] = view.to_pixels @ (wp.vec3d(vertices[i]) - view.origin)
+
+
+@wp.func
+def has_extent(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> bool:
+    """Whether the corners are not on one line."""
+    p = wp.vec3d(v0)
+    n = wp.cross(wp.vec3d(v1) - p, wp.vec3d(v2) - p)
+    return n[0] != ZERO or n[1] != ZERO or n[2] != ZERO
+
+
+@wp.func
+def centres_between(low: wp.float64, high: wp.float64, size: int) -> wp.vec2i:
+    """First and last of the pixels 0 .. size - 1 whose centre is in [low, high]; first > last where there is none."""
+    end = wp.float64(size)
+    first = wp.ceil(wp.clamp(low, ZERO, end) - HALF - CENTRE_PAD)
+    last = wp.floor(wp.clamp(high, ZERO, end) - HALF + CENTRE_PAD)
+    return wp.vec2i(wp.max(int(first), 0), wp.min(int(last), size - 1))
+
+
+@wp.func
+def pixel_box(view: View, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec4i:
+    """The pixels (x0, y0, x1, y1), both ends included, that a triangle may cover; x0 > x1 where there are none.
+
+    In front of the camera's plane this is the box around the corners in the picture. Through the plane it is the whole
+    picture, unless the triangle is on the outer side of one of the picture's borders.
+    """
+    none = wp.vec4i(0, 0, -1, -1)
+    if a[2] > ZERO and b[2] > ZERO and c[2] > ZERO:
+        ax = a[0] / a[2]
+        bx = b[0] / b[2]
+        cx = c[0] / c[2]
+        columns = centres_between(wp.min(ax, wp.min(bx, cx)), wp.max(ax, wp.max(bx, cx)), view.width)
+        if columns[0] > columns[1]:
+            return none
+        ay = a[1] / a[2]
+        by = b[1] / b[2]
+        cy = c[1] / c[2]
+        rows = centres_between(wp.min(ay, wp.min(by, cy)), wp.max(ay, wp.max(by, cy)), view.height)
+        if rows[0] > rows[1]:
+            return none
+        return wp.vec4i(columns[0], rows[0], columns[1], rows[1])
+    if a[2] < ZERO and b[2] < ZERO and c[2] < ZERO:
+        return none
+    for axis in range(2):
+        end = wp.float64(wp.where(axis == 0, view.width, view.height))
+        if a[axis] < ZERO and b[axis] < ZERO and c[axis] < ZERO:
+            return none
+        if a[axis] > end * a[2] and b[axis] > end * b[2] and c[axis] > end * c[2]:
+            return none
+    return wp.vec4i(0, 0, view.width - 1, view.height - 1)
+
+
+@kernel
+def bound(
+    view: View,
+    vertices: wp.array(dtype=wp.vec3),
+    projected: wp.array(dtype=wp.vec3d),
+    faces: wp.array(dtype=wp.vec3i),
+    first: int,
+    boxes: wp.array(dtype=wp.vec4i),
+):
+    """The box of pixels of each triangle. Most small triangles lie between the pixels' centres and end here."""
+    i = first + wp.tid()
+    f = faces[i]
+    box = pixel_box(view, projected[f[0]], projected[f[1]], projected[f[2]])
+    if box[0] <= box[2]:
+        if not has_extent(vertices[f[0]], vertices[f[1]], vertices[f[2]]):
+            box = wp.vec4i(0, 0, -1, -1)
+    boxes[i] = box
+
+
+@wp.func
+def edge_between(p: wp.vec3d, q: wp.vec3d, size: wp.vec2d) -> Edge:
+    """The edge function of Olano and Greer: the plane through the camera and both ends.
+
+    Exactly negated where p and q change places. slack bounds the difference to `turn` at the same pixel: that one has the
+    rounding of p - (x, y) p_w in each factor, this one that of three products, all below (|p_x| + width |p_w|) times
+    (|q_y| + height |q_w|), or likewise with p and q exchanged.
+    """
+    edge = Edge()
+    edge.normal = wp.cross(p, q)
+    p_x = wp.abs(p[0]) + size[0] * wp.abs(p[2])
+    p_y = wp.abs(p[1]) + size[1] * wp.abs(p[2])
+    q_x = wp.abs(q[0]) + size[0] * wp.abs(q[2])
+    q_y = wp.abs(q[1]) + size[1] * wp.abs(q[2])
+    edge.slack = wp.float64(16.0) * ROUNDOFF * (p_x * q_y + p_y * q_x)
+    return edge
+
+
+@wp.func
+def cut(span: wp.vec2d, edge: Edge, side: wp.float64, y: wp.float64) -> wp.vec2d:
+    """The part of a span of a row, from x = span[0] to span[1], that is on the given side (1, -1) of an edge, or near it."""
+    slope = side * edge.normal[0]
+    rest = side * (edge.normal[1] * y + edge.normal[2]) + edge.slack
+    if slope > ZERO:
+        return wp.vec2d(wp.max(span[0], -rest / slope), span[1])
+    if slope < ZERO:
+        return wp.vec2d(span[0], wp.min(span[1], -rest / slope))
+    return wp.where(rest < ZERO, wp.vec2d(ZERO, -wp.float64(1.0)), span)
+
+
+@wp.func
+def product_error(a: wp.float64, b: wp.float64) -> wp.float64:
+    """What a * b loses to rounding, exactly, where nothing over- or underflows (Dekker 1971, section 5.9)."""
+    t = SPLITTER * a
+    a_high = t - (t - a)
+    a_low = a - a_high
+    t = SPLITTER * b
+    b_high = t - (t - b)
+    b_low = b - b_high
+    return ((a_high * b_high - a * b) + a_high * b_low + a_low * b_high) + a_low * b_low
+
+
+@wp.func
+def turn(p: wp.vec2d, q: wp.vec2d) -> wp.float64:
+    """Twice the signed area of (0, p, q), with the right sign; exactly negated where p and q change places.
+
+    Rounding is monotone: where the two products round to different numbers, these are in the right order. Where they round
+    to the same, what each lost decides.
+    """
+    left = p[0] * q[1]
+    right = p[1] * q[0]
+    if left != right:
+        return left - right
+    return product_error(p[0], q[1]) - product_error(p[1], q[0])
+
+
+@wp.func
+def owns(p: wp.vec2d, q: wp.vec2d, area: wp.float64) -> bool:
+    """The fill rule: whether a triangle owns the pixels whose centre (the origin here) is on its edge from p to q.
+
+    As if all centres were moved right by a little and down by much less, so that exactly one of two neighbours owns the
+    edge, and exactly one of a fan of triangles the corner. area: of any sign, the triangle's. Only for edges in front of
+    the camera, where p and q are on opposite sides of the centre.
+    """
+    if p[1] != q[1]:
+        return (p[1] > q[1]) == (area > ZERO)
+    return (q[0] > p[0]) == (area > ZERO)
+
+
+@wp.func
+def depth_at(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, x: wp.float64, y: wp.float64) -> wp.float64:
+    """Where the line through a pixel's centre meets a triangle, in units of the direction (x, y, 1), or -1 on a miss.
+
+    The corners are moved so that the centre is the origin: rounded, but alike for all triangles that share a corner. In
+    that picture all decisions are exact, so that no centre falls between two triangles. Both sides of a triangle count. Edge-on,
+    or behind the camera: a miss.
+    """
+    p = wp.vec2d(a[0] - x * a[2], a[1] - y * a[2])
+    q = wp.vec2d(b[0] - x * b[2], b[1] - y * b[2])
+    r = wp.vec2d(c[0] - x * c[2], c[1] - y * c[2])
+    w_a = turn(q, r)
+    w_b = turn(r, p)
+    w_c = turn(p, q)
+    miss = -wp.float64(1.0)
+    if (w_a < ZERO or w_b < ZERO or w_c < ZERO) and (w_a > ZERO or w_b > ZERO or w_c > ZERO):
+        return miss
+    area = w_a + w_b + w_c
+    if area == ZERO:
+        return miss
+    if w_a == ZERO and not owns(q, r, area):
+        return miss
+    if w_b == ZERO and not owns(r, p, area):
+        return miss
+    if w_c == ZERO and not owns(p, q, area):
+        return miss
+    return (w_a * a[2] + w_b * b[2] + w_c * c[2]) / area
+
+
+@wp.func
+def key_of(depth: wp.float32, prim_id: int) -> wp.uint64:
+    """Keys sort by depth, then by prim_id: the bits of a float32 that is not negative sort as the number does."""
+    return (wp.uint64(wp.cast(depth, wp.uint32)) << wp.uint64(32)) | wp.uint64(prim_id)
+
+
+@wp.func
+def draw_row(
+    view: View, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, columns: wp.vec2i, row: int, prim_id: int, keys: wp.array(dtype=wp.uint64)
+):
+    """Put a triangle's key into the pixels of part of a row where it is covered and nearest."""
+    y = wp.float64(row) + HALF
+    for column in range(columns[0], columns[1] + 1):
+        x = wp.float64(column) + HALF
+        w = depth_at(a, b, c, x, y)
+        if w >= ZERO:
+            depth = wp.float32(w * wp.length(view.from_pixels @ wp.vec3d(x, y, wp.float64(1.0))))
+            if wp.isfinite(depth):
+                wp.atomic_min(keys, row * view.width + column, key_of(depth, prim_id))
+
+
+@kernel
+def rasterize(
+    view: View,
+    projected: wp.array(dtype=wp.vec3d),
+    faces: wp.array(dtype=wp.vec3i),
+    boxes: wp.array(dtype=wp.vec4i),
+    prim_ids: wp.array(dtype=wp.int32),
+    first_row: int,
+    rows: int,
+    keys: wp.array(dtype=wp.uint64),
+):
+    """Launch over (bands, triangles): band i is `rows` rows from first_row + i rows. Two threads may share a pixel on CUDA,
+    where the minimum is atomic, but not on the CPU: there a band is one launch, in one thread."""
+    band, i = wp.tid()
+    prim_id = prim_ids[i]
+    box = boxes[prim_id]
+    top = wp.max(box[1], first_row + band * rows)
+    bottom = wp.min(box[3], first_row + band * rows + rows - 1)
+    if box[0] > box[2] or top > bottom:
+        return
+    f = faces[prim_id]
+    a = projected[f[0]]
+    b = projected[f[1]]
+    c = projected[f[2]]
+    size = wp.vec2d(wp.float64(view.width), wp.float64(view.height))
+    edge_a = edge_between(b, c, size)
+    edge_b = edge_between(c, a, size)
+    edge_c = edge_between(a, b, size)
+    # The inner side of the edges in front of the camera has the determinant's sign; where that is lost to rounding
+    # (edge-on, or through the camera) both sides are looked at.
+    det = wp.dot(a, edge_a.normal)
+    slack = wp.float64(4.0) * (
+        wp.abs(a[2]) * edge_a.slack + wp.abs(b[2]) * edge_b.slack + wp.abs(c[2]) * edge_c.slack
+    )
+    for turned in range(2):
+        side = wp.float64(1 - 2 * turned)
+        if side * det >= -slack:
+            for row in range(top, bottom + 1):
+                y = wp.float64(row) + HALF
+                span = wp.vec2d(wp.float64(box[0]) + HALF, wp.float64(box[2]) + HALF)
+                span = cut(span, edge_a, side, y)
+                span = cut(span, edge_b, side, y)
+                span = cut(span, edge_c, side, y)
+                if span[0] <= span[1]:
+                    columns = wp.vec2i(int(wp.ceil(span[0] - HALF)), int(wp.floor(span[1] - HALF)))
+                    draw_row(view, a, b, c, columns, row, prim_id, keys)

@@ -1,0 +1,573 @@
+"""The command line: what it writes where, what it answers to mistakes, and what Ctrl-C leaves behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import wrt.cli
+from tests.command_line import BOX_OBJ, Result
+from tests.command_line import wrt as run
+from tests.data import ROOT
+from wrt import film as film_module
+from wrt import progress as progress_module
+from wrt.driver import Progress, Renderer
+from wrt.features import features_of
+from wrt.image import read_channels, read_image, read_metadata, write_image
+from wrt.scene_file import load_scene, schema
+
+SMALL = ("--size", "32x18", "--spp", 2)
+TWO_CAMERAS = """\
+[materials.grey]
+[[boxes]]
+low = [-1, -1, -1]
+high = [1, 1, 1]
+material = "grey"
+[cameras.front]
+position = [1, 1, 5]
+target = [0, 0, 0]
+[cameras.side]
+position = [5, 1, 1]
+target = [0, 0, 0]
+[background]
+type = "gradient"
+[[lights]]
+type = "directional"
+direction = [-1, -2, -1]
+irradiance = 1
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Each test works in a folder of its own, with a box in it."""
+    monkeypatch.chdir(tmp_path)
+    Path("box.obj").write_text(BOX_OBJ)
+    return tmp_path
+
+
+def new_files() -> set[str]:
+    return {path.name for path in Path().iterdir()} - {"box.obj", "scene.toml", "bad.toml"}
+
+
+def refused(result: Result, *parts: str) -> None:
+    """Exit code 2, nothing on stdout, one message that has all the parts, and nothing but it and warnings on stderr."""
+    assert result.code == 2 and result.out == "" and len(result.errors) == 1, result
+    assert all(part in result.errors[0] for part in parts), result.err
+    rest = [line for line in result.err.splitlines() if line and line != result.errors[0]]
+    assert all(line.startswith(("warning: ", "Usage: ", "Try ")) for line in rest), result.err
+
+
+def strict_json(text: str) -> Any:
+    def fail(name: str) -> None:
+        raise AssertionError(f"{name} is no JSON")
+
+    return json.loads(text, parse_constant=fail)
+
+
+# --- render -----------------------------------------------------------------------------------------------------------
+
+
+def test_render_writes_a_picture_and_says_its_name_on_stdout() -> None:
+    result = run("render", "box.obj", *SMALL)
+    assert (result.code, result.out) == (0, "box.png\n") and new_files() == {"box.png"}
+    with Image.open("box.png") as image:
+        assert image.size == (32, 18) and image.mode == "RGB"
+    warning, *summary = result.err.splitlines()
+    assert warning.startswith("warning: box.obj: it has no camera") and summary[0].startswith("2 spp, ")
+    assert "cut: 0 rays by depth, 0 by throughput" in summary[0] and summary[1].startswith("seconds: import ")
+    metadata = read_metadata("box.png")
+    assert metadata.items() >= {"scene": "box.obj", "camera": "framing", "spp": "2", "seed": "0"}.items()
+
+
+def test_quiet_is_silent_but_for_the_data() -> None:
+    assert run("render", "box.obj", *SMALL, "--quiet") == Result(0, "box.png\n", "")
+
+
+def test_json_holds_statistics_and_nothing_else_is_on_stdout() -> None:
+    result = run("render", "box.obj", *SMALL, "--seed", 7, "--aov", "depth", "-o", "a.png", "--json")
+    facts = strict_json(result.out)
+    assert result.code == 0 and result.out.count("\n") == 1
+    assert facts["output"] == ["a.png", "a.depth.png"] and facts["spp"] == 2 and facts["seed"] == 7
+    assert facts["samples"] == 2 * 32 * 18 <= facts["rays"] and facts["triangles"] == 12 and facts["interrupted"] is False
+    assert {"import", "load", "upload", "build", "compile", "trace", "write"} <= facts["seconds"].keys()
+    assert all(value >= 0 for value in facts["seconds"].values())
+
+
+@pytest.mark.parametrize(("value", "expected"), [
+    (float("inf"), None), (float("nan"), None), (-float("inf"), None), (1.5, 1.5), (np.float64("inf"), None),
+    ({"a": [float("nan"), (1, float("inf"))]}, {"a": [None, [1, None]]}), (Path("x"), "x"), ({1: True}, {"1": True}),
+], ids=str)
+def test_json_is_json_whatever_is_in_it(value: Any, expected: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    wrt.cli._say_json({"value": value})
+    assert strict_json(capsys.readouterr().out) == {"value": expected}
+
+
+def test_layers_are_files_beside_a_png_and_channels_in_an_exr() -> None:
+    names = ("depth", "normal", "albedo", "prim_id", "material_id")
+    assert run("render", "box.obj", *SMALL, "-o", "a.png", "--aov", ",".join(names)).code == 0
+    assert new_files() == {"a.png", *(f"a.{name}.png" for name in names)}
+    result = run("render", "box.obj", *SMALL, "-o", "b.exr", "--aov", "depth, normal")
+    assert result.out == "b.exr\n" and {"depth.Z", "normal.X", "samples", "variance.R"} <= read_channels("b.exr").keys()
+    assert "prim_id" not in read_channels("b.exr")
+
+
+@pytest.mark.parametrize(("arguments", "bits"), [(["-o", "a.png"], 8), (["-o", "a.png", "--bits", 16], 16)])
+def test_bits_of_a_png(arguments: list[Any], bits: int) -> None:
+    assert run("render", "box.obj", *SMALL, *arguments).code == 0
+    assert Path("a.png").read_bytes()[24] == bits
+
+
+def test_a_crop_is_that_part_of_the_whole_picture() -> None:
+    assert run("render", "box.obj", *SMALL, "-o", "whole.exr").code == 0
+    assert run("render", "box.obj", *SMALL, "-o", "part.exr", "--crop", "5, 3,21,10").code == 0
+    whole, part = read_channels("whole.exr"), read_channels("part.exr")
+    assert whole.keys() == part.keys() and all(np.array_equal(part[name], whole[name][3:10, 5:21]) for name in whole)
+
+
+def test_the_seed_and_the_threads() -> None:
+    pictures = []
+    for i, options in enumerate((("--threads", 1), ("--threads", 2), ("--seed", 0), ("--seed", 1))):
+        assert run("render", "box.obj", *SMALL, "-o", f"{i}.exr", *options).code == 0
+        pictures.append(read_image(f"{i}.exr"))
+    assert np.array_equal(pictures[0], pictures[1]) and np.array_equal(pictures[0], pictures[2])
+    assert not np.array_equal(pictures[0], pictures[3])
+
+
+def test_tone_mapping_and_exposure_change_the_png_only() -> None:
+    for suffix in ("png", "exr"):
+        assert run("render", "box.obj", *SMALL, "-o", f"plain.{suffix}").code == 0
+        assert run("render", "box.obj", *SMALL, "-o", f"shown.{suffix}", "--tonemap", "agx", "--exposure", -1).code == 0
+    assert not np.array_equal(read_image("plain.png"), read_image("shown.png"))
+    assert np.array_equal(read_image("plain.exr"), read_image("shown.exr"))
+
+
+def test_cameras_by_name_and_number() -> None:
+    Path("scene.toml").write_text(TWO_CAMERAS)
+    for name, expected in (("front", "front"), ("side", "side"), ("0", "front"), ("1", "side")):
+        assert run("render", "scene.toml", *SMALL, "--camera", name, "-o", "a.png").code == 0
+        assert read_metadata("a.png")["camera"] == expected
+    for name in ("top", "2", "-1", ""):
+        for command in (("render", *SMALL), ("info",)):
+            refused(run(*command, "scene.toml", "--camera", name), f"scene.toml: no camera {name!r}", "0: 'front', 1: 'side'")
+
+
+def test_a_time_limit_leaves_a_picture_of_whole_samples() -> None:
+    result = run("render", "box.obj", "--size", "32x18", "--spp", 1 << 24, "--time-limit", "0.2s", "-o", "a.exr", "--json")
+    samples = read_channels("a.exr")["samples"]
+    assert result.code == 0 and strict_json(result.out)["timed_out"] is True and "(time limit)" in result.err
+    assert 1 <= samples.min() == samples.max() < 1 << 24
+
+
+def test_names_that_cannot_be_encoded_are_no_reason_to_fail() -> None:
+    name = os.fsdecode(b"box\xff.obj")
+    try:
+        os.rename("box.obj", name)
+    except OSError:
+        pytest.skip("this system has no such file names")
+    for suffix in ("png", "exr", "hdr"):
+        assert run("render", name, *SMALL, "-o", f"a.{suffix}").code == 0
+        assert read_metadata(f"a.{suffix}")["scene"] == "box?.obj"
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------------------
+
+HUGE = "9" * 5000  # more digits than Python converts
+WRONG = [
+    (["--size", "0x0"], "size must be 1x1 to 32768x32768"), (["--size", "100000x100000"], "size must be"),
+    (["--size", "640"], "write 640x360"), (["--size", "-1x3"], "write 640x360"), (["--size", HUGE + "x1"], "write 640x360"),
+    (["--spp", "0"], "spp must be 1 to"), (["--spp", "-1"], "spp must be"), (["--spp", "1000000000"], "spp must be"),
+    (["--spp", "1.5"], "'--spp'"), (["--spp", "many"], "'--spp'"),
+    (["--seed", "-1"], "seed must be 0 to"), (["--seed", str(2**32)], "seed must be 0 to"),
+    (["--crop", "1,2,3"], "write X0,Y0,X1,Y1"), (["--crop", "-1,0,4,4"], "write X0,Y0,X1,Y1"),
+    (["--crop", "²,0,1,1"], "write X0,Y0,X1,Y1"), (["--crop", "0,0,1," + HUGE], "write X0,Y0,X1,Y1"),
+    (["--accel", "nope"], "no structure 'nope'; there is bvh"), (["--device", "nope"], "no device 'nope'; there is cpu"),
+    (["--filter", "nope"], "filter must be one of box"), (["--fresnel", "nope"], "fresnel must be one of exact"),
+    (["--tonemap", "nope"], "tonemap must be one of none"), (["--aov", "depth,nope"], "no AOV nope; there is depth"),
+    (["--bits", "7"], ".png is written with 8 or 16 bits, not 7"),
+    (["--threads", "0"], "threads must be 1 or more"), (["--threads", "-2"], "threads must be 1 or more"),
+    (["--max-depth", "-1"], "max_depth must be 0 to 64"), (["--max-depth", "65"], "max_depth must be 0 to 64"),
+    (["--min-throughput", "nan"], "min_throughput must be finite"), (["--min-throughput", "2"], "in [0, 1]"),
+    (["--exposure", "nan"], "exposure must be finite"), (["--exposure", "1e9"], "exposure must be"),
+    (["--time-limit", "0"], "time_limit must be more than 0"), (["--time-limit", "soon"], "write 30s, 5m or 1h"),
+    (["--time-limit", "-1"], "write 30s"), (["--nope"], "--nope"), (["another.obj"], "another.obj"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG, ids=lambda value: str(value)[:40])
+def test_a_wrong_option_is_told_before_the_scene_is_read(arguments: list[str], message: str,
+                                                         monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    Path("box.png").write_bytes(b"old")
+    result = run("render", "box.obj", *arguments)
+    refused(result, message)
+    assert "warning" not in result.err and Path("box.png").read_bytes() == b"old" and new_files() == {"box.png"}
+
+
+@pytest.mark.parametrize("crop", ["0,0,33,18", "5,5,5,6", "40,0,50,10"])
+def test_a_crop_outside_the_picture(crop: str) -> None:
+    refused(run("render", "box.obj", *SMALL, "--crop", crop), f"crop {crop} is not within the picture of 32x18")
+    assert new_files() == set()
+
+
+@pytest.mark.parametrize(("output", "message"), [
+    ("nowhere/a.png", "nowhere/a.png: its folder does not exist"), ("folder.png", "folder.png: is a folder"),
+    ("a.jpg", "a.jpg: cannot write .jpg; use .png, .exr, .hdr"), ("a", "a: cannot write a file without a suffix"),
+    ("", "cannot write a file without a suffix"), ("box.obj/a.png", "its folder does not exist"),
+    ("a" * 300 + ".png", "too long"), ("link.png", "link.png: its folder does not exist"),
+])
+def test_a_wrong_output_is_told_before_any_work(output: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    Path("folder.png").mkdir()
+    Path("link.png").symlink_to("nowhere/at.png")
+    refused(run("render", "box.obj", "-o", output), message)
+    assert new_files() == {"folder.png", "link.png"}
+
+
+@contextmanager
+def unwritable_folder() -> Iterator[Path]:
+    """A folder that the system lets nobody write to: root may write into any, but not into /proc."""
+    if os.geteuid() != 0:
+        Path("closed").mkdir(mode=0o555)
+        yield Path("closed")
+    elif Path("/proc/self").is_dir():
+        yield Path("/proc")
+    else:
+        pytest.skip("root may write everywhere")
+
+
+def test_an_output_folder_that_cannot_be_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    with unwritable_folder() as closed:
+        refused(run("render", "box.obj", "-o", closed / "a.png"), f"error: {closed / 'a.png'}: cannot be written: ")
+
+
+def test_a_layer_that_cannot_be_written_is_told_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    Path("a.normal.png").mkdir()
+    refused(run("render", "box.obj", "-o", "a.png", "--aov", "depth,normal"), "a.normal.png: is a folder")
+    assert new_files() == {"a.normal.png"}
+
+
+@pytest.mark.parametrize(("scene", "message"), [
+    ("nothing.obj", "nothing.obj: no such file"), ("nothing.xyz", "nothing.xyz: no such file"),
+    (".", ".: is a directory"), ("/", "/: is a directory"), ("..", "..: is a directory"), ("", ".: is a directory"),
+    ("box.txt", "box.txt: is no scene file"), ("empty.toml", "empty.toml: the scene has no shapes"),
+    ("a" * 300 + ".obj", "too long"), ("empty.obj", "empty.obj: holds no triangles"),
+])
+@pytest.mark.parametrize("command", ["render", "info", "validate"])
+def test_a_wrong_scene(command: str, scene: str, message: str) -> None:
+    for name in ("box.txt", "empty.toml", "empty.obj"):
+        Path(name).write_text("")
+    refused(run(command, scene), message)
+    assert new_files() == {"box.txt", "empty.toml", "empty.obj"}
+
+
+def test_what_is_found_late_names_the_scene_and_leaves_the_old_picture() -> None:
+    far = "transform = {translate = [3e38, 0, 0], scale = 3e38}"
+    Path("bad.toml").write_text(TWO_CAMERAS.replace('"grey"\n', f'"grey"\n{far}\n', 1))
+    Path("bad.png").write_bytes(b"old")
+    refused(run("render", "bad.toml", *SMALL), "bad.toml: object 'boxes[0]': its transform moves vertices beyond float32")
+    assert new_files() == {"bad.png"} and Path("bad.png").read_bytes() == b"old"
+
+
+def test_a_picture_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.driver.memory_size", lambda device: 2.0**20)
+    refused(run("render", "box.obj", "--size", "4000x2000"),
+            "box.obj: a picture of 4000x2000 takes 1.0 GiB of memory; cpu has 0.0")
+
+
+def test_no_memory_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: Renderer) -> None:
+        raise MemoryError("Unable to allocate 9 GiB")
+
+    monkeypatch.setattr(Renderer, "_prepare", fail)
+    refused(run("render", "box.obj"), "not enough memory: Unable to allocate 9 GiB")
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """No file may become larger than this: what a full disk looks like from here."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.exr", "a.hdr"])
+def test_a_full_disk(name: str) -> None:
+    size = ("--size", "128x128", "--spp", 1)
+    assert run("render", "box.obj", *size, "-o", name).code == 0  # nothing is compiled under the limit
+    whole = Path(name).read_bytes()
+    with largest_file(min(4096, len(whole) // 2)):
+        refused(run("render", "box.obj", *size, "-o", name, "--seed", 1), f"error: {name}: cannot be written: ")
+        refused(run("render", "box.obj", *size, "-o", f"new-{name}"), f"error: new-{name}: cannot be written: ")
+    assert Path(name).read_bytes() == whole and new_files() == {name}
+
+
+def test_layers_of_a_picture_do_not_take_it_with_them_where_the_disk_is_full() -> None:
+    options = ("--size", "64x64", "--spp", 1, "--aov", "normal", "-o", "a.png")
+    assert run("render", "box.obj", *options, "--tonemap", "none", "--exposure", -100).code == 0
+    sizes = {name: Path(name).stat().st_size for name in new_files()}
+    assert sizes["a.png"] < sizes["a.normal.png"]  # a black picture takes little
+    for name in sizes:
+        Path(name).unlink()
+    with largest_file(sizes["a.png"] + 16):
+        refused(run("render", "box.obj", *options, "--exposure", -100), "error: a.normal.png: cannot be written: ")
+    assert new_files() == {"a.png"} and read_image("a.png").shape == (64, 64, 3)
+
+
+def test_warnings_while_writing_are_told_like_all_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoiled(self: Renderer, *arguments: Any) -> Any:
+        film = original(self, *arguments)
+        film.pixels[0, 0] = np.nan
+        return film
+
+    original = Renderer._result
+    monkeypatch.setattr(Renderer, "_result", spoiled)
+    result = run("render", "box.obj", *SMALL, "-o", "a.png")
+    assert result.code == 0 and "warning: a.png: 1 pixel NaN or infinite, written as black or white\n" in result.err
+    assert "SceneWarning" not in result.err
+    assert run("render", "box.obj", *SMALL, "-o", "a.png", "-q").err == ""
+
+
+# --- Ctrl-C -----------------------------------------------------------------------------------------------------------
+
+
+def report_with(action: Callable[[Progress], None]) -> Callable[[bool], Any]:
+    """A progress_reporter that does that at every report."""
+
+    @contextmanager
+    def reporter(quiet: bool) -> Iterator[Callable[[Progress], None]]:
+        yield action
+
+    return reporter
+
+
+def interrupt(progress: Progress) -> None:
+    if progress.done:
+        for _ in range(3):  # a nervous hand
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_ctrl_c_keeps_the_picture_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress_module, "progress_reporter", report_with(interrupt))
+    result = run("render", "box.obj", "--size", "160x90", "--spp", 100000, "-o", "a.exr")
+    assert (result.code, result.out) == (wrt.cli.INTERRUPTED, "a.exr\n") and "(interrupted" in result.err
+    samples = read_channels("a.exr")["samples"]
+    assert samples.shape == (90, 160) and 0 < samples.max() <= samples.min() + 1 and samples.max() < 100000
+    assert new_files() == {"a.exr"} and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.exr", "a.hdr"])
+def test_ctrl_c_while_saving_waits_for_the_file(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def hurried(self: film_module.Film, *arguments: Any, **options: Any) -> list[Path]:
+        signal.raise_signal(signal.SIGINT)
+        paths = save(self, *arguments, **options)
+        signal.raise_signal(signal.SIGINT)
+        return paths
+
+    save = film_module.Film.save
+    assert run("render", "box.obj", *SMALL, "-o", f"expected-{name}").code == 0
+    monkeypatch.setattr(film_module.Film, "save", hurried)
+    result = run("render", "box.obj", *SMALL, "-o", name)
+    assert (result.code, result.out) == (wrt.cli.INTERRUPTED, f"{name}\n") and new_files() == {name, f"expected-{name}"}
+    assert np.array_equal(read_image(name), read_image(f"expected-{name}"))
+
+
+@pytest.mark.parametrize("where", ["wrt.scene_file.load_scene", "wrt.driver.upload_scene", "wrt.driver.Renderer._aovs"])
+def test_ctrl_c_before_the_first_sample_leaves_everything_as_it_was(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("box.png").write_bytes(b"old")
+    monkeypatch.setattr(where, lambda *arguments: signal.raise_signal(signal.SIGINT) or {})
+    result = run("render", "box.obj", *SMALL, "--aov", "depth")
+    assert result.code == wrt.cli.INTERRUPTED and result.out == "" and result.err.split("\n")[-2] == "interrupted"
+    assert "Traceback" not in result.err and Path("box.png").read_bytes() == b"old" and new_files() == {"box.png"}
+
+
+# --- the other commands -----------------------------------------------------------------------------------------------
+
+
+def test_info_tells_what_is_on_and_what_is_off() -> None:
+    Path("scene.toml").write_text(TWO_CAMERAS)
+    scene = load_scene("scene.toml")
+    switches = features_of(scene, scene.camera()).switches()
+    facts = dict(line.split(": ", 1) for line in run("info", "scene.toml").out.splitlines())
+    assert facts["triangles"] == "12" and facts["cameras"] == "front, side" and facts["background"] == "GradientBackground"
+    assert facts["features on"].split(", ") == [name for name, on in switches.items() if on]
+    assert facts["features off"].split(", ") == [name for name, on in switches.items() if not on]
+    told = strict_json(run("info", "scene.toml", "--json").out)
+    assert told["features"] == switches and told["bounds_low"] == [-1, -1, -1] and told["bounds_high"] == [1, 1, 1]
+
+
+def test_info_of_a_scene_without_shapes() -> None:
+    Path("scene.toml").write_text('[background]\ntype = "gradient"\n[cameras.a]\nposition = [0, 0, 5]\ntarget = [0, 0, 0]\n')
+    result = run("info", "scene.toml")
+    assert result.code == 0 and "bounds_low: none\n" in result.out and "materials: none\n" in result.out
+    assert strict_json(run("info", "scene.toml", "--json").out)["bounds_low"] is None
+    assert run("render", "scene.toml", *SMALL).code == 0
+
+
+def test_schema_is_the_json_schema() -> None:
+    result = run("schema")
+    assert result.code == 0 and result.err == "" and strict_json(result.out) == schema()
+
+
+def test_validate_tells_of_every_file() -> None:
+    Path("scene.toml").write_text(TWO_CAMERAS)
+    Path("bad.toml").write_text("[settings]\nspp = 0\nnothing = 1\n")
+    good = run("validate", "scene.toml", "box.obj")
+    assert (good.code, good.out) == (0, "scene.toml: ok\nbox.obj: ok\n")
+    assert good.err.startswith("warning: box.obj: ") and len(good.err.splitlines()) == 1
+    mixed = run("validate", "scene.toml", "bad.toml", "nothing.glb", "box.obj")
+    assert (mixed.code, mixed.out) == (2, "scene.toml: ok\nbox.obj: ok\n")
+    assert [line.split(": ")[1] for line in mixed.errors] == ["bad.toml", "nothing.glb"]
+    assert "settings.spp" in mixed.err and "settings.nothing" in mixed.err
+    refused(run("validate"), "Missing argument")
+
+
+def test_compare_measures_and_fails_past_its_limits() -> None:
+    image = np.random.default_rng(0).random((20, 30, 3)).astype(np.float32)
+    write_image("a.exr", image)
+    write_image("b.exr", image + np.float32(0.1))
+    same = run("compare", "a.exr", "a.exr", "--max-mse", 0, "--min-psnr", 99, "--max-flip", 0)
+    assert same.code == 0 and "mse: 0\n" in same.out and "psnr: inf\n" in same.out and same.err == ""
+    assert strict_json(run("compare", "a.exr", "a.exr", "--json").out).items() >= {"mse": 0.0, "psnr": None}.items()
+    differs = run("compare", "b.exr", "a.exr", "--json", "-o", "d.png")
+    assert differs.code == 0 and strict_json(differs.out)["mse"] == pytest.approx(0.01, rel=1e-4)
+    with Image.open("d.png") as image_file:
+        assert image_file.width == 30
+    broken = run("compare", "b.exr", "a.exr", "--max-mse", 0.001, "--max-relmse", 1e9, "--min-psnr", 99, "--max-flip", 0)
+    assert broken.code == 1 and [line.split()[0] for line in broken.err.splitlines()] == ["mse", "psnr", "flip"]
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["a.exr", "nothing.png"], "nothing.png: cannot be read"), (["box.obj", "a.exr"], "box.obj: not an image format"),
+    (["a.exr", "small.exr"], "different sizes, 30x20 and 8x4"), (["broken.png", "a.exr"], "broken.png: cannot be read"),
+    (["a.exr", "a.exr", "-o", "d.exr"], "d.exr: a picture of the difference is a .png"),
+    (["a.exr", "a.exr", "-o", "nowhere/d.png"], "its folder does not exist"),
+    (["a.exr", "a.exr", "--tonemap", "nope"], "tonemap must be one of"),
+    (["a.exr", "a.exr", "--exposure", "nan"], "exposure must be finite"),
+    (["a.exr", "a.exr", "--exposure", "1e30"], "exposure must be finite"),
+    (["a.exr", "a.exr", "--max-mse", "little"], "'--max-mse'"), (["a.exr"], "Missing argument"),
+], ids=str)
+def test_compare_refuses(arguments: list[str], message: str) -> None:
+    write_image("a.exr", np.ones((20, 30, 3)))
+    write_image("small.exr", np.ones((4, 8, 3)))
+    Path("broken.png").write_bytes(b"\x89PNG\r\n\x1a\n and no more")
+    refused(run("compare", *arguments), message)
+    assert not Path("d.exr").exists() and not Path("d.png").exists()
+
+
+def test_devices_lists_the_cpu_first() -> None:
+    result = run("devices")
+    assert result.code == 0 and result.err == "" and result.out.startswith("cpu: ") and "threads\n" in result.out
+
+
+def test_help_and_version() -> None:
+    for command in ("", "render", "info", "schema", "validate", "compare", "devices"):
+        result = run(*([command] if command else []), "--help")
+        assert result.code == 0 and result.out.startswith("Usage: ") and result.err == ""
+    assert run("render", "-h").out == run("render", "--help").out
+    assert run().code == 2 and "Commands:" in run().err + run().out
+    refused(run("rendr"), "No such command 'rendr'")
+
+
+# --- real processes ---------------------------------------------------------------------------------------------------
+
+
+def process(*arguments: object, code: str = "", **options: Any) -> subprocess.Popen[str]:
+    """`python -m wrt arguments`, or with some code run before."""
+    start = ["-c", f"{code}\nfrom wrt.cli import main; main()"] if code else ["-m", "wrt"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **options.pop("environment", {})}
+    return subprocess.Popen([sys.executable, *start, *map(str, arguments)], text=True, env=environment,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
+
+
+def finish(running: subprocess.Popen[str]) -> Result:
+    out, err = running.communicate(timeout=120)
+    return Result(running.returncode, out, err)
+
+
+def test_a_process_renders() -> None:
+    result = finish(process("render", "box.obj", *SMALL))
+    assert (result.code, result.out) == (0, "box.png\n") and read_image("box.png").shape == (18, 32, 3)
+    assert [line.split()[0] for line in result.err.splitlines()] == ["warning:", "2", "seconds:"]  # and no word of Warp's
+
+
+def test_a_process_refuses() -> None:
+    refused(finish(process("render", "nothing.obj")), "error: nothing.obj: no such file")
+    refused(finish(process("render", "box.obj", "--device", "cuda:99")), "error: no device 'cuda:99'")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")
+@pytest.mark.parametrize(("redirection", "code", "out", "err"), [
+    ("2>&-", 0, "box.png\n", ""), (">&-", 0, "", "seconds"), (">&- 2>&-", 0, "", ""), ("<&-", 0, "box.png\n", "seconds"),
+    (">/dev/full", 2, "", "error: "),
+])
+def test_closed_and_full_streams(redirection: str, code: int, out: str, err: str) -> None:
+    if "full" in redirection and not Path("/dev/full").is_char_device():
+        pytest.skip("this system has no /dev/full")
+    shell = ["sh", "-c", f'"$0" "$@" {redirection}', sys.executable, "-m", "wrt", "render", "box.obj", *map(str, SMALL)]
+    done = subprocess.run(shell, text=True, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False)
+    assert (done.returncode, done.stdout) == (code, out) and err in done.stderr and "Traceback" not in done.stderr
+    assert read_image("box.png").shape == (18, 32, 3)
+
+
+# The real reporter tells of its first look at the tiles at once: then the process is tracing.
+AT_ONCE = "import wrt.progress; wrt.progress.LINE_EVERY = 0.0"
+
+
+@pytest.mark.parametrize("times", [1, 5])
+def test_a_process_that_is_interrupted_writes_what_it_has(times: int) -> None:
+    running = process("render", "box.obj", "--size", "320x180", "--spp", 1 << 24, "-o", "a.exr", "--aov", "depth", code=AT_ONCE)
+    assert running.stderr is not None
+    assert any("Mray/s" in line for line in running.stderr)
+    for _ in range(times):
+        running.send_signal(signal.SIGINT)
+    result = finish(running)
+    assert (result.code, result.out) == (130, "a.exr\n") and "(interrupted" in result.err and "Traceback" not in result.err
+    samples = read_channels("a.exr")["samples"]
+    assert samples.shape == (180, 320) and samples.max() - samples.min() <= 64 and 0 < samples.max() < 1 << 24
+    assert np.isfinite(read_image("a.exr")).all() and new_files() == {"a.exr"}
+
+
+LOADING = """
+import sys, wrt.scene_file
+def slow(path, load=wrt.scene_file.load_scene):
+    print("now", file=sys.stderr, flush=True)
+    while True: load(path)
+wrt.scene_file.load_scene = slow
+"""
+COMPILING = """
+import sys, wrt.driver
+def told(kernel, device, load=wrt.driver.load_kernel):
+    print("now", file=sys.stderr, flush=True)
+    load(kernel, device)
+wrt.driver.load_kernel = told
+"""
+
+
+@pytest.mark.parametrize("code", [LOADING, COMPILING], ids=["loading", "compiling"])
+def test_a_process_that_is_interrupted_early_leaves_nothing(code: str, folder: Path) -> None:
+    cold = {"WARP_CACHE_PATH": str(folder / "cache")}  # so that there is something to compile
+    running = process("render", "box.obj", "-o", "a.png", "--spp", 1 << 24, code=code, environment=cold)
+    assert running.stderr is not None
+    assert any(line == "now\n" for line in running.stderr)
+    running.send_signal(signal.SIGINT)
+    result = finish(running)
+    assert (result.code, result.out) == (130, "") and result.err.endswith("interrupted\n")
+    assert "Traceback" not in result.err and new_files() <= {"cache"}

@@ -1,0 +1,394 @@
+"""Tiles, passes, threads, Ctrl-C, and what comes back."""
+
+from __future__ import annotations
+
+import itertools
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wrt
+from wrt import driver
+from wrt.driver import MAX_PASS, Options, Progress, Renderer, plain_text, render
+from wrt.errors import InputError
+from wrt.film import Film
+from wrt.scene import Camera, DirectionalLight, GradientBackground, Material, Object, Scene, Settings
+from wrt.shapes import box, quad
+
+SIZE = (37, 22)  # no multiple of any tile
+# One set of features for nearly all tests here: each other one is a kernel to compile.
+SCENE = Scene(
+    objects=(Object(box(), (Material(albedo=(0.7, 0.6, 0.5)),), name="box"),
+             Object(quad((-4, -1, -4), (0, 0, 8), (8, 0, 0)), (Material(albedo=(0.2, 0.4, 0.8)),), name="floor")),
+    lights=(DirectionalLight((-1, -2, -1.5), (1.5, 1.4, 1.3)),),
+    cameras=(Camera.look_at((2, 2, 4), (0, 0, 0), name="first"), Camera.look_at((-3, 1, 4), (0, 0, 0), name="second")),
+    background=GradientBackground(),
+    settings=Settings(size=SIZE, spp=5),
+    name="scene",
+)
+
+
+def same(a: Film, b: Film) -> bool:
+    return (np.array_equal(a.pixels, b.pixels) and np.array_equal(a.variance, b.variance)
+            and np.array_equal(a.samples, b.samples) and a.aov.keys() == b.aov.keys()
+            and all(np.array_equal(a.aov[name], b.aov[name]) for name in a.aov))
+
+
+def counts(film: Film) -> list[Any]:
+    return [film.stats[name] for name in ("rays", "cut_by_depth", "cut_by_throughput", "not_finite", "samples")]
+
+
+# --- the same pixels --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def reference() -> Film:
+    return render(SCENE, aov=driver.AOVS)
+
+
+@pytest.mark.parametrize("options", [
+    {"threads": 1}, {"threads": 2}, {"threads": 7}, {"tile_size": 1}, {"tile_size": 5}, {"tile_size": 64}, {"pass_size": 1},
+    {"pass_size": 2}, {"pass_size": 99}, {"time_limit": 1e9}, {"progress": lambda progress: None},
+    {"threads": 2, "tile_size": 3, "pass_size": 4},
+], ids=lambda options: " ".join(f"{name}={'...' if callable(value) else value}" for name, value in options.items()))
+def test_no_way_of_dividing_the_work_changes_a_pixel(options: dict[str, Any], reference: Film) -> None:
+    film = render(SCENE, aov=driver.AOVS, **options)
+    assert same(film, reference) and counts(film) == counts(reference)
+
+
+@pytest.mark.parametrize("crop", [(0, 0, 37, 22), (3, 5, 20, 6), (36, 21, 37, 22), (0, 7, 37, 8)], ids=str)
+def test_a_crop_is_that_part_of_the_whole_picture(crop: tuple[int, int, int, int], reference: Film) -> None:
+    x0, y0, x1, y1 = crop
+    film = render(SCENE, aov=driver.AOVS, crop=crop)
+    assert film.pixels.shape == (y1 - y0, x1 - x0, 3) and film.stats["samples"] == 5 * (y1 - y0) * (x1 - x0)
+    part = {name: getattr(reference, name)[y0:y1, x0:x1] for name in ("pixels", "variance", "samples")}
+    assert same(film, Film(**part, aov={name: array[y0:y1, x0:x1] for name, array in reference.aov.items()}))
+
+
+def test_crops_make_up_the_whole_picture(reference: Film) -> None:
+    rows = [np.concatenate([render(SCENE, crop=(x0, y0, x1, y1)).pixels for x0, x1 in itertools.pairwise((0, 10, 37))], axis=1)
+            for y0, y1 in itertools.pairwise((0, 11, 22))]
+    assert np.array_equal(np.concatenate(rows), reference.pixels)
+
+
+def test_the_seed_changes_the_noise_and_nothing_else(reference: Film) -> None:
+    assert same(render(SCENE, aov=driver.AOVS, seed=0), reference)
+    films = [render(SCENE, seed=seed, spp=16) for seed in (1, 2, 2**32 - 1)]
+    for a, b in itertools.combinations(films, 2):
+        differ = (a.pixels != b.pixels).any(axis=-1)
+        assert differ.mean() > 0.5
+        sigma = np.sqrt(a.variance + b.variance)
+        z = np.abs(a.pixels - b.pixels)[sigma > 0] / sigma[sigma > 0]
+        assert np.median(z) < 1.0  # of a normal distribution it is 0.67; these samples are stratified, hence less
+
+
+def test_more_samples_go_on_where_fewer_ended() -> None:
+    """The first samples of a long render are those of a short one: sample 3 is (4 mean_4 - 3 mean_3), in its range."""
+    three, four = (render(SCENE, spp=spp).pixels.astype(np.float64) for spp in (3, 4))
+    last = 4.0 * four - 3.0 * three
+    assert last.min() > -1e-4 and last.max() < 2.0
+
+
+def test_scene_settings_count_and_arguments_override_them() -> None:
+    film = render(SCENE, spp=2, size=(8, 6), settings={"exposure": 1.5, "tonemap": "aces"})
+    assert film.pixels.shape == (6, 8, 3) and (film.samples == 2).all()
+    assert (film.exposure, film.tonemap) == (1.5, "aces")
+    assert SCENE.settings == Settings(size=SIZE, spp=5)
+
+
+# --- what comes back --------------------------------------------------------------------------------------------------
+
+
+def test_statistics_and_metadata(reference: Film) -> None:
+    stats, n = reference.stats, SIZE[0] * SIZE[1] * 5
+    assert stats["samples"] == n == reference.samples.sum() and (reference.samples == 5).all()
+    assert n <= stats["rays"] and stats["rays_per_sample"] == stats["rays"] / n
+    assert stats["rays_per_second"] == pytest.approx(stats["rays"] / stats["seconds"]["trace"])
+    assert stats["triangles"] == 14 and stats["spheres"] == 0 and stats["not_finite"] == 0
+    assert stats["seconds"].keys() == {"compile", "upload", "build", "aov", "trace"}
+    assert not stats["interrupted"] and not stats["timed_out"]
+    expected = {"scene": "scene", "camera": "first", "spp": 5, "seed": 0, "version": wrt.__version__, "accel": "bvh"}
+    assert expected.items() <= reference.metadata.items()
+
+
+def test_mean_and_variance_are_those_of_the_single_samples() -> None:
+    """Sample i alone is got from two renders that differ by it; float64 from float32 means is exact enough."""
+    films = [render(SCENE, spp=spp) for spp in range(1, 7)]
+    totals = np.stack([np.zeros_like(films[0].pixels, np.float64), *(f.pixels.astype(np.float64) * (i + 1)
+                                                                       for i, f in enumerate(films))])
+    samples = np.diff(totals, axis=0)
+    expected = samples.var(axis=0, ddof=1) / 6
+    assert np.allclose(films[5].variance, expected, rtol=1e-3, atol=1e-6)
+    assert not films[0].variance.any()  # one sample tells nothing of its variance
+
+
+def test_aovs_are_what_the_pixels_see() -> None:
+    """A square of side 2 at distance 3, seen straight on: depth along the ray, the normal to the viewer."""
+    scene = Scene(objects=(Object(quad((-1, -1, 0), (2, 0, 0), (0, 2, 0)), (Material(albedo=(0.1, 0.5, 0.9)),)),),
+                  lights=SCENE.lights, background=SCENE.background,
+                  cameras=(Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=2 * np.arctan(2 / 3)),))  # 4 wide and high at z = 0
+    film = render(scene, size=(9, 9), spp=1, aov=driver.AOVS)
+    center = (np.arange(9) + 0.5) / 9 * 4 - 2
+    x, y = np.meshgrid(center, -center)
+    inside = (np.abs(x) < 1) & (np.abs(y) < 1)
+    assert inside.sum() == 25  # 5 of 9 pixel centres in each direction
+    depth = np.where(inside, np.sqrt(x * x + y * y + 9), np.inf)
+    assert np.allclose(film.aov["depth"], depth, rtol=1e-6)
+    assert (film.aov["material_id"] == np.where(inside, 0, -1)).all()
+    assert ((film.aov["prim_id"] >= 0) == inside).all() and set(film.aov["prim_id"][inside]) == {0, 1}
+    assert np.allclose(film.aov["normal"], np.where(inside[..., None], (0, 0, 1), 0), atol=1e-6)
+    assert np.allclose(film.aov["albedo"][inside], (0.1, 0.5, 0.9), atol=1e-6) and not film.aov["albedo"][~inside].any()
+
+
+def test_only_the_aovs_that_were_asked_for_come_back() -> None:
+    film = render(SCENE, spp=1, aov=["normal", "depth"])
+    assert film.aov.keys() == {"normal", "depth"}
+    assert film.aov["normal"].dtype == film.aov["depth"].dtype == np.float32
+    assert render(SCENE, spp=1).aov == {}
+
+
+def test_a_sample_that_is_not_finite_is_black_and_counted() -> None:
+    scene = replace(SCENE, background=GradientBackground(bottom=(3e38, 3e38, 3e38), top=(3e38, 3e38, 3e38)))
+    film = render(scene, spp=4)
+    assert film.stats["not_finite"] > 0 and np.isfinite(film.pixels).all() and (film.samples == 4).all()
+
+
+def test_cameras_by_name_number_and_themselves() -> None:
+    first, second = (render(SCENE, spp=1, camera=camera) for camera in ("first", "second"))
+    assert not np.array_equal(first.pixels, second.pixels)
+    assert second.metadata["camera"] == "second"
+    for camera in (1, "1", SCENE.cameras[1]):
+        assert same(render(SCENE, spp=1, camera=camera), second)
+    with pytest.raises(InputError, match=r"no camera 'third'; the scene has 0: 'first', 1: 'second'"):
+        render(SCENE, camera="third")
+
+
+def test_kernels_are_made_once_for_each_set_of_features() -> None:
+    kernels = [Renderer(SCENE.with_settings(spp=spp), Options(aov=["depth"])).kernels for spp in (1, 2)]
+    assert [id(kernel) for kernel in kernels[0]] == [id(kernel) for kernel in kernels[1]]
+
+
+@pytest.mark.parametrize(("name", "expected"), [("plain", "plain"), ("ö😀", "ö😀"), ("a\udcff\ud800", "a??"), ("", "")])
+def test_names_can_be_written(name: str, expected: str) -> None:
+    assert plain_text(name) == expected
+    named = replace(SCENE, name=name)
+    assert render(named, spp=1, size=(2, 2)).metadata["scene"] == expected
+
+
+# --- passes and time --------------------------------------------------------------------------------------------------
+
+
+class Clock:
+    """A time.perf_counter that a test moves."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def passes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[list[int], Film]]:
+    """The sizes of the passes that a render would take if a sample of all pixels took so many seconds, and its film."""
+    clock = Clock()
+    monkeypatch.setattr(driver, "time", clock)
+
+    def taken(spp: int, seconds: float = 1.0, **options: Any) -> tuple[list[int], Film]:
+        sizes: list[int] = []
+
+        def run_pass(self: Renderer, first: int, count: int, begin: float) -> None:
+            assert first == sum(sizes)
+            sizes.append(count)
+            clock.now += count * seconds
+
+        monkeypatch.setattr(Renderer, "_run_pass", run_pass)
+        return sizes, render(SCENE, spp=spp, **options)
+
+    return taken
+
+
+@pytest.mark.parametrize(("spp", "pass_size", "expected"), [
+    (1, None, [1]), (8, None, [1, 1, 2, 4]), (11, None, [1, 1, 2, 4, 3]), (7, 3, [3, 3, 1]), (3, 100, [3]),
+    (300, None, [1, 1, 2, 4, 8, 16, 32, 64, 64, 64, 44]),
+])
+def test_passes_take_each_sample_once(passes: Any, spp: int, pass_size: int | None, expected: list[int]) -> None:
+    sizes, film = passes(spp, pass_size=pass_size)
+    assert sizes == expected and max(sizes) <= max(MAX_PASS, pass_size or 0) and not film.stats["timed_out"]
+
+
+@pytest.mark.parametrize(("limit", "seconds", "expected"), [
+    (10.0, 1.0, [1, 1, 2, 4, 2]),  # the last pass is no longer than the time that is left
+    (10.0, 3.0, [1, 1, 1, 1]),  # what is left is not enough, but one sample is the least there is
+    (0.5, 1.0, [1]),  # the first sample is always taken
+    (1e9, 1.0, [1, 1, 2, 4, 8, 4]),
+    (np.inf, 1.0, [1, 1, 2, 4, 8, 4]),
+])
+def test_a_time_limit_shortens_the_passes(passes: Any, limit: float, seconds: float, expected: list[int]) -> None:
+    sizes, film = passes(20, seconds, time_limit=limit)
+    assert sizes == expected and film.stats["timed_out"] == (sum(expected) < 20)
+
+
+def test_a_time_limit_leaves_a_whole_picture() -> None:
+    film = render(SCENE, spp=1 << 24, time_limit=0.2)
+    assert film.stats["timed_out"] and not film.stats["interrupted"]
+    assert 1 <= film.samples.min() == film.samples.max() == film.metadata["spp"] < 1 << 24
+    assert same(film, render(SCENE, spp=int(film.samples.max())))
+    assert not render(SCENE, spp=2, time_limit=1e6).stats["timed_out"]
+
+
+def test_progress_goes_from_nothing_to_all() -> None:
+    told: list[Progress] = []
+    film = render(SCENE, spp=9, progress=told.append)
+    done = [progress.done for progress in told]
+    assert done == sorted(done) and told[-1].done == told[-1].total == film.stats["samples"]
+    assert told[-1].rays == film.stats["rays"]
+    assert all(progress.seconds >= 0.0 and progress.total == told[0].total for progress in told)
+    assert Progress(50, 200, 10, 2.0).seconds_left == 6.0 and Progress(0, 200, 0, 0.0).seconds_left == float("inf")
+
+
+# --- Ctrl-C -----------------------------------------------------------------------------------------------------------
+
+
+def interrupt(progress: Progress) -> None:
+    if progress.done > 0:
+        signal.raise_signal(signal.SIGINT)
+
+
+def stop(progress: Progress) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("progress", [interrupt, stop])
+@pytest.mark.parametrize("pass_size", [None, 3])
+def test_ctrl_c_keeps_what_there_is(progress: Callable[[Progress], None], pass_size: int | None) -> None:
+    """Also often: a callback of a long render runs several times before the tiles that run have come to their end."""
+    film = render(SCENE, spp=1000, size=(200, 150), tile_size=8, progress=progress, pass_size=pass_size, aov=["depth"])
+    assert film.stats["interrupted"] and not film.stats["timed_out"]
+    assert film.samples.max() - film.samples.min() <= (pass_size or 1) and film.samples.max() < 1000
+    assert film.stats["samples"] == film.samples.sum() and film.aov.keys() == {"depth"}
+    assert not film.pixels[film.samples == 0].any()
+    fewest = int(film.samples.max())
+    whole = render(SCENE, spp=fewest, size=(200, 150)) if fewest else film
+    there = film.samples == fewest
+    assert np.array_equal(film.pixels[there], whole.pixels[there])
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_at_the_very_end_is_not_lost() -> None:
+    last: list[Progress] = []
+
+    def at_the_end(progress: Progress) -> None:
+        if progress.done == progress.total:
+            last.append(progress)
+            signal.raise_signal(signal.SIGINT)
+
+    film = render(SCENE, spp=2, progress=at_the_end)
+    assert last and film.stats["interrupted"] and (film.samples == 2).all()
+
+
+def test_ctrl_c_before_the_first_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Renderer, "_aovs", lambda self: signal.raise_signal(signal.SIGINT) or {})
+    film = render(SCENE, aov=["depth"])
+    assert film.stats["interrupted"] and film.stats["samples"] == 0 and not film.pixels.any() and not film.variance.any()
+
+
+def test_ctrl_c_while_compiling_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    may_end, ended = threading.Event(), threading.Event()
+
+    def compile_for_ever(kernel: Any, device: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        may_end.wait(60.0)
+        ended.set()
+
+    monkeypatch.setattr(driver, "load_kernel", compile_for_ever)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            render(SCENE)
+        assert not ended.is_set()
+    finally:
+        may_end.set()
+
+
+def test_an_error_of_the_scene_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    may_end, ended = threading.Event(), threading.Event()
+    monkeypatch.setattr(driver, "load_kernel", lambda kernel, device: may_end.wait(60.0) and ended.set())
+    far = np.eye(4)
+    far[0, 3] = 1e39
+    scene = replace(SCENE, objects=(Object(box(), (Material(),), far, name="far"),))
+    try:
+        with pytest.raises(InputError, match=r"'far'.*beyond float32"):
+            render(scene)
+        assert not ended.is_set()
+    finally:
+        may_end.set()
+
+
+def test_an_error_in_a_progress_callback_comes_through() -> None:
+    def fail(progress: Progress) -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        render(SCENE, progress=fail)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_who_handles_ctrl_c_goes_on_handling_it() -> None:
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: came.append(number))
+    try:
+        film = render(SCENE, spp=2, progress=interrupt)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert came and not film.stats["interrupted"] and (film.samples == 2).all()
+
+
+def test_renders_in_other_threads(reference: Film) -> None:
+    films: list[Film] = []
+    threads = [threading.Thread(target=lambda: films.append(render(SCENE, aov=driver.AOVS))) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(films) == 3 and all(same(film, reference) for film in films)
+
+
+# --- what cannot be rendered ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"accel": "nope"}, "no structure 'nope'; there is bvh"),
+    ({"device": "nope"}, "no device 'nope'; there is cpu"),
+    ({"aov": ["depth", "nope"]}, "no AOV nope; there is depth, normal"),
+    ({"threads": 0}, "threads must be 1 or more, got 0"),
+    ({"seed": -1}, "seed must be"), ({"seed": 2**32}, "seed must be"),
+    ({"tile_size": 0}, "tile_size"), ({"pass_size": 0}, "pass_size"),
+    ({"time_limit": 0.0}, "time_limit must be more than 0"), ({"time_limit": float("nan")}, "time_limit"),
+    ({"camera": "nope"}, "no camera 'nope'"), ({"camera": 2}, "no camera 2"),
+    ({"spp": 0}, "spp must be 1 to"), ({"spp": 10**9}, "spp must be 1 to"),
+    ({"size": (0, 1)}, "size must be 1x1"), ({"size": (100000, 100000)}, "size must be 1x1 to 32768x32768"),
+    ({"max_depth": -1}, "max_depth"), ({"max_depth": 65}, "max_depth"), ({"min_throughput": float("nan")}, "min_throughput"),
+    ({"settings": {"filter": "nope"}}, "filter must be one of"), ({"settings": {"exposure": float("inf")}}, "exposure"),
+    *(({"crop": crop}, r"crop .* is not within the picture of 37x22") for crop in (
+        (0, 0, 38, 22), (0, 0, 37, 23), (-1, 0, 5, 5), (5, 5, 5, 6), (6, 5, 5, 6), (40, 40, 50, 50))),
+], ids=str)
+def test_a_wrong_value_is_told_by_its_name(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        render(SCENE, **options)
+
+
+def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driver, "memory_size", lambda device: 2.0**30)
+    monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("work was done"))
+    with pytest.raises(InputError, match=r"4096x4096 takes 2\.1 GiB of memory; cpu has 1\.0"):
+        render(SCENE, size=(4096, 4096))
+
+
+def test_a_scene_without_a_camera_is_refused() -> None:
+    with pytest.raises(InputError, match="the scene has no camera"):
+        render(replace(SCENE, cameras=()))

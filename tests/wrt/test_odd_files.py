@@ -1,0 +1,102 @@
+"""Every file of the data set's folder of odd ones makes a picture, or is refused with one message."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.command_line import Result, wrt
+from tests.data import DATA, data_path
+from wrt.image import read_image
+from wrt.mesh import load_mesh
+from wrt.scene_file import LOADERS, load_scene
+
+ODD = DATA / "odd"
+FILES = sorted(path.relative_to(ODD).as_posix() for path in ODD.rglob("*") if path.is_file()) or ["missing"]
+REFUSED = {
+    "BoxMeshopt.glb": "EXT_meshopt_compression",
+    "empty.obj": "no triangles", "empty.stl": "no triangles", "stl_empty_bin.stl": "no triangles",
+    "obj_points.obj": "no triangles", "obj_wireframe.obj": "no triangles", "face_in_group_name.obj": "no triangles",
+    "ply_points_bin.ply": "no triangles", "points_emptyface.ply": "no triangles", "empty_nodes.glb": "no triangles",
+    "empty.ply": "no vertices", "ply_empty_header.ply": "no vertices",
+    "PEER_CASES.md": "no scene file", "MeshPrimitiveModes/buffer.bin": "no scene file",
+}
+# Triangles in the world and those that were dropped, where others agree (the sum of both, where they only count faces).
+TRIANGLES = {
+    "capsule.obj": (10000, 200), "SimpleInstancing.glb": (1500, 0), "MeshPrimitiveModes/MeshPrimitiveModes.gltf": (16, 0),
+    "NegativeScaleTest.glb": (7724, 0), "mode5.gltf": (2786, 0), "nested.glb": (36, 0), "busted.STL": (3878, 0),
+    "no_indices_3storybuilding.glb": (72, 0), "ADIS16480.STL": (7436, 0), "teapot.stl": (894, 0), "unit_sphere.STL": (1280, 0),
+    "negative_indices.obj": (12, 0), "nancolor.obj": (12, 0), "polygonfaces.obj": (3, 0), "plane.ply": (2, 0),
+}
+
+
+def odd(name: str) -> Path:
+    if name == "missing":
+        pytest.skip("needs the folder odd/ of the data set (set WRT_DATA to its folder)")
+    return data_path(f"odd/{name}")
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_it_makes_a_picture_or_one_message(name: str, tmp_path: Path) -> None:
+    path, picture = odd(name), tmp_path / "picture.png"
+    result = wrt("render", path, "-o", picture, "--spp", 1, "--size", "16x9")
+    if name in REFUSED:
+        assert_refused(result, path, picture)
+        assert REFUSED[name] in result.errors[0]
+        return
+    assert result.code == 0 and result.errors == [] and result.out == f"{picture}\n"
+    pixels = read_image(picture)
+    assert pixels.shape == (9, 16, 3) and np.unique(pixels).size > 3  # more than the sky alone
+    assert list(tmp_path.iterdir()) == [picture]
+
+
+def assert_refused(result: Result, path: Path, picture: Path) -> None:
+    assert result.code == 2 and result.out == ""
+    assert len(result.err.splitlines()) == 1 and len(result.errors) == 1
+    assert result.errors[0].startswith(f"error: {path}: ")
+    assert list(picture.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", sorted(TRIANGLES))
+def test_no_triangle_is_lost_on_the_way(name: str) -> None:
+    result = wrt("info", odd(name), "--json")
+    facts = json.loads(result.out)
+    assert (facts["triangles"], facts["zero_area_triangles_left_out"]) == TRIANGLES[name]
+
+
+def test_the_wall_with_a_hole_keeps_its_area() -> None:
+    """Cut fan-wise, its polygons give 66 triangles of which 11 have no area; another cut may make fewer empty ones. Some
+    of its polygons are concave, so that their area is that of the vector sum over the fan, not of the fan's triangles."""
+    path = odd("wallhole.obj")
+    mesh = load_mesh(path)
+    assert len(mesh.faces) + mesh.dropped == 66 and mesh.dropped <= 11
+    positions = np.array([[float(x) for x in line.split()[1:4]] for line in text_lines(path) if line.startswith("v ")])
+    faces = [[int(corner.split("/")[0]) - 1 for corner in line.split()[1:]] for line in text_lines(path) if line[:2] == "f "]
+    fans = [np.cross(*(positions[[f[1:-1], f[2:]]] - positions[f[0]])) / 2 for f in faces]
+    assert sum(map(len, fans)) == 66 and sum((fan == 0).all(axis=1).sum() for fan in fans) == 11
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    cut = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    areas = [np.linalg.norm(fan.sum(axis=0)) for fan in fans]
+    assert np.linalg.norm(cut, axis=1).sum() == pytest.approx(sum(areas))
+
+
+def text_lines(path: Path) -> list[str]:
+    return path.read_text().replace("\\\n", " ").splitlines()
+
+
+@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+@pytest.mark.parametrize("name", [name for name in FILES if name not in REFUSED])
+def test_the_camera_that_is_added_sees_the_whole_scene(name: str) -> None:
+    path = odd(name)
+    scene = load_scene(path)
+    assert path.suffix.lower() in LOADERS
+    if scene.cameras[0].name != "framing":
+        pytest.skip("has a camera of its own")
+    points = np.concatenate([thing.mesh.vertices @ thing.transform[:3, :3].T + thing.transform[:3, 3]
+                             for thing in scene.objects])
+    seen = np.c_[points, np.ones(len(points))] @ np.linalg.inv(scene.cameras[0].camera_to_world).T
+    half = np.tan(0.5 * scene.cameras[0].fov_y) * -seen[:, 2]
+    assert (seen[:, 2] < 0).all() and (np.abs(seen[:, 1]) <= half).all() and (np.abs(seen[:, 0]) <= half * 16 / 9).all()

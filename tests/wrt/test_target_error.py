@@ -1,0 +1,209 @@
+"""`render(target_error=...)`: it stops where it should, and what it says of its error is true."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wrt
+from tests.command_line import wrt as run_command
+from tests.data import ROOT
+from wrt.device_film import GROUPS
+from wrt.driver import MAX_SPP, Options, Renderer, render
+from wrt.errors import InputError
+from wrt.scene import Camera, Material, Object, Scene, Settings, Sphere
+from wrt.shapes import quad
+
+FLOOR = Object(quad((-3, 0, 3), (6, 0, 0), (0, 0, -6)), (Material(albedo=(0.6, 0.5, 0.4)),))
+LAMP = Object(quad((-0.5, 2.0, -0.5), (1, 0, 0), (0, 0, 1)), (Material(albedo=(0, 0, 0), emission=(6, 6, 6)),))
+BALLS = (Sphere((0.3, 0.5, 0.2), 0.5, Material(albedo=(0.2, 0.5, 0.8))), Sphere((-0.9, 0.5, 0.4), 0.5, Material("glass")))
+SCENE = Scene(objects=(FLOOR, LAMP), spheres=BALLS, cameras=(Camera.look_at((0.0, 1.6, 4.5), (0.0, 0.4, 0.0), fov_y=0.7),),
+              settings=Settings(size=(24, 16), max_depth=4))
+
+
+def rmse(a: np.ndarray, b: np.ndarray, known: float = 0.0) -> float:
+    """Root mean square difference; `known`: mean variance of b, taken out."""
+    return math.sqrt(max(float(np.mean((a.astype(np.float64) - b) ** 2)) - known, 0.0))
+
+
+def reference(renderer: Renderer, spp: int, seeds: int = 8) -> tuple[np.ndarray, float]:
+    """The mean of independent renders, in float64, and the mean of its variance."""
+    pictures = np.stack([renderer.run(seed=10_000 + seed, spp=spp).pixels for seed in range(seeds)]).astype(np.float64)
+    return pictures.mean(axis=0), float(pictures.var(axis=0, ddof=1).mean()) / seeds
+
+
+# --- what it does -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("target", [0.05, 0.01, 0.003])
+def test_it_stops_at_the_first_power_of_two_that_is_good_enough(target: float) -> None:
+    film = render(SCENE, target_error=target)
+    taken = film.metadata["spp"]
+    assert (film.samples == taken).all() and taken % GROUPS == 0 and math.log2(taken // GROUPS).is_integer()
+    assert film.stats["estimated_error"] <= target and film.stats["target_reached"] and not film.stats["timed_out"]
+    assert film.stats["estimated_error"] == pytest.approx(math.sqrt(film.variance.mean(dtype=np.float64)), rel=1e-5)
+    before = render(SCENE, target_error=target, spp=taken // 2)
+    assert before.metadata["spp"] == taken // 2
+    assert before.stats["estimated_error"] > target and not before.stats["target_reached"]
+
+
+def test_the_scenes_own_spp_is_no_limit_but_the_callers_is() -> None:
+    scene = SCENE.with_settings(spp=4)
+    assert render(scene, target_error=0.01).metadata["spp"] > 4
+    assert render(scene, target_error=1e-9, spp=30).metadata["spp"] == 30 // GROUPS * GROUPS
+    assert render(scene, target_error=1e-9, spp=1).metadata["spp"] == GROUPS
+    assert MAX_SPP % GROUPS == 0
+
+
+def test_the_picture_is_the_mean_of_independent_ones() -> None:
+    film = render(SCENE, target_error=1e-9, spp=12 * GROUPS, seed=5)
+    one = Renderer(SCENE, Options())
+    seeds = np.random.SeedSequence(5).generate_state(GROUPS)
+    parts = [one.run(seed=int(seed), spp=12) for seed in seeds]
+    pictures = np.stack([part.pixels for part in parts]).astype(np.float64)
+    assert np.allclose(film.pixels, pictures.mean(axis=0), rtol=1e-6)
+    assert np.allclose(film.variance, pictures.var(axis=0, ddof=1) / GROUPS, rtol=1e-5, atol=1e-12)
+    assert len(np.unique(seeds)) == GROUPS and film.pixels.std() > 0.05
+    for name in ("rays", "samples", "cut_by_depth", "cut_by_throughput", "not_finite"):
+        assert film.stats[name] == sum(part.stats[name] for part in parts)
+
+
+@pytest.mark.parametrize("how", [{"threads": 1, "tile_size": 1000}, {"threads": 2, "tile_size": 5}, {"pass_size": 1},
+                                 {"pass_size": 3, "threads": 2, "tile_size": 16}, {"pass_size": 1000}])
+def test_same_pixels_for_any_tiles_threads_and_passes(how: dict[str, Any]) -> None:
+    expected, film = (render(SCENE, target_error=0.02, **options) for options in ({}, how))
+    for name in ("pixels", "variance", "samples"):
+        assert np.array_equal(getattr(film, name), getattr(expected, name)), name
+    for name in ("estimated_error", "rays", "cut_by_depth", "cut_by_throughput", "lost_throughput_per_sample"):
+        assert film.stats[name] == expected.stats[name], name
+    assert expected.stats["lost_throughput_per_sample"] > 0.0
+
+
+def test_a_crop_counts_its_own_error_only() -> None:
+    dark = render(SCENE, target_error=1e-9, spp=16, crop=(0, 0, 3, 2))  # nothing but black above the floor
+    assert dark.stats["estimated_error"] == 0.0 and dark.stats["target_reached"]
+    whole, crop = (render(SCENE, target_error=1e-9, spp=16, crop=crop) for crop in (None, (4, 6, 20, 14)))
+    assert np.array_equal(crop.pixels, whole.pixels[6:14, 4:20])
+    expected = math.sqrt(whole.variance[6:14, 4:20].mean(dtype=np.float64))
+    assert crop.stats["estimated_error"] == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_black_picture_has_no_error_at_all() -> None:
+    film = render(Scene(cameras=SCENE.cameras, settings=SCENE.settings), target_error=1e-12)
+    assert film.metadata["spp"] == GROUPS and film.stats["estimated_error"] == 0.0
+
+
+def test_time_limit_and_interrupt_end_it_as_well() -> None:
+    film = render(SCENE, target_error=1e-9, time_limit=0.2)
+    assert film.stats["timed_out"] and not film.stats["target_reached"] and film.metadata["spp"] >= GROUPS
+
+    def stop(progress: Any) -> None:
+        assert 0 <= progress.done <= progress.total
+        if progress.done > 24 * 16 * 10 * GROUPS:
+            raise KeyboardInterrupt
+
+    film = render(SCENE, target_error=1e-9, progress=stop)
+    assert film.stats["interrupted"] and not film.stats["timed_out"] and not film.stats["target_reached"]
+    assert np.isfinite(film.pixels).all() and (film.samples % GROUPS == 0).all()
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
+def test_a_target_must_be_a_positive_number(bad: float) -> None:
+    with pytest.raises(InputError, match="target_error must be more than 0"):
+        render(SCENE, target_error=bad)
+
+
+def test_the_command_line(tmp_path: Any) -> None:
+    arguments = ("render", ROOT / "scenes" / "whitted.toml", "--size", "32x18", "-o", tmp_path / "a.png")
+    reached = run_command(*arguments, "--target-error", "0.05")
+    assert reached.code == 0 and "estimated error" in reached.err and "above" not in reached.err
+    missed = run_command(*arguments, "--target-error", "1e-9", "--spp", "8")
+    assert missed.code == 0 and "8 spp, estimated error" in missed.err and "above the target of 1e-09" in missed.err
+    assert run_command(*arguments, "--target-error", "0").code == 2
+
+
+# --- whether it is true -----------------------------------------------------------------------------------------------
+
+
+def compared(scene: Scene, spp: int, seeds: int, truth: np.ndarray, known: float) -> tuple[float, float]:
+    """Estimated and true root mean square error, each over `seeds` renders with a fixed number of samples."""
+    films = [renderer_of(scene, 1e-12).run(seed=seed, spp=spp) for seed in range(seeds)]
+    estimated = math.sqrt(np.mean([film.stats["estimated_error"] ** 2 for film in films]))
+    return estimated, math.sqrt(np.mean([rmse(film.pixels, truth, known) ** 2 for film in films]))
+
+
+@cache
+def renderer_of(scene: Scene, target: float | None) -> Renderer:
+    return Renderer(scene, Options(target_error=target))
+
+
+@cache
+def shipped(name: str, size: tuple[int, int]) -> Scene:
+    return wrt.load_scene(ROOT / "scenes" / f"{name}.toml").with_settings(size=size)
+
+
+@cache
+def sampled(sampler: str) -> Scene:
+    return SCENE.with_settings(sampler=sampler)
+
+
+@cache
+def truth_of_scene() -> tuple[np.ndarray, float]:
+    return reference(renderer_of(sampled("sobol"), None), spp=2048)
+
+
+@pytest.mark.parametrize("name", ["whitted", "lens"])
+def test_the_estimate_is_the_true_error(name: str) -> None:
+    scene = shipped(name, (32, 18))
+    truth, known = reference(renderer_of(scene, None), spp=512)
+    for spp in (16, 128):
+        estimated, true = compared(scene, spp, 8, truth, known)
+        assert estimated == pytest.approx(true, rel=0.2), spp
+        assert known < 0.1 * true**2  # the reference is good enough to tell
+
+
+FIVE_SCENES = ["whitted", "cornell_box", "lens", "frosted", "environment"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FIVE_SCENES)
+def test_the_estimate_is_the_true_error_in_five_scenes(name: str) -> None:
+    scene = shipped(name, (96, 54))
+    truth, known = reference(renderer_of(scene, None), spp=1024)
+    table = {spp: compared(scene, spp, 8, truth, known) for spp in (8, 32, 128, 512)}
+    for spp, (estimated, true) in table.items():
+        print(f"{name} {spp} spp: estimated {estimated:.5f}, true {true:.5f}, ratio {estimated / true:.3f}")
+    for spp, (estimated, true) in table.items():
+        assert estimated == pytest.approx(true, rel=0.2), spp
+
+
+def test_stopping_does_not_flatter() -> None:
+    # A render that stops by its own estimate could stop where the estimate is too low by chance: over many seeds, it does not.
+    target, truth = 0.01, truth_of_scene()
+    films = [renderer_of(sampled("sobol"), target).run(seed=seed, spp=MAX_SPP) for seed in range(24)]
+    true = math.sqrt(np.mean([rmse(film.pixels, *truth) ** 2 for film in films]))
+    estimated = math.sqrt(np.mean([film.stats["estimated_error"] ** 2 for film in films]))
+    assert all(film.stats["target_reached"] for film in films)
+    assert true < target and estimated == pytest.approx(true, rel=0.2)
+
+
+def test_the_spread_of_one_sequences_samples_is_no_honest_estimate() -> None:
+    # What this is for: evenly spread samples are far better than their variance lets on; random numbers are not.
+    ratio = {}
+    for sampler in ("sobol", "independent"):
+        one = renderer_of(sampled(sampler), None)
+        truth, known = truth_of_scene()
+        films = [one.run(seed=seed, spp=64) for seed in range(8)]
+        claimed = math.sqrt(np.mean([film.variance.mean(dtype=np.float64) for film in films]))
+        ratio[sampler] = claimed / math.sqrt(np.mean([rmse(film.pixels, truth, known) ** 2 for film in films]))
+    assert ratio["sobol"] > 2.0
+    assert ratio["independent"] == pytest.approx(1.0, rel=0.2)
+
+
+def test_it_is_honest_for_independent_samples_too() -> None:
+    estimated, true = compared(sampled("independent"), 64, 8, *truth_of_scene())
+    assert estimated == pytest.approx(true, rel=0.2)
