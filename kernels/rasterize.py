@@ -230,7 +230,8 @@ def draw_row(
         x = wp.float64(column) + HALF
         w = depth_at(a, b, c, x, y)
         if w >= ZERO:
-            depth = wp.float32(w * wp.length(view.from_pixels @ wp.vec3d(x, y, wp.float64(1.0))))
+            # abs: the bits of -0 would sort behind everything
+            depth = wp.float32(wp.abs(w) * wp.length(view.from_pixels @ wp.vec3d(x, y, wp.float64(1.0))))
             if wp.isfinite(depth):
                 wp.atomic_min(keys, row * view.width + column, key_of(depth, prim_id))
 

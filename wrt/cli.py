@@ -103,7 +103,7 @@ def cli() -> None:
 @click.option("--exposure", type=float, help="Stops  [default: the scene's, 0]")
 @click.option("--time-limit", type=Duration(), help="Stop after 30s, 5m, 1h of tracing, with what there is")
 @click.option("--target-error", type=float,
-              help="Stop when the estimated error of the picture is no larger: the root mean square, over pixels and channels, of"
+              help="Stop when the picture's estimated error is no larger: the root mean square, over pixels and channels, of"
                    " the standard error in linear radiance (noise alone); --spp is then the most to take  [default: 65536]")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print the statistics as JSON")
@@ -305,6 +305,35 @@ def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float
         raise SystemExit(1)
 
 
+@cli.command()
+@click.argument("cases", nargs=-1)
+@click.option("--rays", type=click.IntRange(min=1), default=10_000, show_default=True, help="Rays of each case")
+@click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@click.option("--peers", is_flag=True, help="Also Embree (embreex) and Warp's own mesh_query_ray")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the tables as Markdown (.md)")
+@click.option("--json", "as_json", is_flag=True, help="Print the rows as JSON")
+def stability(cases: tuple[str, ...], rays: int, seed: int, peers: bool, output: Path | None, as_json: bool) -> None:
+    """The hard cases against the intersection tests: rays lost and errors, with the speed beside them.
+
+    CASES: names such as E_grid, or the letters of groups; without any, all.
+    """
+    from wrt.bench import stability as bench_stability
+
+    def report(row: Any) -> None:
+        if not as_json:
+            click.echo("  ".join(bench_stability.cells(row)))
+
+    if output is not None:
+        bench_stability.check_report(output)
+    if not as_json:
+        click.echo("  ".join(bench_stability.COLUMNS))
+    rows = bench_stability.run(cases, rays, peers=peers, seed=seed, report=report)
+    if output is not None:
+        bench_stability.write_report(rows, output)
+    if as_json:
+        _say_json([row.as_dict() for row in rows])
+
+
 @cli.group()
 def bench() -> None:
     """Measure: speed against error, and one method against another."""
@@ -348,6 +377,46 @@ def visibility(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_js
         return
     click.echo(f"{told}\n\n{report.markdown(rows)}\n{report.LEGEND}")
     for path in paths:
+        click.echo(path)
+
+
+@bench.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--knobs", type=Names(), default=(),
+              help="Which to turn: sampler, max_depth, triangle ... (a wrong name lists them)  [default: all]")
+@click.option("--size", type=Size(), default="128x72", show_default=True, help="Pixels")
+@click.option("--max-spp", type=int, default=64, show_default=True, help="Samples a pixel: 1, 2, 4 ... up to this")
+@click.option("--repeats", type=int, default=8, show_default=True, help="Seeds of each picture, for the intervals")
+@click.option("--reference-spp", type=int, help="Samples of each of the reference's seeds  [default: 8 times --max-spp]")
+@click.option("--row-limit", type=Duration(), default="120s", show_default=True,
+              help="Leave out what would take longer than this, with all its seeds")
+@click.option("--camera", help="A camera's name or number  [default: the first]")
+@click.option("--seed", type=int, default=0, show_default=True, help="Decides on all seeds")
+@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
+@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for a report: Markdown, plot and data")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def error(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tuple[int, int], **options: Any) -> None:
+    """Speed against error of SCENE over the knobs that a render has: each picture against a converged reference."""
+    from wrt.bench import error as bench_error
+    from wrt.bench import error_report as report
+    from wrt.driver import Options
+
+    plan = bench_error.Plan(**{name: options.pop(name) for name in (
+        "knobs", "max_spp", "repeats", "reference_spp")}, row_seconds=options.pop("row_limit"))
+    rendering = Options(**options)
+    paths = {} if output is None else report.report_paths(output, scene.stem)
+    loaded = _load(scene, quiet).with_settings(size=size)
+    with _warnings_told(quiet), _naming(scene):
+        result = bench_error.sweep(loaded, plan, rendering, lambda step: None if quiet else _say(step))
+    if paths:
+        report.write_report(result, paths, f"python -m wrt {click.get_current_context().command_path}")
+    if as_json:
+        _say_json({**result.as_dict(), "output": [str(path) for path in paths.values()]})
+        return
+    click.echo(report.text(result))
+    for path in paths.values():
         click.echo(path)
 
 

@@ -60,6 +60,14 @@ class AllHits:
         return AllHits(*(getattr(self, name)[rows] for name in AllHits.__dataclass_fields__))
 
 
+_NO_HITS = AllHits(np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0),
+                   np.zeros(0, np.int8))
+
+
+def _merged(parts: list[AllHits]) -> AllHits:
+    return AllHits(*(np.concatenate([getattr(part, name) for part in parts]) for name in AllHits.__dataclass_fields__))
+
+
 @dataclass(frozen=True, eq=False)
 class Answer:
     """The closest hit of each ray: t (N,) float64, inf on a miss; prim_id (N,) int32, -1 on a miss, the lowest of an exact
@@ -156,9 +164,7 @@ class Reference:
         or (N,). Rays that are not finite, or have no direction, hit nothing."""
         rays = _Rays.of(origins, directions, t_min, t_max)
         found = [self._tested(rays, ray, prim_id) for ray, prim_id in self.candidates(rays)]
-        empty = AllHits(np.zeros(0, np.int64), np.zeros(0, np.int32), *(np.zeros(0) for _ in range(4)), np.zeros(0, np.int8))
-        hits = AllHits(*(np.concatenate([getattr(part, name) for part in [empty, *found]])
-                         for name in AllHits.__dataclass_fields__))
+        hits = _merged([_NO_HITS, *found])
         return hits.chosen(np.lexsort((hits.prim_id, hits.t, hits.ray)))
 
     def _tested(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> AllHits:
@@ -175,7 +181,7 @@ class Reference:
                 place = np.where(found.touching[keep], Place.EDGE, Place.INSIDE).astype(np.int8)
                 zero = np.zeros(len(keep))
                 parts.append(AllHits(r[keep], p[keep], t[keep], zero, zero, t_error[keep], place))
-        return AllHits(*(np.concatenate([getattr(part, name) for part in parts]) for name in AllHits.__dataclass_fields__))
+        return _merged(parts)
 
     def _tested_triangles(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> AllHits:
         o, d = rays.origin[:, ray], rays.direction[:, ray]
@@ -194,7 +200,8 @@ class Reference:
         return AllHits(ray[keep], prim_id[keep], found.t[keep], found.u[keep], found.v[keep], found.t_error[keep],
                        found.place[keep])
 
-    def _sphere_columns(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _sphere_columns(self, rays: _Rays, ray: np.ndarray,
+                        prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         sphere = prim_id - self.n_triangles
         return rays.origin[:, ray], rays.direction[:, ray], self.center[:, sphere], self.radius[sphere]
 

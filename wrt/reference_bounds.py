@@ -90,8 +90,9 @@ def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarra
     lost = (np.abs(d_z) * LARGEST_32 < 1.0) | (np.abs(np.stack(local)).max(axis=(0, 1)) > LARGEST_32)
     unknown = lost | ~(np.abs(crossings.slope) > 0.0)
     t, w = np.where(unknown, np.inf, t), np.where(unknown, np.inf, w)
-    u_and_v = w[1:] + UNIT_32 * (np.abs([crossings.u, crossings.v]) + w[1:]) + TINY_32
-    return Bounds(t, *np.where(unknown, np.inf, u_and_v), w, _meets_rectangle(flat, delta) | lost)
+    u, v_weight = w[1:] + UNIT_32 * (np.abs([crossings.u, crossings.v]) + w[1:]) + TINY_32
+    return Bounds(t, np.where(unknown, np.inf, u), np.where(unknown, np.inf, v_weight), w,
+                  _meets_rectangle(flat, delta) | lost)
 
 
 def _normal(v: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -59,7 +59,8 @@ def _load_gltf(path: Path) -> Scene:
 def _load_bare_mesh(path: Path) -> Scene:
     grey = Material(name="light grey", albedo=(0.75, 0.75, 0.75))
     mesh = load_mesh(path)
-    notes = [f"its {len(mesh.groups)} parts are all light grey: a TOML scene can give each a material"] if len(mesh.groups) > 1 else []
+    parts = f"its {len(mesh.groups)} parts are all light grey: a TOML scene can give each a material"
+    notes = [parts] if len(mesh.groups) > 1 else []
     return _staged(Scene(objects=(Object(mesh, (grey,), name=path.stem),), name=path.stem), path, notes)
 
 

@@ -134,7 +134,8 @@ def whitted_scene() -> Scene:
     specular, diffuse = specular_scene(), thin_lens_scene()
     lamp = Sphere((0.2, -0.4, 1.5), 0.25, Material(emission=(2, 3, 4), albedo=(0.1, 0.1, 0.1)))
     return replace(specular, objects=diffuse.objects + specular.objects, spheres=(*specular.spheres, lamp),
-                   lights=diffuse.lights, ambient=(0.05, 0.06, 0.07), settings=Settings(max_depth=12, min_throughput=0.0, filter="box"))
+                   lights=diffuse.lights, ambient=(0.05, 0.06, 0.07),
+                   settings=Settings(max_depth=12, min_throughput=0.0, filter="box"))
 
 
 @pytest.mark.parametrize(("make", "integrator", "spp"), [

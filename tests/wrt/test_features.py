@@ -174,5 +174,5 @@ def test_emission_by_texture_or_alpha_is_seen_but_does_not_light() -> None:
     black = Texture(np.zeros((1, 1, 4), np.uint8))
     lamp = Material(emission=(3, 3, 3))
     assert lamp.lights_others
-    for hidden in ({"emission_texture": black}, {"alpha_mode": "mask"}, {"alpha_mode": "blend", "alpha": 0.0}, {"emits_light": False}):
+    for hidden in ({"emission_texture": black}, {"alpha_mode": "mask"}, {"alpha_mode": "blend"}, {"emits_light": False}):
         assert not replace(lamp, **hidden).lights_others

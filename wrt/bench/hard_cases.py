@@ -29,11 +29,13 @@ __all__ = ["ASK", "HARD_CASES", "HIT", "MISS", "HardCase", "Verdict", "chunks", 
 HARD_CASES: dict[str, Callable[[Seed, int], HardCase]] = {
     **{f"A_{place}_{aim}": partial(inside.dense_sphere, position=place, aim=aim)
        for place in inside.POSITIONS for aim in AIMS},
+    **{f"A_far_flipped_{aim}": partial(inside.dense_sphere, position="far", aim=aim, flip=True) for aim in AIMS},
     "B_jittered_uniform": partial(inside.jittered_sphere, aim="uniform"),
     "B_jittered_vertices": partial(inside.jittered_sphere, aim="vertices"),
     "C_triangles": outside.respawned_triangles,
     "C_spheres": outside.respawned_spheres,
     "D_without_area": outside.without_area,
+    "D_without_area_wide": partial(outside.without_area, wide=True),
     "D_among_bad": outside.among_bad,
     "D_published": outside.published_bad,
     "D_huge": outside.huge,

@@ -137,10 +137,11 @@ def judge(case: HardCase, hits: Any, asked: int | None = None) -> Verdict:
     verdict = Verdict(rays=len(case), hits=int(reported.sum()))
     verdict.wrong("misses", case, np.flatnonzero(~reported & (case.expected == HIT)), "must hit, is said to miss")
     verdict.wrong("false_hits", case, np.flatnonzero(reported & (case.expected == MISS)), "must miss", prim_id)
-    possible = reported & (prim_id < len(case.geometry.faces) + len(case.geometry.spheres)) & np.isfinite(t)
-    possible &= (t >= case.t_min) & (t <= case.t_max)
+    possible = reported & np.isfinite(t) & (t >= case.t_min) & (t <= case.t_max) & (prim_id < len(reference.finite))
+    possible[possible] &= reference.finite[prim_id[possible]]
+    possible &= np.isfinite(case.origins).all(axis=1) & np.isfinite(case.directions).all(axis=1)
     verdict.wrong("false_hits", case, np.flatnonzero(reported & ~possible & (case.expected != MISS)),
-                  "t outside of the segment, or no such prim_id", prim_id)
+                  "t outside of the segment, or nothing that can be hit", prim_id)
 
     rows = np.flatnonzero(possible & (case.expected != MISS))
     parts = [_claims(case, reference, rows[i:i + RAYS_AT_ONCE], (t, u, v, prim_id), verdict)
@@ -209,7 +210,7 @@ def _judge_closeness(case: HardCase, reference: Reference, claims: _Claims, verd
     wrong[found.ray[passed & certain & other]] = True
     if case.closed:
         skipped = passed & ~certain & other & (claims.t[found.ray] > found.t + bound + claims.t_bound[found.ray])
-        wrong |= _leaks(case, found.chosen(np.flatnonzero(skipped)), claims.row, claims.t)
+        wrong |= _leaks(case, found.chosen(skipped), bound[skipped], claims.row, claims.t)
     same = claims.prim_id == answer.prim_id
     for ray, tied in answer.ties.items():
         same[ray] |= claims.prim_id[ray] in tied
@@ -247,25 +248,28 @@ def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdic
         part = rows[first:first + RAYS_AT_ONCE]
         o, d = case.origins[part], case.directions[part]
         found = reference.all_hits(o, d, case.t_min[part], case.t_max[part])
-        certain, _ = _certain(case, reference, found, part, o, d)
+        certain, bound = _certain(case, reference, found, part, o, d)
         missed, border = np.zeros((2, len(part)), bool)
         missed[found.ray[certain]] = True
         border[found.ray] = True
         if case.closed:
-            missed |= _leaks(case, found.chosen(np.flatnonzero(~missed[found.ray])), part, np.full(len(part), np.inf))
+            left = ~missed[found.ray] & np.isfinite(bound)
+            missed |= _leaks(case, found.chosen(left), bound[left], part, np.full(len(part), np.inf))
         verdict.borderline_misses += int((border & ~missed).sum())
         verdict.wrong("misses", case, part[missed], "has a hit that had to be found")
 
 
-def _leaks(case: HardCase, skipped: AllHits, row: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _leaks(case: HardCase, skipped: AllHits, bound: np.ndarray, row: np.ndarray, end: np.ndarray) -> np.ndarray:
     """(n,) bool for the case's rays `row`: those that pass through a closed surface by crossings that were left out. The
-    winding number behind one of them, before the next or before end[i], is not that of the segment's start."""
+    winding number behind one of them, before the next or before end[i], is not that of the segment's start. Crossings that
+    their bounds on t do not part are taken together: a ray may shave off a corner by less than the bound."""
     leaks = np.zeros(len(row), bool)
     for i in np.unique(skipped.ray):
-        t = skipped.t[skipped.ray == i]
-        t = np.append(t, end[i] if np.isfinite(end[i]) else 2.0 * t.max() + 1.0)
-        wide = np.flatnonzero(np.diff(t) > 1e-6 * np.abs(t[1:]))
-        at = np.array([float(case.t_min[row[i]]), *(0.5 * (t[wide] + t[wide + 1]))])
+        mine = skipped.ray == i
+        low, high = skipped.t[mine] - bound[mine], np.maximum.accumulate(skipped.t[mine] + bound[mine])
+        low = np.append(np.minimum.accumulate(low[::-1])[::-1], end[i] if np.isfinite(end[i]) else 2.0 * high[-1] + 1.0)
+        gap = np.flatnonzero(high < low[1:])
+        at = np.array([float(case.t_min[row[i]]), *(0.5 * (high[gap] + low[gap + 1]))])
         o, d = (x[row[i]].astype(np.float64) for x in (case.origins, case.directions))
         winding = np.round(winding_number(case, o + at[:, None] * d))
         leaks[i] = bool((winding[1:] != winding[0]).any())
@@ -298,9 +302,10 @@ def _lower_twin(case: HardCase, prim_id: int, tied: np.ndarray) -> bool:
 def judge_next(case: HardCase, first_prim_id: np.ndarray, next_prim_id: np.ndarray) -> Verdict:
     """Case C: rays that were spawned at the hits of the first (on a sphere: to its outside) must not hit the same primitive.
 
-    prim_id (N,) each, -1 on a miss; where the first misses, the next is not looked at.
+    prim_id (N,) each, -1 on a miss; where the first misses, the next is not looked at. To be added to judge's verdict, which
+    has counted rays and hits.
     """
-    verdict = Verdict(rays=int((first_prim_id >= 0).sum()))
+    verdict = Verdict()
     again = np.flatnonzero((first_prim_id >= 0) & (next_prim_id == first_prim_id))
     verdict.wrong("self_hits", case, again, "hits the primitive that it starts on", next_prim_id)
     return verdict
@@ -310,12 +315,13 @@ def judge_all_hits(case: HardCase, ray: np.ndarray, prim_id: np.ndarray, t: np.n
     """The verdict on all-hits queries over triangles: one row a reported hit, in any order.
 
     Duplicates: a primitive twice on a ray; and on a closed surface, whose crossings go in and out by turns, two in a row in
-    the same direction that are no farther apart than the bounds: one crossing of an edge, told twice.
+    the same direction that are no farther apart than the bounds: one crossing of an edge, told twice. To be added to judge's
+    verdict, which has counted rays and hits.
     """
     reference = reference_of(case.geometry)
     order = np.lexsort((prim_id, t, ray))
     ray, prim_id, t = ray[order], prim_id[order], t[order].astype(np.float64)
-    verdict = Verdict(rays=len(case), hits=len(ray))
+    verdict = Verdict()
     exact, limit = reference.against(case.origins[ray], case.directions[ray], prim_id)
     sound = limit.touches & (exact.place != Place.DEGENERATE)
     verdict.wrong("false_hits", case, ray[~sound], "passes the primitive by more than rounding")

@@ -56,11 +56,13 @@ def respawned_triangles(seed: Seed, n: int) -> HardCase:
 
 
 def respawned_spheres(seed: Seed, n: int) -> HardCase:
-    """C: 8 spheres of radius 10^U(-4, 4), moved by up to 10^U(-4, 4); rays at them from outside and from inside. A ray from
+    """C: 8 spheres of radius 10^U(-4, 4), moved by up to 1e4, but by no more than 2^22 radii: one that is smaller than the
+    float32 spacing at its centre has no side that a ray could be on. Rays at them from outside and from inside. A ray from
     the hit, turned to the outside of the sphere, must not hit it again."""
     rng = np.random.default_rng(seed)
     radius = 10.0 ** rng.uniform(-4.0, 4.0, (8, 1))
-    spheres = np.concatenate([unit_vectors(rng, 8) * 10.0 ** rng.uniform(-4.0, 4.0, (8, 1)), radius], axis=1)
+    moved = np.minimum(10.0 ** rng.uniform(-4.0, 4.0, (8, 1)), 2.0**22 * radius)
+    spheres = np.concatenate([unit_vectors(rng, 8) * moved, radius], axis=1)
     geometry = surface(np.zeros((0, 3)), np.zeros((0, 3)), spheres)
     chosen = geometry.spheres[rng.integers(8, size=n)].astype(np.float64)
     away = np.where(rng.random((n, 1)) < 0.25, 0.5, 10.0 ** rng.uniform(0.0, 3.0, (n, 1)))
@@ -71,7 +73,7 @@ def respawned_spheres(seed: Seed, n: int) -> HardCase:
 
 @cache
 def _without_area() -> Geometry:
-    """Three corners on a line (small whole numbers, so that they are exactly on it), two or three the same."""
+    """Three corners on a line (small whole numbers, so that they are exactly on it), two or three of them the same."""
     rng = np.random.default_rng(0)
     start, step = rng.integers(-8, 9, (2, 96, 1, 3)) / 8.0
     along = np.stack([rng.permutation(4)[:3] for _ in range(96)])[:, :, None]
@@ -80,10 +82,18 @@ def _without_area() -> Geometry:
     return soup(start + along * step)
 
 
-def without_area(seed: Seed, n: int) -> HardCase:
-    """D: collinear and repeated corners are never hit, whatever rounding says."""
+@cache
+def _line_through_zero() -> Geometry:
+    """Corners on a line through 0, up to 2^60 apart in size: float64 rounds their differences, and their products."""
+    rng = np.random.default_rng(0)
+    step = rng.uniform(-4.0, 4.0, (96, 1, 3)).astype(np.float32).astype(np.float64)
+    return soup(2.0 ** -rng.integers(0, 60, (96, 3, 1)) * step)
+
+
+def without_area(seed: Seed, n: int, *, wide: bool = False) -> HardCase:
+    """D: collinear and repeated corners are never hit, whatever rounding says. wide: corners of very different size."""
     rng = np.random.default_rng(seed)
-    geometry = _without_area()
+    geometry = _line_through_zero() if wide else _without_area()
     origins = in_ball(rng, n, 4.0)
     origins[::2] = (origins[::2] * 8.0).round() / 8.0
     return replace(_towards(geometry, rng, origins, _points(geometry, rng, n)), expected=np.full(n, MISS, np.int8))
@@ -92,11 +102,9 @@ def without_area(seed: Seed, n: int) -> HardCase:
 def among_bad(seed: Seed, n: int) -> HardCase:
     """D: a closed sphere with such triangles inside: the sphere must be hit, through them."""
     rng = np.random.default_rng(seed)
-    bad = _without_area()
-    geometry = _sphere_with_bad()
     origins = in_ball(rng, n, 0.5).astype(np.float32)
-    directions = _points(bad, rng, n) - origins.astype(np.float64)
-    return hard_case(geometry, origins, directions, HIT, closed=True)
+    directions = _points(_without_area(), rng, n) - origins.astype(np.float64)
+    return hard_case(_sphere_with_bad(), origins, directions, HIT, closed=True)
 
 
 @cache

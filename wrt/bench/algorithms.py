@@ -1,0 +1,129 @@
+"""What is put to the hard cases: wrt's own tests through the BVH, and the ray queries of other libraries (peers)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+
+from wrt.accel import Hits, build
+from wrt.accel.base import Geometry
+from wrt.errors import InputError
+
+
+class Algorithm(ABC):
+    """A way to find closest hits. prepare() once a geometry, then closest() on one thread."""
+
+    name: str
+    bytes_per_triangle: float = float("nan")
+    is_peer: ClassVar[bool] = False
+
+    @abstractmethod
+    def prepare(self, geometry: Geometry) -> bool:
+        """Build for this geometry; False where the library cannot take it (spheres)."""
+
+    @abstractmethod
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
+        """As wrt.accel.Accelerator.closest_hit."""
+
+
+class Own(Algorithm):
+    """wrt's BVH with one triangle test and one box test."""
+
+    def __init__(self, triangle: str = "watertight", box: str = "conservative") -> None:
+        self.triangle, self.box = triangle, box
+        self.name = triangle if box == "conservative" else f"{triangle}, {box} boxes"
+
+    def prepare(self, geometry: Geometry) -> bool:
+        self.accel = build(geometry, "bvh", triangle=self.triangle, box=self.box, threads=1)
+        self.bytes_per_triangle = self.accel.stats.bytes / max(len(geometry), 1)
+        return True
+
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
+        return self.accel.closest_hit(origins, directions, t_min, t_max, threads=1)
+
+
+class Peer(Algorithm):
+    """Another library: triangles only. Segments are cut after the query where it has no t_min."""
+
+    is_peer = True
+
+    def prepare(self, geometry: Geometry) -> bool:
+        if len(geometry.spheres) or not len(geometry.faces):
+            return False
+        self.load(geometry)
+        return True
+
+    @abstractmethod
+    def load(self, geometry: Geometry) -> None:
+        """Take the triangles."""
+
+
+class Embree(Peer):
+    """Embree 4 through embreex, with its robust flag off, as embreex sets it."""
+
+    name = "Embree (embreex)"
+
+    def load(self, geometry: Geometry) -> None:
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError as error:
+            raise InputError(f'embreex is not usable ({error}); pip install "wrt[peers]" installs it') from error
+        self.scene = EmbreeScene()
+        self.mesh = TriangleMesh(self.scene, geometry.vertices, geometry.faces)
+
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
+        out = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
+        prim_id = out["primID"].astype(np.int32)
+        return _cut(out["tfar"], prim_id, out["u"], out["v"], t_min, t_max)
+
+
+class WarpMesh(Peer):
+    """Warp's own mesh_query_ray on wp.Mesh with its SAH constructor. It says where, but not at which t below 0."""
+
+    name = "Warp mesh_query_ray"
+
+    def load(self, geometry: Geometry) -> None:
+        import warp as wp
+
+        from wrt.device import start
+
+        self.device = start("cpu")
+        points = wp.array(geometry.vertices.copy(), dtype=wp.vec3, device=self.device)
+        indices = wp.array(geometry.faces.ravel().copy(), dtype=wp.int32, device=self.device)
+        self.mesh = wp.Mesh(points=points, indices=indices, bvh_constructor="sah")
+
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
+        import warp as wp
+
+        from wrt.kernels.peers import warp_mesh_query
+
+        n = len(origins)
+        length = np.linalg.norm(directions.astype(np.float64), axis=1)
+        rays = [wp.array(np.ascontiguousarray(x, np.float32), dtype=wp.vec3, device=self.device)
+                for x in (origins, directions / length[:, None])]
+        t, u, v = (wp.empty(n, dtype=wp.float32, device=self.device) for _ in range(3))
+        prim_id = wp.empty(n, dtype=wp.int32, device=self.device)
+        wp.launch(warp_mesh_query, dim=n, inputs=[self.mesh.id, *rays, t, u, v, prim_id], device=self.device)
+        # Warp's u and v belong to the first two corners; wrt's to the last two.
+        told = (t.numpy() / length).astype(np.float32)
+        return _cut(told, prim_id.numpy(), v.numpy(), 1.0 - u.numpy() - v.numpy(), t_min, t_max)
+
+
+def _cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min: Any, t_max: Any) -> Hits:
+    outside = (prim_id < 0) | ~((t >= t_min) & (t <= t_max))
+    return Hits(np.where(outside, np.float32(np.inf), t), np.where(outside, 0, u), np.where(outside, 0, v),
+                np.where(outside, np.int32(-1), prim_id))
+
+
+def own_algorithms() -> list[Own]:
+    """Every triangle test with conservative boxes, and the default test with every other box test."""
+    from wrt.kernels.ray_aabb import RAY_AABB
+    from wrt.kernels.ray_triangle import RAY_TRIANGLE
+
+    return [Own(triangle) for triangle in RAY_TRIANGLE] + [Own(box=box) for box in RAY_AABB if box != "conservative"]
+
+
+PEERS: dict[str, type[Peer]] = {"embree": Embree, "warp": WarpMesh}

@@ -1,0 +1,363 @@
+"""`python -m wrt bench error`: a scene over the knobs that a user has, speed beside error.
+
+Every picture is held against one reference of the same scene. A knob is turned alone, the others stay as the scene and the
+defaults have them; each setting is rendered with 1, 2, 4 ... samples a pixel and several seeds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+import wrt
+from wrt import metrics
+from wrt.accel import ACCELERATORS
+from wrt.bench import error_statistics as statistics
+from wrt.bench.error_statistics import UNKNOWN, Estimate
+from wrt.driver import Options, Renderer
+from wrt.errors import InputError
+from wrt.features import Features
+from wrt.film import Film
+from wrt.kernels.ray_aabb import RAY_AABB
+from wrt.kernels.ray_triangle import RAY_TRIANGLE
+from wrt.scene import SAMPLERS, Scene
+
+REFERENCE_SEEDS = 8
+REFERENCE_DEPTH, REFERENCE_THROUGHPUT = 32, 1e-5
+BRUTE_FORCE_LIMIT = 5000  # primitives that it is still put to
+BASE = "as it is"
+
+
+# --- the knobs --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Knob:
+    """What a user can turn: a field of wrt.scene.Settings or of wrt.driver.Options, and the values to try.
+
+    matters: whether it changes anything in this scene.
+    """
+
+    name: str
+    kind: Literal["settings", "options"]
+    values: Callable[[Scene], Iterable[Any]]
+    matters: Callable[[Scene, Features], bool] = lambda scene, features: True
+
+
+def branches(scene: Scene, features: Features) -> bool:
+    return features.reflection or features.refraction or features.blend
+
+
+def has_dielectric(scene: Scene, features: Features) -> bool:
+    return features.refraction or features.metallic_roughness
+
+
+def primitives(scene: Scene) -> int:
+    return sum(len(thing.mesh.faces) for thing in scene.objects) + len(scene.spheres)
+
+
+def has_triangles(scene: Scene, features: Features) -> bool:
+    return primitives(scene) > len(scene.spheres)
+
+
+def structures(scene: Scene) -> list[str]:
+    """One name a structure; brute force where it ends in a lifetime."""
+    by_class = {cls: name for name, cls in reversed(ACCELERATORS.items())}
+    names = [name for name in ACCELERATORS if name in by_class.values()]
+    return [name for name in names if name != "brute_force" or primitives(scene) <= BRUTE_FORCE_LIMIT]
+
+
+KNOBS = {knob.name: knob for knob in (
+    Knob("sampler", "settings", lambda scene: SAMPLERS),
+    Knob("max_depth", "settings", lambda scene: (0, 1, 2, 4, 8, 16), branches),
+    Knob("min_throughput", "settings", lambda scene: (0.1, 0.01, 0.001, 0.0001), branches),
+    Knob("fresnel", "settings", lambda scene: ("exact", "schlick"), has_dielectric),
+    Knob("triangle", "options", lambda scene: RAY_TRIANGLE, has_triangles),
+    Knob("box", "options", lambda scene: RAY_AABB),
+    Knob("accel", "options", structures),
+)}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One knob at one value (knob "" and value None: none is turned), ready to be rendered with."""
+
+    knob: str
+    value: Any
+    scene: Scene
+    options: Options
+
+    @property
+    def label(self) -> str:
+        return f"{self.knob} = {self.value}" if self.knob else BASE
+
+
+def variants(scene: Scene, options: Options, features: Features, knobs: Sequence[str]) -> tuple[list[Variant], list[str]]:
+    """The scene as it is, then every value of every knob; and a sentence for each knob that changes nothing."""
+    found, left_out = [Variant("", None, scene, options)], []
+    for name in knobs:
+        knob = KNOBS[name]
+        if not knob.matters(scene, features):
+            left_out.append(f"{name}: it changes nothing in this scene")
+            continue
+        now = getattr(scene.settings if knob.kind == "settings" else options, name)
+        for value in knob.values(scene):
+            if value == now:
+                continue
+            if knob.kind == "settings":
+                found.append(Variant(name, value, scene.with_settings(**{name: value}), options))
+            else:
+                found.append(Variant(name, value, scene, replace(options, **{name: value})))
+    return found, left_out
+
+
+# --- the reference ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What counts as the truth. pixels: (H, W, 3) float64, the mean over independent seeds; variance: of that mean, averaged
+    over pixels and channels; lost: the share of light that was not followed (a bound on what its own cuts may hide)."""
+
+    pixels: np.ndarray
+    variance: float
+    lost: float
+    seeds: int
+    spp: int
+    max_depth: int
+    min_throughput: float
+    seconds: float
+
+    @property
+    def rmse(self) -> float:
+        return float(np.sqrt(self.variance))
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"rmse": self.rmse, "lost_throughput_per_sample": self.lost, "seeds": self.seeds, "spp_each": self.spp,
+                "max_depth": self.max_depth, "min_throughput": self.min_throughput, "seconds": self.seconds,
+                "mean": float(self.pixels.mean())}
+
+
+def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int]) -> Reference:
+    """Exact Fresnel, the even sampler, the default tests and structure, deep and with a low cut-off; float64 over the seeds."""
+    settings = scene.settings
+    depth, throughput = max(settings.max_depth, REFERENCE_DEPTH), min(settings.min_throughput, REFERENCE_THROUGHPUT)
+    scene = scene.with_settings(max_depth=depth, min_throughput=throughput, fresnel="exact", sampler="sobol")
+    renderer = Renderer(scene, Options(device=options.device, threads=options.threads, camera=options.camera))
+    begin = time.perf_counter()
+    mean: Any = 0.0
+    squares: Any = 0.0
+    lost = 0.0
+    for n, seed in enumerate(seeds, start=1):  # Welford 1962
+        film = finished(renderer.run(seed=seed, spp=spp))
+        delta = film.pixels.astype(np.float64) - mean
+        mean = mean + delta / n
+        squares = squares + delta * (film.pixels - mean)
+        lost += film.stats["lost_throughput_per_sample"] / len(seeds)
+    variance = float(np.mean(squares)) / (len(seeds) * (len(seeds) - 1))
+    return Reference(np.asarray(mean), variance, lost, len(seeds), spp, depth, throughput, time.perf_counter() - begin)
+
+
+def finished(film: Film) -> Film:
+    """The film, or KeyboardInterrupt where Ctrl-C ended it early."""
+    if film.stats["interrupted"]:
+        raise KeyboardInterrupt
+    return film
+
+
+# --- one row ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Row:
+    """One variant at one number of samples.
+
+    products: of the repeats' errors (statistics.gram). rmse: of one picture, the reference's own error taken out; NaN where
+    it is below that. bias, noise: root mean squares over the pixels, rmse^2 = bias^2 + noise^2; bias is NaN where it cannot
+    be told from noise, and `bias_below` bounds it. efficiency: 1 / (mse x seconds). digest: equal where all pixels are.
+    """
+
+    variant: Variant
+    spp: int
+    products: np.ndarray = field(repr=False)
+    seconds: Estimate
+    rmse: Estimate
+    efficiency: Estimate
+    relmse: Estimate
+    flip: Estimate
+    bias: float
+    bias_below: float
+    noise: float
+    build_seconds: float
+    rays_per_sample: float
+    digest: str
+    pareto: bool = False
+
+    def as_dict(self) -> dict[str, Any]:
+        v = self.variant
+        return {"variant": v.label, "knob": v.knob or None, "value": v.value, "spp": self.spp, "bias": self.bias,
+                "bias_below": self.bias_below, "noise": self.noise, "build_seconds": self.build_seconds,
+                "rays_per_sample": self.rays_per_sample, "pareto": self.pareto,
+                **{name: getattr(self, name).as_dict() for name in ("seconds", "rmse", "efficiency", "relmse", "flip")}}
+
+
+def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int], truth: Reference) -> Row:
+    """Render with every seed and compare."""
+    films = [finished(renderer.run(seed=seed, spp=spp)) for seed in seeds]
+    n, settings = len(films), variant.scene.settings
+    seconds = np.array([film.stats["seconds"]["trace"] for film in films])
+    products = statistics.gram([film.pixels for film in films], truth.pixels)
+    compared = [metrics.compare(film.pixels, truth.pixels, exposure=settings.exposure, tonemap=settings.tonemap)
+                for film in films]
+
+    def mse(indices: np.ndarray) -> float:
+        return statistics.mse_of(products[np.ix_(indices, indices)], truth.variance)
+
+    def efficiency(indices: np.ndarray) -> float:
+        return 1.0 / (mse(indices) * float(seconds[indices].mean()))
+
+    measurable = mse(np.arange(n)) > 0.0
+    bias, bias_below = statistics.bias_with_bound(products, truth.variance)
+    return Row(
+        variant, spp, products,
+        seconds=statistics.mean_estimate(seconds.tolist()),
+        rmse=statistics.estimate(lambda i: max(mse(i), 0.0) ** 0.5, n, logarithmic=True) if measurable else UNKNOWN,
+        efficiency=statistics.estimate(efficiency, n, logarithmic=True) if measurable else UNKNOWN,
+        relmse=statistics.mean_estimate([result["relmse"] for result in compared]),
+        flip=statistics.mean_estimate([result["flip"] for result in compared]),
+        bias=bias, bias_below=bias_below, noise=max(statistics.noise_of(products), 0.0) ** 0.5,
+        build_seconds=films[0].stats["seconds"]["build"],
+        rays_per_sample=float(np.mean([film.stats["rays_per_sample"] for film in films])),
+        digest=hashlib.sha256(b"".join(film.pixels.tobytes() for film in films)).hexdigest())
+
+
+@dataclass(frozen=True)
+class Slope:
+    """How a variant's log mse, and the log of its variance alone, fall with log spp."""
+
+    variant: Variant
+    mse: Estimate
+    noise: Estimate
+
+    @property
+    def theory(self) -> str:
+        return THEORY[self.variant.scene.settings.sampler]
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"variant": self.variant.label, "mse": self.mse.as_dict(), "noise": self.noise.as_dict(), "theory": self.theory}
+
+
+# Of the variance. Independent samples: -1. Scrambled nets: -3 where the integrand is smooth (Owen 1997, "Scrambled Net Variance
+# for Integrals of Smooth Functions"), -1 - 1/d where an edge crosses d dimensions (He and Wang 2015, "On the Convergence Rate
+# of Randomized Quasi-Monte Carlo for Discontinuous Functions"): -1.5 here. Each pair of dimensions is a net by itself, so that
+# what depends on two pairs at once (pixel and lens, pixel and light) falls as for independent samples.
+THEORY = {"independent": "-1", "sobol": "-1 to -3"}
+
+
+def slope_of(rows: Sequence[Row], known: float) -> Slope:
+    """Over the rows of one variant; known: the reference's variance."""
+
+    def mse(indices: np.ndarray) -> list[float]:
+        return [statistics.mse_of(row.products[np.ix_(indices, indices)], known) for row in rows]
+
+    def noise(indices: np.ndarray) -> list[float]:
+        return [statistics.noise_of(row.products[np.ix_(indices, indices)]) for row in rows]
+
+    spp, repeats = [row.spp for row in rows], len(rows[0].products)
+    return Slope(rows[0].variant, statistics.slope(spp, mse, repeats), statistics.slope(spp, noise, repeats))
+
+
+# --- the sweep --------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Sweep:
+    """Everything that was measured, and what it was measured on."""
+
+    scene: str
+    size: tuple[int, int]
+    repeats: int
+    seed: int
+    reference: Reference
+    machine: dict[str, Any]
+    rows: list[Row] = field(default_factory=list)
+    slopes: list[Slope] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+    @property
+    def same_pixels(self) -> list[str]:
+        """The variants whose pictures are, bit for bit, those of the scene as it is."""
+        base = {row.spp: row.digest for row in self.rows if not row.variant.knob}
+        same: dict[str, bool] = {}
+        for row in self.rows:
+            if row.variant.knob:
+                same[row.variant.label] = same.get(row.variant.label, True) and row.digest == base.get(row.spp)
+        return [label for label, equal in same.items() if equal]
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"scene": self.scene, "size": list(self.size), "repeats": self.repeats, "seed": self.seed,
+                "confidence": statistics.CONFIDENCE, "reference": self.reference.as_dict(), "machine": self.machine,
+                "rows": [row.as_dict() for row in self.rows], "slopes": [slope.as_dict() for slope in self.slopes],
+                "same_pixels": self.same_pixels, "left_out": self.left_out}
+
+
+@dataclass
+class Plan:
+    """What to sweep. knobs: names in KNOBS, empty for all; max_spp: the last power of two; reference_spp: samples of each of
+    the reference's seeds (None: 8 max_spp); row_seconds: a row that would likely take longer is left out."""
+
+    knobs: Sequence[str] = ()
+    max_spp: int = 64
+    repeats: int = 8
+    reference_spp: int | None = None
+    row_seconds: float = 120.0
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.knobs) - set(KNOBS))
+        if unknown:
+            raise InputError(f"no knob {', '.join(unknown)}; there is {', '.join(KNOBS)}")
+        if not 1 <= self.max_spp <= 1 << 16:
+            raise InputError(f"max_spp must be 1 to 65536, got {self.max_spp}")
+        if not 3 <= self.repeats <= 1000:
+            raise InputError(f"repeats must be 3 to 1000 (fewer seeds have no spread to speak of), got {self.repeats}")
+        if self.reference_spp is not None and not 1 <= self.reference_spp <= 1 << 24:
+            raise InputError(f"reference_spp must be 1 to {1 << 24}, got {self.reference_spp}")
+
+    @property
+    def levels(self) -> list[int]:
+        return [1 << i for i in range(self.max_spp.bit_length())]
+
+
+def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], None] = lambda text: None) -> Sweep:
+    """Measure; `report` is told before each step. options.seed decides on all seeds. Raises KeyboardInterrupt at Ctrl-C."""
+    words = [int(word) for word in np.random.SeedSequence(options.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
+    base = Renderer(scene, options)
+    found, left_out = variants(scene, options, base.features, plan.knobs or tuple(KNOBS))
+    reference_spp = plan.reference_spp or 8 * plan.max_spp
+    report(f"reference: {REFERENCE_SEEDS} seeds of {reference_spp} spp")
+    truth = make_reference(scene, options, reference_spp, words[:REFERENCE_SEEDS])
+    machine = {"device": base.device.name or "CPU", "threads": base.threads, "system": platform.machine(),
+               "wrt": wrt.__version__}
+    result = Sweep(scene.name, scene.settings.size, plan.repeats, options.seed, truth, machine, left_out=left_out)
+    for number, variant in enumerate(found, start=1):
+        renderer = base if variant.knob == "" else Renderer(variant.scene, variant.options)
+        finished(renderer.run(spp=1))  # what a first launch costs is not the variant's
+        rows: list[Row] = []
+        for spp in plan.levels:
+            likely = 2.0 * rows[-1].seconds.value * plan.repeats if rows else 0.0
+            if likely > plan.row_seconds:
+                result.left_out.append(f"{variant.label} from {spp} spp on: a row would take some {likely:.0f} s")
+                break
+            report(f"{number}/{len(found)} {variant.label}: {spp} spp")
+            rows.append(measure(variant, renderer, spp, words[REFERENCE_SEEDS:], truth))
+        result.rows += rows
+        result.slopes.append(slope_of(rows, truth.variance))
+    for i in statistics.pareto_front([(row.seconds.value, row.rmse.value) for row in result.rows]):
+        result.rows[i].pareto = True
+    return result

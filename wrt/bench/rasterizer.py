@@ -1,0 +1,183 @@
+"""Primary visibility in both orders: the z-buffer (for each triangle its pixels) and rays (for each pixel its triangle).
+
+Both answer with the same two pictures, depth (H, W) float32 (distance along the ray through the pixel's centre, inf on a
+miss) and prim_id (H, W) int32 (-1 on a miss), and share nothing on the way to them.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.accel.base import Structure
+from wrt.device import load_kernel, run_all, start, thread_count, upload
+from wrt.device_scene import camera_struct
+from wrt.errors import InputError
+from wrt.kernels import rasterize as kernels
+from wrt.kernels.primary_rays import make_primary_rays_kernel
+from wrt.kernels.structs import Surfaces, Tile
+from wrt.scene import Camera
+
+NOTHING = np.uint64(0x7F800000_FFFFFFFF)  # depth inf, prim_id -1
+TRIANGLES_PER_LAUNCH = 65536
+BANDS_PER_THREAD = 4  # where triangles are many differs from row to row
+ROWS_ON_CUDA = 16  # a band: one thread draws a triangle's part of it
+TILE_SIZE = 32
+
+
+def directions_from_pixels(camera: Camera, size: tuple[int, int]) -> np.ndarray:
+    """(3, 3) float64 that takes (x, y, 1), in pixels from the top left corner, to the direction through that point.
+
+    From the float32 numbers that the ray units get: it is the exact value of what they compute (not yet of unit length).
+    """
+    c = camera_struct(camera, size)
+    right, up, forward = (np.array(list(v), np.float64) for v in (c.right, c.up, c.forward))
+    tan_x, tan_y = (float(np.float32(value)) for value in (c.tan_x, c.tan_y))  # the struct still holds what it was given
+    across, down = 2.0 * tan_x / size[0] * right, -2.0 * tan_y / size[1] * up
+    return np.column_stack([across, down, forward - tan_x * right + tan_y * up])
+
+
+def view_struct(camera: Camera, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> Any:
+    """kernels.rasterize.View of a camera. shift: in pixels, of all centres, to the right and down."""
+    from_pixels = directions_from_pixels(camera, size) @ np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
+    view = kernels.View()
+    view.origin = wp.vec3d(*list(camera_struct(camera, size).origin))
+    view.from_pixels, view.to_pixels = wp.mat33d(from_pixels), wp.mat33d(np.linalg.inv(from_pixels))
+    view.width, view.height = size
+    return view
+
+
+class Rasterizer:
+    """A z-buffer over a geometry's triangles; `draw` as often as wanted, then `depth` and `prim_id`.
+
+    Nothing is built beforehand. Raises InputError where the geometry has spheres, which have no corners to project.
+    """
+
+    def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None) -> None:
+        if len(geometry.spheres):
+            raise InputError(f"a rasterizer draws triangles; the geometry has {len(geometry.spheres)} spheres")
+        self.device, self.threads = start(device), thread_count(threads)
+        self.triangles = len(geometry.faces)
+        self.vertices = upload(geometry.vertices, wp.vec3, self.device)
+        self.faces = upload(geometry.faces, wp.vec3i, self.device)
+        self.projected = wp.empty(len(geometry.vertices), dtype=wp.vec3d, device=self.device)
+        self.boxes = wp.empty(self.triangles, dtype=wp.vec4i, device=self.device)
+        self.all = wp.array(np.arange(self.triangles, dtype=np.int32), dtype=wp.int32, device=self.device)
+        self.keys: Any = None
+        self.size = (0, 0)
+        for kernel in (kernels.project, kernels.bound, kernels.rasterize):
+            load_kernel(kernel, self.device)
+
+    def draw(self, camera: Camera, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Draw all triangles into a picture of `size` pixels, seen from the middle of the camera's lens.
+
+        shift: sample so far, in pixels, right and down of the pixels' centres.
+        """
+        width, height = size
+        view = view_struct(camera, size, shift)
+        if self.size != size:
+            self.keys, self.size = wp.empty(width * height, dtype=wp.uint64, device=self.device), size
+        self.keys.fill_(NOTHING)
+        if not self.triangles:
+            return
+        self._each_part(kernels.project, len(self.vertices), lambda first: [view, self.vertices, first, self.projected])
+        self._each_part(kernels.bound, self.triangles,
+                        lambda first: [view, self.vertices, self.projected, self.faces, first, self.boxes])
+        if self.device.is_cuda:
+            bands = -(-height // ROWS_ON_CUDA)
+            self._launch(view, (bands, self.triangles), self.all, 0, ROWS_ON_CUDA)
+            wp.synchronize_device(self.device)
+        else:
+            self._draw_bands(view)
+
+    def _each_part(self, kernel: Any, n: int, arguments: Any) -> None:
+        step = n if self.device.is_cuda else TRIANGLES_PER_LAUNCH
+
+        def job(first: int) -> Any:
+            return lambda: wp.launch(kernel, dim=min(step, n - first), inputs=arguments(first), device=self.device)
+
+        run_all([job(first) for first in range(0, n, step)], self.threads)
+
+    def _draw_bands(self, view: Any) -> None:
+        """On the CPU each band of rows is one thread's, so that no pixel is written by two; it gets its triangles only."""
+        boxes = self.boxes.numpy()
+        there = np.flatnonzero(boxes[:, 0] <= boxes[:, 2]).astype(np.int32)
+        top, bottom = boxes[there, 1], boxes[there, 3]
+        bands = min(BANDS_PER_THREAD * self.threads, view.height)
+        rows = -(-view.height // bands)
+
+        def job(first: int) -> Any:
+            def draw() -> None:
+                mine = there[(top < first + rows) & (bottom >= first)]
+                if len(mine):
+                    self._launch(view, (1, len(mine)), wp.array(mine, dtype=wp.int32, device=self.device), first, rows)
+
+            return draw
+
+        run_all([job(first) for first in range(0, view.height, rows)], self.threads)
+
+    def _launch(self, view: Any, dim: tuple[int, int], prim_ids: Any, first: int, rows: int) -> None:
+        wp.launch(kernels.rasterize, dim=dim, device=self.device, inputs=[
+            view, self.projected, self.faces, self.boxes, prim_ids, first, rows, self.keys])
+
+    def depth(self) -> np.ndarray:
+        return self._half(1, np.float32)
+
+    def prim_id(self) -> np.ndarray:
+        return self._half(0, np.int32)
+
+    def _half(self, which: int, dtype: Any) -> np.ndarray:
+        halves = self.keys.numpy().astype("<u8", copy=False).view("<u4").reshape(-1, 2)[:, which]
+        return np.ascontiguousarray(halves).view(dtype).reshape(self.size[1], self.size[0])
+
+
+@cache
+def primary_rays_kernel(structure: Structure) -> Any:
+    return make_primary_rays_kernel(structure.struct, structure.traversal(any_hit=False))
+
+
+class RayCaster:
+    """The same pictures by rays, one a pixel, through a structure that is built here; `build_seconds` tells how long."""
+
+    def __init__(self, geometry: Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None) -> None:
+        if accel not in ACCELERATORS:
+            raise InputError(f"no structure {accel!r}; there is {', '.join(ACCELERATORS)}")
+        self.device, self.threads = start(device), thread_count(threads)
+        self.accel = build(geometry, accel, device, threads)
+        self.build_seconds = self.accel.stats.build_seconds
+        self.surfaces = Surfaces()
+        self.surfaces.n_triangles = len(geometry.faces)
+        self.surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)
+        self.kernel = primary_rays_kernel(self.accel.structure)
+        load_kernel(self.kernel, self.device)
+        self.size = (0, 0)
+
+    def draw(self, camera: Camera, size: tuple[int, int]) -> None:
+        """Cast the ray through every pixel's centre, from the middle of the camera's lens."""
+        width, height = size
+        if self.size != size:
+            self.size = size
+            self._depth = wp.empty(width * height, dtype=wp.float32, device=self.device)
+            self._prim_id = wp.empty(width * height, dtype=wp.int32, device=self.device)
+        c = camera_struct(camera, size)
+        step = max(size) if self.device.is_cuda else TILE_SIZE
+
+        def job(x: int, y: int) -> Any:
+            tile = Tile()
+            tile.x, tile.y, tile.width = x, y, min(step, width - x)
+            return lambda: wp.launch(self.kernel, dim=tile.width * min(step, height - y), device=self.device, inputs=[
+                self.accel.data, self.surfaces, c, tile, width, height, self._depth, self._prim_id])
+
+        run_all([job(x, y) for y in range(0, height, step) for x in range(0, width, step)], self.threads)
+        if self.device.is_cuda:
+            wp.synchronize_device(self.device)
+
+    def depth(self) -> np.ndarray:
+        return self._depth.numpy().reshape(self.size[1], self.size[0]).copy()
+
+    def prim_id(self) -> np.ndarray:
+        return self._prim_id.numpy().reshape(self.size[1], self.size[0]).copy()

@@ -1,0 +1,223 @@
+"""`python -m wrt bench visibility`: the two classes of visibility, measured. Rasterising goes over triangles and then their
+pixels, ray casting over pixels and then, down a tree, their triangle: what does each cost as triangles and pixels grow?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.bench.rasterizer import Rasterizer, RayCaster
+from wrt.bench.visibility_check import Agreement, agreement
+from wrt.device import start, thread_count
+from wrt.errors import InputError
+from wrt.mesh import Mesh, load_mesh
+from wrt.scene import Camera, Material, Object, Scene
+from wrt.shapes import icosphere
+from wrt.staging import frame_camera
+
+MIN_SIDE = 64  # pixels; the sweep over pixels doubles it
+SWEEP_TRIANGLES = 80_000  # about as many in the sweep over pixels
+MAX_BUILDS = 3
+SPHERES, TERRAINS = range(3, 10), [22 * 2**k for k in range(8)]  # subdivisions, cells a side
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to measure: meshes (files; none: the sphere and the terrain), pictures of size x size pixels for the sweep over
+    triangles and up to max_size for that over pixels, runs of each kind, and on what. Raises InputError."""
+
+    meshes: Sequence[str | Path] = ()
+    size: int = 512
+    max_size: int = 1024
+    max_triangles: int = 1_500_000
+    runs: int = 7
+    accel: str = "bvh"
+    device: str = "cpu"
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("size", 1, 16384), ("max_size", MIN_SIDE, 16384), ("max_triangles", 1, 2**30), ("runs", 1, 1000)):
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name} must be {low} to {high}, got {getattr(self, name)}")
+        if self.accel not in ACCELERATORS:
+            raise InputError(f"no structure {self.accel!r}; there is {', '.join(ACCELERATORS)}")
+        thread_count(self.threads)
+        start(self.device)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One mesh in one picture. raster, cast: seconds of each run, run i of the one next to run i of the other; build:
+    seconds of each build of the structure, which casting needs first."""
+
+    sweep: str
+    surface: str
+    triangles: int
+    pixels: int
+    raster: tuple[float, ...]
+    cast: tuple[float, ...]
+    build: tuple[float, ...]
+    agreement: Agreement
+
+    def ratios(self, with_build: bool) -> np.ndarray:
+        """Seconds of casting over seconds of rasterising, run by run."""
+        extra = float(np.median(self.build)) if with_build else 0.0
+        return (np.array(self.cast) + extra) / np.array(self.raster)
+
+    def as_dict(self) -> dict[str, Any]:
+        medians = {f"{name}_median": float(np.median(getattr(self, name))) for name in ("raster", "cast", "build")}
+        return asdict(self) | medians | {
+            "cast_over_raster": float(np.median(self.ratios(False))),
+            "cast_and_build_over_raster": float(np.median(self.ratios(True)))}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """seconds ~ n^exponent, by least squares on logarithms; error: of the exponent, one standard deviation (NaN for two
+    points); last: the exponent between the two largest n."""
+
+    exponent: float
+    error: float
+    last: float
+
+
+def terrain(cells: int) -> Mesh:
+    """2 cells^2 triangles over the square from -1 to 1, hills of a fixed form: finer cells change little of the picture."""
+    x, z = np.meshgrid(np.linspace(-1.0, 1.0, cells + 1), np.linspace(-1.0, 1.0, cells + 1), indexing="ij")
+    y = sum(0.3 / k * np.sin(k * (2.1 * x + 0.7 * z) + k * k) * np.cos(k * (1.9 * z - 0.6 * x) + 2.0 * k) for k in (1, 2, 4, 8))
+    i, j = np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij")
+    corner = (i * (cells + 1) + j).reshape(-1)
+    a, b, c, d = corner, corner + 1, corner + cells + 2, corner + cells + 1
+    faces = np.stack([a, b, c, a, c, d], axis=1).reshape(-1, 3)
+    return Mesh(np.stack([x, y, z], axis=-1).reshape(-1, 3), faces, name="terrain")
+
+
+def subdivided(mesh: Mesh) -> Mesh:
+    """Each triangle cut into four at the middles of its sides: the same surface, but for rounding; flat-shaded."""
+    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    ends, middle = np.unique(edges, axis=0, return_inverse=True)
+    points = np.concatenate([mesh.vertices, mesh.vertices[ends].astype(np.float64).mean(axis=1)])
+    (a, b, c), (ab, bc, ca) = mesh.faces.T, middle.reshape(-1, 3).T + len(mesh.vertices)
+    faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
+    return Mesh(points, faces, name=mesh.name)
+
+
+def levels(plan: Plan) -> dict[str, list[Mesh]]:
+    """By surface, the same shape ever finer, up to plan.max_triangles (but its coarsest in any case)."""
+    if not plan.meshes:
+        return {"sphere": [icosphere(n) for n in SPHERES if n == SPHERES[0] or 20 * 4**n <= plan.max_triangles],
+                "terrain": [terrain(n) for n in TERRAINS if n == TERRAINS[0] or 2 * n * n <= plan.max_triangles]}
+    out: dict[str, list[Mesh]] = {}
+    for path in plan.meshes:
+        mesh = load_mesh(path)
+        if not len(mesh.faces):
+            raise InputError("there are no triangles to see", path)
+        finer = out[str(path)] = [replace(mesh, normals=None)]
+        while 4 * len(finer[-1].faces) <= plan.max_triangles:
+            finer.append(subdivided(finer[-1]))
+    return out
+
+
+def run(plan: Plan, report: Callable[[Row], None] | None = None) -> list[Row]:
+    """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a device, a structure)."""
+    rows = []
+    for surface, meshes in levels(plan).items():
+        camera = frame_camera(Scene(objects=(Object(meshes[0], (Material(),)),)), 1.0)
+        for row in _rows(plan, surface, meshes, camera):
+            rows.append(row)
+            if report is not None:
+                report(row)
+    return rows
+
+
+def _rows(plan: Plan, surface: str, meshes: list[Mesh], camera: Camera) -> Iterator[Row]:
+    swept = min(meshes, key=lambda mesh: abs(math.log(len(mesh.faces) / SWEEP_TRIANGLES)))
+    sides = [MIN_SIDE * 2**k for k in range(int(math.log2(plan.max_size / MIN_SIDE)) + 1)]
+    for mesh in meshes:
+        bench = _Bench(plan, Geometry.of(mesh))
+        yield bench.measure("triangles", surface, camera, plan.size)
+        if mesh is swept:
+            for side in sides:
+                yield bench.measure("pixels", surface, camera, side)
+
+
+class _Bench:
+    """One geometry, ready to be seen in both ways."""
+
+    def __init__(self, plan: Plan, geometry: Geometry) -> None:
+        self.plan, self.geometry = plan, geometry
+        self.rasterizer = Rasterizer(geometry, plan.device, plan.threads)
+        self.caster = RayCaster(geometry, plan.accel, plan.device, plan.threads)
+        again = [build(geometry, plan.accel, plan.device, plan.threads) for _ in range(min(plan.runs, MAX_BUILDS) - 1)]
+        self.build = tuple(accel.stats.build_seconds for accel in (self.caster.accel, *again))
+
+    def measure(self, sweep: str, surface: str, camera: Camera, side: int) -> Row:
+        """The runs of both kinds alternate, and so does who goes first: what else the machine does meets both alike."""
+        size = (side, side)
+        drawers = {"raster": self.rasterizer.draw, "cast": self.caster.draw}
+        seconds: dict[str, list[float]] = {name: [] for name in drawers}
+        for name in drawers:  # warm up
+            drawers[name](camera, size)
+        for i in range(self.plan.runs):
+            for name in sorted(drawers, reverse=i % 2 == 0):
+                begin = perf_counter()
+                drawers[name](camera, size)
+                seconds[name].append(perf_counter() - begin)
+        checked = agreement(self.rasterizer, self.caster, self.geometry, camera, size)
+        return Row(sweep, surface, len(self.geometry.faces), side * side, tuple(seconds["raster"]), tuple(seconds["cast"]),
+                   self.build, checked)
+
+
+def fit(n: Sequence[float], seconds: Sequence[float]) -> Fit:
+    """The exponent of seconds over n. Raises ValueError for fewer than two points."""
+    x, y = np.log(np.asarray(n, np.float64)), np.log(np.asarray(seconds, np.float64))
+    if len(x) < 2:
+        raise ValueError("an exponent needs two points")
+    dx = x - x.mean()
+    exponent = float(dx @ y / (dx @ dx))
+    rest = y - y.mean() - exponent * dx
+    error = math.sqrt(float(rest @ rest) / (len(x) - 2) / float(dx @ dx)) if len(x) > 2 else math.nan
+    return Fit(exponent, error, float((y[-1] - y[-2]) / (x[-1] - x[-2])))
+
+
+def series(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Rows by (sweep, surface), in order of what grows."""
+    out: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        out.setdefault((row.sweep, row.surface), []).append(row)
+    return {key: sorted(group, key=lambda row: getattr(row, key[0])) for key, group in out.items()}
+
+
+def fits(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """The exponents of every sweep that has two points or more: of rasterising, casting and, over triangles, building."""
+    out = []
+    for (sweep, surface), group in series(rows).items():
+        if len(group) < 2:
+            continue
+        for cost in ("raster", "cast", "build") if sweep == "triangles" else ("raster", "cast"):
+            found = fit([getattr(row, sweep) for row in group], [float(np.median(getattr(row, cost))) for row in group])
+            out.append({"sweep": sweep, "surface": surface, "cost": cost, **asdict(found)})
+    return out
+
+
+def crossings(rows: Sequence[Row]) -> dict[str, float | None]:
+    """By surface, from how many triangles on casting (a structure that is there) costs less than rasterising, between two
+    measured counts by interpolation of logarithms; None where that is not within the sweep."""
+    out: dict[str, float | None] = {}
+    for (sweep, surface), group in series(rows).items():
+        if sweep != "triangles":
+            continue
+        ratio = [math.log(float(np.median(row.ratios(False)))) for row in group]
+        out[surface] = None
+        for (a, before), (b, after) in zip(zip(group, ratio, strict=True), list(zip(group, ratio, strict=True))[1:], strict=False):
+            if before > 0.0 >= after:
+                share = before / (before - after)
+                out[surface] = math.exp((1.0 - share) * math.log(a.triangles) + share * math.log(b.triangles))
+    return out

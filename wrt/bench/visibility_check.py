@@ -1,0 +1,139 @@
+"""Do z-buffer and rays see the same? Every pixel where they differ is explained by rounding, or counted."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from wrt.accel import Geometry
+from wrt.bench.rasterizer import Rasterizer, RayCaster, directions_from_pixels
+from wrt.device_scene import camera_struct
+from wrt.scene import Camera
+
+# How far the ray units' rounding can move the place of a corner, as a share of its distance: the direction's sum and length,
+# the offset from the origin, the shear. Each is a few units of roundoff; together they stay below this many.
+ROUNDINGS = 16.0
+ROUNDOFF = 2.0**-24
+AROUND = [(np.cos(a), np.sin(a)) for a in np.arange(8) * (np.pi / 4.0)]
+MAX_RINGS = 8  # the last of 128 times the smallest radius
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Two answers to one question, pixel by pixel.
+
+    pixels, covered: all, and those where the z-buffer has a triangle. differ: another prim_id, of which: ties, where the
+    depths agree within their bound (the centre is on a common edge, or triangles coincide); silhouettes, where the rays'
+    depth is the exact one less than a rounding error (some 1e-4 pixels) beside the centre; unexplained: the rest. Where
+    prim_id is the same: depth_error, the largest relative difference of depth, and depth_share, of its bound (above 1: out
+    of bound).
+    """
+
+    pixels: int
+    covered: int
+    differ: int
+    ties: int
+    silhouettes: int
+    unexplained: int
+    depth_error: float
+    depth_share: float
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def agreement(rasterizer: Rasterizer, caster: RayCaster, geometry: Geometry, camera: Camera, size: tuple[int, int]) -> Agreement:
+    """Draw the same picture with both, and compare. The rasterizer's picture is another one afterwards."""
+    caster.draw(camera, size)
+    return compare(rasterizer, caster.depth(), caster.prim_id(), geometry, camera, size)
+
+
+def compare(rasterizer: Rasterizer, depth: np.ndarray, prim_id: np.ndarray, geometry: Geometry, camera: Camera,
+            size: tuple[int, int]) -> Agreement:
+    """Hold pictures by rays, depth (H, W) float32 and prim_id (H, W) int32, against the rasterizer's."""
+    rasterizer.draw(camera, size)
+    exact_depth, exact_id = rasterizer.depth(), rasterizer.prim_id()
+    same = (exact_id == prim_id) & (exact_id >= 0)
+    bound = depth_bound(geometry, camera, size, exact_id)
+    error = np.zeros(exact_depth.shape)
+    error[same] = np.abs(exact_depth[same].astype(np.float64) - depth[same])
+    share = np.divide(error, bound, out=np.zeros_like(error), where=same & (error > 0.0))
+    relative = np.divide(error, exact_depth, out=np.zeros_like(error), where=same & (error > 0.0))
+
+    differ = exact_id != prim_id
+    bound = bound + depth_bound(geometry, camera, size, prim_id)
+    tied = differ & _close(exact_depth, depth, bound)
+    asked = differ & ~tied
+    reach = np.maximum(edge_reach(geometry, camera, size, exact_id, exact_depth),
+                       edge_reach(geometry, camera, size, prim_id, depth))
+    beside = _beside(rasterizer, depth, bound, np.where(asked, reach, 0.0), camera, size, geometry)
+    return Agreement(
+        pixels=differ.size, covered=int((exact_id >= 0).sum()), differ=int(differ.sum()), ties=int(tied.sum()),
+        silhouettes=int(beside.sum()), unexplained=int((asked & ~beside).sum()),
+        depth_error=float(relative.max(initial=0.0)), depth_share=float(share.max(initial=0.0)))
+
+
+def _close(a: np.ndarray, b: np.ndarray, bound: np.ndarray) -> np.ndarray:
+    with np.errstate(invalid="ignore"):  # inf - inf, of two misses
+        return (a == b) | (np.abs(a.astype(np.float64) - b) <= bound)
+
+
+def _corners(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray) -> np.ndarray:
+    """Offsets from the camera of the corners of the triangles that some pixels show: (N, 3 corners, 3) float64."""
+    origin = np.array(list(camera_struct(camera, size).origin), np.float64)
+    return geometry.vertices[geometry.faces[prim_id]].astype(np.float64) - origin
+
+
+def depth_bound(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray) -> np.ndarray:
+    """How far a ray's depth can be off where it meets the triangles of `prim_id` (H, W), to first order; 0 on a miss.
+
+    Corners that are off by e move the plane by no more than e, and the hit by e / cos of the angle of incidence; nowhere by
+    more than the triangle is large.
+    """
+    row, column = np.nonzero(prim_id >= 0)
+    out = np.zeros(prim_id.shape)
+    corners = _corners(geometry, camera, size, prim_id[row, column])
+    d = np.column_stack([column + 0.5, row + 0.5, np.ones(len(row))]) @ directions_from_pixels(camera, size).T
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    cosine = np.abs(np.einsum("ij,ij->i", normal, d))
+    far = np.linalg.norm(corners, axis=2).max(axis=1)
+    error = ROUNDINGS * ROUNDOFF * far
+    along = np.einsum("nij,nj->ni", corners, d)
+    out[row, column] = np.minimum(error / np.maximum(cosine, 1e-300), np.ptp(along, axis=1) + error)
+    return out
+
+
+def _beside(rasterizer: Rasterizer, depth: np.ndarray, bound: np.ndarray, reach: np.ndarray, camera: Camera,
+            size: tuple[int, int], geometry: Geometry) -> np.ndarray:
+    """Where the exact picture has the rays' depth within `reach` pixels of the centre (0: not asked), looked for on rings
+    around it, of twice the radius each."""
+    found = np.zeros(depth.shape, bool)
+    radius = reach[reach > 0.0].min(initial=np.inf)
+    for _ in range(MAX_RINGS):
+        left = ~found & (reach >= radius)
+        if not left.any():
+            break
+        for x, y in AROUND:
+            rasterizer.draw(camera, size, (radius * x, radius * y))
+            there = np.where(left, rasterizer.prim_id(), -1)
+            found |= left & _close(rasterizer.depth(), depth, bound + depth_bound(geometry, camera, size, there))
+        radius *= 2.0
+    return found
+
+
+def edge_reach(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """How far, in pixels, rounding moves an edge of the triangles of `prim_id` (H, W) that rays meet at `depth`; 0 on a miss.
+
+    A far corner's error also counts where a near part of the triangle is seen.
+    """
+    c = camera_struct(camera, size)
+    per_radian = 0.5 * max(size[0] / c.tan_x, size[1] / c.tan_y) * (1.0 + c.tan_x**2 + c.tan_y**2)
+    out = np.zeros(prim_id.shape)
+    hit = prim_id >= 0
+    far = np.linalg.norm(_corners(geometry, camera, size, prim_id[hit]), axis=2).max(axis=1)
+    out[hit] = ROUNDINGS * ROUNDOFF * per_radian * far / np.maximum(depth[hit], 1e-300)
+    return out
