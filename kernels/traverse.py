@@ -42,7 +42,8 @@ def no_hit(ray: Ray) -> Hit:
     A ray that is not finite has an empty segment: comparisons with NaN would let it into every box, the empty ones too.
     """
     best = Hit()
-    s = ray.origin[0] + ray.origin[1] + ray.origin[2] + ray.direction[0] + ray.direction[1] + ray.direction[2]
+    zero = 0.0 * ray.origin + 0.0 * ray.direction  # 0, or NaN; a sum of the components could overflow
+    s = zero[0] + zero[1] + zero[2]
     best.t = wp.where(wp.isfinite(s), ray.t_max, float(-wp.inf))
     best.prim_id = NO_HIT
     return best

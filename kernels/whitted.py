@@ -15,7 +15,7 @@ from wrt.kernels.lights import (
     make_sky_sample,
     shadow_ray,
 )
-from wrt.kernels.materials import BLEND, Scatter, make_bump, make_resolve, make_scatter
+from wrt.kernels.materials import BLEND, GLASS, Scatter, make_bump, make_resolve, make_scatter
 from wrt.kernels.sampling import hash_pair, make_sample_2d
 from wrt.kernels.structs import Lighting, Limits, Material, Ray, Surfaces
 from wrt.kernels.surface import Surface, make_surface_at, spawn_point
@@ -123,15 +123,18 @@ def make_transmittance(features, accel_struct, closest_hit, any_hit):
         return through
 
     @wp.func
-    def through_surfaces(accel: accel_struct, surfaces: Surfaces, first: Ray) -> Shadow:
+    def through_surfaces(accel: accel_struct, surfaces: Surfaces, first: Ray, end: wp.vec3) -> Shadow:
         out = Shadow()
         out.transmittance = wp.vec3(1.0, 1.0, 1.0)
         ray = first
-        end = first.origin + first.direction
+        medium = int(OUTSIDE)
         for _i in range(MAX_TRANSPARENT):
             out.rays += 1
             hit = closest_hit(accel, surfaces, ray)
             if hit.prim_id < 0:
+                if wp.static(features.absorption):
+                    if medium >= 0 and ray.t_max <= 1.0:  # the light is inside it
+                        out.transmittance = wp.cw_mul(out.transmittance, attenuation(surfaces, medium, wp.length(ray.direction)))
                 return out
             s = surface_at(surfaces, ray, hit)
             m = resolve(surfaces, s)
@@ -149,6 +152,7 @@ def make_transmittance(features, accel_struct, closest_hit, any_hit):
                 return out
             ray.origin = spawn_point(s.point, s.error, s.geometric, d)
             ray.exclude = s.exclude
+            medium = wp.where(inward and m.thin == 0, s.material, OUTSIDE)
             if ray.t_max <= 1.0:
                 ray.direction = end - ray.origin
                 if wp.dot(ray.direction, d) <= 0.0:
@@ -157,10 +161,10 @@ def make_transmittance(features, accel_struct, closest_hit, any_hit):
         return out
 
     @wp.func
-    def transmittance(accel: accel_struct, surfaces: Surfaces, ray: Ray) -> Shadow:
+    def transmittance(accel: accel_struct, surfaces: Surfaces, ray: Ray, end: wp.vec3) -> Shadow:
         out = Shadow()
         if wp.static(features.transparent_shadows):
-            out = through_surfaces(accel, surfaces, ray)
+            out = through_surfaces(accel, surfaces, ray, end)
         else:
             out.rays = 1
             hit = any_hit(accel, surfaces, ray)
@@ -198,7 +202,7 @@ def make_direct_light(features, accel_struct, closest_hit, any_hit):
             sample = choose(lighting, surfaces, i, s, light_xi(key, index, i))
             value = reflected(sample, m, s, scatter, wo)
             if wp.max(value) > 0.0:
-                shadow = transmittance(accel, surfaces, shadow_ray(s, sample))
+                shadow = transmittance(accel, surfaces, shadow_ray(s, sample), sample.end)
                 out.transmittance += wp.cw_mul(value, shadow.transmittance)
                 out.rays += shadow.rays
         return out
@@ -273,8 +277,11 @@ def make_radiance(features, accel_struct, closest_hit, any_hit):
             wo = -path.direction
             s.shading = shading_normal(surfaces, m, s, wo)
             if wp.static(features.absorption):
-                if path.medium >= 0:
-                    path.throughput = wp.cw_mul(path.throughput, attenuation(surfaces, path.medium, hit.t))
+                # A back side is seen from within, whatever the path knows of: the camera may stand in the glass.
+                clear = m.thin == 0 and (m.kind == wp.static(GLASS) or m.transmission > 0.0)
+                medium = wp.where(s.front == 0 and clear, s.material, path.medium)
+                if medium >= 0:
+                    path.throughput = wp.cw_mul(path.throughput, attenuation(surfaces, medium, hit.t))
             xi = wp.vec2(0.0, 0.0)
             if wp.static(features.rough):
                 xi = sample_2d(path.key, index, 2)

@@ -366,7 +366,7 @@ def visibility(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_js
 
     def progress(row: Any) -> None:
         if not quiet:
-            _say("  ".join(report.cells(row)[:7]))
+            _say("  ".join(report.cells(row)[:8]))
 
     with _warnings_told(quiet):
         rows = bench_visibility.run(plan, progress)

@@ -67,6 +67,8 @@ def _replacing(path: PathLike) -> Iterator[Path]:
         raise InputError("its folder does not exist", path)
     if target.is_dir():
         raise InputError("is a folder", path)
+    if target.exists() and not target.is_file():
+        raise InputError("is no regular file", path)  # a device: replacing it would destroy its node
     if target.exists() and not os.access(target, os.W_OK):
         raise InputError("is write-protected", path)
     # The suffix stays, since OpenImageIO takes the format from it.

@@ -20,6 +20,7 @@ from wrt.mesh import Mesh
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
+LARGEST = 1e30  # of any number in a scene: what comes near the end of float32 turns into infinities on the device
 
 
 def as_vector(value: Any, what: str, *, low: float = -math.inf, high: float = math.inf) -> Color:
@@ -32,6 +33,7 @@ def as_vector(value: Any, what: str, *, low: float = -math.inf, high: float = ma
         array = np.repeat(array, 3)
     if array.shape != (3,) or not np.isfinite(array).all():
         raise InputError(f"{what} must be three finite numbers, got {value!r}")
+    low, high = max(low, -LARGEST), min(high, LARGEST)
     if (array < low).any() or (array > high).any():
         raise InputError(f"{what} must lie in [{low:g}, {high:g}], got {array.tolist()}")
     return (float(array[0]), float(array[1]), float(array[2]))
@@ -43,6 +45,7 @@ def as_number(value: Any, what: str, *, low: float = -math.inf, high: float = ma
         number = float(value)
     except (TypeError, ValueError) as error:
         raise InputError(f"{what} must be a number, got {value!r}") from error
+    low, high = max(low, -LARGEST), min(high, LARGEST)
     if not math.isfinite(number) or not low <= number <= high:
         raise InputError(f"{what} must be finite and in [{low:g}, {high:g}], got {value!r}")
     return number
@@ -533,8 +536,9 @@ class Scene:
         for camera in self.cameras:
             if camera.name == name:
                 return camera
-        if str(name).isdigit() and int(name) < len(self.cameras):
-            return self.cameras[int(name)]
+        for index, camera in enumerate(self.cameras):
+            if str(index) == str(name):
+                return camera
         known = ", ".join(f"{i}: {camera.name!r}" for i, camera in enumerate(self.cameras))
         raise InputError(f"no camera {name!r}; the scene has {known}")
 

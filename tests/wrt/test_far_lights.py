@@ -63,3 +63,14 @@ def test_mesh_light(distance: float) -> None:
     # A ball of triangles: half of its emitters face away, and the others are seen edge-on too.
     ball = Object(icosphere(4, 0.4), (EMITTER,), transform=place(distance, (0, 0, 0)))
     assert irradiance({"objects": (ball,)}, distance, (0, 0, 0)) == pytest.approx(math.pi * (0.4 / distance) ** 2, rel=0.04)
+
+
+@pytest.mark.parametrize(("distance", "radius"), [(10.0, 0.05), (100.0, 0.4), (1000.0, 0.05)])
+def test_a_lamp_in_a_clear_bulb_is_not_shaded_by_itself(distance: float, radius: float) -> None:
+    # The end of a shadow ray was rebuilt from its direction, with the rounding of the whole way.
+    clear = Material("glass", albedo=(1, 1, 1), ior=1.0, thin=True)
+    lamp = Sphere((0, 0, 0), radius, EMITTER)
+    bulb = Sphere((0, 0, 0), 1.5 * radius, clear)
+    shift = (0.0, -distance, 0.0)
+    alone = irradiance({"spheres": (lamp,)}, distance, shift)
+    assert irradiance({"spheres": (lamp, bulb)}, distance, shift) == pytest.approx(alone, rel=1e-4)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import wrt
-from wrt.scene import Camera, DirectionalLight, Material, Object, Scene, Settings
+from wrt.scene import Camera, ConstantBackground, DirectionalLight, Material, Object, Scene, Settings, Sphere
 from wrt.shapes import box, quad
 
 
@@ -57,3 +57,16 @@ def test_a_thin_pane_always_lets_light_through(degrees: float) -> None:
     expected = 0.8 * (1.0 - 2.0 * r / (1.0 + r))
     pane = Material("glass", albedo=(1.0, 0.8, 1.0), thin=True)
     assert np.isclose(floor_below(pane, angle, "opaque"), expected, rtol=1e-4)
+
+
+def test_absorption_counts_from_where_the_camera_stands_in_the_glass() -> None:
+    ball = Sphere((0, 0, 0), 2.0, Material("glass", albedo=(1, 1, 1), ior=1.0, absorption=(1.0, 1.0, 1.0)))
+    inner = Sphere((0, 0, 0), 1.0, Material("glass", albedo=(1, 1, 1), ior=1.0))
+    white = {"background": ConstantBackground((1, 1, 1)), "settings": Settings(filter="box")}
+    within = Camera.look_at((0, 0, 0), (0, 0, -1), fov_y=0.01)
+    outside = Camera.look_at((0, 0, 9), (0, 0, 0), fov_y=0.01)
+    seen = wrt.render(Scene(spheres=(ball,), cameras=(within,), **white), spp=1, size=(2, 2)).pixels.mean()
+    assert seen == pytest.approx(math.exp(-2.0), rel=1e-4)
+    # Through a clear ball within: what is left is 1 on each side.
+    seen = wrt.render(Scene(spheres=(ball, inner), cameras=(outside,), **white), spp=1, size=(2, 2)).pixels.mean()
+    assert seen == pytest.approx(math.exp(-2.0), rel=1e-3)

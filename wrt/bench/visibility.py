@@ -109,43 +109,56 @@ def subdivided(mesh: Mesh) -> Mesh:
     return Mesh(points, faces, name=mesh.name)
 
 
-def levels(plan: Plan) -> dict[str, list[Mesh]]:
-    """By surface, the same shape ever finer, up to plan.max_triangles (but its coarsest in any case)."""
-    if not plan.meshes:
-        return {"sphere": [icosphere(n) for n in SPHERES if n == SPHERES[0] or 20 * 4**n <= plan.max_triangles],
-                "terrain": [terrain(n) for n in TERRAINS if n == TERRAINS[0] or 2 * n * n <= plan.max_triangles]}
-    out: dict[str, list[Mesh]] = {}
+@dataclass(frozen=True)
+class Surface:
+    """One shape, ever finer, and the camera that sees each alike (square pictures)."""
+
+    name: str
+    meshes: list[Mesh]
+    camera: Camera
+
+
+def surfaces(plan: Plan) -> Iterator[Surface]:
+    """What to see, up to plan.max_triangles (but its coarsest in any case)."""
     for path in plan.meshes:
         mesh = load_mesh(path)
         if not len(mesh.faces):
             raise InputError("there are no triangles to see", path)
-        finer = out[str(path)] = [replace(mesh, normals=None)]
+        finer = [replace(mesh, normals=None)]
         while 4 * len(finer[-1].faces) <= plan.max_triangles:
             finer.append(subdivided(finer[-1]))
-    return out
+        yield Surface(str(path), finer, framing(mesh))
+    if not plan.meshes:
+        balls = [icosphere(n) for n in SPHERES if n == SPHERES[0] or 20 * 4**n <= plan.max_triangles]
+        yield Surface("sphere", balls, framing(balls[0]))
+        hills = [terrain(n) for n in TERRAINS if n == TERRAINS[0] or 2 * n * n <= plan.max_triangles]
+        yield Surface("terrain", hills, Camera.look_at((0.0, 0.9, 1.2), (0.0, -0.3, -0.2), fov_y=math.radians(60.0)))
+
+
+def framing(mesh: Mesh) -> Camera:
+    return frame_camera(Scene(objects=(Object(mesh, (Material(),)),)), 1.0)
 
 
 def run(plan: Plan, report: Callable[[Row], None] | None = None) -> list[Row]:
     """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a device, a structure)."""
     rows = []
-    for surface, meshes in levels(plan).items():
-        camera = frame_camera(Scene(objects=(Object(meshes[0], (Material(),)),)), 1.0)
-        for row in _rows(plan, surface, meshes, camera):
+    for surface in surfaces(plan):
+        for row in _rows(plan, surface):
             rows.append(row)
             if report is not None:
                 report(row)
     return rows
 
 
-def _rows(plan: Plan, surface: str, meshes: list[Mesh], camera: Camera) -> Iterator[Row]:
-    swept = min(meshes, key=lambda mesh: abs(math.log(len(mesh.faces) / SWEEP_TRIANGLES)))
+def _rows(plan: Plan, surface: Surface) -> Iterator[Row]:
+    swept = min(surface.meshes, key=lambda mesh: abs(math.log(len(mesh.faces) / SWEEP_TRIANGLES)))
     sides = [MIN_SIDE * 2**k for k in range(int(math.log2(plan.max_size / MIN_SIDE)) + 1)]
-    for mesh in meshes:
+    for mesh in surface.meshes:
         bench = _Bench(plan, Geometry.of(mesh))
-        yield bench.measure("triangles", surface, camera, plan.size)
+        yield bench.measure("triangles", surface, plan.size)
         if mesh is swept:
             for side in sides:
-                yield bench.measure("pixels", surface, camera, side)
+                yield bench.measure("pixels", surface, side)
 
 
 class _Bench:
@@ -158,9 +171,9 @@ class _Bench:
         again = [build(geometry, plan.accel, plan.device, plan.threads) for _ in range(min(plan.runs, MAX_BUILDS) - 1)]
         self.build = tuple(accel.stats.build_seconds for accel in (self.caster.accel, *again))
 
-    def measure(self, sweep: str, surface: str, camera: Camera, side: int) -> Row:
+    def measure(self, sweep: str, surface: Surface, side: int) -> Row:
         """The runs of both kinds alternate, and so does who goes first: what else the machine does meets both alike."""
-        size = (side, side)
+        camera, size = surface.camera, (side, side)
         drawers = {"raster": self.rasterizer.draw, "cast": self.caster.draw}
         seconds: dict[str, list[float]] = {name: [] for name in drawers}
         for name in drawers:  # warm up
@@ -171,7 +184,7 @@ class _Bench:
                 drawers[name](camera, size)
                 seconds[name].append(perf_counter() - begin)
         checked = agreement(self.rasterizer, self.caster, self.geometry, camera, size)
-        return Row(sweep, surface, len(self.geometry.faces), side * side, tuple(seconds["raster"]), tuple(seconds["cast"]),
+        return Row(sweep, surface.name, len(self.geometry.faces), side * side, tuple(seconds["raster"]), tuple(seconds["cast"]),
                    self.build, checked)
 
 

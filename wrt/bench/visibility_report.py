@@ -18,15 +18,15 @@ from wrt.image import check_writable, write_codes
 
 REPORT = "visibility.md"
 PLOTS = {"triangles": "visibility-triangles.png", "pixels": "visibility-pixels.png"}
-COLUMNS = ("surface", "triangles", "pixels", "raster ms", "cast ms", "build ms", "cast / raster", "with build", "differ",
+COLUMNS = ("surface", "triangles", "pixels", "covered", "raster ms", "cast ms", "build ms", "cast / raster", "with build", "differ",
            "ties", "silhouettes", "unexplained", "depth error", "of bound")
 LEGEND = """\
-raster: a z-buffer, all triangles; cast: one ray a pixel through a structure that is there; build: of that structure. Medians
-of alternating runs; in brackets the middle half of the runs. cast / raster above 1: rasterising is cheaper; with build: as if
-the structure were built for this one picture. differ: pixels with another prim_id, of which ties (depths agree within their
-bound: common edges, coincident triangles), silhouettes (the rays' answer is the exact one within a rounding error, some 1e-4
-pixels, of the centre), and unexplained (must be 0). depth error: the largest relative one where prim_id agrees, and its share
-of the bound derived for it (must not be above 1)."""
+covered: pixels with a triangle. raster: a z-buffer, all triangles; cast: one ray a pixel through a structure that is there;
+build: of that structure. Medians of alternating runs, ratios taken run by run; in brackets the middle half of the runs. cast /
+raster above 1: rasterising is cheaper; with build: as if the structure were built for this one picture. differ: pixels with
+another prim_id, of which ties (depths agree within their bound: common edges, coincident triangles), silhouettes (the rays'
+answer is the exact one within a rounding error, some 1e-4 pixels, of the centre), and unexplained (must be 0). depth error: the
+largest relative one where prim_id agrees, and its share of the bound derived for it (must not be above 1)."""
 
 
 def machine(plan: Plan) -> str:
@@ -46,8 +46,9 @@ def spread(values: Any, scale: float, digits: int = 3) -> str:
 def cells(row: Row) -> tuple[str, ...]:
     """One line of the table, as COLUMNS names it."""
     a = row.agreement
-    return (Path(row.surface).name, f"{row.triangles}", f"{row.pixels}", spread(row.raster, 1e3), spread(row.cast, 1e3),
-            f"{1e3 * float(np.median(row.build)):.3g}", spread(row.ratios(False), 1.0), f"{np.median(row.ratios(True)):.3g}",
+    return (Path(row.surface).name, f"{row.triangles}", f"{row.pixels}", f"{a.covered / a.pixels:.1%}",
+            spread(row.raster, 1e3), spread(row.cast, 1e3), f"{1e3 * float(np.median(row.build)):.3g}",
+            spread(row.ratios(False), 1.0), f"{np.median(row.ratios(True)):.3g}",
             f"{a.differ}", f"{a.ties}", f"{a.silhouettes}", f"{a.unexplained}", f"{a.depth_error:.1e}", f"{a.depth_share:.2f}")
 
 
@@ -75,10 +76,10 @@ def markdown(rows: Sequence[Row], plots: bool = False) -> str:
                 parts.append(f"![cost over {sweep}]({PLOTS[sweep]})\n")
     found = fits(rows)
     if found:
-        parts.append("## Exponents\n\nseconds ~ n^exponent over the whole sweep (one standard deviation in brackets), and "
+        parts.append("## Exponents\n\nseconds ~ n^exponent over the whole sweep (± one standard deviation), and "
                      "between its two last points.\n")
         parts.append(table(("cost", "surface", "n", "exponent", "at the end"), [
-            (f["cost"], Path(f["surface"]).name, f["sweep"], f"{f['exponent']:.3f} [{f['error']:.3f}]", f"{f['last']:.3f}")
+            (f["cost"], Path(f["surface"]).name, f["sweep"], f"{f['exponent']:.3f} ± {f['error']:.3f}", f"{f['last']:.3f}")
             for f in found]) + "\n")
     for surface, n in crossings(rows).items():
         told = "not within the sweep" if n is None else f"about {n:.2g} triangles"
