@@ -18,7 +18,7 @@ from wrt import driver
 from wrt.driver import MAX_PASS, Options, Progress, Renderer, plain_text, render
 from wrt.errors import InputError
 from wrt.film import Film
-from wrt.scene import Camera, DirectionalLight, GradientBackground, Material, Object, Scene, Settings
+from wrt.scene import Camera, DirectionalLight, EnvironmentBackground, GradientBackground, Material, Object, Scene, Settings
 from wrt.shapes import box, quad
 
 SIZE = (37, 22)  # no multiple of any tile
@@ -154,7 +154,8 @@ def test_only_the_aovs_that_were_asked_for_come_back() -> None:
 
 
 def test_a_sample_that_is_not_finite_is_black_and_counted() -> None:
-    scene = replace(SCENE, background=GradientBackground(bottom=(3e38, 3e38, 3e38), top=(3e38, 3e38, 3e38)))
+    # Numbers of a scene end at 1e30; a picture's pixels times its scale can still leave float32.
+    scene = replace(SCENE, background=EnvironmentBackground(np.full((2, 4, 3), 3e38, np.float32), scale=4.0))
     film = render(scene, spp=4)
     assert film.stats["not_finite"] > 0 and np.isfinite(film.pixels).all() and (film.samples == 4).all()
 
