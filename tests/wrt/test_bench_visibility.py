@@ -261,9 +261,13 @@ def test_fits_and_crossings_come_from_the_rows() -> None:
     assert found["pixels", "cast"]["exponent"] == pytest.approx(1.0)
     assert found["pixels", "raster"]["exponent"] == pytest.approx(0.0, abs=1e-12)
     assert 0.0 < found["triangles", "cast"]["exponent"] < 0.2
-    assert crossings(rows) == {"s": None, "alone": None}
-    steep = [row("triangles", n, 4096, 1e-6 * n, 1e-2) for n in (1000, 100_000)]
-    assert crossings(steep)["s"] == pytest.approx(10_000)
+    over_triangles, over_pixels = crossings(rows)
+    assert over_triangles == {"sweep": "triangles", "surface": "s", "n": None, "cheaper": "raster"}
+    assert over_pixels["cheaper"] == "raster" and over_pixels["n"] is None
+    steep, = crossings([row("triangles", n, 4096, 1e-6 * n, 1e-2) for n in (1000, 100_000)])
+    assert steep["cheaper"] == "cast" and steep["n"] == pytest.approx(10_000)
+    finer, = crossings([row("pixels", 1000, n, 1e-3, 1e-7 * n) for n in (100, 1000, 1_000_000)])
+    assert finer["cheaper"] == "raster" and finer["n"] == pytest.approx(10_000)
     assert rows[0].ratios(with_build=True)[0] == pytest.approx((1e-4 * math.log2(64000) + 1.0) / 64e-5)
 
 
@@ -302,7 +306,7 @@ def test_the_tables_hold_what_was_measured() -> None:
     assert named["cast / raster"] == "3 [3, 3]" and named["with build"] == "503" and named["build ms"] == "1e+03"
     assert (named["differ"], named["ties"], named["silhouettes"], named["unexplained"]) == ("3", "2", "1", "0")
     assert len({len(line) for line in text.splitlines() if line.startswith("| s ") and line.count("|") == 16}) == 1
-    assert "not within the sweep" in text
+    assert "s, as triangles grow: raster costs less throughout." in text
 
 
 # --- the command ----------------------------------------------------------------------------------------------------------
@@ -336,7 +340,7 @@ def test_the_command_prints_json(folder: Path) -> None:
     assert [r["triangles"] for r in facts["rows"]] == [12, 48, 48]
     assert all(r["agreement"]["unexplained"] == 0 for r in facts["rows"])
     assert {f["cost"] for f in facts["exponents"]} == {"raster", "cast", "build"}
-    assert set(facts["crossings"]) == {"box.obj"} and "threads" in facts["machine"]
+    assert [c["surface"] for c in facts["crossings"]] == ["box.obj"] and "threads" in facts["machine"]
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

@@ -220,17 +220,20 @@ def fits(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return out
 
 
-def crossings(rows: Sequence[Row]) -> dict[str, float | None]:
-    """By surface, from how many triangles on casting (a structure that is there) costs less than rasterising, between two
-    measured counts by interpolation of logarithms; None where that is not within the sweep."""
-    out: dict[str, float | None] = {}
+def crossings(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """For every sweep of two points or more, the n from which on the other way of seeing costs less (the structure is there;
+    between two points by interpolation of logarithms), and which that is; n is None where one is cheaper throughout."""
+    out = []
     for (sweep, surface), group in series(rows).items():
-        if sweep != "triangles":
+        if len(group) < 2:
             continue
-        ratio = [math.log(float(np.median(row.ratios(False)))) for row in group]
-        out[surface] = None
-        for (a, before), (b, after) in zip(zip(group, ratio, strict=True), list(zip(group, ratio, strict=True))[1:], strict=False):
-            if before > 0.0 >= after:
-                share = before / (before - after)
-                out[surface] = math.exp((1.0 - share) * math.log(a.triangles) + share * math.log(b.triangles))
+        n = np.log([getattr(row, sweep) for row in group])
+        ratio = np.log([float(np.median(row.ratios(False))) for row in group])
+        cheaper = np.where(ratio > 0.0, "raster", "cast")
+        change = np.flatnonzero(cheaper[1:] != cheaper[:-1])
+        found = None
+        if len(change):
+            i = change[-1]
+            found = math.exp(n[i] + (n[i + 1] - n[i]) * ratio[i] / (ratio[i] - ratio[i + 1]))
+        out.append({"sweep": sweep, "surface": surface, "n": found, "cheaper": str(cheaper[-1])})
     return out

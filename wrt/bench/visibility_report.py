@@ -81,9 +81,9 @@ def markdown(rows: Sequence[Row], plots: bool = False) -> str:
         parts.append(table(("cost", "surface", "n", "exponent", "at the end"), [
             (f["cost"], Path(f["surface"]).name, f["sweep"], f"{f['exponent']:.3f} ± {f['error']:.3f}", f"{f['last']:.3f}")
             for f in found]) + "\n")
-    for surface, n in crossings(rows).items():
-        told = "not within the sweep" if n is None else f"about {n:.2g} triangles"
-        parts.append(f"{Path(surface).name}: casting through a structure that is there becomes cheaper than rasterising: {told}.\n")
+    for c in crossings(rows):
+        since = "throughout" if c["n"] is None else f"from about {c['n']:.2g} {c['sweep']} on"
+        parts.append(f"{Path(c['surface']).name}, as {c['sweep']} grow: {c['cheaper']} costs less {since}.\n")
     return "\n".join(parts)
 
 
