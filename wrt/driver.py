@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from typing import Any
 
@@ -338,8 +338,8 @@ class Renderer:
             "lost_throughput_per_sample": film.lost() / total,
             "not_finite": film.count("not_finite"), "samples": int(samples.sum()),
             "triangles": len(self.accel.geometry.faces), "spheres": len(self.accel.geometry.spheres),
-            "accel": repr(self.accel), "interrupted": interrupted,
-            "timed_out": self.timed_out and not interrupted,
+            "accel": {"name": self.options.accel, **asdict(self.accel.stats)}, "interrupted": interrupted,
+            "signal": int(self.interrupts[0]) if self.interrupts else None, "timed_out": self.timed_out and not interrupted,
         }
         if self.options.target_error is not None:
             error = film.error()

@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import wrt.cli
 from tests.command_line import BOX_OBJ, Result
 from tests.command_line import wrt as run
 from tests.data import ROOT
+from wrt import __version__, cli_common
 from wrt import film as film_module
 from wrt import progress as progress_module
 from wrt.driver import Progress, Renderer
@@ -101,6 +101,7 @@ def test_json_holds_statistics_and_nothing_else_is_on_stdout() -> None:
     facts = strict_json(result.out)
     assert result.code == 0 and result.out.count("\n") == 1
     assert facts["output"] == ["a.png", "a.depth.png"] and facts["spp"] == 2 and facts["seed"] == 7
+    assert facts["accel"].keys() >= {"name", "nodes", "leaves", "depth", "bytes", "sah_cost"} and facts["accel"]["nodes"] > 0
     assert facts["samples"] == 2 * 32 * 18 <= facts["rays"] and facts["triangles"] == 12 and facts["interrupted"] is False
     assert {"import", "load", "upload", "build", "compile", "trace", "write"} <= facts["seconds"].keys()
     assert all(value >= 0 for value in facts["seconds"].values())
@@ -111,7 +112,7 @@ def test_json_holds_statistics_and_nothing_else_is_on_stdout() -> None:
     ({"a": [float("nan"), (1, float("inf"))]}, {"a": [None, [1, None]]}), (Path("x"), "x"), ({1: True}, {"1": True}),
 ], ids=str)
 def test_json_is_json_whatever_is_in_it(value: Any, expected: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    wrt.cli._say_json({"value": value})
+    cli_common.say_json({"value": value})
     assert strict_json(capsys.readouterr().out) == {"value": expected}
 
 
@@ -367,7 +368,7 @@ def interrupt(progress: Progress) -> None:
 def test_ctrl_c_keeps_the_picture_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress_module, "progress_reporter", report_with(interrupt))
     result = run("render", "box.obj", "--size", "160x90", "--spp", 100000, "-o", "a.exr")
-    assert (result.code, result.out) == (wrt.cli.INTERRUPTED, "a.exr\n") and "(interrupted" in result.err
+    assert (result.code, result.out) == (130, "a.exr\n") and "(interrupted" in result.err
     samples = read_channels("a.exr")["samples"]
     assert samples.shape == (90, 160) and 0 < samples.max() <= samples.min() + 1 and samples.max() < 100000
     assert new_files() == {"a.exr"} and signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -385,7 +386,7 @@ def test_ctrl_c_while_saving_waits_for_the_file(name: str, monkeypatch: pytest.M
     assert run("render", "box.obj", *SMALL, "-o", f"expected-{name}").code == 0
     monkeypatch.setattr(film_module.Film, "save", hurried)
     result = run("render", "box.obj", *SMALL, "-o", name)
-    assert (result.code, result.out) == (wrt.cli.INTERRUPTED, f"{name}\n") and new_files() == {name, f"expected-{name}"}
+    assert (result.code, result.out) == (130, f"{name}\n") and new_files() == {name, f"expected-{name}"}
     assert np.array_equal(read_image(name), read_image(f"expected-{name}"))
 
 
@@ -394,7 +395,7 @@ def test_ctrl_c_before_the_first_sample_leaves_everything_as_it_was(where: str, 
     Path("box.png").write_bytes(b"old")
     monkeypatch.setattr(where, lambda *arguments: signal.raise_signal(signal.SIGINT) or {})
     result = run("render", "box.obj", *SMALL, "--aov", "depth")
-    assert result.code == wrt.cli.INTERRUPTED and result.out == "" and result.err.split("\n")[-2] == "interrupted"
+    assert result.code == 130 and result.out == "" and result.err.split("\n")[-2] == "interrupted"
     assert "Traceback" not in result.err and Path("box.png").read_bytes() == b"old" and new_files() == {"box.png"}
 
 
@@ -484,6 +485,7 @@ def test_help_and_version() -> None:
     assert run("render", "-h").out == run("render", "--help").out
     assert run().code == 2 and "Commands:" in run().err + run().out
     refused(run("rendr"), "No such command 'rendr'")
+    assert run("--version") == Result(0, f"wrt {__version__}\n", "")  # of this code, installed or not
 
 
 # --- real processes ---------------------------------------------------------------------------------------------------
@@ -545,6 +547,28 @@ def test_a_process_that_is_interrupted_writes_what_it_has(times: int) -> None:
     assert np.isfinite(read_image("a.exr")).all() and new_files() == {"a.exr"}
 
 
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_process_that_is_ended_writes_what_it_has(name: str) -> None:
+    number = getattr(signal, name)
+    running = process("render", "box.obj", "--size", "320x180", "--spp", 1 << 24, "-o", "a.exr", "--json", code=AT_ONCE)
+    assert running.stderr is not None
+    assert any("Mray/s" in line for line in running.stderr)
+    running.send_signal(number)
+    result = finish(running)
+    assert result.code == 128 + number and "(interrupted" in result.err and "Traceback" not in result.err
+    assert strict_json(result.out).items() >= {"interrupted": True, "signal": number}.items()
+    assert np.isfinite(read_image("a.exr")).all() and new_files() == {"a.exr"}
+
+
+def test_an_ignored_signal_stays_ignored() -> None:
+    code = f"import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n{AT_ONCE}"
+    running = process("render", "box.obj", "--size", "64x36", "--spp", 4096, "--time-limit", "2s", "-o", "a.png", code=code)
+    assert running.stderr is not None
+    assert any("Mray/s" in line for line in running.stderr)
+    running.send_signal(signal.SIGHUP)
+    assert finish(running).code == 0
+
+
 LOADING = """
 import sys, wrt.scene_file
 def slow(path, load=wrt.scene_file.load_scene):
@@ -561,13 +585,27 @@ wrt.driver.load_kernel = told
 """
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("code", [LOADING, COMPILING], ids=["loading", "compiling"])
-def test_a_process_that_is_interrupted_early_leaves_nothing(code: str, folder: Path) -> None:
+def test_a_process_that_is_interrupted_early_leaves_nothing(code: str, number: int, folder: Path) -> None:
     cold = {"WARP_CACHE_PATH": str(folder / "cache")}  # so that there is something to compile
     running = process("render", "box.obj", "-o", "a.png", "--spp", 1 << 24, code=code, environment=cold)
     assert running.stderr is not None
     assert any(line == "now\n" for line in running.stderr)
-    running.send_signal(signal.SIGINT)
+    running.send_signal(number)
     result = finish(running)
-    assert (result.code, result.out) == (130, "") and result.err.endswith("interrupted\n")
+    assert (result.code, result.out) == (128 + number, "") and result.err.endswith("interrupted\n")
     assert "Traceback" not in result.err and new_files() <= {"cache"}
+
+
+FAILING = """
+import time, wrt.driver
+def slow(kernel, device):
+    while True: time.sleep(1.0)
+def failing(*arguments): raise wrt.driver.InputError("a transform that is found late")
+wrt.driver.load_kernel, wrt.driver.upload_scene = slow, failing
+"""
+
+
+def test_an_error_does_not_wait_for_the_compiler() -> None:
+    refused(finish(process("render", "box.obj", code=FAILING)), "box.obj: a transform that is found late")

@@ -1,0 +1,125 @@
+"""The commands that measure: `stability` and `bench`. They parse, call and print, as those of wrt.cli do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wrt.cli_common import Duration, Names, Size, load, naming, say, say_json, warnings_told
+
+
+@click.command()
+@click.argument("cases", nargs=-1)
+@click.option("--rays", type=click.IntRange(min=1), default=10_000, show_default=True, help="Rays of each case")
+@click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@click.option("--peers", is_flag=True, help="Also Embree (embreex) and Warp's own mesh_query_ray")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the tables as Markdown (.md)")
+@click.option("--json", "as_json", is_flag=True, help="Print the rows as JSON")
+def stability(cases: tuple[str, ...], rays: int, seed: int, peers: bool, output: Path | None, as_json: bool) -> None:
+    """The hard cases against the intersection tests: rays lost and errors, with the speed beside them.
+
+    CASES: names such as E_grid, or the letters of groups; without any, all.
+    """
+    from wrt.bench import stability as bench_stability
+
+    def report(row: Any) -> None:
+        if not as_json:
+            click.echo("  ".join(bench_stability.cells(row)))
+
+    if output is not None:
+        bench_stability.check_report(output)
+    if not as_json:
+        click.echo("  ".join(bench_stability.COLUMNS))
+    rows = bench_stability.run(cases, rays, peers=peers, seed=seed, report=report)
+    if output is not None:
+        bench_stability.write_report(rows, output)
+    if as_json:
+        say_json([row.as_dict() for row in rows])
+
+
+@click.group()
+def bench() -> None:
+    """Measure: speed against error, and one method against another."""
+
+
+@bench.command()
+@click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--size", type=int, default=512, show_default=True, help="Pixels a side as triangles grow")
+@click.option("--max-size", type=int, default=1024, show_default=True, help="Pixels a side at the end of the sweep from 64 on")
+@click.option("--max-triangles", type=int, default=1_500_000, show_default=True, help="Meshes are cut finer up to this many")
+@click.option("--runs", type=int, default=7, show_default=True, help="Runs of each kind, alternating")
+@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
+@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
+@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for a report with plots")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def visibility(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+    """Rasterising against ray casting, as triangles and pixels grow: the cost of both, and where they differ.
+
+    MESHES: .obj, .ply or .stl files; without any, a sphere and a terrain.
+    """
+    from wrt.bench import visibility as bench_visibility
+    from wrt.bench import visibility_report as report
+
+    plan = bench_visibility.Plan(meshes, **options)
+    if output is not None:
+        report.check_folder(output)
+    told = report.machine(plan)
+
+    def progress(row: Any) -> None:
+        if not quiet:
+            say("  ".join(report.cells(row)[:8]))
+
+    with warnings_told(quiet):
+        rows = bench_visibility.run(plan, progress)
+    paths = [] if output is None else report.write_report(rows, plan, output, told)
+    if as_json:
+        say_json({"machine": told, "rows": [row.as_dict() for row in rows], "exponents": bench_visibility.fits(rows),
+                   "crossings": bench_visibility.crossings(rows), "output": paths})
+        return
+    click.echo(f"{told}\n\n{report.markdown(rows)}\n{report.LEGEND}")
+    for path in paths:
+        click.echo(path)
+
+
+@bench.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--knobs", type=Names(), default=(),
+              help="Which to turn: sampler, max_depth, triangle ... (a wrong name lists them)  [default: all]")
+@click.option("--size", type=Size(), default="128x72", show_default=True, help="Pixels")
+@click.option("--max-spp", type=int, default=64, show_default=True, help="Samples a pixel: 1, 2, 4 ... up to this")
+@click.option("--repeats", type=int, default=8, show_default=True, help="Seeds of each picture, for the intervals")
+@click.option("--reference-spp", type=int, help="Samples of each of the reference's seeds  [default: 8 times --max-spp]")
+@click.option("--row-limit", type=Duration(), default="120s", show_default=True,
+              help="Leave out what would take longer than this, with all its seeds")
+@click.option("--camera", help="A camera's name or number  [default: the first]")
+@click.option("--seed", type=int, default=0, show_default=True, help="Decides on all seeds")
+@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
+@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for a report: Markdown, plot and data")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def error(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tuple[int, int], **options: Any) -> None:
+    """Speed against error of SCENE over the knobs that a render has: each picture against a converged reference."""
+    from wrt.bench import error as bench_error
+    from wrt.bench import error_report as report
+    from wrt.driver import Options
+
+    plan = bench_error.Plan(**{name: options.pop(name) for name in (
+        "knobs", "max_spp", "repeats", "reference_spp")}, row_seconds=options.pop("row_limit"))
+    rendering = Options(**options)
+    paths = {} if output is None else report.report_paths(output, scene.stem)
+    loaded = load(scene, quiet).with_settings(size=size)
+    with warnings_told(quiet), naming(scene):
+        result = bench_error.sweep(loaded, plan, rendering, lambda step: None if quiet else say(step))
+    if paths:
+        report.write_report(result, paths, f"python -m wrt {click.get_current_context().command_path}")
+    if as_json:
+        say_json({**result.as_dict(), "output": [str(path) for path in paths.values()]})
+        return
+    click.echo(report.text(result))
+    for path in paths.values():
+        click.echo(path)

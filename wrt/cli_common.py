@@ -1,0 +1,117 @@
+"""What the commands share: types of options, how a scene is loaded, and how they tell of things."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import re
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wrt.errors import InputError, SceneWarning
+
+DIGITS = "[0-9]{1,9}"  # more are no pixel, and Python refuses to read thousands
+
+
+class Size(click.ParamType):
+    """640x360"""
+
+    name = "WxH"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, int]:
+        match = re.fullmatch(f"({DIGITS})[xX]({DIGITS})", str(value))
+        if not match:
+            self.fail(f"{value!r} is not a size; write 640x360", param, ctx)
+        return int(match[1]), int(match[2])
+
+
+class Crop(click.ParamType):
+    """X0,Y0,X1,Y1"""
+
+    name = "X0,Y0,X1,Y1"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
+        numbers = [number.strip() for number in str(value).split(",")]
+        if len(numbers) != 4 or not all(re.fullmatch(DIGITS, number) for number in numbers):
+            self.fail(f"{value!r} is not a rectangle; write X0,Y0,X1,Y1 in pixels from the top left", param, ctx)
+        return tuple(int(number) for number in numbers)
+
+
+class Duration(click.ParamType):
+    """30, 30s, 5m or 1h"""
+
+    name = "TIME"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        match = re.fullmatch(r"([0-9]+(?:\.[0-9]*)?)\s*([smh]?)", str(value))
+        if not match:
+            self.fail(f"{value!r} is not a time; write 30s, 5m or 1h", param, ctx)
+        return float(match[1]) * {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}[match[2]]
+
+
+class Names(click.ParamType):
+    """Comma-separated names."""
+
+    name = "NAME,..."
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, ...]:
+        if isinstance(value, tuple):  # the default
+            return value
+        return tuple(name.strip() for name in str(value).split(",") if name.strip())
+
+
+def load(path: Path, quiet: bool, clock: dict[str, float] | None = None) -> Any:
+    """The scene, with the loader's warnings on stderr."""
+    begin = time.perf_counter()
+    from wrt.scene_file import load_scene
+
+    with warnings_told(quiet):
+        scene = load_scene(path)
+    if clock is not None:
+        clock["load"] = time.perf_counter() - begin
+    return scene
+
+
+@contextlib.contextmanager
+def warnings_told(quiet: bool) -> Iterator[None]:
+    """Tell the block's warnings on stderr when it is over, a line each; none where it fails: one message is enough."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", SceneWarning)
+        yield
+    for warning in caught:
+        if not (quiet and issubclass(warning.category, SceneWarning)):
+            say(f"warning: {warning.message}")
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """What is found wrong with a scene after it was read is told with its file."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error), path) from error
+
+
+def say_json(value: Any) -> None:
+    """As JSON on stdout, which has no NaN and no infinity: they become null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {str(key): plain(each) for key, each in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(each) for each in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    click.echo(json.dumps(plain(value), default=str, allow_nan=False))
+
+
+def say(text: str) -> None:
+    """On stderr; that its terminal is gone is no reason to fail."""
+    with contextlib.suppress(OSError):
+        click.echo(text, err=True)
