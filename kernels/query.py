@@ -35,6 +35,7 @@ def load_ray(rays: RayArrays, i: int) -> Ray:
     ray.t_min = rays.t_min[i]
     ray.t_max = rays.t_max[i]
     ray.exclude = -1
+    ray.slot = i
     return ray
 
 

@@ -33,7 +33,8 @@ def gamma(n: float) -> float:
 class Ray:
     """The points origin + t * direction for t_min <= t <= t_max; direction need not be of unit length.
 
-    exclude: a triangle that is not hit, because the ray starts on it (a plane is crossed once), or -1.
+    exclude: a triangle that is not hit, because the ray starts on it (a plane is crossed once), or -1. slot: the row of the
+    counters that this ray adds to, where they are compiled in.
     """
 
     origin: wp.vec3
@@ -41,6 +42,7 @@ class Ray:
     t_min: float
     t_max: float
     exclude: int
+    slot: int
 
 
 @wp.struct

@@ -11,11 +11,12 @@ from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
 
 
 class Units(NamedTuple):
-    """What a traversal unit is made of: names in RAY_TRIANGLE and RAY_AABB, and whether there are spheres."""
+    """What a traversal unit is made of: names in RAY_TRIANGLE and RAY_AABB, whether there are spheres, and whether it counts."""
 
     triangle: str = "watertight"
     box: str = "conservative"
     spheres: bool = False
+    counters: bool = False
 
     @property
     def triangle_test(self) -> Any:
@@ -46,15 +47,6 @@ def no_hit(ray: Ray) -> Hit:
     s = zero[0] + zero[1] + zero[2]
     best.t = wp.where(wp.isfinite(s), ray.t_max, float(-wp.inf))
     best.prim_id = NO_HIT
-    return best
-
-
-@wp.func
-def finished(best: Hit) -> Hit:
-    """The answer to the outside: a miss has t = inf and prim_id = -1."""
-    if best.prim_id == NO_HIT:
-        best.t = float(wp.inf)
-        best.prim_id = -1
     return best
 
 

@@ -4,8 +4,9 @@ from functools import cache
 
 import warp as wp
 
+from wrt.kernels.counters import Counts, Recorder, make_counters
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
-from wrt.kernels.traverse import Units, finished, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
 
 
 @cache
@@ -15,6 +16,7 @@ def make_struct(record):
     @wp.struct
     class BruteForce:
         primitives: wp.array(dtype=record)
+        recorder: Recorder
 
     return BruteForce
 
@@ -23,17 +25,20 @@ def make_traversal(units: Units, any_hit: bool, accepts=None):
     """The closest hit, or any (the first that is found), among all primitives."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
+    _, fetch_primitive, _, finish = make_counters(units, 0)
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
     def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
+        counts = Counts()
         for i in range(accel.primitives.shape[0]):
             best = intersect(probe, surfaces, accel.primitives[i], best)
+            counts = fetch_primitive(accel.recorder, ray, counts, i)
             if wp.static(any_hit):
                 if best.prim_id != NO_HIT:
                     break
-        return finished(best)
+        return finish(accel.recorder, ray, counts, best)
 
     return traverse

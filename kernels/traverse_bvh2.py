@@ -8,8 +8,9 @@ from functools import cache
 
 import warp as wp
 
+from wrt.kernels.counters import Counts, Recorder, make_counters
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
-from wrt.kernels.traverse import Units, finished, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
 
 # Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
 STACK_SIZE = 64
@@ -40,6 +41,7 @@ def make_struct(record):
     class Bvh2:
         nodes: wp.array(dtype=Bvh2Node)
         primitives: wp.array(dtype=record)
+        recorder: Recorder
 
     return Bvh2
 
@@ -49,12 +51,14 @@ def make_traversal(units: Units, any_hit: bool, accepts=None):
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
     ray_aabb = units.box_test
+    fetch_node, fetch_primitive, push, finish = make_counters(units, Bvh2Node.numpy_dtype()["itemsize"])
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
     def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
+        counts = Counts()
         stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_t = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
@@ -63,13 +67,16 @@ def make_traversal(units: Units, any_hit: bool, accepts=None):
         count = int(0)
         while True:
             if count > 0:
+                counts.leaves += 1
                 for i in range(first, first + count):
                     best = intersect(probe, surfaces, accel.primitives[i], best)
+                    counts = fetch_primitive(accel.recorder, ray, counts, i)
                     if wp.static(any_hit):
                         if best.prim_id != NO_HIT:
-                            return finished(best)
+                            return finish(accel.recorder, ray, counts, best)
             else:
                 node = accel.nodes[first]
+                counts = fetch_node(accel.recorder, ray, counts, first, 2)
                 t_0 = ray_aabb(probe.box, node.lo_0, node.hi_0, best.t)
                 t_1 = ray_aabb(probe.box, node.lo_1, node.hi_1, best.t)
                 hit_0 = t_0 < wp.inf
@@ -80,6 +87,7 @@ def make_traversal(units: Units, any_hit: bool, accepts=None):
                     stack_count[size] = wp.where(swap, node.count_0, node.count_1)
                     stack_t[size] = wp.where(swap, t_0, t_1)
                     size = size + 1
+                    counts = push(counts, size)
                     first = wp.where(swap, node.first_1, node.first_0)
                     count = wp.where(swap, node.count_1, node.count_0)
                     continue
@@ -95,12 +103,13 @@ def make_traversal(units: Units, any_hit: bool, accepts=None):
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
+                counts.pops += 1
                 if stack_t[size] <= best.t:
                     first = stack_first[size]
                     count = stack_count[size]
                     found = True
             if not found:
                 break
-        return finished(best)
+        return finish(accel.recorder, ray, counts, best)
 
     return traverse

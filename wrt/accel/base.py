@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cache
-from types import ModuleType
+from inspect import signature
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ import warp as wp
 from wrt.accel.triangle_data import TRIANGLE_DATA
 from wrt.device import load_kernel, records, run_all, start, thread_count, upload
 from wrt.errors import InputError
+from wrt.kernels.counters import SIZE_RANGE, Counts, Recorder
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
 from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT, RAY_AABB
 from wrt.kernels.ray_triangle import RAY_TRIANGLE
@@ -75,26 +76,64 @@ class Geometry:
 
 @dataclass(frozen=True)
 class AccelStats:
-    """build_seconds: wall clock; nodes, leaves, depth: 0 where there is no tree; bytes: on the device, triangles included;
-    sah_cost: expected cost of a random line through the root box, traversal and intersection costing 1 each."""
+    """build_seconds: wall clock; nodes, leaves, depth: 0 where there is no tree; references: primitives in all leaves together,
+    more than there are where a structure splits space; bytes: on the device, triangles included; sah_cost: expected cost of a
+    random line through the root box, one node visited and one primitive tested costing 1 each (NaN where nobody knows)."""
 
     build_seconds: float
     nodes: int
     leaves: int
     depth: int
+    references: int
     bytes: int
     sah_cost: float
 
 
 @dataclass(frozen=True, eq=False)
+class Built:
+    """What a builder gives: arrays, one for each field of the structure's struct but `primitives` and `recorder`, records or
+    rows of numbers (a field that is no array: a NumPy scalar or row); order: (R,) int32, the prim_id of each record of
+    `primitives`, where one may stand more than once; and what AccelStats tells of a tree."""
+
+    arrays: dict[str, np.ndarray]
+    order: np.ndarray
+    nodes: int = 0
+    leaves: int = 0
+    depth: int = 0
+    sah_cost: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class Counters:
+    """What each ray cost, (N,) each, as in kernels.counters.Counts; trace: the fetches of all rays one after another, those of
+    ray i from first[i] to first[i + 1]: address (int64, bytes; primitives from PRIMITIVE_SPACE on) and size (int64, bytes)."""
+
+    counts: np.ndarray
+    first: np.ndarray
+    address: np.ndarray
+    size: np.ndarray
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        if name.startswith("_") or name not in (self.counts.dtype.names or ()):
+            raise AttributeError(name)
+        return self.counts[name]
+
+    def __repr__(self) -> str:
+        means = ", ".join(f"{name} {self.counts[name].mean():.2f}" for name in self.counts.dtype.names or ())
+        return f"Counters({len(self.counts)} rays; a ray: {means})" if len(self.counts) else "Counters(0 rays)"
+
+
+@dataclass(frozen=True, eq=False)
 class Hits:
     """t: (N,) float32, in units of |direction|, inf on a miss; prim_id: (N,) int32, -1 on a miss; u, v: (N,) float32:
-    the point is (1 - u - v) v0 + u v1 + v v2 (0 on a miss and on spheres). NumPy arrays, or Warp's if the rays were."""
+    the point is (1 - u - v) v0 + u v1 + v v2 (0 on a miss and on spheres). NumPy arrays, or Warp's if the rays were.
+    counters: what each ray cost, where that was asked for."""
 
     t: Any
     u: Any
     v: Any
     prim_id: Any
+    counters: Counters | None = None
 
     def __len__(self) -> int:
         return len(self.t)
@@ -133,7 +172,7 @@ class Accelerator(ABC):
     """
 
     name: ClassVar[str]
-    kernels: ClassVar[ModuleType]
+    kernels: ClassVar[Any]
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
                  box: str = "conservative", **options: Any) -> None:
@@ -145,12 +184,30 @@ class Accelerator(ABC):
         self._surfaces = Surfaces()
         self._surfaces.n_triangles = len(geometry.faces)
         self._surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # the caller may change his
+        known = [p for p in signature(self._build).parameters if p != "options"]
+        for option in options:
+            if option not in known:
+                raise InputError(f"{self.name} has no option {option!r}; there is {', '.join([*known, 'triangle', 'box'])}")
         begin = time.perf_counter()
-        self.data, self.stats = self._build(begin, **options)
+        built = self._build(**options)
+        self.data = self._upload(built)
+        self.stats = AccelStats(time.perf_counter() - begin, built.nodes, built.leaves, built.depth, len(built.order),
+                                array_bytes(self.data), built.sah_cost)
 
     @abstractmethod
-    def _build(self, begin: float, **options: Any) -> tuple[Any, AccelStats]:
-        """The device struct, and what there is to tell of it. `begin`: time.perf_counter() at the start of the build."""
+    def _build(self, *args: Any, **options: Any) -> Built:
+        """The structure over self.geometry, on the host. Raises InputError for options out of range."""
+
+    def _upload(self, built: Built) -> Any:
+        units = self.structure.units
+        data = self.structure.struct()
+        types = {name: field.type for name, field in data._cls.vars.items()}
+        for name, array in built.arrays.items():
+            kind = types[name]
+            is_array = isinstance(kind, wp.array)
+            setattr(data, name, upload(array, kind.dtype, self.device) if is_array else kind(*np.atleast_1d(array)))
+        data.primitives = upload(self.geometry.primitives(units, built.order), units.triangle_test.record, self.device)
+        return data
 
     def __repr__(self) -> str:
         s = self.stats
@@ -158,20 +215,23 @@ class Accelerator(ABC):
                 f"{s.bytes / 1e6:.1f} MB, SAH {s.sah_cost:.1f}, built in {s.build_seconds:.3f} s)")
 
     def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-                    threads: int | None = None) -> Hits:
+                    threads: int | None = None, *, counters: bool = False, trace: bool = False) -> Hits:
         """The closest hit of each ray in the closed segment [t_min, t_max]; at equal t the lowest prim_id.
 
         origins, directions: (N, 3) float32, finite, directions not zero and of any length; t_min (>= 0), t_max: scalars or
-        (N,). Raises InputError that names the argument, its shape and what was expected.
+        (N,). counters: count what each ray costs (hits.counters); trace: also record what it fetches, which takes a second
+        run. Raises InputError that names the argument, its shape and what was expected.
         """
         rays, as_warp = self._rays(origins, directions, t_min, t_max)
         n = len(rays.t_min)
         hits = HitArrays()
         for field, dtype in (("t", wp.float32), ("u", wp.float32), ("v", wp.float32), ("prim_id", wp.int32)):
             setattr(hits, field, wp.empty(n, dtype=dtype, device=self.device))
-        self._launch(closest_hit_kernel(self.structure), rays, hits, n, threads)
-        out = [hits.t, hits.u, hits.v, hits.prim_id]
-        return Hits(*(out if as_warp else [array.numpy() for array in out]))
+        counted = self._counted(closest_hit_kernel, rays, hits, trace, threads) if counters or trace else None
+        if counted is None:
+            self._launch(closest_hit_kernel(self.structure), rays, hits, n, threads)
+        t, u, v, prim_id = (array if as_warp else array.numpy() for array in (hits.t, hits.u, hits.v, hits.prim_id))
+        return Hits(t, u, v, prim_id, counted)
 
     def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                 threads: int | None = None) -> Any:
@@ -181,6 +241,30 @@ class Accelerator(ABC):
         dark = wp.empty(n, dtype=wp.bool, device=self.device)
         self._launch(any_hit_kernel(self.structure), rays, dark, n, threads)
         return dark if as_warp else dark.numpy()
+
+    def _counted(self, make_kernel: Any, rays: RayArrays, out: Any, trace: bool, threads: int | None) -> Counters:
+        """Launch with counters; with a trace once more, when it is known how long the trace of each ray is."""
+        n = len(rays.t_min)
+        structure = self.structure._replace(units=self.structure.units._replace(counters=True))
+        kernel = make_kernel(structure)
+
+        def run(first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            # The struct of the counting kernel is the same: only the recorder is set.
+            self.data.recorder.counts = wp.zeros(n, dtype=Counts, device=self.device)
+            self.data.recorder.first = upload(first, wp.int64, self.device)
+            self.data.recorder.fetches = wp.zeros(int(first[-1]) if len(first) else 0, dtype=wp.int64, device=self.device)
+            self._launch(kernel, rays, out, n, threads)
+            return self.data.recorder.counts.numpy().copy(), self.data.recorder.fetches.numpy().copy()
+
+        try:
+            counts, fetches = run(np.zeros(0, np.int64))
+            first = np.zeros(n + 1, np.int64)
+            if trace:
+                np.cumsum(counts["nodes"].astype(np.int64) + counts["primitives"], out=first[1:])
+                counts, fetches = run(first)
+        finally:
+            self.data.recorder = Recorder()
+        return Counters(counts, first, fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
 
     def _launch(self, kernel: Any, rays: RayArrays, out: Any, n: int, threads: int | None) -> None:
         surfaces = self._surfaces
@@ -230,6 +314,12 @@ class Accelerator(ABC):
         if np.isnan(array).any() or (array < low).any():
             raise InputError(f"{name} must not be NaN" + (f" or below {low:g}" if low > -np.inf else ""))
         return upload(np.broadcast_to(array, (n,)).copy(), wp.float32, self.device)
+
+
+def array_bytes(data: Any) -> int:
+    """Bytes of all arrays of a Warp struct."""
+    arrays = (getattr(data, name) for name in data._cls.vars)
+    return sum(array.capacity for array in arrays if isinstance(array, wp.array))
 
 
 def _vectors(value: Any, name: str) -> np.ndarray:

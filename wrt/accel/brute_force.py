@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import time
-from typing import Any
+import numpy as np
 
-from wrt.accel.base import Accelerator, AccelStats
-from wrt.device import upload
+from wrt.accel.base import Accelerator, Built
 from wrt.kernels import traverse_brute_force as kernels
 
 
 class BruteForce(Accelerator):
+    """No options."""
+
     name = "brute_force"
     kernels = kernels
 
-    def _build(self, begin: float, **options: Any) -> tuple[Any, AccelStats]:
-        if options:
-            raise TypeError(f"brute_force takes no options, got {', '.join(options)}")
-        data = self.structure.struct()
-        primitives = self.geometry.primitives(self.structure.units)
-        data.primitives = upload(primitives, self.structure.units.triangle_test.record, self.device)
-        stats = AccelStats(time.perf_counter() - begin, 0, 0, 0, primitives.nbytes, float(len(self.geometry)))
-        return data, stats
+    def _build(self) -> Built:
+        n = len(self.geometry)
+        return Built({}, np.arange(n, dtype=np.int32), sah_cost=float(n))

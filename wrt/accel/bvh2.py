@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator, AccelStats
+from wrt.accel.base import Accelerator, Built
 from wrt.device import records, run_all, start, upload
 from wrt.errors import InputError
 from wrt.kernels import build_bvh2
@@ -22,21 +21,15 @@ class Bvh2(Accelerator):
     name = "bvh2"
     kernels = kernels
 
-    def _build(self, begin: float, max_leaf: int = 4, cost_traversal: float = 1.0,  # type: ignore[override]
-               cost_intersection: float = 1.0) -> tuple[Any, AccelStats]:
+    def _build(self, max_leaf: int = 4, cost_traversal: float = 1.0,
+               cost_intersection: float = 1.0) -> Built:
         if not 1 <= max_leaf <= 64:
             raise InputError(f"max_leaf must be 1 to 64, got {max_leaf}")
         options = build_bvh2.BuildOptions()
         options.max_leaf, options.cost_traversal, options.cost_intersection = max_leaf, cost_traversal, cost_intersection
         nodes, order, depth = build_nodes(self.geometry.bounds(), options, self.threads)
-        primitives = self.geometry.primitives(self.structure.units, order)
-        data = self.structure.struct()
-        data.nodes = upload(nodes, kernels.Bvh2Node, self.device)
-        data.primitives = upload(primitives, self.structure.units.triangle_test.record, self.device)
         leaves = int((nodes["count_0"] > 0).sum() + (nodes["count_1"] > 0).sum())
-        stats = AccelStats(time.perf_counter() - begin, len(nodes), leaves, depth, nodes.nbytes + primitives.nbytes,
-                           sah_cost(nodes))
-        return data, stats
+        return Built({"nodes": nodes}, order, len(nodes), leaves, depth, sah_cost(nodes))
 
 
 def build_nodes(bounds: tuple[np.ndarray, np.ndarray], options: Any, threads: int) -> tuple[np.ndarray, np.ndarray, int]:

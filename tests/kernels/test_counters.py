@@ -1,0 +1,83 @@
+"""The counters: exactly what a walk in plain Python counts, for every structure, and no code where they are off."""
+
+import numpy as np
+import pytest
+
+from tests.data import data_path
+from tests.kernel_tools import rounded
+from tests.rewalk import PRIMITIVE_BYTES, REWALK, rays
+from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.mesh import Mesh, load_mesh
+from wrt.shapes import icosphere
+
+STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
+NAMES = ("nodes", "boxes", "box_operations", "primitives", "leaves", "pushes", "pops", "stack")
+
+
+def aimed(geometry, n, seed):
+    """Half of the rays start inside the box of the geometry, half outside; all go towards a point of the box."""
+    rng = np.random.default_rng(seed)
+    lo, hi = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
+    center, half = 0.5 * (lo + hi), 0.5 * (hi - lo)
+    reach = np.where(np.arange(n) % 2, 1.0, 4.0)[:, None]
+    origins = rounded(center + half * reach * rng.uniform(-1.0, 1.0, (n, 3)))
+    return origins, rounded(center + half * rng.uniform(-1.0, 1.0, (n, 3)) - origins)
+
+
+def check(geometry, name, n, seed, **options):
+    """Every counter and every fetch of n rays equals the walk's."""
+    structure = build(geometry, name, **options)
+    origins, directions = aimed(geometry, n, seed)
+    hits = structure.closest_hit(origins, directions, trace=True)
+    counters = hits.counters
+    assert len(counters.address) == counters.first[-1]
+    for i, ray in enumerate(rays(geometry, origins, directions)):
+        walk = REWALK[name](structure, ray)
+        assert (ray.best[1] if ray.best[1] < 1 << 31 else -1) == hits.prim_id[i]
+        assert {k: int(counters.counts[k][i]) for k in NAMES} == {k: getattr(walk, k) for k in NAMES}, f"ray {i}"
+        part = slice(counters.first[i], counters.first[i + 1])
+        assert list(zip(counters.address[part].tolist(), counters.size[part].tolist(), strict=True)) == walk.trace
+        assert counters.node_bytes[i] + counters.primitive_bytes[i] == sum(size for _, size in walk.trace)
+    assert (counters.probes == 1).all()
+    assert (counters.primitive_bytes == PRIMITIVE_BYTES * counters.primitives).all()
+    return counters
+
+
+def test_every_structure_has_a_walk():
+    assert set(REWALK) >= set(STRUCTURES)
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_counters_equal_a_walk_in_python(name):
+    rng = np.random.default_rng(5)
+    corners = rng.uniform(-1.0, 1.0, (300, 1, 3)) + 0.2 * rng.normal(size=(300, 3, 3))
+    soup = Geometry.of(Mesh(rounded(corners.reshape(-1, 3)), np.arange(900, dtype=np.int32).reshape(-1, 3)))
+    counters = check(soup, name, 60, 1)
+    assert counters.primitives.sum() > 0
+    check(Geometry.of(icosphere(2)), name, 60, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in STRUCTURES if name != "brute_force"])
+@pytest.mark.parametrize("mesh", ["cow.obj", "suzanne.obj", "teapot.obj", "rocker-arm.obj", "legocar.obj"])
+def test_counters_equal_a_walk_on_real_meshes(name, mesh):
+    folder = "medium" if mesh == "rocker-arm.obj" else "small"
+    check(Geometry.of(load_mesh(data_path(f"meshes/{folder}/{mesh}"))), name, 10_000, 3)
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_counting_changes_no_hit(name):
+    structure = build(icosphere(2), name)
+    origins, directions = aimed(structure.geometry, 500, 4)
+    plain, counted = structure.closest_hit(origins, directions), structure.closest_hit(origins, directions, counters=True)
+    assert plain.counters is None and "probes 1.00" in repr(counted.counters)
+    for field in ("t", "u", "v", "prim_id"):
+        np.testing.assert_array_equal(getattr(plain, field), getattr(counted, field))
+    with pytest.raises(AttributeError):
+        counted.counters.nonsense  # noqa: B018
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_no_rays_cost_nothing(name):
+    counters = build(icosphere(1), name).closest_hit(np.zeros((0, 3)), np.zeros((0, 3)), trace=True).counters
+    assert len(counters.counts) == len(counters.address) == 0

@@ -1,0 +1,145 @@
+"""What a ray costs, told by plain Python: each structure is walked again, ray by ray, and its counters must come out exactly.
+
+REWALK[name](structure, ray) gives the `Walk` of one ray. What the triangle unit says is taken from testing every primitive
+(`rays`), so that a walk knows nothing of the code that it checks but the layout of the structure's arrays. A new structure
+adds its walk here.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from wrt.device import load_kernel, upload
+from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
+from wrt.kernels.ray_aabb import FAR_PAD
+
+INF = np.float32(np.inf)
+PRIMITIVES = 1 << 40
+PRIMITIVE_BYTES = 40
+
+
+@dataclass
+class Walk:
+    """The counters of one ray, and what it fetched: (address, bytes)."""
+
+    nodes: int = 0
+    boxes: int = 0
+    box_operations: int = 0
+    primitives: int = 0
+    leaves: int = 0
+    pushes: int = 0
+    pops: int = 0
+    stack: int = 0
+    trace: list[tuple[int, int]] = field(default_factory=list)
+
+    def node(self, index: int, size: int, boxes: int) -> None:
+        self.nodes += 1
+        self.boxes += boxes
+        self.box_operations += 1
+        self.trace.append((index * size, size))
+
+    def push(self, size: int) -> None:
+        self.pushes += 1
+        self.stack = max(self.stack, size)
+
+
+@dataclass
+class WalkRay:
+    """One ray; hits: what the triangle unit says of each primitive on it, prim_id -> t; best: (t, prim_id) so far."""
+
+    origin: np.ndarray
+    direction: np.ndarray
+    t_min: np.float32
+    t_max: np.float32
+    hits: dict[int, np.float32]
+    best: tuple[np.float32, int] = (INF, -1)
+
+    def __post_init__(self) -> None:
+        self.best = (self.t_max, 1 << 31)
+        with np.errstate(divide="ignore"):
+            self.inv_dir = np.float32(1.0) / self.direction
+
+    def test(self, walk: Walk, accel, index: int) -> None:
+        """Record `index` of the primitives is tested."""
+        walk.primitives += 1
+        walk.trace.append((PRIMITIVES + index * PRIMITIVE_BYTES, PRIMITIVE_BYTES))
+        prim_id = int(accel.data.primitives.numpy()["prim_id"][index])
+        if prim_id in self.hits:
+            self.best = min(self.best, (self.hits[prim_id], prim_id))
+
+    def enter(self, lo: np.ndarray, hi: np.ndarray) -> np.float32:
+        """Where the ray enters a box before its best hit, by conservative slabs in float32; inf if it does not."""
+        backwards = self.inv_dir < 0.0
+        with np.errstate(invalid="ignore", over="ignore"):
+            near = (np.where(backwards, hi, lo) - self.origin) * self.inv_dir
+            far = (np.where(backwards, lo, hi) - self.origin) * self.inv_dir
+        enter = np.fmax.reduce(near, initial=self.t_min)
+        leave = np.minimum(np.float32(np.fmin.reduce(far, initial=INF) * np.float32(FAR_PAD)), self.best[0])
+        return enter if enter <= leave else INF
+
+
+def rays(geometry, origins, directions, t_min=0.0, t_max=np.inf, capacity=256) -> list[WalkRay]:
+    """The rays with all their hits, found by testing every primitive with the default unit."""
+    from wrt.accel import build
+
+    yardstick = build(geometry, "brute_force")
+    kernel = make_all_hits_kernel(yardstick.structure.units)
+    n = len(origins)
+    arrays = RayArrays()
+    arrays.origin, arrays.direction = (upload(np.ascontiguousarray(a, np.float32), wp.vec3, "cpu") for a in (origins, directions))
+    arrays.t_min, arrays.t_max = (upload(np.full(n, t, np.float32), wp.float32, "cpu") for t in (t_min, t_max))
+    out = HitList()
+    out.capacity = capacity
+    out.count = wp.zeros(n, dtype=wp.int32, device="cpu")
+    out.prim_id = wp.zeros(n * capacity, dtype=wp.int32, device="cpu")
+    out.t = wp.zeros(n * capacity, dtype=wp.float32, device="cpu")
+    load_kernel(kernel, yardstick.device)
+    wp.launch(kernel, dim=n, inputs=[yardstick.data.primitives, yardstick._surfaces, arrays, out, 0], device="cpu")
+    count = out.count.numpy()
+    assert count.max(initial=0) <= capacity, "more hits on a ray than there is room for"
+    prim_id, t = out.prim_id.numpy().reshape(n, capacity), out.t.numpy().reshape(n, capacity)
+    origin, direction = arrays.origin.numpy(), arrays.direction.numpy()
+    return [WalkRay(origin[i], direction[i], np.float32(t_min), np.float32(t_max),
+                    dict(zip(prim_id[i, :count[i]].tolist(), t[i, :count[i]], strict=True))) for i in range(n)]
+
+
+def brute_force(accel, ray: WalkRay) -> Walk:
+    walk = Walk()
+    for i in range(len(accel.geometry)):
+        ray.test(walk, accel, i)
+    return walk
+
+
+def bvh2(accel, ray: WalkRay) -> Walk:
+    walk, nodes, stack = Walk(), accel.data.nodes.numpy(), [(np.float32(0.0), 0, 0)]
+    first_visit = True
+    while stack:
+        t, first, count = stack.pop()
+        if not first_visit:
+            walk.pops += 1
+            if t > ray.best[0]:
+                continue
+        first_visit = False
+        while True:
+            if count:
+                walk.leaves += 1
+                for i in range(first, first + count):
+                    ray.test(walk, accel, i)
+                break
+            node = nodes[first]
+            walk.node(first, nodes.itemsize, 2)
+            near = sorted((t, k) for k in (0, 1) if (t := ray.enter(node[f"lo_{k}"], node[f"hi_{k}"])) < INF)
+            if not near:
+                break
+            if len(near) == 2:
+                t, k = near[1]
+                stack.append((t, int(node[f"first_{k}"]), int(node[f"count_{k}"])))
+                walk.push(len(stack))
+            k = near[0][1]
+            first, count = int(node[f"first_{k}"]), int(node[f"count_{k}"])
+    return walk
+
+
+REWALK: dict[str, Callable[..., Walk]] = {"brute_force": brute_force, "bvh2": bvh2}
