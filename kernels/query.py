@@ -28,34 +28,48 @@ class HitArrays:
 
 
 @wp.func
+def direction_scale(direction: wp.vec3) -> float:
+    """A power of two that brings a very short or very long direction to where 1 / d is no denormal and no infinity, else 1.
+
+    Scaling by it is exact. What is left is between 2^-64 and 2^64, also of a direction that is denormal.
+    """
+    longest = wp.max(wp.max(wp.abs(direction[0]), wp.abs(direction[1])), wp.abs(direction[2]))
+    short = wp.where(longest < wp.static(2.0**-64), wp.static(2.0**96), 1.0)
+    return wp.where(longest > wp.static(2.0**64), wp.static(2.0**-96), short)
+
+
+@wp.func
 def load_ray(rays: RayArrays, i: int) -> Ray:
+    """Ray i in units of its scaled direction: t times `direction_scale` is in the caller's."""
+    scale = direction_scale(rays.direction[i])
     ray = Ray()
     ray.origin = rays.origin[i]
-    ray.direction = rays.direction[i]
-    ray.t_min = rays.t_min[i]
-    ray.t_max = rays.t_max[i]
+    ray.direction = scale * rays.direction[i]
+    ray.t_min = rays.t_min[i] / scale
+    ray.t_max = rays.t_max[i] / scale
     ray.exclude = -1
     ray.slot = i
     return ray
 
 
 def make_closest_hit_kernel(accel_struct, traverse):
-    """rays first .. first + dim - 1 against the structure."""
+    """rays first .. first + dim - 1 against the structure. A hit whose t is beyond float32 is a miss."""
 
     @kernel
     def closest_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, hits: HitArrays, first: int):
         i = first + wp.tid()
         hit = traverse(accel, surfaces, load_ray(rays, i))
-        hits.t[i] = hit.t
+        t = hit.t * direction_scale(rays.direction[i])
+        hits.t[i] = t
         hits.u[i] = hit.u
         hits.v[i] = hit.v
-        hits.prim_id[i] = hit.prim_id
+        hits.prim_id[i] = wp.where(t < wp.inf, hit.prim_id, -1)
 
     return closest_hit
 
 
 def make_any_hit_kernel(accel_struct, traverse):
-    """As closest_hit, but only whether there is one."""
+    """As closest_hit, but only whether there is one (also beyond float32)."""
 
     @kernel
     def any_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, dark: wp.array(dtype=wp.bool), first: int):
@@ -133,7 +147,7 @@ def make_all_hits_kernel(units):
             if hit.prim_id != NO_HIT:
                 if n < out.capacity:
                     out.prim_id[i * out.capacity + n] = hit.prim_id
-                    out.t[i * out.capacity + n] = hit.t
+                    out.t[i * out.capacity + n] = hit.t * direction_scale(rays.direction[i])
                 n = n + 1
         out.count[i] = n
 

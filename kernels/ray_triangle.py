@@ -49,22 +49,17 @@ def triangle_ray(ray: Ray) -> TriangleRay:
 
 
 @wp.func
-def has_area(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> bool:
-    """Whether the corners span a plane; in float64 the products are exact, so that only truly collinear ones do not."""
-    p = wp.vec3d(v0)
-    n = wp.cross(wp.vec3d(v1) - p, wp.vec3d(v2) - p)
-    zero = wp.float64(0.0)
-    return n[0] != zero or n[1] != zero or n[2] != zero
-
-
-@wp.func
 def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> Hit:
     """Both sides count. The hit lies on the whole line: t may be negative. prim_id is 0 on a hit, else NO_HIT.
 
     Products of two float32 are monotone, so an area's sign can only be wrong where it is 0, under- or overflows: most
     triangles are refused in float32. For the others the areas are taken again in float64, where the products are exact: that
-    decides those cases, and seen nearly edge-on, where the areas cancel, it keeps the digits of t, u and v. A triangle
-    without area, or seen exactly edge-on, is missed. NaN coordinates miss.
+    decides those cases, and seen nearly edge-on, where the areas cancel, it keeps the digits of t, u and v. A triangle that
+    is seen exactly edge-on is missed, and so are NaN coordinates: the record of a triangle without area has them, as corners
+    on a line may no longer be on one after their rounding here (wrt.accel.triangle_data.corners).
+
+    Domain: differences of coordinates below 2^127, and a direction whose longest component is between 2^-64 and 2^64
+    (kernels.query brings others there); beyond, rays may be lost. The error bounds are in wrt.reference_bounds.
     """
     hit = Hit()
     hit.prim_id = NO_HIT
@@ -95,7 +90,7 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
     if (w_0 < zero or w_1 < zero or w_2 < zero) and (w_0 > zero or w_1 > zero or w_2 > zero):
         return hit
     area = w_0 + w_1 + w_2
-    if not (area < zero or area > zero) or not has_area(v0, v1, v2):
+    if not (area < zero or area > zero):
         return hit
     hit.t = float((w_0 * wp.float64(a_z) + w_1 * wp.float64(b_z) + w_2 * wp.float64(c_z)) / area * wp.float64(shear.shear_z))
     hit.u = float(w_1 / area)

@@ -14,6 +14,7 @@ from wrt.accel import Geometry
 from wrt.device import records, upload
 from wrt.errors import InputError, SceneWarning
 from wrt.kernels import lights, structs, textures
+from wrt.mesh_clean import flip_collinear
 from wrt.scene import (
     ALPHA_MODES,
     MATERIAL_KINDS,
@@ -47,7 +48,11 @@ class WorldMesh:
 
 
 def world_mesh(scene: Scene) -> WorldMesh:
-    """Transform and join all objects. Positions are computed in float64 and rounded once."""
+    """Transform and join all objects. Positions are computed in float64 and rounded once.
+
+    prim_id counts the faces of all objects in their order; of faces whose corners rounding put on a line, see
+    `wrt.mesh_clean.flip_collinear`.
+    """
     index = {id(material): i for i, material in enumerate(scene.materials)}
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
@@ -57,12 +62,13 @@ def world_mesh(scene: Scene) -> WorldMesh:
     first = 0
     for thing in scene.objects:
         v, f, n, t = _transformed(thing)
+        f, source = flip_collinear(v, f)  # far from 0, rounding puts corners on a line that were on none
         vertices.append(v)
         faces.append(f + np.int32(first))
         normals.append(n)
         uvs.append(t)
         table = np.array([index[id(m)] for m in thing.materials], np.int32)
-        material.append(np.full(len(f), table[0]) if thing.face_material is None else table[thing.face_material])
+        material.append(np.full(len(f), table[0]) if thing.face_material is None else table[thing.face_material][source])
         first += len(v)
     spheres = np.array([(*s.center, s.radius) for s in scene.spheres], np.float32).reshape(-1, 4)
     material.append(np.array([index[id(s.material)] for s in scene.spheres], np.int32))

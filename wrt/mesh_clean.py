@@ -7,6 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from wrt.errors import InputError
+from wrt.reference_exact import whole_numbers
+
+AT_ONCE = 1 << 15  # faces whose float64 temporaries stay in the cache
+ROUNDS = 64  # of flips; each takes at least one face whose corners are on a line
 
 
 class Cleaned(NamedTuple):
@@ -22,13 +26,12 @@ class Cleaned(NamedTuple):
 
 def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = None, uvs: np.ndarray | None = None,
           face_group: np.ndarray | None = None) -> Cleaned:
-    """Drop the faces whose area is exactly zero, then the vertices that no remaining face uses.
+    """Flip the faces whose corners are on a line (`flip_collinear`), drop those whose area is exactly zero, then the
+    vertices that no remaining face uses.
 
     vertices: (V, 3), taken as float32; faces: (F, 3) integers; normals (V, 3), uvs (V, 2) and face_group (F,) or None.
-    The order of what remains is kept. Area is the cross product of two edges, in float64 from the float32 positions:
-    zero for repeated indices, coincident corners and corners exactly on a line; it neither overflows nor underflows. A
-    face with a NaN or an infinite corner is kept, so that whoever makes the `Mesh` reports it.
-    Raises InputError that names the first face with an index outside of [0, V).
+    The order of what remains is kept. A face with a NaN or an infinite corner is kept, so that whoever makes the `Mesh`
+    reports it. Raises InputError that names the first face with an index outside of [0, V).
     """
     vertices = np.asarray(vertices, dtype=np.float32).reshape(-1, 3)
     faces = np.asarray(faces).reshape(-1, 3)
@@ -38,11 +41,11 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
         corners = faces[face].tolist()
         raise InputError(f"face {face} is {corners}, but there are {len(vertices)} vertices", None, "faces")
 
-    has_area = _has_area(vertices, faces)
-    dropped = len(faces) - int(np.count_nonzero(has_area))
-    if dropped:
-        faces = faces[has_area]
-        face_group = face_group[has_area] if face_group is not None else None
+    faces, source = flip_collinear(vertices, faces)
+    kept = has_area(vertices, faces)
+    dropped = len(faces) - int(np.count_nonzero(kept))
+    faces, source = faces[kept], source[kept]
+    face_group = face_group[source] if face_group is not None else None
 
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
@@ -54,11 +57,112 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     return Cleaned(vertices, faces.astype(np.int32), normals, uvs, face_group, dropped)
 
 
-def _has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool. One component of the cross product at a time, which keeps the float64 temporaries small."""
-    x, y, z = (vertices[:, axis].astype(np.float64)[faces] for axis in range(3))
-    nonzero = np.zeros(len(faces), dtype=bool)
-    with np.errstate(invalid="ignore"):  # inf - inf: NaN differs from zero, so the face is kept
-        for a, b in ((y, z), (z, x), (x, y)):
-            nonzero |= (a[:, 1] - a[:, 0]) * (b[:, 2] - b[:, 0]) != (b[:, 1] - b[:, 0]) * (a[:, 2] - a[:, 0])
-    return nonzero
+def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) bool: whether the corners of faces (F, 3) in vertices (V, 3) float32 are not on one line, exactly; True where one
+    is not finite.
+
+    The cross product of two edges is taken in float64 and believed where a component exceeds its rounding error; the few
+    others are taken again in whole numbers.
+    """
+    out = np.ones(len(faces), dtype=bool)
+    for first in range(0, len(faces), AT_ONCE):
+        part = faces[first:first + AT_ONCE]
+        a, b, c = (vertices[part[:, i]].astype(np.float64).T for i in range(3))
+        e, f = b - a, c - a
+        unknown: np.ndarray | slice = slice(None)
+        with np.errstate(invalid="ignore"):
+            for i, j in ((1, 2), (2, 0), (0, 1)):
+                left, right = e[i, unknown] * f[j, unknown], e[j, unknown] * f[i, unknown]
+                # Two roundings in each product's factors and one in itself. NaN is not below anything: has area.
+                doubt = np.flatnonzero(np.abs(left - right) <= 2.0**-50 * (np.abs(left) + np.abs(right)))
+                unknown = doubt if isinstance(unknown, slice) else unknown[doubt]
+                if not len(unknown):
+                    break
+        assert isinstance(unknown, np.ndarray)
+        out[first + unknown] = _has_area_exactly(a[:, unknown], b[:, unknown], c[:, unknown])
+    return out
+
+
+def _has_area_exactly(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """As has_area, for corners (3, N) in float64 that hold float32 values."""
+    finite = (np.isfinite(a) & np.isfinite(b) & np.isfinite(c)).all(axis=0)
+    out = ~finite | ~((a == b).all(axis=0) | (b == c).all(axis=0) | (c == a).all(axis=0))
+    rows = np.flatnonzero(out & finite)
+    if len(rows):
+        (p, q, r), _ = whole_numbers(a[:, rows], b[:, rows], c[:, rows])
+        e, f = ([x - y for x, y in zip(corner, p, strict=True)] for corner in (q, r))
+        out[rows] = np.any([e[i] * f[j] != e[j] * f[i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=0)
+    return out
+
+
+def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface, without faces that have their three corners on a line where a flip can take them away.
+
+    Such a face (a, b, c), b between a and c, has no area, but it parts the edge from a to c in two. Were it only dropped, its
+    neighbour (a, c, d) would no longer have an edge with the same two ends as those on the other side, and rays could pass
+    between the roundings of the two. With it, it becomes (a, b, d) and (b, c, d): as many faces, and the same area.
+
+    vertices (V, 3) float32, faces (F, 3). Returns faces (F, 3) of the same type, and source (F,): of which face each one is a
+    part now, whose material and group it has. Faces with two corners in one place stay, as those whose longest edge has no
+    other face, or more than one.
+    """
+    faces, source = faces.copy(), np.arange(len(faces))
+    suspects = np.arange(len(faces))
+    for _ in range(ROUNDS):
+        flat = suspects[~has_area(vertices, faces[suspects])]
+        flat, ends, middle = _longest_edges(vertices, faces, flat)
+        if not len(flat):
+            break
+        neighbour = _across(faces, flat, ends, len(vertices))
+        # A neighbour that is flat itself must have the same longest edge; else its own flip comes first.
+        place = np.full(len(faces), -1)
+        place[flat] = np.arange(len(flat))
+        other = place[neighbour]
+        ready = (neighbour >= 0) & ((other < 0) | (np.sort(ends) == np.sort(ends[other])).all(axis=1))
+        flat, ends, middle, neighbour = (x[ready] for x in (flat, ends, middle, neighbour))
+        # A face takes part in one flip a round: the one with the lowest number.
+        first = np.full(len(faces), len(faces))
+        for side in (flat, neighbour):
+            np.minimum.at(first, side, flat)
+        mine = (first[flat] == flat) & (first[neighbour] == flat)
+        flat, ends, middle, neighbour = (x[mine] for x in (flat, ends, middle, neighbour))
+        if not len(flat):
+            break
+        row, corners = np.arange(len(flat)), faces[neighbour]
+        apex = np.argmin((corners[:, :, None] == ends[:, None, :]).any(axis=2), axis=1)
+        d, p, q = (corners[row, (apex + i) % 3] for i in range(3))  # wound as the neighbour is
+        faces[flat], faces[neighbour] = np.stack([p, middle, d], axis=1), np.stack([middle, q, d], axis=1)
+        source[flat] = source[neighbour]
+        suspects = np.union1d(suspects[place[suspects] >= 0], neighbour)
+    return faces, source
+
+
+def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of faces without area, those with corners in three places; the ends (N, 2) of their longest edge; the third corner."""
+    corners = vertices[faces[flat]].astype(np.float64)
+    edges = np.stack([corners[:, (i + 2) % 3] - corners[:, (i + 1) % 3] for i in range(3)], axis=1)  # opposite of corner i
+    apart = (edges != 0.0).any(axis=2).all(axis=1)
+    flat = flat[apart]
+    middle = np.argmax(np.abs(edges[apart]).max(axis=2), axis=1)
+    ends = np.stack([faces[flat, (middle + i) % 3] for i in (1, 2)], axis=1)
+    return flat, ends, faces[flat, middle]
+
+
+def _across(faces: np.ndarray, flat: np.ndarray, ends: np.ndarray, n_vertices: int) -> np.ndarray:
+    """(N,) the one other face with each edge, or -1 where there is none or more than one."""
+
+    def key(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return np.minimum(p, q).astype(np.int64) * n_vertices + np.maximum(p, q)
+
+    wanted = key(ends[:, 0], ends[:, 1])
+    known = np.unique(wanted)
+    owners = [np.zeros((2, 0), np.int64)]
+    for i in range(3):
+        edge = key(faces[:, i], faces[:, (i + 1) % 3])
+        found = np.flatnonzero(np.isin(edge, known))
+        owners.append(np.stack([np.searchsorted(known, edge[found]), found]))
+    edge, face = np.concatenate(owners, axis=1)
+    count, total = np.bincount(edge, minlength=len(known)), np.zeros(len(known), np.int64)
+    np.add.at(total, edge, face)
+    at = np.searchsorted(known, wanted)
+    return np.where(count[at] == 2, total[at] - flat, -1)

@@ -171,6 +171,46 @@ def test_signed_zeros_of_the_direction_agree():
     assert np.isfinite(plus).any() and (plus == INF).any()
 
 
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), test=st.sampled_from(list(RAY_AABB)))
+def test_properties_of_every_box_test(seed, test):
+    # Coordinates are small whole numbers: origins in faces, edges and corners, and directions with zeros, are common.
+    rng = np.random.default_rng(seed)
+    n = 400
+    corners = rng.integers(-3, 4, (2, n, 3)).astype(float)
+    lo, hi = corners.min(axis=0), corners.max(axis=0)
+    origin = rng.integers(-3, 4, (n, 3)).astype(float)
+    direction = rng.integers(-2, 3, (n, 3)).astype(float)
+    direction[~direction.any(axis=1), 2] = 1.0
+
+    def entries(o, d, low, high):
+        alone, together = zeros(n), zeros(n)
+        launch(row_kernel(test, 1), n, vec3s(o), vec3s(d), floats(np.zeros(n)), floats(np.full(n, np.inf)), vec3s(low),
+               vec3s(high), alone, together)
+        return alone.numpy()
+
+    zero = direction == 0.0
+    plus, minus = (entries(origin, np.where(zero, z, direction), lo, hi) for z in (0.0, -0.0))
+    in_face = (zero & ((origin == lo) | (origin == hi))).any(axis=1)
+    agree = ~in_face if test == "plain" else np.ones(n, bool)  # plain: a NaN goes where the comparisons send it
+    assert np.array_equal(plus[agree], minus[agree])
+    within = ((origin >= lo) & (origin <= hi)).all(axis=1)
+    assert (plus[within & agree] == 0.0).all()
+    # Empty on one axis or on all of them: never entered.
+    empty = lo.copy(), hi.copy()
+    axis, row = rng.integers(3, size=n), np.arange(n)
+    empty[0][row, axis], empty[1][row, axis] = np.inf, -np.inf
+    assert (entries(origin, direction, np.full((n, 3), np.inf), np.full((n, 3), -np.inf)) == INF).all()
+    if test != "plain":  # which looks for an empty box on x alone, as builders' empty boxes are so on every axis
+        assert (entries(origin, direction, *empty) == INF).all()
+    # Turned by a quarter, mirrored, scaled and moved by powers of two: nothing is rounded, so nothing changes.
+    turn, sign, scale = rng.permutation(3), rng.choice([-1.0, 1.0], 3), 2.0 ** rng.integers(-8, 9)
+    a, b = (sign * corner[:, turn] * scale + 16.0 * scale for corner in (lo, hi))
+    moved = entries(sign * origin[:, turn] * scale + 16.0 * scale, sign * direction[:, turn] * scale,
+                    np.minimum(a, b), np.maximum(a, b))
+    assert np.array_equal(moved[agree], plus[agree])
+
+
 def doubtful_rays(rng, n):
     """Rays aimed at the corners, edges and faces of their boxes, at many scales, with zeros in direction and box."""
     scale = 10.0 ** rng.uniform(-5, 5, (n, 1))

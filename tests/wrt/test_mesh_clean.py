@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from wrt.bench.hard_cases_common import sphere
 from wrt.errors import InputError
-from wrt.mesh_clean import clean
+from wrt.mesh_clean import clean, flip_collinear, has_area
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 
@@ -70,3 +71,80 @@ def test_index_out_of_range_is_named(bad):
 def test_empty_mesh_stays_empty():
     result = clean(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
     assert result.faces.shape == (0, 3) and result.vertices.shape == (0, 3) and result.dropped == 0
+
+
+def on_a_line(vertices, faces):
+    """How many faces have three different corners on one line."""
+    a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
+    apart = (a != b).any(axis=1) & (b != c).any(axis=1) & (c != a).any(axis=1)
+    return int((apart & ~np.cross(b - a, c - a).any(axis=1)).sum())
+
+
+def volume(vertices, faces, center=0.0):
+    a, b, c = (vertices[faces[:, i]].astype(np.float64) - center for i in range(3))
+    return float((a * np.cross(b, c)).sum())
+
+
+def area(vertices, faces):
+    a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def is_closed(faces):
+    """Whether each edge has its other face, wound the other way."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    unique = np.unique(edges, axis=0)
+    return len(unique) == len(edges) and np.array_equal(unique, np.unique(edges[:, ::-1], axis=0))
+
+
+def test_flips_remove_corners_on_a_line_and_nothing_else():
+    center = np.array([148376.0, 1234.0, -223423.0])
+    rough = sphere(300, 150, 2.0, tuple(center))
+    faces, source = flip_collinear(rough.vertices, rough.faces)
+    assert on_a_line(rough.vertices, rough.faces) > 500 and on_a_line(rough.vertices, faces) == 0
+    assert len(faces) == len(rough.faces) and is_closed(faces) and faces.dtype == np.int32
+    assert volume(rough.vertices, faces, center) == pytest.approx(volume(rough.vertices, rough.faces, center), rel=1e-12)
+    # Each face with area is the sum of those that it is the source of.
+    changed = (faces != rough.faces).any(axis=1)
+    assert (source[~changed] == np.flatnonzero(~changed)).all() and 500 < changed.sum() < 10_000
+    before, after = (area(rough.vertices, f) for f in (rough.faces, faces))
+    np.testing.assert_allclose(np.bincount(source, after, len(faces)), before, rtol=1e-9, atol=1e-16)
+
+
+def test_a_chain_of_faces_on_one_line_is_flipped_from_its_outer_end():
+    # 0 to 4 on the x axis; below it a fan of flat faces that leads to one longest edge; 5 and 6 close it to the sides.
+    vertices = np.array([[x, 0, 0] for x in range(5)] + [[2, 1, 0], [2, -1, 0]], np.float32)
+    below = np.array([[6, 1, 0], [6, 2, 1], [6, 3, 2], [6, 4, 3]])
+    flat = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4]])
+    faces = np.concatenate([flat, below, [[0, 4, 5]]])
+    flipped, source = flip_collinear(vertices, faces)
+    assert on_a_line(vertices, flipped) == 0 and len(flipped) == len(faces)
+    assert (source[:3] == 7).all() and np.array_equal(flipped[3:7], below)
+    # Above the axis each stretch is an edge now, with face 5 on its other side.
+    above = {tuple(sorted(face)) for face in flipped[[0, 1, 2, 7]].tolist()}
+    assert above == {(0, 1, 5), (1, 2, 5), (2, 3, 5), (3, 4, 5)}
+    normals = np.cross(*(vertices[flipped[:, i]] - vertices[flipped[:, 0]] for i in (1, 2)))
+    assert (normals[:, 2] > 0.0).all()
+
+
+def test_what_cannot_be_flipped_is_dropped():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 1, 0], [1, 0, 1], [1, -1, 0]], np.float32)
+    alone, closed = [[0, 1, 2]], [[0, 1, 2], [2, 0, 3]]
+    assert clean(vertices, alone).dropped == 1
+    assert clean(vertices, closed, face_group=np.array([7, 8])).face_group.tolist() == [8, 8]
+    assert clean(vertices, closed + [[0, 2, 4]]).dropped == 1  # three faces at one edge: which of them is its neighbour?
+    assert clean(vertices, [[0, 1, 2], [0, 2, 1]]).dropped == 2  # two on one line: both are nothing
+    assert clean(vertices, [[0, 1, 1], [1, 0, 3]]).dropped == 1  # an edge that was folded to a point parts nothing
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(0, 60), min_size=9, max_size=9), st.integers(0, 2**32 - 1))
+def test_corners_of_very_different_size_are_decided_exactly(powers, seed):
+    rng = np.random.default_rng(seed)
+    step = rng.uniform(-4.0, 4.0, 3).astype(np.float32).astype(np.float64)
+    line = (2.0 ** -np.array(powers[:3], np.float64)[:, None] * step).astype(np.float32)
+    assert not has_area(line, np.array([[0, 1, 2]]))[0]
+    assert has_area(np.array([[0, 0, 0], [1, 0, 0], [1, 1e-30, 0]], np.float32), np.array([[0, 1, 2], [2, 1, 0]])).all()
+    bent = line.copy()
+    bent[0, 1] = np.nextafter(bent[0, 1], np.float32(9.0))
+    assert has_area(bent, np.array([[0, 1, 2]]))[0] == (len(np.unique(line[1:], axis=0)) == 2 and step[[0, 2]].any())

@@ -345,8 +345,9 @@ def test_bounds_hold_for_the_watertight_test_and_are_not_idle() -> None:
     assert (worst > 0.25).all()  # a bound four times tighter would fail
 
 
-def test_nothing_is_promised_where_the_reciprocal_overflows() -> None:
+def test_nothing_is_promised_where_differences_overflow_or_in_the_plane() -> None:
     triangle = np.array([[[-1, -1, 1], [3, -1, 1], [-1, 3, 1]]])
-    assert np.isinf(t_bound([[0, 0, 0]], [[0, 0, 1e-41]], triangle)).all()
+    assert np.isinf(t_bound([[0, 0, -3e38]], [[0, 0, 1]], triangle + [0, 0, 3e38])).all()
+    assert t_bound([[0, 0, 0]], [[0, 0, 1e-41]], 1e-5 * triangle)[0] < 1e31  # t is 1e36
     assert t_bound([[0, 0, 0]], [[0, 0, 1.0]], triangle)[0] < 1e-5
     assert np.isinf(t_bound([[0, 0, 1]], [[1, 1, 0]], triangle)).all()  # in the plane

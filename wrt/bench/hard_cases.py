@@ -29,7 +29,6 @@ __all__ = ["ASK", "HARD_CASES", "HIT", "MISS", "HardCase", "Verdict", "chunks", 
 HARD_CASES: dict[str, Callable[[Seed, int], HardCase]] = {
     **{f"A_{place}_{aim}": partial(inside.dense_sphere, position=place, aim=aim)
        for place in inside.POSITIONS for aim in AIMS},
-    **{f"A_far_flipped_{aim}": partial(inside.dense_sphere, position="far", aim=aim, flip=True) for aim in AIMS},
     "B_jittered_uniform": partial(inside.jittered_sphere, aim="uniform"),
     "B_jittered_vertices": partial(inside.jittered_sphere, aim="vertices"),
     "C_triangles": outside.respawned_triangles,

@@ -23,7 +23,6 @@ from wrt.bench.hard_cases_common import (
     Seed,
     aimed,
     cube,
-    flipped,
     hard_case,
     in_ball,
     joined,
@@ -32,6 +31,7 @@ from wrt.bench.hard_cases_common import (
     surface,
     unit_vectors,
 )
+from wrt.mesh_clean import flip_collinear
 from wrt.shapes import teapot
 
 POSITIONS = {"origin": (0.0, 0.0, 0.0), "1e4": (1e4, 1e4, 1e4), "far": (148376.0, 1234.0, -223423.0)}
@@ -45,18 +45,18 @@ def inside(geometry: Geometry, origins: np.ndarray, rng: np.random.Generator, ai
 
 
 @cache
-def _dense(position: str, flip: bool) -> Geometry:
+def _dense(position: str) -> Geometry:
     geometry = sphere(400, 200, 2.0, POSITIONS[position])
-    return flipped(geometry) if flip else geometry
+    return surface(geometry.vertices, flip_collinear(geometry.vertices, geometry.faces)[0])
 
 
-def dense_sphere(seed: Seed, n: int, *, position: str, aim: str, flip: bool = False) -> HardCase:
+def dense_sphere(seed: Seed, n: int, *, position: str, aim: str) -> HardCase:
     """A: a sphere of radius 2 with 159,200 triangles. The origins are in the cube of side 2 around its centre, whose corners
     are 0.26 from the surface; float32 moves a point 2e5 from 0 by 0.012 at most. "far", rounding leaves 2356 faces with their
-    corners on a line: the exact surface has no hole there, but neighbours no longer share an edge. flip: without those."""
+    corners on a line, which are flipped as every scene's are (wrt.mesh_clean.flip_collinear)."""
     rng = np.random.default_rng(seed)
     center = np.array(POSITIONS[position])
-    return inside(_dense(position, flip), center + rng.uniform(-1.0, 1.0, (n, 3)), rng, aim)
+    return inside(_dense(position), center + rng.uniform(-1.0, 1.0, (n, 3)), rng, aim)
 
 
 def jittered_sphere(seed: Seed, n: int, *, aim: str) -> HardCase:

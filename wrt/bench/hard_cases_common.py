@@ -136,38 +136,3 @@ def cube(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     return vertices, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-
-
-def flipped(geometry: Geometry) -> Geometry:
-    """The same closed surface, without faces whose three corners are on a line and all different.
-
-    Such a face (a, b, c), b between a and c, is no surface, but it parts the edge from a to c into two: its neighbours no
-    longer have one edge with the same two ends, and no unit that looks at one triangle at a time can keep a ray from passing
-    between them. With its neighbour (a, c, d) it becomes (a, b, d) and (b, c, d).
-    """
-    faces = geometry.faces.astype(np.int64)
-    place = geometry.vertices.astype(np.float64)
-    owner = {edge: k for k, (a, b, c) in enumerate(faces.tolist()) for edge in ((a, b), (b, c), (c, a))}
-
-    def middle(face: np.ndarray) -> int | None:
-        """Which corner is between the other two; None for a face with area or with two corners in one place."""
-        a, b, c = place[face]
-        if np.cross(b - a, c - a).any() or (a == b).all() or (b == c).all() or (c == a).all():
-            return None
-        return next(i for i in range(3) if (place[face[i - 2]] - place[face[i]]) @ (place[face[i - 1]] - place[face[i]]) < 0.0)
-
-    corners = place[faces]
-    work = np.flatnonzero(~np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any(axis=1)).tolist()
-    while work:
-        k = work.pop()
-        at = middle(faces[k])
-        if at is None:
-            continue
-        a, b, c = (int(faces[k][(at + i) % 3]) for i in (2, 0, 1))
-        other = owner[a, c]
-        d = int(next(x for x in faces[other] if x not in (a, c)))
-        for row, face in ((k, (a, b, d)), (other, (b, c, d))):
-            faces[row] = face
-            owner |= {(face[i], face[(i + 1) % 3]): row for i in range(3)}
-        work += [k, other]
-    return surface(geometry.vertices, faces)
