@@ -10,26 +10,28 @@ from tests.kernel_tools import rounded  # isort: skip (starts Warp)
 
 from wrt.accel import build
 from wrt.accel.base import Geometry
-from wrt.accel.bvh2 import build_nodes, sah_cost
+from wrt.accel.bvh_build import BVH_BUILDERS, BvhOptions, build_binary, sah_cost
 from wrt.errors import InputError
-from wrt.kernels.build_bvh2 import BuildOptions
 from wrt.kernels.traverse_bvh2 import STACK_SIZE
 from wrt.shapes import icosphere, torus
 
 
-def options(max_leaf=4, cost_traversal=1.0, cost_intersection=1.0):
-    out = BuildOptions()
-    out.max_leaf, out.cost_traversal, out.cost_intersection = max_leaf, cost_traversal, cost_intersection
-    return out
+def geometry_of(lo, hi):
+    """A triangle in each box: from one corner by a third to the opposite one."""
+    lo, hi = np.asarray(lo, np.float32).reshape(-1, 3), np.asarray(hi, np.float32).reshape(-1, 3)
+    third = np.where([True, False, True], lo, hi)
+    vertices = np.stack([lo, third, hi], axis=1).reshape(-1, 3)
+    return Geometry(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), np.zeros((0, 4), np.float32))
 
 
-def make(lo, hi, threads=1, **changes):
-    return build_nodes((np.asarray(lo, np.float32), np.asarray(hi, np.float32)), options(**changes), threads)
+def make(lo, hi, builder="binned", threads=1, **changes):
+    return build_binary(geometry_of(lo, hi), BvhOptions(builder, **changes), threads)
 
 
-def check_tree(lo, hi, nodes, order, depth, max_leaf=4):
+def check_tree(lo, hi, tree, max_leaf=4):
     """Every primitive in one leaf, boxes tight and nested, depth right and within the stack; number of leaves."""
-    lo, hi = np.asarray(lo, np.float32), np.asarray(hi, np.float32)
+    lo, hi = geometry_of(lo, hi).bounds()
+    nodes, order, depth = tree.nodes, tree.order, tree.depth
     assert np.array_equal(np.sort(order), np.arange(len(lo)))
     seen = np.zeros(len(lo), int)
     visited = np.zeros(len(nodes), int)
@@ -101,11 +103,12 @@ CASES = {
 
 @pytest.mark.parametrize("max_leaf", [1, 4, 64])
 @pytest.mark.parametrize("case", CASES)
-def test_every_primitive_in_one_leaf_and_boxes_nested(case, max_leaf):
+@pytest.mark.parametrize("builder", BVH_BUILDERS)
+def test_every_primitive_in_one_leaf_and_boxes_nested(builder, case, max_leaf):
     lo, hi = CASES[case](np.random.default_rng(1))
-    nodes, order, depth = make(lo, hi, max_leaf=max_leaf)
-    leaves = check_tree(lo, hi, nodes, order, depth, max_leaf)
-    assert leaves == len(nodes) + 1  # a binary tree
+    tree = make(lo, hi, builder, max_leaf=max_leaf)
+    leaves = check_tree(lo, hi, tree, max_leaf)
+    assert leaves == tree.leaves == len(tree.nodes) + 1  # a binary tree
     assert leaves >= len(lo) / max_leaf
 
 
@@ -113,28 +116,33 @@ special = st.sampled_from([0.0, 1.0, 1.0 + 2.0**-23, 2.0**-100, 2.0**127, -(2.0*
 coordinate = st.floats(-(2.0**100), 2.0**100, width=32) | special
 
 
-@settings(max_examples=150, deadline=None)
+@pytest.mark.parametrize("builder", BVH_BUILDERS)
+@settings(max_examples=100, deadline=None)
 @given(st.integers(2, 40).flatmap(lambda n: arrays(np.float32, (n, 3), elements=coordinate)), st.sampled_from([1, 3, 8]))
-def test_any_points_make_a_valid_tree(values, max_leaf):
-    nodes, order, depth = make(values, values, max_leaf=max_leaf)
-    check_tree(values, values, nodes, order, depth, max_leaf)
+def test_any_points_make_a_valid_tree(builder, values, max_leaf):
+    check_tree(values, values, make(values, values, builder, max_leaf=max_leaf), max_leaf)
 
 
 @pytest.mark.parametrize("n", [0, 1])
-def test_nothing_and_a_single_primitive(n):
+@pytest.mark.parametrize("builder", BVH_BUILDERS)
+def test_nothing_and_a_single_primitive(builder, n):
     lo, hi = boxes(np.random.default_rng(2), n)
-    nodes, order, depth = make(lo, hi)
-    assert len(nodes) == 1 and depth == 1
-    check_tree(lo, hi, nodes, order, depth)
+    tree = make(lo, hi, builder)
+    assert len(tree.nodes) == 1 and tree.depth == 1
+    check_tree(lo, hi, tree)
 
 
-def test_one_and_two_threads_build_the_same_tree():
+def same(one, two):
+    return np.array_equal(one.nodes, two.nodes) and np.array_equal(one.order, two.order) and one.depth == two.depth
+
+
+@pytest.mark.parametrize("builder", BVH_BUILDERS)
+def test_one_and_two_threads_build_the_same_tree(builder):
     lo, hi = boxes(np.random.default_rng(3), 30_000)
-    one, two = make(lo, hi, threads=1), make(lo, hi, threads=2)
-    assert np.array_equal(one[0], two[0]) and np.array_equal(one[1], two[1]) and one[2] == two[2]
-    check_tree(lo, hi, *two)
-    again = make(lo, hi, threads=2)
-    assert np.array_equal(again[0], two[0]) and np.array_equal(again[1], two[1])
+    one, two = make(lo, hi, builder, threads=1), make(lo, hi, builder, threads=2)
+    assert same(one, two)
+    check_tree(lo, hi, two)
+    assert same(two, make(lo, hi, builder, threads=2))
 
 
 def test_no_subtree_is_forgotten_however_many_are_left_to_the_threads():
@@ -150,15 +158,15 @@ def test_no_subtree_is_forgotten_however_many_are_left_to_the_threads():
                 shell[:, axis] += 2.0 ** (17 - k)
                 parts.append(shell)
     lo, hi = points(np.concatenate(parts))
-    one, two = make(lo, hi, threads=1), make(lo, hi, threads=2)
-    assert np.array_equal(one[1], two[1]) and np.array_equal(one[0], two[0])
+    assert same(make(lo, hi, threads=1), make(lo, hi, threads=2))
 
 
 def test_splits_follow_the_surface_area():
     # Two far clusters: the root must separate them; the expected cost is far below that of a split in the middle by number.
     rng = np.random.default_rng(4)
     center = np.where(np.arange(1000)[:, None] < 100, [-50.0, 0.0, 0.0], [50.0, 0.0, 0.0]) + rng.random((1000, 3))
-    nodes, order, _ = make(center, center + 0.01)
+    tree = make(center, center + 0.01)
+    nodes, order = tree.nodes, tree.order
     sides = [nodes[0]["lo_0"][0], nodes[0]["lo_1"][0]]
     assert min(sides) < -40.0 and max(sides) > 40.0
     left = (center[order[: 100 if sides[0] < 0.0 else 900], 0] < 0.0).mean()
@@ -180,8 +188,16 @@ def test_quality_and_statistics(mesh):
 
 def test_sah_cost_by_hand():
     # Two unit cubes side by side, one primitive each: 1 node + each cube's share (6 of the root's 10) of one test.
-    nodes, _, _ = make([[0, 0, 0], [1, 0, 0]], [[1, 1, 1], [2, 1, 1]])
-    assert sah_cost(nodes) == pytest.approx(1.0 + 2.0 * 6.0 / 10.0)
+    nodes = make([[0, 0, 0], [1, 0, 0]], [[1, 1, 1], [2, 1, 1]]).nodes
+    assert sah_cost(nodes) == pytest.approx(1.0 + 2.0 * 6.0 / 10.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("options, message", [
+    ({"builder": "guess"}, "no builder 'guess'; there is binned"), ({"cost_traversal": -1.0}, "cost_traversal must be finite"),
+    ({"cost_intersection": np.inf}, "cost_intersection must be finite")])
+def test_options_that_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        build(icosphere(0), "bvh2", **options)
 
 
 @pytest.mark.parametrize("max_leaf", [0, 65, -1])

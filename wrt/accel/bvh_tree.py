@@ -1,0 +1,81 @@
+"""What builders of binary BVHs take and give, and the surface area heuristic that they are judged by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wrt.errors import InputError
+from wrt.kernels.traverse_bvh2 import Bvh2Node
+
+MAX_LEAF = 64
+NODE_DTYPE = np.dtype(Bvh2Node.numpy_dtype())
+
+
+@dataclass(frozen=True)
+class BvhOptions:
+    """builder: a name in BVH_BUILDERS; max_leaf: 1 to 64 primitives; cost_traversal, cost_intersection: of the SAH, of one node
+    visited and one primitive tested. Raises InputError for values out of range."""
+
+    builder: str = "binned"
+    max_leaf: int = 4
+    cost_traversal: float = 1.0
+    cost_intersection: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.max_leaf <= MAX_LEAF:
+            raise InputError(f"max_leaf must be 1 to {MAX_LEAF}, got {self.max_leaf}")
+        for name in ("cost_traversal", "cost_intersection"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise InputError(f"{name} must be finite and not negative, got {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class BinaryTree:
+    """nodes: (N,) Bvh2Node records, the root first, a parent before its children; order: (R,) int32, the prim_id of each
+    record of the leaves, where one may stand more than once; depth: inner nodes on the longest way from the root."""
+
+    nodes: np.ndarray
+    order: np.ndarray
+    depth: int
+
+    @property
+    def leaves(self) -> int:
+        return int((self.nodes["count_0"] > 0).sum() + (self.nodes["count_1"] > 0).sum())
+
+
+def small_tree(lo: np.ndarray, hi: np.ndarray) -> BinaryTree:
+    """The tree over no box or one: a root with nothing to split. lo, hi: (0 or 1, 3) float32."""
+    nodes = np.zeros(1, NODE_DTYPE)
+    nodes["lo_0"], nodes["hi_0"], nodes["lo_1"], nodes["hi_1"] = np.inf, -np.inf, np.inf, -np.inf
+    if len(lo):
+        nodes["lo_0"], nodes["hi_0"], nodes["count_0"] = lo, hi, 1
+    return BinaryTree(nodes, np.arange(len(lo), dtype=np.int32), 1)
+
+
+def squeeze(nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """The nodes in use, renumbered; their order (a parent before its children, left before right) stays."""
+    index = np.cumsum(used, dtype=np.int32) - 1
+    out = nodes[used]
+    for side in ("0", "1"):
+        inner = out["count_" + side] == 0
+        out["first_" + side] = np.where(inner, index[np.minimum(out["first_" + side], len(index) - 1)], out["first_" + side])
+    return out
+
+
+def sah_cost(nodes: np.ndarray) -> float:
+    """Expected node visits plus triangle tests of a random line that meets the root box (both costing 1)."""
+    def area(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+        e = np.clip(hi.astype(np.float64) - lo.astype(np.float64), 0.0, 1e39)
+        return e[:, 0] * e[:, 1] + e[:, 1] * e[:, 2] + e[:, 2] * e[:, 0]
+
+    root = area(np.minimum(nodes["lo_0"][:1], nodes["lo_1"][:1]), np.maximum(nodes["hi_0"][:1], nodes["hi_1"][:1]))[0]
+    if not root > 0.0:
+        return float(nodes["count_0"].sum() + nodes["count_1"].sum())
+    total = root  # the root itself is visited
+    for side in ("0", "1"):
+        areas = area(nodes["lo_" + side], nodes["hi_" + side])
+        total += float((areas * np.where(nodes["count_" + side] > 0, nodes["count_" + side], 1.0)).sum())
+    return total / root
