@@ -15,13 +15,15 @@ if not (Path(__file__).parent / "kernels").is_dir():
 # Public names and where they live. They are imported on first use: `python -m wrt --help` must not wait for Warp.
 _PUBLIC = {
     "ACCELERATORS": "wrt.accel",
-    "build": "wrt.accel",
+    "build": "wrt.queries",
     "Mesh": "wrt.mesh",
     "load_mesh": "wrt.mesh",
     "InputError": "wrt.errors",
     "SceneWarning": "wrt.errors",
     "load_scene": "wrt.scene_file",
     "render": "wrt.driver",
+    "Options": "wrt.driver",
+    "Progress": "wrt.driver",
     "Film": "wrt.film",
     "Camera": "wrt.scene",
     "Checkerboard": "wrt.scene",

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import cache
 from typing import Any
 
@@ -16,6 +17,7 @@ import warp as wp
 import wrt
 from wrt.accel import ACCELERATORS, Structure, build
 from wrt.accel.base import check_units
+from wrt.arguments import as_integer, as_names, as_one, as_tuple, shown, unknown
 from wrt.device import load_kernel, memory_size, start, thread_count
 from wrt.device_film import BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS, DeviceFilm
 from wrt.device_scene import camera_struct, upload_scene
@@ -26,23 +28,30 @@ from wrt.interrupt import held_interrupts
 from wrt.kernels import render as kernels
 from wrt.kernels import structs
 from wrt.kernels.traverse import Units
-from wrt.scene import Camera, Scene
+from wrt.mesh import Mesh
+from wrt.scene import SETTINGS, Camera, Scene
+from wrt.scene_file import as_scene
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 TILE_SIZE = 32
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
 MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
+COMPILE_TOLD = 1.0  # seconds of waiting for the compiler before `progress` is told of it
 MAX_SPP = 1 << 16  # where a target error asks for more than anybody said
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a render is: samples done and to do (summed over pixels), rays so far, seconds of tracing."""
+    """How far a render is: samples done and to do (summed over pixels), rays so far, seconds of tracing.
+
+    stage: "trace"; or, once and before anything is done, "compile", where compiling takes longer than COMPILE_TOLD.
+    """
 
     done: int
     total: int
     rays: int
     seconds: float
+    stage: str = "trace"
 
     @property
     def rays_per_second(self) -> float:
@@ -81,38 +90,58 @@ class Options:
     accel_options: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name in ("accel", "device", "triangle", "box"):
+            as_one(getattr(self, name), str, name)
         if self.accel not in ACCELERATORS:
             raise InputError(f"no structure {self.accel!r}; there is {', '.join(ACCELERATORS)}")
         check_units(self.triangle, self.box)
-        unknown = sorted(set(self.aov) - set(AOVS))
-        if unknown:
-            raise InputError(f"no AOV {', '.join(unknown)}; there is {', '.join(AOVS)}")
-        if self.tile_size < 1 or (self.pass_size is not None and self.pass_size < 1):
-            raise InputError("tile_size and pass_size must be 1 or more")
+        self.aov = as_names(self.aov, "aov")
+        no_aov = sorted(set(self.aov) - set(AOVS))
+        if no_aov:
+            raise InputError(f"no AOV {', '.join(no_aov)}; there is {', '.join(AOVS)}")
+        for name in ("time_limit", "target_error"):
+            as_one(getattr(self, name), (int, float, np.number, type(None)), name)
         if self.time_limit is not None and not self.time_limit > 0.0:
             raise InputError(f"time_limit must be more than 0 seconds, got {self.time_limit}")
         if self.target_error is not None and not 0.0 < self.target_error < math.inf:
             raise InputError(f"target_error must be more than 0 and finite, got {self.target_error}")
-        if not 0 <= self.seed < 2**32:
-            raise InputError(f"seed must be 0 to 2^32 - 1, got {self.seed}")
+        self.tile_size = as_integer(self.tile_size, "tile_size", 1, 1 << 15)
+        self.pass_size = None if self.pass_size is None else as_integer(self.pass_size, "pass_size", 1, 1 << 24)
+        self.seed = as_integer(self.seed, "seed", 0, 2**32 - 1)
+        if self.crop is not None and len(as_tuple(self.crop, (int, np.integer), "crop")) != 4:
+            raise InputError(f"crop must be x0, y0, x1, y1 in pixels, got {self.crop!r}")
+        if not (self.progress is None or callable(self.progress)):
+            raise InputError(f"progress must be a function of a Progress, got {shown(self.progress)}")
+        as_one(self.camera, (str, int, np.integer, Camera, type(None)), "camera")
+        as_one(self.threads, (int, np.integer, type(None)), "threads")
         thread_count(self.threads)
         start(self.device)
 
 
-def render(scene: Scene, *, spp: int | None = None, size: tuple[int, int] | None = None, max_depth: int | None = None,
-           min_throughput: float | None = None, settings: dict[str, Any] | None = None, **options: Any) -> Film:
-    """Render a scene; returns a Film (linear pixels, variance, AOVs, stats).
+OPTIONS = tuple(each.name for each in fields(Options))
 
-    spp, size, max_depth, min_throughput, and any other of wrt.scene.Settings in `settings`, override the scene's own;
-    `options` are the fields of Options: seed, device, accel, threads, camera, crop, aov, time_limit, target_error, progress ...
+
+def render(scene: Scene | Mesh | str | os.PathLike[str], *, spp: int | None = None,
+           size: tuple[int, int] | str | None = None, settings: dict[str, Any] | None = None, **options: Any) -> Film:
+    """Render a scene; returns a Film (linear pixels, variance, AOVs, stats), whose docstring defines each AOV.
+
+    scene: a Scene; the path of a scene or mesh file, or a Mesh, is loaded as `load_scene` does. size: width and height, or
+    "640x360". spp, size and all other fields of Settings (max_depth, filter, tonemap ...), here or in `settings`, override
+    the scene's own; the other `options` are the fields of Options: seed, device, accel, threads, camera, crop, aov,
+    time_limit, target_error, progress ...
     With target_error the scene's own spp is no limit, but MAX_SPP is, unless spp is given.
     The same arguments give the same pixels, bit for bit, for any threads, tile_size and pass_size. Interrupted by Ctrl-C, it
     returns what it has, with stats["interrupted"] set. Raises InputError for anything that cannot be rendered.
     """
     if options.get("target_error") is not None and spp is None:
         spp = MAX_SPP
-    scene = scene.with_settings(spp=spp, size=size, max_depth=max_depth, min_throughput=min_throughput, **(settings or {}))
-    return Renderer(scene, Options(**options)).run()
+    changes = {**(settings or {}), **{name: options.pop(name) for name in SETTINGS if name in options}}
+    changes |= {name: value for name, value in (("spp", spp), ("size", size)) if value is not None}
+    for name in options:
+        if name not in OPTIONS:
+            raise InputError(unknown(name, "argument of render", (*SETTINGS, *OPTIONS)))
+    rendering = Options(**options)
+    return Renderer(as_scene(scene).with_settings(**changes), rendering).run()
 
 
 @cache
@@ -168,10 +197,16 @@ class Renderer:
         """Compile, which takes longest, and build the structure meanwhile. Neither Ctrl-C nor an error waits for the
         compiler, and no wait is long: Python may hear of Ctrl-C only between two of them."""
         pool = ThreadPoolExecutor(2)
-        jobs: set[Future[None]] = {pool.submit(self._compile), pool.submit(self._build)}
+        compiling = pool.submit(self._compile)
+        jobs: set[Future[None]] = {compiling, pool.submit(self._build)}
+        begin, tell = time.perf_counter(), self.options.progress
         try:
             while jobs:
                 finished, jobs = wait(jobs, timeout=0.1, return_when=FIRST_EXCEPTION)
+                if tell is not None and compiling in jobs and time.perf_counter() - begin >= COMPILE_TOLD:
+                    area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
+                    tell(Progress(0, area * self.scene.settings.spp, 0, 0.0, stage="compile"))
+                    tell = None
                 for job in finished:
                     job.result()
         finally:

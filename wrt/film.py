@@ -34,8 +34,15 @@ class Film:
     pixels: (H, W, 3) float32, linear Rec. 709 radiance, the mean of the samples; row 0 is on top.
     variance: (H, W, 3) float32, estimated variance of that mean (its root is the standard error).
     samples: (H, W) int32, samples taken of each pixel.
-    aov: by name, of the first hit: "depth" (H, W) float32, inf on a miss; "normal" (H, W, 3) float32, 0 on a miss;
-        "albedo" (H, W, 3) float32; "prim_id" and "material_id" (H, W) int32, -1 on a miss.
+    aov: by name, of what one ray through the pixel's centre, and the middle of the lens, hits first (blended surfaces
+        count, cut-out parts do not; no filter, no mean over samples):
+        "depth" (H, W) float32: the distance from the camera to the hit along that ray, in scene units, not the distance
+            along the camera's axis; inf on a miss;
+        "normal" (H, W, 3) float32: of unit length, in world space, the one that shades (interpolated and bent by a normal
+            map where the surface has such), on the side that the ray comes from; 0 on a miss;
+        "albedo" (H, W, 3) float32: the material's, with its texture; 0 on a miss;
+        "prim_id" (H, W) int32: index of the triangle (all objects in order, then the spheres); -1 on a miss;
+        "material_id" (H, W) int32: index into `scene.materials`; -1 on a miss.
     stats: counts and seconds of the render. metadata: what a file says about it (scene, spp, seed, seconds, version).
     exposure (stops) and tonemap (a name in wrt.tonemap.TONEMAPS): how it wants to be shown.
     """
@@ -57,6 +64,14 @@ class Film:
         for name, array in self.aov.items():
             if array.shape[:2] != size:
                 raise InputError(f"film: aov {name!r} must be {size} like the pixels, got {array.shape[:2]}")
+
+    def __repr__(self) -> str:
+        height, width = self.samples.shape
+        low, high = int(self.samples.min(initial=1 << 30)), int(self.samples.max(initial=0))
+        parts = [f"{width}x{height}", f"{high} spp" if low == high else f"{low} to {high} spp"]
+        parts += [f"mean radiance {float(np.mean(self.pixels)):.3g}"] if self.pixels.size else []
+        parts += [f"aov: {', '.join(self.aov)}"] if self.aov else []
+        return f"Film({', '.join(parts)})"
 
     @property
     def layers(self) -> dict[str, np.ndarray]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from wrt.arguments import as_array, as_path
 from wrt.errors import InputError, SceneWarning
 from wrt.mesh_clean import clean
 
@@ -52,21 +53,37 @@ class Mesh:
                                      attribute)
                 _require_finite(array, self.name, attribute)
         if self.face_group is not None:
-            group = np.ascontiguousarray(self.face_group, dtype=np.int32)
+            group = as_array(self.face_group, np.int32, "face_group")
             if group.shape != (len(faces),):
                 raise InputError(f"face_group must be ({len(faces)},), got {group.shape}", self.name or None)
             object.__setattr__(self, "face_group", group)
 
     def _array(self, attribute: str, dtype: type, width: int) -> np.ndarray:
-        raw = np.asarray(getattr(self, attribute))
+        try:
+            raw = np.asarray(getattr(self, attribute))
+        except ValueError:
+            raise InputError(f"must be (N, {width}), got rows of different lengths", self.name or None, attribute) from None
         if raw.ndim != 2 or raw.shape[1] != width:
             raise InputError(f"must be (N, {width}), got {raw.shape}", self.name or None, attribute)
         if dtype is np.int32 and raw.size and not np.issubdtype(raw.dtype, np.integer):
             raise InputError(f"must hold integers, got {raw.dtype}", self.name or None, attribute)
-        with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, which the check for finite reports
-            array: np.ndarray = np.ascontiguousarray(raw, dtype=dtype)
+        array = as_array(raw, dtype, ": ".join(part for part in (self.name, attribute) if part))
         object.__setattr__(self, attribute, array)
         return array
+
+
+    def __repr__(self) -> str:
+        parts = [repr(self.name)] if self.name else []
+        parts += [f"{len(self.vertices)} vertices", f"{len(self.faces)} faces"]
+        parts += [name for name in ("normals", "uvs") if getattr(self, name) is not None]
+        parts += [f"{len(self.groups)} groups"] * bool(self.groups) + [f"{self.dropped} dropped"] * bool(self.dropped)
+        if len(self.vertices):
+            parts.append(f"from {_corner(self.vertices.min(axis=0))} to {_corner(self.vertices.max(axis=0))}")
+        return f"Mesh({', '.join(parts)})"
+
+
+def _corner(point: np.ndarray) -> str:
+    return f"({', '.join(f'{value:.4g}' for value in point)})"
 
 
 def _require_finite(array: np.ndarray, name: str, attribute: str) -> None:
@@ -115,7 +132,7 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
     index out of range, a position that is NaN or infinite. Normals and uvs that are not finite are replaced by zero
     with one SceneWarning.
     """
-    path = Path(path)
+    path = as_path(path, "path")
     if path.suffix.lower() not in READERS:
         raise InputError(f"is no mesh file: known are {', '.join(READERS)}", path)
     if not path.is_file():

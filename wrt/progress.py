@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from wrt.driver import Progress
 
+COMPILING = "compiling kernels (first time for this kind of scene) ..."
 LINE_EVERY = 10.0  # seconds between lines where stderr is no terminal
 
 
@@ -32,28 +34,50 @@ def progress_reporter(quiet: bool) -> Iterator[Callable[[Progress], None] | None
         yield _lines()
 
 
+def _while_there_is_a_terminal(report: Callable[[Progress], None]) -> Callable[[Progress], None]:
+    """One that is gone (SIGHUP) is no reason to lose the picture."""
+
+    def careful(progress: Progress) -> None:
+        with contextlib.suppress(OSError):
+            report(progress)
+
+    return careful
+
+
 @contextmanager
 def _bar() -> Iterator[Callable[[Progress], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn
     from rich.progress import Progress as RichProgress
 
-    columns = (TextColumn("render"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
-    with RichProgress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("render", total=None, note="")
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
+    bar = RichProgress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task("render", total=None, note="")
 
-        def report(progress: Progress) -> None:
-            bar.update(task, completed=progress.done, total=progress.total, note=describe(progress))
+    @_while_there_is_a_terminal
+    def report(progress: Progress) -> None:
+        if progress.stage == "compile":
+            bar.update(task, description=COMPILING)
+            return
+        bar.update(task, completed=progress.done, total=progress.total, note=describe(progress), description="render")
 
+    bar.start()
+    try:
         yield report
+    finally:
+        with contextlib.suppress(OSError):
+            bar.stop()
 
 
 def _lines() -> Callable[[Progress], None]:
     due = LINE_EVERY
 
+    @_while_there_is_a_terminal
     def report(progress: Progress) -> None:
         nonlocal due
-        if progress.seconds >= due:
+        if progress.stage == "compile":
+            print(COMPILING, file=sys.stderr, flush=True)
+        elif progress.seconds >= due:
             due = progress.seconds + LINE_EVERY
             print(f"{100.0 * progress.done / progress.total:.0f} %, {describe(progress)}", file=sys.stderr, flush=True)
 

@@ -7,13 +7,15 @@ scene's own unit; colours are linear Rec. 709 (`(3,)` floats); angles are radian
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
+from wrt.arguments import as_array, as_integer, as_one, as_size, as_tuple, unknown
 from wrt.errors import InputError
 from wrt.mesh import Mesh
 
@@ -53,7 +55,7 @@ def as_number(value: Any, what: str, *, low: float = -math.inf, high: float = ma
 
 def as_transform(value: Any, what: str) -> np.ndarray:
     """A (4, 4) float64 affine matrix that acts on column vectors. Raises InputError where it is singular or not finite."""
-    matrix = np.asarray(value, dtype=np.float64)
+    matrix = as_array(value, np.float64, what)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"{what} must be a finite 4x4 matrix, got shape {matrix.shape}")
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0)):
@@ -80,10 +82,10 @@ class Texture:
     glTF; readers of formats with v upwards (OBJ, PLY) flip v when they load the mesh.
     """
 
-    image: np.ndarray
+    image: np.ndarray = field(repr=False)
     srgb: bool = True
     wrap: tuple[str, str] = ("repeat", "repeat")
-    uv_transform: np.ndarray = field(default_factory=lambda: np.eye(2, 3))
+    uv_transform: np.ndarray = field(default_factory=lambda: np.eye(2, 3), repr=False)
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -92,7 +94,7 @@ class Texture:
             raise InputError(f"texture {self.name!r}: image must be (H, W, 4) uint8, got {image.shape} {image.dtype}")
         for wrap in self.wrap:
             _choice(wrap, WRAPS, f"texture {self.name!r}: wrap")
-        transform = np.asarray(self.uv_transform, dtype=np.float64)
+        transform = as_array(self.uv_transform, np.float64, f"texture {self.name!r}: uv_transform")
         if transform.shape != (2, 3) or not np.isfinite(transform).all():
             raise InputError(f"texture {self.name!r}: uv_transform must be a finite 2x3 matrix")
         object.__setattr__(self, "image", image)
@@ -191,6 +193,11 @@ class Material:
         }
         for name, (low, high) in scalars.items():
             object.__setattr__(self, name, as_number(getattr(self, name), at + name, low=low, high=high))
+        for name in ("albedo", "emission", "metallic_roughness", "transmission", "normal"):
+            slot = f"{name}_texture"
+            if getattr(self, slot) is not None:
+                kinds = (Texture, Checkerboard) if name in ("albedo", "emission") else (Texture,)
+                as_one(getattr(self, slot), kinds, at + slot)
 
     @property
     def is_emissive(self) -> bool:
@@ -223,19 +230,19 @@ class Object:
 
     mesh: Mesh
     materials: tuple[Material, ...]
-    transform: np.ndarray = field(default_factory=lambda: np.eye(4))
-    face_material: np.ndarray | None = None
+    transform: np.ndarray = field(default_factory=lambda: np.eye(4), repr=False)
+    face_material: np.ndarray | None = field(default=None, repr=False)
     name: str = ""
 
     def __post_init__(self) -> None:
         at = f"object {self.name!r}: "
-        if isinstance(self.materials, Material):
-            object.__setattr__(self, "materials", (self.materials,))
+        as_one(self.mesh, Mesh, at + "mesh")
+        object.__setattr__(self, "materials", as_tuple(self.materials, Material, at + "materials"))
         if not self.materials:
             raise InputError(at + "needs a material")
         object.__setattr__(self, "transform", as_transform(self.transform, at + "transform"))
         if self.face_material is not None:
-            index = np.ascontiguousarray(self.face_material, dtype=np.int32)
+            index = as_array(self.face_material, np.int32, at + "face_material")
             if index.shape != (len(self.mesh.faces),):
                 raise InputError(at + f"face_material must be ({len(self.mesh.faces)},), got {index.shape}")
             if index.size and (index.min() < 0 or index.max() >= len(self.materials)):
@@ -254,6 +261,7 @@ class Sphere:
 
     def __post_init__(self) -> None:
         at = f"sphere {self.name!r}: "
+        as_one(self.material, Material, at + "material")
         object.__setattr__(self, "center", as_vector(self.center, at + "center"))
         object.__setattr__(self, "radius", as_number(self.radius, at + "radius", low=1e-30, high=1e18))
 
@@ -352,14 +360,14 @@ class EnvironmentBackground:
     columns run to the right of that view (towards +x). rotation: radians about +y, counter-clockwise seen from above.
     """
 
-    image: np.ndarray
+    image: np.ndarray = field(repr=False)
     scale: float = 1.0
     rotation: float = 0.0
     name: str = ""
 
     def __post_init__(self) -> None:
         at = f"environment {self.name!r}: "
-        image = np.ascontiguousarray(self.image, dtype=np.float32)
+        image = as_array(self.image, np.float32, at + "image")
         if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
             raise InputError(at + f"image must be (H, W, 3), got {image.shape}")
         if not np.isfinite(image).all() or (image < 0.0).any():
@@ -409,7 +417,8 @@ class Camera:
         object.__setattr__(self, "aperture_radius", as_number(self.aperture_radius, at + "aperture_radius", low=0.0))
         object.__setattr__(self, "focus_distance", as_number(self.focus_distance, at + "focus_distance", low=1e-12))
         object.__setattr__(self, "blade_rotation", as_number(self.blade_rotation, at + "blade_rotation"))
-        if self.blades != 0 and not 3 <= self.blades <= 64:
+        as_integer(self.blades, at + "blades", 0, 64)
+        if self.blades in (1, 2):
             raise InputError(at + f"blades must be 0 (round) or 3 to 64, got {self.blades}")
 
     @staticmethod
@@ -479,13 +488,9 @@ class Settings:
     tonemap: str = "none"
 
     def __post_init__(self) -> None:
-        width, height = self.size
-        if not (1 <= width <= 32768 and 1 <= height <= 32768):
-            raise InputError(f"size must be 1x1 to 32768x32768, got {width}x{height}")
-        if not 1 <= self.spp <= 1 << 24:
-            raise InputError(f"spp must be 1 to {1 << 24}, got {self.spp}")
-        if not 0 <= self.max_depth <= 64:
-            raise InputError(f"max_depth must be 0 to 64, got {self.max_depth}")
+        object.__setattr__(self, "size", as_size(self.size))
+        object.__setattr__(self, "spp", as_integer(self.spp, "spp", 1, 1 << 24))
+        object.__setattr__(self, "max_depth", as_integer(self.max_depth, "max_depth", 0, 64))
         as_number(self.min_throughput, "min_throughput", low=0.0, high=1.0)
         as_number(self.exposure, "exposure", low=-100.0, high=100.0)
         _choice(self.filter, FILTERS, "filter")
@@ -493,6 +498,9 @@ class Settings:
         _choice(self.glass_shadows, ("opaque", "tinted"), "glass_shadows")
         _choice(self.sampler, SAMPLERS, "sampler")
         _choice(self.tonemap, TONEMAPS, "tonemap")
+
+
+SETTINGS = tuple(each.name for each in fields(Settings))
 
 
 @dataclass(frozen=True, eq=False)
@@ -512,9 +520,23 @@ class Scene:
     name: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("objects", "spheres", "lights", "cameras"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
+        kinds: dict[str, Any] = {"objects": Object, "spheres": Sphere, "cameras": Camera,
+                                 "lights": (PointLight, DirectionalLight, SpotLight)}
+        for name, kind in kinds.items():
+            object.__setattr__(self, name, as_tuple(getattr(self, name), kind, name))
+        as_one(self.background, (ConstantBackground, GradientBackground, EnvironmentBackground), "background")
+        as_one(self.settings, Settings, "settings")
         object.__setattr__(self, "ambient", as_vector(self.ambient, "ambient", low=0.0))
+
+    def __repr__(self) -> str:
+        counts = {"triangle": sum(len(thing.mesh.faces) for thing in self.objects), "object": len(self.objects),
+                  "sphere": len(self.spheres), "material": len(self.materials), "light": len(self.lights),
+                  "camera": len(self.cameras)}
+        parts = [f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items() if count]
+        with contextlib.suppress(InputError):  # without shapes there are no bounds
+            low, high = ("({})".format(", ".join(f"{value:.4g}" for value in corner)) for corner in self.bounds())
+            parts.append(f"from {low} to {high}")
+        return f"Scene({', '.join([repr(self.name)] * bool(self.name) + parts)})"
 
     @property
     def materials(self) -> tuple[Material, ...]:
@@ -539,8 +561,8 @@ class Scene:
         for index, camera in enumerate(self.cameras):
             if str(index) == str(name):
                 return camera
-        known = ", ".join(f"{i}: {camera.name!r}" for i, camera in enumerate(self.cameras))
-        raise InputError(f"no camera {name!r}; the scene has {known}")
+        known = ", ".join(f"{camera.name!r} (number {i})" for i, camera in enumerate(self.cameras))
+        raise InputError(f"no camera {name!r}; the scene's cameras are {known}")
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corner (3,) float64 of all shapes in world space; raises InputError where there are none."""
@@ -557,5 +579,8 @@ class Scene:
         return np.min(corners, axis=0), np.max(corners, axis=0)
 
     def with_settings(self, **changes: Any) -> Scene:
-        """A copy with some settings changed (None leaves one as it is)."""
+        """A copy with some settings changed (None leaves one as it is). Raises InputError for a setting that is none."""
+        for name in changes:
+            if name not in SETTINGS:
+                raise InputError(unknown(name, "setting", SETTINGS))
         return replace(self, settings=replace(self.settings, **{k: v for k, v in changes.items() if v is not None}))

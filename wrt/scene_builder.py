@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wrt import shapes
+from wrt.arguments import unknown
 from wrt.errors import InputError
 from wrt.mesh import Mesh, load_mesh
 from wrt.scene import (
@@ -35,7 +36,7 @@ from wrt.scene import (
     Texture,
     as_vector,
 )
-from wrt.scene_check import raise_all, unknown, unknown_materials
+from wrt.scene_check import raise_all, unknown_materials
 from wrt.smooth import smooth
 
 if TYPE_CHECKING:
@@ -270,7 +271,7 @@ class _Builder:
 
 def make_light(table: tables.LightTable, name: str) -> Light | Object:
     """A light; a rectangle is an object that shines and reflects nothing."""
-    fields = table.given("type")
+    fields = {**table.given("type"), "name": table.name or name}
     if table.type == "rectangle":
         material = Material(name=table.name or name, albedo=BLACK, emission=as_vector(table.radiance, "radiance"),
                             two_sided=table.two_sided)

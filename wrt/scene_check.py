@@ -3,12 +3,12 @@ person."""
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from wrt.arguments import unknown
 from wrt.errors import InputError
 
 if TYPE_CHECKING:
@@ -70,15 +70,6 @@ def unknown_materials(data: dict[str, Any], known: Iterable[str]) -> list[str]:
 
 def _tables(value: Any) -> list[dict[str, Any]]:
     return [table if isinstance(table, dict) else {} for table in value] if isinstance(value, list) else []
-
-
-def unknown(name: str, what: str, known: Iterable[str]) -> str:
-    """A sentence on a name that is not known, with the nearest one that is, and all of them."""
-    names = [str(each) for each in known]
-    near = difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    return f"unknown {what} {name!r}; {hint}known are {', '.join(map(repr, names))}" if names else (
-        f"unknown {what} {name!r}; there are none")
 
 
 def _line(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> str:

@@ -10,8 +10,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from wrt.arguments import as_path, shown
 from wrt.errors import InputError, SceneWarning
-from wrt.mesh import READERS, load_mesh
+from wrt.mesh import READERS, Mesh, load_mesh
 from wrt.scene import Material, Object, Scene
 from wrt.staging import stage
 
@@ -23,7 +24,7 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     in a SceneWarning. Raises InputError that names the file and the place; for TOML it lists all that is wrong at
     once, each with its path in the file, its value and what was expected.
     """
-    path = Path(path)
+    path = as_path(path, "path")
     known = ", ".join(LOADERS)
     if not path.exists():
         raise InputError(f"no such file (a scene is one of {known})", path)
@@ -32,6 +33,20 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     if path.suffix.lower() not in LOADERS:
         raise InputError(f"is no scene file: known are {known}", path)
     return LOADERS[path.suffix.lower()](path)
+
+
+def as_scene(value: Scene | Mesh | str | os.PathLike[str]) -> Scene:
+    """A scene as it is; of a path or a Mesh, the one that `load_scene` would make of the file, with the same warnings.
+
+    Raises InputError for anything else.
+    """
+    if isinstance(value, Scene):
+        return value
+    if isinstance(value, Mesh):
+        return _bare(value, value.name or "mesh", value.name or "mesh")
+    if isinstance(value, str | os.PathLike):
+        return load_scene(value)
+    raise InputError(f"scene must be a Scene, a Mesh, or the path of a scene or mesh file, got {shown(value)}")
 
 
 def schema() -> dict[str, Any]:
@@ -57,11 +72,15 @@ def _load_gltf(path: Path) -> Scene:
 
 
 def _load_bare_mesh(path: Path) -> Scene:
+    return _bare(load_mesh(path), path.stem, path)
+
+
+def _bare(mesh: Mesh, name: str, path: str | os.PathLike[str]) -> Scene:
+    """A mesh alone, in light grey."""
     grey = Material(name="light grey", albedo=(0.75, 0.75, 0.75))
-    mesh = load_mesh(path)
     parts = f"its {len(mesh.groups)} parts are all light grey: a TOML scene can give each a material"
     notes = [parts] if len(mesh.groups) > 1 else []
-    return _staged(Scene(objects=(Object(mesh, (grey,), name=path.stem),), name=path.stem), path, notes)
+    return _staged(Scene(objects=(Object(mesh, (grey,), name=name),), name=name), path, notes)
 
 
 LOADERS: dict[str, Callable[[Path], Scene]] = {
@@ -85,12 +104,12 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError(message, path, place) from error
 
 
-def _staged(scene: Scene, path: Path, notes: Sequence[str] = ()) -> Scene:
+def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = ()) -> Scene:
     """The scene with a camera and light where it lacks them; what was added is told, after `notes`."""
     try:
         scene, added = stage(scene)
     except InputError as error:
         raise InputError(str(error), path) from error
     if notes or added:
-        warnings.warn(f"{path}: {'; '.join([*notes, *added])}", SceneWarning, stacklevel=4)
+        warnings.warn(f"{os.fspath(path)}: {'; '.join([*notes, *added])}", SceneWarning, stacklevel=4)
     return scene

@@ -162,7 +162,8 @@ def test_cameras_by_name_and_number() -> None:
         assert read_metadata("a.png")["camera"] == expected
     for name in ("top", "2", "-1", ""):
         for command in (("render", *SMALL), ("info",)):
-            refused(run(*command, "scene.toml", "--camera", name), f"scene.toml: no camera {name!r}", "0: 'front', 1: 'side'")
+            refused(run(*command, "scene.toml", "--camera", name), f"scene.toml: no camera {name!r}",
+                    "cameras are 'front' (number 0), 'side' (number 1)")
 
 
 def test_a_time_limit_leaves_a_picture_of_whole_samples() -> None:

@@ -7,6 +7,7 @@ import signal
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from time import sleep
 from typing import Any
 
@@ -14,11 +15,14 @@ import numpy as np
 import pytest
 
 import wrt
+from tests.command_line import BOX_OBJ
 from wrt import driver
 from wrt.driver import MAX_PASS, Options, Progress, Renderer, plain_text, render
-from wrt.errors import InputError
+from wrt.errors import InputError, SceneWarning
 from wrt.film import Film
+from wrt.mesh import load_mesh
 from wrt.scene import Camera, DirectionalLight, EnvironmentBackground, GradientBackground, Material, Object, Scene, Settings
+from wrt.scene_file import load_scene
 from wrt.shapes import box, quad
 
 SIZE = (37, 22)  # no multiple of any tile
@@ -166,7 +170,7 @@ def test_cameras_by_name_number_and_themselves() -> None:
     assert second.metadata["camera"] == "second"
     for camera in (1, "1", SCENE.cameras[1]):
         assert same(render(SCENE, spp=1, camera=camera), second)
-    with pytest.raises(InputError, match=r"no camera 'third'; the scene has 0: 'first', 1: 'second'"):
+    with pytest.raises(InputError, match=r"no camera 'third'; the scene's cameras are 'first' \(number 0\), 'second' \(number 1\)"):
         render(SCENE, camera="third")
 
 
@@ -390,6 +394,81 @@ def test_renders_in_other_threads(reference: Film) -> None:
 def test_a_wrong_value_is_told_by_its_name(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         render(SCENE, **options)
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"sp": 4}, "unknown argument of render 'sp'; did you mean 'spp'"), ({"settings": {"fov": 4}}, "unknown setting 'fov'"),
+    ({"spp": 1.5}, "spp must be a whole number, got 1.5"), ({"spp": "many"}, "spp must be a whole number, got 'many'"),
+    ({"size": 640}, 'size must be two whole numbers or text such as "640x360", got 640'),
+    ({"size": (32.0, 18.0)}, "size must be two whole"), ({"size": "32*18"}, "size must be two whole numbers"),
+    ({"size": (1, 2, 3)}, "size must be two whole"), ({"seed": 0.5}, "seed must be a whole number"),
+    ({"threads": "two"}, "threads must be an? int.*, got 'two'"), ({"crop": (0, 0, 4)}, "crop must be x0, y0, x1, y1"),
+    ({"crop": "0,0,4,4"}, "crop: each must be an int"), ({"crop": (0, 0, 4.5, 4)}, r"crop\[2\] must be an int"),
+    ({"progress": True}, "progress must be a function of a Progress, got True"), ({"camera": 1.5}, "camera must be"),
+    ({"time_limit": "30s"}, "time_limit must be"), ({"accel": None}, "accel must be a str, got None"),
+    ({"aov": 3}, "aov must be a name or several, got 3"), ({"aov": [None]}, r"aov\[0\] must be a str, got None"),
+    ({"device": 0}, "device must be a str, got 0"),
+], ids=str)
+def test_a_value_of_the_wrong_type_is_told_by_its_name(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        render(SCENE, **options)
+
+
+@pytest.mark.parametrize("value", [None, 5, [SCENE], np.zeros(3)], ids=str)
+def test_what_is_no_scene_is_refused_by_name(value: Any) -> None:
+    with pytest.raises(InputError, match="scene must be a Scene, a Mesh, or the path of a scene or mesh file, got"):
+        render(value)
+
+
+def test_a_path_and_a_mesh_are_rendered_as_the_command_line_does(tmp_path: Path) -> None:
+    path = tmp_path / "box.obj"
+    path.write_text(BOX_OBJ)
+    with pytest.warns(SceneWarning, match="box.obj: it has no camera: one that frames the scene was added; it has no lights"):
+        expected = render(load_scene(path), spp=1, size=SIZE)
+    for value in (path, str(path), load_mesh(path)):
+        with pytest.warns(SceneWarning, match="box.obj: it has no camera"):
+            assert same(render(value, spp=1, size=SIZE), expected)
+    with pytest.raises(InputError, match=r"nothing\.toml: no such file"):
+        render("nothing.toml")
+
+
+def test_one_name_and_text_for_a_size_and_settings_by_keyword() -> None:
+    film = render(SCENE, spp=np.int64(1), size="12x7", aov="depth", filter="box", tonemap="aces", max_depth=None)
+    assert film.pixels.shape == (7, 12, 3) and list(film.aov) == ["depth"] and film.metadata["filter"] == "box"
+    assert film.tonemap == "aces" and film.metadata["max_depth"] == SCENE.settings.max_depth
+    assert same(film, render(SCENE, spp=1, size=(12, 7), aov=["depth"], settings={"filter": "box"}))
+
+
+def test_a_film_tells_of_itself_in_a_line() -> None:
+    text = repr(render(SCENE, spp=2, size=(12, 7), aov="depth"))
+    assert text.startswith("Film(12x7, 2 spp, mean radiance 0.") and text.endswith(", aov: depth)")
+
+
+def test_depth_is_the_distance_along_the_ray_and_normals_face_it() -> None:
+    for side in (1.0, -1.0):  # the front of a wall at z = 0, then its back
+        wall = Object(quad((-50, -50, 0), (100, 0, 0), (0, 100, 0)), (Material(),))
+        camera = Camera.look_at((0, 0, 2 * side), (0, 0, 0), fov_y=1.5, aperture_radius=0.1, focus_distance=2)
+        film = render(replace(SCENE, objects=(wall,), cameras=(camera,)), spp=1, size=(16, 16), aov=("depth", "normal"))
+        x = (np.arange(16) + 0.5) / 8 - 1
+        slope = np.tan(0.75) * np.hypot(x[None], x[:, None])
+        assert np.allclose(film.aov["depth"], 2 * np.sqrt(1 + slope**2), rtol=1e-6)
+        assert np.array_equal(film.aov["normal"], np.broadcast_to(np.float32((0, 0, side)), (16, 16, 3)))
+
+
+def test_progress_is_told_once_of_a_compiler_that_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(kernel: Any, device: Any) -> None:
+        sleep(0.5)
+        load(kernel, device)
+
+    load = driver.load_kernel
+    monkeypatch.setattr(driver, "COMPILE_TOLD", 0.2)
+    seen: list[Progress] = []
+    render(SCENE, spp=2, progress=seen.append)
+    quick = len([each for each in seen if each.stage == "compile"])
+    monkeypatch.setattr(driver, "load_kernel", slow)
+    render(SCENE, spp=2, progress=seen.append)
+    told = [each for each in seen if each.stage == "compile"]
+    assert len(told) == quick + 1 and (told[-1].done, told[-1].rays) == (0, 0) and seen[-1].stage == "trace"
 
 
 def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,13 +6,14 @@ import io
 import os
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from tests.command_line import BOX_OBJ, wrt
 from wrt.driver import Progress
-from wrt.progress import LINE_EVERY, describe, progress_reporter
+from wrt.progress import COMPILING, LINE_EVERY, describe, progress_reporter
 
 
 def at(seconds: float, done: int = 50) -> Progress:
@@ -56,6 +57,27 @@ def test_a_process_without_stderr_can_render(monkeypatch: pytest.MonkeyPatch) ->
         report(at(1.0))
 
 
+def test_compiling_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    stderr = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stderr)
+    with progress_reporter(False) as report:
+        assert report is not None
+        report(Progress(0, 200, 0, 0.0, stage="compile"))
+    assert stderr.getvalue() == f"{COMPILING}\n"
+
+
+def test_a_terminal_that_is_gone_is_no_reason_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(text: str) -> int:
+        raise OSError("Input/output error")
+
+    stderr = io.StringIO()
+    monkeypatch.setattr(stderr, "write", gone)
+    monkeypatch.setattr(sys, "stderr", stderr)
+    with progress_reporter(False) as report:
+        assert report is not None
+        report(at(LINE_EVERY))
+
+
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
 def test_on_a_terminal_there_is_a_bar_that_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
@@ -75,10 +97,13 @@ def test_on_a_terminal_there_is_a_bar_that_goes_away(monkeypatch: pytest.MonkeyP
         monkeypatch.setattr(sys, "stderr", stderr)
         with progress_reporter(False) as report:
             assert report is not None
+            report(Progress(0, 200, 0, 0.0, stage="compile"))
+            time.sleep(0.3)  # it draws itself ten times a second
             report(at(10.0))
     reader.join()
     os.close(main)
     text = b"".join(seen).decode()
+    assert COMPILING in text and text.index(COMPILING) < text.index("25%")
     assert "render" in text and "25%" in text and "4.0 Mray/s, 0:30 left" in text
     assert "\x1b[?25h" in text and text.rindex("\x1b[?25h") > text.rindex("25%")  # the cursor is back
     assert text.endswith("\x1b[2K")  # and the line is empty again

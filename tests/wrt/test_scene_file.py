@@ -143,9 +143,9 @@ two_sided = true
     assert isinstance(scene.background, GradientBackground) and scene.background.top == (0, 0, 1)
     assert scene.background.bottom == GradientBackground().bottom
     point, spot, sun = scene.lights
-    assert point == PointLight((1, 2, 3), (5, 5, 5))
-    assert sun == DirectionalLight((1, 0, 0), (2, 2, 2))
-    assert spot == SpotLight((0, 5, 0), (0, -1, 0), (1, 2, 3), inner=math.radians(10), outer=math.radians(20))
+    assert point == PointLight((1, 2, 3), (5, 5, 5), name="lights[0]")
+    assert sun == DirectionalLight((1, 0, 0), (2, 2, 2), name="lights[2]")
+    assert spot == SpotLight((0, 5, 0), (0, -1, 0), (1, 2, 3), inner=math.radians(10), outer=math.radians(20), name="lights[1]")
     panel, = scene.objects
     assert panel.materials[0].emission == (4, 3, 2) and panel.materials[0].two_sided
     assert panel.materials[0].albedo == (0, 0, 0)

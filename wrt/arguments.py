@@ -1,0 +1,104 @@
+"""What users give for an argument, checked and brought to one form; an InputError names the argument and what was expected."""
+
+from __future__ import annotations
+
+import difflib
+import operator
+import os
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from wrt.errors import InputError
+
+T = TypeVar("T")
+
+
+def as_integer(value: Any, what: str, low: int, high: int) -> int:
+    """A whole number in [low, high]: an int, or NumPy's; no float, even if whole, and no text."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise InputError(f"{what} must be a whole number, got {shown(value)}") from None
+    if not low <= number <= high:
+        raise InputError(f"{what} must be {low} to {high}, got {number}")
+    return number
+
+
+def as_size(value: Any, what: str = "size", high: int = 32768) -> tuple[int, int]:
+    """Width and height in pixels from a pair, or from text such as "640x360"."""
+    if isinstance(value, str) and (match := re.fullmatch(r"\s*([0-9]{1,9})\s*[xX]\s*([0-9]{1,9})\s*", value)):
+        value = (int(match[1]), int(match[2]))
+    try:
+        width, height = map(operator.index, value if not isinstance(value, str) else ())
+    except (TypeError, ValueError):
+        raise InputError(f'{what} must be two whole numbers or text such as "640x360", got {shown(value)}') from None
+    if not (1 <= width <= high and 1 <= height <= high):
+        raise InputError(f"{what} must be 1x1 to {high}x{high}, got {width}x{height}")
+    return width, height
+
+
+def as_array(value: Any, dtype: Any, what: str) -> np.ndarray:
+    """A contiguous array; what is beyond the type's range becomes infinite."""
+    try:
+        with np.errstate(over="ignore"):
+            return np.ascontiguousarray(value, dtype=dtype)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} must be an array of numbers, got {shown(value)}") from None
+
+
+def as_path(value: Any, what: str) -> Path:
+    try:
+        return Path(os.fsdecode(value))
+    except TypeError:
+        raise InputError(f"{what} must be a path, got {shown(value)}") from None
+
+
+def as_one(value: Any, kind: type[T] | tuple[type[T], ...], what: str) -> T:
+    """The value, if it is of that type or one of those types."""
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    if not isinstance(value, kinds):
+        raise InputError(f"{what} must be {' or '.join(_a(each.__name__) for each in kinds)}, got {shown(value)}")
+    return value
+
+
+def as_tuple(value: Any, kind: type[T] | tuple[type[T], ...], what: str) -> tuple[T, ...]:
+    """A sequence of such values; a single one stands for itself."""
+    if isinstance(value, kind):
+        return (value,)
+    if isinstance(value, str) or not hasattr(value, "__iter__"):
+        as_one(value, kind, f"{what}: each")
+    return tuple(as_one(each, kind, f"{what}[{i}]") for i, each in enumerate(value))
+
+
+def as_names(value: Any, what: str) -> tuple[str, ...]:
+    """Names; a single one stands for itself."""
+    if not isinstance(value, str | Sequence | set | frozenset):
+        raise InputError(f"{what} must be a name or several, got {shown(value)}")
+    return as_tuple(value, str, what) if isinstance(value, str | Sequence) else tuple(sorted(value))
+
+
+def unknown(name: str, what: str, known: Iterable[str]) -> str:
+    """A sentence on a name that is not known, with the nearest one that is, and all of them."""
+    names = [str(each) for each in known]
+    near = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return f"unknown {what} {name!r}; {hint}known are {', '.join(map(repr, names))}" if names else (
+        f"unknown {what} {name!r}; there are none")
+
+
+def shown(value: Any) -> str:
+    """A value as a message shows it: with its type, where it does not tell that itself, and short."""
+    if isinstance(value, str | int | float | tuple | list) or value is None:
+        text = repr(value)
+        return text if len(text) <= 60 else text[:57] + "..."
+    if isinstance(value, np.ndarray):
+        return f"an array {value.shape} of {value.dtype}"
+    return _a(type(value).__name__)
+
+
+def _a(name: str) -> str:
+    return f"{'an' if name[:1] in 'AEIOaeio' else 'a'} {name}"

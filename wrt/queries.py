@@ -1,0 +1,25 @@
+"""Ray queries from Python: `wrt.build` makes a structure of a mesh or of a mesh file."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from wrt import accel as structures
+from wrt.arguments import as_one, shown
+from wrt.errors import InputError
+from wrt.mesh import Mesh, load_mesh
+
+
+def build(mesh: Mesh | structures.Geometry | str | os.PathLike[str], accel: str = "bvh", device: str = "cpu",
+          threads: int | None = None, **options: Any) -> structures.Accelerator:
+    """An acceleration structure over a mesh, ready for `closest_hit` and `any_hit`.
+
+    mesh: a Mesh, a Geometry, or the path of an .obj, .ply or .stl file. accel: a name in ACCELERATORS. options: `triangle` and
+    `box`, the intersection tests, and the structure's own (see its class). Raises InputError that names the argument.
+    """
+    if isinstance(mesh, str | os.PathLike):
+        mesh = load_mesh(mesh)
+    if not isinstance(mesh, Mesh | structures.Geometry):
+        raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(mesh)}")
+    return structures.build(mesh, as_one(accel, str, "accel"), as_one(device, str, "device"), threads, **options)
