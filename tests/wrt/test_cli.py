@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.command_line import BOX_OBJ, Result
+from tests.command_line import BOX_OBJ, Result, without_compiling
 from tests.command_line import wrt as run
 from tests.data import ROOT
 from wrt import __version__, cli_common
@@ -502,7 +502,7 @@ def process(*arguments: object, code: str = "", **options: Any) -> subprocess.Po
 
 def finish(running: subprocess.Popen[str]) -> Result:
     out, err = running.communicate(timeout=120)
-    return Result(running.returncode, out, err)
+    return Result(running.returncode, out, without_compiling(err))
 
 
 def test_a_process_renders() -> None:
