@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from wrt.accel.base import Geometry
-from wrt.accel.bvh_ranges import build_binned
+from wrt.accel.bvh_ranges import build_binned, build_lbvh, build_median, build_sweep
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions, sah_cost
 from wrt.errors import InputError
 
@@ -13,6 +13,9 @@ __all__ = ["BVH_BUILDERS", "BinaryTree", "BvhOptions", "build_binary", "sah_cost
 
 BVH_BUILDERS: dict[str, Callable[[Geometry, BvhOptions, int], BinaryTree]] = {
     "binned": build_binned,
+    "sweep": build_sweep,
+    "median": build_median,
+    "lbvh": build_lbvh,
 }
 
 

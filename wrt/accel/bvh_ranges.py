@@ -10,38 +10,96 @@ import warp as wp
 
 from wrt.accel.base import Geometry
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions, small_tree, squeeze
-from wrt.device import records, run_all, start, upload
+from wrt.device import load_kernel, records, run_all, start, upload
 from wrt.kernels import build_bvh2
 from wrt.kernels.traverse_bvh2 import Bvh2Node
 
 
 def build_binned(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Binned SAH: fast, and within a few per cent of the full sweep."""
+    """Binned SAH (Wald 2007): fast, and within a few per cent of the full sweep."""
+    lo, hi = geometry.bounds()
+    return split_ranges("binned", in_order(lo, hi), options, threads)
+
+
+def build_median(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
+    """Object median along the longest axis: what there was before the surface area heuristic."""
+    lo, hi = geometry.bounds()
+    return split_ranges("median", in_order(lo, hi), options, threads)
+
+
+def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
+    """Along a Morton curve (Lauterbach et al. 2009): the least work, and the worst tree but for the median's."""
+    lo, hi = geometry.bounds()
+    codes = morton_codes(0.5 * lo + 0.5 * hi)
+    order = np.argsort(codes, kind="stable")
+    return split_ranges("lbvh", in_order(lo, hi, order), options, threads, codes=codes[order])
+
+
+def build_sweep(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
+    """Full-sweep SAH: every split of a range by centroid, along all three axes."""
+    lo, hi = geometry.bounds()
+    center = 0.5 * lo + 0.5 * hi
+    n = len(lo)
+    build = in_order(lo, hi)
+    order = np.concatenate([np.argsort(center[:, axis], kind="stable") for axis in range(3)]).astype(np.int32)
+    return split_ranges("sweep", build, options, threads, boxes=build.copy(), order=order, area=np.empty(n, np.float32),
+                        left=np.empty(n, np.uint8), scratch=np.empty(n, np.int32))
+
+
+def in_order(lo: np.ndarray, hi: np.ndarray, order: np.ndarray | None = None) -> np.ndarray:
+    """BuildRecords of the boxes lo, hi (N, 3) float32 in the given order of prim_id, or in their own."""
+    build = records(build_bvh2.BuildRecord, len(lo))
+    build["prim_id"] = np.arange(len(lo)) if order is None else order
+    build["lo"], build["hi"] = (lo, hi) if order is None else (lo[order], hi[order])
+    return build
+
+
+def morton_codes(points: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 -> (N,) uint64: 21 bits of each coordinate, relative to the box of all that are finite."""
+    points = np.where(np.isfinite(points), points, 0.0).astype(np.float64)
+    low = points.min(axis=0, initial=np.inf)
+    extent = points.max(axis=0, initial=-np.inf) - low
+    cell = (points - low) * ((2.0**21 - 1.0) / np.where(extent > 0.0, extent, 1.0))
+    codes = np.zeros(len(points), np.uint64)
+    for axis in range(3):
+        bits = cell[:, axis].astype(np.uint64)
+        for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
+                            (2, 0x1249249249249249)):
+            bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
+        codes |= bits << np.uint64(2 - axis)
+    return codes
+
+
+def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: int, **arrays: np.ndarray) -> BinaryTree:
+    """Run a builder of kernels.build_bvh2 over BuildRecords; arrays: the other fields of BuildData that it reads."""
     cpu = start("cpu")
-    bounds = geometry.bounds()
-    n = len(bounds[0])
+    n = len(build)
     if n <= 1:
-        return small_tree(*bounds)
+        return small_tree(build["lo"], build["hi"])
+    data = build_bvh2.BuildData()
+    arrays |= {"records": build, "nodes": records(Bvh2Node, n - 1), "used": np.zeros(n - 1, np.uint8)}
+    for name, array in arrays.items():
+        setattr(data, name, upload(array, data._cls.vars[name].type.dtype, cpu))
     settings = build_bvh2.BuildOptions()
     settings.max_leaf = options.max_leaf
     settings.cost_traversal, settings.cost_intersection = options.cost_traversal, options.cost_intersection
-    build = records(build_bvh2.BuildRecord, n)
-    build["lo"], build["hi"], build["prim_id"] = bounds[0], bounds[1], np.arange(n)
-    nodes = records(Bvh2Node, n - 1)
-    used = np.zeros(len(nodes), np.uint8)
+    depth = run_tasks(build_bvh2.make_build_ranges(builder), data, settings, n, threads)
+    return BinaryTree(squeeze(data.nodes.numpy(), data.used.numpy() != 0), data.records.numpy()["prim_id"].copy(), depth)
+
+
+def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int) -> int:
+    """Build the top of the tree over records 0 .. n - 1, then its subtrees on all threads; the depth of the tree."""
+    cpu = start("cpu")
+    load_kernel(kernel, cpu)
     root = records(build_bvh2.BuildTask, 1)
-    root["end"] = n
-    device_records, device_nodes, device_used = (
-        upload(array, dtype, cpu) for array, dtype in
-        ((build, build_bvh2.BuildRecord), (nodes, Bvh2Node), (used, wp.uint8)))
-    stop_size = max(n // 64, 4096) if threads > 1 else 0
+    root["end"], root["parent"] = n, -1
+    stop_size = max(n // 32, 4096) if threads > 1 else 0
     # Ranges of two or more records that do not overlap: there can be no more of them than this.
-    left_over = upload(records(build_bvh2.BuildTask, n // 2 if stop_size else 1), build_bvh2.BuildTask, cpu)
+    left_over = wp.empty(max(n // 2, 1) if stop_size else 1, dtype=build_bvh2.BuildTask, device=cpu)
     count = wp.zeros(1, dtype=wp.int32, device=cpu)
 
     def launch(tasks: Any, depth: Any, task: int, stop: int) -> None:
-        wp.launch(build_bvh2.build_ranges, dim=1, device=cpu, inputs=[
-            device_records, device_nodes, device_used, tasks, task, settings, stop, left_over, count, depth])
+        wp.launch(kernel, dim=1, device=cpu, inputs=[data, tasks, task, settings, stop, left_over, count, depth])
 
     depth = wp.zeros(1, dtype=wp.int32, device=cpu)
     launch(upload(root, build_bvh2.BuildTask, cpu), depth, 0, stop_size)
@@ -54,5 +112,4 @@ def build_binned(geometry: Geometry, options: BvhOptions, threads: int) -> Binar
         device_tasks = upload(tasks, build_bvh2.BuildTask, cpu)
         run_all([partial(launch, device_tasks, depth, i, 0) for i in range(len(tasks))], threads)
         max_depth = max(max_depth, int(depth.numpy().max()))
-    return BinaryTree(squeeze(device_nodes.numpy(), device_used.numpy() != 0), device_records.numpy()["prim_id"].copy(),
-                      max_depth + 1)
+    return max_depth + 1
