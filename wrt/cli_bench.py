@@ -7,36 +7,49 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import Duration, Names, Size, load, naming, say, say_json, warnings_told
+from wrt.cli_common import Duration, Names, Size, load, naming, now_and_then, say, say_json, warnings_told
+from wrt.errors import InputError
 
 
 @click.command()
 @click.argument("cases", nargs=-1)
-@click.option("--rays", type=click.IntRange(min=1), default=10_000, show_default=True, help="Rays of each case")
+@click.option("--rays", type=click.IntRange(min=1), default=10_000, show_default=True, help="Rays of each case, for the default")
+@click.option("--sample", type=click.IntRange(min=1), default=10_000, show_default=True,
+              help="How many of them the oracle judges, and the other tests and peers get")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
-@click.option("--peers", is_flag=True, help="Also Embree (embreex) and Warp's own mesh_query_ray")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the tables as Markdown (.md)")
-@click.option("--json", "as_json", is_flag=True, help="Print the rows as JSON")
-def stability(cases: tuple[str, ...], rays: int, seed: int, peers: bool, output: Path | None, as_json: bool) -> None:
+@click.option("--peers", is_flag=True, help="Also Embree (embreex), Warp's mesh_query_ray and Open3D, where installed")
+@click.option("--threads", type=int, help="Threads for the rays beyond the sample  [default: all cores]")
+@click.option("--runs", type=click.IntRange(min=1), default=7, show_default=True, help="Runs of each for the speed, by turns")
+@click.option("-o", "--output", type=click.Path(path_type=Path),
+              help="Write a report: Markdown with plots beside it (.md), or one page (.html)")
+@click.option("-q", "--quiet", is_flag=True, help="No progress")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def stability(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
     """The hard cases against the intersection tests: rays lost and errors, with the speed beside them.
 
     CASES: names such as E_grid, or the letters of groups; without any, all.
     """
     from wrt.bench import stability as bench_stability
+    from wrt.bench import stability_report as report
 
-    def report(row: Any) -> None:
+    def told(row: Any) -> None:
         if not as_json:
-            click.echo("  ".join(bench_stability.cells(row)))
+            click.echo("  ".join(report.cells(row)))
 
+    plan = bench_stability.Plan(**options)
+    bench_stability.chosen(plan.cases)
     if output is not None:
-        bench_stability.check_report(output)
+        report.check_report(output)
     if not as_json:
-        click.echo("  ".join(bench_stability.COLUMNS))
-    rows = bench_stability.run(cases, rays, peers=peers, seed=seed, report=report)
-    if output is not None:
-        bench_stability.write_report(rows, output)
+        click.echo("  ".join(report.COLUMNS))
+    result = bench_stability.run(plan, told, now_and_then(quiet))
+    paths = [] if output is None else report.write_report(result, plan, output)
     if as_json:
-        say_json([row.as_dict() for row in rows])
+        say_json({"machine": report.machine(plan), **result.as_dict(), "output": [str(path) for path in paths]})
+        return
+    click.echo(f"\n{report.summary(result)}")
+    for path in paths:
+        click.echo(path)
 
 
 @click.group()
@@ -83,6 +96,39 @@ def visibility(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_js
     click.echo(f"{told}\n\n{report.markdown(rows)}\n{report.LEGEND}")
     for path in paths:
         click.echo(path)
+
+
+@bench.command()
+@click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--rays", type=int, default=2**17, show_default=True, help="Rays of each kind")
+@click.option("--runs", type=int, default=9, show_default=True, help="Runs of each unit, by turns")
+@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
+@click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the table as Markdown (.md)")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def units(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+    """The default triangle and box tests beside the others: what they cost, as ratios with their spread, on one thread.
+
+    MESHES: .obj, .ply or .stl files; without any, a sphere, a terrain and a teapot.
+    """
+    from dataclasses import asdict
+
+    from wrt.bench import units as bench_units
+
+    plan = bench_units.Plan(**options)
+    if output is not None and (output.suffix.lower() != ".md" or not output.parent.is_dir()):
+        raise InputError("the report is a .md file in a folder that is there", output)
+    told = bench_units.machine()
+    with warnings_told(quiet):
+        rows = bench_units.run(plan, now_and_then(quiet))
+    text = bench_units.text(rows, plan, told)
+    if output is not None:
+        output.write_text(text, encoding="utf-8")
+    if as_json:
+        say_json({"machine": told, "rows": [asdict(row) for row in rows], "output": output})
+        return
+    click.echo(text)
 
 
 @bench.command()

@@ -6,9 +6,10 @@ import contextlib
 import json
 import math
 import re
+import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -115,3 +116,20 @@ def say(text: str) -> None:
     """On stderr; that its terminal is gone is no reason to fail."""
     with contextlib.suppress(OSError):
         click.echo(text, err=True)
+
+
+def now_and_then(quiet: bool, every: float = 10.0) -> Callable[[str], None]:
+    """Where lines of progress go: on a terminal each one over the last, else one in `every` seconds."""
+    terminal = sys.stderr is not None and sys.stderr.isatty()
+    due = time.monotonic()
+
+    def tell(line: str) -> None:
+        nonlocal due
+        if terminal:
+            with contextlib.suppress(OSError):
+                click.echo(f"\r\x1b[2K{line[:100]}\r", err=True, nl=False)
+        elif time.monotonic() >= due:
+            due = time.monotonic() + every
+            say(line)
+
+    return (lambda line: None) if quiet else tell

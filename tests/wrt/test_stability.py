@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from wrt.accel import Geometry
 from wrt.bench import stability
-from wrt.bench.algorithms import Embree, Own, WarpMesh, own_algorithms
+from wrt.bench import stability_report as report
+from wrt.bench.algorithms import Embree, Open3D, Own, WarpMesh, own_algorithms
 from wrt.bench.hard_cases import generate
 from wrt.errors import InputError
 from wrt.kernels.ray_aabb import RAY_AABB
@@ -61,12 +66,106 @@ def test_names_and_letters_choose_cases() -> None:
         stability.chosen(["Q"])
 
 
-def test_the_report_has_a_row_for_each(tmp_path) -> None:
-    row = stability.run_case("E_grid", 50, Own())
-    assert row is not None
-    path = tmp_path / "stability.md"
-    stability.write_report([row], path)
-    assert f"| E_grid | watertight | {row.verdict.rays} | 0 | 0 | 0 |" in path.read_text()
-    assert len(stability.cells(row)) == len(stability.COLUMNS)
-    with pytest.raises(InputError, match=r"use \.md"):
-        stability.check_report(tmp_path / "stability.txt")
+def test_rays_beyond_the_sample_are_held_to_what_is_known_of_them() -> None:
+    for name, more in (("E_grid", 700), ("C_spheres", 700), ("D_published", 700), ("E_beside", 0), ("G_fan_edges", 7)):
+        verdict, _ = stability.run_more(name, stability.Plan(rays=1000, sample=300), lambda line: None)
+        assert verdict.rays == more and verdict.ok
+    only_some = stability.run_more("F_edge_on", stability.Plan(rays=1000, sample=300), lambda line: None)[0]
+    assert 100 < only_some.rays < 600  # those exactly in the triangles' planes
+    # They are other rays than the sample's, and the same each time.
+    assert np.unique(np.concatenate([generate("E_grid", 50, (0, i)).origins for i in (0, 1)]), axis=0).shape[0] > 50
+
+
+def test_what_is_wrong_beyond_the_sample_is_seen(monkeypatch) -> None:
+    class Lossy(Own):
+        def closest(self, *arguments):
+            hits = super().closest(*arguments)
+            hits.prim_id[:5], hits.t[:5] = -1, np.inf
+            return hits
+
+    monkeypatch.setattr(stability, "Own", Lossy)
+    verdict, _ = stability.run_more("B_jittered_uniform", stability.Plan(rays=1000, sample=300), lambda line: None)
+    assert verdict.misses == 5 and verdict.rays == 700
+
+
+@pytest.fixture(scope="module")
+def result():
+    lines: list[str] = []
+    plan = stability.Plan(("E_grid", "D_published", "I_rays_not_finite"), rays=60, sample=40, runs=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stability, "SPEED_RAYS", 2000)
+        found = stability.run(plan, progress=lines.append)
+    assert any("E_grid" in line and "M rays more" in line for line in lines)
+    return found, plan
+
+
+def test_the_report_has_a_row_for_each(result, tmp_path) -> None:
+    found, plan = result
+    assert {row.algorithm for row in found.rows} == {a.name for a in own_algorithms()} == set(found.speeds)
+    paths = report.write_report(found, plan, tmp_path / "stability.md")
+    assert [path.name for path in paths] == ["stability.md", "stability-lost.png", "stability-error.png"]
+    text = paths[0].read_text()
+    grid = next(line for line in text.splitlines() if line.startswith("| E_grid") and "| " in line and " watertight |" in line)
+    assert [cell.strip() for cell in grid.split("|")[3:8]] == ["60", "40", "0", "0", "0"]
+    assert "--rays 60 --sample 40" in text and "| A to H" in text and "refused" in text
+    assert all(len(report.cells(row)) == len(report.COLUMNS) for row in found.rows)
+    page = report.write_report(found, plan, tmp_path / "stability.html")
+    assert len(page) == 1 and page[0].read_text().count("data:image/png;base64,") == 2
+    for name in ("stability.txt", "nowhere/stability.md"):
+        with pytest.raises(InputError):
+            report.check_report(tmp_path / name)
+
+
+def test_speed_is_told_with_its_spread(result) -> None:
+    found, _ = result
+    assert all(speed.mrays[0] <= speed.mrays[1] <= speed.mrays[2] for speed in found.speeds.values())
+    assert found.speeds["watertight"].ratio == (1.0, 1.0, 1.0) and found.speeds["watertight"].bytes_per_triangle > 40
+
+
+def test_a_peer_that_is_not_installed_is_named(monkeypatch) -> None:
+    class Nowhere(WarpMesh):
+        name, package = "Nowhere", "no_such_package_at_all"
+
+    monkeypatch.setattr(stability, "PEERS", {"nowhere": Nowhere})
+    monkeypatch.setattr(stability, "SPEED_RAYS", 2000)
+    found = stability.run(stability.Plan(("D_published",), rays=5, sample=5, peers=True, runs=1))
+    assert found.missing == ("Nowhere",) and "Nowhere: not installed" in report.summary(found)
+    assert Own().is_installed() and WarpMesh().is_installed()
+
+
+def test_open3d_is_asked_by_its_documented_interface(monkeypatch) -> None:
+    # Not Open3D itself, but its documented types and shapes; the answers are wrt's own.
+    class Tensor:
+        def __init__(self, array):
+            self.array = array
+
+        from_numpy = classmethod(lambda cls, array: cls(array))
+
+        def numpy(self):
+            return self.array
+
+    class RaycastingScene:
+        INVALID_ID = 4294967295
+
+        def __init__(self, nthreads=0):
+            pass
+
+        def add_triangles(self, vertices, triangles):
+            assert vertices.array.dtype == np.float32 and triangles.array.dtype == np.uint32
+            self.own = Own()
+            self.own.prepare(Geometry(vertices.array, triangles.array.astype(np.int32), np.zeros((0, 4), np.float32)))
+
+        def cast_rays(self, rays, nthreads=0):
+            assert rays.array.dtype == np.float32 and rays.array.shape[1] == 6
+            hits = self.own.closest(rays.array[:, :3].copy(), rays.array[:, 3:].copy())
+            prim_id = np.where(hits.prim_id < 0, self.INVALID_ID, hits.prim_id.astype(np.int64)).astype(np.uint32)
+            uvs = np.stack([hits.u, hits.v], axis=1)
+            return {"t_hit": Tensor(hits.t), "primitive_ids": Tensor(prim_id), "primitive_uvs": Tensor(uvs)}
+
+    module = SimpleNamespace(core=SimpleNamespace(Tensor=Tensor),
+                             t=SimpleNamespace(geometry=SimpleNamespace(RaycastingScene=RaycastingScene)))
+    monkeypatch.setitem(sys.modules, "open3d", module)
+    row = stability.run_case("E_grid", 200, Open3D())
+    assert row is not None and row.verdict.ok and row.verdict.hits == 200
+    cut = stability.run_case("H_exact_ends", 200, Open3D())
+    assert cut is not None and cut.verdict.false_hits == 0

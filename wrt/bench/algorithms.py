@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 import numpy as np
 
-from wrt.accel import Hits, build
+from wrt.accel import Accelerator, Hits, build
 from wrt.accel.base import Geometry
 from wrt.errors import InputError
 
@@ -18,6 +19,11 @@ class Algorithm(ABC):
     name: str
     bytes_per_triangle: float = float("nan")
     is_peer: ClassVar[bool] = False
+    package: ClassVar[str] = ""  # what a peer imports
+
+    @classmethod
+    def is_installed(cls) -> bool:
+        return not cls.package or importlib.util.find_spec(cls.package) is not None
 
     @abstractmethod
     def prepare(self, geometry: Geometry) -> bool:
@@ -31,16 +37,20 @@ class Algorithm(ABC):
 class Own(Algorithm):
     """wrt's BVH with one triangle test and one box test."""
 
+    accel: Accelerator | None = None
+
     def __init__(self, triangle: str = "watertight", box: str = "conservative") -> None:
         self.triangle, self.box = triangle, box
         self.name = triangle if box == "conservative" else f"{triangle}, {box} boxes"
 
     def prepare(self, geometry: Geometry) -> bool:
-        self.accel = build(geometry, "bvh", triangle=self.triangle, box=self.box, threads=1)
+        if self.accel is None or self.accel.geometry is not geometry:
+            self.accel = build(geometry, "bvh", triangle=self.triangle, box=self.box, threads=1)
         self.bytes_per_triangle = self.accel.stats.bytes / max(len(geometry), 1)
         return True
 
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
+        assert self.accel is not None  # prepare() comes first
         return self.accel.closest_hit(origins, directions, t_min, t_max, threads=1)
 
 
@@ -64,6 +74,7 @@ class Embree(Peer):
     """Embree 4 through embreex, with its robust flag off, as embreex sets it."""
 
     name = "Embree (embreex)"
+    package = "embreex"
 
     def load(self, geometry: Geometry) -> None:
         try:
@@ -112,6 +123,28 @@ class WarpMesh(Peer):
         return _cut(told, prim_id.numpy(), v.numpy(), 1.0 - u.numpy() - v.numpy(), t_min, t_max)
 
 
+class Open3D(Peer):
+    """Open3D's RaycastingScene, which is Embree with its robust flag on."""
+
+    name = "Open3D RaycastingScene"
+    package = "open3d"
+
+    def load(self, geometry: Geometry) -> None:
+        import open3d
+
+        self.tensor = open3d.core.Tensor.from_numpy
+        self.scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+        self.scene.add_triangles(self.tensor(geometry.vertices.copy()), self.tensor(geometry.faces.astype(np.uint32)))
+        self.none = self.scene.INVALID_ID
+
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
+        rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
+        told = {name: array.numpy() for name, array in self.scene.cast_rays(self.tensor(rays), nthreads=1).items()}
+        prim_id = np.where(told["primitive_ids"] == self.none, -1, told["primitive_ids"].astype(np.int64)).astype(np.int32)
+        u, v = told["primitive_uvs"].T
+        return _cut(told["t_hit"], prim_id, u, v, t_min, t_max)
+
+
 def _cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min: Any, t_max: Any) -> Hits:
     outside = (prim_id < 0) | ~((t >= t_min) & (t <= t_max))
     return Hits(np.where(outside, np.float32(np.inf), t), np.where(outside, 0, u), np.where(outside, 0, v),
@@ -126,4 +159,4 @@ def own_algorithms() -> list[Own]:
     return [Own(triangle) for triangle in RAY_TRIANGLE] + [Own(box=box) for box in RAY_AABB if box != "conservative"]
 
 
-PEERS: dict[str, type[Peer]] = {"embree": Embree, "warp": WarpMesh}
+PEERS: dict[str, type[Peer]] = {"embree": Embree, "warp": WarpMesh, "open3d": Open3D}

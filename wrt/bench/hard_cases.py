@@ -20,11 +20,11 @@ from functools import partial
 from wrt.bench import hard_cases_closed as inside
 from wrt.bench import hard_cases_open as outside
 from wrt.bench.hard_cases_common import AIMS, ASK, HIT, MISS, HardCase, Seed
-from wrt.bench.hard_cases_judge import Verdict, judge, judge_all_hits, judge_next
+from wrt.bench.hard_cases_judge import Verdict, check, judge, judge_all_hits, judge_next
 from wrt.errors import InputError
 
-__all__ = ["ASK", "HARD_CASES", "HIT", "MISS", "HardCase", "Verdict", "chunks", "generate", "judge", "judge_all_hits",
-           "judge_next"]
+__all__ = ["ASK", "HARD_CASES", "HIT", "MISS", "HardCase", "Verdict", "check", "chunks", "generate", "judge",
+           "judge_all_hits", "judge_next"]
 
 HARD_CASES: dict[str, Callable[[Seed, int], HardCase]] = {
     **{f"A_{place}_{aim}": partial(inside.dense_sphere, position=place, aim=aim)

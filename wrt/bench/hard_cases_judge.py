@@ -134,15 +134,7 @@ def judge(case: HardCase, hits: Any, asked: int | None = None) -> Verdict:
     reference = reference_of(case.geometry)
     t, u, v, prim_id = (np.asarray(getattr(hits, name)) for name in ("t", "u", "v", "prim_id"))
     reported = prim_id >= 0
-    verdict = Verdict(rays=len(case), hits=int(reported.sum()))
-    verdict.wrong("misses", case, np.flatnonzero(~reported & (case.expected == HIT)), "must hit, is said to miss")
-    verdict.wrong("false_hits", case, np.flatnonzero(reported & (case.expected == MISS)), "must miss", prim_id)
-    possible = reported & np.isfinite(t) & (t >= case.t_min) & (t <= case.t_max) & (prim_id < len(reference.finite))
-    possible[possible] &= reference.finite[prim_id[possible]]
-    possible &= np.isfinite(case.origins).all(axis=1) & np.isfinite(case.directions).all(axis=1)
-    verdict.wrong("false_hits", case, np.flatnonzero(reported & ~possible & (case.expected != MISS)),
-                  "t outside of the segment, or nothing that can be hit", prim_id)
-
+    verdict, possible = _plain_faults(case, t, prim_id, reference.finite)
     rows = np.flatnonzero(possible & (case.expected != MISS))
     parts = [_claims(case, reference, rows[i:i + RAYS_AT_ONCE], (t, u, v, prim_id), verdict)
              for i in range(0, len(rows), RAYS_AT_ONCE)]
@@ -155,6 +147,27 @@ def judge(case: HardCase, hits: Any, asked: int | None = None) -> Verdict:
         _judge_closeness(case, reference, _Claims(*(getattr(claims, f.name)[chosen] for f in fields(_Claims))), verdict)
     _judge_misses(case, reference, np.flatnonzero(~reported & (case.expected == ASK)), verdict)
     return verdict
+
+
+def check(case: HardCase, hits: Any) -> Verdict:
+    """What can be said of closest hits at once, for any number of rays: those that must hit do, those that must miss do, t is
+    inside of the segment. Rays whose answer only the oracle knows (ASK) may miss. Arguments as for `judge`."""
+    every = np.ones(len(case.geometry), bool)
+    return _plain_faults(case, np.asarray(hits.t), np.asarray(hits.prim_id), every)[0]
+
+
+def _plain_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np.ndarray) -> tuple[Verdict, np.ndarray]:
+    """What is wrong whatever the oracle says, and which rays claim a hit that may be one. finite: the primitives that are."""
+    reported = prim_id >= 0
+    verdict = Verdict(rays=len(case), hits=int(reported.sum()))
+    verdict.wrong("misses", case, np.flatnonzero(~reported & (case.expected == HIT)), "must hit, is said to miss")
+    verdict.wrong("false_hits", case, np.flatnonzero(reported & (case.expected == MISS)), "must miss", prim_id)
+    possible = reported & np.isfinite(t) & (t >= case.t_min) & (t <= case.t_max) & (prim_id < len(finite))
+    possible[possible] &= finite[prim_id[possible]]
+    possible &= np.isfinite(case.origins).all(axis=1) & np.isfinite(case.directions).all(axis=1)
+    verdict.wrong("false_hits", case, np.flatnonzero(reported & ~possible & (case.expected != MISS)),
+                  "t outside of the segment, or nothing that can be hit", prim_id)
+    return verdict, possible
 
 
 def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[np.ndarray, ...],

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cache
-from pathlib import Path
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,9 @@ import warp as wp
 
 from wrt.accel.base import Structure
 from wrt.bench.algorithms import PEERS, Algorithm, Own, own_algorithms
-from wrt.bench.hard_cases import HARD_CASES, HardCase, Verdict, chunks, generate, judge, judge_all_hits, judge_next
-from wrt.device import load_kernel, upload
+from wrt.bench.hard_cases import ASK, HARD_CASES, HardCase, Verdict, check, chunks, generate, judge, judge_all_hits, judge_next
+from wrt.bench.price import Quartiles, alternate, quartiles
+from wrt.device import load_kernel, thread_count, upload
 from wrt.errors import InputError
 from wrt.kernels.query import HitList, RayArrays, Respawn, make_all_hits_kernel, make_respawn_kernel
 from wrt.kernels.structs import Surfaces
@@ -24,48 +26,99 @@ from wrt.kernels.traverse import Units
 
 ALL_HITS_TESTS = 20_000_000  # ray-primitive tests that a case's all-hits check may take
 ALL_HITS_RAYS = 2000
-SPEED_RAYS, SPEED_RUNS = 200_000, 5
+SPEED_RAYS = 200_000
+ASKED = 2000  # of a rival's claimed hits in one case: is anything nearer? Of the default's, all are asked
+CHUNK = 2**18
+COSTLY = {"G_fan": 100}  # 10,000 triangles at one vertex are all tested: so many times fewer rays
+
+
+@dataclass(frozen=True)
+class Plan:
+    """rays: of each case, through the default units. sample: of these, how many the oracle judges, and all algorithms get;
+    the others are held to what is known of them without it (`check`). runs: of the measurement of speed."""
+
+    cases: tuple[str, ...] = ()
+    rays: int = 10_000
+    sample: int = 10_000
+    peers: bool = False
+    seed: int = 0
+    threads: int | None = None
+    runs: int = 7
 
 
 @dataclass
 class Row:
-    """One case with one algorithm. offset_self_hits: re-hits of the start triangle if only the offset kept rays off it.
-    refused: for input that is not finite, whether the host said so."""
+    """One case with one algorithm. judged: how many of the rays the oracle judged; the others have a known answer.
+    offset_self_hits: re-hits of the start triangle if only the offset kept rays off it. refused: for input that is not
+    finite, whether the host said so."""
 
     case: str
     algorithm: str
     verdict: Verdict = field(default_factory=Verdict)
+    judged: int = 0
     offset_self_hits: int = 0
     refused: bool | None = None
-    mrays: float = float("nan")
-    bytes_per_triangle: float = float("nan")
 
     def as_dict(self) -> dict[str, Any]:
-        return {"case": self.case, "algorithm": self.algorithm, "mrays_per_second": self.mrays,
-                "bytes_per_triangle": self.bytes_per_triangle, "offset_self_hits": self.offset_self_hits,
-                "refused": self.refused, **self.verdict.as_dict()}
+        return {"case": self.case, "algorithm": self.algorithm, "judged": self.judged,
+                "offset_self_hits": self.offset_self_hits, "refused": self.refused, **self.verdict.as_dict()}
 
 
-def run(cases: Sequence[str], rays: int, *, peers: bool = False, seed: int = 0,
-        report: Callable[[Row], None] | None = None) -> list[Row]:
-    """Every case (names in HARD_CASES or letters of groups; an empty list is all) with every algorithm, `rays` rays each.
+@dataclass(frozen=True)
+class Speed:
+    """On one thread, on case A's sphere: Mray/s; its share of the default's, taken run by run; bytes a triangle."""
 
-    The same rays for all. `report` is called with each row as it is done. Raises InputError for an unknown case.
+    mrays: Quartiles
+    ratio: Quartiles
+    bytes_per_triangle: float
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"mrays_per_second": self.mrays, "ratio_to_default": self.ratio, "bytes_per_triangle": self.bytes_per_triangle}
+
+
+@dataclass
+class Result:
+    """All rows, the speeds by algorithm, the peers that were asked for and are not installed, and the seconds it took."""
+
+    rows: list[Row] = field(default_factory=list)
+    speeds: dict[str, Speed] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"seconds": self.seconds, "not_installed": self.missing,
+                "speed": {name: speed.as_dict() for name, speed in self.speeds.items()},
+                "rows": [row.as_dict() for row in self.rows]}
+
+
+def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
+        progress: Callable[[str], None] = lambda line: None) -> Result:
+    """Every case (names in HARD_CASES or letters of groups; none: all) with every algorithm, the same rays for all.
+
+    report: called with each row as it is done; progress: now and then with a line of text, from any thread. Raises
+    InputError for an unknown case.
     """
-    names = chosen(cases)
-    algorithms: list[Algorithm] = [*own_algorithms(), *(PEERS[name]() for name in PEERS if peers)]
-    speeds = measure_speed(algorithms)
-    rows = []
-    for name in names:
+    begin = time.perf_counter()
+    names = chosen(plan.cases)
+    algorithms: list[Algorithm] = list(own_algorithms())
+    peers = PEERS.values() if plan.peers else ()
+    algorithms += [peer() for peer in peers if peer.is_installed()]
+    result = Result(missing=tuple(peer.name for peer in peers if not peer.is_installed()))
+    progress("measuring the speed")
+    result.speeds = measure_speed(algorithms, plan.runs)
+    for i, name in enumerate(names):
         for algorithm in algorithms:
-            row = run_case(name, rays, algorithm, seed)
+            progress(f"case {i + 1} of {len(names)}, {name}, {algorithm.name}")
+            row = run_case(name, fewer(name, min(plan.sample, plan.rays)), algorithm, plan.seed)
             if row is None:
                 continue
-            row.mrays, row.bytes_per_triangle = speeds[algorithm.name]
-            rows.append(row)
-            if report is not None:
-                report(row)
-    return rows
+            if algorithm is algorithms[0] and row.refused is None:
+                more, offset = run_more(name, plan, progress)
+                row.verdict, row.offset_self_hits = row.verdict + more, row.offset_self_hits + offset
+            result.rows.append(row)
+            report(row)
+    result.seconds = time.perf_counter() - begin
+    return result
 
 
 def chosen(cases: Sequence[str]) -> list[str]:
@@ -80,7 +133,7 @@ def chosen(cases: Sequence[str]) -> list[str]:
 
 
 def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row | None:
-    """One case, in parts; None where the algorithm cannot take it (peers: spheres, and input that is not finite)."""
+    """One case, judged by the oracle; None where the algorithm cannot take it (peers: spheres, and input not finite)."""
     row = Row(name, algorithm.name)
     for case in chunks(name, rays, seed):
         if case.refused:
@@ -91,7 +144,9 @@ def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row |
         if not algorithm.prepare(case.geometry):
             return None
         hits = algorithm.closest(case.origins, case.directions, case.t_min, case.t_max)
-        row.verdict += judge(case, hits)
+        is_default = algorithm.name == Own().name
+        row.verdict += judge(case, hits, None if is_default else min(ASKED, case.asked))
+        row.judged += len(case)
         if isinstance(algorithm, Own):
             if case.next_directions is not None:
                 row.verdict += judge_next(case, *respawn(algorithm, case, exclude=True))
@@ -99,6 +154,52 @@ def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row |
             if not len(case.geometry.spheres) and len(case.geometry) * ALL_HITS_RAYS <= ALL_HITS_TESTS:
                 row.verdict += _judge_all(algorithm, case)
     return row
+
+
+def fewer(name: str, rays: int) -> int:
+    """How many rays a case gets where the others get `rays`."""
+    return max(1, rays // next((divisor for start, divisor in COSTLY.items() if name.startswith(start)), 1))
+
+
+def run_more(name: str, plan: Plan, progress: Callable[[str], None]) -> tuple[Verdict, int]:
+    """The rays of a case beyond the sample through the default units, on all threads, held to what is known of them; and
+    self-hits if only the offset kept rays off. Nothing where nothing is known of them: a case that only the oracle can judge.
+    """
+    left = fewer(name, plan.rays) - fewer(name, plan.sample)
+    probe = generate(name, 64, plan.seed)
+    if left <= 0 or ((probe.expected == ASK).all() and probe.next_directions is None):
+        return Verdict(), 0
+    first = -(-fewer(name, plan.sample) // CHUNK)  # `chunks` has used the seeds below it
+    own, lock = threading.local(), threading.Lock()
+    done, begin = 0, time.perf_counter()
+
+    def part(index: int) -> tuple[Verdict, int]:
+        nonlocal done
+        case = generate(name, min(CHUNK, left - index * CHUNK), (plan.seed, first + index))
+        if not hasattr(own, "default"):
+            own.default = Own()
+        own.default.prepare(case.geometry)
+        verdict = check(case, own.default.closest(case.origins, case.directions, case.t_min, case.t_max))
+        offset = 0
+        if case.next_directions is not None:
+            verdict += judge_next(case, *respawn(own.default, case, exclude=True))
+            offset = judge_next(case, *respawn(own.default, case, exclude=False)).self_hits
+        else:
+            verdict.rays -= int((case.expected == ASK).sum())  # nothing was checked of them
+        with lock:
+            done += len(case)
+            rate = done / (time.perf_counter() - begin) / 1e6
+            progress(f"{name}, {done / 1e6:.1f} of {left / 1e6:.1f} M rays more, {rate:.2f} Mray/s")
+        return verdict, offset
+
+    total, offsets = Verdict(), 0
+    pool = ThreadPoolExecutor(thread_count(plan.threads))
+    try:
+        for verdict, offset in pool.map(part, range(-(-left // CHUNK))):
+            total, offsets = total + verdict, offsets + offset
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return total, offsets
 
 
 def _is_refused(case: HardCase, algorithm: Algorithm) -> bool:
@@ -142,10 +243,10 @@ def _respawn_kernel(structure: Structure) -> Any:
 def respawn(algorithm: Own, case: HardCase, *, exclude: bool) -> tuple[np.ndarray, np.ndarray]:
     """prim_id of each ray's hit, and of the ray that goes on from it towards case.next_directions."""
     accel, n = algorithm.accel, len(case)
+    assert accel is not None and case.next_directions is not None
     kernel = _respawn_kernel(accel.structure)
     load_kernel(kernel, accel.device)
     out = Respawn()
-    assert case.next_directions is not None
     out.direction = upload(case.next_directions, wp.vec3, accel.device)
     out.exclude = int(exclude)
     out.first_prim_id, out.next_prim_id = (wp.empty(n, dtype=wp.int32, device=accel.device) for _ in range(2))
@@ -162,6 +263,7 @@ def _all_hits_kernel(units: Units) -> Any:
 def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
     """All hits along the first ALL_HITS_RAYS rays; only what concerns duplicates is added to the case's verdict."""
     accel, n = algorithm.accel, min(len(case), ALL_HITS_RAYS)
+    assert accel is not None
     units = accel.structure.units
     out = HitList()
     out.capacity = max(64, len(case.geometry))
@@ -180,65 +282,12 @@ def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
     return Verdict(duplicate_hits=verdict.duplicate_hits, examples=[e for e in verdict.examples if "twice" in e["why"]])
 
 
-def measure_speed(algorithms: Sequence[Algorithm]) -> dict[str, tuple[float, float]]:
-    """Mray/s on one thread (median of alternating runs) and bytes a triangle, on case A's sphere of 159,200 triangles."""
+def measure_speed(algorithms: Sequence[Algorithm], runs: int) -> dict[str, Speed]:
+    """On one thread, by turns, on case A's sphere of 159,200 triangles. The first algorithm is the default."""
     case = generate("A_origin_uniform", SPEED_RAYS, seed=1)
-    seconds: dict[str, list[float]] = {algorithm.name: [] for algorithm in algorithms}
     for algorithm in algorithms:
         algorithm.prepare(case.geometry)
-        algorithm.closest(case.origins[:100], case.directions[:100])
-    for _ in range(SPEED_RUNS):
-        for algorithm in algorithms:
-            begin = time.perf_counter()
-            algorithm.closest(case.origins, case.directions)
-            seconds[algorithm.name].append(time.perf_counter() - begin)
-    return {a.name: (SPEED_RAYS / float(np.median(seconds[a.name])) / 1e6, a.bytes_per_triangle) for a in algorithms}
-
-
-COLUMNS = ("case", "algorithm", "rays", "misses", "false hits", "wrong prim", "self-hits", "duplicates", "ties",
-           "t ulp max", "t ulp 99.9 %", "t / bound", "Mray/s", "B/tri")
-
-
-def cells(row: Row) -> tuple[str, ...]:
-    """A row as text, in the order of COLUMNS."""
-    v = row.verdict
-    if row.refused is not None:
-        said = "refused" if row.refused else "ACCEPTED"
-        return (row.case, row.algorithm, said, *[""] * 9, f"{row.mrays:.2f}", f"{row.bytes_per_triangle:.0f}")
-    return (row.case, row.algorithm, str(v.rays), *(str(n) for n in (v.misses, v.false_hits, v.wrong_prim, v.self_hits,
-            v.duplicate_hits, v.ties)), f"{v.t.largest:.3g}", f"{v.t.percentile(99.9):.3g}", f"{v.t.largest_ratio:.2g}",
-            f"{row.mrays:.2f}", f"{row.bytes_per_triangle:.0f}")
-
-
-def markdown(rows: Sequence[Row]) -> str:
-    """The table, after one summary line an algorithm."""
-    lines = ["# Stability of the intersection tests", "", "Summed over the cases, with the speed on one thread beside it.", "",
-             "| algorithm | rays | misses | false hits | wrong prim | self-hits | duplicates | t over bound | Mray/s | B/tri |",
-             "| --- |" + " ---: |" * 9]
-    for name in dict.fromkeys(row.algorithm for row in rows):
-        mine = [row for row in rows if row.algorithm == name]
-        v = sum((row.verdict for row in mine), Verdict())
-        lines.append(f"| {name} | {v.rays} | {v.misses} | {v.false_hits} | {v.wrong_prim} | {v.self_hits} | {v.duplicate_hits} "
-                     f"| {v.t.over} | {mine[0].mrays:.2f} | {mine[0].bytes_per_triangle:.0f} |")
-    lines += ["", "| " + " | ".join(COLUMNS) + " |", "| --- | --- |" + " ---: |" * (len(COLUMNS) - 2)]
-    lines += ["| " + " | ".join(cells(row)) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
-
-
-def check_report(path: Path) -> None:
-    """Raise InputError where write_report could not write, before the work."""
-    if path.suffix.lower() != ".md":
-        raise InputError("the report is Markdown: use .md", path)
-    if not path.parent.is_dir():
-        raise InputError("no such folder", path.parent)
-
-
-def write_report(rows: Sequence[Row], path: Path) -> None:
-    """A Markdown file; written whole or not at all."""
-    temporary = path.with_name(path.name + ".part")
-    try:
-        temporary.write_text(markdown(rows))
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"cannot be written: {error.strerror}", path) from error
+    seconds = alternate({a.name: partial(a.closest, case.origins, case.directions) for a in algorithms}, runs)
+    default = seconds[algorithms[0].name]
+    return {a.name: Speed(quartiles(SPEED_RAYS / seconds[a.name] / 1e6), quartiles(default / seconds[a.name]),
+                          a.bytes_per_triangle) for a in algorithms}

@@ -1,0 +1,62 @@
+"""What the default costs beside the others: that the measurement is of what it says."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from wrt.accel import Geometry, build
+from wrt.bench import units
+from wrt.bench.price import alternate, quartiles, shown
+from wrt.bench.visibility import terrain
+from wrt.errors import InputError
+from wrt.kernels.ray_aabb import RAY_AABB
+from wrt.kernels.ray_triangle import RAY_TRIANGLE
+from wrt.shapes import icosphere
+
+
+def test_jobs_run_by_turns_and_the_first_run_is_not_counted() -> None:
+    order: list[str] = []
+    jobs = {"a": lambda: order.append("a"), "b": lambda: (order.append("b"), time.sleep(0.003))}
+    seconds = alternate(jobs, 3)
+    assert "".join(order) == "ab" + "ab" + "ba" + "ab"
+    assert seconds["a"].shape == (3,) and (seconds["b"] > 0.0029).all() and (seconds["a"] < seconds["b"]).all()
+    assert quartiles([5, 1, 2, 3, 4]) == (2.0, 3.0, 4.0) and shown((2.0, 3.0, 4.0)) == "3 [2, 4]"
+
+
+@pytest.mark.parametrize("kind", ["primary", "random"])
+def test_rays_meet_the_mesh(kind: str) -> None:
+    geometry = Geometry.of(icosphere(3))
+    origins, directions = units.rays_at(geometry, kind, 5000, 1)
+    assert origins.shape == directions.shape == (5000, 3) and origins.dtype == directions.dtype == np.float32
+    hit = build(geometry).closest_hit(origins, directions).prim_id >= 0
+    assert hit.mean() > 0.6
+    assert (len(np.unique(origins, axis=0)) == 1) == (kind == "primary")
+
+
+def test_every_unit_has_a_row_on_every_mesh(monkeypatch) -> None:
+    assert {name for name, _ in units.surfaces(units.Plan())} == {"sphere", "terrain", "teapot"}
+    small = [("sphere", Geometry.of(icosphere(2))), ("terrain", Geometry.of(terrain(8))), ("ball", Geometry.of(icosphere(1)))]
+    monkeypatch.setattr(units, "surfaces", lambda plan: small)
+    told: list[str] = []
+    plan = units.Plan(rays=500, runs=2)
+    rows = units.run(plan, told.append)
+    on_meshes = {(row.mesh, row.rays) for row in rows if "no structure" not in row.mesh}
+    assert len(on_meshes) == 6 and len(told) == 7
+    names = [*RAY_TRIANGLE, *(f"{box} boxes" for box in list(RAY_AABB)[1:])]
+    for place in on_meshes:
+        assert [row.unit for row in rows if (row.mesh, row.rays) == place] == names
+    assert [row.unit for row in rows if "no structure" in row.mesh] == list(RAY_TRIANGLE)
+    for row in rows:
+        assert row.extremes[0] <= row.price[0] <= row.price[1] <= row.price[2] <= row.extremes[1]
+        assert row.unit != "watertight" or row.price == (1.0, 1.0, 1.0)
+    assert "| terrain" in units.text(rows, plan, "here") and "--rays 500 --runs 2" in units.text(rows, plan, "here")
+
+
+def test_bad_plans_are_refused() -> None:
+    with pytest.raises(InputError, match="no structure 'sphere'"):
+        units.Plan(accel="sphere")
+    with pytest.raises(InputError, match="1 or more"):
+        units.Plan(runs=0)

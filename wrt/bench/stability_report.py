@@ -1,0 +1,202 @@
+"""What `stability` tells: tables for the terminal, and a report as Markdown with plots beside it or as one HTML file."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import wrt
+from wrt.bench.hard_cases import Verdict
+from wrt.bench.plot import LogLogPlot, Series
+from wrt.bench.price import shown
+from wrt.bench.stability import ASKED, Plan, Result, Row
+from wrt.bench.visibility_report import table
+from wrt.device import describe_devices, thread_count
+from wrt.errors import InputError
+from wrt.image import check_writable, write_codes
+
+COLUMNS = ("case", "algorithm", "rays", "judged", "misses", "false hits", "wrong prim", "self-hits", "duplicates", "ties",
+           "near ties", "borderline", "t ulp max", "t ulp 99.9 %", "t / bound")
+NO_LOSS = 0.3  # where "none" is drawn: as if a third of a ray had been lost
+LEGEND = f"""\
+rays: of which the oracle judged the first ones ("judged", {{sample}} of a case at most); the others have an answer that is known
+without it (a closed surface must be hit, corners on a line never, a ray must not hit the triangle that it leaves), and were held
+to that. misses, false hits, wrong prim: rays lost, invented, or given to a primitive behind another, by more than the derived error
+bound. Within the bound nothing is wrong, but counted: ties (the same exact t), near ties (the bound cannot tell which is nearer; of
+all hits for the default, of {ASKED} a case for the others) and borderline (the exact ray passes an edge by less than the bound).
+duplicates: one crossing of a surface told twice by an all-hits query. t: error in float32 ulp of the exact distance, and its share
+of the bound."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A piece of the report: text, a table, or a plot by its file name's ending."""
+
+    title: str = ""
+    text: str = ""
+    head: Sequence[str] = ()
+    lines: Sequence[Sequence[str]] = ()
+    plot: str = ""
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """A row as text, in the order of COLUMNS."""
+    v = row.verdict
+    if row.refused is not None:
+        return (row.case, row.algorithm, "refused" if row.refused else "ACCEPTED", *[""] * (len(COLUMNS) - 3))
+    counts = (v.rays, row.judged, v.misses, v.false_hits, v.wrong_prim, v.self_hits, v.duplicate_hits, v.ties, v.near_ties,
+              v.borderline_hits + v.borderline_misses)
+    return (row.case, row.algorithm, *map(str, counts), f"{v.t.largest:.3g}", f"{v.t.percentile(99.9):.3g}",
+            f"{v.t.largest_ratio:.2g}")
+
+
+def sums(rows: Sequence[Row]) -> dict[str, Verdict]:
+    """The verdict of each algorithm over all cases, in their order."""
+    out: dict[str, Verdict] = {}
+    for row in rows:
+        out[row.algorithm] = out.get(row.algorithm, Verdict()) + row.verdict
+    return out
+
+
+def wrong(verdict: Verdict) -> int:
+    return verdict.misses + verdict.false_hits + verdict.wrong_prim + verdict.self_hits
+
+
+def _summary(result: Result) -> Part:
+    head = ("algorithm", "rays", "misses", "false hits", "wrong prim", "self-hits", "t over bound", "wrong per million",
+            "t ulp 99.9 %", "Mray/s", "speed / default", "B/tri")
+    lines = []
+    for name, v in sums(result.rows).items():
+        speed = result.speeds[name]
+        lines.append((name, f"{v.rays}", f"{v.misses}", f"{v.false_hits}", f"{v.wrong_prim}", f"{v.self_hits}", f"{v.t.over}",
+                      f"{1e6 * wrong(v) / max(v.rays, 1):.3g}", f"{v.t.percentile(99.9):.3g}", shown(speed.mrays),
+                      shown(speed.ratio), f"{speed.bytes_per_triangle:.0f}"))
+    text = "Summed over all cases. Speed on one thread, case A's sphere of 159,200 triangles, runs by turns: median [quartiles]."
+    return Part("All cases", text, head, lines)
+
+
+def _groups(result: Result) -> Part:
+    """The default by the letters of the cases."""
+    default = next(iter(result.speeds))
+    lines = []
+    for letter in (*sorted({row.case[0] for row in result.rows}), "A to H"):
+        mine = [row for row in result.rows if row.algorithm == default and (
+            row.case[0] == letter or (letter == "A to H" and row.case[0] in "ABCDEFGH"))]
+        v = sum((row.verdict for row in mine), Verdict())
+        counts = (v.rays, sum(row.judged for row in mine), v.misses, v.false_hits, v.wrong_prim, v.self_hits, v.t.over)
+        lines.append((letter, *map(str, counts), f"{v.t.largest_ratio:.2g}"))
+    head = ("group", "rays", "judged", "misses", "false hits", "wrong prim", "self-hits", "t over bound", "t / bound")
+    return Part(f"The default ({default}) by group", "", head, lines)
+
+
+def parts(result: Result, plan: Plan) -> list[Part]:
+    """The whole report, in order."""
+    command = " ".join(["python -m wrt stability", *plan.cases, f"--rays {plan.rays}", f"--sample {plan.sample}",
+                        *(["--peers"] if plan.peers else []), *([f"--seed {plan.seed}"] if plan.seed else [])])
+    told = "\n\n".join([f"Machine: {machine(plan)}; {result.seconds:.0f} s in all.", f"To repeat: `{command}`",
+                        LEGEND.format(sample=plan.sample), *(f"{name}: not installed." for name in result.missing)])
+    return [Part("Stability of the intersection tests", told), _summary(result),
+            Part("Speed against rays lost or wrong", f"None is drawn at {NO_LOSS} rays: the more rays, the lower.", plot="lost"),
+            Part("Speed against error of t", "", plot="error"), _groups(result),
+            Part("Every case", "", COLUMNS, [cells(row) for row in result.rows])]
+
+
+def summary(result: Result) -> str:
+    """What the terminal gets when all is done."""
+    out = [table(part.head, part.lines) for part in (_summary(result), _groups(result))]
+    return "\n\n".join([*out, *(f"{name}: not installed" for name in result.missing)])
+
+
+def machine(plan: Plan) -> str:
+    """What it ran on."""
+    device = next((line for line in describe_devices() if line.startswith("cpu:")), "cpu")
+    return f"{device}, {thread_count(plan.threads)} used; wrt {wrt.__version__}"
+
+
+def plot(result: Result, which: str) -> LogLogPlot:
+    """A point an algorithm: time a ray against rays lost or wrong per million ("lost"), or the error of t ("error")."""
+    series = []
+    for name, v in sums(result.rows).items():
+        lost = 1e6 * max(wrong(v), NO_LOSS) / max(v.rays, 1)
+        series.append(Series(name, [(1e3 / result.speeds[name].mrays[1], lost if which == "lost" else v.t.percentile(99.9))]))
+    title = "Rays lost or wrong per million" if which == "lost" else "Error of t, 99.9th percentile, in float32 ulp"
+    return LogLogPlot(f"{title}, all hard cases", "ns a ray, one thread", title, series)
+
+
+def markdown(result: Result, plan: Plan, stem: str = "") -> str:
+    """All of it as Markdown; stem: plots are STEM-lost.png and STEM-error.png, left out where it is empty."""
+    out = []
+    for i, part in enumerate(parts(result, plan)):
+        if part.plot and not stem:
+            continue
+        out.append(f"{'#' if i == 0 else '##'} {part.title}")
+        out += [part.text] if part.text else []
+        out += [f"![{part.title}]({stem}-{part.plot}.png)"] if part.plot else []
+        out += [table(part.head, part.lines)] if part.lines else []
+    return "\n\n".join(out) + "\n"
+
+
+STYLE = """body{font:15px/1.5 sans-serif;max-width:1300px;margin:2em auto;padding:0 1em}
+table{border-collapse:collapse;font-size:13px}td,th{padding:2px 9px;border-bottom:1px solid #ddd;text-align:right}
+td:first-child,th:first-child{text-align:left}img{max-width:100%}"""
+
+
+def page(result: Result, plan: Plan) -> str:
+    """All of it as one HTML file, plots within."""
+    out = [f"<!DOCTYPE html><html lang=en><meta charset=utf-8><title>wrt stability</title><style>{STYLE}</style>"]
+    for i, part in enumerate(parts(result, plan)):
+        out.append(f"<h{1 + (i > 0)}>{html.escape(part.title)}</h{1 + (i > 0)}>")
+        out += [f"<p>{html.escape(paragraph)}</p>" for paragraph in part.text.split("\n\n") if paragraph]
+        if part.plot:
+            image = base64.b64encode(_png(plot(result, part.plot).draw())).decode()
+            out.append(f'<img alt="{html.escape(part.title)}" src="data:image/png;base64,{image}">')
+        if part.lines:
+            rows = ["".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in part.lines]
+            head = "".join(f"<th>{html.escape(cell)}</th>" for cell in part.head)
+            out.append(f"<table><tr>{head}</tr><tr>{'</tr><tr>'.join(rows)}</tr></table>")
+    return "\n".join(out) + "</html>\n"
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "png")
+    return stream.getvalue()
+
+
+def check_report(path: Path) -> None:
+    """Raise InputError where write_report could not write, before the work."""
+    if path.suffix.lower() not in (".md", ".html"):
+        raise InputError("the report is Markdown or HTML: use .md or .html", path)
+    if not path.parent.is_dir():
+        raise InputError("no such folder", path.parent)
+    for target in paths(path)[1:]:
+        check_writable(target)
+
+
+def paths(path: Path) -> list[Path]:
+    """The report and what stands beside it."""
+    beside = ("lost", "error") if path.suffix.lower() == ".md" else ()
+    return [path, *(path.with_name(f"{path.stem}-{which}.png") for which in beside)]
+
+
+def write_report(result: Result, plan: Plan, path: Path) -> list[Path]:
+    """The files; the report is written whole or not at all. Raises InputError where the system refuses."""
+    text = page(result, plan) if path.suffix.lower() == ".html" else markdown(result, plan, path.stem)
+    temporary = path.with_name(path.name + ".part")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"cannot be written: {error.strerror}", path) from error
+    for target in paths(path)[1:]:
+        write_codes(target, plot(result, target.stem.rsplit("-", 1)[1]).draw())
+    return paths(path)
