@@ -15,6 +15,7 @@ import numpy as np
 from wrt.errors import InputError
 
 T = TypeVar("T")
+LARGEST = 1e30  # of any number in a scene: what comes near the end of float32 turns into infinities on the device
 
 
 def as_integer(value: Any, what: str, low: int, high: int) -> int:

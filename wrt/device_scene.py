@@ -62,16 +62,14 @@ def world_mesh(scene: Scene) -> WorldMesh:
     first = 0
     for thing in scene.objects:
         v, f, n, t = _transformed(thing)
-        f, source = flip_collinear(v, f)  # far from 0, rounding puts corners on a line that were on none
         vertices.append(v)
         faces.append(f + np.int32(first))
         normals.append(n)
         uvs.append(t)
         table = np.array([index[id(m)] for m in thing.materials], np.int32)
-        material.append(np.full(len(f), table[0]) if thing.face_material is None else table[thing.face_material][source])
+        material.append(np.full(len(f), table[0]) if thing.face_material is None else table[thing.face_material])
         first += len(v)
-    spheres = np.array([(*s.center, s.radius) for s in scene.spheres], np.float32).reshape(-1, 4)
-    material.append(np.array([index[id(s.material)] for s in scene.spheres], np.int32))
+    of_spheres = np.array([index[id(s.material)] for s in scene.spheres], np.int32)
     if first > 2**31 - 1 or sum(len(f) for f in faces) > 2**31 - 2:
         raise InputError("the scene has more than 2^31 vertices or faces")
     smooth = any(thing.mesh.normals is not None for thing in scene.objects)
@@ -79,9 +77,13 @@ def world_mesh(scene: Scene) -> WorldMesh:
     def join(parts: list[np.ndarray], width: int, dtype: Any) -> np.ndarray:
         return np.concatenate(parts) if parts else np.zeros((0, width), dtype)
 
-    geometry = Geometry(join(vertices, 3, np.float32), join(faces, 3, np.int32), spheres)
-    return WorldMesh(geometry, join(normals, 3, np.float32) if smooth else None, join(uvs, 2, np.float32),
-                     np.concatenate(material).astype(np.int32))
+    # Far from 0, rounding puts corners on a line that were on none. All at once: a call for each of many boxes takes long.
+    corners = join(vertices, 3, np.float32)
+    triangles, source = flip_collinear(corners, join(faces, 3, np.int32))
+    of_triangles = np.concatenate([np.zeros(0, np.int32), *material])[source]
+    spheres = np.array([(*s.center, s.radius) for s in scene.spheres], np.float32).reshape(-1, 4)
+    return WorldMesh(Geometry(corners, triangles, spheres), join(normals, 3, np.float32) if smooth else None,
+                     join(uvs, 2, np.float32), np.concatenate([of_triangles, of_spheres]).astype(np.int32))
 
 
 def _transformed(thing: Object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -92,10 +94,7 @@ def _transformed(thing: Object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     if np.array_equal(matrix, np.eye(4)):
         return mesh.vertices, faces, normals, uvs
     linear = matrix[:3, :3]
-    with np.errstate(over="ignore"):  # caught below, with the object's name
-        vertices = (mesh.vertices.astype(np.float64) @ linear.T + matrix[:3, 3]).astype(np.float32)
-    if not np.isfinite(vertices).all():
-        raise InputError(f"object {thing.name!r}: its transform moves vertices beyond float32")
+    vertices = (mesh.vertices.astype(np.float64) @ linear.T + matrix[:3, 3]).astype(np.float32)
     # Normals go by the cofactors: the inverse transpose times the determinant, which exists for flat objects too. Its sign
     # turns them inwards where the object is mirrored, and so it is taken out; the faces are turned round instead.
     mirrored = np.linalg.det(linear) < 0.0

@@ -24,13 +24,12 @@ from wrt.gltf_materials import Materials
 from wrt.gltf_schema import Instancing, PunctualLightOfNode, PunctualLights, SpotCone, at, exactly
 from wrt.mesh import Mesh
 from wrt.mesh_clean import clean
-from wrt.scene import Camera, DirectionalLight, Light, Object, PointLight, Scene, SpotLight, as_transform
+from wrt.scene import MAX_REACH, Camera, DirectionalLight, Light, Object, PointLight, Scene, SpotLight, as_transform
 from wrt.staging import stage
 
 # Attributes that are read, or named by who wants them (skins, textures), or are the application's own (underscore).
-# Tangents follow from the texture coordinates.
+# TANGENT is named where a normal map would use it: tangents are made from the texture coordinates.
 _NAMED_ELSEWHERE = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_", "JOINTS_", "WEIGHTS_", "_")
-MAX_REACH = 1e18
 # What a node's instances may set, and what holds where they do not.
 _INSTANCE_ATTRIBUTES: dict[str, tuple[str, tuple[float, ...]]] = {
     "TRANSLATION": ("VEC3", (0.0, 0.0, 0.0)),
@@ -341,6 +340,8 @@ class _Reader:
             mesh = self._meshes.mesh(primitive, mesh_name, where)
             if mesh is not None:
                 material = self._materials.material(primitive.material, f"{where}.material")
+                if "TANGENT" in primitive.attributes and material.normal_texture is not None:
+                    left_out.add("TANGENT, in place of which tangents are made from TEXCOORD_0", "mesh", mesh_name)
                 with at(place):
                     _require_reach(mesh, transforms)
                     self.objects += [Object(mesh, (material,), transform, name=name) for transform in transforms]

@@ -126,7 +126,7 @@ def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapp
     spec.channelformats = tuple(oiio.TypeDesc(name) for name in types)
     spec.attribute("compression", "zip")
     for key, value in (metadata or {}).items():
-        spec.attribute(METADATA_PREFIX + key, str(value))
+        spec.attribute(METADATA_PREFIX + key, _utf8(value).decode())
     for name, array in channels.items():
         if array.dtype.kind in "iu" and array.size and int(array.max()) > EXACT_IN_FLOAT:
             warnings.warn(f"{os.fspath(path)}: {name} goes up to {array.max()} and is rounded: its channel is exact to"
@@ -177,7 +177,7 @@ def _write_hdr(path: PathLike, pixels: np.ndarray, bits: int, exposure: float, t
     held = np.clip(np.nan_to_num(pixels, nan=0.0, posinf=1e38, neginf=0.0), 0.0, 1e38)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "float")
     header = "".join(f"# {METADATA_PREFIX}{key}={' '.join(str(value).split())}\n" for key, value in metadata.items())
-    _write_oiio(path, spec, lambda y0, y1: held[y0:y1], header.encode())
+    _write_oiio(path, spec, lambda y0, y1: held[y0:y1], _utf8(header))
 
 
 WRITERS = {".png": _write_png, ".exr": _write_exr, ".hdr": _write_hdr}
@@ -193,6 +193,11 @@ def as_half(path: PathLike, pixels: np.ndarray) -> np.ndarray:
     beyond = np.isfinite(pixels) & (np.abs(pixels) > HALF_MAX)
     _warn_replaced(path, beyond, f"beyond {HALF_MAX:g}, the largest half, and clipped to it")
     return np.where(beyond, np.copysign(np.float32(HALF_MAX), pixels), pixels).astype(np.float16)
+
+
+def _utf8(value: Any) -> bytes:
+    """As text; lone surrogates (of file names that are no UTF-8) become "?"."""
+    return str(value).encode("utf-8", "replace")
 
 
 def _warn_replaced(path: PathLike, where: np.ndarray, what: str) -> None:
@@ -226,7 +231,7 @@ def encode_png(codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> 
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     header = struct.pack(">IIBBBBB", width, height, 8 * codes.dtype.itemsize, 2, 0, 0, 0)
-    texts = [chunk(b"iTXt", (METADATA_PREFIX + key).encode("latin-1", "replace")[:79] + bytes(5) + str(value).encode())
+    texts = [chunk(b"iTXt", (METADATA_PREFIX + key).encode("latin-1", "replace")[:79] + bytes(5) + _utf8(value))
              for key, value in (metadata or {}).items()]
     return b"".join([b"\x89PNG\r\n\x1a\n", chunk(b"IHDR", header), chunk(b"sRGB", b"\0"), *texts,
                      chunk(b"IDAT", zlib.compress(filtered.tobytes(), 6)), chunk(b"IEND", b"")])

@@ -7,11 +7,12 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from wrt.arguments import as_array, as_path
+from wrt.arguments import LARGEST, as_array, as_path
 from wrt.errors import InputError, SceneWarning
 from wrt.mesh_clean import clean
 
@@ -23,8 +24,8 @@ class Mesh:
     vertices: (V, 3) float32, finite; faces: (F, 3) int32, counter-clockwise seen from outside; normals: (V, 3)
     float32 or None (flat shading), unit length where not zero (zero: flat there); uvs: (V, 2) float32 or None, (0, 0)
     the top left of a picture; groups: names of parts, and face_group: (F,) int32 index into them, or None. dropped:
-    how many faces were left out on loading because their area is exactly zero. Raises InputError that names the mesh,
-    the array and the first place that is wrong.
+    how many faces were left out on loading because their area is exactly zero. Coordinates end at 1e30 (and at 1e18 in an
+    Object's world). Raises InputError that names the mesh, the array and the first place that is wrong.
     """
 
     vertices: np.ndarray
@@ -40,6 +41,10 @@ class Mesh:
         vertices = self._array("vertices", np.float32, 3)
         faces = self._array("faces", np.int32, 3)
         _require_finite(vertices, self.name, "vertices")
+        if self.reach > np.float32(LARGEST):
+            row = int(np.argmax(np.abs(vertices).max(axis=1)))
+            raise InputError(f"vertex {row} is {vertices[row].tolist()}; at most {LARGEST:g} can be traced", self.name or None,
+                             "vertices")
         outside = (faces < 0) | (faces >= len(vertices))
         if outside.any():
             face = int(np.nonzero(outside.any(axis=1))[0][0])
@@ -71,6 +76,11 @@ class Mesh:
         object.__setattr__(self, attribute, array)
         return array
 
+
+    @cached_property
+    def reach(self) -> float:
+        """The largest coordinate of any vertex, without its sign."""
+        return float(np.abs(self.vertices).max(initial=0.0))
 
     def __repr__(self) -> str:
         parts = [repr(self.name)] if self.name else []

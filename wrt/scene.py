@@ -15,14 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from wrt.arguments import as_array, as_integer, as_one, as_size, as_tuple, unknown
+from wrt.arguments import LARGEST, as_array, as_integer, as_one, as_size, as_tuple, unknown
 from wrt.errors import InputError
 from wrt.mesh import Mesh
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
-LARGEST = 1e30  # of any number in a scene: what comes near the end of float32 turns into infinities on the device
+SMALLEST = 1e-30  # of a length that must not be 0
+MAX_REACH = 1e18  # of a shape from the origin, in scene units: the square of a distance must be a float32
 
 
 def as_vector(value: Any, what: str, *, low: float = -math.inf, high: float = math.inf) -> Color:
@@ -58,7 +59,7 @@ def as_transform(value: Any, what: str) -> np.ndarray:
     matrix = as_array(value, np.float64, what)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"{what} must be a finite 4x4 matrix, got shape {matrix.shape}")
-    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0)):
+    if max(map(abs, (matrix[3] - (0.0, 0.0, 0.0, 1.0)).tolist())) > 1e-6:
         raise InputError(f"{what} must be affine (last row 0 0 0 1), got {matrix[3].tolist()}")
     return matrix
 
@@ -241,6 +242,10 @@ class Object:
         if not self.materials:
             raise InputError(at + "needs a material")
         object.__setattr__(self, "transform", as_transform(self.transform, at + "transform"))
+        with np.errstate(over="ignore"):
+            reach = (np.abs(self.transform[:3, :3]).sum(axis=1) * self.mesh.reach + np.abs(self.transform[:3, 3])).max()
+        if not reach <= MAX_REACH:
+            raise InputError(at + f"reaches {reach:.3g} units from the origin; at most {MAX_REACH:g} can be rendered")
         if self.face_material is not None:
             index = as_array(self.face_material, np.int32, at + "face_material")
             if index.shape != (len(self.mesh.faces),):
@@ -262,8 +267,8 @@ class Sphere:
     def __post_init__(self) -> None:
         at = f"sphere {self.name!r}: "
         as_one(self.material, Material, at + "material")
-        object.__setattr__(self, "center", as_vector(self.center, at + "center"))
-        object.__setattr__(self, "radius", as_number(self.radius, at + "radius", low=1e-30, high=1e18))
+        object.__setattr__(self, "center", as_vector(self.center, at + "center", low=-MAX_REACH, high=MAX_REACH))
+        object.__setattr__(self, "radius", as_number(self.radius, at + "radius", low=SMALLEST, high=MAX_REACH))
 
 
 # --- lights -----------------------------------------------------------------------------------------------------------
@@ -415,7 +420,7 @@ class Camera:
         object.__setattr__(self, "camera_to_world", matrix)
         object.__setattr__(self, "fov_y", as_number(self.fov_y, at + "fov_y", low=1e-5, high=math.pi - 1e-3))
         object.__setattr__(self, "aperture_radius", as_number(self.aperture_radius, at + "aperture_radius", low=0.0))
-        object.__setattr__(self, "focus_distance", as_number(self.focus_distance, at + "focus_distance", low=1e-12))
+        object.__setattr__(self, "focus_distance", as_number(self.focus_distance, at + "focus_distance", low=SMALLEST))
         object.__setattr__(self, "blade_rotation", as_number(self.blade_rotation, at + "blade_rotation"))
         as_integer(self.blades, at + "blades", 0, 64)
         if self.blades in (1, 2):
@@ -445,9 +450,9 @@ class Camera:
         The sensor stands where the lens makes `focus_distance` sharp, s' = f s / (s - f), so that focusing near narrows
         the view a little, as in a real camera. f_number N gives the radius f / (2 N).
         """
-        f = as_number(focal_length, "focal_length", low=1e-12)
-        s = as_number(focus_distance, "focus_distance", low=1e-12)
-        h = as_number(sensor_height, "sensor_height", low=1e-12)
+        f = as_number(focal_length, "focal_length", low=SMALLEST)
+        s = as_number(focus_distance, "focus_distance", low=SMALLEST)
+        h = as_number(sensor_height, "sensor_height", low=SMALLEST)
         if s <= f:
             raise InputError(f"focus_distance ({s:g}) must be longer than focal_length ({f:g})")
         if (f_number is None) == (aperture_radius is None):

@@ -18,6 +18,7 @@ from wrt.mesh import Mesh, load_mesh
 from wrt.scene import (
     BLACK,
     CONDUCTORS,
+    SMALLEST,
     Background,
     Camera,
     Checkerboard,
@@ -286,7 +287,7 @@ def make_camera(table: tables.CameraTable, name: str) -> Camera:
     """A camera from where it stands and looks, or from its matrix; from its angle of view, or from a real lens."""
     focus = table.focus_distance
     if focus is None and table.position is not None and table.target is not None:
-        focus = max(math.dist(table.position, table.target), 1e-12)
+        focus = max(math.dist(table.position, table.target), SMALLEST)
     fields: dict[str, Any] = {"blades": table.blades, "blade_rotation": math.radians(table.blade_rotation), "name": name}
     if table.focal_length is not None and table.sensor_height is not None:
         fields |= Camera.lens(table.focal_length, focus or 1.0, table.sensor_height, f_number=table.f_number,

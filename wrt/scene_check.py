@@ -14,6 +14,7 @@ from wrt.errors import InputError
 if TYPE_CHECKING:
     from wrt.scene_schema import SceneTable
 
+MOST = 20  # problems that are told of one file
 # What was expected, by pydantic's type of error; {} is filled from the error's context.
 _EXPECTED = {
     "float_type": "a number", "int_type": "a whole number", "string_type": "text", "bool_type": "true or false",
@@ -43,12 +44,15 @@ def check(data: dict[str, Any], path: Path) -> SceneTable:
 
 
 def raise_all(problems: Sequence[str], path: Path) -> None:
-    """Raise one InputError with all problems, each a line; nothing where there are none."""
+    """Raise one InputError with all problems, each a line, but no more than MOST; nothing where there are none."""
     problems = list(dict.fromkeys(problems))
+    count = len(problems)
+    if count > MOST:
+        problems = [*problems[:MOST], f"and {count - MOST} more"]
     if len(problems) == 1:
         raise InputError(problems[0], path)
     if problems:
-        raise InputError("\n  ".join([f"{len(problems)} errors", *problems]), path)
+        raise InputError("\n  ".join([f"{count} errors", *problems]), path)
 
 
 def unknown_materials(data: dict[str, Any], known: Iterable[str]) -> list[str]:

@@ -102,6 +102,8 @@ def _parse(path: Path) -> dict[str, Any]:
         if at := re.fullmatch(r"(.*) \(at (line \d+, column \d+|end of document)\)", message, re.DOTALL):
             message, place = at.groups()
         raise InputError(message, path, place) from error
+    except ValueError as error:  # Python's int refuses thousands of digits
+        raise InputError("holds a number of thousands of digits", path) from error
 
 
 def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = ()) -> Scene:

@@ -38,16 +38,25 @@ def box(low: Point = (-0.5, -0.5, -0.5), high: Point = (0.5, 0.5, 0.5)) -> Mesh:
     bottom, top = np.array(as_vector(low, "box low")), np.array(as_vector(high, "box high"))
     if not (top > bottom).all():
         raise InputError(f"box: high {top.tolist()} must be above low {bottom.tolist()} in every axis")
-    sides = []
+    return Mesh(np.where(_BOX_TOP, top, bottom), _BOX_FACES, uvs=_BOX_UVS, name="box")
+
+
+def _box_corners() -> np.ndarray:
+    """(24, 3) bool: which corners of a box are at `high` in which axis; four for each side, in the order of a quad's."""
+    corners = np.zeros((3, 2, 4, 3), dtype=bool)  # axis of the side, low and high, corner, axis
+    along_u, along_v = np.array([False, True, True, False]), np.array([False, False, True, True])
     for axis in range(3):
-        for side, start in ((-1.0, bottom), (1.0, top)):
-            u, v = np.zeros(3), np.zeros(3)
-            u[(axis + 1) % 3] = side * (top - bottom)[(axis + 1) % 3]
-            v[(axis + 2) % 3] = (top - bottom)[(axis + 2) % 3]
-            corner = np.array(bottom)
-            corner[axis] = start[axis]
-            sides.append(quad(corner if side > 0.0 else corner - u, u, v))
-    return merged(sides, "box")
+        corners[axis, 1, :, axis] = True
+        corners[axis, 0, :, (axis + 1) % 3] = ~along_u  # u runs back there, so that the side faces out
+        corners[axis, 1, :, (axis + 1) % 3] = along_u
+        corners[axis, :, :, (axis + 2) % 3] = along_v
+    return corners.reshape(24, 3)
+
+
+_BOX_TOP = _box_corners()
+_BOX_FACES = (np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]).reshape(12, 3).astype(np.int32)
+_BOX_UVS = np.tile(np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32), (6, 1))
+_BOX_FACES.flags.writeable = _BOX_UVS.flags.writeable = False  # all boxes share them
 
 
 def icosphere(subdivisions: int = 3, radius: float = 1.0) -> Mesh:

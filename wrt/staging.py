@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wrt.scene import BLACK, Camera, ConstantBackground, DirectionalLight, GradientBackground, Scene
+from wrt.scene import BLACK, SMALLEST, Camera, ConstantBackground, DirectionalLight, GradientBackground, Scene
 
 FOV_Y = math.radians(40.0)
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # from the scene to the camera: glTF's front is +z, its up +y
@@ -42,7 +42,7 @@ def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
     """
     center, radius = bounding_sphere(scene)
     half_angle = math.atan(math.tan(0.5 * FOV_Y) * min(aspect, 1.0))
-    radius = max(radius, 1e-9 * float(np.abs(center).max()), 1e-18)  # a single point has none
+    radius = max(radius, 1e-9 * float(np.abs(center).max()), SMALLEST)  # a single point has none
     distance = _MARGIN * radius / math.sin(half_angle)
     position = center + distance * _THREE_QUARTER / np.linalg.norm(_THREE_QUARTER)
     return Camera.look_at(position, center, fov_y=FOV_Y, focus_distance=distance, name="framing")

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from wrt.arguments import shown
-from wrt.errors import InputError
+from wrt.driver import render
+from wrt.errors import InputError, SceneWarning
+from wrt.film import Film
 from wrt.mesh import Mesh, load_mesh
+from wrt.queries import build
 from wrt.scene import (
     Camera,
     EnvironmentBackground,
@@ -23,7 +26,7 @@ from wrt.scene import (
     Texture,
 )
 from wrt.scene_file import load_scene
-from wrt.shapes import box
+from wrt.shapes import box, icosphere, quad
 
 GREY = Material(name="grey")
 
@@ -55,6 +58,52 @@ GREY = Material(name="grey")
 def test_the_wrong_type_is_told_by_name(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         make()
+
+
+@pytest.mark.parametrize("matrix", [np.diag([1e39, 1, 1, 1]), np.diag([1, 1, 1e19, 1]),
+                                    [[1, 0, 0, -2e18], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]], ids=["wide", "deep", "far"])
+def test_objects_out_of_reach_are_refused(matrix: Any) -> None:
+    with pytest.raises(InputError, match=r"object 'planet': reaches .* units from the origin; at most 1e\+18"):
+        Object(box(), GREY, matrix, name="planet")
+
+
+def test_what_is_within_reach_is_hit_and_lit() -> None:
+    def picture(size: float) -> Film:
+        lamp = Object(quad((-2, 3, -2), (4, 0, 0), (0, 0, 4)), Material(albedo=0, emission=3.0), np.diag([size] * 3 + [1.0]))
+        camera = Camera.look_at((2 * size, 2 * size, 4 * size), (0, 0, 0))
+        scene = Scene((Object(box(), GREY, lamp.transform), lamp), cameras=(camera,))
+        return render(scene, size=(16, 9), spp=4, aov="depth")
+
+    unit, large = picture(1.0), picture(2.0**57)  # 1.4e17: the lamp reaches 4.3e17
+    assert np.isfinite(unit.aov["depth"]).any() and unit.pixels.max() > 0.0
+    assert np.allclose(large.aov["depth"] / 2.0**57, unit.aov["depth"], rtol=1e-6)
+    assert np.allclose(large.pixels, unit.pixels, rtol=1e-3, atol=1e-5)
+
+
+def test_meshes_end_at_1e30() -> None:
+    vertices = np.float32([[0, 0, 0], [1e29, 0, 0], [0, 1e30, 0]])
+    hits = build(Mesh(vertices, [[0, 1, 2]])).closest_hit([[1e28, 1e29, 1e29]], [[0, 0, -1]])
+    assert hits.prim_id.tolist() == [0] and hits.t.tolist() == [np.float32(1e29)]
+    with pytest.raises(InputError, match=r"vertices: vertex 2 is .*; at most 1e\+30 can be traced"):
+        Mesh(vertices * 3, [[0, 1, 2]])
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e-14, 1e-17])
+def test_tiny_meshes_are_framed_and_hit(size: float) -> None:
+    def first_hits(scale: float) -> np.ndarray:
+        mesh = icosphere(1, scale)
+        with pytest.warns(SceneWarning, match="no camera"):
+            return render(mesh, size=(16, 9), spp=1, aov=("prim_id",)).aov["prim_id"]
+
+    # Rays through edges may go to either side as the vertices round.
+    assert (first_hits(1.0) >= 0).sum() > 20 and (first_hits(1.0) != first_hits(size)).sum() <= 2
+
+
+def test_lenses_may_be_tiny() -> None:
+    assert Camera(focus_distance=1e-30).focus_distance == 1e-30
+    tiny, unit = (Camera.lens(0.5 * scale, 2 * scale, scale, f_number=2) for scale in (1e-20, 1.0))
+    assert tiny["fov_y"] == pytest.approx(unit["fov_y"])
+    assert tiny["aperture_radius"] == pytest.approx(1e-20 * unit["aperture_radius"])
 
 
 def test_one_thing_stands_for_a_tuple_of_it() -> None:

@@ -278,10 +278,11 @@ def test_a_wrong_scene(command: str, scene: str, message: str) -> None:
 
 
 def test_what_is_found_late_names_the_scene_and_leaves_the_old_picture() -> None:
-    far = "transform = {translate = [3e38, 0, 0], scale = 3e38}"
-    Path("bad.toml").write_text(TWO_CAMERAS.replace('"grey"\n', f'"grey"\n{far}\n', 1))
+    holes = '[materials.holes]\nalpha_mode = "mask"\nalbedo_texture = {checkerboard = {}}\n'
+    sphere = '[[spheres]]\ncenter = [0, 0, 0]\nradius = 1\nmaterial = "holes"\nname = "sieve"\n'
+    Path("bad.toml").write_text(TWO_CAMERAS + holes + sphere)
     Path("bad.png").write_bytes(b"old")
-    refused(run("render", "bad.toml", *SMALL), "bad.toml: object 'boxes[0]': its transform moves vertices beyond float32")
+    refused(run("render", "bad.toml", *SMALL), "bad.toml: sphere 'sieve': a cut-out texture needs a mesh")
     assert new_files() == {"bad.png"} and Path("bad.png").read_bytes() == b"old"
 
 

@@ -96,12 +96,6 @@ def test_a_flattened_object_has_finite_normals() -> None:
     assert ((length < 1e-6) | (np.abs(length - 1.0) < 1e-5)).all()
 
 
-def test_a_transform_beyond_float32_is_refused() -> None:
-    big = transform(np.diag([1e39, 1.0, 1.0]).tolist())
-    with pytest.raises(InputError, match=r"object 'planet'.*beyond float32"):
-        world_mesh(Scene(objects=(Object(box(), (GREY,), big, name="planet"),)))
-
-
 def test_objects_are_joined_with_their_materials() -> None:
     red, blue, green = (Material(name=name) for name in ("red", "blue", "green"))
     which = np.array([0, 1] * 6, np.int32)

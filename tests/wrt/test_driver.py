@@ -21,7 +21,18 @@ from wrt.driver import MAX_PASS, Options, Progress, Renderer, plain_text, render
 from wrt.errors import InputError, SceneWarning
 from wrt.film import Film
 from wrt.mesh import load_mesh
-from wrt.scene import Camera, DirectionalLight, EnvironmentBackground, GradientBackground, Material, Object, Scene, Settings
+from wrt.scene import (
+    Camera,
+    Checkerboard,
+    DirectionalLight,
+    EnvironmentBackground,
+    GradientBackground,
+    Material,
+    Object,
+    Scene,
+    Settings,
+    Sphere,
+)
 from wrt.scene_file import load_scene
 from wrt.shapes import box, quad
 
@@ -332,11 +343,10 @@ def test_ctrl_c_while_compiling_does_not_wait_for_the_compiler(monkeypatch: pyte
 def test_an_error_of_the_scene_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     may_end, ended = threading.Event(), threading.Event()
     monkeypatch.setattr(driver, "load_kernel", lambda kernel, device: (may_end.wait(10.0), ended.set()))
-    far = np.eye(4)
-    far[0, 3] = 1e39
-    scene = replace(SCENE, objects=(Object(box(), (Material(),), far, name="far"),))
+    holes = Material(alpha_mode="mask", albedo_texture=Checkerboard())
+    scene = replace(SCENE, spheres=(Sphere((0, 0, 0), 1.0, holes, name="sieve"),))
     try:
-        with pytest.raises(InputError, match=r"'far'.*beyond float32"):
+        with pytest.raises(InputError, match=r"'sieve'.*needs a mesh"):
             render(scene)
         assert not ended.is_set()
     finally:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.gltf_files import GltfFile, encode, one_material, one_triangle
+from tests.gltf_files import GltfFile, encode, load_warned, one_material, one_triangle
 from wrt.errors import InputError, SceneWarning
 from wrt.gltf import load_gltf
 from wrt.gltf_materials import MAX_SIDE, decode_image
@@ -351,3 +351,16 @@ def test_an_image_in_a_data_uri(tmp_path):
     file.add("textures", {"source": 0})
     file.add("images", {"uri": "data:image/png;base64," + base64.b64encode(encode(pixels)).decode()})
     assert np.array_equal(load(file, tmp_path).materials[0].albedo_texture.image, pixels)
+
+
+@pytest.mark.parametrize("mapped", [True, False])
+def test_tangents_are_named_where_a_normal_map_would_use_them(tmp_path, mapped):
+    file = one_material({"name": "bumpy"})
+    texture = {"index": file.add("textures", {"source": file.image(np.zeros((1, 1, 3), np.uint8))})}
+    if mapped:
+        file.json["materials"][0]["normalTexture"] = texture
+    primitive = file.json["meshes"][0]["primitives"][0]
+    primitive["attributes"]["TANGENT"] = file.accessor([[1, 0, 0, 1]] * 4)
+    file.json["meshes"][0]["primitives"].append(dict(primitive))
+    _, told = load_warned(file.write(tmp_path))
+    assert sum(text.count("TANGENT") for text in told) == int(mapped)

@@ -408,3 +408,10 @@ def test_unknown_suffixes_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("hello")
     with pytest.raises(InputError, match=r"a\.txt: not an image format that wrt reads \(\.exr, \.hdr, \.png"):
         read_image(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("suffix", ["png", "exr", "hdr"])
+def test_metadata_may_hold_what_cannot_be_encoded(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a.{suffix}"
+    write_image(path, np.ones((2, 2, 3)), metadata={"scene": "a\udcffö"})
+    assert read_metadata(path)["scene"] == "a?ö"

@@ -221,6 +221,17 @@ def test_transforms(tmp_path: Path, transform: str, point: list[float], image: l
     np.testing.assert_allclose(scene.objects[0].transform @ [*point, 1], [*image, 1], atol=1e-12)
 
 
+def test_numbers_of_thousands_of_digits(tmp_path: Path) -> None:
+    assert errors(tmp_path, f"ambient = {'9' * 5000}\n") == ["holds a number of thousands of digits"]
+
+
+def test_no_more_than_twenty_mistakes_are_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        load(tmp_path, CAMERA + "[[spheres]]\n" * 10 + "".join(f"wrong_{i} = 1\n" for i in range(5)))
+    head, *lines = str(caught.value).split("\n  ")
+    assert head.endswith("35 errors") and len(lines) == 21 and lines[-1] == "and 15 more"
+
+
 def test_environment(tmp_path: Path) -> None:
     from wrt.image import write_image
 

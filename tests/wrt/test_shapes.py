@@ -26,6 +26,22 @@ CLOSED = {  # name: mesh, its exact volume, and how much less a mesh of flat tri
 }
 
 
+def test_a_box_is_six_quads_that_face_out() -> None:
+    low, high = np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 6.0])
+    mesh = shapes.box(low, high)
+    sides = mesh.vertices.reshape(6, 4, 3)
+    for axis in range(3):
+        for far in (0, 1):
+            side = sides[2 * axis + far]
+            assert (side[:, axis] == (low, high)[far][axis]).all()
+            normal = np.cross(side[1] - side[0], side[3] - side[0])
+            expected = np.zeros(3)
+            expected[axis] = (2 * far - 1) * 6.0 / (high - low)[axis]
+            assert normal.tolist() == expected.tolist()
+            assert np.array_equal(side[2] - side[1], side[3] - side[0])
+    assert np.array_equal(mesh.uvs.reshape(6, 4, 2), np.broadcast_to([[0, 1], [1, 1], [1, 0], [0, 0]], (6, 4, 2)))
+
+
 def corners(mesh: Mesh) -> np.ndarray:
     return mesh.vertices.astype(np.float64)[mesh.faces]
 
