@@ -109,7 +109,7 @@ def bin_of(center: wp.vec3, axis: int, origin: wp.vec3, scale: wp.vec3) -> int:
 def levels(n: int) -> int:
     """ceil(log2(n)): the depth of a balanced tree over n primitives."""
     result = int(0)
-    while (1 << result) < n:
+    while result < 31 and (1 << result) < n:  # 1 << 31 is negative
         result = result + 1
     return result
 

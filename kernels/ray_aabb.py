@@ -100,7 +100,10 @@ def slab_interval(ray: BoxRay, lo: wp.vec3, hi: wp.vec3) -> wp.vec2:
 def ray_aabb(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, t_max: float) -> float:
     """Distance at which the segment [t_min, t_max] enters the box, or inf where it misses.
 
-    An origin inside is a hit (entry t_min). Conservative: no ray that meets the box in exact arithmetic is missed.
+    An origin inside is a hit (entry t_min), an empty box never. Conservative: no ray that meets the box in exact arithmetic is
+    missed, within this domain: the direction's longest component is between 2^-64 and 2^64 (kernels.query brings others
+    there), distances to the box are below 2^126, and coordinates differ by less than 2^127. A component of the direction
+    below 2^-128 counts as 0, whose plane is reached at infinity. A ray with NaN may be let in: no_hit keeps such rays out.
     """
     interval = slab_interval(ray, lo, hi)
     enter = wp.where(interval[0] > ray.t_min, interval[0], ray.t_min)

@@ -55,7 +55,11 @@ def as_number(value: Any, what: str, *, low: float = -math.inf, high: float = ma
 
 
 def as_transform(value: Any, what: str) -> np.ndarray:
-    """A (4, 4) float64 affine matrix that acts on column vectors. Raises InputError where it is singular or not finite."""
+    """A (4, 4) float64 affine matrix that acts on column vectors.
+
+    Raises InputError where it is not finite, not (4, 4) or not affine. A singular one is taken: it flattens what it moves,
+    and glTF files hide nodes by a scale of 0. Who cannot do with one asks himself (`Camera`, TOML scenes).
+    """
     matrix = as_array(value, np.float64, what)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"{what} must be a finite 4x4 matrix, got shape {matrix.shape}")

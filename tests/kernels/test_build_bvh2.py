@@ -6,12 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tests.kernel_tools import rounded  # isort: skip (starts Warp)
+from tests.kernel_tools import ints, launch, rounded, zeros  # isort: skip (starts Warp)
+import warp as wp
 
 from wrt.accel import build
 from wrt.accel.base import Geometry
 from wrt.accel.bvh_build import BVH_BUILDERS, BvhOptions, build_binary, sah_cost
 from wrt.errors import InputError
+from wrt.kernels.build_bvh2 import levels
+from wrt.kernels.structs import kernel
 from wrt.kernels.traverse_bvh2 import STACK_SIZE
 from wrt.shapes import icosphere, torus
 
@@ -223,3 +226,27 @@ def test_the_deepest_tree_still_finds_everything():
     expected = build(geometry, "brute_force").closest_hit(origin, direction)
     assert np.array_equal(found.prim_id, expected.prim_id) and np.array_equal(found.t, expected.t)
     assert (found.prim_id >= 0).all()
+
+
+@kernel
+def levels_kernel(n: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    out[i] = levels(n[i])
+
+
+def test_levels_end_for_every_number():
+    n = np.array([1, 2, 3, 4, 5, 2**20, 2**30 - 1, 2**30, 2**30 + 1, 2**31 - 1])
+    out = zeros(len(n), wp.int32)
+    launch(levels_kernel, len(n), ints(n), out)
+    assert out.numpy().tolist() == [0, 1, 2, 2, 3, 20, 30, 30, 31, 31]
+
+
+@pytest.mark.parametrize("builder", BVH_BUILDERS)
+@pytest.mark.parametrize("power", [-80, 66])
+def test_a_tree_does_not_depend_on_the_scale(builder, power):
+    # 2^-80 is about 1e-24, 2^66 about 1e20: areas are beyond float32, and the padding scales too.
+    mesh = torus(segments=24, tube_segments=12)
+    lo, hi = (corner.astype(np.float64) for corner in Geometry.of(mesh).bounds())
+    reference, scaled = (make(lo * scale, hi * scale, builder) for scale in (1.0, 2.0**power))
+    assert np.array_equal(reference.order, scaled.order) and len(reference.nodes) == len(scaled.nodes)
+    assert sah_cost(scaled.nodes) == pytest.approx(sah_cost(reference.nodes), rel=1e-6)

@@ -218,7 +218,9 @@ class Accelerator(ABC):
                     threads: int | None = None, *, counters: bool = False, trace: bool = False) -> Hits:
         """The closest hit of each ray in the closed segment [t_min, t_max]; at equal t the lowest prim_id.
 
-        origins, directions: (N, 3) float32, finite, directions not zero and of any length; t_min (>= 0), t_max: scalars or
+        Closed means that a surface through the origin is hit at t_min = 0; a t_min above 0 leaves it out. origins,
+        directions: (N, 3) float32, finite, directions not zero and of any length (where t would be beyond float32, the hit
+        is a miss); coordinates up to 1e37, so that differences are finite; t_min (>= 0), t_max: scalars or
         (N,). counters: count what each ray costs (hits.counters); trace: also record what it fetches, which takes a second
         run. Raises InputError that names the argument, its shape and what was expected.
         """
