@@ -132,6 +132,51 @@ def units(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> No
 
 
 @bench.command()
+@click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--structures", type=Names(), default=(), help="Which, by name  [default: all but brute_force]")
+@click.option("--kinds", type=Names(), default=("primary", "shadow", "diffuse", "random"), help="Of rays  [default: all]")
+@click.option("--rays", type=int, default=100_000, show_default=True, help="Rays of each kind")
+@click.option("--runs", type=int, default=5, show_default=True, help="Runs of each structure, alternating")
+@click.option("--builds", type=int, default=1, show_default=True, help="Builds of each structure")
+@click.option("--max-triangles", type=int, default=1_000_000, show_default=True, help="Without meshes, the terrain grows to this")
+@click.option("--threads", type=int, default=1, show_default=True, help="Threads to search with (builds use all cores)")
+@click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for a report with plots")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def accel(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+    """Structure against structure: time to build, memory, steps and time to search, and answers that differ (none may).
+
+    MESHES: .obj, .ply or .stl files; without any, a terrain that grows from a thousand triangles on.
+    """
+    from dataclasses import asdict
+
+    from wrt.bench import accel as bench_accel
+    from wrt.bench import accel_report as report
+
+    plan = bench_accel.Plan(meshes, **options)
+    if output is not None:
+        report.check_folder(output)
+    told = report.machine(plan)
+
+    def progress(row: Any) -> None:
+        if not quiet:
+            say(f"{row.mesh}: {'  '.join(report.cells(row, row)) if isinstance(row, bench_accel.Row) else row.reason}")
+
+    with warnings_told(quiet):
+        rows = bench_accel.run(plan, progress)
+    paths = [] if output is None else report.write_report(rows, plan, output, told)
+    if as_json:
+        say_json({"machine": told, "rows": [row.as_dict() for row in rows if isinstance(row, bench_accel.Row)],
+                  "refused": [asdict(row) for row in rows if isinstance(row, bench_accel.Refused)],
+                  "growth": bench_accel.growth(rows), "output": paths})
+        return
+    click.echo(f"{told}\n\n{report.markdown(rows)}\n{report.LEGEND}")
+    for path in paths:
+        click.echo(path)
+
+
+@bench.command()
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--knobs", type=Names(), default=(),
               help="Which to turn: sampler, max_depth, triangle ... (a wrong name lists them)  [default: all]")

@@ -1,0 +1,128 @@
+"""bench accel: the rows hold what was measured, a structure that loses a ray is told, and the command writes what it says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.command_line import BOX_OBJ
+from tests.command_line import wrt as command
+from wrt.accel import ACCELERATORS
+from wrt.bench import accel as bench
+from wrt.bench import accel_report as report
+from wrt.bench.accel import Plan, Refused, Row, growth, run
+from wrt.errors import InputError
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Path:
+    (tmp_path / "box.obj").write_text(BOX_OBJ)
+    return tmp_path / "box.obj"
+
+
+def plan(box: Path, **options) -> Plan:
+    return Plan((box,), **{"rays": 400, "runs": 2, "structures": ("brute_force", "bvh2"), **options})
+
+
+def made(structure="s", triangles=1000, seconds=(1.0,), build=(0.5,), kind="primary", **fields) -> Row:
+    row = Row("m", triangles, structure, kind, 10**6, build, 50.0, 7.0, 5, triangles, 3.0, 6.0, 2.0, seconds, 0, 10, 0)
+    return replace(row, **fields)
+
+
+def test_rows_hold_what_the_structures_say(box) -> None:
+    rows = run(plan(box))
+    assert [(row.structure, row.kind) for row in rows] == [
+        (name, kind) for kind in ("primary", "shadow", "diffuse", "random") for name in ("brute_force", "bvh2")]
+    for row in rows:
+        assert isinstance(row, Row)
+        assert row.mesh == "box.obj" and row.triangles == 12 and row.rays == 400 and row.checked == 400
+        assert row.differ == row.wrong == 0 and len(row.seconds) == 2 and (row.mrays > 0.0).all()
+        if row.structure == "brute_force":
+            assert (row.primitives, row.nodes) == (12.0, 0.0) and row.bytes_per_triangle == 40.0
+        else:
+            assert 1.0 <= row.nodes and row.boxes == pytest.approx(2.0 * row.nodes) and row.primitives < 12.0
+    assert set(rows[0].as_dict()) >= {"mrays_median", "build_median", "wrong"}
+
+
+def test_a_structure_that_loses_rays_is_told(box, monkeypatch) -> None:
+    class Losing(ACCELERATORS["bvh2"]):  # type: ignore[misc, name-defined]
+        name = "losing"
+
+        def closest_hit(self, *args, **options):
+            hits = super().closest_hit(*args, **options)
+            hits.prim_id[::10] = -1
+            return hits
+
+        def any_hit(self, *args, **options):
+            return ~super().any_hit(*args, **options)
+
+    monkeypatch.setitem(bench.ACCELERATORS, "losing", Losing)
+    rows = run(plan(box, structures=("losing",), kinds=("primary", "shadow")))
+    assert [row.kind for row in rows if isinstance(row, Row)] == ["primary", "shadow"]
+    primary, shadow = rows
+    assert 0 < primary.differ <= 40 and 0 < primary.wrong <= 40 and shadow.differ == shadow.wrong == 400
+
+
+def test_a_structure_that_refuses_is_named_and_the_others_go_on(box, monkeypatch) -> None:
+    class Refusing(ACCELERATORS["bvh2"]):  # type: ignore[misc, name-defined]
+        name = "refusing"
+
+        def _build(self):
+            raise InputError("more than 11 triangles")
+
+    monkeypatch.setitem(bench.ACCELERATORS, "refusing", Refusing)
+    rows = run(plan(box, structures=("refusing", "bvh2"), kinds=("random",)))
+    assert rows[0] == Refused("box.obj", "refusing", "more than 11 triangles") and rows[1].structure == "bvh2"
+    assert "refusing over box.obj: more than 11 triangles" in report.markdown(rows)
+
+
+def test_growth_fits_exponents() -> None:
+    rows = [made(triangles=n, seconds=(1e-3 * n**0.25,), build=(2e-6 * n,)) for n in (1000, 10_000, 100_000)]
+    found = {g["cost"]: g for g in growth([*rows, made("alone")])}
+    assert found["search"]["exponent"] == pytest.approx(0.25) and found["build"]["exponent"] == pytest.approx(1.0)
+    assert found["search"]["times"] == pytest.approx(100.0**0.25) and growth(rows[:2]) == []
+
+
+def test_the_tables_hold_what_was_measured() -> None:
+    text = report.markdown([made("a", seconds=(1.0, 1.0)), made("b", seconds=(0.5, 0.5), differ=3)])
+    line = next(line for line in text.splitlines() if line.startswith("| b"))
+    named = dict(zip(report.COLUMNS, (cell.strip() for cell in line.strip("|").split("|")), strict=True))
+    assert named["Mray/s"] == "2 [2, 2]" and named["/ first"] == "2.00" and named["differ"] == "3" and named["build ms"] == "500"
+
+
+def test_without_meshes_a_terrain_grows() -> None:
+    sizes = [len(mesh.faces) for mesh in bench.meshes(Plan(max_triangles=20_000))]
+    assert sizes == sorted(sizes) and len(sizes) >= 3 and sizes[-1] <= 20_000
+    assert np.all(np.diff(np.log(sizes)) > 1.0)
+
+
+def test_all_structures_but_brute_force_by_default() -> None:
+    names = Plan().names
+    assert "bvh2" in names and "brute_force" not in names and "bvh" not in names and len(set(names)) == len(names)
+
+
+def test_the_command_prints_json_and_writes_a_report(box, tmp_path) -> None:
+    out = command("bench", "accel", str(box), "--rays", "100", "--runs", "1", "--structures", "bvh2", "--kinds", "random,diffuse",
+                  "--json", "-q", "-o", str(tmp_path / "report"))
+    assert out.code == 0 and out.err == ""
+    facts = json.loads(out.out)
+    assert [row["kind"] for row in facts["rows"]] == ["diffuse", "random"] and facts["refused"] == []
+    for name in (report.REPORT, *report.PLOTS):
+        assert (tmp_path / "report" / name).stat().st_size > 500
+    text = (tmp_path / "report" / report.REPORT).read_text()
+    assert "bench accel box.obj" in text and str(tmp_path) not in text
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (("--structures", "nonsense"), "no structure 'nonsense'"),
+    (("--kinds", "x"), "no kind of ray 'x'"),
+    (("--rays", "0"), "rays must be 1"),
+    (("nothing.obj",), "nothing.obj"),
+])
+def test_mistakes_are_told_in_a_line(arguments, message) -> None:
+    out = command("bench", "accel", *arguments)
+    assert out.code == 2 and len(out.errors) == 1 and message in out.errors[0]

@@ -1,0 +1,203 @@
+"""`python -m wrt bench accel`: every structure on the same rays. What does it cost to build, to keep and to search?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
+from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
+from wrt.bench.visibility import TERRAINS, fit, terrain
+from wrt.device import thread_count
+from wrt.errors import InputError
+from wrt.mesh import Mesh, load_mesh
+
+YARDSTICK = "bvh2"  # every ray is compared with it, and as many as YARDSTICK_TESTS allow with brute force
+BRUTE_FORCE_TESTS = 200_000_000
+COUNTED_RAYS = 20_000
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to measure: mesh files (none: a terrain that grows up to max_triangles), structures (none: all but brute force), kinds
+    of ray, rays of each kind, runs of each, builds of each. Raises InputError."""
+
+    meshes: Sequence[str | Path] = ()
+    structures: Sequence[str] = ()
+    kinds: Sequence[str] = tuple(RAY_KINDS)
+    rays: int = 100_000
+    runs: int = 5
+    builds: int = 1
+    max_triangles: int = 1_000_000
+    threads: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("rays", 1, 2**28), ("runs", 1, 1000), ("builds", 1, 100), ("max_triangles", 1000, 2**28)):
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name} must be {low} to {high}, got {getattr(self, name)}")
+        for what, names, table in (("structure", self.structures, ACCELERATORS), ("kind of ray", self.kinds, RAY_KINDS)):
+            for name in names:
+                if name not in table:
+                    raise InputError(f"no {what} {name!r}; there is {', '.join(table)}")
+        thread_count(self.threads)
+
+    @property
+    def names(self) -> list[str]:
+        """Structures in the order of the registry, each once."""
+        if self.structures:
+            return list(dict.fromkeys(self.structures))
+        return [name for name, cls in ACCELERATORS.items() if name == cls.name and name != "brute_force"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One structure, mesh and kind of ray. build: seconds of each build; seconds: of each run over `rays` rays; nodes, boxes,
+    primitives: fetched and tested, a ray (mean; of any-hit rays: as if the closest hit were asked); differ: rays whose prim_id or
+    bits of t are not the yardstick's; checked, wrong: rays given to brute force, and those that it contradicts."""
+
+    mesh: str
+    triangles: int
+    structure: str
+    kind: str
+    rays: int
+    build: tuple[float, ...]
+    bytes_per_triangle: float
+    sah_cost: float
+    depth: int
+    references: int
+    nodes: float
+    boxes: float
+    primitives: float
+    seconds: tuple[float, ...]
+    differ: int
+    checked: int
+    wrong: int
+
+    @property
+    def mrays(self) -> np.ndarray:
+        """Million rays a second, run by run."""
+        return self.rays / np.array(self.seconds) / 1e6
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self) | {"build_median": float(np.median(self.build)), "mrays_median": float(np.median(self.mrays))}
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A structure that cannot be built over a mesh, in its own words."""
+
+    mesh: str
+    structure: str
+    reason: str
+
+
+def meshes(plan: Plan) -> Iterator[Mesh]:
+    for path in plan.meshes:
+        mesh = load_mesh(path)
+        if not len(mesh.faces):
+            raise InputError("there are no triangles to hit", path)
+        yield mesh
+    if not plan.meshes:
+        cells = [n for k in range(14) for n in [TERRAINS[0] * 2**k] if 2 * n * n <= plan.max_triangles]
+        yield from map(terrain, cells)
+
+
+def run(plan: Plan, report: Callable[[Row | Refused], None] | None = None) -> list[Row | Refused]:
+    """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a structure)."""
+    out: list[Row | Refused] = []
+    for mesh in meshes(plan):
+        for row in _Bench(plan, mesh).rows():
+            out.append(row)
+            if report is not None:
+                report(row)
+    return out
+
+
+class _Bench:
+    """One mesh, all structures, all kinds of ray."""
+
+    def __init__(self, plan: Plan, mesh: Mesh) -> None:
+        self.plan, self.name, self.geometry = plan, Path(mesh.name or "mesh").name, Geometry.of(mesh)
+        self.yardstick = build(self.geometry, YARDSTICK)
+        self.rays = {kind: rays for kind, rays in ray_sets(self.yardstick, plan.rays, plan.seed).items() if kind in plan.kinds}
+        self.checked = max(min(BRUTE_FORCE_TESTS // max(len(self.geometry), 1), plan.rays), 1)
+
+    def rows(self) -> Iterator[Row | Refused]:
+        built: dict[str, tuple[Accelerator, tuple[float, ...]]] = {}
+        for name in self.plan.names:
+            try:
+                accels = [build(self.geometry, name) for _ in range(self.plan.builds)]
+            except InputError as error:
+                yield Refused(self.name, name, str(error))
+                continue
+            built[name] = accels[-1], tuple(accel.stats.build_seconds for accel in accels)
+        brute_force = build(self.geometry, "brute_force")
+        for rays in self.rays.values():
+            truth = answer(self.yardstick, rays, None)
+            few = rays.part(slice(None, None, max(len(rays) // self.checked, 1)))
+            exact = answer(brute_force, few, None)
+            seconds = self._timed({name: accel for name, (accel, _) in built.items()}, rays)
+            for name, (accel, build_seconds) in built.items():
+                yield self._row(name, accel, build_seconds, rays, seconds[name],
+                                differing(answer(accel, rays, None), truth), len(few), differing(answer(accel, few, None), exact))
+
+    def _timed(self, accels: dict[str, Accelerator], rays: RaySet) -> dict[str, list[float]]:
+        """The runs of all structures alternate, and their order turns: what else the machine does meets all alike."""
+        seconds: dict[str, list[float]] = {name: [] for name in accels}
+        names = list(accels)
+        for i in range(-1, self.plan.runs):  # -1: warm up
+            for name in names[i % len(names):] + names[:i % len(names)]:
+                begin = perf_counter()
+                answer(accels[name], rays, self.plan.threads)
+                if i >= 0:
+                    seconds[name].append(perf_counter() - begin)
+        return seconds
+
+    def _row(self, name: str, accel: Accelerator, build_seconds: tuple[float, ...], rays: RaySet, seconds: list[float],
+             differ: int, checked: int, wrong: int) -> Row:
+        counted = rays.part(slice(None, None, max(len(rays) // COUNTED_RAYS, 1)))
+        c = accel.closest_hit(counted.origins, counted.directions, 0.0, counted.t_max, counters=True).counters
+        assert c is not None
+        s, n = accel.stats, len(self.geometry)
+        return Row(self.name, n, name, rays.kind, len(rays), build_seconds, s.bytes / n, s.sah_cost, s.depth, s.references,
+                   float(c.nodes.mean()), float(c.boxes.mean()), float(c.primitives.mean()), tuple(seconds), differ, checked, wrong)
+
+
+def answer(accel: Accelerator, rays: RaySet, threads: int | None) -> Hits | np.ndarray:
+    if rays.any_hit:
+        return accel.any_hit(rays.origins, rays.directions, 0.0, rays.t_max, threads)
+    return accel.closest_hit(rays.origins, rays.directions, 0.0, rays.t_max, threads)
+
+
+def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
+    """Rays with another answer: prim_id or a bit of t, or where any hit was asked another yes or no."""
+    if isinstance(found, Hits) and isinstance(truth, Hits):
+        return int(((found.prim_id != truth.prim_id) | (found.t.view(np.int32) != truth.t.view(np.int32))).sum())
+    return int((np.asarray(found) != np.asarray(truth)).sum())
+
+
+def growth(rows: Sequence[Row | Refused]) -> list[dict[str, Any]]:
+    """How seconds a ray and seconds of the build grow with the triangles: exponents over meshes of one name, where there are three
+    sizes or more."""
+    out = []
+    series: dict[tuple[str, str, str], list[Row]] = {}
+    for row in rows:
+        if isinstance(row, Row):
+            series.setdefault((row.mesh, row.structure, row.kind), []).append(row)
+    for (mesh, structure, kind), group in series.items():
+        sizes = [row.triangles for row in group]
+        if len(set(sizes)) < 3:
+            continue
+        costs = {"search": [float(np.median(row.seconds)) / row.rays for row in group],
+                 "build": [float(np.median(row.build)) for row in group]}
+        for cost, seconds in costs.items():
+            found = fit(sizes, seconds)
+            out.append({"mesh": mesh, "structure": structure, "kind": kind, "cost": cost, "from": min(sizes), "to": max(sizes),
+                        "times": seconds[-1] / seconds[0], **asdict(found)})
+    return out
