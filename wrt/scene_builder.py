@@ -86,7 +86,7 @@ class _Builder:
     def scene(self, table: tables.SceneTable) -> Scene | None:
         for name, material in table.materials.items():
             self.materials |= self.material(material, name, f"materials.{name}")
-        included = [scene for i, name in enumerate(table.include) for scene in self.included(name, f"include[{i}]")]
+        included = [scene for i, entry in enumerate(table.include) for scene in self.included(entry, f"include[{i}]")]
         included = self.overridden(included, table)
         known = {m.name: m for scene in included for m in scene.materials} | self.materials
         # A material that is itself wrong is known all the same: one mistake gives one line.
@@ -144,13 +144,14 @@ class _Builder:
 
     # --- included files ---
 
-    def included(self, name: str, place: str) -> list[Scene]:
+    def included(self, entry: str | tables.IncludeTable, place: str) -> list[Scene]:
         from wrt.gltf import load_gltf
 
+        name, to_world = (entry, None) if isinstance(entry, str) else (entry.file, entry.transform)
         with self.at(place):
             if not name.lower().endswith((".gltf", ".glb")):
                 raise InputError(f"{name!r} is no .gltf or .glb file; a mesh file belongs into [[meshes]]")
-            return [load_gltf(self.file(name), staged=False)]
+            return [moved(load_gltf(self.file(name), staged=False), transform(to_world))]
         return []
 
     def overridden(self, included: list[Scene], table: tables.SceneTable) -> list[Scene]:
@@ -268,6 +269,27 @@ class _Builder:
             if key not in self._meshes:
                 self._meshes[key] = smooth(plain) if table.smooth else replace(plain, normals=None)
         return self._meshes[key]
+
+
+def moved(scene: Scene, matrix: np.ndarray) -> Scene:
+    """The scene's shapes, lights and cameras under a further (4, 4) transform; intensities stay as they are, as in glTF."""
+    if np.array_equal(matrix, np.eye(4)):
+        return scene
+    return replace(
+        scene,
+        objects=tuple(replace(thing, transform=matrix @ thing.transform) for thing in scene.objects),
+        lights=tuple(_moved_light(light, matrix) for light in scene.lights),
+        cameras=tuple(replace(camera, camera_to_world=matrix @ camera.camera_to_world) for camera in scene.cameras),
+    )
+
+
+def _moved_light(light: Light, matrix: np.ndarray) -> Light:
+    changes: dict[str, Any] = {}
+    if not isinstance(light, DirectionalLight):
+        changes["position"] = matrix[:3, :3] @ light.position + matrix[:3, 3]
+    if not isinstance(light, PointLight):
+        changes["direction"] = matrix[:3, :3] @ light.direction
+    return replace(light, **changes)
 
 
 def make_light(table: tables.LightTable, name: str) -> Light | Object:

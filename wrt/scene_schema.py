@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from wrt import scene
 from wrt.material_schema import (
@@ -142,6 +142,14 @@ class TransformTable(Table):
         if not all(self.scale):
             raise ValueError("scale must not be zero in any axis")
         return self
+
+
+class IncludeTable(Table):
+    """A glTF file, placed as a whole."""
+
+    file: str = Field(description="glTF file, relative to the scene file")
+    transform: TransformTable | None = Field(
+        None, description="the file's world to this one's: of shapes, cameras and lights, whose intensities stay as they are")
 
 
 class SphereTable(Table):
@@ -314,6 +322,10 @@ class RectangleLightTable(Table):
 
 LightTable = Annotated[PointLightTable | DirectionalLightTable | SpotLightTable | RectangleLightTable,
                        Field(discriminator="type")]
+IncludeEntry = Annotated[
+    Annotated[str, Tag("file")] | Annotated[IncludeTable, Tag("table")],
+    Discriminator(lambda value: "file" if isinstance(value, str) else "table" if isinstance(value, dict | IncludeTable) else None,
+                  custom_error_type="include_type", custom_error_message="a file's name or a table")]
 BackgroundTable = Annotated[ConstantTable | GradientTable | EnvironmentTable, Field(discriminator="type")]
 
 
@@ -322,7 +334,8 @@ class SceneTable(Table):
     grey); +y is up by convention."""
 
     title: str = Field("", description="what the picture shows")
-    include: list[str] = Field([], description="glTF files; their shapes, cameras and lights come behind this file's")
+    include: list[IncludeEntry] = Field(
+        [], description="glTF files, or tables with a transform; their shapes, cameras and lights come behind this file's")
     settings: SettingsTable = Field(default_factory=lambda: SettingsTable.model_validate({}),
                                     description="how the scene wants to be rendered")
     cameras: dict[str, CameraTable] = Field({}, description="by name; the first is the default")

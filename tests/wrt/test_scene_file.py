@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from tests.data import data_path
+from tests.gltf_files import one_triangle
+from wrt.device_scene import world_mesh
 from wrt.errors import InputError, SceneWarning
 from wrt.scene import (
     CONDUCTORS,
@@ -230,6 +232,57 @@ def test_no_more_than_twenty_mistakes_are_told(tmp_path: Path) -> None:
         load(tmp_path, CAMERA + "[[spheres]]\n" * 10 + "".join(f"wrong_{i} = 1\n" for i in range(5)))
     head, *lines = str(caught.value).split("\n  ")
     assert head.endswith("35 errors") and len(lines) == 21 and lines[-1] == "and 15 more"
+
+
+def including(folder: Path, transform: str) -> tuple[Scene, Scene]:
+    """A glTF file with a moved triangle, a camera and lights of each kind: alone, and included under a transform."""
+    file = one_triangle()
+    file.json["nodes"][0]["translation"] = [1, 0, 0]
+    file.json["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.5, "znear": 0.1}}]
+    file.node(camera=0, translation=[0, 0, 3], name="eye")
+    kinds = [{"type": kind, "intensity": 3.0} for kind in ("point", "directional", "spot")]
+    file.json["extensions"] = {"KHR_lights_punctual": {"lights": kinds}}
+    for i in range(3):
+        file.node(translation=[1, 2, 3], extensions={"KHR_lights_punctual": {"light": i}})
+    file.write(folder, "model.glb")
+    plain = load(folder, 'include = ["model.glb"]\n')
+    return plain, load(folder, f'[[include]]\nfile = "model.glb"\ntransform = {{ {transform} }}\n')
+
+
+def test_an_included_file_is_moved_as_a_whole(tmp_path: Path) -> None:
+    # Twice as large, then y to z and z to -y, then 10 along x: (x, y, z) is at (2 x + 10, -2 z, 2 y).
+    plain, scene = including(tmp_path, "scale = 2, rotate = [90, 0, 0], translate = [10, 0, 0]")
+    geometry = world_mesh(scene).geometry
+    assert geometry.vertices[geometry.faces[0]].tolist() == [[12, 0, 0], [14, 0, 0], [12, 0, 2]]
+    point, sun, spot = scene.lights
+    assert isinstance(point, PointLight) and isinstance(sun, DirectionalLight) and isinstance(spot, SpotLight)
+    assert point.position == spot.position == (12, -6, 4)
+    assert sun.direction == spot.direction == (0, 1, 0)  # each shone along -z
+    assert (point.intensity, sun.irradiance, spot.intensity, spot.outer) == (
+        plain.lights[0].intensity, plain.lights[1].irradiance, plain.lights[2].intensity, plain.lights[2].outer)
+    camera, = scene.cameras
+    assert camera.camera_to_world.tolist() == [[1, 0, 0, 10], [0, 0, -1, -6], [0, 1, 0, 0], [0, 0, 0, 1]]
+    assert camera.name == "eye" and camera.fov_y == plain.cameras[0].fov_y
+
+
+def test_an_included_file_may_be_mirrored(tmp_path: Path) -> None:
+    plain, scene = including(tmp_path, "scale = [-1, 1, 1]")
+    before, after = world_mesh(plain).geometry, world_mesh(scene).geometry
+    normals = [np.cross(*(np.diff(g.vertices[g.faces[0]], axis=0))) for g in (before, after)]
+    assert normals[0].tolist() == normals[1].tolist() == [0, 0, 1]  # its outside stays outside
+    assert after.vertices[:, 0].min() == -2 and np.linalg.det(scene.cameras[0].camera_to_world) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("include = [3]", "include[0]: got 3, expected a file's name or a table"),
+    ("[[include]]\ntransform = {}", "include[0].file: is missing"),
+    ("[[include]]\nfile = 'a.glb'\nplace = 1", "include[0].place: unknown key 'place'; known are 'file', 'transform'"),
+    ("[[include]]\nfile = 'a.glb'\ntransform = {scale = 0}", "include[0].transform: scale must not be zero in any axis"),
+    ("[[include]]\nfile = 'a.obj'", "include[0]: 'a.obj' is no .gltf or .glb file; a mesh file belongs into [[meshes]]"),
+    ("include = 'a.glb'", "include: got 'a.glb', expected an array"),
+], ids=str)
+def test_wrong_includes(tmp_path: Path, text: str, message: str) -> None:
+    assert errors(tmp_path, text + "\n") == [message]
 
 
 def test_environment(tmp_path: Path) -> None:
