@@ -78,7 +78,8 @@ def _load_bare_mesh(path: Path) -> Scene:
 def _bare(mesh: Mesh, name: str, path: str | os.PathLike[str]) -> Scene:
     """A mesh alone, in light grey."""
     grey = Material(name="light grey", albedo=(0.75, 0.75, 0.75))
-    parts = f"its {len(mesh.groups)} parts are all light grey: a TOML scene can give each a material"
+    unread = " (.mtl files are not read)" if os.fspath(path).lower().endswith(".obj") else ""
+    parts = f"its {len(mesh.groups)} parts are all light grey{unread}: a TOML scene can give each a material"
     notes = [parts] if len(mesh.groups) > 1 else []
     return _staged(Scene(objects=(Object(mesh, (grey,), name=name),), name=name), path, notes)
 

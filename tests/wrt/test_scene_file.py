@@ -285,6 +285,16 @@ def test_wrong_includes(tmp_path: Path, text: str, message: str) -> None:
     assert errors(tmp_path, text + "\n") == [message]
 
 
+def test_unread_materials_of_an_obj_file_are_told_once(tmp_path: Path) -> None:
+    path = tmp_path / "two.obj"
+    path.write_text("mtllib x.mtl\n" + TRIANGLES + "usemtl a\nf 1 2 3\nusemtl b\nf 1 2 4\nmtllib y.mtl\nusemtl a\nf 1 3 4\n")
+    with pytest.warns(SceneWarning) as caught:
+        load_scene(path)
+    told = " ".join(str(each.message) for each in caught)
+    assert len(caught) == 1 and told.count("its 2 parts are all light grey (.mtl files are not read): a TOML scene") == 1
+    assert told.count(".mtl") == 1
+
+
 def test_environment(tmp_path: Path) -> None:
     from wrt.image import write_image
 
