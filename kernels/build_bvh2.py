@@ -31,11 +31,12 @@ class BuildRecord:
 class BuildTask:
     """A range of records that becomes a child of `parent` (-1: the root): a leaf, or the inner node `slot`.
 
-    lo, hi: its box; center_lo, center_hi: the box of its centroids.
+    lo, hi: its box; center_lo, center_hi: the box of its centroids; limit: the end of the room that it has (spatial splits).
     """
 
     begin: int
     end: int
+    limit: int
     slot: int
     parent: int
     side: int

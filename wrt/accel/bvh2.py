@@ -9,12 +9,13 @@ from wrt.kernels import traverse_bvh2 as kernels
 
 class Bvh2(Accelerator):
     """Options: builder (a name in wrt.accel.bvh_build.BVH_BUILDERS), max_leaf (1 to 64 primitives), cost_traversal and
-    cost_intersection (of the SAH)."""
+    cost_intersection (of the SAH), split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
 
     name = "bvh2"
     kernels = kernels
 
     def _build(self, builder: str = "binned", max_leaf: int = 4, cost_traversal: float = 1.0,
-               cost_intersection: float = 1.0) -> Built:
-        tree = build_binary(self.geometry, BvhOptions(builder, max_leaf, cost_traversal, cost_intersection), self.threads)
+               cost_intersection: float = 1.0, split_alpha: float = 1e-5, split_budget: float = 0.5) -> Built:
+        options = BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget)
+        tree = build_binary(self.geometry, options, self.threads)
         return Built({"nodes": tree.nodes}, tree.order, len(tree.nodes), tree.leaves, tree.depth, sah_cost(tree.nodes))

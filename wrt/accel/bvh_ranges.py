@@ -87,15 +87,18 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
     return BinaryTree(squeeze(data.nodes.numpy(), data.used.numpy() != 0), data.records.numpy()["prim_id"].copy(), depth)
 
 
-def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int) -> int:
-    """Build the top of the tree over records 0 .. n - 1, then its subtrees on all threads; the depth of the tree."""
+def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int, room: int = 0) -> int:
+    """Build the top of the tree over records 0 .. n - 1, then its subtrees on all threads; the depth of the tree.
+
+    room: how many records there is room for, where references may be duplicated.
+    """
     cpu = start("cpu")
     load_kernel(kernel, cpu)
     root = records(build_bvh2.BuildTask, 1)
-    root["end"], root["parent"] = n, -1
+    root["end"], root["parent"], root["limit"] = n, -1, room
     stop_size = max(n // 32, 4096) if threads > 1 else 0
     # Ranges of two or more records that do not overlap: there can be no more of them than this.
-    left_over = wp.empty(max(n // 2, 1) if stop_size else 1, dtype=build_bvh2.BuildTask, device=cpu)
+    left_over = wp.empty(max(max(n, room) // 2, 1) if stop_size else 1, dtype=build_bvh2.BuildTask, device=cpu)
     count = wp.zeros(1, dtype=wp.int32, device=cpu)
 
     def launch(tasks: Any, depth: Any, task: int, stop: int) -> None:

@@ -16,17 +16,21 @@ NODE_DTYPE = np.dtype(Bvh2Node.numpy_dtype())
 @dataclass(frozen=True)
 class BvhOptions:
     """builder: a name in BVH_BUILDERS; max_leaf: 1 to 64 primitives; cost_traversal, cost_intersection: of the SAH, of one node
-    visited and one primitive tested. Raises InputError for values out of range."""
+    visited and one primitive tested. Of spatial splits (builder "sbvh"): split_alpha: the overlap of an object split, as a share
+    of the root's area, from which a plane is tried (Stich et al. 2009); split_budget: how many references there may be beyond
+    one a primitive, as a share of the primitives. Raises InputError for values out of range."""
 
     builder: str = "binned"
     max_leaf: int = 4
     cost_traversal: float = 1.0
     cost_intersection: float = 1.0
+    split_alpha: float = 1e-5
+    split_budget: float = 0.5
 
     def __post_init__(self) -> None:
         if not 1 <= self.max_leaf <= MAX_LEAF:
             raise InputError(f"max_leaf must be 1 to {MAX_LEAF}, got {self.max_leaf}")
-        for name in ("cost_traversal", "cost_intersection"):
+        for name in ("cost_traversal", "cost_intersection", "split_alpha", "split_budget"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0.0):
                 raise InputError(f"{name} must be finite and not negative, got {value}")

@@ -1,0 +1,435 @@
+"""The inner loop of the builder with spatial splits, on the CPU backend.
+
+Stich, Friedrich and Dietrich 2009, "Spatial Splits in Bounding Volume Hierarchies": where the sides of the best object split
+overlap, a plane may cut the range instead, and primitives on both sides of it are referred to twice. A range has room to grow,
+which is shared between its sides in proportion, so that subtrees can be built on all cores.
+"""
+
+import warp as wp
+
+from wrt.kernels.build_bvh2 import (
+    BINS,
+    MAX_DEPTH,
+    SMALL,
+    BuildData,
+    BuildOptions,
+    BuildRecord,
+    BuildTask,
+    Split,
+    area_scale,
+    bin_of,
+    bin_scale,
+    binned_split,
+    center_of,
+    choose_small,
+    half_area,
+    levels,
+    measured,
+    tell_parent,
+)
+from wrt.kernels.ray_aabb import box_pad, padded_hi, padded_lo
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
+
+
+@wp.struct
+class Box:
+    lo: wp.vec3
+    hi: wp.vec3
+
+
+@wp.struct
+class SpatialOptions:
+    """min_overlap: the least overlap of an object split's sides, in units of the root's half area, for a spatial split to be
+    tried; corners: of triangle i from 3 i on; what is no triangle (a sphere) is cut by its box."""
+
+    build: BuildOptions
+    min_overlap: float
+    corners: wp.array(dtype=wp.vec3)
+
+
+@wp.func
+def empty_box() -> Box:
+    out = Box()
+    out.lo = wp.vec3(wp.inf, wp.inf, wp.inf)
+    out.hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    return out
+
+
+@wp.func
+def joined(a: Box, lo: wp.vec3, hi: wp.vec3) -> Box:
+    out = Box()
+    out.lo = wp.min(a.lo, lo)
+    out.hi = wp.max(a.hi, hi)
+    return out
+
+
+@wp.func
+def crossing(a: wp.vec3, b: wp.vec3, axis: int, plane: float) -> wp.vec3:
+    """Where the edge a b meets a plane that parts its ends, in float64 rounded once: far within the pads that are added."""
+    s = (wp.float64(plane) - wp.float64(a[axis])) / (wp.float64(b[axis]) - wp.float64(a[axis]))
+    p = wp.vec3d(a) + s * (wp.vec3d(b) - wp.vec3d(a))
+    return wp.vec3(p)
+
+
+@wp.func
+def cut(record: BuildRecord, axis: int, low: float, high: float, corners: wp.array(dtype=wp.vec3)) -> Box:
+    """The box of a reference between two planes; lo > hi where nothing of it is there.
+
+    Conservative: the triangle's part between the planes, each moved out by the pads of the triangle's own box, is padded as
+    that box is, and kept within the reference's box. A hit is within these pads of the triangle, and so of a part of it. But
+    a hit's t is held to the triangle's own box, and a ray that grazes a triangle in an axis plane moves far on the way there:
+    of such a triangle, whose box is no thicker than its pads, the box is cut, not the triangle.
+    """
+    out = Box()
+    out.lo = record.lo
+    out.hi = record.hi
+    out.lo[axis] = wp.max(record.lo[axis], low)
+    out.hi[axis] = wp.min(record.hi[axis], high)
+    first = 3 * record.prim_id
+    if first >= corners.shape[0]:
+        return out
+    a = corners[first]
+    b = corners[first + 1]
+    c = corners[first + 2]
+    lo = wp.min(wp.min(a, b), c)
+    hi = wp.max(wp.max(a, b), c)
+    pad = box_pad(lo, hi)
+    e = hi - lo
+    margin = 2.0 * pad + 2.0**-20.0 * wp.max(wp.max(wp.abs(lo)), wp.max(wp.abs(hi)))
+    if not wp.min(e) > margin or not wp.isfinite(margin):
+        return out
+    part = empty_box()
+    from_plane = low - margin
+    to_plane = high + margin
+    for k in range(3):
+        p = wp.where(k == 0, a, wp.where(k == 1, b, c))
+        q = wp.where(k == 0, b, wp.where(k == 1, c, a))
+        if p[axis] >= from_plane and p[axis] <= to_plane:
+            part = joined(part, p, p)
+        if (p[axis] < from_plane) != (q[axis] < from_plane):
+            x = crossing(p, q, axis, from_plane)
+            part = joined(part, x, x)
+        if (p[axis] > to_plane) != (q[axis] > to_plane):
+            x = crossing(p, q, axis, to_plane)
+            part = joined(part, x, x)
+    out.lo = wp.max(out.lo, padded_lo(part.lo, pad))
+    out.hi = wp.min(out.hi, padded_hi(part.hi, pad))
+    return out
+
+
+@wp.func
+def is_empty(box: Box) -> bool:
+    return box.lo[0] > box.hi[0] or box.lo[1] > box.hi[1] or box.lo[2] > box.hi[2]
+
+
+@wp.func
+def plane_of(task: BuildTask, axis: int, k: int) -> float:
+    """The plane between bins k - 1 and k of a range's box."""
+    f = float(k) / float(BINS)
+    return task.lo[axis] * (1.0 - f) + task.hi[axis] * f
+
+
+@wp.func
+def spatial_bin(task: BuildTask, axis: int, x: float) -> int:
+    """The bin of a coordinate: the last one that begins at or before it, by the planes themselves."""
+    k = wp.clamp(int(float(BINS) * ((x - task.lo[axis]) / (task.hi[axis] - task.lo[axis]))), 0, BINS - 1)
+    while k > 0 and x < plane_of(task, axis, k):
+        k = k - 1
+    while k < BINS - 1 and x >= plane_of(task, axis, k + 1):
+        k = k + 1
+    return k
+
+
+@wp.func
+def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners: wp.array(dtype=wp.vec3), best: Split) -> Split:
+    """The cheapest plane between two bins, if it costs less than `best`; a side may hold fewer references than the range.
+
+    Where a range is long, its references are clipped to every bin that they reach into.
+    """
+    scale = area_scale(task)
+    n = task.end - task.begin
+    for axis in range(3):
+        extent = task.hi[axis] - task.lo[axis]
+        if extent > 0.0 and wp.isfinite(extent):
+            enter = wp.zeros(shape=16, dtype=wp.int32)
+            leave = wp.zeros(shape=16, dtype=wp.int32)
+            lo = wp.zeros(shape=16, dtype=wp.vec3)
+            hi = wp.zeros(shape=16, dtype=wp.vec3)
+            right_cost = wp.zeros(shape=16, dtype=wp.float32)
+            right_count = wp.zeros(shape=16, dtype=wp.int32)
+            for b in range(BINS):
+                lo[b] = wp.vec3(wp.inf, wp.inf, wp.inf)
+                hi[b] = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+            for i in range(task.begin, task.end):
+                record = records[i]
+                first = spatial_bin(task, axis, record.lo[axis])
+                last = spatial_bin(task, axis, record.hi[axis])
+                enter[first] = enter[first] + 1
+                leave[last] = leave[last] + 1
+                for b in range(first, last + 1):
+                    part = Box()
+                    part.lo = record.lo
+                    part.hi = record.hi
+                    if first < last:
+                        part = cut(record, axis, plane_of(task, axis, b), plane_of(task, axis, b + 1), corners)
+                    if not is_empty(part):
+                        lo[b] = wp.min(lo[b], part.lo)
+                        hi[b] = wp.max(hi[b], part.hi)
+            side = empty_box()
+            count = int(0)
+            for k in range(BINS - 1):
+                b = BINS - 1 - k
+                side = joined(side, lo[b], hi[b])
+                count = count + leave[b]
+                right_cost[b] = half_area(side.lo, side.hi, scale) * float(count)
+                right_count[b] = count
+            side = empty_box()
+            count = int(0)
+            for b in range(1, BINS):
+                side = joined(side, lo[b - 1], hi[b - 1])
+                count = count + enter[b - 1]
+                cost = half_area(side.lo, side.hi, scale) * float(count) + right_cost[b]
+                fits = count > 0 and count < n and right_count[b] > 0 and right_count[b] < n
+                if fits and count + right_count[b] <= task.limit - task.begin and cost < best.cost:
+                    best.axis = axis
+                    best.bin = b
+                    best.cost = cost
+    return best
+
+
+@wp.func
+def part_by_plane(data_records: wp.array(dtype=BuildRecord), room: wp.array(dtype=BuildRecord), task: BuildTask, split: Split,
+                  corners: wp.array(dtype=wp.vec3)) -> wp.vec2i:
+    """References left of the plane to room[begin ..], those right of it to room[.. limit - 1] backwards; how many each.
+
+    One on both sides is not split where leaving it whole on one side costs less ("reference unsplitting", section 4.4).
+    """
+    scale = area_scale(task)
+    plane = plane_of(task, split.axis, split.bin)
+    left = empty_box()
+    right = empty_box()
+    n_left = int(0)
+    n_right = int(0)
+    for i in range(task.begin, task.end):  # what is surely on one side, and the parts of what is not
+        record = data_records[i]
+        if record.hi[split.axis] < plane:
+            left = joined(left, record.lo, record.hi)
+            n_left = n_left + 1
+        elif record.lo[split.axis] >= plane:
+            right = joined(right, record.lo, record.hi)
+            n_right = n_right + 1
+        else:
+            part = cut(record, split.axis, -wp.inf, plane, corners)
+            if not is_empty(part):
+                left = joined(left, part.lo, part.hi)
+                n_left = n_left + 1
+            part = cut(record, split.axis, plane, wp.inf, corners)
+            if not is_empty(part):
+                right = joined(right, part.lo, part.hi)
+                n_right = n_right + 1
+
+    l = int(0)
+    r = int(0)
+    for i in range(task.begin, task.end):
+        record = data_records[i]
+        to_left = bool(record.hi[split.axis] < plane)
+        to_right = bool(record.lo[split.axis] >= plane)
+        if not to_left and not to_right:
+            part_0 = cut(record, split.axis, -wp.inf, plane, corners)
+            part_1 = cut(record, split.axis, plane, wp.inf, corners)
+            to_left = is_empty(part_1)
+            to_right = is_empty(part_0) and not to_left
+            if not to_left and not to_right:
+                area_0 = half_area(left.lo, left.hi, scale)
+                area_1 = half_area(right.lo, right.hi, scale)
+                wide_0 = joined(left, record.lo, record.hi)
+                wide_1 = joined(right, record.lo, record.hi)
+                both = area_0 * float(n_left) + area_1 * float(n_right)
+                only_0 = half_area(wide_0.lo, wide_0.hi, scale) * float(n_left) + area_1 * float(n_right - 1)
+                only_1 = area_0 * float(n_left - 1) + half_area(wide_1.lo, wide_1.hi, scale) * float(n_right)
+                if only_0 < both and only_0 <= only_1:
+                    to_left = bool(True)
+                    left = wide_0
+                    n_right = n_right - 1
+                elif only_1 < both:
+                    to_right = bool(True)
+                    right = wide_1
+                    n_left = n_left - 1
+                elif l + r + 1 + task.end - i <= task.limit - task.begin:
+                    half = record
+                    half.lo = part_0.lo
+                    half.hi = part_0.hi
+                    room[task.begin + l] = half
+                    l = l + 1
+                    half.lo = part_1.lo
+                    half.hi = part_1.hi
+                    r = r + 1
+                    room[task.limit - r] = half
+                else:
+                    to_left = bool(True)
+        if to_left:
+            room[task.begin + l] = record
+            l = l + 1
+        elif to_right:
+            r = r + 1
+            room[task.limit - r] = record
+    return wp.vec2i(l, r)
+
+
+@wp.func
+def object_split(data: BuildData, task: BuildTask) -> wp.vec2i:
+    """Left references to room[begin ..], right ones to room[.. limit - 1] backwards, by centroid; how many each."""
+    n = task.end - task.begin
+    middle = task.begin + n / 2
+    if task.depth + levels(n) < MAX_DEPTH:
+        if n <= SMALL:
+            middle = choose_small(data, task)
+        else:
+            bins = bin_scale(task)
+            split = binned_split(data, task, bins)
+            if split.axis >= 0:
+                l = int(0)
+                r = int(0)
+                for i in range(task.begin, task.end):
+                    record = data.records[i]
+                    if bin_of(center_of(record), split.axis, task.center_lo, bins) < split.bin:
+                        data.boxes[task.begin + l] = record
+                        l = l + 1
+                    else:
+                        r = r + 1
+                        data.boxes[task.limit - r] = record
+                return wp.vec2i(l, r)
+    for i in range(task.begin, middle):
+        data.boxes[i] = data.records[i]
+    for i in range(middle, task.end):
+        data.boxes[task.limit - 1 - (i - middle)] = data.records[i]
+    return wp.vec2i(middle - task.begin, task.end - middle)
+
+
+@wp.func
+def box_of(records: wp.array(dtype=BuildRecord), begin: int, end: int) -> Box:
+    out = empty_box()
+    for i in range(begin, end):
+        out = joined(out, records[i].lo, records[i].hi)
+    return out
+
+
+@wp.func
+def split_references(data: BuildData, task: BuildTask, options: SpatialOptions) -> wp.vec2i:
+    """Both sides of the cheaper of the best object split and, if the sides of that overlap, the best plane: as object_split."""
+    scale = area_scale(task)
+    counts = object_split(data, task)
+    left = box_of(data.boxes, task.begin, task.begin + counts[0])
+    right = box_of(data.boxes, task.limit - counts[1], task.limit)
+    n = task.end - task.begin
+    overlap = half_area(wp.max(left.lo, right.lo), wp.min(left.hi, right.hi), 1.0)
+    if task.depth + levels(n) >= MAX_DEPTH or not overlap > options.min_overlap:
+        return counts
+    best = Split()
+    best.axis = -1
+    best.cost = (half_area(left.lo, left.hi, scale) * float(counts[0]) + half_area(right.lo, right.hi, scale) * float(counts[1]))
+    best = spatial_split(data.records, task, options.corners, best)
+    if best.axis < 0:
+        return counts
+    parted = part_by_plane(data.records, data.boxes, task, best, options.corners)
+    if parted[0] == 0 or parted[1] == 0:
+        return object_split(data, task)
+    return parted
+
+
+@wp.func
+def take_room(data: BuildData, task: BuildTask, counts: wp.vec2i) -> int:
+    """Copy both sides back, the free room between them shared in proportion; where the right side begins."""
+    free = task.limit - task.begin - counts[0] - counts[1]
+    share = int(wp.int64(free) * wp.int64(counts[0]) / wp.int64(counts[0] + counts[1]))
+    middle = task.begin + counts[0] + share
+    for i in range(counts[0]):
+        data.records[task.begin + i] = data.boxes[task.begin + i]
+    for i in range(counts[1]):
+        data.records[middle + i] = data.boxes[task.limit - 1 - i]
+    return middle
+
+
+@wp.func
+def reference_child(data: BuildData, task: BuildTask, side: int, begin: int, count: int, limit: int) -> BuildTask:
+    child = BuildTask()
+    child.begin = begin
+    child.end = begin + count
+    child.limit = limit
+    child.slot = wp.where(side == 0, task.slot + 1, task.slot + begin - task.begin)
+    child.parent = task.slot
+    child.side = side
+    child.depth = task.depth + 1
+    return measured(data, child)
+
+
+@wp.func
+def mark(left: wp.array(dtype=wp.uint8), begin: int, end: int):
+    """These records are a leaf's: the host drops the others."""
+    for i in range(begin, end):
+        left[i] = wp.uint8(1)
+
+
+@kernel
+def build_references(data: BuildData, tasks: wp.array(dtype=BuildTask), first_task: int, options: SpatialOptions, stop_size: int,
+                     left_over: wp.array(dtype=BuildTask), n_left_over: wp.array(dtype=wp.int32),
+                     max_depth: wp.array(dtype=wp.int32)):
+    """As kernels.build_bvh2's build_ranges, with references; data.boxes is room, data.left tells which records are in leaves.
+
+    Inner nodes of a range with room for n references take the slots slot .. slot + n - 2.
+    """
+    tid = first_task + wp.tid()
+    stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=BuildTask)
+    stack[0] = tasks[tid]
+    size = int(1)
+    while size > 0:
+        size = size - 1
+        task = stack[size]
+        n = task.end - task.begin
+        if n <= stop_size and task.parent >= 0:
+            left_over[wp.atomic_add(n_left_over, 0, 1)] = task
+            continue
+        if task.parent < 0:
+            task = measured(data, task)
+
+        counts = split_references(data, task, options)
+        if n <= options.build.max_leaf and task.parent >= 0:
+            scale = area_scale(task)
+            area = half_area(task.lo, task.hi, scale)
+            left_box = box_of(data.boxes, task.begin, task.begin + counts[0])
+            right_box = box_of(data.boxes, task.limit - counts[1], task.limit)
+            parts = (half_area(left_box.lo, left_box.hi, scale) * float(counts[0])
+                     + half_area(right_box.lo, right_box.hi, scale) * float(counts[1]))
+            split_cost = options.build.cost_traversal * area + options.build.cost_intersection * parts
+            if not split_cost < options.build.cost_intersection * float(n) * area:
+                tell_parent(data.nodes, task, task.begin, n)
+                mark(data.left, task.begin, task.end)
+                continue
+
+        middle = take_room(data, task, counts)
+        left = reference_child(data, task, 0, task.begin, counts[0], middle)
+        right = reference_child(data, task, 1, middle, counts[1], task.limit)
+        max_depth[tid] = wp.max(max_depth[tid], task.depth)
+        tell_parent(data.nodes, task, task.slot, 0)
+        data.used[task.slot] = wp.uint8(1)
+        node = Bvh2Node()
+        node.lo_0 = left.lo
+        node.hi_0 = left.hi
+        node.lo_1 = right.lo
+        node.hi_1 = right.hi
+        node.first_0 = left.begin
+        node.count_0 = counts[0]
+        node.first_1 = right.begin
+        node.count_1 = counts[1]
+        data.nodes[task.slot] = node
+        if counts[1] > 1:
+            stack[size] = right
+            size = size + 1
+        else:
+            mark(data.left, right.begin, right.end)
+        if counts[0] > 1:
+            stack[size] = left
+            size = size + 1
+        else:
+            mark(data.left, left.begin, left.end)

@@ -1,0 +1,62 @@
+"""The builder with spatial splits (the loop is a Warp kernel, kernels/build_sbvh.py)."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Geometry
+from wrt.accel.bvh_ranges import in_order, run_tasks
+from wrt.accel.bvh_tree import BinaryTree, BvhOptions, small_tree, squeeze
+from wrt.device import records, start, upload
+from wrt.errors import InputError
+from wrt.kernels import build_bvh2
+from wrt.kernels import build_sbvh as kernels
+from wrt.kernels.traverse_bvh2 import Bvh2Node
+
+MAX_BUDGET = 8.0
+
+
+def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
+    """Spatial splits where the sides of an object split overlap (Stich et al. 2009); a primitive may be in several leaves.
+
+    Raises InputError for a split_budget above MAX_BUDGET.
+    """
+    if options.split_budget > MAX_BUDGET:
+        raise InputError(f"split_budget must be at most {MAX_BUDGET:g}, got {options.split_budget}")
+    cpu = start("cpu")
+    lo, hi = geometry.bounds()
+    n = len(lo)
+    if n <= 1:
+        return small_tree(lo, hi)
+    room = n + int(options.split_budget * n)
+    build = records(build_bvh2.BuildRecord, room)
+    build[:n] = in_order(lo, hi)
+    data = build_bvh2.BuildData()
+    data.records = upload(build, build_bvh2.BuildRecord, cpu)
+    data.boxes = wp.empty(room, dtype=build_bvh2.BuildRecord, device=cpu)
+    data.nodes = upload(records(Bvh2Node, room - 1), Bvh2Node, cpu)
+    data.used = wp.zeros(room - 1, dtype=wp.uint8, device=cpu)
+    data.left = wp.zeros(room, dtype=wp.uint8, device=cpu)
+    settings = kernels.SpatialOptions()
+    settings.build.max_leaf = options.max_leaf
+    settings.build.cost_traversal, settings.build.cost_intersection = options.cost_traversal, options.cost_intersection
+    with np.errstate(over="ignore", invalid="ignore"):
+        x, y, z = hi.max(axis=0).astype(np.float64) - lo.min(axis=0)
+        area = min(options.split_alpha * (x * y + y * z + z * x), 3e38)
+    # Where areas underflow there is no overlap to tell of, and where they overflow no split that is worth it.
+    settings.min_overlap = area if np.isfinite(area) else 3e38
+    settings.corners = upload(geometry.vertices[geometry.faces].reshape(-1, 3), wp.vec3, cpu)
+    depth = run_tasks(kernels.build_references, data, settings, n, threads, room)
+    return compact(data, depth)
+
+
+def compact(data: build_bvh2.BuildData, depth: int) -> BinaryTree:
+    """The tree without the room between its leaves."""
+    used = data.left.numpy() != 0
+    nodes = squeeze(data.nodes.numpy(), data.used.numpy() != 0)
+    index = np.cumsum(used, dtype=np.int32) - 1
+    for side in ("0", "1"):
+        leaf = nodes["count_" + side] > 0
+        nodes["first_" + side][leaf] = index[nodes["first_" + side][leaf]]
+    return BinaryTree(nodes, data.records.numpy()["prim_id"][used], depth)
