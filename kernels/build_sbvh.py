@@ -229,8 +229,8 @@ def part_by_plane(data_records: wp.array(dtype=BuildRecord), room: wp.array(dtyp
                 right = joined(right, part.lo, part.hi)
                 n_right = n_right + 1
 
-    l = int(0)
-    r = int(0)
+    done_0 = int(0)
+    done_1 = int(0)
     for i in range(task.begin, task.end):
         record = data_records[i]
         to_left = bool(record.hi[split.axis] < plane)
@@ -256,25 +256,25 @@ def part_by_plane(data_records: wp.array(dtype=BuildRecord), room: wp.array(dtyp
                     to_right = bool(True)
                     right = wide_1
                     n_left = n_left - 1
-                elif l + r + 1 + task.end - i <= task.limit - task.begin:
+                elif done_0 + done_1 + 1 + task.end - i <= task.limit - task.begin:
                     half = record
                     half.lo = part_0.lo
                     half.hi = part_0.hi
-                    room[task.begin + l] = half
-                    l = l + 1
+                    room[task.begin + done_0] = half
+                    done_0 = done_0 + 1
                     half.lo = part_1.lo
                     half.hi = part_1.hi
-                    r = r + 1
-                    room[task.limit - r] = half
+                    done_1 = done_1 + 1
+                    room[task.limit - done_1] = half
                 else:
                     to_left = bool(True)
         if to_left:
-            room[task.begin + l] = record
-            l = l + 1
+            room[task.begin + done_0] = record
+            done_0 = done_0 + 1
         elif to_right:
-            r = r + 1
-            room[task.limit - r] = record
-    return wp.vec2i(l, r)
+            done_1 = done_1 + 1
+            room[task.limit - done_1] = record
+    return wp.vec2i(done_0, done_1)
 
 
 @wp.func
@@ -289,17 +289,17 @@ def object_split(data: BuildData, task: BuildTask) -> wp.vec2i:
             bins = bin_scale(task)
             split = binned_split(data, task, bins)
             if split.axis >= 0:
-                l = int(0)
-                r = int(0)
+                done_0 = int(0)
+                done_1 = int(0)
                 for i in range(task.begin, task.end):
                     record = data.records[i]
                     if bin_of(center_of(record), split.axis, task.center_lo, bins) < split.bin:
-                        data.boxes[task.begin + l] = record
-                        l = l + 1
+                        data.boxes[task.begin + done_0] = record
+                        done_0 = done_0 + 1
                     else:
-                        r = r + 1
-                        data.boxes[task.limit - r] = record
-                return wp.vec2i(l, r)
+                        done_1 = done_1 + 1
+                        data.boxes[task.limit - done_1] = record
+                return wp.vec2i(done_0, done_1)
     for i in range(task.begin, middle):
         data.boxes[i] = data.records[i]
     for i in range(middle, task.end):
