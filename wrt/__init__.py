@@ -16,6 +16,7 @@ if not (Path(__file__).parent / "kernels").is_dir():
 _PUBLIC = {
     "ACCELERATORS": "wrt.accel",
     "build": "wrt.queries",
+    "load_accel": "wrt.queries",
     "Mesh": "wrt.mesh",
     "load_mesh": "wrt.mesh",
     "InputError": "wrt.errors",

@@ -21,6 +21,7 @@ import click
 
 import wrt
 from wrt.cli_bench import bench, stability
+from wrt.cli_build import build
 from wrt.cli_common import Crop, Duration, Names, Size, load, naming, say, say_json, warnings_told
 from wrt.errors import InputError
 from wrt.interrupt import Interrupted, exit_code, held_interrupts, raise_on_termination
@@ -34,6 +35,7 @@ def cli() -> None:
 
 cli.add_command(stability)
 cli.add_command(bench)
+cli.add_command(build)
 
 
 @cli.command()

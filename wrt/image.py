@@ -50,13 +50,13 @@ def output_format(path: PathLike, bits: int | None = None) -> tuple[str, int]:
 def check_writable(path: PathLike, bits: int | None = None) -> None:
     """Raise the InputError that writing an image to `path` would end in, before any work is done for it."""
     output_format(path, bits)
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         temporary.touch()
         temporary.unlink()
 
 
 @contextlib.contextmanager
-def _replacing(path: PathLike) -> Iterator[Path]:
+def replacing(path: PathLike) -> Iterator[Path]:
     """A new name in the folder of `path`, to write to; on success that file takes the place of `path`.
 
     On any failure the new file is removed and an existing `path` stays as it was. A link is followed, not replaced.
@@ -104,7 +104,7 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
 def write_codes(path: PathLike, codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> None:
     """Write display codes, (H, W, 3) uint8 or uint16, to a PNG file as they are. Raises InputError as write_image."""
     data = encode_png(codes, metadata or {})
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         temporary.write_bytes(data)
 
 
@@ -138,7 +138,7 @@ def _write_oiio(path: PathLike, spec: Any, rows: Callable[[int, int], np.ndarray
     """Write rows y0 to y1, (y1 - y0, W, C) float32, in bands; `header` is put in behind the file's first line."""
     import OpenImageIO as oiio
 
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         out = oiio.ImageOutput.create(str(temporary))
         if out is None:
             raise InputError(f"cannot be written: {oiio.geterror()}", path)

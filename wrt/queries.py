@@ -23,3 +23,16 @@ def build(mesh: Mesh | structures.Geometry | str | os.PathLike[str], accel: str 
     if not isinstance(mesh, Mesh | structures.Geometry):
         raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(mesh)}")
     return structures.build(mesh, as_one(accel, str, "accel"), as_one(device, str, "device"), threads, **options)
+
+
+def load_accel(path: str | os.PathLike[str], mesh: Mesh | structures.Geometry | str | os.PathLike[str], device: str = "cpu",
+               threads: int | None = None) -> structures.Accelerator:
+    """The structure that Accelerator.save or `wrt build` wrote to `path`, over the same mesh (or the path of its file).
+
+    Raises InputError for a file that is missing, foreign, damaged, of another version or over another mesh.
+    """
+    if isinstance(mesh, str | os.PathLike):
+        mesh = load_mesh(mesh)
+    if not isinstance(mesh, Mesh | structures.Geometry):
+        raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(mesh)}")
+    return structures.load_accel(path, mesh, as_one(device, str, "device"), threads)

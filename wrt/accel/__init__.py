@@ -7,10 +7,12 @@ from typing import Any
 from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
 from wrt.accel.brute_force import BruteForce
 from wrt.accel.bvh2 import Bvh2
+from wrt.accel.store import build_cached, load_accel
 from wrt.errors import InputError
 from wrt.mesh import Mesh
 
-__all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "Structure", "build"]
+__all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "Structure", "build", "build_cached",
+           "load_accel"]
 
 ACCELERATORS: dict[str, type[Accelerator]] = {
     "bvh": Bvh2,  # the default: the best one there is

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import time
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
+from hashlib import sha256
 from inspect import signature
 from typing import Any, ClassVar, NamedTuple
 
@@ -24,6 +26,7 @@ from wrt.kernels.traverse import Units
 from wrt.mesh import Mesh
 
 RAYS_PER_LAUNCH = 16384
+OPTION_TYPES: dict[str, Any] = {"int": int, "float": int | float, "bool": bool, "str": str}  # by the annotations of _build
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +46,13 @@ class Geometry:
 
     def __len__(self) -> int:
         return len(self.faces) + len(self.spheres)
+
+    def digest(self) -> str:
+        """SHA-256 of the arrays: the same for the same geometry, whatever file it came from."""
+        out = sha256()
+        for array in (self.vertices, self.faces, self.spheres):
+            out.update(f"{array.shape}{array.dtype.str}".encode() + np.ascontiguousarray(array).tobytes())
+        return out.hexdigest()
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corner of every primitive's padded box, two (N, 3) float32.
@@ -101,6 +111,16 @@ class Built:
     leaves: int = 0
     depth: int = 0
     sah_cost: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Refit:
+    """What Accelerator.refit did: seconds; growth: SAH cost of the refitted tree over that of the tree when it was built; rebuilt:
+    whether that was too much, and a new tree was built."""
+
+    seconds: float
+    growth: float
+    rebuilt: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +196,31 @@ class Accelerator(ABC):
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
                  box: str = "conservative", **options: Any) -> None:
+        self._begin(geometry, device, threads, triangle, box)
+        known = {name: p.annotation for name, p in signature(self._build).parameters.items() if name != "options"}
+        for option, value in options.items():
+            if option not in known:
+                raise InputError(f"{self.name} has no option {option!r}; there is {', '.join([*known, 'triangle', 'box'])}")
+            kind = OPTION_TYPES.get(known[option], object)
+            if not isinstance(value, kind) or isinstance(value, bool) and kind is not bool:
+                raise InputError(f"{option} must be {known[option]}, got {value!r}")
+        begin = time.perf_counter()
+        self._take(self._build(**options), begin)
+
+    @classmethod
+    def restore(cls, built: Built, geometry: Geometry, device: str = "cpu", threads: int | None = None, *,
+                triangle: str = "watertight", box: str = "conservative") -> Accelerator:
+        """What was built before over the same geometry. Raises InputError where `built` is no such structure."""
+        self = cls.__new__(cls)
+        self._begin(geometry, device, threads, triangle, box)
+        begin = time.perf_counter()
+        if not np.array_equal(np.unique(built.order), np.arange(len(geometry))):
+            raise InputError(f"is no {cls.name} over this geometry: its primitives are not in it, or not all of them")
+        self._check(built)
+        self._take(built, begin)
+        return self
+
+    def _begin(self, geometry: Geometry, device: str, threads: int | None, triangle: str, box: str) -> None:
         check_units(triangle, box)
         self.device = start(device)
         self.geometry = geometry
@@ -184,12 +229,9 @@ class Accelerator(ABC):
         self._surfaces = Surfaces()
         self._surfaces.n_triangles = len(geometry.faces)
         self._surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # the caller may change his
-        known = [p for p in signature(self._build).parameters if p != "options"]
-        for option in options:
-            if option not in known:
-                raise InputError(f"{self.name} has no option {option!r}; there is {', '.join([*known, 'triangle', 'box'])}")
-        begin = time.perf_counter()
-        built = self._build(**options)
+
+    def _take(self, built: Built, begin: float) -> None:
+        self.built = built
         self.data = self._upload(built)
         self.stats = AccelStats(time.perf_counter() - begin, built.nodes, built.leaves, built.depth, len(built.order),
                                 array_bytes(self.data), built.sah_cost)
@@ -197,6 +239,39 @@ class Accelerator(ABC):
     @abstractmethod
     def _build(self, *args: Any, **options: Any) -> Built:
         """The structure over self.geometry, on the host. Raises InputError for options out of range."""
+
+    def _check(self, built: Built) -> None:
+        """Raise InputError where arrays that come from a file would lead a ray out of them or round in circles."""
+        raise InputError(f"a {self.name} cannot be read from a file")
+
+    def _refit(self, built: Built) -> Built:
+        """The same tree around self.geometry, whose vertices have moved."""
+        raise InputError(f"a {self.name} cannot follow vertices that move; build it again, or take bvh2")
+
+    def refit(self, vertices: np.ndarray, rebuild_at: float = np.inf) -> Refit:
+        """Follow vertices that have moved, (V, 3) float32, as many as before: boxes are fitted anew, the tree stays as it is.
+
+        It answers as exactly as a new one, but slower and slower as the motion mixes what was near. rebuild_at: build it anew
+        (with default options) where the SAH cost passes this multiple of what it was when built. Raises InputError for another
+        shape or values that are not finite, and from structures that cannot be refitted.
+        """
+        moved = _vectors(vertices, "vertices").copy()
+        if moved.shape != self.geometry.vertices.shape:
+            raise InputError(f"vertices must be {self.geometry.vertices.shape}, got {moved.shape}")
+        begin = time.perf_counter()
+        before, self._built_cost = self.geometry, getattr(self, "_built_cost", self.stats.sah_cost)
+        self.geometry = replace(before, vertices=moved)
+        try:
+            built = self._refit(self.built)
+        except InputError:
+            self.geometry = before
+            raise
+        growth = float(built.sah_cost) / float(self._built_cost) if self._built_cost > 0.0 else 1.0
+        if rebuilt := growth > rebuild_at:
+            built = self._build()
+            self._built_cost = built.sah_cost
+        self._take(built, begin)
+        return Refit(self.stats.build_seconds, growth, rebuilt)
 
     def _upload(self, built: Built) -> Any:
         units = self.structure.units
@@ -208,6 +283,12 @@ class Accelerator(ABC):
             setattr(data, name, upload(array, kind.dtype, self.device) if is_array else kind(*np.atleast_1d(array)))
         data.primitives = upload(self.geometry.primitives(units, built.order), units.triangle_test.record, self.device)
         return data
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the structure to a file (.accel) that wrt.load_accel reads. Raises InputError where the system refuses."""
+        from wrt.accel.store import save
+
+        save(self, path)
 
     def __repr__(self) -> str:
         s = self.stats

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wrt.accel.base import Accelerator, Built
+from wrt.errors import InputError
 from wrt.kernels import traverse_brute_force as kernels
 
 
@@ -17,3 +18,10 @@ class BruteForce(Accelerator):
     def _build(self) -> Built:
         n = len(self.geometry)
         return Built({}, np.arange(n, dtype=np.int32), sah_cost=float(n))
+
+    def _check(self, built: Built) -> None:
+        if not np.array_equal(built.order, np.arange(len(self.geometry))):
+            raise InputError("is damaged: not every primitive stands once, in order")
+
+    def _refit(self, built: Built) -> Built:
+        return built

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from wrt.accel.base import Accelerator, Built
 from wrt.accel.bvh_build import BvhOptions, build_binary, sah_cost
+from wrt.accel.refit import refit_nodes
+from wrt.accel.store import check_binary
 from wrt.kernels import traverse_bvh2 as kernels
 
 
@@ -19,3 +23,10 @@ class Bvh2(Accelerator):
         options = BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget)
         tree = build_binary(self.geometry, options, self.threads)
         return Built({"nodes": tree.nodes}, tree.order, len(tree.nodes), tree.leaves, tree.depth, sah_cost(tree.nodes))
+
+    def _check(self, built: Built) -> None:
+        check_binary(built.arrays["nodes"], len(built.order), kernels.STACK_SIZE)
+
+    def _refit(self, built: Built) -> Built:
+        nodes = refit_nodes(built.arrays["nodes"], built.order, self.geometry)
+        return replace(built, arrays={"nodes": nodes}, sah_cost=sah_cost(nodes))

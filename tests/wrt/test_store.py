@@ -1,0 +1,178 @@
+"""Structures in files: the same answers after a round trip, and one clear message for every file that is not one."""
+
+from __future__ import annotations
+
+import json
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import wrt
+from tests.command_line import BOX_OBJ
+from tests.command_line import wrt as command
+from wrt.accel import ACCELERATORS, Geometry, build, build_cached
+from wrt.accel.store import DIGEST_BYTES, MAGIC, load_accel
+from wrt.errors import InputError
+from wrt.shapes import icosphere
+
+STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
+BALL = icosphere(2)
+
+
+def rays(n: int = 500) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return rng.normal(size=(n, 3)).astype(np.float32), rng.normal(size=(n, 3)).astype(np.float32)
+
+
+def same(a, b) -> None:
+    one, other = a.closest_hit(*rays()), b.closest_hit(*rays())
+    for field in ("t", "u", "v", "prim_id"):
+        np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+
+
+def signed(data: bytes) -> bytes:
+    """With a checksum that fits, as somebody with bad intentions would write it."""
+    return data + sha256(data).digest()
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    build(BALL, "bvh2").save(tmp_path / "ball.accel")
+    return tmp_path / "ball.accel"
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize("geometry", ["triangles", "spheres", "one", "none"])
+def test_a_round_trip_changes_nothing(name: str, geometry: str, tmp_path: Path) -> None:
+    g = {"triangles": Geometry.of(BALL), "spheres": Geometry(BALL.vertices, BALL.faces, np.array([[0, 0, 2, 0.5]], np.float32)),
+         "one": Geometry(BALL.vertices, BALL.faces[:1], np.zeros((0, 4), np.float32)),
+         "none": Geometry(BALL.vertices, BALL.faces[:0], np.zeros((0, 4), np.float32))}[geometry]
+    before = build(g, name, triangle="moeller_trumbore")
+    before.save(tmp_path / "x.accel")
+    after = load_accel(tmp_path / "x.accel", g)
+    assert type(after) is type(before) and after.structure == before.structure
+    assert (after.stats.nodes, after.stats.depth, after.stats.bytes) == (before.stats.nodes, before.stats.depth, before.stats.bytes)
+    same(before, after)
+
+
+def test_public_names_take_paths(saved: Path, tmp_path: Path) -> None:
+    same(wrt.load_accel(saved, BALL), build(BALL))
+    with pytest.raises(InputError, match="mesh must be"):
+        wrt.load_accel(saved, 7)  # type: ignore[arg-type]
+
+
+def test_another_mesh_is_refused(saved: Path) -> None:
+    with pytest.raises(InputError, match=r"ball\.accel.*built over another mesh"):
+        load_accel(saved, icosphere(3))
+
+
+@pytest.mark.parametrize(("spoil", "message"), [
+    (lambda data: data[:-1], "damaged"),
+    (lambda data: data[:200], "damaged"),
+    (lambda data: b"", "no acceleration structure"),
+    (lambda data: b"PK\3\4" + data, "no acceleration structure"),
+    (lambda data: data[:5000] + bytes([data[5000] ^ 1]) + data[5001:], "damaged"),
+    (lambda data: signed(MAGIC + b"[]\n"), "no acceleration structure"),
+    (lambda data: signed(MAGIC + b"{}\n"), "no structure of this version"),
+    (lambda data: signed(MAGIC + b"{" * 100000), "damaged"),
+    (lambda data: signed(MAGIC + b"[" * 60000 + b"\n"), "no structure|damaged|no acceleration"),
+])
+def test_a_damaged_or_foreign_file_is_refused(saved: Path, spoil, message: str) -> None:
+    saved.write_bytes(spoil(saved.read_bytes()))
+    with pytest.raises(InputError, match=message) as error:
+        load_accel(saved, BALL)
+    assert "ball.accel" in str(error.value)
+
+
+def test_missing_files_and_wrong_suffixes(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"nothing\.accel"):
+        load_accel(tmp_path / "nothing.accel", BALL)
+    with pytest.raises(InputError, match=r"a \.accel file"):
+        build(BALL).save(tmp_path / "x.npz")
+    with pytest.raises(InputError, match="does not exist"):
+        build(BALL).save(tmp_path / "no" / "x.accel")
+
+
+def edited(path: Path, change) -> None:
+    """The file with its nodes and order changed, and a checksum that fits."""
+    data = path.read_bytes()[:-DIGEST_BYTES]
+    end = data.index(b"\n", len(MAGIC)) + 1
+    header = json.loads(data[len(MAGIC):end])
+    tree = build(BALL, "bvh2").built
+    nodes, order = tree.arrays["nodes"].copy(), tree.order.copy()
+    change(nodes, order, header)
+    path.write_bytes(signed(MAGIC + json.dumps(header).encode() + b"\n" + nodes.tobytes() + order.tobytes()))
+
+
+def set_child(i: int, first: int, count: int):
+    def change(nodes, order, header) -> None:
+        nodes["first_0"][i], nodes["count_0"][i] = first, count
+
+    return change
+
+
+@pytest.mark.parametrize("change", [
+    set_child(0, 0, 0), set_child(3, 1, 0), set_child(3, 10**9, 0), set_child(3, -5, 0), set_child(3, 10**6, 4),
+    set_child(3, 0, 2**31 - 1), set_child(3, 0, -1), set_child(0, 5, 0),
+    lambda nodes, order, header: order.__setitem__(0, 10**6), lambda nodes, order, header: order.__setitem__(0, order[1]),
+    lambda nodes, order, header: header.update(order=-1), lambda nodes, order, header: header["bytes"].update(nodes=-64),
+    lambda nodes, order, header: header.update(accel="brute_force"), lambda nodes, order, header: header.update(triangle="x"),
+    lambda nodes, order, header: header.update(depth="deep"), lambda nodes, order, header: header.update(accel=["bvh2"]),
+])
+def test_indices_are_checked_before_a_ray_follows_them(saved: Path, change) -> None:
+    edited(saved, change)
+    with pytest.raises(InputError, match=r"ball\.accel"):
+        load_accel(saved, BALL)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(at=st.integers(0, 10**6), value=st.integers(0, 255))
+def test_any_byte_may_be_changed(saved: Path, at: int, value: int) -> None:
+    """Changed before the checksum is taken: what is accepted then answers without leaving its arrays."""
+    data = bytearray(saved.read_bytes()[:-DIGEST_BYTES])
+    data[at % len(data)] = value
+    path = saved.with_name("changed.accel")
+    path.write_bytes(signed(bytes(data)))
+    try:
+        load_accel(path, BALL).closest_hit(*rays(50))
+    except InputError as error:
+        assert "changed.accel" in str(error)
+
+
+def test_the_cache_builds_once(tmp_path: Path, monkeypatch) -> None:
+    first = build_cached(tmp_path / "cache", BALL, "bvh2", max_leaf=2)
+    monkeypatch.setattr(ACCELERATORS["bvh2"], "_build", None)
+    same(build_cached(tmp_path / "cache", BALL, "bvh2", max_leaf=2), first)
+    with pytest.raises(TypeError):  # other options: another structure
+        build_cached(tmp_path / "cache", BALL, "bvh2", max_leaf=3)
+
+
+def test_a_damaged_entry_of_the_cache_is_made_anew(tmp_path: Path) -> None:
+    build_cached(tmp_path, BALL, "bvh2")
+    (entry,) = tmp_path.iterdir()
+    entry.write_bytes(b"half")
+    same(build_cached(tmp_path, BALL, "bvh2"), build(BALL))
+    assert entry.stat().st_size > 1000
+
+
+def test_the_command(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("box.obj").write_text(BOX_OBJ)
+    out = command("build", "box.obj", "-o", "box.accel", "--accel", "bvh2", "--set", "max_leaf=2", "--set", "builder=median",
+                  "--json")
+    assert out.code == 0 and json.loads(out.out)["accel"] == "bvh2"
+    assert wrt.load_accel("box.accel", "box.obj").stats.references == 12
+    for arguments, message in (
+            (("box.obj", "-o", "box.npz"), ".accel file"), (("none.obj", "-o", "a.accel"), "none.obj"),
+            (("box.obj", "-o", "a.accel", "--accel", "x"), "no structure 'x'"),
+            (("box.obj", "-o", "a.accel", "--set", "leaf=2"), "no option 'leaf'"),
+            (("box.obj", "-o", "a.accel", "--set", "max_leaf=2", "--set", "max_leaf=3"), "set twice"),
+            (("box.obj", "-o", "a.accel", "--set", "max_leaf=many"), "max_leaf"),
+            (("box.obj", "-o", "a.accel", "--set", "max_leaf"), "NAME=VALUE")):
+        out = command("build", *arguments)
+        assert out.code == 2 and len(out.errors) == 1 and message in out.errors[0], arguments
+        assert not Path("a.accel").exists()

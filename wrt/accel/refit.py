@@ -1,0 +1,23 @@
+"""Binary trees that follow their vertices."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Geometry
+from wrt.device import load_kernel, start, upload
+from wrt.kernels.refit_bvh2 import refit
+from wrt.kernels.traverse_bvh2 import Bvh2Node
+
+
+def refit_nodes(nodes: np.ndarray, order: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """Copies of Bvh2Node records, a parent before its children, whose boxes fit the geometry as it is now; order: (R,) int32, the
+    prim_id of each primitive that the leaves name. Boxes of spatial splits become those of the whole triangles."""
+    cpu = start("cpu")
+    lo, hi = geometry.bounds()
+    device_nodes = upload(nodes.copy(), Bvh2Node, cpu)
+    load_kernel(refit, cpu)
+    wp.launch(refit, dim=1, device=cpu, inputs=[device_nodes, upload(order.copy(), wp.int32, cpu), upload(lo, wp.vec3, cpu),
+                                                upload(hi, wp.vec3, cpu)])
+    return np.asarray(device_nodes.numpy()).copy()

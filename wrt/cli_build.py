@@ -1,0 +1,66 @@
+"""The command that builds a structure for later: `build`."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wrt.cli_common import say, say_json, warnings_told
+from wrt.errors import InputError
+
+
+class Setting(click.ParamType):
+    """NAME=VALUE; the value is a number, True, False or a word."""
+
+    name = "NAME=VALUE"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, Any]:
+        name, sign, text = str(value).partition("=")
+        if not sign or not name:
+            self.fail(f"{value!r} is not NAME=VALUE", param, ctx)
+        try:
+            parsed = ast.literal_eval(text)
+        except (ValueError, SyntaxError, MemoryError, RecursionError):
+            parsed = text
+        return name, parsed if isinstance(parsed, bool | int | float | str) else text
+
+
+@click.command()
+@click.argument("mesh", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write: .accel")
+@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
+@click.option("--set", "settings", type=Setting(), multiple=True, help="An option of the structure, such as max_leaf=8; repeatable")
+@click.option("--threads", type=int, help="Threads to build with  [default: all cores]")
+@click.option("-q", "--quiet", is_flag=True, help="No warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print the statistics as JSON")
+def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any], ...], threads: int | None, quiet: bool,
+          as_json: bool) -> None:
+    """Build a structure over MESH (.obj, .ply or .stl) once, and write it to a file for wrt.load_accel."""
+    from dataclasses import asdict
+
+    import wrt
+    from wrt.accel.store import check_target
+
+    check_target(output)
+    with warnings_told(quiet):
+        structure = wrt.build(mesh, accel, threads=threads, **settled(settings))
+    structure.save(output)
+    if as_json:
+        say_json({"output": output, "accel": structure.name, **asdict(structure.stats)})
+        return
+    if not quiet:
+        say(repr(structure))
+    click.echo(output)
+
+
+def settled(settings: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
+    """Options by name; InputError where one is set twice or belongs to another flag."""
+    out: dict[str, Any] = {}
+    for name, value in settings:
+        if name in out or name in ("mesh", "accel", "device", "threads"):
+            raise InputError(f"--set {name}: {'set twice' if name in out else 'has a flag of its own'}")
+        out[name] = value
+    return out
