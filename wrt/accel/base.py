@@ -202,7 +202,7 @@ class Accelerator(ABC):
             if option not in known:
                 raise InputError(f"{self.name} has no option {option!r}; there is {', '.join([*known, 'triangle', 'box'])}")
             kind = OPTION_TYPES.get(known[option], object)
-            if not isinstance(value, kind) or isinstance(value, bool) and kind is not bool:
+            if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
                 raise InputError(f"{option} must be {known[option]}, got {value!r}")
         begin = time.perf_counter()
         self._take(self._build(**options), begin)
