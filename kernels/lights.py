@@ -141,19 +141,11 @@ def spot_falloff(light: Light, cos_angle: float) -> float:
 @wp.func
 def mesh_light_sample(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
     """A point on the emitters of one light, by power and then uniformly by area."""
-    low = int(light.first)
-    high = int(light.first + light.count - 1)
-    while low < high:
-        middle = (low + high) / 2
-        if xi[0] < lighting.emitters[middle].cdf:
-            high = middle
-        else:
-            low = middle + 1
-    emitter = lighting.emitters[low]
-    below = float(0.0)
-    if low > light.first:
-        below = lighting.emitters[low - 1].cdf
-    within = wp.clamp((xi[0] - below) / wp.max(emitter.cdf - below, 1.0e-30), 0.0, 0.99999994)
+    chosen = search_cdf(lighting.emitter_cdf, light.first, light.count, xi[0])
+    emitter = lighting.emitters[light.first + chosen]
+    share = share_of_row(lighting.emitter_cdf, light.first, chosen)
+    left = lighting.emitter_cdf[light.first + chosen] - xi[0]
+    within = wp.clamp(1.0 - left / wp.max(share, 1.0e-30), 0.0, 0.99999994)
     b = triangle(wp.vec2(within, xi[1]))
     point = triangle_point(surfaces, emitter.prim_id, b[0], b[1])
     n = triangle_normal(surfaces, emitter.prim_id)
@@ -175,11 +167,41 @@ def mesh_light_sample(lighting: Lighting, surfaces: Surfaces, light: Light, s: S
 
 
 @wp.func
+def is_within(light: Light, s: Surface, way: wp.vec3) -> bool:
+    """Whether a surface is inside a sphere; on the sphere itself, but for rounding, its normal decides. way: to the center."""
+    rounding = wp.length(s.error) + wp.static(16.0 * 2.0**-24) * (light.radius + wp.length(light.position))
+    distance = wp.length(way)
+    if distance < light.radius - rounding:
+        return True
+    return distance < light.radius + rounding and wp.dot(s.geometric, way) > 0.0
+
+
+@wp.func
+def sphere_light_from_within(light: Light, s: Surface, way: wp.vec3, xi: wp.vec2) -> LightSample:
+    """A direction by the cosine around the normal: every one of them meets the sphere's inside, where that emits."""
+    sample = LightSample()
+    if light.two_sided == 0:
+        return sample
+    sample.wi = cosine_hemisphere(xi, s.shading)
+    along = wp.dot(sample.wi, way)
+    across = way - along * sample.wi
+    half_chord = wp.sqrt(wp.max(0.0, light.radius * light.radius - wp.dot(across, across)))
+    n = wp.normalize(s.point + (along + half_chord) * sample.wi - light.position)
+    extent = wp.vec3(light.radius, light.radius, light.radius) + wp.abs(light.position)
+    sample.end = spawn_point(light.position + light.radius * n, wp.static(16.0 * 2.0**-24) * extent, n, -n)
+    sample.weight = light.color * (PI / wp.max(wp.dot(sample.wi, s.shading), 1.0e-9))
+    sample.area = 1
+    return sample
+
+
+@wp.func
 def sphere_light_sample(light: Light, s: Surface, xi: wp.vec2) -> LightSample:
-    """A direction in the cone that the sphere fills, uniformly (PBR, section 6.2.4); nothing from within the sphere."""
+    """A direction in the cone that the sphere fills, uniformly (PBR, section 6.2.4); from within, one by the cosine."""
     sample = LightSample()
     way = light.position - s.point
     distance2 = wp.dot(way, way)
+    if is_within(light, s, way):
+        return sphere_light_from_within(light, s, way, xi)
     sin2_max = light.radius * light.radius / distance2
     if sin2_max >= 1.0:
         return sample

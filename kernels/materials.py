@@ -4,7 +4,7 @@ import warp as wp
 
 from wrt.kernels.sampling import PI, ggx_normal, ggx_visible_share
 from wrt.kernels.structs import Material, Surfaces
-from wrt.kernels.surface import Surface
+from wrt.kernels.surface import Surface, make_surface_at
 from wrt.kernels.textures import make_sample_texture
 
 DIFFUSE = 0
@@ -173,6 +173,42 @@ def make_bump(features, sample_texture):
     return bump
 
 
+def make_shade(features):
+    """Surface and material at a hit, and the scattering there: shared by the integrator, shadow rays and AOVs."""
+    sample_texture = make_sample_texture(features.textures, features.checkerboards)
+    uvs = features.textures or features.checkerboards
+    surface_at = make_surface_at(features.spheres, features.smooth, uvs, features.normal_maps)
+    resolve = make_resolve(features, sample_texture)
+    bump = make_bump(features, sample_texture)
+
+    @wp.func
+    def shading_normal(surfaces: Surfaces, m: Material, s: Surface, wo: wp.vec3) -> wp.vec3:
+        """The interpolated or mapped normal, bent no farther than it is still seen from wo."""
+        n = s.shading
+        if wp.static(features.normal_maps):
+            n = bump(surfaces, m, s)
+        if wp.static(features.smooth or features.normal_maps):
+            facing = wp.dot(n, wo)
+            if facing < 1.0e-3:
+                n = wp.normalize(n + (1.0e-3 - facing) * wo)
+        return n
+
+    return surface_at, resolve, shading_normal
+
+
+def make_is_solid(features):
+    """Glass with an inside: what a ray enters at the front of a surface and leaves at its back."""
+
+    @wp.func
+    def is_solid(m: Material) -> bool:
+        clear = m.kind == wp.static(GLASS) or (m.kind == wp.static(METALLIC_ROUGHNESS) and m.transmission > 0.0)
+        if wp.static(features.thin_glass):
+            clear = clear and m.thin == 0
+        return clear
+
+    return is_solid
+
+
 def make_scatter(features):
     """How a surface splits what arrives: the one place where the kinds of material differ."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
@@ -181,14 +217,15 @@ def make_scatter(features):
     def dielectric(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> Scatter:
         """Reflection and refraction at a boundary to index m.ior, or at a thin pane of it."""
         cos_o = wp.clamp(wp.dot(n, wo), 0.0, 1.0)
-        if m.thin != 0:
-            # Light goes to and fro between the faces: R + T^2 R + T^2 R^3 + ... = 2 R / (1 + R).
-            r = fresnel(cos_o, m.ior)
-            share = 2.0 * r / (1.0 + r)
-            out.reflected = wp.vec3(share, share, share)
-            out.transmitted = (1.0 - share) * m.albedo
-            out.refraction = -wo
-            return out
+        if wp.static(features.thin_glass):
+            if m.thin != 0:
+                # Light goes to and fro between the faces: R + T^2 R + T^2 R^3 + ... = 2 R / (1 + R).
+                r = fresnel(cos_o, m.ior)
+                both = 2.0 * r / (1.0 + r)
+                out.reflected = wp.vec3(both, both, both)
+                out.transmitted = (1.0 - both) * m.albedo
+                out.refraction = -wo
+                return out
         eta = wp.where(s.front != 0, m.ior, 1.0 / m.ior)
         share = fresnel(cos_o, eta)
         out.reflected = wp.vec3(share, share, share)

@@ -3,10 +3,10 @@
 import warp as wp
 
 from wrt.kernels.camera import chief_ray, make_camera_ray
-from wrt.kernels.materials import make_cutout
+from wrt.kernels.materials import make_cutout, make_shade
 from wrt.kernels.sampling import hash_pair, make_sample_2d
 from wrt.kernels.structs import AovFilm, Camera, Film, Lighting, Limits, Ray, Surfaces, Tile, kernel
-from wrt.kernels.whitted import make_radiance, make_shade
+from wrt.kernels.whitted import make_radiance
 
 
 @wp.func

@@ -165,7 +165,7 @@ class Light:
     """kind: one of the LIGHT_ constants of lights.py.
 
     Point, spot: position, color = radiant intensity; directional: direction of travel, color = irradiance; sphere:
-    position, radius, color = radiance; mesh: emitters first .. first + count - 1, together of the given area-weighted power.
+    position, radius, color = radiance, two_sided: inwards too; mesh: emitters first .. first + count - 1.
     """
 
     kind: int
@@ -175,16 +175,16 @@ class Light:
     cos_inner: float
     cos_outer: float
     radius: float
+    two_sided: int
     first: int
     count: int
 
 
 @wp.struct
 class Emitter:
-    """A triangle that emits: prim_id, and the share of its light's power up to and with it."""
+    """A triangle that emits: prim_id, and the density per area with which its points are chosen among its light's."""
 
     prim_id: int
-    cdf: float
     pdf_area: float
 
 
@@ -205,11 +205,15 @@ class Background:
 
 @wp.struct
 class Lighting:
-    """Every source of light but the surfaces that are seen directly."""
+    """Every source of light but the surfaces that are seen directly.
+
+    emitter_cdf: per emitter, the share of its light's power up to and with it.
+    """
 
     count: int
     lights: wp.array(dtype=Light)
     emitters: wp.array(dtype=Emitter)
+    emitter_cdf: wp.array(dtype=wp.float32)
     background: Background
     ambient: wp.vec3
 

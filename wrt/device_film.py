@@ -69,21 +69,29 @@ class DeviceFilm:
         return sum((self.picture(film.samples) for film in self.groups[1:]), self.picture(self.groups[0].samples))
 
     def pixels_and_variance(self) -> tuple[np.ndarray, np.ndarray]:
-        """The mean of the samples and the estimated variance of that mean, both (H, W, 3) float32."""
+        """The mean of the samples and the estimated variance of that mean, both (H, W, 3) float32.
+
+        The variance is inf where nothing tells it: of fewer than two samples, or groups.
+        """
         if len(self.groups) == 1:
             film = self.groups[0]
-            n = np.maximum(self.picture(film.samples), 1)[..., None].astype(np.float32)
-            return self.picture(film.mean), self.picture(film.m2) / (n * np.maximum(n - 1.0, 1.0))
+            n = self.picture(film.samples)[..., None].astype(np.float32)
+            m2 = np.where(n < 2.0, np.float32(np.inf), self.picture(film.m2))
+            return self.picture(film.mean), m2 / np.maximum(n * (n - 1.0), 1.0)
         mean, variance = self._over_groups()
         return mean.astype(np.float32), variance.astype(np.float32)
 
     def error(self) -> float:
-        """Estimated root mean square error over pixels and channels, from the spread of the groups; needs two or more."""
+        """Estimated root mean square error over pixels and channels, from the spread of the groups; needs two or more.
+
+        inf where a pixel has no samples.
+        """
         return math.sqrt(float(self._over_groups()[1].mean()))
 
     def _over_groups(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean of the groups' means and its estimated variance, (H, W, 3) float64, one group in memory at a time."""
+        """Mean of the groups' means and its estimated variance, (H, W, 3) float64, one group in memory at a time; the
+        variance is inf where there are no samples."""
         n = len(self.groups)
         mean = sum(self.picture(film.mean) / np.float64(n) for film in self.groups)
         variance = sum((self.picture(film.mean) - mean) ** 2 for film in self.groups) / (n * (n - 1.0))
-        return np.asarray(mean), np.asarray(variance)
+        return np.asarray(mean), np.where(self.samples()[..., None] > 0, variance, np.inf)

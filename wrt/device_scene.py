@@ -171,8 +171,9 @@ def material_records(materials: tuple[Material, ...], table: TextureTable) -> np
     return out
 
 
-def light_records(scene: Scene, world: WorldMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Lights and emitters. Each object with emissive faces is one light; beyond MAX_MESH_LIGHTS all are one together."""
+def light_records(scene: Scene, world: WorldMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lights, emitters and the emitters' cdf (float32). Each object with emissive faces is one light; beyond
+    MAX_MESH_LIGHTS all are one together."""
     rows: list[dict[str, Any]] = []
     for light in scene.lights:
         if isinstance(light, PointLight):
@@ -185,23 +186,25 @@ def light_records(scene: Scene, world: WorldMesh) -> tuple[np.ndarray, np.ndarra
     for sphere in scene.spheres:
         if sphere.material.lights_others:
             rows.append({"kind": lights.LIGHT_SPHERE, "position": sphere.center, "radius": sphere.radius,
-                         "color": sphere.material.emission})
+                         "color": sphere.material.emission, "two_sided": sphere.material.two_sided})
     groups = _emissive_groups(scene, world)
     if len(groups) > MAX_MESH_LIGHTS:
         groups = [np.concatenate(groups)]
-    parts = []
+    parts = [records(structs.Emitter, 1)[:0]]
+    cdfs = [np.zeros(0, np.float32)]
     first = 0
     for prim_id in groups:
-        part = _emitters(scene, world, prim_id)
-        if part is not None:
+        part, cdf = _emitters(scene, world, prim_id)
+        if len(part):
             rows.append({"kind": lights.LIGHT_MESH, "first": first, "count": len(part)})
             parts.append(part)
+            cdfs.append(cdf)
             first += len(part)
     out = records(structs.Light, max(len(rows), 1))
     for i, values in enumerate(rows):
         for name, value in values.items():
             out[i][name] = value
-    return out[: len(rows)], np.concatenate(parts) if parts else records(structs.Emitter, 1)[:0]
+    return out[: len(rows)], np.concatenate(parts), np.concatenate(cdfs)
 
 
 def _emissive_groups(scene: Scene, world: WorldMesh) -> list[np.ndarray]:
@@ -218,19 +221,22 @@ def _emissive_groups(scene: Scene, world: WorldMesh) -> list[np.ndarray]:
     return groups
 
 
-def _emitters(scene: Scene, world: WorldMesh, prim_id: np.ndarray) -> np.ndarray | None:
+def _emitters(scene: Scene, world: WorldMesh, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The emitters of one light and their cdf; both empty where they have no power."""
     corner = world.geometry.vertices[world.geometry.faces[prim_id]].astype(np.float64)
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     power = np.array([LUMINANCE @ np.array(m.emission) for m in scene.materials])[world.prim_material[prim_id]] * area
     total = power.sum()
     if not total > 0.0:
-        return None
+        return records(structs.Emitter, 1)[:0], np.zeros(0, np.float32)
+    # The density is that of the rounded table, by which they are chosen.
+    cdf = (np.cumsum(power) / total).astype(np.float32)
+    cdf[np.nonzero(power)[0][-1] :] = 1.0
+    share = np.diff(cdf.astype(np.float64), prepend=0.0)
     out = records(structs.Emitter, len(prim_id))
     out["prim_id"] = prim_id
-    out["cdf"] = np.cumsum(power) / total
-    out["cdf"][np.nonzero(power)[0][-1] :] = 1.0
-    out["pdf_area"] = np.divide(power, area * total, out=np.zeros_like(area), where=area > 0.0)
-    return out
+    out["pdf_area"] = np.divide(share, area, out=np.zeros_like(area), where=area > 0.0)
+    return out, cdf
 
 
 def background_struct(scene: Scene, device: Any) -> Any:
@@ -278,6 +284,11 @@ def upload_scene(scene: Scene, device: Any) -> DeviceScene:
     if bare:
         warnings.warn(f"no texture coordinates, so that a texture's first texel is everywhere: objects {', '.join(bare)}",
                       SceneWarning, stacklevel=2)
+    unreached = [m.name or str(i) for i, m in enumerate(scene.materials)
+                 if m.is_emissive and m.emits_light and not m.lights_others]
+    if unreached:
+        warnings.warn("emission that is seen but lights nothing, since a texture or alpha says where it is: materials"
+                      f" {', '.join(unreached)} (emits_light = false says that it is meant)", SceneWarning, stacklevel=2)
     world = world_mesh(scene)
     geometry = world.geometry
     table = TextureTable()
@@ -297,10 +308,11 @@ def upload_scene(scene: Scene, device: Any) -> DeviceScene:
     s.srgb_to_linear = upload(srgb_table(), wp.float32, device)
 
     lighting = structs.Lighting()
-    rows, emitters = light_records(scene, world)
+    rows, emitters, cdf = light_records(scene, world)
     lighting.count = len(rows)
     lighting.lights = upload(rows, structs.Light, device)
     lighting.emitters = upload(emitters, structs.Emitter, device)
+    lighting.emitter_cdf = upload(cdf, wp.float32, device)
     lighting.background = background_struct(scene, device)
     lighting.ambient = wp.vec3(*scene.ambient)
     return DeviceScene(world, s, lighting)

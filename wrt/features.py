@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -21,6 +22,8 @@ from wrt.scene import (
     Texture,
 )
 
+STACK_STEP = 16
+
 
 @dataclass(frozen=True)
 class Features:
@@ -28,8 +31,8 @@ class Features:
 
     lens, blades, filter: the camera's; independent: the samples are random numbers; spheres, smooth, textures, checkerboards,
     normal_maps, cutout, blend: the surfaces'; mirror .. rough: the materials'; lights .. tinted_shadows: the lighting;
-    derived: reflection, refraction, transmission, transparent_shadows, sky_light, highlight. stack_size: the most rays that
-    can be pending.
+    derived: reflection, refraction, transmission, transparent_shadows, sky_light, highlight. stack_size: room for the rays
+    that can be pending, in whole STACK_STEPs, so that neighbouring depths share a kernel.
     """
 
     lens: bool = False
@@ -109,6 +112,9 @@ def features_of(scene: Scene, camera: Camera) -> Features:
     reflection = bool(kinds - {"diffuse"})
     refraction = bool(clear)
     children = int(reflection) + int(refraction) + int(blend)
+    # The ray at hand is popped before its children are pushed: each level adds one ray less than it has children. What goes
+    # straight on through a blended surface takes no level: it waits below its siblings, until they are done.
+    pending = (children - 1) * (settings.max_depth + 1) + 1
     return Features(
         lens=camera.aperture_radius > 0.0,
         blades=camera.aperture_radius > 0.0 and camera.blades > 0,
@@ -142,8 +148,7 @@ def features_of(scene: Scene, camera: Camera) -> Features:
         transparent_shadows=lit and (blend or tinted or any(m.thin for m in clear)),
         reflection=reflection,
         refraction=refraction,
-        # The ray at hand is popped before its children are pushed: each level adds one ray less than it has children.
-        stack_size=max(1, (children - 1) * (settings.max_depth + 1) + 1),
+        stack_size=1 if children < 2 else STACK_STEP * math.ceil(pending / STACK_STEP),
     )
 
 

@@ -32,7 +32,8 @@ class Film:
     """What `render` gives back.
 
     pixels: (H, W, 3) float32, linear Rec. 709 radiance, the mean of the samples; row 0 is on top.
-    variance: (H, W, 3) float32, estimated variance of that mean (its root is the standard error).
+    variance: (H, W, 3) float32, estimated variance of that mean (its root is the standard error); inf where it is not known:
+        one sample tells nothing of it.
     samples: (H, W) int32, samples taken of each pixel.
     aov: by name, of what one ray through the pixel's centre, and the middle of the lens, hits first (blended surfaces
         count, cut-out parts do not; no filter, no mean over samples):
@@ -160,7 +161,7 @@ def _view_id(ids: np.ndarray) -> np.ndarray:
 
 
 def _view_variance(variance: np.ndarray) -> np.ndarray:
-    """The standard error, on the scale of the picture itself without exposure and tone mapping."""
+    """The standard error, on the scale of the picture itself without exposure and tone mapping; unknown is white."""
     return to_codes(np.sqrt(np.maximum(variance, 0.0)))
 
 

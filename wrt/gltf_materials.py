@@ -262,7 +262,7 @@ class Materials:
         texture = self._textures.texture(source.emissiveTexture, True, name, f"{place}.emissiveTexture")
         if texture is None:  # it could not be read, and without it the whole surface would glow
             return {}
-        return {"emission": emission, "emission_texture": texture, "emits_light": False}
+        return {"emission": emission, "emission_texture": texture}
 
 
 def absorption(volume: Volume) -> Color:

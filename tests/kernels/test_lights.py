@@ -216,10 +216,38 @@ def test_sphere_light_by_its_closed_form(ratio, degrees):
     assert np.allclose(found, expected, rtol=2e-3)
 
 
-def test_sphere_light_gives_nothing_to_who_is_inside():
-    scene = Scene(spheres=(Sphere((0.0, 0.1, 0.0), 1.0, Material(emission=(1.0, 1.0, 1.0))),))
-    out, _ = take(scene)
+def inside_out(center=(0.0, 0.1, 0.0), radius=1.0, two_sided=True):
+    return Scene(spheres=(Sphere(center, radius, Material(emission=(3.0, 2.0, 1.0), two_sided=two_sided)),))
+
+
+def test_a_sphere_that_emits_outwards_only_gives_nothing_to_who_is_inside():
+    out, _ = take(inside_out(two_sided=False))
     assert not out["weight"].any()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+@pytest.mark.parametrize("point", [(0.0, 0.0, 0.0), (0.3, -0.5, 0.6), (0.0, 0.9999, 0.0)])
+def test_inside_a_glowing_sphere_the_irradiance_is_pi_l(point, scale):
+    rng = np.random.default_rng(3)
+    scene = inside_out((0.0, 0.0, 0.0), scale)
+    for n in directions(rng, 3):
+        at = np.array(point) * scale
+        out, ray = take(scene, at, n, xi=rng.random((2000, 2)))
+        each = out["weight"] * np.maximum(out["wi"].astype(np.float64) @ n, 0.0)[:, None]
+        assert np.allclose(each, np.pi * np.array([3.0, 2.0, 1.0]), rtol=1e-3)  # each sample alone: there is no noise
+        structure = build(upload_scene(scene, CPU).world.geometry, "bvh")
+        assert not structure.any_hit(ray["origin"], ray["direction"], 0.0, ray["t_max"]).any()
+        assert structure.any_hit(ray["origin"], ray["direction"], 0.0, 1.02).mean() > 0.999
+
+
+def test_a_glowing_sphere_lights_its_own_inside_but_not_its_own_outside():
+    # At points on the sphere itself, rounded to one side or the other, the normal tells which side is meant.
+    rng = np.random.default_rng(4)
+    center = np.array([10.0, -3.0, 0.5])
+    for n in directions(rng, 40):
+        point = rounded(center + 2.0 * n)
+        inner, outer = (irradiance(inside_out(tuple(center), 2.0), point, side * n, xi=rng.random((64, 2))) for side in (-1.0, 1.0))
+        assert np.allclose(inner, np.pi * np.array([3.0, 2.0, 1.0]), rtol=1e-3) and not outer.any()
 
 
 def random_points(rng, n):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,7 @@ from wrt.device_scene import (
     upload_scene,
     world_mesh,
 )
-from wrt.errors import InputError
+from wrt.errors import InputError, SceneWarning
 from wrt.kernels import lights
 from wrt.mesh import Mesh
 from wrt.scene import (
@@ -149,7 +151,7 @@ def test_srgb_table() -> None:
 def test_lights_without_area() -> None:
     scene = Scene(lights=(PointLight((1, 2, 3), (4, 5, 6)), DirectionalLight((0, -3, 0), (7, 8, 9)),
                           SpotLight((1, 1, 1), (0, 0, -2), (1, 2, 3), 0.25, 0.5)))
-    rows, emitters = light_records(scene, world_mesh(scene))
+    rows, emitters, _ = light_records(scene, world_mesh(scene))
     assert rows["kind"].tolist() == [lights.LIGHT_POINT, lights.LIGHT_DIRECTIONAL, lights.LIGHT_SPOT] and len(emitters) == 0
     assert rows["position"][0].tolist() == [1, 2, 3] and rows["color"][1].tolist() == [7, 8, 9]
     assert np.allclose(rows["direction"][1:], [[0, -1, 0], [0, 0, -1]])
@@ -165,11 +167,11 @@ def lamps(count: int, **rest: float) -> Scene:
 
 def test_each_glowing_object_is_a_light() -> None:
     scene = lamps(3)
-    rows, emitters = light_records(scene, world_mesh(scene))
+    rows, emitters, cdf = light_records(scene, world_mesh(scene))
     assert (rows["kind"] == lights.LIGHT_MESH).all()
     assert rows["count"].tolist() == [2, 2, 2] and rows["first"].tolist() == [0, 2, 4]
     assert emitters["prim_id"].tolist() == list(range(12, 18))
-    assert np.allclose(emitters["cdf"], [0.5, 1.0] * 3)
+    assert np.allclose(cdf, [0.5, 1.0] * 3)
     assert np.allclose(emitters["pdf_area"], 1.0 / np.repeat([1.0, 2.0, 3.0], 2))  # uniform over each quad
     dark = lamps(3, emits_light=False)
     assert len(light_records(dark, world_mesh(dark))[0]) == 0
@@ -178,29 +180,63 @@ def test_each_glowing_object_is_a_light() -> None:
 def test_beyond_some_number_all_are_one_light_by_power() -> None:
     count = MAX_MESH_LIGHTS + 4
     scene = lamps(count)
-    rows, emitters = light_records(scene, world_mesh(scene))
+    rows, emitters, cdf = light_records(scene, world_mesh(scene))
     assert len(rows) == 1 and rows["count"][0] == 2 * count == len(emitters)
     area = 0.5 * (1.0 + np.repeat(np.arange(count), 2))
     power = area * np.repeat([LUMINANCE @ [1.0 + i, 2.0, 0.5] for i in range(count)], 2)
-    assert np.allclose(np.diff(emitters["cdf"], prepend=0.0), power / power.sum(), atol=1e-6)
-    assert emitters["cdf"][-1] == 1.0
+    assert np.allclose(np.diff(cdf, prepend=0.0), power / power.sum(), atol=1e-6)
+    assert cdf[-1] == 1.0
     # Density over all: chance of the triangle, uniform over its area; in all it is 1.
     assert np.allclose(emitters["pdf_area"], power / power.sum() / area, rtol=1e-5)
     assert (emitters["pdf_area"] * area).sum() == pytest.approx(1.0, rel=1e-5)
 
 
+def test_the_density_of_emitters_is_that_of_the_rounded_table_by_which_they_are_chosen() -> None:
+    # A million triangles: each has a share of about 16 steps of float32 near 1, and some a sixteenth more than others.
+    rng = np.random.default_rng(0)
+    count = 1_000_000
+    corner = rng.random((count, 1, 3)).astype(np.float32)
+    vertices = np.concatenate([corner, corner + [[[0.01, 0, 0]]], corner + [[[0, 0.01, 0]]]], axis=1).reshape(-1, 3)
+    mesh = Mesh(vertices, np.arange(3 * count).reshape(-1, 3))
+    scene = Scene(objects=(Object(mesh, (Material(emission=(1, 1, 1)),)),))
+    world = world_mesh(scene)
+    _, emitters, cdf = light_records(scene, world)
+    assert cdf.dtype == np.float32 and cdf[-1] == 1.0 and (np.diff(cdf) >= 0.0).all()
+    corner = world.geometry.vertices[world.geometry.faces].astype(np.float64)
+    area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    chance = np.diff(cdf.astype(np.float64), prepend=0.0)
+    assert np.allclose(emitters["pdf_area"] * area, chance, rtol=1e-6)
+    assert np.abs(chance * count - 1.0).max() > 0.01  # what rounding makes of equal shares
+
+
+def test_emission_that_light_samples_cannot_reach_is_told_once() -> None:
+    picture = Texture(np.zeros((2, 3, 4), np.uint8))
+    glowing = [Material(name="sign", emission=(1, 1, 1), emission_texture=picture),
+               Material(name="veil", emission=(1, 1, 1), alpha_mode="blend"), Material(emission=(1, 1, 1), alpha_mode="mask"),
+               Material(name="meant", emission=(1, 1, 1), emission_texture=picture, emits_light=False),
+               Material(name="lamp", emission=(1, 1, 1)), Material(name="dark", alpha_mode="blend")]
+    objects = tuple(Object(quad(), (material,)) for material in glowing)
+    with pytest.warns(SceneWarning) as told:
+        upload_scene(Scene(objects=objects), CPU)
+    assert len(told) == 1
+    assert "seen but lights nothing" in str(told[0].message) and "materials sign, veil, 2 (" in str(told[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        upload_scene(Scene(objects=objects[3:]), CPU)
+
+
 def test_emitters_without_area_or_light_are_never_chosen() -> None:
     mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], [[0, 1, 1], [0, 1, 2], [0, 1, 3]])
     scene = Scene(objects=(Object(mesh, (Material(emission=(1, 1, 1)),)),))
-    rows, emitters = light_records(scene, world_mesh(scene))
-    assert rows["count"][0] == 3 and emitters["cdf"].tolist() == [0.0, 1.0, 1.0]
+    rows, emitters, cdf = light_records(scene, world_mesh(scene))
+    assert rows["count"][0] == 3 and cdf.tolist() == [0.0, 1.0, 1.0] and emitters["pdf_area"].tolist() == [0.0, 2.0, 0.0]
     flat = Scene(objects=(Object(Mesh(mesh.vertices, mesh.faces[[0, 2]]), (Material(emission=(1, 1, 1)),)),))
     assert len(light_records(flat, world_mesh(flat))[0]) == 0
 
 
 def test_glowing_spheres() -> None:
     scene = Scene(spheres=(Sphere((0, 1, 0), 0.5, Material(emission=(1, 2, 3))), Sphere((5, 1, 0), 0.5, GREY)))
-    rows, _ = light_records(scene, world_mesh(scene))
+    rows, *_ = light_records(scene, world_mesh(scene))
     assert len(rows) == 1 and rows["kind"][0] == lights.LIGHT_SPHERE and rows["radius"][0] == 0.5
     assert rows["position"][0].tolist() == [0, 1, 0] and rows["color"][0].tolist() == [1, 2, 3]
 

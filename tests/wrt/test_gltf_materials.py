@@ -118,7 +118,7 @@ def test_unlit_shows_its_base_colour_and_lights_nothing(tmp_path):
 
 def test_an_emission_texture_is_seen_but_lights_nothing(tmp_path):
     material = load(textured({"emissiveTexture": {"index": 0}, "emissiveFactor": [1, 1, 1]}), tmp_path).materials[0]
-    assert material.is_emissive and not material.emits_light and material.emission_texture.srgb
+    assert material.is_emissive and not material.lights_others and material.emission_texture.srgb
     assert not load(textured({"emissiveTexture": {"index": 0}}), tmp_path).materials[0].textures  # the factor is black
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -40,6 +41,15 @@ def features(path: Path) -> set[Features]:
 @pytest.mark.parametrize("name", Features().switches())
 def test_every_feature_has_a_scene_that_needs_it(name: str) -> None:
     assert any(getattr(f, name) for path in SCENES for f in features(path)), f"no scene in scenes/ needs {name}"
+
+
+@pytest.mark.parametrize("name", Features().switches())
+def test_every_feature_changes_the_code_of_a_scene_that_needs_it(name: str) -> None:
+    start("cpu")
+    needed = next(f for path in SCENES for f in features(path) if getattr(f, name))
+    codes = [render_kernel(f, Structure(ACCELERATORS["bvh"], Units(spheres=f.spheres))).module.hash_module()
+             for f in (needed, replace(needed, **{name: False}))]
+    assert codes[0] != codes[1]
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)

@@ -15,6 +15,8 @@ from tests.data import ROOT
 from wrt.device_film import GROUPS
 from wrt.driver import MAX_SPP, Options, Renderer, render
 from wrt.errors import InputError
+from wrt.film import aov_to_srgb8
+from wrt.image import read_channels
 from wrt.scene import Camera, Material, Object, Scene, Settings, Sphere
 from wrt.shapes import quad
 
@@ -95,6 +97,21 @@ def test_a_crop_counts_its_own_error_only() -> None:
 def test_a_black_picture_has_no_error_at_all() -> None:
     film = render(Scene(cameras=SCENE.cameras, settings=SCENE.settings), target_error=1e-12)
     assert film.metadata["spp"] == GROUPS and film.stats["estimated_error"] == 0.0
+
+
+def test_what_is_not_known_is_not_called_small(tmp_path: Any) -> None:
+    def at_once(progress: Any) -> None:
+        raise KeyboardInterrupt
+
+    film = render(SCENE, target_error=0.5, progress=at_once, size=(480, 320), threads=1)
+    none = film.samples == 0
+    assert none.any() and np.isposinf(film.variance[none]).all() and np.isfinite(film.variance[~none]).all()
+    assert film.stats["estimated_error"] == math.inf and not film.stats["target_reached"]
+    one = render(SCENE, spp=1)
+    assert np.isposinf(one.variance).all()
+    one.save(tmp_path / "one.exr")
+    assert np.isposinf(read_channels(tmp_path / "one.exr")["variance.R"]).all()
+    assert (aov_to_srgb8("variance", one.variance) == 255).all()
 
 
 def test_time_limit_and_interrupt_end_it_as_well() -> None:

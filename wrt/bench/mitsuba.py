@@ -145,7 +145,7 @@ def _translate(mi: Any, scene: Scene, camera: Camera, options: Options) -> Trans
     background = background_emitter(mi, scene.background)
     if background is not None:
         contents["background"] = background
-    lit = bool(scene.lights) or background is not None or any(m.is_emissive and m.emits_light for m in scene.materials)
+    lit = bool(scene.lights) or background is not None or any(m.lights_others for m in scene.materials)
     if not lit:  # Mitsuba refuses a scene whose emitters are all never sampled
         contents["darkness"] = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 0.0}
     _check_light_transport(scene, integrator, notes)
@@ -182,8 +182,8 @@ def _check_light_transport(scene: Scene, integrator: str, notes: Approximations)
         return
     if max(scene.ambient) > 0.0:
         notes.add("the ambient term (left out)")
-    if any(m.is_emissive and not m.emits_light for m in materials):
-        notes.add("emits_light = false (the surface lights others)")
+    if any(m.is_emissive and not m.lights_others for m in materials):
+        notes.add("emission that is only seen (the surface lights others)")
     if integrator != "volpath":
         if any(max(m.absorption) > 0.0 for m in materials):
             notes.add(f'absorption with integrator "{integrator}" (left out)')
@@ -197,7 +197,8 @@ def _integrator(mi: Any, name: str, scene: Scene, options: Options, lit: bool, p
         from wrt.bench.mitsuba_whitted import whitted_integrator
 
         inside = {key: part.material.absorption for key, part in parts.items() if max(part.material.absorption) > 0.0}
-        return whitted_integrator(mi, max_depth, scene.ambient, lit, inside)
+        blended = {key for key, part in parts.items() if part.material.alpha_mode == "blend"}
+        return whitted_integrator(mi, max_depth, scene.ambient, lit, inside, blended)
     if name == "direct":
         return {"type": "direct"}
     # Mitsuba counts a path's edges: 1 is emission seen by the camera, 2 direct light. No Russian roulette: less noise.

@@ -24,6 +24,8 @@ def bsdf(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
         result = {"type": "normalmap", "normalmap": _normal_map(mi, material, notes), "bsdf": result}
     if not transmits:
         result = {"type": "twosided", "bsdf": result}
+    if transmits and not material.thin and material.alpha_mode == "blend":
+        notes.add("blended solid glass (each face by itself)", f"material {material.name!r}")
     opacity = _opacity(mi, material, notes)
     return result if opacity is None else {"type": "mask", "opacity": opacity, "bsdf": result}
 
@@ -33,7 +35,7 @@ def emission(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
     if material.alpha_mode != "opaque":
         notes.add("emission of a surface that is partly transparent (emits as if opaque)", f"material {material.name!r}")
     radiance = _color(mi, material.emission, material.emission_texture, notes)
-    return {"type": "area", "radiance": radiance, "sampling_weight": 1.0 if material.emits_light else 0.0}
+    return {"type": "area", "radiance": radiance, "sampling_weight": 1.0 if material.lights_others else 0.0}
 
 
 def _diffuse(mi: Any, material: Material, notes: Any) -> dict[str, Any]:

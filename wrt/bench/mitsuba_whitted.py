@@ -7,15 +7,17 @@ from typing import Any
 
 from wrt.scene import Color
 
-MAX_TRANSPARENT = 256  # surfaces that one shadow ray may pass through
+MAX_TRANSPARENT = 256  # surfaces in a row that a ray may go straight through
 
 
-def whitted_integrator(mi: Any, max_depth: int, ambient: Color, lights: bool, absorption: dict[str, Color]) -> Any:
+def whitted_integrator(mi: Any, max_depth: int, ambient: Color, lights: bool, absorption: dict[str, Color],
+                       blended: set[str]) -> Any:
     """An integrator whose expectation is wrt's picture: direct light and ambient at diffuse surfaces, where paths end.
 
     Reflection, refraction and transparency are followed, one of them by chance where wrt follows all. max_depth:
     bounces after the first hit. lights: whether there is an emitter to sample. absorption: shape id -> coefficient
-    inside it. It is Python code in a scalar variant, some 10 microseconds a bounce: for small pictures.
+    inside it; blended: ids of shapes that rays pass by their alpha, which is no bounce.
+    It is Python code in a scalar variant, some 10 microseconds a bounce: for small pictures.
     """
     flags = mi.BSDFFlags
     diffuse, smooth = int(flags.Diffuse), int(flags.Smooth)
@@ -58,7 +60,8 @@ def whitted_integrator(mi: Any, max_depth: int, ambient: Color, lights: bool, ab
 
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: bool = True) -> Any:
             radiance, throughput, within = mi.Color3f(0.0), mi.Color3f(1.0), None
-            for depth in range(max_depth + 1):
+            depth = passed = 0
+            while depth <= max_depth and passed <= MAX_TRANSPARENT:
                 si = scene.ray_intersect(ray)
                 if within is not None and si.is_valid():
                     throughput *= exp(-within * si.t)
@@ -66,7 +69,7 @@ def whitted_integrator(mi: Any, max_depth: int, ambient: Color, lights: bool, ab
                 if emitter is not None:
                     radiance += throughput * emitter.eval(si)
                 if not si.is_valid():
-                    return radiance, depth > 0, []
+                    return radiance, depth + passed > 0, []
                 bsdf = si.bsdf()
                 if lights and bsdf.flags() & smooth:
                     radiance += throughput * direct_light(scene, sampler, si, bsdf)
@@ -83,6 +86,10 @@ def whitted_integrator(mi: Any, max_depth: int, ambient: Color, lights: bool, ab
                 if bounce.eta != 1.0:  # refracted, and now on the side where it goes
                     within = inside.get(si.shape.id()) if direction @ si.n < 0.0 else None
                 ray = si.spawn_ray(direction)
+                if si.shape.id() in blended and bounce.sampled_component == bsdf.component_count() - 1:
+                    passed += 1  # straight on past a blended surface (the last component of Mitsuba's mask): no bounce
+                else:
+                    depth, passed = depth + 1, 0
             return radiance, True, []
 
     return Whitted()

@@ -1,0 +1,84 @@
+"""Shadow rays through what lets light through, by pictures whose answer is known; tests/wrt/test_tinted_shadows.py has more."""
+
+import numpy as np
+import pytest
+
+from wrt.driver import render
+from wrt.kernels.shadows import MAX_TRANSPARENT
+from wrt.scene import Camera, Color, DirectionalLight, Material, Object, PointLight, Scene, Settings
+from wrt.shapes import box, quad
+
+ONE: Color = (1.0, 1.0, 1.0)
+WHITE = Material(albedo=ONE)
+FLOOR = Object(quad((-10, 0, 10), (20, 0, 0), (0, 0, -20)), (WHITE,))
+SUN = DirectionalLight((0.6, -0.8, 0.0), (np.pi,) * 3)
+SIGMA = {"absorption": (0.5, 0.1, 0.9)}
+# Far away, so that the pictures here share a kernel.
+EXTRA = tuple(Object(quad((1e4, i, 0), (1, 0, 0), (0, 1, 0)), (material,)) for i, material in enumerate(
+    (Material("glass", alpha_mode="blend", **SIGMA), Material("glass", thin=True), Material(alpha_mode="mask"))))
+
+
+def lit(*objects, light=SUN, shadows="opaque"):
+    """Radiance of a white floor below the objects, and the render's statistics."""
+    scene = Scene(objects=(FLOOR, *objects, *EXTRA), lights=(light,),
+                  cameras=(Camera.look_at((0.0, 0.5, 0.8), (0.0, 0.0, 0.0), fov_y=0.01),),
+                  settings=Settings(size=(2, 2), spp=1, filter="box", glass_shadows=shadows, max_depth=0))
+    film = render(scene)
+    return film.pixels.mean(axis=(0, 1), dtype=np.float64), film.stats
+
+
+def pane(material, y=1.0):
+    return Object(quad((-10, y, 10), (20, 0, 0), (0, 0, -20)), (material,))
+
+
+def block(material, low=1.0, high=1.5):
+    return Object(box((-10.0, low, -10.0), (10.0, high, 10.0)), (material,))
+
+
+@pytest.mark.parametrize("count", [1, 12, 256, 257])
+def test_panes_of_alpha_0_shade_nothing_up_to_a_number_that_is_counted(count):
+    clear = Material(alpha=0.0, alpha_mode="blend")
+    lamp = PointLight((0.0, 3.0, 0.0), (9.0 * np.pi,) * 3)
+    value, stats = lit(*(pane(clear, y) for y in np.linspace(1.0, 2.0, count)), light=lamp)
+    there = count <= MAX_TRANSPARENT
+    assert np.allclose(value, float(there), rtol=1e-3)
+    assert stats["cut_by_depth"] == (0 if there else stats["samples"])
+    assert stats["lost_throughput_per_sample"] == pytest.approx(float(not there))  # a white floor reflects all of it
+
+
+@pytest.mark.parametrize("shadows", ["opaque", "tinted"])
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0])
+def test_the_shadow_of_blended_solid_glass_is_that_with_and_without_it(shadows, alpha):
+    without, opaque = lit(shadows=shadows)[0], lit(block(Material("glass", albedo=ONE, **SIGMA)), shadows=shadows)[0]
+    assert (opaque < 0.9 * without).all() and (opaque.any() == (shadows == "tinted"))
+    value, _ = lit(block(Material("glass", albedo=ONE, alpha=alpha, alpha_mode="blend", **SIGMA)), shadows=shadows)
+    assert np.allclose(value, (1.0 - alpha) * without + alpha * opaque, rtol=1e-5)
+
+
+def test_a_light_within_blended_glass_shines_out_through_one_face_or_none():
+    lamp = PointLight((0.0, 1.25, 0.0), (1.5625 * np.pi,) * 3)
+    glass = {"albedo": (1.0, 0.5, 1.0), "absorption": (0.0, 0.0, 2.0)}
+    without = lit(light=lamp, shadows="tinted")[0]
+    opaque = lit(block(Material("glass", **glass)), light=lamp, shadows="tinted")[0]
+    assert np.allclose(opaque, 0.96 * np.array([1.0, 0.5, np.exp(-0.5)]), rtol=2e-3)
+    value, _ = lit(block(Material("glass", alpha=0.4, alpha_mode="blend", **glass)), light=lamp, shadows="tinted")
+    assert np.allclose(value, 0.6 * without + 0.4 * opaque, rtol=1e-5)
+
+
+def test_absorption_goes_on_behind_a_pane_within_the_glass():
+    # The block's own light path is cut in two by a clear pane: the whole way counts.
+    glass = Material("glass", albedo=ONE, ior=1.0, **SIGMA)
+    whole, _ = lit(block(glass), shadows="tinted")
+    cut, _ = lit(block(glass), pane(Material(alpha=0.0, alpha_mode="blend"), 1.2), shadows="tinted")
+    assert np.allclose(whole, np.exp(-np.array(SIGMA["absorption"]) * 0.5 / 0.8) * 0.8, rtol=1e-4)
+    assert np.allclose(cut, whole, rtol=1e-4)
+
+
+@pytest.mark.parametrize("mode", ["opaque", "mask"])
+def test_alpha_lets_no_light_through_what_is_not_blended(mode):
+    assert not lit(pane(Material(alpha=0.7, alpha_mode=mode)))[0].any()
+
+
+def test_layers_of_blended_surfaces_multiply():
+    layers = [pane(Material(alpha=alpha, alpha_mode="blend"), 1.0 + alpha) for alpha in (0.25, 0.5)]
+    assert np.allclose(lit(*layers)[0], 0.8 * 0.75 * 0.5, rtol=1e-5)
