@@ -6,7 +6,7 @@ import difflib
 import operator
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -77,9 +77,9 @@ def as_tuple(value: Any, kind: type[T] | tuple[type[T], ...], what: str) -> tupl
 
 def as_names(value: Any, what: str) -> tuple[str, ...]:
     """Names; a single one stands for itself."""
-    if not isinstance(value, str | Sequence | set | frozenset):
+    if not isinstance(value, Iterable):
         raise InputError(f"{what} must be a name or several, got {shown(value)}")
-    return as_tuple(value, str, what) if isinstance(value, str | Sequence) else tuple(sorted(value))
+    return as_tuple(value, str, what)
 
 
 def unknown(name: str, what: str, known: Iterable[str]) -> str:
@@ -89,6 +89,11 @@ def unknown(name: str, what: str, known: Iterable[str]) -> str:
     hint = f"did you mean {near[0]!r}? " if near else ""
     return f"unknown {what} {name!r}; {hint}known are {', '.join(map(repr, names))}" if names else (
         f"unknown {what} {name!r}; there are none")
+
+
+def at_thing(kind: str, name: str) -> str:
+    """How a message begins that is about a thing of that name, or of none."""
+    return f"{kind} {name!r}: " if name else f"{kind}: "
 
 
 def shown(value: Any) -> str:

@@ -145,7 +145,8 @@ def info(scene: Path, camera: str | None, as_json: bool) -> None:
         return
     features = facts.pop("features")
     for name, value in facts.items():
-        shown = "none" if value in (None, []) else ", ".join(map(str, value)) if isinstance(value, list) else value
+        between = "; " if isinstance(value, list) and value and isinstance(value[0], str) else ", "  # names may have commas
+        shown = "none" if value in (None, []) else between.join(map(str, value)) if isinstance(value, list) else value
         click.echo(f"{name}: {shown}")
     for state in (True, False):
         names = [name for name, on in features.items() if on is state]

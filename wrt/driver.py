@@ -113,6 +113,7 @@ class Options:
         if not (self.progress is None or callable(self.progress)):
             raise InputError(f"progress must be a function of a Progress, got {shown(self.progress)}")
         as_one(self.camera, (str, int, np.integer, Camera, type(None)), "camera")
+        as_one(self.accel_options, dict, "accel_options")
         as_one(self.threads, (int, np.integer, type(None)), "threads")
         thread_count(self.threads)
         start(self.device)

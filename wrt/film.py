@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from wrt.arguments import as_names
 from wrt.errors import InputError
 from wrt.image import (
     PathLike,
@@ -86,7 +87,7 @@ class Film:
     def _repr_png_(self) -> bytes:
         return encode_png(self.to_srgb8(), self.metadata)
 
-    def save(self, path: PathLike, *, bits: int | None = None, aov: Iterable[str] | None = None) -> list[Path]:
+    def save(self, path: PathLike, *, bits: int | None = None, aov: str | Iterable[str] | None = None) -> list[Path]:
         """Write the picture, and other layers with it; returns the paths written.
 
         path: .png gets exposure and tone mapping, .exr and .hdr stay linear. bits: as in wrt.image.write_image. aov:
@@ -112,10 +113,10 @@ class Film:
             write_codes(view_path, aov_to_srgb8(name, array), self.metadata)
         return [Path(path), *views]
 
-    def _layer_names(self, aov: Iterable[str] | None, suffix: str) -> list[str]:
+    def _layer_names(self, aov: str | Iterable[str] | None, suffix: str) -> list[str]:
         if aov is None:
             return list(self.layers) if suffix == ".exr" else []
-        names = list(dict.fromkeys(aov))
+        names = list(dict.fromkeys(as_names(aov, "aov")))
         unknown = [name for name in names if name not in self.layers]
         if unknown:
             raise InputError(f"no AOV {unknown[0]!r}; there are {', '.join(self.layers)}")

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.arguments import LARGEST, as_array, as_integer, as_one, as_size, as_tuple, unknown
+from wrt.arguments import LARGEST, as_array, as_integer, as_one, as_size, as_tuple, at_thing, unknown
 from wrt.errors import InputError
 from wrt.mesh import Mesh
 
@@ -96,12 +96,12 @@ class Texture:
     def __post_init__(self) -> None:
         image = np.ascontiguousarray(self.image)
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 4 or image.size == 0:
-            raise InputError(f"texture {self.name!r}: image must be (H, W, 4) uint8, got {image.shape} {image.dtype}")
+            raise InputError(at_thing("texture", self.name) + f"image must be (H, W, 4) uint8, got {image.shape} {image.dtype}")
         for wrap in self.wrap:
-            _choice(wrap, WRAPS, f"texture {self.name!r}: wrap")
-        transform = as_array(self.uv_transform, np.float64, f"texture {self.name!r}: uv_transform")
+            _choice(wrap, WRAPS, at_thing("texture", self.name) + "wrap")
+        transform = as_array(self.uv_transform, np.float64, at_thing("texture", self.name) + "uv_transform")
         if transform.shape != (2, 3) or not np.isfinite(transform).all():
-            raise InputError(f"texture {self.name!r}: uv_transform must be a finite 2x3 matrix")
+            raise InputError(at_thing("texture", self.name) + "uv_transform must be a finite 2x3 matrix")
         object.__setattr__(self, "image", image)
         object.__setattr__(self, "uv_transform", transform)
 
@@ -183,7 +183,7 @@ class Material:
     normal_texture: Texture | None = None
 
     def __post_init__(self) -> None:
-        at = f"material {self.name!r}: "
+        at = at_thing("material", self.name)
         _choice(self.kind, MATERIAL_KINDS, at + "kind")
         _choice(self.alpha_mode, ALPHA_MODES, at + "alpha_mode")
         bounds: dict[str, tuple[float, float]] = {
@@ -240,7 +240,7 @@ class Object:
     name: str = ""
 
     def __post_init__(self) -> None:
-        at = f"object {self.name!r}: "
+        at = at_thing("object", self.name)
         as_one(self.mesh, Mesh, at + "mesh")
         object.__setattr__(self, "materials", as_tuple(self.materials, Material, at + "materials"))
         if not self.materials:
@@ -269,7 +269,7 @@ class Sphere:
     name: str = ""
 
     def __post_init__(self) -> None:
-        at = f"sphere {self.name!r}: "
+        at = at_thing("sphere", self.name)
         as_one(self.material, Material, at + "material")
         object.__setattr__(self, "center", as_vector(self.center, at + "center", low=-MAX_REACH, high=MAX_REACH))
         object.__setattr__(self, "radius", as_number(self.radius, at + "radius", low=SMALLEST, high=MAX_REACH))
@@ -287,8 +287,8 @@ class PointLight:
     name: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position", as_vector(self.position, f"light {self.name!r}: position"))
-        object.__setattr__(self, "intensity", as_vector(self.intensity, f"light {self.name!r}: intensity", low=0.0))
+        object.__setattr__(self, "position", as_vector(self.position, at_thing("light", self.name) + "position"))
+        object.__setattr__(self, "intensity", as_vector(self.intensity, at_thing("light", self.name) + "intensity", low=0.0))
 
 
 @dataclass(frozen=True)
@@ -300,7 +300,7 @@ class DirectionalLight:
     name: str = ""
 
     def __post_init__(self) -> None:
-        at = f"light {self.name!r}: "
+        at = at_thing("light", self.name)
         object.__setattr__(self, "direction", _unit(as_vector(self.direction, at + "direction"), at + "direction"))
         object.__setattr__(self, "irradiance", as_vector(self.irradiance, at + "irradiance", low=0.0))
 
@@ -318,7 +318,7 @@ class SpotLight:
     name: str = ""
 
     def __post_init__(self) -> None:
-        at = f"light {self.name!r}: "
+        at = at_thing("light", self.name)
         object.__setattr__(self, "position", as_vector(self.position, at + "position"))
         object.__setattr__(self, "direction", _unit(as_vector(self.direction, at + "direction"), at + "direction"))
         object.__setattr__(self, "intensity", as_vector(self.intensity, at + "intensity", low=0.0))
@@ -375,7 +375,7 @@ class EnvironmentBackground:
     name: str = ""
 
     def __post_init__(self) -> None:
-        at = f"environment {self.name!r}: "
+        at = at_thing("environment", self.name)
         image = as_array(self.image, np.float32, at + "image")
         if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
             raise InputError(at + f"image must be (H, W, 3), got {image.shape}")
@@ -411,7 +411,7 @@ class Camera:
     name: str = ""
 
     def __post_init__(self) -> None:
-        at = f"camera {self.name!r}: "
+        at = at_thing("camera", self.name)
         matrix = as_transform(self.camera_to_world, at + "camera_to_world").copy()
         # Only the pose counts: scale and shear would bend the picture, and glTF says that a camera ignores them.
         z = matrix[:3, 2]

@@ -52,6 +52,9 @@ GREY = Material(name="grey")
     (lambda: Scene(lights=5), "lights: each must be a PointLight or a DirectionalLight or a SpotLight, got 5"),
     (lambda: Scene(background=(0, 0, 0)), "background must be a ConstantBackground or .*, got \\(0, 0, 0\\)"),
     (lambda: Scene(settings={"spp": 4}), "settings must be a Settings, got a dict"),
+    (lambda: Material(kind="gold"), "^material: kind must be one of"),
+    (lambda: Material(kind="gold", name="ring"), "^material 'ring': kind must be one of"),
+    (lambda: PointLight((0, 0), 1), "^light: position must be three finite numbers"),
     (lambda: Settings(spp=2.0), "spp must be a whole number, got 2.0"),
     (lambda: Settings(size="640"), "size must be two whole numbers or text"),
 ], ids=lambda value: value if isinstance(value, str) else "")

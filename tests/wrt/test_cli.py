@@ -409,7 +409,7 @@ def test_info_tells_what_is_on_and_what_is_off() -> None:
     scene = load_scene("scene.toml")
     switches = features_of(scene, scene.camera()).switches()
     facts = dict(line.split(": ", 1) for line in run("info", "scene.toml").out.splitlines())
-    assert facts["triangles"] == "12" and facts["cameras"] == "front, side" and facts["background"] == "GradientBackground"
+    assert facts["triangles"] == "12" and facts["cameras"] == "front; side" and facts["background"] == "GradientBackground"
     assert facts["features on"].split(", ") == [name for name, on in switches.items() if on]
     assert facts["features off"].split(", ") == [name for name, on in switches.items() if not on]
     told = strict_json(run("info", "scene.toml", "--json").out)

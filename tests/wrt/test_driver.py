@@ -418,7 +418,7 @@ def test_a_wrong_value_is_told_by_its_name(options: dict[str, Any], message: str
     ({"progress": True}, "progress must be a function of a Progress, got True"), ({"camera": 1.5}, "camera must be"),
     ({"time_limit": "30s"}, "time_limit must be"), ({"accel": None}, "accel must be a str, got None"),
     ({"aov": 3}, "aov must be a name or several, got 3"), ({"aov": [None]}, r"aov\[0\] must be a str, got None"),
-    ({"device": 0}, "device must be a str, got 0"),
+    ({"device": 0}, "device must be a str, got 0"), ({"accel_options": []}, r"accel_options must be a dict, got \[\]"),
 ], ids=str)
 def test_a_value_of_the_wrong_type_is_told_by_its_name(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):

@@ -91,6 +91,13 @@ def test_wrong_names_write_nothing(film: Film, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.depth.png"]
 
 
+def test_one_name_stands_for_a_list_of_it(film: Film, tmp_path: Path) -> None:
+    assert film.save(tmp_path / "a.png", aov="depth") == [tmp_path / "a.png", tmp_path / "a.depth.png"]
+    with pytest.raises(InputError, match="aov must be a name or several, got 5"):
+        film.save(tmp_path / "b.png", aov=5)  # type: ignore[arg-type]
+    assert not (tmp_path / "b.png").exists()
+
+
 def test_layer_paths_keep_dots_in_the_name() -> None:
     assert aov_path("x/v1.2.hdr", "depth") == Path("x/v1.2.depth.png")
 
