@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.kernel_tools import directions, floats, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
@@ -179,6 +181,29 @@ def test_nothing_depends_on_the_scale(power):
     assert np.array_equal(np.isinf(longer), np.isinf(reference))
     hit = np.isfinite(reference)
     assert np.allclose(longer[hit], reference[hit], rtol=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), power=st.integers(-90, 90), turn=st.permutations(range(3)),
+       sign=st.tuples(*[st.sampled_from([-1.0, 1.0])] * 3))
+def test_turned_mirrored_scaled_and_moved_by_powers_of_two(seed, power, turn, sign):
+    # Whole numbers up to 2^10, moved by such: no float32 is rounded. Turning takes float64 sums in another order.
+    rng = np.random.default_rng(seed)
+    n = 500
+    center, direction = rng.integers(-512, 513, (n, 3)), rng.integers(-64, 65, (n, 3))
+    direction[~direction.any(axis=1), 1] = 1
+    radius, origin = rng.integers(1, 400, n), center + rng.integers(-512, 513, (n, 3))
+    reference = run(origin, direction, center, radius)
+    scale, turn, sign = 2.0**power, list(turn), np.array(sign)
+    moved = run((origin + 1024.0) * scale, direction * scale, (center + 1024.0) * scale, radius * scale)
+    turned = run(sign * origin[:, turn], sign * direction[:, turn], sign * center[:, turn], radius)
+    _, inside = exact(origin, direction, center, radius)
+    clear = np.abs(inside) > 1e-9  # a grazing line is decided by the last digit of float64
+    assert np.isfinite(reference).sum() > 10
+    for other in (moved, turned):
+        assert np.array_equal(np.isinf(other)[clear], np.isinf(reference)[clear])
+        both = np.isfinite(other) & np.isfinite(reference) & clear
+        assert np.allclose(other[both], reference[both], rtol=2.0**-20, atol=1e-12)
 
 
 def test_nan_misses():
