@@ -358,7 +358,7 @@ def test_ticks_are_few_round_and_within(low: float, extent: float) -> None:
 
 
 @pytest.mark.parametrize(("value", "text"), [(0.001, "0.001"), (0.5, "0.5"), (1000.0, "1000"), (1e-5, "1e-5"), (1e6, "1e6"),
-                                             (2e-10, "2e-10")])
+                                             (2e-10, "2e-10"), (15000.0, "1.5e4")])
 def test_numbers_at_the_axes(value: float, text: str) -> None:
     assert plot.number(value) == text
 

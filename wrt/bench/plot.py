@@ -130,7 +130,9 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def number(value: float) -> str:
-    return f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+    if 1e-3 <= value < 1e4:
+        return f"{value:g}"
+    return f"{value:.1e}".replace(".0e", "e").replace("e-0", "e-").replace("e+0", "e")
 
 
 def font(size: int) -> Any:
