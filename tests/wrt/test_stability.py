@@ -60,6 +60,11 @@ def test_peers_answer_as_wrt_does_where_it_is_easy(peer) -> None:
     assert not rival.prepare(generate("C_spheres", 10).geometry)  # triangles only
 
 
+def test_peers_need_not_keep_to_the_rule_for_ties() -> None:
+    row = stability.run_case("G_coincident_uniform", 300, WarpMesh())
+    assert row is not None and row.verdict.wrong_prim == 0 and row.verdict.ties > 250
+
+
 def test_names_and_letters_choose_cases() -> None:
     assert stability.chosen(["E"]) == ["E_grid", "E_beside"] and stability.chosen(["C_spheres"]) == ["C_spheres"]
     with pytest.raises(InputError, match="no hard case 'Q'"):
@@ -167,5 +172,4 @@ def test_open3d_is_asked_by_its_documented_interface(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", module)
     row = stability.run_case("E_grid", 200, Open3D())
     assert row is not None and row.verdict.ok and row.verdict.hits == 200
-    cut = stability.run_case("H_exact_ends", 200, Open3D())
-    assert cut is not None and cut.verdict.false_hits == 0
+    assert stability.run_case("H_exact_ends", 200, Open3D()) is None  # it has no t_min

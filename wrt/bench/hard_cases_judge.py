@@ -124,8 +124,10 @@ class _Claims:
     hit: np.ndarray
 
 
-def judge(case: HardCase, hits: Any, asked: int | None = None) -> Verdict:
+def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool = True) -> Verdict:
     """The verdict on closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.Hits).
+
+    lowest: of triangles that are the same, the one with the lowest prim_id must be told: wrt's own rule, not a peer's.
 
     Every claimed hit is held against its own primitive, exactly. The oracle is asked about every ray that claims to miss
     where it is not known to have to hit, and, whether something nearer was left out, about `asked` claimed hits (case.asked
@@ -144,7 +146,8 @@ def judge(case: HardCase, hits: Any, asked: int | None = None) -> Verdict:
         chosen = np.flatnonzero(claims.sound)
         if len(chosen) > asked:
             chosen = np.sort(np.random.default_rng(0).choice(chosen, asked, replace=False))
-        _judge_closeness(case, reference, _Claims(*(getattr(claims, f.name)[chosen] for f in fields(_Claims))), verdict)
+        chosen_claims = _Claims(*(getattr(claims, f.name)[chosen] for f in fields(_Claims)))
+        _judge_closeness(case, reference, chosen_claims, verdict, lowest)
     _judge_misses(case, reference, np.flatnonzero(~reported & (case.expected == ASK)), verdict)
     return verdict
 
@@ -207,7 +210,7 @@ def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[
     return _Claims(rows, t, prim_id, bound[0], sound, hit)
 
 
-def _judge_closeness(case: HardCase, reference: Reference, claims: _Claims, verdict: Verdict) -> None:
+def _judge_closeness(case: HardCase, reference: Reference, claims: _Claims, verdict: Verdict, lowest: bool) -> None:
     """Whether anything nearer than the claimed hits had to be found, and which of them are ties."""
     n = len(claims.row)
     verdict.asked += n
@@ -227,7 +230,7 @@ def _judge_closeness(case: HardCase, reference: Reference, claims: _Claims, verd
     same = claims.prim_id == answer.prim_id
     for ray, tied in answer.ties.items():
         same[ray] |= claims.prim_id[ray] in tied
-        wrong[ray] |= same[ray] and _lower_twin(case, int(claims.prim_id[ray]), tied)
+        wrong[ray] |= lowest and same[ray] and _lower_twin(case, int(claims.prim_id[ray]), tied)
     verdict.ties += int((answer.tie & same & ~wrong).sum())
     verdict.near_ties += int((~same & claims.hit & ~wrong).sum())
     rows = claims.row[wrong]

@@ -133,7 +133,8 @@ def chosen(cases: Sequence[str]) -> list[str]:
 
 
 def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row | None:
-    """One case, judged by the oracle; None where the algorithm cannot take it (peers: spheres, and input not finite)."""
+    """One case, judged by the oracle; None where the algorithm cannot take it (peers: spheres, input not finite, and
+    segments that begin after the origin)."""
     row = Row(name, algorithm.name)
     for case in chunks(name, rays, seed):
         if case.refused:
@@ -141,11 +142,11 @@ def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row |
                 return None
             row.refused = row.refused is not False and _is_refused(case, algorithm)
             continue
-        if not algorithm.prepare(case.geometry):
+        if (algorithm.is_peer and case.t_min.any()) or not algorithm.prepare(case.geometry):
             return None
         hits = algorithm.closest(case.origins, case.directions, case.t_min, case.t_max)
         is_default = algorithm.name == Own().name
-        row.verdict += judge(case, hits, None if is_default else min(ASKED, case.asked))
+        row.verdict += judge(case, hits, None if is_default else min(ASKED, case.asked), lowest=not algorithm.is_peer)
         row.judged += len(case)
         if isinstance(algorithm, Own):
             if case.next_directions is not None:
