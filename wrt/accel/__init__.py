@@ -7,6 +7,7 @@ from typing import Any
 from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
 from wrt.accel.brute_force import BruteForce
 from wrt.accel.bvh2 import Bvh2
+from wrt.accel.kdtree import KdTree
 from wrt.accel.store import build_cached, load_accel
 from wrt.errors import InputError
 from wrt.mesh import Mesh
@@ -17,6 +18,7 @@ __all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "Str
 ACCELERATORS: dict[str, type[Accelerator]] = {
     "bvh": Bvh2,  # the default: the best one there is
     "bvh2": Bvh2,
+    "kdtree": KdTree,
     "brute_force": BruteForce,
 }
 

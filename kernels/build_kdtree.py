@@ -1,0 +1,350 @@
+"""The builder's inner loop: a subtree of the k-d tree by the surface area heuristic with perfect splits, on the CPU backend.
+
+Wald and Havran 2006, "On building fast kd-Trees for Ray Tracing, and on doing that in O(N log N)": every face of every
+reference's box is a candidate plane. The faces are events, sorted once for the subtree; a sweep over them finds the best plane,
+and a split keeps their order: those of references on one side only are handed down, those of references that straddle the
+plane are clipped to both cells, sorted by themselves and merged in. The host launches this once a subtree, on all cores.
+"""
+
+import warp as wp
+
+from wrt.kernels.clip import Clippable, clip_to_cell
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse_kdtree import LEAF, STACK_SIZE, KdNode
+
+BOTH = wp.constant(wp.uint8(0))
+LEFT = wp.constant(wp.uint8(1))
+RIGHT = wp.constant(wp.uint8(2))
+RUN = wp.constant(8)  # so many events are sorted by insertion before the runs are merged
+
+
+@wp.struct
+class KdEvent:
+    """A face of a reference's box. code = 8 * (number of the reference) + 2 * axis + (1 where the box begins, 0: ends)."""
+
+    position: float
+    code: int
+
+
+@wp.struct
+class KdOptions:
+    """A cell becomes a leaf with max_leaf references, at max_depth, or (by_cost) where no split costs less. empty_bonus: part
+    of its cost that a split is let off which cuts off empty space."""
+
+    max_leaf: int
+    max_depth: int
+    by_cost: int
+    cost_traversal: wp.float64
+    cost_intersection: wp.float64
+    empty_bonus: wp.float64
+
+
+@wp.struct
+class KdTask:
+    """A cell to build. first, count: its events; budget: leaves' references (an empty leaf counts as one) that it may come to
+    in the end; slot: its node."""
+
+    lo: wp.vec3
+    hi: wp.vec3
+    first: int
+    count: int
+    budget: int
+    depth: int
+    slot: int
+
+
+@wp.struct
+class KdWork:
+    """Memory of one subtree of n references. prim_id (n), side (n): of each; lo, hi (n): their boxes in the root's cell; events
+    (6 budget): a stack of the lists of all cells that wait; kept_*, fresh_*, scratch (6 n each): the lists of one split."""
+
+    prim_id: wp.array(dtype=wp.int32)
+    lo: wp.array(dtype=wp.vec3)
+    hi: wp.array(dtype=wp.vec3)
+    side: wp.array(dtype=wp.uint8)
+    events: wp.array(dtype=KdEvent)
+    kept_left: wp.array(dtype=KdEvent)
+    kept_right: wp.array(dtype=KdEvent)
+    fresh_left: wp.array(dtype=KdEvent)
+    fresh_right: wp.array(dtype=KdEvent)
+    scratch: wp.array(dtype=KdEvent)
+
+
+@wp.struct
+class KdTotals:
+    """cost: sum of half areas, of each inner node once and of a leaf once a reference; depth: nodes on the longest path."""
+
+    nodes: int
+    leaves: int
+    references: int
+    depth: int
+    cost: wp.float64
+
+
+@wp.struct
+class KdOutput:
+    """nodes (2 budget), with the subtree's root first; references (budget): prim_id in the order of the leaves; totals (1)."""
+
+    nodes: wp.array(dtype=KdNode)
+    references: wp.array(dtype=wp.int32)
+    totals: wp.array(dtype=KdTotals)
+
+
+@wp.struct
+class KdSplit:
+    """axis < 0: none. n_left, n_right: references on each side, those that straddle the plane on both."""
+
+    axis: int
+    position: float
+    cost: wp.float64
+    n_left: int
+    n_right: int
+
+
+@wp.func
+def before(a: KdEvent, b: KdEvent) -> bool:
+    """The order of the sweep: by position; there by axis; there those that end first."""
+    return a.position < b.position or (a.position == b.position and (a.code & 7) < (b.code & 7))
+
+
+@wp.func
+def merge(a: wp.array(dtype=KdEvent), first_a: int, end_a: int, b: wp.array(dtype=KdEvent), first_b: int, end_b: int,
+          out: wp.array(dtype=KdEvent), first: int):
+    """Two sorted lists into one, at out[first]."""
+    i = int(first_a)
+    j = int(first_b)
+    k = int(first)
+    while i < end_a or j < end_b:
+        take_b = i >= end_a
+        if not take_b and j < end_b:
+            take_b = before(b[j], a[i])
+        if take_b:
+            out[k] = b[j]
+            j = j + 1
+        else:
+            out[k] = a[i]
+            i = i + 1
+        k = k + 1
+
+
+@wp.func
+def sort(events: wp.array(dtype=KdEvent), first: int, count: int, scratch: wp.array(dtype=KdEvent)):
+    """events[first : first + count], by insertion in short runs and then by merging; scratch is from 0 on."""
+    for run in range((count + RUN - 1) / RUN):
+        begin = first + run * RUN
+        for i in range(begin + 1, wp.min(begin + RUN, first + count)):
+            event = events[i]
+            j = int(i)
+            while j > begin and before(event, events[wp.max(j - 1, begin)]):
+                events[j] = events[j - 1]
+                j = j - 1
+            events[j] = event
+    width = int(RUN)
+    while width < count:
+        for pair in range((count + 2 * width - 1) / (2 * width)):
+            begin = first + pair * 2 * width
+            middle = wp.min(begin + width, first + count)
+            end = wp.min(middle + width, first + count)
+            if middle < end and before(events[middle], events[middle - 1]):
+                # Only the left run is moved away: what is merged never overtakes the right one.
+                for i in range(begin, middle):
+                    scratch[i - begin] = events[i]
+                merge(scratch, 0, middle - begin, events, middle, end, events, begin)
+        width = 2 * width
+
+
+@wp.func
+def add_events(events: wp.array(dtype=KdEvent), count: int, lo: wp.vec3, hi: wp.vec3, reference: int) -> int:
+    """Append the six faces of a box; the new count."""
+    event = KdEvent()
+    for axis in range(3):
+        event.position = hi[axis]
+        event.code = reference * 8 + 2 * axis
+        events[count + 2 * axis] = event
+        event.position = lo[axis]
+        event.code = reference * 8 + 2 * axis + 1
+        events[count + 2 * axis + 1] = event
+    return count + 6
+
+
+@wp.func
+def half_area(e: wp.vec3d) -> wp.float64:
+    return e[0] * e[1] + e[1] * e[2] + e[2] * e[0]
+
+
+@wp.func
+def cheapest_split(work: KdWork, task: KdTask, options: KdOptions) -> KdSplit:
+    """The plane of least expected cost, if (by_cost) it is below the cost of a leaf and the references are in the budget."""
+    best = KdSplit()
+    best.axis = -1
+    n = task.count / 6
+    best.cost = wp.where(options.by_cost != 0, options.cost_intersection * wp.float64(n), wp.float64(wp.inf))
+    e = wp.vec3d(task.hi) - wp.vec3d(task.lo)
+    scale = options.cost_intersection / half_area(e)
+    n_left = wp.vec3i(0, 0, 0)
+    n_right = wp.vec3i(n, n, n)
+    end = task.first + task.count
+    i = int(task.first)
+    while i < end:
+        event = work.events[i]
+        position = event.position
+        axis = (event.code & 7) >> 1
+        starts = int(0)
+        ends = int(0)
+        same = bool(True)
+        while same:  # all faces in this plane
+            starts = starts + (event.code & 1)
+            ends = ends + 1 - (event.code & 1)
+            i = i + 1
+            same = i < end
+            if same:
+                event = work.events[i]
+                same = event.position == position and (event.code & 7) >> 1 == axis
+        right = n_right[axis] - ends
+        n_right[axis] = right
+        left = n_left[axis]
+        n_left[axis] = left + starts
+        if position > task.lo[axis] and position < task.hi[axis] and wp.max(left, 1) + wp.max(right, 1) <= task.budget:
+            e_1 = e[(axis + 1) % 3]
+            e_2 = e[(axis + 2) % 3]
+            area_left = (wp.float64(position) - wp.float64(task.lo[axis])) * (e_1 + e_2) + e_1 * e_2
+            area_right = (wp.float64(task.hi[axis]) - wp.float64(position)) * (e_1 + e_2) + e_1 * e_2
+            cost = options.cost_traversal + scale * (area_left * wp.float64(left) + area_right * wp.float64(right))
+            if left == 0 or right == 0:
+                cost = cost * (wp.float64(1.0) - options.empty_bonus)
+            if cost < best.cost:
+                best.axis = axis
+                best.position = position
+                best.cost = cost
+                best.n_left = left
+                best.n_right = right
+    return best
+
+
+@wp.func
+def moved(corner: wp.vec3, split: KdSplit) -> wp.vec3:
+    """A corner of the cell, moved into the splitting plane."""
+    x = wp.where(split.axis == 0, split.position, corner[0])
+    y = wp.where(split.axis == 1, split.position, corner[1])
+    z = wp.where(split.axis == 2, split.position, corner[2])
+    return wp.vec3(x, y, z)
+
+
+@wp.func
+def mark_sides(work: KdWork, task: KdTask, split: KdSplit):
+    """Where each reference lies. Every box has an inside, so that its beginning comes before its end."""
+    begins = 2 * split.axis + 1
+    for i in range(task.first, task.first + task.count):
+        event = work.events[i]
+        kind = event.code & 7
+        if kind == begins:
+            work.side[event.code >> 3] = wp.where(event.position >= split.position, RIGHT, BOTH)
+        elif kind == begins - 1:
+            if event.position <= split.position:
+                work.side[event.code >> 3] = LEFT
+
+
+@wp.func
+def divide(shapes: Clippable, work: KdWork, task: KdTask, split: KdSplit) -> wp.vec2i:
+    """The events of both children in place of the task's, those of the right one first; the number of both, (right, left)."""
+    middle_hi = moved(task.hi, split)
+    middle_lo = moved(task.lo, split)
+    kept_left = int(0)
+    kept_right = int(0)
+    fresh_left = int(0)
+    fresh_right = int(0)
+    for i in range(task.first, task.first + task.count):
+        event = work.events[i]
+        reference = event.code >> 3
+        side = work.side[reference]
+        if side == LEFT:
+            work.kept_left[kept_left] = event
+            kept_left = kept_left + 1
+        elif side == RIGHT:
+            work.kept_right[kept_right] = event
+            kept_right = kept_right + 1
+        elif (event.code & 7) == 1:  # once for each that straddles the plane
+            box = clip_to_cell(shapes, work.prim_id[reference], task.lo, middle_hi)
+            if box.lo[0] < box.hi[0]:
+                fresh_left = add_events(work.fresh_left, fresh_left, box.lo, box.hi, reference)
+            box = clip_to_cell(shapes, work.prim_id[reference], middle_lo, task.hi)
+            if box.lo[0] < box.hi[0]:
+                fresh_right = add_events(work.fresh_right, fresh_right, box.lo, box.hi, reference)
+    sort(work.fresh_left, 0, fresh_left, work.scratch)
+    sort(work.fresh_right, 0, fresh_right, work.scratch)
+    n_right = kept_right + fresh_right
+    merge(work.kept_right, 0, kept_right, work.fresh_right, 0, fresh_right, work.events, task.first)
+    merge(work.kept_left, 0, kept_left, work.fresh_left, 0, fresh_left, work.events, task.first + n_right)
+    return wp.vec2i(n_right, kept_left + fresh_left)
+
+
+@wp.func
+def write_leaf(out: KdOutput, work: KdWork, task: KdTask, totals: KdTotals) -> KdTotals:
+    node = KdNode()
+    node.split = float(task.count / 6)
+    node.word = 4 * totals.references + LEAF
+    out.nodes[task.slot] = node
+    for i in range(task.first, task.first + task.count):
+        event = work.events[i]
+        if (event.code & 7) == 1:
+            out.references[totals.references] = work.prim_id[event.code >> 3]
+            totals.references += 1
+    totals.leaves += 1
+    totals.cost += half_area(wp.vec3d(task.hi) - wp.vec3d(task.lo)) * wp.float64(task.count / 6)
+    totals.depth = wp.max(totals.depth, task.depth + 1)
+    return totals
+
+
+@kernel
+def build_subtree(shapes: Clippable, work: KdWork, root: KdTask, options: KdOptions, out: KdOutput):
+    """The subtree of one cell, with the references of `work`; one thread."""
+    stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=KdTask)
+    count = int(0)
+    for i in range(work.prim_id.shape[0]):
+        count = add_events(work.events, count, work.lo[i], work.hi[i], i)
+    sort(work.events, 0, count, work.scratch)
+    task = root
+    task.count = count
+    stack[0] = task
+    size = int(1)
+    totals = KdTotals()
+    totals.nodes = 1
+    while size > 0:
+        size = size - 1
+        task = stack[size]
+        split = KdSplit()
+        split.axis = -1
+        if task.count > 6 * options.max_leaf and task.depth < options.max_depth:
+            split = cheapest_split(work, task, options)
+        if split.axis < 0:
+            totals = write_leaf(out, work, task, totals)
+            continue
+        mark_sides(work, task, split)
+        counts = divide(shapes, work, task, split)
+        node = KdNode()
+        node.split = split.position
+        node.word = 4 * totals.nodes + split.axis
+        out.nodes[task.slot] = node
+        totals.cost += half_area(wp.vec3d(task.hi) - wp.vec3d(task.lo))
+
+        # What the budget has left over is shared out by the number of references.
+        left = wp.max(split.n_left, 1)
+        right = wp.max(split.n_right, 1)
+        spare = wp.float64(task.budget - left - right) * (wp.float64(right) / wp.float64(left + right))
+        child = task
+        child.depth = task.depth + 1
+        child.slot = totals.nodes + 1
+        child.count = counts[0]
+        child.budget = right + int(spare)
+        child.lo = moved(task.lo, split)
+        stack[size] = child
+        child.slot = totals.nodes
+        child.first = task.first + counts[0]
+        child.count = counts[1]
+        child.budget = task.budget - (right + int(spare))
+        child.lo = task.lo
+        child.hi = moved(task.hi, split)
+        stack[size + 1] = child
+        size = size + 2
+        totals.nodes += 2
+    out.totals[0] = totals

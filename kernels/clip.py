@@ -1,0 +1,126 @@
+"""What of a triangle lies in an axis-aligned cell: the box of the clipped polygon, on the CPU backend, for builders.
+
+Sutherland and Hodgman 1974, "Reentrant Polygon Clipping", in float64. Conservative: the triangle unit takes hits up to some
+u of the triangle's extent beside it, so that the triangle is clipped to a cell larger by twice that, and the box of what
+remains is larger by as much again. A leaf without the triangle then never holds such a hit.
+"""
+
+import warp as wp
+
+from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT
+from wrt.kernels.structs import kernel
+
+CLIP_EXTENT = wp.constant(wp.float64(2.0 * PAD_EXTENT))
+CLIP_COORDINATE = wp.constant(wp.float64(PAD_COORDINATE))
+MAX_CORNERS = 12  # a triangle, and one more for each of the six planes; rounding may add some
+
+
+@wp.struct
+class Clippable:
+    """The primitives by prim_id. faces: of the triangles; lo, hi: padded boxes; exact: 1 where the triangle itself is clipped,
+    0 where its box is (spheres, and sizes at the ends of float32)."""
+
+    vertices: wp.array(dtype=wp.vec3)
+    faces: wp.array(dtype=wp.vec3i)
+    lo: wp.array(dtype=wp.vec3)
+    hi: wp.array(dtype=wp.vec3)
+    exact: wp.array(dtype=wp.uint8)
+
+
+@wp.struct
+class Box:
+    """Empty: lo = inf, hi = -inf."""
+
+    lo: wp.vec3
+    hi: wp.vec3
+
+
+@wp.func
+def empty_box() -> Box:
+    box = Box()
+    box.lo = wp.vec3(wp.inf, wp.inf, wp.inf)
+    box.hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    return box
+
+
+@wp.func
+def within_cell(lo: wp.vec3, hi: wp.vec3, cell_lo: wp.vec3, cell_hi: wp.vec3) -> Box:
+    """The part of a box in a cell; empty also where it has no inside."""
+    box = Box()
+    box.lo = wp.max(lo, cell_lo)
+    box.hi = wp.min(hi, cell_hi)
+    if not (box.lo[0] < box.hi[0] and box.lo[1] < box.hi[1] and box.lo[2] < box.hi[2]):
+        return empty_box()
+    return box
+
+
+@wp.func
+def clip_to_cell(shapes: Clippable, prim_id: int, cell_lo: wp.vec3, cell_hi: wp.vec3) -> Box:
+    """The box of what of the primitive is in the cell, larger by its margin and within the cell; or an empty box."""
+    if shapes.exact[prim_id] == wp.uint8(0):
+        return within_cell(shapes.lo[prim_id], shapes.hi[prim_id], cell_lo, cell_hi)
+    polygon = wp.zeros(shape=wp.static(MAX_CORNERS), dtype=wp.vec3d)
+    clipped = wp.zeros(shape=wp.static(MAX_CORNERS), dtype=wp.vec3d)
+    face = shapes.faces[prim_id]
+    for i in range(3):
+        polygon[i] = wp.vec3d(shapes.vertices[face[i]])
+    lo = wp.min(wp.min(polygon[0], polygon[1]), polygon[2])
+    hi = wp.max(wp.max(polygon[0], polygon[1]), polygon[2])
+    e = hi - lo
+    pad = CLIP_EXTENT * wp.max(wp.max(e[0], e[1]), e[2])
+    n = int(3)
+    planes = int(6)
+    for plane in range(planes):
+        axis = plane / 2
+        sign = wp.where(plane % 2 == 0, wp.float64(1.0), wp.float64(-1.0))
+        wall = wp.float64(wp.where(plane % 2 == 0, cell_lo[axis], cell_hi[axis]))
+        wall = wall - sign * (pad + CLIP_COORDINATE * wp.abs(wall))
+        outside = wp.where(plane % 2 == 0, lo[axis] < wall, hi[axis] > wall)
+        if outside:
+            m = int(0)
+            last = polygon[n - 1]
+            last_inside = sign * (last[axis] - wall)
+            for i in range(n):
+                if m > wp.static(MAX_CORNERS - 2):
+                    return within_cell(shapes.lo[prim_id], shapes.hi[prim_id], cell_lo, cell_hi)
+                corner = polygon[i]
+                inside = sign * (corner[axis] - wall)
+                if (inside < wp.float64(0.0)) != (last_inside < wp.float64(0.0)):
+                    cut = last + (last_inside / (last_inside - inside)) * (corner - last)
+                    cut[axis] = wall
+                    clipped[m] = cut
+                    m = m + 1
+                if inside >= wp.float64(0.0):
+                    clipped[m] = corner
+                    m = m + 1
+                last = corner
+                last_inside = inside
+            if m == 0:
+                return empty_box()
+            n = m
+            lo = clipped[0]
+            hi = clipped[0]
+            for i in range(n):
+                polygon[i] = clipped[i]
+                lo = wp.min(lo, clipped[i])
+                hi = wp.max(hi, clipped[i])
+    margin = wp.vec3d(pad, pad, pad)
+    lo = lo - margin - CLIP_COORDINATE * wp.vec3d(wp.abs(lo[0]), wp.abs(lo[1]), wp.abs(lo[2]))
+    hi = hi + margin + CLIP_COORDINATE * wp.vec3d(wp.abs(hi[0]), wp.abs(hi[1]), wp.abs(hi[2]))
+    return within_cell(wp.vec3(lo), wp.vec3(hi), cell_lo, cell_hi)
+
+
+@kernel
+def clip_references(
+    shapes: Clippable,
+    prim_id: wp.array(dtype=wp.int32),
+    cell_lo: wp.vec3,
+    cell_hi: wp.vec3,
+    lo: wp.array(dtype=wp.vec3),
+    hi: wp.array(dtype=wp.vec3),
+):
+    """lo, hi: the boxes of what of each primitive is in the cell."""
+    i = wp.tid()
+    box = clip_to_cell(shapes, prim_id[i], cell_lo, cell_hi)
+    lo[i] = box.lo
+    hi[i] = box.hi

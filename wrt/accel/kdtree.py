@@ -1,0 +1,30 @@
+"""The k-d tree: space is split by axis-aligned planes, and a primitive stands in every leaf that it reaches into."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from wrt.accel.base import Accelerator, Built
+from wrt.accel.kdtree_build import KdOptions, build_tree
+from wrt.kernels import traverse_kdtree as kernels
+
+
+class KdTree(Accelerator):
+    """Options: max_leaf (cells with so many primitives are not split), max_depth (None: 8 + 1.3 log2 n), by_cost (stop where no
+    split costs less than a leaf); cost_traversal, cost_intersection (of the SAH), empty_bonus (0 to 1: what a split that cuts
+    off empty space is let off); perfect_below (larger cells are split between 64 bins, smaller ones at the best of all planes);
+    clip (triangles are put into cells by what lies in them, not by their boxes); max_growth (references for each primitive)."""
+
+    name = "kdtree"
+    kernels = kernels
+
+    def _build(self, max_leaf: int = 1, max_depth: int | None = None, by_cost: bool = True, cost_traversal: float = 1.0,
+               cost_intersection: float = 1.0, empty_bonus: float = 0.2, perfect_below: int = 32768, clip: bool = True,
+               max_growth: float = 16.0) -> Built:
+        options = KdOptions(max_leaf, max_depth, by_cost, cost_traversal, cost_intersection, empty_bonus, perfect_below, clip,
+                            max_growth)
+        tree = build_tree(self.geometry, options, self.threads)
+        arrays: dict[str, Any] = {"nodes": tree.nodes, "lo": tree.lo, "hi": tree.hi, "reach": np.float32(tree.reach)}
+        return Built(arrays, tree.order, len(tree.nodes) - tree.leaves, tree.leaves, tree.depth, tree.cost)

@@ -1,0 +1,274 @@
+"""The k-d tree's builder: binned SAH for large cells here, in whole-array NumPy; perfect splits below, a subtree a task."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Geometry
+from wrt.device import load_kernel, records, run_all, start, upload
+from wrt.errors import InputError
+from wrt.kernels import build_kdtree as kernels
+from wrt.kernels.clip import Clippable, clip_references
+from wrt.kernels.traverse_kdtree import LEAF, STACK_SIZE, KdNode
+
+BINS = 64
+# Triangles beyond are put into cells by their boxes: the margin of clipping would underflow, or be all of space.
+CLIP_SIZES = (1e-30, 1e30)
+MAX_IN_LEAF = 1 << 24  # the node holds the number as a float32
+MAX_INDEX = 1 << 29  # a node's word has 29 bits for it
+
+
+@dataclass(frozen=True)
+class KdOptions:
+    """As the options of wrt.accel.kdtree.KdTree, checked; max_depth: as given, or None."""
+
+    max_leaf: int = 1
+    max_depth: int | None = None
+    by_cost: bool = True
+    cost_traversal: float = 1.0
+    cost_intersection: float = 1.0
+    empty_bonus: float = 0.2
+    perfect_below: int = 32768
+    clip: bool = True
+    max_growth: float = 16.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("max_leaf", 1, MAX_IN_LEAF), ("max_depth", 0, STACK_SIZE), ("perfect_below", 1, 2**27)):
+            value = getattr(self, name)
+            if value is None and name == "max_depth":
+                continue
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
+                raise InputError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
+        for name, most in (("cost_traversal", 1e6), ("cost_intersection", 1e6), ("empty_bonus", 1.0), ("max_growth", 1e4)):
+            value = getattr(self, name)
+            least = 1.0 if name == "max_growth" else 0.0
+            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not least <= value <= most:
+                raise InputError(f"{name} must be a number from {least:g} to {most:g}, got {value!r}")
+        for name in ("by_cost", "clip"):
+            if not isinstance(getattr(self, name), (bool, np.bool_)):
+                raise InputError(f"{name} must be True or False, got {getattr(self, name)!r}")
+
+    def depth(self, n: int) -> int:
+        """As given, or 8 + 1.3 log2 n (Havran 2000; Pharr et al., "Physically Based Rendering", section 4.4)."""
+        if self.max_depth is not None:
+            return self.max_depth
+        return min(round(8.0 + 1.3 * np.log2(max(n, 1))), STACK_SIZE)
+
+
+class KdTreeData(NamedTuple):
+    """nodes: records of KdNode, root first; order: prim_id in the order of the leaves; leaves counts empty ones too; cost: the
+    SAH cost, with both costs 1; reach: the largest extent of a triangle that was clipped."""
+
+    nodes: np.ndarray
+    order: np.ndarray
+    lo: np.ndarray
+    hi: np.ndarray
+    leaves: int
+    depth: int
+    cost: float
+    reach: float
+
+
+class Cell(NamedTuple):
+    """A cell to build, and its references: prim_id (n,) and their boxes in it (n, 3)."""
+
+    cell_lo: np.ndarray
+    cell_hi: np.ndarray
+    prim_id: np.ndarray
+    lo: np.ndarray
+    hi: np.ndarray
+    depth: int
+    budget: int
+    slot: int
+
+
+def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> KdTreeData:
+    """The tree over a geometry; the same for every number of threads."""
+    lo, hi = geometry.bounds()
+    n = len(lo)
+    if n == 0:
+        nodes = records(KdNode, 1)
+        nodes["word"] = LEAF
+        return KdTreeData(nodes, np.zeros(0, np.int32), np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32), 1, 1, 0.0, 0.0)
+    hi = np.where(lo < hi, hi, np.nextafter(hi, np.float32(np.inf)))  # a box has an inside
+    shapes, reach = clippable(geometry, lo, hi, options.clip)
+    budget = int(min(options.max_growth * n + 64, MAX_INDEX / 2))
+    root = Cell(lo.min(axis=0), hi.max(axis=0), np.arange(n, dtype=np.int32), lo, hi, 0, budget, 0)
+    top, tasks, area = split_top(root, shapes, options)
+    parts = build_subtrees(tasks, shapes, options, threads)
+    return joined(top, tasks, parts, root, area, reach)
+
+
+def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) -> tuple[Any, float]:
+    """The primitives for kernels.clip, and the largest extent of those that it clips."""
+    cpu = start("cpu")
+    with np.errstate(over="ignore"):
+        extent = (hi - lo).max(axis=1)
+    exact = (extent > CLIP_SIZES[0]) & (extent < CLIP_SIZES[1]) & (np.arange(len(lo)) < len(geometry.faces)) & clip
+    shapes = Clippable()
+    shapes.vertices = upload(geometry.vertices, wp.vec3, cpu)
+    shapes.faces = upload(geometry.faces, wp.vec3i, cpu)
+    shapes.lo, shapes.hi = upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu)
+    shapes.exact = upload(exact.astype(np.uint8), wp.uint8, cpu)
+    return shapes, float(extent[exact].max(initial=0.0))
+
+
+def half_area(e: np.ndarray) -> Any:
+    return e[..., 0] * e[..., 1] + e[..., 1] * e[..., 2] + e[..., 2] * e[..., 0]
+
+
+def split_top(root: Cell, shapes: Any, options: KdOptions) -> tuple[list[tuple[float, int]], list[Cell], float]:
+    """Nodes (split, word) of the top of the tree, the cells that are left to do, and the half areas of the nodes together."""
+    max_depth = options.depth(len(root.prim_id))
+    nodes, tasks, area = [(0.0, 0)], [], 0.0
+    todo = [root]
+    while todo:
+        cell = todo.pop()
+        n = len(cell.prim_id)
+        plane = None
+        if n > max(options.perfect_below, options.max_leaf) and cell.depth < max_depth:
+            plane = binned_split(cell, options)
+        if plane is None:
+            tasks.append(cell)
+            continue
+        nodes[cell.slot] = (float(plane[1]), 4 * len(nodes) + plane[0])
+        area += float(half_area(cell.cell_hi.astype(np.float64) - cell.cell_lo))
+        todo += reversed(divide(cell, plane, shapes, len(nodes)))
+        nodes += [(0.0, 0), (0.0, 0)]
+    return nodes, tasks, area
+
+
+def binned_split(cell: Cell, options: KdOptions) -> tuple[int, np.float32] | None:
+    """The cheapest plane (axis, position) between bins, if that is (by_cost) cheaper than a leaf and within the budget.
+
+    Shevtsov, Soupikov and Kapustin 2007, "Highly Parallel Fast KD-tree Construction": boxes are counted in the bins where they
+    begin and in those where they end.
+    """
+    n = len(cell.prim_id)
+    best = options.cost_intersection * n if options.by_cost else np.inf
+    found = None
+    e = cell.cell_hi.astype(np.float64) - cell.cell_lo
+    for axis in range(3):
+        low, width = float(cell.cell_lo[axis]), e[axis]
+        planes = (low + width / BINS * np.arange(1, BINS)).astype(np.float32)
+        if not np.isfinite(width) or not (np.diff(planes) > 0.0).all():
+            continue
+        # A box that begins in a plane lies on its right only, one that ends there on its left only.
+        left = np.cumsum(np.bincount(np.searchsorted(planes, cell.lo[:, axis], side="right"), minlength=BINS))[:-1]
+        right = n - np.cumsum(np.bincount(np.searchsorted(planes, cell.hi[:, axis], side="left"), minlength=BINS))[:-1]
+        caps, sides = e[axis - 2] * e[axis - 1], e[axis - 2] + e[axis - 1]
+        share = planes.astype(np.float64) - low
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            cost = options.cost_traversal + options.cost_intersection / half_area(e) * (
+                (share * sides + caps) * left + ((width - share) * sides + caps) * right)
+        cost = np.where((left == 0) | (right == 0), (1.0 - options.empty_bonus) * cost, cost)
+        inside = (planes > cell.cell_lo[axis]) & (planes < cell.cell_hi[axis])
+        inside &= np.maximum(left, 1) + np.maximum(right, 1) <= cell.budget
+        cost = np.where(inside & ~np.isnan(cost), cost, np.inf)
+        if cost.min() < best:
+            best, found = cost.min(), (axis, planes[np.argmin(cost)])
+    return found
+
+
+def divide(cell: Cell, plane: tuple[int, np.float32], shapes: Any, slot: int) -> list[Cell]:
+    """The cells on both sides of the plane, in the slots `slot` and slot + 1; what straddles it is clipped to both."""
+    axis, position = plane
+    goes = [cell.lo[:, axis] < position, cell.hi[:, axis] > position]
+    straddles = goes[0] & goes[1]
+    counts = [max(int(np.count_nonzero(side)), 1) for side in goes]
+    spare = cell.budget - sum(counts)
+    budgets = [0, counts[1] + int(spare * counts[1] / sum(counts))]
+    budgets[0] = cell.budget - budgets[1]
+    out = []
+    for side in (0, 1):
+        cell_lo, cell_hi = cell.cell_lo.copy(), cell.cell_hi.copy()
+        (cell_hi if side == 0 else cell_lo)[axis] = position
+        whole = goes[side] & ~straddles
+        cut = cell.prim_id[straddles]
+        cut_lo, cut_hi = clipped(shapes, cut, cell_lo, cell_hi)
+        there = cut_lo[:, 0] < cut_hi[:, 0]
+        out.append(Cell(cell_lo, cell_hi, *(np.concatenate([a[whole], b[there]]) for a, b in (
+            (cell.prim_id, cut), (cell.lo, cut_lo), (cell.hi, cut_hi))), cell.depth + 1, budgets[side], slot + side))
+    return out
+
+
+def clipped(shapes: Any, prim_id: np.ndarray, cell_lo: np.ndarray, cell_hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The boxes of what of each primitive is in a cell."""
+    cpu = start("cpu")
+    lo, hi = (wp.zeros(len(prim_id), dtype=wp.vec3, device=cpu) for _ in range(2))
+    wp.launch(clip_references, dim=len(prim_id), device=cpu, inputs=[
+        shapes, upload(prim_id, wp.int32, cpu), wp.vec3(*cell_lo), wp.vec3(*cell_hi), lo, hi])
+    return lo.numpy(), hi.numpy()
+
+
+def build_subtrees(tasks: list[Cell], shapes: Any, options: KdOptions, threads: int) -> list[tuple]:
+    """nodes, order and totals of each task."""
+    chosen = kernels.KdOptions()
+    chosen.max_leaf, chosen.by_cost, chosen.empty_bonus = options.max_leaf, options.by_cost, options.empty_bonus
+    chosen.cost_traversal, chosen.cost_intersection = options.cost_traversal, options.cost_intersection
+    chosen.max_depth = options.depth(shapes.exact.shape[0])
+    load_kernel(kernels.build_subtree, start("cpu"))
+    parts: list[Any] = [None] * len(tasks)
+
+    def job(i: int) -> Any:
+        def run() -> None:
+            parts[i] = build_subtree(tasks[i], shapes, chosen)
+        return run
+
+    # Largest first, so that no thread is left with a big one at the end.
+    run_all([job(i) for i in sorted(range(len(tasks)), key=lambda i: -len(tasks[i].prim_id))], threads)
+    return parts
+
+
+def build_subtree(cell: Cell, shapes: Any, options: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One launch. Its memory is not touched before it is needed: most of what the budget allows never is."""
+    cpu = start("cpu")
+    n = len(cell.prim_id)
+    work = kernels.KdWork()
+    work.prim_id = upload(cell.prim_id, wp.int32, cpu)
+    work.lo, work.hi = upload(cell.lo, wp.vec3, cpu), upload(cell.hi, wp.vec3, cpu)
+    work.side = wp.empty(n, dtype=wp.uint8, device=cpu)
+    work.events = wp.empty(6 * cell.budget, dtype=kernels.KdEvent, device=cpu)
+    for name in ("kept_left", "kept_right", "fresh_left", "fresh_right", "scratch"):
+        setattr(work, name, wp.empty(6 * n, dtype=kernels.KdEvent, device=cpu))
+    out = kernels.KdOutput()
+    out.nodes = wp.empty(2 * cell.budget, dtype=KdNode, device=cpu)
+    out.references = wp.empty(cell.budget, dtype=wp.int32, device=cpu)
+    out.totals = wp.zeros(1, dtype=kernels.KdTotals, device=cpu)
+    root = kernels.KdTask()
+    root.lo, root.hi = wp.vec3(*cell.cell_lo), wp.vec3(*cell.cell_hi)
+    root.budget, root.depth = cell.budget, cell.depth
+    wp.launch(kernels.build_subtree, dim=1, device=cpu, inputs=[shapes, work, root, options, out])
+    totals = out.totals.numpy()[0].copy()
+    return out.nodes.numpy()[: totals["nodes"]].copy(), out.references.numpy()[: totals["references"]].copy(), totals
+
+
+def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[tuple], root: Cell, area: float,
+           reach: float) -> KdTreeData:
+    """One tree of the top and the subtrees: each root goes to its slot, the other nodes and the references behind all before."""
+    n_nodes = len(top) + sum(len(nodes) - 1 for nodes, _, _ in parts)
+    n_references = sum(len(references) for _, references, _ in parts)
+    if max(n_nodes, n_references) >= MAX_INDEX:
+        raise InputError(f"a k-d tree of {n_references} references is too large; lower max_growth or max_depth")
+    nodes = records(KdNode, n_nodes)
+    nodes["split"][: len(top)], nodes["word"][: len(top)] = zip(*top, strict=True)
+    order = np.empty(n_references, np.int32)
+    next_node, next_reference = len(top), 0
+    for cell, (subtree, references, _) in zip(tasks, parts, strict=True):
+        leaf = (subtree["word"] & 3) == LEAF
+        if (subtree["split"][leaf] > MAX_IN_LEAF).any():
+            raise InputError(f"more than {MAX_IN_LEAF} primitives in one leaf of a k-d tree")
+        subtree["word"] += np.where(leaf, 4 * next_reference, 4 * (next_node - 1)).astype(np.int32)
+        nodes[cell.slot] = subtree[0]
+        nodes[next_node : next_node + len(subtree) - 1] = subtree[1:]
+        order[next_reference : next_reference + len(references)] = references
+        next_node += len(subtree) - 1
+        next_reference += len(references)
+    totals = [totals for _, _, totals in parts]
+    cost = (area + sum(float(t["cost"]) for t in totals)) / float(half_area(root.cell_hi.astype(np.float64) - root.cell_lo))
+    return KdTreeData(nodes, order, root.cell_lo, root.cell_hi, sum(int(t["leaves"]) for t in totals),
+                      max(int(t["depth"]) for t in totals), cost, reach)
