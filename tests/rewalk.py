@@ -14,6 +14,7 @@ import warp as wp
 from wrt.device import load_kernel, upload
 from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
 from wrt.kernels.ray_aabb import FAR_PAD
+from wrt.kernels.traverse_kdtree import HELD_GRAZING, HELD_RELATIVE, NEAR_PAD
 
 INF = np.float32(np.inf)
 PRIMITIVES = 1 << 40
@@ -142,4 +143,54 @@ def bvh2(accel, ray: WalkRay) -> Walk:
     return walk
 
 
-REWALK: dict[str, Callable[..., Walk]] = {"brute_force": brute_force, "bvh2": bvh2}
+def widened(t: np.float32) -> tuple[np.float32, np.float32]:
+    """t less and t plus the rounding of what it is compared with."""
+    ends = t * np.float32(NEAR_PAD), t * np.float32(FAR_PAD)
+    return np.minimum(*ends), np.maximum(*ends)
+
+
+def kdtree(accel, ray: WalkRay) -> Walk:
+    walk, nodes, stack = Walk(boxes=1, box_operations=1), accel.data.nodes.numpy(), []
+    lo, hi = np.array(accel.data.lo, np.float32), np.array(accel.data.hi, np.float32)
+    if ray.enter(lo, hi) == INF:
+        return walk
+    finite = np.abs(ray.inv_dir[np.isfinite(ray.inv_dir)])
+    box = np.float32(1.01) / np.abs(ray.direction).max()
+    held = np.float32(accel.data.reach) * min(np.float32(HELD_GRAZING) * finite.max(), box)
+    backwards = ray.inv_dir < 0.0
+    enter = np.fmax.reduce((np.where(backwards, hi, lo) - ray.origin) * ray.inv_dir)
+    leave = np.fmin.reduce((np.where(backwards, lo, hi) - ray.origin) * ray.inv_dir)
+    t_enter = max(widened(enter)[0] - held, ray.t_min * np.float32(2.0 - HELD_RELATIVE) - held)
+    t_exit = min(widened(leave)[1] + held, ray.best[0] * np.float32(HELD_RELATIVE) + held)
+    index = 0
+    while True:
+        split, word = nodes[index]
+        walk.node(index, nodes.itemsize, 0)
+        axis, first = int(word) & 3, int(word) >> 2
+        if axis != 3:
+            with np.errstate(invalid="ignore"):
+                far_enter, near_exit = widened((split - ray.origin[axis]) * ray.inv_dir[axis])
+            near, far = (first + 1, first) if backwards[axis] else (first, first + 1)
+            if t_enter > near_exit:
+                index, t_enter = far, np.fmax(t_enter, far_enter)
+                continue
+            if not t_exit < far_enter:
+                stack.append((far, np.fmax(t_enter, far_enter), t_exit))
+                walk.push(len(stack))
+            index, t_exit = near, np.fmin(t_exit, near_exit)
+            continue
+        walk.box_operations -= 1  # a leaf has no plane
+        walk.leaves += 1
+        for i in range(first, first + int(split)):
+            ray.test(walk, accel, i)
+        while True:
+            if not stack:
+                return walk
+            walk.pops += 1
+            index, t_enter, t_exit = stack.pop()
+            t_exit = min(t_exit, ray.best[0] * np.float32(HELD_RELATIVE) + held)
+            if t_enter <= t_exit:
+                break
+
+
+REWALK: dict[str, Callable[..., Walk]] = {"brute_force": brute_force, "bvh2": bvh2, "kdtree": kdtree}

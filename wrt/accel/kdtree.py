@@ -8,6 +8,7 @@ import numpy as np
 
 from wrt.accel.base import Accelerator, Built
 from wrt.accel.kdtree_build import KdOptions, build_tree
+from wrt.errors import InputError
 from wrt.kernels import traverse_kdtree as kernels
 
 
@@ -15,16 +16,43 @@ class KdTree(Accelerator):
     """Options: max_leaf (cells with so many primitives are not split), max_depth (None: 8 + 1.3 log2 n), by_cost (stop where no
     split costs less than a leaf); cost_traversal, cost_intersection (of the SAH), empty_bonus (0 to 1: what a split that cuts
     off empty space is let off); perfect_below (larger cells are split between 64 bins, smaller ones at the best of all planes);
-    clip (triangles are put into cells by what lies in them, not by their boxes); max_growth (references for each primitive)."""
+    clip (triangles are put into cells by what lies in them, not by their boxes); max_growth (how many references, and empty
+    leaves, there may be for each primitive)."""
 
     name = "kdtree"
     kernels = kernels
 
     def _build(self, max_leaf: int = 1, max_depth: int | None = None, by_cost: bool = True, cost_traversal: float = 1.0,
-               cost_intersection: float = 1.0, empty_bonus: float = 0.2, perfect_below: int = 32768, clip: bool = True,
+               cost_intersection: float = 1.0, empty_bonus: float = 0.2, perfect_below: int = 65536, clip: bool = True,
                max_growth: float = 16.0) -> Built:
         options = KdOptions(max_leaf, max_depth, by_cost, cost_traversal, cost_intersection, empty_bonus, perfect_below, clip,
                             max_growth)
         tree = build_tree(self.geometry, options, self.threads)
         arrays: dict[str, Any] = {"nodes": tree.nodes, "lo": tree.lo, "hi": tree.hi, "reach": np.float32(tree.reach)}
         return Built(arrays, tree.order, len(tree.nodes) - tree.leaves, tree.leaves, tree.depth, tree.cost)
+
+    def _check(self, built: Built) -> None:
+        nodes = built.arrays["nodes"]
+        if any(built.arrays[name].size != size for name, size in (("lo", 3), ("hi", 3), ("reach", 1))):
+            raise InputError("is damaged: a tree has one cell")
+        if not is_tree(nodes, kernels.STACK_SIZE):
+            raise InputError(f"is damaged: its nodes are no tree of at most {kernels.STACK_SIZE} levels below the root")
+        leaf = (nodes["word"] & 3) == kernels.LEAF
+        first, count = (nodes["word"][leaf] >> 2).astype(np.int64), nodes["split"][leaf].astype(np.float64)
+        if not ((first >= 0) & (count >= 0.0) & (first + count <= len(built.order))).all():
+            raise InputError("is damaged: a leaf has primitives that are not there")
+
+
+def is_tree(nodes: np.ndarray, max_depth: int) -> bool:
+    """Whether each node but the root is the child of one that stands before it, and none is deeper than max_depth."""
+    inner = np.nonzero((nodes["word"] & 3) != kernels.LEAF)[0]
+    left = (nodes["word"][inner] >> 2).astype(np.int64)
+    children = np.sort(np.concatenate([left, left + 1]))
+    if not (left > inner).all() or not np.array_equal(children, np.arange(1, len(nodes))):
+        return False
+    parent = np.zeros(len(nodes), np.int64)
+    parent[left] = parent[left + 1] = inner
+    at = np.arange(len(nodes))
+    for _ in range(max_depth):
+        at = parent[at]
+    return len(nodes) > 0 and not at.any()

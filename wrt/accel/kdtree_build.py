@@ -12,7 +12,7 @@ from wrt.accel.base import Geometry
 from wrt.device import load_kernel, records, run_all, start, upload
 from wrt.errors import InputError
 from wrt.kernels import build_kdtree as kernels
-from wrt.kernels.clip import Clippable, clip_references
+from wrt.kernels.build_clip import Clippable, clip_references
 from wrt.kernels.traverse_kdtree import LEAF, STACK_SIZE, KdNode
 
 BINS = 64
@@ -24,7 +24,7 @@ MAX_INDEX = 1 << 29  # a node's word has 29 bits for it
 
 @dataclass(frozen=True)
 class KdOptions:
-    """As the options of wrt.accel.kdtree.KdTree, checked; max_depth: as given, or None."""
+    """Those of wrt.accel.kdtree.KdTree. Raises InputError for values out of range."""
 
     max_leaf: int = 1
     max_depth: int | None = None
@@ -32,25 +32,19 @@ class KdOptions:
     cost_traversal: float = 1.0
     cost_intersection: float = 1.0
     empty_bonus: float = 0.2
-    perfect_below: int = 32768
+    perfect_below: int = 65536
     clip: bool = True
     max_growth: float = 16.0
 
     def __post_init__(self) -> None:
-        for name, low, high in (("max_leaf", 1, MAX_IN_LEAF), ("max_depth", 0, STACK_SIZE), ("perfect_below", 1, 2**27)):
+        if self.max_depth is not None and (isinstance(self.max_depth, bool) or not isinstance(self.max_depth, int)):
+            raise InputError(f"max_depth must be int or None, got {self.max_depth!r}")
+        for name, low, high in (("max_leaf", 1, MAX_IN_LEAF), ("max_depth", 0, STACK_SIZE), ("perfect_below", 1024, 1 << 27),
+                                ("cost_traversal", 0.0, 1e6), ("cost_intersection", 0.0, 1e6), ("empty_bonus", 0.0, 1.0),
+                                ("max_growth", 1.0, 1e4)):
             value = getattr(self, name)
-            if value is None and name == "max_depth":
-                continue
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
-                raise InputError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
-        for name, most in (("cost_traversal", 1e6), ("cost_intersection", 1e6), ("empty_bonus", 1.0), ("max_growth", 1e4)):
-            value = getattr(self, name)
-            least = 1.0 if name == "max_growth" else 0.0
-            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not least <= value <= most:
-                raise InputError(f"{name} must be a number from {least:g} to {most:g}, got {value!r}")
-        for name in ("by_cost", "clip"):
-            if not isinstance(getattr(self, name), (bool, np.bool_)):
-                raise InputError(f"{name} must be True or False, got {getattr(self, name)!r}")
+            if value is not None and not low <= value <= high:
+                raise InputError(f"{name} must be {low:g} to {high:g}, got {value}")
 
     def depth(self, n: int) -> int:
         """As given, or 8 + 1.3 log2 n (Havran 2000; Pharr et al., "Physically Based Rendering", section 4.4)."""
@@ -93,7 +87,8 @@ def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> KdTreeDa
     if n == 0:
         nodes = records(KdNode, 1)
         nodes["word"] = LEAF
-        return KdTreeData(nodes, np.zeros(0, np.int32), np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32), 1, 1, 0.0, 0.0)
+        nowhere = np.full(3, np.inf, np.float32)
+        return KdTreeData(nodes, np.zeros(0, np.int32), nowhere, -nowhere, 1, 1, 0.0, 0.0)
     hi = np.where(lo < hi, hi, np.nextafter(hi, np.float32(np.inf)))  # a box has an inside
     shapes, reach = clippable(geometry, lo, hi, options.clip)
     budget = int(min(options.max_growth * n + 64, MAX_INDEX / 2))
@@ -104,7 +99,7 @@ def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> KdTreeDa
 
 
 def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) -> tuple[Any, float]:
-    """The primitives for kernels.clip, and the largest extent of those that it clips."""
+    """The primitives for kernels.build_clip, and the largest extent of those that it clips."""
     cpu = start("cpu")
     with np.errstate(over="ignore"):
         extent = (hi - lo).max(axis=1)
@@ -191,8 +186,9 @@ def divide(cell: Cell, plane: tuple[int, np.float32], shapes: Any, slot: int) ->
         cut = cell.prim_id[straddles]
         cut_lo, cut_hi = clipped(shapes, cut, cell_lo, cell_hi)
         there = cut_lo[:, 0] < cut_hi[:, 0]
-        out.append(Cell(cell_lo, cell_hi, *(np.concatenate([a[whole], b[there]]) for a, b in (
-            (cell.prim_id, cut), (cell.lo, cut_lo), (cell.hi, cut_hi))), cell.depth + 1, budgets[side], slot + side))
+        prim_id, lo, hi = (np.concatenate([a[whole], b[there]]) for a, b in (
+            (cell.prim_id, cut), (cell.lo, cut_lo), (cell.hi, cut_hi)))
+        out.append(Cell(cell_lo, cell_hi, prim_id, lo, hi, cell.depth + 1, budgets[side], slot + side))
     return out
 
 
