@@ -193,4 +193,68 @@ def kdtree(accel, ray: WalkRay) -> Walk:
                 break
 
 
-REWALK: dict[str, Callable[..., Walk]] = {"brute_force": brute_force, "bvh2": bvh2, "kdtree": kdtree}
+def grid(accel, ray: WalkRay) -> Walk:
+    """From plane to plane, with the distances to all planes taken beforehand."""
+    walk, layout = Walk(), accel.data
+    n, mailbox, seen = tuple(layout.n), int(accel.data.mailbox), [0] * 8
+    cells, references = accel.data.cells.numpy(), accel.data.references.numpy()
+    slack = cell_slack(accel, ray)
+    lo, hi, size = (np.array(v, np.float32) for v in (layout.lo, layout.hi, layout.size))
+    with np.errstate(invalid="ignore", over="ignore"):
+        slabs = []
+        for a in range(3):
+            planes = (lo[a] + np.arange(n[a], dtype=np.float32) * size[a]).astype(np.float32)
+            t = (np.append(planes, hi[a]) - ray.origin[a]) * ray.inv_dir[a]
+            t = t if ray.inv_dir[a] > 0.0 else t[::-1]
+            slabs.append((t[:-1], t[1:]))
+        t_in = max(max(s[0][0] for s in slabs), earlier(ray.t_min) - slack)
+        if not t_in <= later(min(s[1][-1] for s in slabs)):
+            return walk
+        at = [int(np.argmax(later(s[1]) >= t_in)) for s in slabs]
+        while t_in <= later(ray.best[0]) + slack:
+            leave = [slabs[a][1][at[a]] for a in range(3)]
+            axis = int(np.argmin(leave))
+            t_in = leave[axis]
+            beside = [[at[a]] if a == axis else [b for b in range(at[a], n[a]) if slabs[a][0][b] <= later(t_in) or b == at[a]]
+                      for a in range(3)]
+            side, other = (axis + 1) % 3, (axis + 2) % 3
+            for q in beside[other]:
+                for p in beside[side]:
+                    cell = {axis: at[axis], side: p, other: q}
+                    x, y, z = (cell[a] if ray.inv_dir[a] > 0.0 else n[a] - 1 - cell[a] for a in range(3))
+                    index = x + n[0] * (y + n[1] * z)
+                    walk.node(index, cells.itemsize, 0)
+                    first, count = int(cells[index]["first"]), int(cells[index]["count"])
+                    walk.leaves += count > 0
+                    for primitive in references[first : first + count].tolist():
+                        if mailbox and seen[primitive % 8] == primitive + 1:
+                            continue
+                        seen[primitive % 8] = primitive + 1
+                        ray.test(walk, accel, primitive)
+            at[axis] += 1
+            if at[axis] == n[axis]:
+                break
+    return walk
+
+
+def later(t: np.ndarray) -> np.ndarray:
+    return np.maximum(t * np.float32(FAR_PAD), t * np.float32(2.0 - FAR_PAD))
+
+
+def earlier(t: np.ndarray) -> np.ndarray:
+    return np.minimum(t * np.float32(FAR_PAD), t * np.float32(2.0 - FAR_PAD))
+
+
+def cell_slack(accel, ray: WalkRay) -> np.float32:
+    """How far a hit may be told to lie from the cells that list it."""
+    inverse = np.abs(ray.inv_dir)
+    two, pad, extent = (np.float32(x) for x in (2.0, accel.data.pad, accel.data.extent))
+    return min(two * pad * inverse[inverse < INF].max(), two * extent * inverse.min())
+
+
+REWALK: dict[str, Callable[..., Walk]] = {
+    "brute_force": brute_force,
+    "bvh2": bvh2,
+    "kdtree": kdtree,
+    "grid": grid,
+}

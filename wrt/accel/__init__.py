@@ -7,6 +7,7 @@ from typing import Any
 from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
 from wrt.accel.brute_force import BruteForce
 from wrt.accel.bvh2 import Bvh2
+from wrt.accel.grid import Grid
 from wrt.accel.kdtree import KdTree
 from wrt.accel.store import build_cached, load_accel
 from wrt.errors import InputError
@@ -20,6 +21,7 @@ ACCELERATORS: dict[str, type[Accelerator]] = {
     "bvh2": Bvh2,
     "kdtree": KdTree,
     "brute_force": BruteForce,
+    "grid": Grid,
 }
 
 

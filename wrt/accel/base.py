@@ -103,7 +103,8 @@ class AccelStats:
 class Built:
     """What a builder gives: arrays, one for each field of the structure's struct but `primitives` and `recorder`, records or
     rows of numbers (a field that is no array: a NumPy scalar or row); order: (R,) int32, the prim_id of each record of
-    `primitives`, where one may stand more than once; and what AccelStats tells of a tree."""
+    `primitives`, where one may stand more than once, unless cells share records: then there is an array `references` of their
+    indices; and what AccelStats tells of a tree."""
 
     arrays: dict[str, np.ndarray]
     order: np.ndarray
@@ -111,6 +112,10 @@ class Built:
     leaves: int = 0
     depth: int = 0
     sah_cost: float = float("nan")
+
+    @property
+    def references(self) -> int:
+        return len(self.arrays.get("references", self.order))
 
 
 @dataclass(frozen=True)
@@ -233,7 +238,7 @@ class Accelerator(ABC):
     def _take(self, built: Built, begin: float) -> None:
         self.built = built
         self.data = self._upload(built)
-        self.stats = AccelStats(time.perf_counter() - begin, built.nodes, built.leaves, built.depth, len(built.order),
+        self.stats = AccelStats(time.perf_counter() - begin, built.nodes, built.leaves, built.depth, built.references,
                                 array_bytes(self.data), built.sah_cost)
 
     @abstractmethod
@@ -280,7 +285,7 @@ class Accelerator(ABC):
         for name, array in built.arrays.items():
             kind = types[name]
             is_array = isinstance(kind, wp.array)
-            setattr(data, name, upload(array, kind.dtype, self.device) if is_array else kind(*np.atleast_1d(array)))
+            setattr(data, name, upload(array, kind.dtype, self.device) if is_array else kind(*np.ravel(array)))
         data.primitives = upload(self.geometry.primitives(units, built.order), units.triangle_test.record, self.device)
         return data
 

@@ -1,0 +1,101 @@
+"""The grid builder's inner loops, on the CPU backend: count the cells of each primitive, list them, sort them by cell.
+
+Counting and listing run over ranges of primitives on all cores; the sort is one pass, in the order of the primitives, so that
+the lists do not depend on the number of threads.
+"""
+
+import warp as wp
+
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse_grid import GridCell, GridLayout, grid_plane
+from wrt.kernels.triangle_cell import CellSource, TriangleCell, meets_cell, triangle_cell
+
+
+@wp.func
+def slab_of(layout: GridLayout, axis: int, x: float) -> int:
+    """The lowest slab whose upper plane is not below x; closed slabs, so that a plane is in both."""
+    last = layout.n[axis] - 1
+    guess = (x - layout.lo[axis]) / layout.size[axis]
+    slab = int(wp.where(guess > 0.0, wp.min(guess, float(last)), 0.0))
+    while slab < last and grid_plane(layout, axis, slab + 1) < x:
+        slab += 1
+    while slab > 0 and grid_plane(layout, axis, slab) >= x:
+        slab -= 1
+    return slab
+
+
+@wp.func
+def slabs_of(layout: GridLayout, lo: wp.vec3, hi: wp.vec3, axis: int) -> wp.vec2i:
+    """The first and the last closed slab that [lo, hi] meets."""
+    first = slab_of(layout, axis, lo[axis])
+    last = slab_of(layout, axis, hi[axis])
+    if last < layout.n[axis] - 1 and grid_plane(layout, axis, last + 1) <= hi[axis]:
+        last += 1
+    return wp.vec2i(first, last)
+
+
+@wp.func
+def slab_lo(layout: GridLayout, x: int, y: int, z: int) -> wp.vec3:
+    return wp.vec3(grid_plane(layout, 0, x), grid_plane(layout, 1, y), grid_plane(layout, 2, z))
+
+
+@kernel
+def list_cells(
+    source: CellSource,
+    layout: GridLayout,
+    first: int,
+    begin: wp.array(dtype=wp.int64),
+    count: wp.array(dtype=wp.int32),
+    cells: wp.array(dtype=wp.int32),
+):
+    """Primitive first + tid: write `count`, or, where there is room for cells, the cells from `begin` on."""
+    i = first + wp.tid()
+    lo = source.lo[i]
+    hi = source.hi[i]
+    x = slabs_of(layout, lo, hi, 0)
+    y = slabs_of(layout, lo, hi, 1)
+    z = slabs_of(layout, lo, hi, 2)
+    exact = i < source.faces.shape[0] and (x[0] != x[1] or y[0] != y[1] or z[0] != z[1])
+    triangle = TriangleCell()
+    if exact:
+        face = source.faces[i]
+        triangle = triangle_cell(source.vertices[face[0]], source.vertices[face[1]], source.vertices[face[2]], lo, hi)
+    writes = cells.shape[0] > 0
+    n = int(0)
+    for k in range(z[0], z[1] + 1):
+        for j in range(y[0], y[1] + 1):
+            # A row that is missed as a whole is passed over, which is most of them under a large triangle.
+            if exact and x[1] - x[0] > 1:
+                if not meets_cell(triangle, slab_lo(layout, x[0], j, k), slab_lo(layout, x[1] + 1, j + 1, k + 1)):
+                    continue
+            for m in range(x[0], x[1] + 1):
+                if exact:
+                    if not meets_cell(triangle, slab_lo(layout, m, j, k), slab_lo(layout, m + 1, j + 1, k + 1)):
+                        continue
+                if writes:
+                    cells[int(begin[i]) + n] = m + layout.n[0] * (j + layout.n[1] * k)
+                n += 1
+    if not writes:
+        count[i] = n
+
+
+@kernel
+def sort_by_cell(
+    begin: wp.array(dtype=wp.int64),
+    cell_of: wp.array(dtype=wp.int32),
+    cells: wp.array(dtype=GridCell),
+    references: wp.array(dtype=wp.int32),
+):
+    """A counting sort by one thread: the primitives of each cell in ascending order. cells: zeroed."""
+    for r in range(cell_of.shape[0]):
+        cells[cell_of[r]].count += 1
+    total = int(0)
+    for c in range(cells.shape[0]):
+        cells[c].first = total
+        total += cells[c].count
+        cells[c].count = 0
+    for i in range(begin.shape[0] - 1):
+        for r in range(int(begin[i]), int(begin[i + 1])):
+            c = cell_of[r]
+            references[cells[c].first + cells[c].count] = i
+            cells[c].count += 1

@@ -1,0 +1,183 @@
+"""The traversal unit of the uniform grid: from cell to cell along the ray (3D-DDA), and an early stop.
+
+Amanatides and Woo 1987, "A Fast Voxel Traversal Algorithm for Ray Tracing", made to lose no ray: the distance to every plane
+is taken afresh, so that no error adds up, and where the ray leaves a cell within rounding of an edge or a corner, all the cells
+around that it may have passed through are visited too. Exactly those cells are visited that the conservative box test would
+enter, each once. Mailboxing: Amanatides and Woo, section 3, with a few slots by the primitive's number.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from wrt.kernels.cell_ray import cell_slack, earlier, later, parallel
+from wrt.kernels.counters import Counts, Recorder, make_counters
+from wrt.kernels.ray_aabb import BoxRay, slab_interval
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
+
+MAILBOX_SIZE = 8
+
+
+@wp.struct
+class GridCell:
+    """The references first .. first + count - 1."""
+
+    first: int
+    count: int
+
+
+@wp.struct
+class GridLayout:
+    """n cells along each axis, of one size but for rounding, from lo to hi."""
+
+    lo: wp.vec3
+    hi: wp.vec3
+    size: wp.vec3
+    n: wp.vec3i
+
+
+@wp.func
+def grid_plane(layout: GridLayout, axis: int, i: int) -> float:
+    """Plane i of the n + 1 across this axis; monotone in i. The builder and the traversal call this one function."""
+    return wp.where(i >= layout.n[axis], layout.hi[axis], layout.lo[axis] + float(i) * layout.size[axis])
+
+
+@wp.func
+def exit_distance(layout: GridLayout, ray: BoxRay, axis: int, cell: int) -> float:
+    """Where the ray leaves this slab of cells; inf where it is parallel to it."""
+    plane = grid_plane(layout, axis, wp.where(ray.inv_dir[axis] < 0.0, cell, cell + 1))
+    return wp.where(parallel(ray, axis), float(wp.inf), (plane - ray.origin[axis]) * ray.inv_dir[axis])
+
+
+@wp.func
+def first_slab(layout: GridLayout, ray: BoxRay, direction: wp.vec3, axis: int, t: float) -> int:
+    """The first slab along the ray that it may not have left at t; where it is parallel, the lowest that holds the origin.
+
+    The guess by division only saves time: the slab is the one that the distances tell.
+    """
+    last = layout.n[axis] - 1
+    origin = ray.origin[axis]
+    guess = (origin + wp.where(parallel(ray, axis), 0.0, t * direction[axis]) - layout.lo[axis]) / layout.size[axis]
+    slab = int(wp.where(guess > 0.0, wp.min(guess, float(last)), 0.0))
+    if parallel(ray, axis):
+        while slab < last and grid_plane(layout, axis, slab + 1) < origin:
+            slab += 1
+        while slab > 0 and grid_plane(layout, axis, slab) >= origin:
+            slab -= 1
+        return slab
+    step = wp.where(ray.inv_dir[axis] < 0.0, -1, 1)
+    begin = wp.where(step < 0, last, 0)
+    while slab != last - begin and later(exit_distance(layout, ray, axis, slab)) < t:
+        slab += step
+    while slab != begin and later(exit_distance(layout, ray, axis, slab - step)) >= t:
+        slab -= step
+    return slab
+
+
+@wp.func
+def slabs_left(layout: GridLayout, ray: BoxRay, axis: int, slab: int, limit: float) -> int:
+    """How many slabs, from this one on, the ray leaves for the next up to `limit`."""
+    n = int(0)
+    step = wp.where(ray.inv_dir[axis] < 0.0, -1, 1)
+    while slab + step >= 0 and slab + step < layout.n[axis] and exit_distance(layout, ray, axis, slab) <= limit:
+        slab += step
+        n += 1
+    return n
+
+
+@cache
+def make_struct(record):
+    """The structure over records of this kind, in the order of prim_id. lo, hi, size, n: the GridLayout; pad, extent: the largest
+    of any triangle's box; mailbox: 1 to remember what was tested; cells: x first, then y, then z; references: indices of
+    primitives."""
+
+    @wp.struct
+    class Grid:
+        lo: wp.vec3
+        hi: wp.vec3
+        size: wp.vec3
+        n: wp.vec3i
+        pad: float
+        extent: float
+        mailbox: int
+        cells: wp.array(dtype=GridCell)
+        references: wp.array(dtype=wp.int32)
+        primitives: wp.array(dtype=record)
+        recorder: Recorder
+
+    return Grid
+
+
+def make_traversal(units: Units, any_hit: bool, accepts=None):
+    """The closest hit, or any (the first that is found). The box test is the walk's own, whatever `units` says."""
+    probe_of = make_probe(units)
+    intersect = make_intersect(units, accepts)
+    fetch_node, fetch_primitive, _, finish = make_counters(units, GridCell.numpy_dtype()["itemsize"])
+    struct = make_struct(units.triangle_test.record)
+
+    @wp.func
+    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+        probe = probe_of(ray)
+        best = no_hit(ray)
+        counts = Counts()
+        layout = GridLayout()
+        layout.lo = accel.lo
+        layout.hi = accel.hi
+        layout.size = accel.size
+        layout.n = accel.n
+        slack = cell_slack(probe.box, accel.pad, accel.extent)
+        interval = slab_interval(probe.box, layout.lo, layout.hi)
+        t_in = wp.max(interval[0], earlier(ray.t_min) - slack)
+        if not (t_in <= later(interval[1]) and t_in < wp.inf):
+            return finish(accel.recorder, ray, counts, best)
+        slab = wp.vec3i()
+        step = wp.vec3i()
+        t_next = wp.vec3()
+        for axis in range(3):
+            slab[axis] = first_slab(layout, probe.box, ray.direction, axis, t_in)
+            step[axis] = wp.where(probe.box.inv_dir[axis] < 0.0, -1, 1)
+            t_next[axis] = exit_distance(layout, probe.box, axis, slab[axis])
+        stride = wp.vec3i(1, layout.n[0], layout.n[0] * layout.n[1])
+        mailbox = wp.zeros(shape=wp.static(MAILBOX_SIZE), dtype=wp.int32)  # primitive + 1, or 0
+
+        while t_in <= later(best.t) + slack:
+            axis = wp.where(t_next[0] <= t_next[1], wp.where(t_next[0] <= t_next[2], 0, 2), wp.where(t_next[1] <= t_next[2], 1, 2))
+            side = wp.where(axis == 2, 0, axis + 1)
+            other = wp.where(axis == 0, 2, axis - 1)
+            t_out = t_next[axis]
+            # Slabs across the two other axes that it leaves as good as at the same place: this cell and those are visited.
+            limit = wp.where(t_out < wp.inf, later(t_out), float(-wp.inf))
+            side_slabs = int(0)
+            other_slabs = int(0)
+            if t_next[side] <= limit:
+                side_slabs = slabs_left(layout, probe.box, side, slab[side], limit)
+            if t_next[other] <= limit:
+                other_slabs = slabs_left(layout, probe.box, other, slab[other], limit)
+            corner = slab[0] + slab[1] * stride[1] + slab[2] * stride[2]
+            for k in range((side_slabs + 1) * (other_slabs + 1)):
+                index = (corner + (k % (side_slabs + 1)) * step[side] * stride[side]
+                         + (k / (side_slabs + 1)) * step[other] * stride[other])
+                cell = accel.cells[index]
+                counts = fetch_node(accel.recorder, ray, counts, index, 0)
+                if cell.count > 0:
+                    counts.leaves += 1
+                for i in range(cell.first, cell.first + cell.count):
+                    primitive = accel.references[i]
+                    slot = primitive % wp.static(MAILBOX_SIZE)
+                    if accel.mailbox > 0 and mailbox[slot] == primitive + 1:
+                        continue
+                    mailbox[slot] = primitive + 1
+                    best = intersect(probe, surfaces, accel.primitives[primitive], best)
+                    counts = fetch_primitive(accel.recorder, ray, counts, primitive)
+                    if wp.static(any_hit):
+                        if best.prim_id != NO_HIT:
+                            return finish(accel.recorder, ray, counts, best)
+            slab[axis] = slab[axis] + step[axis]
+            if slab[axis] < 0 or slab[axis] >= layout.n[axis]:
+                break
+            t_in = t_out
+            t_next[axis] = exit_distance(layout, probe.box, axis, slab[axis])
+        return finish(accel.recorder, ray, counts, best)
+
+    return traverse

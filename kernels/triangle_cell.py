@@ -1,0 +1,90 @@
+"""Builders that split space ask: does a triangle, grown by its pad, meet this cell? If not, no ray needs it there.
+
+The separating axes of a triangle and a box: Akenine-Moeller 2001, "Fast 3D Triangle-Box Overlap Testing" (JGT 6(1)). The three
+axes of the box are not tested again: the caller has compared the cell with the triangle's padded box.
+"""
+
+import warp as wp
+
+
+@wp.struct
+class CellSource:
+    """Triangles (spheres come after them) and the padded boxes of all primitives."""
+
+    vertices: wp.array(dtype=wp.vec3)
+    faces: wp.array(dtype=wp.vec3i)
+    lo: wp.array(dtype=wp.vec3)
+    hi: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class TriangleCell:
+    """Set-up, once a triangle; in float64, where all that is left to rounding is far below the pad.
+
+    grow: how far the triangle stands off its own box, (3,); normal and offset: its plane; v0, v1, v2: its corners.
+    """
+
+    v0: wp.vec3d
+    v1: wp.vec3d
+    v2: wp.vec3d
+    normal: wp.vec3d
+    grow: wp.vec3d
+
+
+@wp.func
+def triangle_cell(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, lo: wp.vec3, hi: wp.vec3) -> TriangleCell:
+    """lo, hi: the triangle's padded box. Grown by the same pads, the triangle holds every point that its unit may call a hit,
+    but for what is proportional to the hit's distance, which the ray's side widens (kernels.cell_ray)."""
+    out = TriangleCell()
+    out.v0 = wp.vec3d(v0)
+    out.v1 = wp.vec3d(v1)
+    out.v2 = wp.vec3d(v2)
+    out.normal = wp.cross(out.v1 - out.v0, out.v2 - out.v0)
+    below = wp.vec3d(wp.min(wp.min(v0, v1), v2)) - wp.vec3d(lo)
+    above = wp.vec3d(hi) - wp.vec3d(wp.max(wp.max(v0, v1), v2))
+    out.grow = wp.max(below, above)
+    return out
+
+
+@wp.func
+def apart_along(u: wp.float64, v: wp.float64, a: wp.vec2d, b: wp.vec2d, half_u: wp.float64, half_v: wp.float64) -> bool:
+    """Whether the axis (u, v) across an edge parts a box of these half sizes around 0 from the edge (a) and the corner (b)."""
+    p = u * a[0] + v * a[1]
+    q = u * b[0] + v * b[1]
+    reach = wp.abs(u) * half_u + wp.abs(v) * half_v
+    return wp.min(p, q) > reach or wp.max(p, q) < -reach
+
+
+@wp.func
+def edge_apart(edge: wp.vec3d, on: wp.vec3d, off: wp.vec3d, half: wp.vec3d) -> bool:
+    """The axes edge x (the three of the box); on: a corner of the edge, off: the corner opposite, both from the cell's center."""
+    if apart_along(-edge[2], edge[1], wp.vec2d(on[1], on[2]), wp.vec2d(off[1], off[2]), half[1], half[2]):
+        return True
+    if apart_along(-edge[0], edge[2], wp.vec2d(on[2], on[0]), wp.vec2d(off[2], off[0]), half[2], half[0]):
+        return True
+    return apart_along(-edge[1], edge[0], wp.vec2d(on[0], on[1]), wp.vec2d(off[0], off[1]), half[0], half[1])
+
+
+@wp.func
+def meets_cell(triangle: TriangleCell, lo: wp.vec3, hi: wp.vec3) -> bool:
+    """Whether the grown triangle meets the closed cell [lo, hi], given that its padded box does.
+
+    Conservative; a cell without end is met. The triangle's coordinates are finite.
+    """
+    half_one = wp.float64(0.5)
+    low = wp.vec3d(lo)
+    high = wp.vec3d(hi)
+    center = half_one * (low + high)
+    half = half_one * (high - low) + triangle.grow
+    a = triangle.v0 - center
+    distance = wp.dot(triangle.normal, a)
+    reach = wp.dot(wp.abs(triangle.normal), half)
+    if wp.abs(distance) > reach:
+        return False
+    b = triangle.v1 - center
+    c = triangle.v2 - center
+    if edge_apart(b - a, a, c, half):
+        return False
+    if edge_apart(c - b, b, a, half):
+        return False
+    return not edge_apart(a - c, c, b, half)

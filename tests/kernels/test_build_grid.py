@@ -1,0 +1,174 @@
+"""The grid's builder: every cell lists what is in it, whatever the grid is built over."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import rounded  # isort: skip (starts Warp)
+
+from wrt.accel import Geometry, build
+from wrt.accel import grid as module
+from wrt.errors import InputError
+from wrt.mesh import Mesh
+from wrt.shapes import icosphere
+
+NO_SPHERES = np.zeros((0, 4), np.float32)
+
+
+def triangles(corners, spheres=NO_SPHERES):
+    corners = np.asarray(corners, np.float32).reshape(-1, 3)
+    return Geometry(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3), np.asarray(spheres, np.float32))
+
+
+CASES = {
+    "soup": lambda rng: triangles(rng.uniform(-1.0, 1.0, (500, 1, 3)) + 0.2 * rng.normal(size=(500, 3, 3))),
+    "flat": lambda rng: triangles(np.insert(rng.uniform(-1.0, 1.0, (500, 3, 2)), 1, 0.25, axis=2)),
+    "line": lambda rng: triangles(rng.uniform(-1.0, 1.0, (200, 3, 1)) * [1.0, 0.0, 0.0]),
+    "point": lambda rng: triangles(np.ones((50, 3, 3))),
+    "far": lambda rng: triangles(1000.0 + rng.uniform(-1.0, 1.0, (300, 3, 3))),
+    "huge": lambda rng: triangles(rng.uniform(-3e38, 3e38, (100, 3, 3))),
+    "subnormal": lambda rng: triangles(rng.uniform(-1e-40, 1e-40, (100, 3, 3))),
+    "spheres": lambda rng: triangles(np.zeros((0, 3, 3)), rng.uniform([-1, -1, -1, 0.1], [1, 1, 1, 0.3], (50, 4))),
+    "none": lambda rng: triangles(np.zeros((0, 3, 3))),
+}
+
+
+def lists(grid):
+    """Cell of each reference, in x, y, z, and the primitive."""
+    cells = grid.data.cells.numpy()
+    where = np.repeat(np.arange(len(cells)), cells["count"])
+    assert np.array_equal(cells["first"], np.cumsum(cells["count"]) - cells["count"])
+    n = np.array(grid.data.n)
+    return np.stack([where % n[0], where // n[0] % n[1], where // (n[0] * n[1])], axis=1), grid.data.references.numpy()
+
+
+def planes(layout, axis):
+    """The planes across an axis, rounded as the device rounds them."""
+    lo, size, n = np.float32(layout.lo[axis]), np.float32(layout.size[axis]), layout.n[axis]
+    return np.append(lo + np.arange(n, dtype=np.float32) * size, np.float32(layout.hi[axis]))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_points_of_a_primitive_are_in_cells_that_list_it(case):
+    rng = np.random.default_rng(2)
+    geometry = CASES[case](rng)
+    grid = build(geometry, "grid", density=20.0)
+    where, reference = lists(grid)
+    listed = set(zip(*where.T.tolist(), reference.tolist(), strict=True))
+    assert len(listed) == len(reference) == grid.stats.references  # none is there twice in a cell
+    layout = grid.data
+    n = len(geometry.faces)
+    for _ in range(20):
+        weight = rng.dirichlet([0.3, 0.3, 0.3], n)
+        point = (weight[:, :, None] * geometry.vertices[geometry.faces].astype(np.float64)).sum(axis=1)
+        if len(geometry.spheres):
+            around = rng.normal(size=(len(geometry.spheres), 3))
+            around *= geometry.spheres[:, 3:] / np.linalg.norm(around, axis=1, keepdims=True)
+            point = np.concatenate([point, geometry.spheres[:, :3] + around])
+        cell = [np.clip(np.searchsorted(planes(layout, a), point[:, a], "right") - 1, 0, layout.n[a] - 1) for a in range(3)]
+        assert all(entry in listed for entry in zip(*(c.tolist() for c in cell), range(len(point)), strict=True))
+
+
+def test_primitives_of_a_cell_are_in_ascending_order_on_any_number_of_threads():
+    corners = icosphere(5)
+    one, two = build(corners, "grid", threads=1), build(corners, "grid", threads=2)
+    assert np.array_equal(one.data.references.numpy(), two.data.references.numpy())
+    assert np.array_equal(one.data.cells.numpy(), two.data.cells.numpy())
+    where, reference = lists(one)
+    same = (where[1:] == where[:-1]).all(axis=1)
+    assert (np.diff(reference)[same] > 0).all() and same.sum() > 1000
+
+
+def test_cells_that_only_the_box_of_a_triangle_meets_do_not_list_it():
+    # One triangle across a cube: of n^3 cells it meets about as many as a plane does, not all.
+    corners = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    grid = build(triangles(np.repeat(corners[None], 20, axis=0)), "grid", density=50.0)
+    n = np.array(grid.data.n)
+    assert (n == 10).all()
+    where, _ = lists(grid)
+    # In units of cells the triangle is x + y + z = n: a cell meets it if its lowest corner is below and its highest above.
+    lowest = where.sum(axis=1)
+    assert (lowest <= 10).all() and (lowest + 3 >= 10).all()
+    x, y, z = np.indices((10, 10, 10))
+    expected = ((x + y + z <= 10) & (x + y + z + 3 >= 10)).sum()  # closed, and the pads: those that touch at a corner too
+    assert len(where) == 20 * expected
+
+
+@pytest.mark.parametrize("density", [0.1, 1.0, 8.0])
+def test_as_many_cells_as_the_density_asks_for(density):
+    # Boxes of many shapes, also without height: the number of cells comes out, and they are nearly cubes.
+    rng = np.random.default_rng(3)
+    for shape in ([1, 1, 1], [1, 2, 3], [30, 1, 1], [1, 0, 1], [20, 5, 0]):
+        geometry = triangles((rng.uniform(-1.0, 1.0, (5000, 1, 3)) + 0.02 * rng.normal(size=(5000, 3, 3))) * shape)
+        layout = build(geometry, "grid", density=density).data
+        n = np.array(layout.n)
+        assert 0.6 * density * 5000 <= n.prod() <= 1.001 * density * 5000
+        size = np.array(layout.size)[n > 1]
+        assert size.max() < 1.6 * size.min()
+
+
+def test_too_many_references_make_larger_cells_and_a_warning(monkeypatch):
+    geometry = triangles(np.random.default_rng(4).uniform(-1.0, 1.0, (2000, 3, 3)))
+    monkeypatch.setattr(module, "MAX_REFERENCES", 50_000)
+    with pytest.warns(RuntimeWarning, match="references fit"):
+        grid = build(geometry, "grid")
+    assert 2000 < grid.stats.references <= 50_000
+    assert max(grid.data.n) > 1
+    monkeypatch.setattr(module, "MAX_CELLS", 1000)
+    with pytest.warns(RuntimeWarning, match="at most 1000 cells"):
+        assert build(icosphere(4), "grid").stats.nodes <= 1000
+
+
+@pytest.mark.parametrize("density", [0.0, -1.0, 1e9, float("nan")])
+def test_densities_that_are_refused(density):
+    with pytest.raises(InputError, match="density"):
+        build(icosphere(0), "grid", density=density)
+
+
+def test_random_lines_cost_what_the_statistics_expect():
+    # Triangles without area are listed where they are, and are never hit: the whole line is walked.
+    rng = np.random.default_rng(5)
+    ends = rng.uniform(-1.0, 1.0, (400, 2, 3)) * [1.0, 0.5, 2.0]
+    segments = Mesh(ends.reshape(-1, 3), np.stack([2 * np.arange(400), 2 * np.arange(400) + 1, 2 * np.arange(400)], axis=1))
+    grid = build(Geometry.of(segments), "grid", mailbox=False, density=5.0)
+    lo, hi = np.array(grid.data.lo, np.float64), np.array(grid.data.hi, np.float64)
+    n = 40_000
+    # Uniform lines: a point on the surface, by area, and a direction inwards by the cosine.
+    extent = hi - lo
+    area = np.array([extent[1] * extent[2], extent[2] * extent[0], extent[0] * extent[1]])
+    axis = rng.choice(3, n, p=area / area.sum())
+    side = rng.integers(0, 2, n)
+    point = lo + rng.random((n, 3)) * extent
+    point[np.arange(n), axis] = np.where(side == 0, lo[axis], hi[axis])
+    r, phi = np.sqrt(rng.random(n)), 2.0 * np.pi * rng.random(n)
+    direction = np.empty((n, 3))
+    direction[np.arange(n), axis] = np.where(side == 0, 1.0, -1.0) * np.sqrt(1.0 - r**2)
+    direction[np.arange(n), (axis + 1) % 3] = r * np.cos(phi)
+    direction[np.arange(n), (axis + 2) % 3] = r * np.sin(phi)
+    hits = grid.closest_hit(rounded(point - direction), rounded(direction), counters=True)
+    assert (hits.prim_id < 0).all()
+    cost = hits.counters.nodes + hits.counters.primitives
+    assert abs(cost.mean() - grid.stats.sah_cost) < 3.0 * cost.std() / np.sqrt(n)
+
+
+def spoilt(name, change):
+    grid = build(icosphere(2), "grid")
+    arrays = {key: np.array(value) for key, value in grid.built.arrays.items()}
+    change(arrays[name])
+    return grid, replace(grid.built, arrays=arrays)
+
+
+@pytest.mark.parametrize(("name", "change"), [
+    ("cells", lambda a: a["first"].__setitem__(5, -1)), ("cells", lambda a: a["count"].__setitem__(5, 1 << 30)),
+    ("cells", lambda a: a["count"].__setitem__(5, -1)), ("references", lambda a: a.__setitem__(3, 320)),
+    ("references", lambda a: a.__setitem__(3, -1)), ("n", lambda a: a.__setitem__(0, 100)), ("n", lambda a: a.__setitem__(1, -3)),
+    ("size", lambda a: a.__setitem__(2, np.nan)), ("size", lambda a: a.__setitem__(2, 1.0)),
+    ("lo", lambda a: a.__setitem__(0, 5.0)),
+    ("pad", lambda a: a.__setitem__((), np.nan)), ("mailbox", lambda a: a.__setitem__((), 2)),
+])
+def test_arrays_from_a_file_are_checked(name, change):
+    grid, built = spoilt(name, change)
+    type(grid).restore(grid.built, grid.geometry)
+    with pytest.raises(InputError, match="damaged"):
+        type(grid).restore(built, grid.geometry)

@@ -1,0 +1,126 @@
+"""The grid's walk where it is hard: rays in the planes and through the corners of cells, from far away, and grazing ones."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
+
+from wrt.accel import Geometry, build
+from wrt.mesh import Mesh
+from wrt.shapes import icosphere
+
+
+def soup(rng, n=600, size=0.15):
+    corners = rng.uniform(-1.0, 1.0, (n, 1, 3)) + size * rng.normal(size=(n, 3, 3))
+    spheres = np.concatenate([rng.uniform(-1.0, 1.0, (40, 3)), rng.uniform(0.02, 0.3, (40, 1))], axis=1)
+    return Geometry(corners.reshape(-1, 3).astype(np.float32), np.arange(3 * n, dtype=np.int32).reshape(-1, 3),
+                    spheres.astype(np.float32))
+
+
+def assert_same(found, expected):
+    for name in ("prim_id", "t", "u", "v"):
+        a, b = getattr(found, name).view(np.int32), getattr(expected, name).view(np.int32)
+        assert np.array_equal(a, b), f"{(a != b).sum()} of {len(a)} rays differ in {name}"
+
+
+def corner_planes(grid):
+    """Coordinates of the cells' planes, one array an axis."""
+    layout = grid.data
+    return [np.append(np.float32(layout.lo[a]) + np.arange(layout.n[a], dtype=np.float32) * np.float32(layout.size[a]),
+                      np.float32(layout.hi[a])) for a in range(3)]
+
+
+@pytest.mark.parametrize("mailbox", [True, False])
+def test_rays_in_faces_and_through_edges_and_corners_of_cells(mailbox):
+    rng = np.random.default_rng(1)
+    geometry = soup(rng)
+    grid, brute = build(geometry, "grid", mailbox=mailbox), build(geometry, "brute_force")
+    planes = corner_planes(grid)
+    n = 3000
+    corner = np.stack([rng.choice(p, n) for p in planes], axis=1)
+    size = np.array(grid.data.size)
+    for d in product([-1.0, -0.0, 0.0, 1.0], repeat=3):
+        if not np.any(d):
+            continue
+        direction = np.broadcast_to(np.array(d) * size, (n, 3)).astype(np.float32)  # diagonals of the cells: corner to corner
+        origin = (corner - 8 * direction).astype(np.float32)
+        origin[: n // 2] = corner[: n // 2]
+        assert_same(grid.closest_hit(origin, direction), brute.closest_hit(origin, direction))
+        assert np.array_equal(grid.any_hit(origin, direction, 0.1, 3.0), brute.any_hit(origin, direction, 0.1, 3.0))
+
+
+@pytest.mark.parametrize("distance", [1e2, 1e4, 1e6, 1e8])
+def test_far_origins(distance):
+    # From 1e6 on, rounding is as wide as the cells: the walk widens, up to the whole grid.
+    rng = np.random.default_rng(2)
+    geometry = soup(rng, size=0.3)
+    grid, brute = build(geometry, "grid"), build(geometry, "brute_force")
+    away = distance * unit(rng.normal(size=(3000, 3)))
+    away[::5] *= [1.0, 0.0, 0.0]
+    origin = rounded(rng.uniform(-1.0, 1.0, (3000, 3)) + away)
+    direction = rounded(rng.uniform(-1.0, 1.0, (3000, 3)) - origin)
+    direction[~direction.any(axis=1), 0] = 1.0
+    expected = brute.closest_hit(origin, direction)
+    assert_same(grid.closest_hit(origin, direction), expected)
+    assert (expected.prim_id >= 0).sum() > 300
+
+
+def grazing(rng, n):
+    """Long thin triangles in three planes, on top of each other, and rays that all but lie in the planes."""
+    corners = rng.uniform(-1.0, 1.0, (200, 3, 3))
+    corners[:, :, 1] = rng.choice([0.0, 1e-7, 1e-6], (200, 1))
+    corners[:, 2] = corners[:, 1] + 0.01 * rng.normal(size=(200, 3)) * [1.0, 0.0, 1.0]
+    geometry = Geometry(corners.reshape(-1, 3).astype(np.float32), np.arange(600, dtype=np.int32).reshape(-1, 3),
+                        np.zeros((0, 4), np.float32))
+    target = rng.uniform(-1.0, 1.0, (n, 3)) * [1.0, 0.0, 1.0]
+    direction = rng.normal(size=(n, 3))
+    direction[:, 1] = rng.choice([-1.0, 1.0], n) * 10.0 ** rng.uniform(-9, -4, n)
+    origin = rounded(target - direction * rng.uniform(0.0, 2.0, (n, 1)))
+    return geometry, origin, rounded(direction)
+
+
+def test_grazing_rays_find_the_same():
+    geometry, origin, direction = grazing(np.random.default_rng(3), 50_000)
+    grid, brute = build(geometry, "grid", density=100.0), build(geometry, "brute_force")
+    expected = brute.closest_hit(origin, direction)
+    assert (expected.prim_id >= 0).sum() > 5000
+    assert_same(grid.closest_hit(origin, direction), expected)
+    hit = expected.prim_id >= 0
+    at = expected.t[hit]
+    assert_same(grid.closest_hit(origin[hit], direction[hit], at, at), brute.closest_hit(origin[hit], direction[hit], at, at))
+
+
+def test_a_hit_in_a_later_cell_does_not_end_the_walk():
+    # A long triangle begins in the first cell and is hit in the last; a short one in between is nearer.
+    long = [[-1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [9.0, 0.0, 9.0]]
+    short = [[6.0, -1.0, 5.0], [6.0, 1.0, 5.0], [6.0, 0.0, 9.0]]
+    rest = [[[x, 20.0, z], [x + 1.0, 20.0, z], [x, 20.0, z + 1.0]] for x in range(9) for z in range(9)]
+    vertices = np.array([long, short, *rest]).reshape(-1, 3)
+    mesh = Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3))
+    grid = build(mesh, "grid", density=50.0)
+    hits = grid.closest_hit([[-1.0, 0.0, 7.0]], [[1.0, 0.0, 0.0]], counters=True)
+    assert hits.prim_id[0] == 1 and hits.t[0] == 7.0
+
+
+def test_mailboxing_saves_tests_and_no_cells():
+    rng = np.random.default_rng(4)
+    geometry = soup(rng, 300, 0.6)
+    origin = rounded(4.0 * unit(rng.normal(size=(2000, 3))))
+    direction = rounded(rng.uniform(-0.5, 0.5, (2000, 3)) - origin)
+    with_it, without = (build(geometry, "grid", mailbox=m).closest_hit(origin, direction, counters=True) for m in (True, False))
+    assert_same(with_it, without)
+    assert np.array_equal(with_it.counters.nodes, without.counters.nodes)
+    assert (with_it.counters.primitives <= without.counters.primitives).all()
+    assert with_it.counters.primitives.sum() < 0.95 * without.counters.primitives.sum()
+
+
+def test_the_walk_ends_at_the_hit_and_at_t_max():
+    ball = build(icosphere(4), "grid")
+    outside = ball.closest_hit([[-5.0, 0.01, 0.02]], [[1.0, 0.0, 0.0]], counters=True).counters
+    through = ball.closest_hit([[-0.5, 0.01, 0.02]], [[1.0, 0.0, 0.0]], counters=True).counters
+    n = ball.data.n[0]
+    assert outside.nodes[0] <= 3 and n / 2 < through.nodes[0] <= n
+    near = ball.closest_hit([[-0.5, 0.01, 0.02]], [[1.0, 0.0, 0.0]], 0.0, 0.001, counters=True).counters
+    assert near.nodes[0] <= 2

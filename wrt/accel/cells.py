@@ -1,0 +1,60 @@
+"""What the builders of structures with cells share: their input on the device, and what is checked of a file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Accelerator, Built, Geometry
+from wrt.accel.store import row_type
+from wrt.device import start, upload
+from wrt.errors import InputError
+from wrt.kernels.ray_aabb import PAD_EXTENT
+from wrt.kernels.triangle_cell import CellSource
+
+
+def cell_source(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray]) -> Any:
+    """The triangles, and the padded boxes of all primitives."""
+    cpu, source = start("cpu"), CellSource()
+    source.vertices = upload(geometry.vertices, wp.vec3, cpu)
+    source.faces = upload(geometry.faces, wp.vec3i, cpu)
+    source.lo, source.hi = (upload(array, wp.vec3, cpu) for array in bounds)
+    return source
+
+
+def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
+    """The arrays of `built`, where what is a single vector or number is one, and no longer the one row that it is in a file."""
+    arrays = dict(built.arrays)
+    for name, field in accel.structure.struct()._cls.vars.items():
+        if name in arrays and not isinstance(field.type, wp.array):
+            arrays[name] = np.reshape(arrays[name], row_type(field.type).shape)
+    return arrays
+
+
+def check_numbers(arrays: dict[str, np.ndarray]) -> None:
+    """Raise InputError unless pad and extent are what kernels.cell_ray.cell_slack may be given."""
+    if not (arrays["pad"] >= 0.0 and arrays["extent"] >= 0.0):
+        raise InputError("is damaged: its numbers are out of range")
+
+
+def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: int) -> None:
+    """Raise InputError unless these records (first, count) stay within the references, and those within the primitives."""
+    first, count = cells["first"].astype(np.int64), cells["count"].astype(np.int64)
+    if ((first < 0) | (count < 0) | (first + count > len(references))).any():
+        raise InputError("is damaged: a cell leads out of the references")
+    if ((references < 0) | (references >= n_primitives)).any():
+        raise InputError("is damaged: a reference leads out of the primitives")
+
+
+def triangle_reach(geometry: Geometry, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For kernels.cell_ray.cell_slack: the largest pad and the largest extent of all triangles' padded boxes."""
+    n = len(geometry.faces)
+    if not n:
+        return np.zeros((), np.float32), np.zeros((), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        extent = (hi[:n] - lo[:n]).max()
+        # The pad of a box is no larger than this share of its extent and its coordinates (Geometry.bounds).
+        pad = np.float32(PAD_EXTENT) * (extent + np.maximum(np.abs(lo[:n]), np.abs(hi[:n])).max())
+    return np.asarray(pad), np.asarray(extent)

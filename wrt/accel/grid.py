@@ -1,0 +1,158 @@
+"""The uniform grid: cells of one size, each with a list of the primitives that meet it."""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Accelerator, Built, Geometry
+from wrt.accel.cells import cell_source, check_numbers, check_references, one_row, triangle_reach
+from wrt.device import load_kernel, records, run_all, start, upload
+from wrt.errors import InputError
+from wrt.kernels import build_grid
+from wrt.kernels import traverse_grid as kernels
+from wrt.kernels.ray_aabb import PAD_EXTENT
+
+MAX_CELLS = 1 << 25
+MAX_REFERENCES = 1 << 27
+MAX_AXIS = 2048
+PRIMITIVES_PER_LAUNCH = 16384
+
+
+class Grid(Accelerator):
+    """Options: density (cells for each primitive, on average over the grid's box; 1e-3 to 1e3), mailbox (whether a primitive that
+    spans several cells is tested once where it can be).
+
+    At most MAX_CELLS cells and, as estimated from the boxes, MAX_REFERENCES references: beyond, the cells are larger, and a
+    RuntimeWarning says so. Spheres are listed wherever their box is. The `box` test is not used.
+    """
+
+    name = "grid"
+    kernels = kernels
+
+    def _build(self, density: float = 2.0, mailbox: bool = True) -> Built:
+        if not 1e-3 <= density <= 1e3:
+            raise InputError(f"density must be 1e-3 to 1e3 cells a primitive, got {density}")
+        lo, hi = self.geometry.bounds()
+        layout = resolution(lo, hi, density)
+        cells, references = list_references(self.geometry, (lo, hi), layout, self.threads)
+        pad, extent = triangle_reach(self.geometry, lo, hi)
+        return Built({"lo": np.array(layout.lo), "hi": np.array(layout.hi), "size": np.array(layout.size),
+                      "n": np.array(layout.n), "pad": pad, "extent": extent, "mailbox": np.array(mailbox, np.int32),
+                      "cells": cells, "references": references},
+                     np.arange(len(lo), dtype=np.int32), len(cells), int((cells["count"] > 0).sum()), 1,
+                     sah_cost(layout, len(cells) + len(references)))
+
+    def _check(self, built: Built) -> None:
+        arrays = one_row(self, built)
+        check_numbers(arrays)
+        check_layout(*(arrays[name] for name in ("lo", "hi", "size", "n")))
+        if arrays["mailbox"] not in (0, 1):
+            raise InputError("is damaged: its numbers are out of range")
+        if len(arrays["cells"]) != np.prod(arrays["n"].astype(np.int64)):
+            raise InputError("is damaged: its cells are not those of its layout")
+        check_references(arrays["cells"], arrays["references"], len(built.order))
+
+
+def check_layout(lo: np.ndarray, hi: np.ndarray, size: np.ndarray, n: np.ndarray) -> None:
+    """Raise InputError unless the planes of a layout from a file are in ascending order."""
+    last = lo + (n - 1).astype(np.float32) * size
+    empty = (lo == np.inf).all() and (hi == -np.inf).all()
+    if not ((n >= 1) & (n <= MAX_AXIS) & (size >= 0.0) & ((last <= hi) | empty)).all():
+        raise InputError("is damaged: its planes are not in order")
+
+
+def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> Any:
+    """The layout: nearly cubic cells, about `density` of them a primitive (Cleary and Wyvill 1988: the cube root)."""
+    layout = kernels.GridLayout()
+    low, high = lo.min(axis=0, initial=np.inf), hi.max(axis=0, initial=-np.inf)
+    extent = high.astype(np.float64) - low.astype(np.float64)
+    wanted = density * len(lo)
+    n = np.ones(3, np.int64)
+    if len(lo) and np.isfinite(extent).all():
+        # A cell is not so small that the rounding of its planes matters.
+        finest = np.maximum(np.abs(low), np.abs(high)).astype(np.float64) * PAD_EXTENT
+        with np.errstate(divide="ignore", invalid="ignore"):
+            most = np.clip(np.where(extent > 0.0, extent / finest, 1.0), 1, MAX_AXIS)
+        n = cells_along(extent, most, min(wanted, MAX_CELLS))
+        fits = n
+        while fits.max() > 1 and references_bound(lo, hi, extent / fits) > MAX_REFERENCES:
+            fits = np.maximum(fits * 3 // 4, 1)
+        if wanted > MAX_CELLS or not np.array_equal(n, fits):
+            warnings.warn(f"grid: {' x '.join(map(str, fits))} cells, not about {wanted:.3g}: at most {MAX_CELLS} cells and an "
+                          f"estimated {MAX_REFERENCES} references fit", RuntimeWarning, stacklevel=2)
+        n = fits
+    layout.lo, layout.hi, layout.n = wp.vec3(*low), wp.vec3(*high), wp.vec3i(*n.tolist())
+    size = np.zeros(3, np.float32)
+    size[n > 1] = (extent[n > 1] / n[n > 1]).astype(np.float32)
+    layout.size = wp.vec3(*size)
+    return layout
+
+
+def cells_along(extent: np.ndarray, most: np.ndarray, wanted: float) -> np.ndarray:
+    """(3,) numbers of cells: each 1 to `most`, in proportion to the extent between, and their product near `wanted`."""
+    def along(log_scale: float) -> np.ndarray:
+        return np.clip(extent * 2.0**log_scale, 1.0, most)
+
+    low, high = -1000.0, 1000.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if along(middle).prod() < wanted:
+            low = middle
+        else:
+            high = middle
+    n = np.floor(along(low) + 1e-9).astype(np.int64)
+    return np.maximum(n, 1)
+
+
+def references_bound(lo: np.ndarray, hi: np.ndarray, size: np.ndarray) -> float:
+    """About as many references as there may be: a triangle that spans a x b x c cells meets up to ab + bc + ca of them."""
+    a, b, c = (((hi.astype(np.float64) - lo) / np.maximum(size, 1e-300)) + 1.0).T
+    return float((a * b + b * c + c * a).sum()) / 3.0
+
+
+def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: Any,
+                    threads: int) -> tuple[np.ndarray, np.ndarray]:
+    """Cell records, and the primitives of all cells one after another (R,) int32."""
+    cpu = start("cpu")
+    source = cell_source(geometry, bounds)
+    n = len(geometry)
+    count = wp.zeros(n, dtype=wp.int32, device=cpu)
+    for kernel in (build_grid.list_cells, build_grid.sort_by_cell):
+        load_kernel(kernel, cpu)
+
+    def launch(begin: Any, cells: Any, first: int) -> None:
+        wp.launch(build_grid.list_cells, dim=min(PRIMITIVES_PER_LAUNCH, n - first), device=cpu,
+                  inputs=[source, layout, first, begin, count, cells])
+
+    def run(begin: Any, cells: Any) -> None:
+        run_all([partial(launch, begin, cells, first) for first in range(0, n, PRIMITIVES_PER_LAUNCH)], threads)
+
+    run(wp.zeros(0, dtype=wp.int64, device=cpu), wp.zeros(0, dtype=wp.int32, device=cpu))
+    begin = np.zeros(n + 1, np.int64)
+    np.cumsum(count.numpy(), out=begin[1:])
+    total = int(begin[-1])
+    if total >= 1 << 31:
+        raise InputError(f"grid: {total} references to primitives are too many; choose a lower density")
+    device_begin = upload(begin, wp.int64, cpu)
+    cell_of = wp.zeros(total, dtype=wp.int32, device=cpu)
+    if total:
+        run(device_begin, cell_of)
+    cells = upload(records(kernels.GridCell, int(np.prod(layout.n))), kernels.GridCell, cpu)
+    references = wp.zeros(total, dtype=wp.int32, device=cpu)
+    wp.launch(build_grid.sort_by_cell, dim=1, inputs=[device_begin, cell_of, cells, references], device=cpu)
+    return cells.numpy(), references.numpy()
+
+
+def sah_cost(layout: Any, visits: int) -> float:
+    """Expected cells and primitives of a random line through the grid's box: `visits` cells and references, all of one size."""
+    extent = np.clip(np.array(layout.hi, np.float64) - np.array(layout.lo, np.float64), 0.0, 1e39)
+    def area(e: np.ndarray) -> float:
+        return float(e[0] * e[1] + e[1] * e[2] + e[2] * e[0])
+
+    whole = area(extent)
+    return visits * area(extent / np.array(layout.n, np.float64)) / whole if whole > 0.0 else float(visits)
