@@ -17,6 +17,7 @@ from wrt.errors import InputError
 from wrt.kernels.build_bvh2 import levels
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse_bvh2 import STACK_SIZE
+from wrt.mesh import Mesh
 from wrt.shapes import icosphere, torus
 
 
@@ -202,6 +203,32 @@ def test_quality_and_statistics(mesh):
     # A random line through a closed convex surface of n triangles must meet two of them and some log2(n) nodes.
     assert 2.0 < stats.sah_cost < 4.0 * np.log2(len(mesh.faces))
     assert build(mesh, "bvh2", max_leaf=64, cost_traversal=1e9).stats.sah_cost > stats.sah_cost
+
+
+def test_builders_rank_as_the_literature_says():
+    # Two shells through each other, triangles of very different sizes and a long sliver: splits matter.
+    ball, ring = icosphere(3), torus()
+    slivers = np.random.default_rng(6).uniform(-2.0, 2.0, (300, 3, 3)) * [1.0, 1.0, 0.02]
+    vertices = np.concatenate([ball.vertices, 1.5 * ring.vertices, slivers.reshape(-1, 3)])
+    offset = len(ball.vertices) + len(ring.vertices)
+    faces = np.concatenate([ball.faces, ring.faces + len(ball.vertices), offset + np.arange(900).reshape(-1, 3)])
+    geometry = Geometry.of(Mesh(vertices, faces))
+    cost = {name: build(geometry, "bvh2", builder=name).stats.sah_cost for name in BVH_BUILDERS}
+    assert cost["reinsertion"] < 0.98 * cost["binned"] and cost["sbvh"] < 0.9 * cost["sweep"]
+    assert 0.9 * cost["binned"] < cost["sweep"] < 1.01 * cost["binned"]
+    assert max(cost["binned"], cost["sweep"]) < min(cost["lbvh"], cost["median"])
+
+
+def test_spatial_splits_stay_within_their_budget():
+    rng = np.random.default_rng(7)
+    ends = rng.uniform(-1.0, 1.0, (400, 2, 3))  # needles: their boxes are nearly empty
+    corners = np.concatenate([ends, ends[:, :1] + 0.01 * rng.normal(size=(400, 1, 3))], axis=1)
+    geometry = Geometry.of(Mesh(corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3)))
+    references = [build(geometry, "bvh2", builder="sbvh", split_budget=b).stats.references for b in (0.0, 0.3, 2.0)]
+    assert references[0] == 400 < references[1] <= 520 and references[1] < references[2] <= 1200
+    assert build(geometry, "bvh2", builder="sbvh", split_alpha=1.0).stats.references == 400  # no overlap is as large
+    with pytest.raises(InputError, match="split_budget must be at most 8"):
+        build(geometry, "bvh2", builder="sbvh", split_budget=9.0)
 
 
 def test_sah_cost_by_hand():

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from wrt.accel.base import Geometry
 from wrt.accel.bvh_ranges import build_binned, build_lbvh, build_median, build_sweep
+from wrt.accel.bvh_reinsertion import build_reinsertion
 from wrt.accel.bvh_spatial import build_sbvh
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions, sah_cost
 from wrt.errors import InputError
@@ -16,6 +17,7 @@ BVH_BUILDERS: dict[str, Callable[[Geometry, BvhOptions, int], BinaryTree]] = {
     "binned": build_binned,
     "sweep": build_sweep,
     "sbvh": build_sbvh,
+    "reinsertion": build_reinsertion,
     "median": build_median,
     "lbvh": build_lbvh,
 }

@@ -1,0 +1,265 @@
+"""The inner loops of the optimiser by reinsertion, on the CPU backend.
+
+Meister and Bittner 2018, "Parallel Reinsertion for Bounding Volume Hierarchy Optimization": a subtree is taken out together
+with its parent, and put back where that makes the sum of all boxes' areas the smallest. The searches of many subtrees read the
+same tree, on all cores; then the moves are made one after the other, the best first, unless an earlier one stands in the way.
+"""
+
+import warp as wp
+
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse_bvh2 import Bvh2Node
+
+QUEUE = 96
+QUEUE_SIZE = wp.constant(QUEUE)
+
+
+@wp.struct
+class Link:
+    """A node of the tree while it is optimised: children (-1: a leaf), parent (-1: the root), box."""
+
+    left: int
+    right: int
+    parent: int
+    lo: wp.vec3
+    hi: wp.vec3
+
+
+@wp.struct
+class Move:
+    """What becomes of subtree `node` if it goes beside `target`: the areas shrink by `gain` together (0: it stays)."""
+
+    node: int
+    target: int
+    gain: float
+
+
+@wp.func
+def area_of(lo: wp.vec3, hi: wp.vec3, scale: float) -> float:
+    e = (0.5 * hi - 0.5 * lo) * scale
+    return e[0] * e[1] + e[1] * e[2] + e[2] * e[0]
+
+
+@wp.func
+def joined_area(a: Link, b: Link, scale: float) -> float:
+    return area_of(wp.min(a.lo, b.lo), wp.max(a.hi, b.hi), scale)
+
+
+@kernel
+def find_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), first: int, scale: float):
+    """The best place of each node of `moves`: branch and bound over the rest of the tree (section 3.1).
+
+    From the node upwards: the subtree beside each ancestor is searched. `saved` is what the boxes on the way shrink by
+    when the node leaves them; a place costs the area of the new parent's box, and what the boxes above it grow by.
+    """
+    i = first + wp.tid()
+    move = moves[i]
+    node = links[move.node]
+    best = float(0.0)
+    target = int(-1)
+    parent = links[node.parent]
+    own_area = area_of(node.lo, node.hi, scale)
+    saved = area_of(parent.lo, parent.hi, scale)  # the parent itself goes
+    pivot = int(node.parent)
+    child = int(move.node)
+    # The box of the pivot without the node, empty at first.
+    lo = wp.vec3(wp.inf, wp.inf, wp.inf)
+    hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    stack = wp.zeros(shape=wp.static(QUEUE), dtype=wp.int32)
+    bound = wp.zeros(shape=wp.static(QUEUE), dtype=wp.float32)
+    while True:
+        sibling = wp.where(links[pivot].left == child, links[pivot].right, links[pivot].left)
+        stack[0] = sibling
+        bound[0] = saved
+        size = int(1)
+        while size > 0:
+            size = size - 1
+            left = bound[size]
+            if left - own_area <= best:
+                continue
+            at = stack[size]
+            place = links[at]
+            joined = joined_area(place, node, scale)
+            gain = left - joined
+            # Back beside its old sibling nothing changes.
+            if gain > best and not (pivot == node.parent and at == sibling):
+                best = gain
+                target = at
+            if place.left >= 0 and size + 2 <= QUEUE_SIZE:
+                below = gain + area_of(place.lo, place.hi, scale)
+                if below - own_area > best:
+                    stack[size] = place.left
+                    bound[size] = below
+                    stack[size + 1] = place.right
+                    bound[size + 1] = below
+                    size = size + 2
+        lo = wp.min(lo, links[sibling].lo)
+        hi = wp.max(hi, links[sibling].hi)
+        child = pivot
+        pivot = links[pivot].parent
+        if pivot < 0:
+            break
+        if links[child].parent >= 0 and child != node.parent:
+            # The box of `child` shrinks to that of what remains in it.
+            saved = saved + area_of(links[child].lo, links[child].hi, scale) - area_of(lo, hi, scale)
+    move.target = target
+    move.gain = wp.where(target >= 0, best, 0.0)
+    moves[i] = move
+
+
+@wp.func
+def replace_child(links: wp.array(dtype=Link), parent: int, old: int, new: int):
+    if links[parent].left == old:
+        links[parent].left = new
+    else:
+        links[parent].right = new
+    links[new].parent = parent
+
+
+@wp.func
+def refit_up(links: wp.array(dtype=Link), start: int):
+    """Boxes from a node up to the root, as long as they change."""
+    i = int(start)
+    while i >= 0:
+        link = links[i]
+        left = links[link.left]
+        right = links[link.right]
+        lo = wp.min(left.lo, right.lo)
+        hi = wp.max(left.hi, right.hi)
+        if lo == link.lo and hi == link.hi:
+            break
+        links[i].lo = lo
+        links[i].hi = hi
+        i = link.parent
+
+
+@kernel
+def make_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), touched: wp.array(dtype=wp.uint8)):
+    """Make the moves in their order; one that touches a node that an earlier one changed is left for another round."""
+    for m in range(moves.shape[0]):
+        move = moves[m]
+        if move.gain > 0.0:
+            parent = links[move.node].parent
+            sibling = wp.where(links[parent].left == move.node, links[parent].right, links[parent].left)
+            grandparent = links[parent].parent
+            above = links[move.target].parent
+            taken = int(touched[move.node]) + int(touched[parent]) + int(touched[sibling]) + int(touched[move.target])
+            taken = taken + int(touched[grandparent]) + int(touched[above])
+            # Earlier moves may have brought the target below the node.
+            i = int(move.target)
+            while i >= 0 and i != move.node:
+                i = links[i].parent
+            if taken == 0 and i < 0 and move.target != parent and move.target != sibling:
+                touched[move.node] = wp.uint8(1)
+                touched[parent] = wp.uint8(1)
+                touched[sibling] = wp.uint8(1)
+                touched[move.target] = wp.uint8(1)
+                touched[grandparent] = wp.uint8(1)
+                touched[above] = wp.uint8(1)
+                replace_child(links, grandparent, parent, sibling)
+                refit_up(links, grandparent)
+                above = links[move.target].parent
+                replace_child(links, above, move.target, parent)
+                links[parent].left = move.node
+                links[parent].right = move.target
+                links[move.node].parent = parent
+                links[move.target].parent = parent
+                links[parent].lo = wp.min(links[move.node].lo, links[move.target].lo)
+                links[parent].hi = wp.max(links[move.node].hi, links[move.target].hi)
+                refit_up(links, above)
+
+
+@wp.struct
+class Walk:
+    """Room for walks over the tree: order: the nodes, parents first; level: of each node, from 1; count: its records;
+    cost: of its subtree, by the surface area heuristic; index: where it is written."""
+
+    order: wp.array(dtype=wp.int32)
+    level: wp.array(dtype=wp.int32)
+    index: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    cost: wp.array(dtype=wp.float32)
+    depth: wp.array(dtype=wp.int32)
+
+
+@kernel
+def walk_down(links: wp.array(dtype=Link), walk: Walk):
+    """The order of the nodes, left before right, and the depth of the tree: inner nodes on the longest way."""
+    stack = int(walk.order.shape[0])  # the end of the order is the stack: both together are never longer
+    stack = stack - 1
+    walk.order[stack] = 0
+    walk.level[0] = 1
+    done = int(0)
+    while stack < walk.order.shape[0]:
+        i = walk.order[stack]
+        stack = stack + 1
+        walk.order[done] = i
+        done = done + 1
+        link = links[i]
+        if link.left >= 0:
+            walk.depth[0] = wp.max(walk.depth[0], walk.level[i])
+            walk.level[link.left] = walk.level[i] + 1
+            walk.level[link.right] = walk.level[i] + 1
+            stack = stack - 2
+            walk.order[stack + 1] = link.right
+            walk.order[stack] = link.left
+
+
+@kernel
+def weigh(links: wp.array(dtype=Link), walk: Walk, max_leaf: int, cost_traversal: float, cost_intersection: float, scale: float):
+    """Leaves where they cost no more than the best that can be made of the subtree, from the bottom up: their left gets < -1."""
+    n = walk.order.shape[0]
+    for k in range(n):
+        i = walk.order[n - 1 - k]
+        link = links[i]
+        area = area_of(link.lo, link.hi, scale)
+        if link.left < 0:
+            walk.count[i] = 1
+            walk.cost[i] = cost_intersection * area
+        else:
+            walk.count[i] = walk.count[link.left] + walk.count[link.right]
+            cost = cost_traversal * area + walk.cost[link.left] + walk.cost[link.right]
+            whole = cost_intersection * float(walk.count[i]) * area
+            walk.cost[i] = cost
+            if walk.count[i] <= max_leaf and not cost < whole and i > 0:
+                walk.cost[i] = whole
+                links[i].left = -2 - link.left
+
+
+@kernel
+def write_nodes(links: wp.array(dtype=Link), walk: Walk, n_inner: int, leaf_of: wp.array(dtype=wp.int32),
+                order: wp.array(dtype=wp.int32), nodes: wp.array(dtype=Bvh2Node), n_nodes: wp.array(dtype=wp.int32)):
+    """The tree as nodes in the order of `walk`, and the records (leaf_of: of the links from n_inner on) in that of the leaves."""
+    inner = int(0)
+    first = int(0)
+    inside = int(0)  # so many more links belong to the leaf that began last
+    for k in range(walk.order.shape[0]):
+        i = walk.order[k]
+        if inside > 0:
+            inside = inside - 1
+            walk.index[i] = -1
+        elif links[i].left >= 0:
+            walk.index[i] = inner
+            inner = inner + 1
+        else:
+            walk.index[i] = first
+            inside = 2 * walk.count[i] - 2
+        if i >= n_inner:
+            order[first] = leaf_of[i - n_inner]
+            first = first + 1
+    n_nodes[0] = inner
+    for i in range(n_inner):
+        link = links[i]
+        if link.left >= 0 and walk.index[i] >= 0:
+            left = links[link.left]
+            right = links[link.right]
+            node = Bvh2Node()
+            node.lo_0 = left.lo
+            node.hi_0 = left.hi
+            node.lo_1 = right.lo
+            node.hi_1 = right.hi
+            node.first_0 = walk.index[link.left]
+            node.first_1 = walk.index[link.right]
+            node.count_0 = wp.where(left.left >= 0, 0, walk.count[link.left])
+            node.count_1 = wp.where(right.left >= 0, 0, walk.count[link.right])
+            nodes[walk.index[i]] = node
