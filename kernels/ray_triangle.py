@@ -135,7 +135,7 @@ def ray_triangle(box: BoxRay, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: 
     hit = watertight(box.origin, shear, v0, v1, v2)
     if hit.prim_id != NO_HIT:
         hit.t = within_bounds(box, hit.t, wp.min(wp.min(v0, v1), v2), wp.max(wp.max(v0, v1), v2))
-        if not wp.isfinite(hit.t):
+        if not wp.abs(hit.t) < wp.inf:
             hit.prim_id = NO_HIT
     return hit
 

@@ -45,7 +45,7 @@ def no_hit(ray: Ray) -> Hit:
     best = Hit()
     zero = 0.0 * ray.origin + 0.0 * ray.direction  # 0, or NaN; a sum of the components could overflow
     s = zero[0] + zero[1] + zero[2]
-    best.t = wp.where(wp.isfinite(s), ray.t_max, float(-wp.inf))
+    best.t = wp.where(s == 0.0, ray.t_max, float(-wp.inf))  # wp.isfinite would be a call
     best.prim_id = NO_HIT
     return best
 

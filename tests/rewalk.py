@@ -66,7 +66,7 @@ class WalkRay:
         """Record `index` of the primitives is tested."""
         walk.primitives += 1
         walk.trace.append((PRIMITIVES + index * PRIMITIVE_BYTES, PRIMITIVE_BYTES))
-        prim_id = int(accel.data.primitives.numpy()["prim_id"][index])
+        prim_id = int(prim_ids(accel)[index])
         if prim_id in self.hits:
             self.best = min(self.best, (self.hits[prim_id], prim_id))
 
@@ -79,6 +79,14 @@ class WalkRay:
         enter = np.fmax.reduce(near, initial=self.t_min)
         leave = np.minimum(np.float32(np.fmin.reduce(far, initial=INF) * np.float32(FAR_PAD)), self.best[0])
         return enter if enter <= leave else INF
+
+
+def prim_ids(accel) -> np.ndarray:
+    """The prim_id of every record; a wide structure keeps one number of so many records as a row."""
+    primitives = accel.data.primitives.numpy()
+    if primitives.dtype.names:
+        return primitives["prim_id"]
+    return primitives.reshape(-1, PRIMITIVE_BYTES // 4, accel.width)[:, -1].copy().view(np.int32).reshape(-1)
 
 
 def rays(geometry, origins, directions, t_min=0.0, t_max=np.inf, capacity=256) -> list[WalkRay]:
@@ -252,9 +260,55 @@ def cell_slack(accel, ray: WalkRay) -> np.float32:
     return min(two * pad * inverse[inverse < INF].max(), two * extent * inverse.min())
 
 
+def wide(accel, ray: WalkRay) -> Walk:
+    """A child's reference is 0 for none, an inner node, or ~(64 * (first row) + primitives - 1)."""
+    walk, stack, width = Walk(), [], accel.width
+    nodes = accel.data.nodes.numpy().reshape(-1, 8, width)
+    references = nodes[:, 6].copy().view(np.int32)
+    current: int | None = 0
+    while current is not None:
+        if current < 0:
+            walk.leaves += 1
+            first, count = -1 - current >> 6, (-1 - current & 63) + 1
+            for i in range(first * width, first * width + count):
+                ray.test(walk, accel, i)
+        else:
+            walk.node(current, nodes[0].nbytes, int((references[current] != 0).sum()))
+            boxes = nodes[current, :6].T
+            entered = [(t, int(references[current, k])) for k in range(width)
+                       if (t := ray.enter(boxes[k, 0::2], boxes[k, 1::2])) < INF]
+            if entered:
+                current = visit_order(walk, stack, entered)
+                continue
+        current = None
+        while stack and current is None:
+            t, reference = stack.pop()
+            walk.pops += 1
+            if t <= ray.best[0]:
+                current = reference
+    return walk
+
+
+def visit_order(walk: Walk, stack: list[tuple[np.float32, int]], entered: list[tuple[np.float32, int]]) -> int:
+    """Push all but the nearest, never one above a farther one that is above the rest; at equal t by the reference, unsigned."""
+    def key(entry: tuple[np.float32, int]) -> tuple[np.float32, int]:
+        return entry[0], entry[1] % (1 << 32)
+
+    nearest, begin = entered[0], len(stack)
+    for entry in entered[1:]:
+        nearest, far = sorted((nearest, entry), key=key)
+        stack.append(far)
+        if len(stack) > begin + 1:
+            stack[-2:] = sorted(stack[-2:], key=key, reverse=True)
+        walk.push(len(stack))
+    return nearest[1]
+
+
 REWALK: dict[str, Callable[..., Walk]] = {
     "brute_force": brute_force,
     "bvh2": bvh2,
+    "bvh4": wide,
+    "bvh8": wide,
     "kdtree": kdtree,
     "grid": grid,
 }

@@ -51,7 +51,7 @@ def test_nothing_imports_the_command_line(path: Path) -> None:
 
 
 def test_units_come_before_traversals_before_the_integrator() -> None:
-    layers = [("structs",), ("ray_", "sampling", "camera"), ("counters", "triangle_cell", "cell_ray"),
+    layers = [("structs",), ("ray_", "sampling", "camera"), ("counters", "lanes", "triangle_cell", "cell_ray"),
               ("textures", "surface", "materials", "traverse", "lights"),
               ("shadows", "whitted", "query", "build_", "refit_", "peers"), ("render", "rasterize", "primary_rays")]
 

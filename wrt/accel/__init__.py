@@ -7,6 +7,7 @@ from typing import Any
 from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
 from wrt.accel.brute_force import BruteForce
 from wrt.accel.bvh2 import Bvh2
+from wrt.accel.bvh_wide import Bvh4, Bvh8
 from wrt.accel.grid import Grid
 from wrt.accel.kdtree import KdTree
 from wrt.accel.store import build_cached, load_accel
@@ -19,6 +20,8 @@ __all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "Str
 ACCELERATORS: dict[str, type[Accelerator]] = {
     "bvh": Bvh2,  # the default: the best one there is
     "bvh2": Bvh2,
+    "bvh4": Bvh4,
+    "bvh8": Bvh8,
     "kdtree": KdTree,
     "brute_force": BruteForce,
     "grid": Grid,

@@ -26,7 +26,8 @@ from wrt.kernels.traverse import Units
 from wrt.mesh import Mesh
 
 RAYS_PER_LAUNCH = 16384
-OPTION_TYPES: dict[str, Any] = {"int": int, "float": int | float, "bool": bool, "str": str}  # by the annotations of _build
+# By the annotations of _build.
+OPTION_TYPES: dict[str, Any] = {"int": int, "int | None": int | None, "float": int | float, "bool": bool, "str": str}
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,15 +280,18 @@ class Accelerator(ABC):
         return Refit(self.stats.build_seconds, growth, rebuilt)
 
     def _upload(self, built: Built) -> Any:
-        units = self.structure.units
         data = self.structure.struct()
         types = {name: field.type for name, field in data._cls.vars.items()}
         for name, array in built.arrays.items():
             kind = types[name]
             is_array = isinstance(kind, wp.array)
             setattr(data, name, upload(array, kind.dtype, self.device) if is_array else kind(*np.ravel(array)))
-        data.primitives = upload(self.geometry.primitives(units, built.order), units.triangle_test.record, self.device)
+        data.primitives = upload(self._primitives(built), types["primitives"].dtype, self.device)
         return data
+
+    def _primitives(self, built: Built) -> np.ndarray:
+        """What the struct's `primitives` holds: the triangle test's records, in the order of the leaves."""
+        return self.geometry.primitives(self.structure.units, built.order)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the structure to a file (.accel) that wrt.load_accel reads. Raises InputError where the system refuses."""

@@ -1,0 +1,313 @@
+"""Collapsing a binary BVH into a wide one, at the least expected cost.
+
+Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", section 3.1: from
+the bottom up, what it costs at least to represent a subtree by at most k roots, for k up to the width; then from the top
+down, the nodes that this calls for. A leaf costs as much as the full rows of primitives that it takes to test it.
+"""
+
+import warp as wp
+
+from wrt.kernels.lanes import EMPTY
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.traverse_wide import LEAF_RANGE
+
+MAX_WIDTH = wp.constant(8)
+
+
+@wp.struct
+class CollapseOptions:
+    """width: children a node, and primitives a row; leaves hold at most max_leaf; costs of the surface area heuristic: of a
+    node, and of a row of primitives; stack: how many entries a traversal has room for."""
+
+    width: int
+    max_leaf: int
+    cost_traversal: float
+    cost_intersection: float
+    stack: int
+
+
+@wp.struct
+class Subtrees:
+    """Of each binary node: primitives and height below it; cost and choice, one for each number of roots 1 .. MAX_WIDTH.
+
+    choice of k roots: how many of them go to the left child (fewer roots are taken where they cost as much); of one root: 1 for
+    a leaf.
+    """
+
+    size: wp.array(dtype=wp.int32)
+    height: wp.array(dtype=wp.int32)
+    cost: wp.array(dtype=wp.float32)
+    choice: wp.array(dtype=wp.uint8)
+
+
+@wp.struct
+class WideTree:
+    """What comes out. children: `width` a node, references as in kernels.traverse_wide; boxes: whose box a child has, as
+    2 * (binary node) + side, or -1; order: the prim_id of each lane, rows filled up with -1; count: nodes, rows, leaves, depth,
+    and the most entries on a traversal's stack."""
+
+    children: wp.array(dtype=wp.int32)
+    boxes: wp.array(dtype=wp.int32)
+    order: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class WideTask:
+    """Binary node `node` becomes the wide node `slot`; room: entries of the stack that are left to it; depth: 1 at the root."""
+
+    node: int
+    slot: int
+    room: int
+    depth: int
+
+
+@wp.func
+def half_area(node: Bvh2Node, side: int) -> float:
+    """Half the surface of a child's box, scaled so that only boxes near the end of float32 have one that overflows."""
+    lo = wp.where(side == 0, node.lo_0, node.lo_1)
+    hi = wp.where(side == 0, node.hi_0, node.hi_1)
+    e = wp.max(hi - lo, wp.vec3(0.0, 0.0, 0.0))
+    return wp.min(e[0] * e[1] + e[1] * e[2] + e[2] * e[0], 1.0e30)
+
+
+@wp.func
+def first_of(node: Bvh2Node, side: int) -> int:
+    return wp.where(side == 0, node.first_0, node.first_1)
+
+
+@wp.func
+def count_of(node: Bvh2Node, side: int) -> int:
+    return wp.where(side == 0, node.count_0, node.count_1)
+
+
+@wp.func
+def child_size(trees: Subtrees, node: Bvh2Node, side: int) -> int:
+    """Primitives of a child."""
+    n = count_of(node, side)
+    if n == 0:
+        n = trees.size[first_of(node, side)]
+    return n
+
+
+@wp.func
+def leaf_cost(options: CollapseOptions, area: float, count: int) -> float:
+    return options.cost_intersection * area * float((count + options.width - 1) / options.width)
+
+
+@wp.func
+def child_cost(trees: Subtrees, options: CollapseOptions, node: Bvh2Node, side: int, k: int) -> float:
+    """The least cost of a child as at most k roots."""
+    n = count_of(node, side)
+    if n > 0:
+        return leaf_cost(options, half_area(node, side), n)
+    return trees.cost[first_of(node, side) * MAX_WIDTH + k - 1]
+
+
+@kernel
+def subtree_costs(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees: Subtrees):
+    """From the last node to the first: a parent stands before its children. One thread.
+
+    The cost of one root includes its own box's area, which the parent knows: it is added when the parent looks at it.
+    """
+    n_nodes = nodes.shape[0]
+    for j in range(n_nodes):
+        i = n_nodes - 1 - j
+        node = nodes[i]
+        height = int(0)
+        # The costs of a child as one root could not be told before its box was known.
+        for side in range(2):
+            if count_of(node, side) == 0:
+                c = first_of(node, side)
+                area = half_area(node, side)
+                height = wp.max(height, trees.height[c])
+                inner = options.cost_traversal * area + trees.cost[c * MAX_WIDTH + options.width - 1]
+                whole = leaf_cost(options, area, trees.size[c])
+                leaf = trees.size[c] <= options.max_leaf and whole <= inner
+                trees.choice[c * MAX_WIDTH] = wp.where(leaf, wp.uint8(1), wp.uint8(0))
+                trees.cost[c * MAX_WIDTH] = wp.where(leaf, whole, inner)
+                for k in range(2, options.width + 1):
+                    if trees.cost[c * MAX_WIDTH + k - 2] <= trees.cost[c * MAX_WIDTH + k - 1]:
+                        trees.cost[c * MAX_WIDTH + k - 1] = trees.cost[c * MAX_WIDTH + k - 2]
+        trees.height[i] = height + 1
+        trees.size[i] = child_size(trees, node, 0) + child_size(trees, node, 1)
+        for k in range(2, options.width + 1):
+            best = float(wp.inf)
+            left = int(1)
+            for a in range(1, k):
+                cost = child_cost(trees, options, node, 0, a) + child_cost(trees, options, node, 1, k - a)
+                if cost < best:
+                    best = cost
+                    left = a
+            trees.cost[i * MAX_WIDTH + k - 1] = best
+            trees.choice[i * MAX_WIDTH + k - 1] = wp.uint8(left)
+
+
+@wp.func
+def roots_of(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, out: WideTree, slot: int) -> int:
+    """Write the at most k roots that stand for the children of binary node i to boxes[slot ..]; how many they are.
+
+    Node i itself is opened, so that there are at least two.
+    """
+    node_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
+    side_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
+    k_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
+    while k > 2 and trees.cost[i * MAX_WIDTH + k - 2] <= trees.cost[i * MAX_WIDTH + k - 1]:
+        k = k - 1
+    left = int(trees.choice[i * MAX_WIDTH + k - 1])
+    node_of[0] = i
+    side_of[0] = 1
+    k_of[0] = k - left
+    node_of[1] = i
+    side_of[1] = 0
+    k_of[1] = left
+    size = int(2)
+    n = int(0)
+    while size > 0:
+        size = size - 1
+        parent = node_of[size]
+        side = side_of[size]
+        roots = k_of[size]
+        c = first_of(nodes[parent], side)
+        if count_of(nodes[parent], side) > 0:
+            roots = int(1)
+        while roots > 1 and trees.cost[c * MAX_WIDTH + roots - 2] <= trees.cost[c * MAX_WIDTH + roots - 1]:
+            roots = roots - 1
+        if roots == 1:
+            out.boxes[slot + n] = 2 * parent + side
+            n = n + 1
+            continue
+        left = int(trees.choice[c * MAX_WIDTH + roots - 1])
+        node_of[size] = c
+        side_of[size] = 1
+        k_of[size] = roots - left
+        node_of[size + 1] = c
+        side_of[size + 1] = 0
+        k_of[size + 1] = left
+        size = size + 2
+    return n
+
+
+@wp.func
+def gather(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), parent: int, side: int, out: WideTree, slot: int):
+    """Write the primitives of a child, of its whole subtree, to order[slot ..]."""
+    stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=wp.int32)
+    stack[0] = 2 * parent + side
+    size = int(1)
+    n = int(0)
+    while size > 0:
+        size = size - 1
+        node = nodes[stack[size] / 2]
+        s = stack[size] % 2
+        first = first_of(node, s)
+        count = count_of(node, s)
+        for j in range(count):
+            out.order[slot + n] = order[first + j]
+            n = n + 1
+        if count == 0:
+            stack[size] = 2 * first + 1
+            stack[size + 1] = 2 * first
+            size = size + 2
+
+
+@kernel
+def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), options: CollapseOptions, trees: Subtrees,
+             out: WideTree):
+    """Write the wide tree, depth first. One thread.
+
+    A node of k children leaves k - 1 on the stack while the last is walked. Where its plan would leave too little room for the
+    binary tree below, which needs one entry a level, it takes fewer children.
+    """
+    stack = wp.zeros(shape=wp.static(8 * STACK_SIZE), dtype=WideTask)
+    root = WideTask()
+    root.room = options.stack
+    root.depth = 1
+    stack[0] = root
+    size = int(1)
+    n_nodes = int(1)
+    n_rows = int(0)
+    n_leaves = int(0)
+    depth = int(0)
+    least_room = int(options.stack)
+    while size > 0:
+        size = size - 1
+        task = stack[size]
+        depth = wp.max(depth, task.depth)
+        base = task.slot * options.width
+        k = int(options.width)
+        n = int(0)
+        room = int(0)
+        while True:
+            n = roots_of(nodes, trees, task.node, k, out, base)
+            room = task.room - (n - 1)
+            tallest = int(0)
+            for j in range(n):
+                code = out.boxes[base + j]
+                if count_of(nodes[code / 2], code % 2) == 0:
+                    tallest = wp.max(tallest, trees.height[first_of(nodes[code / 2], code % 2)])
+            if k == 2 or room >= tallest:
+                break
+            k = k - 1
+        least_room = wp.min(least_room, room)
+        for j in range(n, options.width):
+            out.boxes[base + j] = -1
+            out.children[base + j] = EMPTY
+        for j in range(n):
+            # The last child is taken from the stack first: it gets the next slots.
+            code = out.boxes[base + j]
+            node = nodes[code / 2]
+            side = code % 2
+            c = first_of(node, side)
+            count = child_size(trees, node, side)
+            if count_of(node, side) > 0 or trees.choice[c * MAX_WIDTH] == wp.uint8(1):
+                rows = (count + options.width - 1) / options.width
+                gather(nodes, order, code / 2, side, out, n_rows * options.width)
+                for i in range(count, rows * options.width):
+                    out.order[n_rows * options.width + i] = -1
+                out.children[base + j] = -1 - (n_rows * LEAF_RANGE + count - 1)
+                n_rows = n_rows + rows
+                n_leaves = n_leaves + 1
+            else:
+                child = WideTask()
+                child.node = c
+                child.slot = n_nodes
+                child.room = room
+                child.depth = task.depth + 1
+                out.children[base + j] = n_nodes
+                stack[size] = child
+                size = size + 1
+                n_nodes = n_nodes + 1
+    out.count[0] = n_nodes
+    out.count[1] = n_rows
+    out.count[2] = n_leaves
+    out.count[3] = depth
+    out.count[4] = options.stack - least_room
+
+
+@kernel
+def refit(children: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32), width: int, low: wp.array(dtype=wp.vec3),
+          high: wp.array(dtype=wp.vec3), lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3)):
+    """The boxes of all children around primitives that have moved, from the last node to the first. One thread.
+
+    low, high: a box for each prim_id, and one more, empty, for lanes without (order -1).
+    """
+    n = children.shape[0]
+    none = low.shape[0] - 1
+    for k in range(n):
+        i = n - 1 - k
+        reference = children[i]
+        a = wp.vec3(wp.inf, wp.inf, wp.inf)
+        b = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+        if reference < 0:
+            first = (-1 - reference) / LEAF_RANGE * width
+            for j in range(first, first + (-1 - reference) % LEAF_RANGE + 1):
+                prim_id = wp.where(order[j] < 0, none, order[j])
+                a = wp.min(a, low[prim_id])
+                b = wp.max(b, high[prim_id])
+        elif reference != EMPTY:
+            for j in range(reference * width, reference * width + width):
+                a = wp.min(a, lo[j])
+                b = wp.max(b, hi[j])
+        lo[i] = a
+        hi[i] = b

@@ -1,0 +1,255 @@
+"""The traversal unit of the wide BVHs: nodes of 4 or 8 children, whose boxes are tested as one row, like the triangles of a leaf.
+
+Wald, Benthin and Boulos 2008, "Getting Rid of Packets"; Afra and Ernst 2008 and 2010 for one ray at a time. A row of triangles
+is only sifted: those that the watertight unit would refuse in float32 are left out, and the unit itself decides on the others,
+so that the answers are its own to the last bit. Children are visited from the near to the far: the nearest at once, the others
+by way of the stack, the farthest deepest; what was popped and begins beyond the closest hit is dropped. Any hit asks for no
+order: there the last child comes first, and the builder puts leaves and large boxes last.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from wrt.kernels.counters import Counts, Recorder, make_counters
+from wrt.kernels.lanes import EMPTY, LaneRay, make_lanes, make_twins
+from wrt.kernels.ray_aabb import FAR_PAD
+from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray, Surfaces
+from wrt.kernels.traverse import Probe, Units, make_intersect, make_probe, no_hit
+
+# The builder lets no walk have more entries than this (kernels.build_wide.collapse).
+STACK_SIZE = 64
+# A node of width w is NODE_ROWS rows of w float32: lo_x, hi_x, lo_y, hi_y, lo_z, hi_z, the references of its children (int32),
+# and one that is not used, so that nodes begin where cache lines do.
+NODE_ROWS = 8
+# A reference is EMPTY, an inner node's index, or ~(LEAF_RANGE * (first row of primitives) + number of primitives - 1).
+LEAF_RANGE = 64
+
+
+@cache
+def make_struct(record):
+    """nodes: rows as above, nodes[0] the root. primitives: rows too: every number of `record` has one, of as many primitives
+    as a node has children; leaves begin with a row of their own."""
+
+    @wp.struct
+    class WideBvh:
+        nodes: wp.array(dtype=wp.float32)
+        primitives: wp.array(dtype=wp.float32)
+        recorder: Recorder
+
+    return WideBvh
+
+
+@wp.func
+def key_of(t: float, reference: int) -> wp.uint64:
+    """An entry of the stack: sorted by t, which is never below 0 nor -0."""
+    return (wp.uint64(wp.cast(t, wp.uint32)) << wp.uint64(32)) | wp.uint64(wp.cast(reference, wp.uint32))
+
+
+@wp.func
+def reference_of(key: wp.uint64) -> int:
+    return wp.cast(wp.uint32(key & wp.uint64(0xFFFFFFFF)), wp.int32)
+
+
+@wp.func
+def t_of(key: wp.uint64) -> float:
+    return wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)
+
+
+@wp.func
+def lane_ray(probe: Probe) -> LaneRay:
+    """Set-up, once a ray."""
+    out = LaneRay()
+    out.box = probe.box
+    out.box.t_min = probe.box.t_min + 0.0  # not -0: entries are sorted by their bits
+    out.near_x = wp.where(probe.box.inv_dir[0] < 0.0, 1, 0)
+    out.near_y = wp.where(probe.box.inv_dir[1] < 0.0, 3, 2)
+    out.near_z = wp.where(probe.box.inv_dir[2] < 0.0, 5, 4)
+    out.kx = probe.triangle.kx
+    out.ky = probe.triangle.ky
+    out.kz = probe.triangle.kz
+    out.shear_x = probe.triangle.shear_x
+    out.shear_y = probe.triangle.shear_y
+    origin = probe.ray.origin
+    out.origin = wp.vec3(origin[out.kx], origin[out.ky], origin[out.kz])
+    return out
+
+
+@cache
+def make_gather(record, width):
+    """One lane of a block of rows as a record."""
+    value, bits = make_lanes(width).value, make_lanes(width).bits
+
+    @wp.func
+    def gather_corners(rows: wp.array(dtype=wp.float32), i: int) -> Primitive:
+        out = Primitive()
+        out.v0 = wp.vec3(value(rows, i), value(rows, i + width), value(rows, i + 2 * width))
+        out.v1 = wp.vec3(value(rows, i + 3 * width), value(rows, i + 4 * width), value(rows, i + 5 * width))
+        out.v2 = wp.vec3(value(rows, i + 6 * width), value(rows, i + 7 * width), value(rows, i + 8 * width))
+        out.prim_id = bits(rows, i + 9 * width)
+        return out
+
+    @wp.func
+    def plane(rows: wp.array(dtype=wp.float32), i: int) -> wp.vec4:
+        return wp.vec4(value(rows, i), value(rows, i + width), value(rows, i + 2 * width), value(rows, i + 3 * width))
+
+    @wp.func
+    def gather_planes(rows: wp.array(dtype=wp.float32), i: int) -> PlanePrimitive:
+        out = PlanePrimitive()
+        out.a = plane(rows, i)
+        out.b = plane(rows, i + 4 * width)
+        out.c = plane(rows, i + 8 * width)
+        out.prim_id = bits(rows, i + 12 * width)
+        return out
+
+    return {Primitive: gather_corners, PlanePrimitive: gather_planes}[record]
+
+
+def make_row_test(units: Units, any_hit, accepts, width):
+    """The unit that tests one row of primitives, whose numbers begin at `first`."""
+    intersect = make_intersect(units, accepts)
+    gather = make_gather(units.triangle_test.record, width)
+    candidates, lowest = make_lanes(width).candidates, make_lanes(width).lowest
+    sifted = units.triangle == "watertight"
+
+    @wp.func
+    def test_row(rows: wp.array(dtype=wp.float32), first: int, count: int, surfaces: Surfaces, probe: Probe, ray: LaneRay,
+                 best: Hit) -> Hit:
+        mask = (2 << (count - 1)) - 1
+        if wp.static(sifted):
+            mask = mask & candidates(rows, first, ray)
+        while mask != 0:
+            best = intersect(probe, surfaces, gather(rows, first + lowest(mask)), best)
+            mask = mask & (mask - 1)
+            if wp.static(any_hit):
+                if best.prim_id != NO_HIT:
+                    return best
+        return best
+
+    return test_row
+
+
+def make_box_test(box, width):
+    """The unit that tests the boxes of one node: (rows, first, ray, t_max) -> row of entry distances."""
+    if box == "plain":
+        return make_twins(width, box).entries, 1.0
+    return make_lanes(width).entries, FAR_PAD if box == "conservative" else 1.0
+
+
+def make_traversal(units: Units, any_hit: bool, accepts, width: int):
+    """The closest hit, or any (the first that is found), in a tree of nodes of `width` children."""
+    lanes = make_lanes(width)
+    lowest, bits, entered, prefetch = lanes.lowest, lanes.bits, lanes.entered, lanes.prefetch
+    entries, pad = make_box_test(units.box, width)
+    probe_of = make_probe(units)
+    test_row = make_row_test(units, any_hit, accepts, width)
+    fetch_node, fetch_primitive, push, finish = make_counters(units, 4 * NODE_ROWS * width)
+    struct = make_struct(units.triangle_test.record)
+    node_size = NODE_ROWS * width
+    row_size = units.triangle_test.record.numpy_dtype()["itemsize"] // 4 * width
+    stack_type = wp.types.vector(STACK_SIZE, wp.uint64)
+
+    @wp.func
+    def child(accel: struct, at: int) -> int:
+        """The reference at `at`; what it refers to is called into the cache, as it is needed soon."""
+        reference = bits(accel.nodes, at)
+        if reference >= 0:
+            prefetch(accel.nodes, reference * wp.static(node_size))
+        else:
+            prefetch(accel.primitives, (-1 - reference) / LEAF_RANGE * wp.static(row_size))
+        return reference
+
+    @wp.func
+    def count_node(accel: struct, ray: Ray, counts: Counts, index: int) -> Counts:
+        if wp.static(units.counters):
+            boxes = int(0)
+            for j in range(width):
+                if bits(accel.nodes, index * wp.static(node_size) + 6 * width + j) != EMPTY:
+                    boxes += 1
+            return fetch_node(accel.recorder, ray, counts, index, boxes)
+        return counts
+
+    @wp.func
+    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+        probe = probe_of(ray)
+        rows = lane_ray(probe)
+        best = no_hit(ray)
+        counts = Counts()
+        stack = stack_type()
+        size = int(0)
+        reference = int(0)
+        while True:
+            if reference < 0:
+                counts.leaves += 1
+                block = (-1 - reference) / LEAF_RANGE
+                count = (-1 - reference) % LEAF_RANGE + 1
+                while count > 0:
+                    n = wp.min(count, width)
+                    best = test_row(accel.primitives, block * wp.static(row_size), n, surfaces, probe, rows, best)
+                    if wp.static(units.counters):
+                        for j in range(n):
+                            counts = fetch_primitive(accel.recorder, ray, counts, block * width + j)
+                    if wp.static(any_hit):
+                        if best.prim_id != NO_HIT:
+                            return finish(accel.recorder, ray, counts, best)
+                    count = count - width
+                    block = block + 1
+            else:
+                first = reference * wp.static(node_size)
+                counts = count_node(accel, ray, counts, reference)
+                t = entries(accel.nodes, first, rows, best.t, wp.static(pad))
+                mask = entered(t)
+                if mask != 0:
+                    first = first + 6 * width
+                    lane = lowest(mask)
+                    mask = mask & (mask - 1)
+                    near = key_of(t[lane], child(accel, first + lane))
+                    begin = size
+                    while mask != 0:
+                        lane = lowest(mask)
+                        mask = mask & (mask - 1)
+                        key = key_of(t[lane], child(accel, first + lane))
+                        if wp.static(any_hit):
+                            stack[size] = near
+                            near = key
+                        else:
+                            far = wp.max(near, key)
+                            near = wp.min(near, key)
+                            # Not sorted, but the farthest so far is deeper than this one: most nodes have two or three.
+                            if size > begin:
+                                under = stack[size - 1]
+                                stack[size] = wp.min(far, under)
+                                stack[size - 1] = wp.max(far, under)
+                            else:
+                                stack[size] = far
+                        size = size + 1
+                        counts = push(counts, size)
+                    reference = reference_of(near)
+                    continue
+            # Pop; what begins beyond the closest hit is dropped. Equal stays: a tie may have a lower prim_id there.
+            found = bool(False)
+            while size > 0 and not found:
+                size = size - 1
+                counts.pops += 1
+                key = stack[size]
+                if t_of(key) <= best.t:
+                    reference = reference_of(key)
+                    found = True
+            if not found:
+                break
+        return finish(accel.recorder, ray, counts, best)
+
+    return traverse
+
+
+class WideTraversal:
+    """What wrt.accel takes for the traversal's module, for one width."""
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+
+    def make_struct(self, record):
+        return make_struct(record)
+
+    def make_traversal(self, units: Units, any_hit: bool, accepts=None):
+        return make_traversal(units, any_hit, accepts, self.width)

@@ -1,0 +1,104 @@
+"""Wide BVHs on the host: files, refit, options, layout."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wrt.accel import Geometry, build
+from wrt.accel.wide_tree import check_wide, lanes_of
+from wrt.errors import InputError
+from wrt.shapes import icosphere
+
+WIDE = {"bvh4": 4, "bvh8": 8}
+BALL = icosphere(3)
+
+
+def rays(n: int = 2000) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(1)
+    origins = rng.normal(size=(n, 3)).astype(np.float32)
+    return origins, (0.5 * rng.normal(size=(n, 3)) - origins).astype(np.float32)
+
+
+def assert_same(accel, truth) -> None:
+    hits, expected = accel.closest_hit(*rays()), truth.closest_hit(*rays())
+    for field in ("t", "u", "v", "prim_id"):
+        np.testing.assert_array_equal(getattr(hits, field), getattr(expected, field))
+    np.testing.assert_array_equal(accel.any_hit(*rays()), expected.prim_id >= 0)
+
+
+@pytest.mark.parametrize("name", WIDE)
+@pytest.mark.parametrize("builder", ["binned", "sbvh"])
+def test_refit_follows_vertices_that_move(name: str, builder: str) -> None:
+    spheres = np.array([[0.0, 0.5, 0.0, 0.3]], np.float32)
+    accel = build(Geometry(BALL.vertices, BALL.faces, spheres), name, builder=builder)
+    cost = accel.stats.sah_cost
+    assert accel.refit(BALL.vertices).growth == pytest.approx(1.0, rel=1e-3 if builder == "binned" else 0.5)
+    for scale in ([2.0, 0.5, 1.0], [0.1, 0.1, 3.0]):
+        moved = (BALL.vertices * scale).astype(np.float32)
+        done = accel.refit(moved)
+        assert accel.stats.sah_cost == pytest.approx(done.growth * cost)
+        assert_same(accel, build(Geometry(moved, BALL.faces, spheres), "brute_force"))
+    mixed = BALL.vertices[np.random.default_rng(0).permutation(len(BALL.vertices))]
+    assert accel.refit(mixed).growth > 1.5
+
+
+@pytest.mark.parametrize("name", WIDE)
+def test_arrays_of_a_file_are_checked(name: str) -> None:
+    width = WIDE[name]
+    accel = build(BALL, name)
+    children = accel._tree(accel.built).children
+    check_wide(children, len(BALL.faces), width)
+    inner = np.argwhere(children > 0)
+    leaf = np.argwhere(children < 0)
+    for (i, j), value, message in [
+        (inner[0], 0, "no tree"), (inner[0], len(children), "leads out"), (inner[-1], 1, "leads out|no tree"),
+        (leaf[0], 0, "other primitives"), (leaf[0], children[tuple(leaf[0])] - 64, "other primitives"),
+        (leaf[1], -(2**31), "other primitives"), (leaf[0], 1, "leads out|no tree")]:
+        spoiled = children.copy()
+        spoiled[i, j] = value
+        with pytest.raises(InputError, match=message):
+            check_wide(spoiled, len(BALL.faces), width)
+    with pytest.raises(InputError, match="leads out"):
+        check_wide(np.zeros((0, width), np.int32), 0, width)
+
+
+def test_a_tree_too_deep_for_the_stack_is_refused() -> None:
+    # A chain of nodes with 8 children each: 7 stay on the stack at every level.
+    def chain(n: int) -> np.ndarray:
+        children = -1 - 64 * np.arange(8 * n, dtype=np.int32).reshape(n, 8)
+        children[:-1, 0] = np.arange(1, n)
+        leaves = children < 0
+        children[leaves] = -1 - 64 * np.arange(leaves.sum())
+        return children
+
+    check_wide(chain(9), 9 * 8 - 8, 8)
+    with pytest.raises(InputError, match="64 entries"):
+        check_wide(chain(10), 10 * 8 - 9, 8)
+
+
+@pytest.mark.parametrize("width", [4, 8])
+def test_lanes_follow_the_leaves(width: int) -> None:
+    # Three leaves of 1, width + 1 and width primitives, at rows 0, 1 and 3.
+    children = np.array([[0, -1 - (64 + width), -1 - 0, -1 - (3 * 64 + width - 1)]], np.int32)
+    order = np.arange(10, 10 + 2 * width + 2, dtype=np.int32)
+    rows = lanes_of(children, order, width)
+    assert rows.shape == (4, width)
+    assert rows[0].tolist() == [10] + [-1] * (width - 1)
+    assert rows[1:3].reshape(-1).tolist() == order[1 : width + 2].tolist() + [-1] * (width - 1)
+    assert np.array_equal(rows[3], order[width + 2 :])
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"max_leaf": 0}, "max_leaf"), ({"max_leaf": 65}, "max_leaf"), ({"cost_traversal": -1.0}, "cost_traversal"),
+    ({"builder": "nonsense"}, "no builder"), ({"width": 3}, "no option"), ({"max_leaf": 2.5}, "max_leaf must be"),
+])
+def test_options_out_of_range_are_refused(options, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        build(BALL, "bvh8", **options)
+
+
+@pytest.mark.parametrize("name", WIDE)
+def test_nodes_and_rows_begin_where_cache_lines_do(name: str) -> None:
+    data = build(BALL, name).data
+    assert data.nodes.ptr % 64 == 0 and data.primitives.ptr % 64 == 0

@@ -1,0 +1,153 @@
+"""Wide trees: a binary BVH collapsed into nodes of several children (the loops are Warp kernels, kernels/build_wide.py)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Geometry
+from wrt.accel.bvh_tree import BinaryTree
+from wrt.device import load_kernel, start, upload
+from wrt.errors import InputError
+from wrt.kernels import build_wide
+from wrt.kernels.lanes import EMPTY
+from wrt.kernels.traverse_bvh2 import Bvh2Node
+from wrt.kernels.traverse_wide import LEAF_RANGE, STACK_SIZE
+
+MAX_ROWS = 2**31 // LEAF_RANGE  # of primitives: what a reference can tell
+
+
+@dataclass(frozen=True, eq=False)
+class WideTree:
+    """lo, hi: (N, W, 3) float32, the boxes of each node's children, empty where there is none (these come first); children: (N, W)
+    int32, references as in kernels.traverse_wide; order: (rows, W) int32, the prim_id in each lane of the leaves' rows, -1 where
+    there is none; leaves: how many; depth: nodes on the longest way from the root; stack: the most entries a walk has."""
+
+    lo: np.ndarray
+    hi: np.ndarray
+    children: np.ndarray
+    order: np.ndarray
+    leaves: int
+    depth: int
+    stack: int
+
+    @property
+    def areas(self) -> np.ndarray:
+        """(N, W): half the surface of each child's box in float64, 0 where there is none."""
+        e = np.clip(self.hi.astype(np.float64) - self.lo, 0.0, 1e39)
+        return e[..., 0] * e[..., 1] + e[..., 1] * e[..., 2] + e[..., 2] * e[..., 0]
+
+    def sah_cost(self) -> float:
+        """Expected node visits plus primitives tested of a random line that meets the root box (both costing 1)."""
+        count = np.where(self.children < 0, (-1 - self.children) % LEAF_RANGE + 1, 1)
+        e = np.clip(self.hi[0].max(axis=0).astype(np.float64) - self.lo[0].min(axis=0), 0.0, 1e39)
+        root = e[0] * e[1] + e[1] * e[2] + e[2] * e[0]
+        if not root > 0.0:
+            return float((self.order >= 0).sum())
+        return 1.0 + float((self.areas * np.where(self.children == EMPTY, 0, count)).sum() / root)
+
+
+def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float, cost_intersection: float) -> WideTree:
+    """The wide tree of least expected cost over the nodes of a binary one of two or more leaves."""
+    cpu = start("cpu")
+    n = len(tree.nodes)
+    options = build_wide.CollapseOptions()
+    options.width, options.max_leaf, options.stack = width, max_leaf, STACK_SIZE
+    options.cost_traversal, options.cost_intersection = cost_traversal, cost_intersection
+    nodes, order = upload(tree.nodes, Bvh2Node, cpu), upload(tree.order, wp.int32, cpu)
+    trees = build_wide.Subtrees()
+    trees.size, trees.height = (wp.zeros(n, dtype=wp.int32, device=cpu) for _ in range(2))
+    trees.cost = wp.zeros(build_wide.MAX_WIDTH * n, dtype=wp.float32, device=cpu)
+    trees.choice = wp.zeros(build_wide.MAX_WIDTH * n, dtype=wp.uint8, device=cpu)
+    load_kernel(build_wide.subtree_costs, cpu)
+    load_kernel(build_wide.collapse, cpu)
+    wp.launch(build_wide.subtree_costs, dim=1, device=cpu, inputs=[nodes, options, trees])
+    out = build_wide.WideTree()
+    out.children, out.boxes = (wp.empty(n * width, dtype=wp.int32, device=cpu) for _ in range(2))
+    out.order = wp.empty(len(tree.order) * width, dtype=wp.int32, device=cpu)
+    out.count = wp.zeros(5, dtype=wp.int32, device=cpu)
+    wp.launch(build_wide.collapse, dim=1, device=cpu, inputs=[nodes, order, options, trees, out])
+    n_nodes, rows, leaves, depth, stack = out.count.numpy().tolist()
+    if rows > MAX_ROWS:
+        raise InputError(f"a wide BVH holds at most {MAX_ROWS} rows of primitives, and these need {rows}; take accel='bvh2'")
+    code = out.boxes.numpy()[: n_nodes * width].reshape(-1, width)
+    lo, hi = (np.stack([tree.nodes[f"{end}_0"], tree.nodes[f"{end}_1"]], axis=1).reshape(-1, 3)[code] for end in ("lo", "hi"))
+    lo[code < 0], hi[code < 0] = np.inf, -np.inf
+    return in_order(WideTree(lo, hi, out.children.numpy()[: n_nodes * width].reshape(-1, width).copy(),
+                             out.order.numpy()[: rows * width].reshape(-1, width).copy(), leaves, depth, stack))
+
+
+def in_order(tree: WideTree) -> WideTree:
+    """The children of each node from the one to visit last to the one to visit first by a ray that asks for any hit: those
+    that do not exist, inner nodes, leaves; and large boxes after small ones."""
+    kind = np.where(tree.children == EMPTY, 0, np.where(tree.children > 0, 1, 2))
+    by = np.lexsort((tree.areas, kind), axis=1)
+    lo, hi = (np.take_along_axis(array, by[..., None], axis=1) for array in (tree.lo, tree.hi))
+    return WideTree(lo, hi, np.take_along_axis(tree.children, by, axis=1), tree.order, tree.leaves, tree.depth, tree.stack)
+
+
+def small_tree(tree: BinaryTree, width: int) -> WideTree:
+    """The wide tree over no primitive or one."""
+    n = len(tree.order)
+    lo, hi = np.full((1, width, 3), np.inf, np.float32), np.full((1, width, 3), -np.inf, np.float32)
+    children, order = np.full((1, width), EMPTY, np.int32), np.full((n, width), -1, np.int32)
+    if n:
+        lo[0, -1], hi[0, -1], children[0, -1], order[0, 0] = tree.nodes["lo_0"][0], tree.nodes["hi_0"][0], -1, tree.order[0]
+    return WideTree(lo, hi, children, order, n, 1, 0)
+
+
+def refit(tree: WideTree, geometry: Geometry) -> WideTree:
+    """The same tree around the geometry as it is now. Boxes of spatial splits become those of the whole triangles."""
+    cpu = start("cpu")
+    width = tree.children.shape[1]
+    low, high = (upload(np.append(box, [[end] * 3], axis=0), wp.vec3, cpu)  # lane -1: an empty box
+                 for box, end in zip(geometry.bounds(), (np.inf, -np.inf), strict=True))
+    lo, hi = (wp.empty(tree.children.size, dtype=wp.vec3, device=cpu) for _ in range(2))
+    load_kernel(build_wide.refit, cpu)
+    wp.launch(build_wide.refit, dim=1, device=cpu, inputs=[
+        upload(tree.children.reshape(-1).copy(), wp.int32, cpu), upload(tree.order.reshape(-1).copy(), wp.int32, cpu), width,
+        low, high, lo, hi])
+    return replace(tree, lo=lo.numpy().reshape(-1, width, 3), hi=hi.numpy().reshape(-1, width, 3))
+
+
+def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
+    """Which record stands in each lane of the leaves' rows: (rows, width), -1 where there is none. children: the references of all
+    nodes; order: (R,) the prim_id of every record, leaf after leaf as their rows are."""
+    leaf = np.sort(-1 - children[children < 0].astype(np.int64))
+    row, count = leaf // LEAF_RANGE, leaf % LEAF_RANGE + 1
+    rows = int(row[-1] + -(-count[-1] // width)) if len(leaf) else 0
+    out = np.full(rows * width, -1, np.int32)
+    begin = np.cumsum(count) - count
+    out[np.repeat(row * width - begin, count) + np.arange(int(count.sum()))] = order
+    return out.reshape(rows, width)
+
+
+def check_wide(children: np.ndarray, n_primitives: int, width: int) -> None:
+    """Raise InputError unless (N, width) references are a tree from node 0 whose leaves have n rows one after another, and whose
+    walks fit on a traversal's stack."""
+    n = len(children)
+    inner = children > 0
+    if n == 0 or (children[inner] >= n).any() or (children <= np.arange(n)[:, None])[inner].any():
+        raise InputError("is damaged: a node leads out of the tree")
+    if (np.bincount(children[inner], minlength=n) != (np.arange(n) > 0)).any():
+        raise InputError("is damaged: its nodes are no tree")
+    leaf = np.sort(-1 - children[children < 0].astype(np.int64))
+    count = leaf % LEAF_RANGE + 1
+    rows = -(-count // width)
+    if (leaf // LEAF_RANGE != np.cumsum(rows) - rows).any() or count.sum() != n_primitives:
+        raise InputError("is damaged: a leaf leads to other primitives")
+    if n and stack_need(children) > STACK_SIZE:
+        raise InputError(f"is damaged: a walk needs more than {STACK_SIZE} entries")
+
+
+def stack_need(children: np.ndarray) -> int:
+    """The most entries that a walk can have on its stack."""
+    level, used, most = np.zeros(1, np.int64), np.zeros(1, np.int64), 0
+    while len(level):
+        below = used + np.maximum((children[level] != EMPTY).sum(axis=1) - 1, 0)
+        most = max(most, int(below.max()))
+        inner = children[level] > 0
+        level, used = children[level][inner].astype(np.int64), np.repeat(below, inner.sum(axis=1))
+    return most
