@@ -22,8 +22,8 @@ class KdTree(Accelerator):
     name = "kdtree"
     kernels = kernels
 
-    def _build(self, max_leaf: int = 1, max_depth: int | None = None, by_cost: bool = True, cost_traversal: float = 1.0,
-               cost_intersection: float = 1.0, empty_bonus: float = 0.2, perfect_below: int = 65536, clip: bool = True,
+    def _build(self, max_leaf: int = 1, max_depth: int | None = None, by_cost: bool = True, cost_traversal: float = 2.0,
+               cost_intersection: float = 1.0, empty_bonus: float = 0.1, perfect_below: int = 65536, clip: bool = True,
                max_growth: float = 16.0) -> Built:
         options = KdOptions(max_leaf, max_depth, by_cost, cost_traversal, cost_intersection, empty_bonus, perfect_below, clip,
                             max_growth)

@@ -29,9 +29,9 @@ class KdOptions:
     max_leaf: int = 1
     max_depth: int | None = None
     by_cost: bool = True
-    cost_traversal: float = 1.0
+    cost_traversal: float = 2.0
     cost_intersection: float = 1.0
-    empty_bonus: float = 0.2
+    empty_bonus: float = 0.1
     perfect_below: int = 65536
     clip: bool = True
     max_growth: float = 16.0

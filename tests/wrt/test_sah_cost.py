@@ -1,0 +1,136 @@
+"""The SAH cost is what it says: the steps of a random line that nothing stops, counted by the very traversal that is measured.
+
+Lines that meet a convex region uniformly meet a convex part of it with the ratio of the surface areas (Crofton; MacDonald and
+Booth 1990, "Heuristics for ray tracing using space subdivision"). So inner nodes and primitives of the leaves on a line are, in
+the mean, `stats.sah_cost`, if traversal and builder agree on every region.
+
+The lines are a scrambled Sobol sequence. sigma is what as many independent ones would have, so that 2 sigma is never left by
+chance however many structures there are; what is found is far closer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wrt
+from tests.data import data_path
+from wrt.accel import ACCELERATORS, Accelerator, Geometry, build
+from wrt.accel.base import Counters
+from wrt.accel.bvh_build import BVH_BUILDERS
+from wrt.shapes import icosphere, torus
+
+REAL = ["small/suzanne.obj", "small/legocar.obj", "medium/stanford_bunny.ply", "medium/sponza_dabrovic.obj",
+        "large/dragon_871k.ply"]
+BATCH = 1 << 16
+
+
+def lines_through_box(accel: Accelerator, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform lines that meet the box of the geometry: a point of its surface, a cosine-distributed direction inwards, and the
+    origin moved back along it to where the whole line is ahead. n: a power of 2."""
+    from scipy.stats import qmc
+
+    lo, hi = accel.geometry.bounds()
+    lo, hi = lo.min(axis=0).astype(np.float64), hi.max(axis=0).astype(np.float64)
+    which, x, y, radius, angle = qmc.Sobol(5, seed=seed).random(n).T
+    e = hi - lo
+    areas = e[[1, 2, 0]] * e[[2, 0, 1]]
+    face = np.minimum(np.searchsorted(np.cumsum(np.repeat(areas, 2)) / (2.0 * areas.sum()), which, side="right"), 5)
+    axis, upper = face // 2, face % 2
+    point, direction = np.empty((n, 3)), np.empty((n, 3))
+    row, side, other = np.arange(n), (axis + 1) % 3, (axis + 2) % 3
+    point[row, axis] = np.where(upper == 1, hi[axis], lo[axis])
+    point[row, side], point[row, other] = lo[side] + x * e[side], lo[other] + y * e[other]
+    direction[row, axis] = np.where(upper == 1, -1.0, 1.0) * np.sqrt(1.0 - radius)
+    direction[row, side] = np.sqrt(radius) * np.cos(2.0 * np.pi * angle)
+    direction[row, other] = np.sqrt(radius) * np.sin(2.0 * np.pi * angle)
+    origin = point - direction * np.linalg.norm(e)
+    return origin.astype(np.float32), direction.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a structure is asked for: options; inner: the inner nodes among what it counted; lines: those that meet its root
+    region, if that is not the box of the geometry."""
+
+    options: dict[str, Any] = field(default_factory=dict)
+    inner: Callable[[Counters], np.ndarray] = lambda counters: counters.nodes
+    lines: Callable[[Accelerator, int, int], tuple[np.ndarray, np.ndarray]] = lines_through_box
+
+
+# Structures that are not here are asked for as they are by default.
+CASES: dict[str, list[Case]] = {
+    "brute_force": [Case(lines=lambda accel, n, seed: lines_through_box(accel, 64, seed))],  # each line takes as many steps
+    "bvh2": [Case({"builder": builder}) for builder in BVH_BUILDERS],
+    "grid": [Case({"mailbox": False})],  # the SAH knows of no primitive that is not tested again
+    "kdtree": [Case(options, inner=lambda counters: counters.nodes - counters.leaves)  # a leaf is fetched as a node
+               for options in ({}, {"clip": False, "empty_bonus": 0.8}, {"max_leaf": 8, "perfect_below": 1024})],
+}
+ALL = [pytest.param(name, case, id="-".join([name, *map(str, case.options.values())]))
+       for name in sorted({cls.name for cls in ACCELERATORS.values()}) for case in CASES.get(name, [Case()])]
+
+
+def let_through(accel: Accelerator) -> None:
+    """Make all primitives ones that no ray hits: the structure stays, and every ray goes to its end."""
+    records = accel.data.primitives.numpy()  # shares its memory on the CPU
+    if records.dtype.names is None:
+        records[...] = np.nan
+    for name in records.dtype.names or ():
+        if records.dtype[name].base.kind == "f":
+            records[name] = np.nan
+
+
+def check(geometry: Geometry, name: str, case: Case, n: int, most: float) -> None:
+    """The mean of n lines is the SAH cost within 2 sigma, and sigma is at most this share of it."""
+    accel = build(geometry, name, **case.options)
+    if np.isnan(accel.stats.sah_cost):
+        pytest.skip(f"{name} tells no SAH cost")
+    origins, directions = case.lines(accel, n, 7)
+    let_through(accel)
+    n = len(origins)
+    steps = np.zeros(n)
+    for first in range(0, n, BATCH):
+        hits = accel.closest_hit(origins[first : first + BATCH], directions[first : first + BATCH], counters=True)
+        assert hits.counters is not None and (hits.prim_id < 0).all()
+        steps[first : first + BATCH] = case.inner(hits.counters) + hits.counters.primitives
+    cost, mean, sigma = accel.stats.sah_cost, steps.mean(), steps.std(ddof=1) / np.sqrt(n)
+    told = f"SAH cost {cost:.4f}, measured {mean:.4f}, sigma {sigma:.4f} ({(mean - cost) / max(sigma, 1e-30):+.2f} sigma)"
+    print(told)
+    assert sigma <= most * cost, told
+    assert abs(mean - cost) <= 2.0 * sigma + 1e-6 * cost, told
+
+
+def soup() -> Geometry:
+    """Triangles of all sizes and shapes, flat ones along the axes among them."""
+    rng = np.random.default_rng(3)
+    corners = rng.uniform(-1.0, 1.0, (500, 1, 3)) + 10.0 ** rng.uniform(-3.0, -0.3, (500, 1, 1)) * rng.normal(size=(500, 3, 3))
+    corners[::7, :, 0] = corners[::7, :1, 0]
+    return Geometry(corners.reshape(-1, 3).astype(np.float32), np.arange(1500, dtype=np.int32).reshape(-1, 3),
+                    np.zeros((0, 4), np.float32))
+
+
+GEOMETRIES = {"icosphere": lambda: Geometry.of(icosphere(3)), "torus": lambda: Geometry.of(torus()), "soup": soup}
+
+
+@pytest.mark.parametrize("kind", GEOMETRIES)
+@pytest.mark.parametrize("name, case", ALL)
+def test_random_lines_take_as_many_steps_as_the_sah_says(name: str, case: Case, kind: str) -> None:
+    check(GEOMETRIES[kind](), name, case, 1 << 15, 0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mesh", REAL)
+@pytest.mark.parametrize("name, case", ALL)
+def test_random_lines_on_real_meshes(name: str, case: Case, mesh: str) -> None:
+    check(Geometry.of(wrt.load_mesh(data_path(f"meshes/{mesh}"))), name, case, 1 << 18, 0.005)
+
+
+def test_a_wrong_cost_is_noticed() -> None:
+    # One node more or less on each line is many sigma.
+    case = Case(inner=lambda counters: counters.nodes + 1)
+    with pytest.raises(AssertionError, match="measured"):
+        check(GEOMETRIES["icosphere"](), "bvh2", case, 1 << 15, 0.01)
