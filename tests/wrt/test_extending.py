@@ -1,0 +1,106 @@
+"""docs/extending.md is followed to the letter, in a copy of the project."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.data import ROOT
+
+BLOCK = re.compile(r"^```(python|diff)\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+TRY_IT = """
+import numpy as np, wrt
+from wrt.shapes import icosphere
+
+ball = icosphere(4)
+rng = np.random.default_rng(0)
+target = rng.normal(size=(4000, 3)).astype(np.float32)
+target *= (1.2 * rng.random((4000, 1)) / np.linalg.norm(target, axis=1, keepdims=True)).astype(np.float32)
+origin = np.broadcast_to(np.float32([3.0, 1.0, 2.0]), target.shape)
+rays = origin, target - origin
+hits = {name: wrt.build(ball, **options).closest_hit(*rays, counters=True) for name, options in {
+    "brute": {"accel": "brute_force"}, "runs": {"accel": "runs", "length": 16}, "volumes": {"triangle": "signed_volumes"}}.items()}
+brute, runs, volumes = (hits[name] for name in ("brute", "runs", "volumes"))
+assert 1000 < (brute.prim_id >= 0).sum() < 4000
+for field in ("t", "u", "v", "prim_id"):
+    assert np.array_equal(getattr(brute, field), getattr(runs, field)), field
+assert (runs.counters.nodes == len(ball.faces) // 16).all()
+assert runs.counters.primitives.mean() < 0.7 * len(ball.faces)
+both = brute.prim_id == volumes.prim_id
+assert both.mean() > 0.995
+found = both & (brute.prim_id >= 0)
+assert np.quantile(np.abs(volumes.t[found] - brute.t[found]), 0.9) < 1e-4
+
+wrt.build(ball, accel="runs").save("ball.accel")
+again = wrt.load_accel("ball.accel", ball).closest_hit(*rays)
+assert np.array_equal(again.prim_id, brute.prim_id)
+
+# Rays come back to where they came from: a pixel that looks up shows half of what is below, behind the camera's back.
+sign = wrt.render("sign.toml", threads=2).pixels[:, 16, 0]
+slope = np.tan(np.radians(20.0)) * (1.0 - (2.0 * np.arange(32) + 1.0) / 32.0)
+assert np.allclose(sign, 0.5 * 0.5 * (1.0 - slope / np.sqrt(1.0 + slope**2)), atol=1e-3)
+print("all of it works")
+"""
+
+SIGN = """
+[settings]
+size = [32, 32]
+spp = 64
+filter = "box"
+[cameras.main]
+position = [0, 0, 5]
+target = [0, 0, 0]
+fov_y = 40
+[background]
+type = "gradient"
+bottom = 0
+top = 1
+[materials.sign]
+kind = "retroreflector"
+albedo = 0.5
+[[boxes]]
+low = [-9, -9, -1]
+high = [9, 9, 0]
+material = "sign"
+"""
+
+
+def apply(copy: Path) -> None:
+    """Follow the text. An edit's old lines stand exactly once in its file."""
+    text = (ROOT / "docs" / "extending.md").read_text()
+    blocks = BLOCK.findall(text)
+    assert 2 * len(blocks) == text.count("```"), "a block names no file"
+    for kind, name, body in blocks:
+        path = copy / name
+        if kind == "python":
+            assert not path.exists()
+            path.write_text(body)
+        else:
+            lines = body.splitlines()
+            old = "\n".join(line[1:] for line in lines if line[:1] in (" ", "-")) + "\n"
+            new = "\n".join(line[1:] for line in lines if line[:1] in (" ", "+")) + "\n"
+            before = path.read_text()
+            assert before.count("\n" + old) == 1, f"{name}: {old}"
+            path.write_text(before.replace("\n" + old, "\n" + new))
+
+
+def python(folder: Path, *arguments: str) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    done = subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def test_the_text_can_be_followed(tmp_path: Path) -> None:
+    for folder in ("wrt", "kernels"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    apply(tmp_path)
+    (tmp_path / "sign.toml").write_text(SIGN)
+    assert python(tmp_path, "-c", TRY_IT).endswith("all of it works\n")
+    python(tmp_path, "-m", "wrt", "render", "sign.toml", "-q", "--accel", "runs", "-o", "sign.png")
+    assert (tmp_path / "sign.png").exists()
