@@ -17,6 +17,7 @@ from wrt.kernels.ray_aabb import FAR_PAD
 from wrt.kernels.traverse_kdtree import HELD_GRAZING, HELD_RELATIVE, NEAR_PAD
 
 INF = np.float32(np.inf)
+REACH = np.float32(2.0**-19)
 PRIMITIVES = 1 << 40
 PRIMITIVE_BYTES = 40
 
@@ -304,9 +305,69 @@ def visit_order(walk: Walk, stack: list[tuple[np.float32, int]], entered: list[t
     return nearest[1]
 
 
+def bsp_reach(accel, ray: WalkRay) -> tuple[np.float32, ...]:
+    """t_0, t_1, how far the walk goes on behind the best hit, and the planes' thickness for each unit of t; in float32."""
+    lo, hi = (np.array(getattr(accel.data, name), np.float32) for name in ("lo", "hi"))
+    grow = REACH * np.maximum(np.abs(lo - ray.origin), np.abs(hi - ray.origin)).max() + np.float32(2.0**-120)
+    backwards = ray.inv_dir < 0.0
+    with np.errstate(invalid="ignore", over="ignore"):
+        near = (np.where(backwards, hi + grow, lo - grow) - ray.origin) * ray.inv_dir
+        far = (np.where(backwards, lo - grow, hi + grow) - ray.origin) * ray.inv_dir
+    size = np.abs(ray.direction)
+    beyond = grow / size[size > 0.0].min()
+    return (np.maximum(np.fmax.reduce(near), ray.t_min - beyond), np.minimum(np.fmin.reduce(far), ray.t_max + beyond), beyond,
+            REACH * size.max())
+
+
+def bsp(accel, ray: WalkRay) -> Walk:
+    walk, nodes = Walk(), accel.data.nodes.numpy()
+    t_0, t_1, beyond, drift = bsp_reach(accel, ray)
+    stack = [(t_0, t_1, int(accel.data.first), int(accel.data.count))] if t_0 <= t_1 else []
+    first_visit = True
+    while stack:
+        t_0, t_1, first, count = stack.pop()
+        if not first_visit:
+            walk.pops += 1
+            if t_0 > ray.best[0] + beyond:
+                continue
+            t_1 = min(t_1, ray.best[0] + beyond)
+        first_visit = False
+        while count < 0:
+            node = nodes[first]
+            walk.node(first, nodes.itemsize, 0)
+            axis, n = int(node["axis"]), node["normal"]
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                if axis < 3:
+                    height, inv = -node["offset"] - ray.origin[axis], ray.inv_dir[axis]
+                else:
+                    o, d = ray.origin, ray.direction
+                    height = -(n[0] * o[0] + n[1] * o[1] + n[2] * o[2] + node["offset"])
+                    inv = np.float32(1.0) / (n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
+                thick = node["tolerance"] + drift * max(-t_0, t_1)
+                near, far = ("1", "0") if inv < 0.0 else ("0", "1")
+                near_end, far_begin = ((height - thick) * inv, (height + thick) * inv) if inv < 0.0 else (
+                    (height + thick) * inv, (height - thick) * inv)
+            visits = []
+            if node["count_" + near] != 0 and not t_0 > near_end:
+                visits.append((t_0, near_end if near_end < t_1 else t_1, int(node["first_" + near]), int(node["count_" + near])))
+            if node["count_" + far] != 0 and not far_begin > t_1:
+                visits.append((far_begin if far_begin > t_0 else t_0, t_1, int(node["first_" + far]), int(node["count_" + far])))
+            if not visits:
+                break
+            if len(visits) == 2:
+                stack.append(visits[1])
+                walk.push(len(stack))
+            t_0, t_1, first, count = visits[0]
+        if count > 0:
+            walk.leaves += 1
+            for i in range(first, first + count):
+                ray.test(walk, accel, i)
+    return walk
+
+
 REWALK: dict[str, Callable[..., Walk]] = {
     "brute_force": brute_force,
-    "bvh2": bvh2,
+    "bvh2": bvh2, "bsp": bsp,
     "bvh4": wide,
     "bvh8": wide,
     "kdtree": kdtree,

@@ -6,6 +6,7 @@ from typing import Any
 
 from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
 from wrt.accel.brute_force import BruteForce
+from wrt.accel.bsp import Bsp
 from wrt.accel.bvh2 import Bvh2
 from wrt.accel.bvh_wide import Bvh4, Bvh8
 from wrt.accel.grid import Grid
@@ -23,6 +24,7 @@ ACCELERATORS: dict[str, type[Accelerator]] = {
     "bvh4": Bvh4,
     "bvh8": Bvh8,
     "kdtree": KdTree,
+    "bsp": Bsp,
     "brute_force": BruteForce,
     "grid": Grid,
 }

@@ -1,0 +1,319 @@
+"""The BSP builder: cells are split, and their primitives clipped to the parts, until a split no longer pays; CPU backend.
+
+The host launches it once for the top of the tree, and then once for each of the cells that this left over, on all cores. A
+launch works depth first, so that it holds no more pieces at a time than lie along one path.
+"""
+
+import warp as wp
+
+from wrt.kernels.build_bsp_cell import Cells, box_cell, cell_area, clip_cell, copy_cell, crossing, plane_side
+from wrt.kernels.build_bsp_split import (
+    OUTWARDS,
+    BspSplit,
+    BspTools,
+    Pieces,
+    Scope,
+    best_across,
+    best_plane,
+    extent_on,
+    plane_tolerance,
+    sides_of,
+)
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse_bsp import INNER, STACK_SIZE, BspNode
+
+MAX_CORNERS = wp.constant(16)  # a piece of a triangle that would get more keeps those it has, and sticks out of its cell
+CELL_SLOTS = STACK_SIZE + 1
+HAND = wp.constant(STACK_SIZE)  # the slot of the cell that is being split
+LEFT_OVER = wp.constant(-2)  # count of a child that is built by a later launch: `first` of those left over
+
+# Where a launch leaves its numbers. FULL: an array was too short, and the rest is of no use.
+N_NODES = wp.constant(0)
+N_ORDER = wp.constant(1)
+N_LEFT_OVER = wp.constant(2)
+DEPTH = wp.constant(3)
+LEAVES = wp.constant(4)
+FULL = wp.constant(5)
+ROOT_FIRST = wp.constant(6)
+ROOT_COUNT = wp.constant(7)
+N_RESULTS = 8
+
+
+@wp.struct
+class BspTask:
+    """A cell to be built: pieces begin .. end - 1, whose points end before points_end; the link to it is that of `parent` to its
+    child `side` (parent < 0: the root's)."""
+
+    begin: int
+    end: int
+    points_end: int
+    parent: int
+    side: int
+    depth: int
+
+
+@wp.struct
+class BspOutput:
+    """What a launch gives: nodes, leaves' primitives, cells left over, results (N_RESULTS numbers); cost[0]: expected nodes and
+    primitives of a line that meets a root box of surface 1."""
+
+    nodes: wp.array(dtype=BspNode)
+    order: wp.array(dtype=wp.int32)
+    left_over: wp.array(dtype=BspTask)
+    left_cells: Cells
+    results: wp.array(dtype=wp.int32)
+    cost: wp.array(dtype=wp.float64)
+
+
+@wp.func
+def copy_piece(source: Pieces, i: int, target: Pieces, to: int):
+    """Everything but the points, which stay where they are."""
+    target.prim_id[to] = source.prim_id[i]
+    target.first[to] = source.first[i]
+    target.count[to] = source.count[i]
+    target.lo[to] = source.lo[i]
+    target.hi[to] = source.hi[i]
+    target.ball[to] = source.ball[i]
+    target.extent[to] = source.extent[i]
+
+
+@wp.func
+def clip_piece(pieces: Pieces, i: int, to: int, size: int, split: BspSplit, side: int) -> int:
+    """Piece `to` becomes the part of piece i on one side (0 below, 1 above); its points go to `size` and on. The new size."""
+    copy_piece(pieces, i, pieces, to)
+    count = pieces.count[i]
+    first = pieces.first[i]
+    zero = wp.float64(0.0)
+    sign = wp.where(side == 0, wp.float64(-1.0), wp.float64(1.0))
+    n = int(0)
+    lo = wp.vec3d(wp.float64(wp.inf), wp.float64(wp.inf), wp.float64(wp.inf))
+    hi = -lo
+    for k in range(count):
+        p = pieces.points[first + k]
+        q = pieces.points[first + (k + 1) % count]
+        s_p = sign * plane_side(split.normal, split.offset, p)
+        s_q = sign * plane_side(split.normal, split.offset, q)
+        if n + 2 > MAX_CORNERS:
+            return size
+        if s_p >= zero:
+            pieces.points[size + n] = p
+            lo = wp.min(lo, p)
+            hi = wp.max(hi, p)
+            n = n + 1
+        if (s_p >= zero) != (s_q >= zero):
+            c = crossing(p, q, s_p, s_q)
+            pieces.points[size + n] = c
+            lo = wp.min(lo, c)
+            hi = wp.max(hi, c)
+            n = n + 1
+    if n == 0:
+        return size  # a sphere, which is not clipped
+    center = wp.float64(0.5) * (lo + hi)
+    radius = zero
+    for k in range(n):
+        radius = wp.max(radius, wp.length(pieces.points[size + k] - center))
+    pieces.first[to] = size
+    pieces.count[to] = n
+    pieces.lo[to] = lo
+    pieces.hi[to] = hi
+    pieces.ball[to] = wp.vec4d(center[0], center[1], center[2], radius * OUTWARDS)
+    return size + n
+
+
+@wp.func
+def scope_of(tools: BspTools, task: BspTask, slot: int) -> Scope:
+    scope = Scope()
+    scope.begin = task.begin
+    scope.end = task.end
+    scope.lo = wp.vec3d(wp.float64(wp.inf), wp.float64(wp.inf), wp.float64(wp.inf))
+    scope.hi = -scope.lo
+    for i in range(task.begin, task.end):
+        scope.lo = wp.min(scope.lo, tools.pieces.lo[i])
+        scope.hi = wp.max(scope.hi, tools.pieces.hi[i])
+        scope.extent = wp.max(scope.extent, tools.pieces.extent[i])
+    scope.far = wp.max(wp.abs(scope.lo), wp.abs(scope.hi))
+    scope.slot = slot
+    scope.area = cell_area(tools.cells, slot)
+    return scope
+
+
+@wp.func
+def choose(tools: BspTools, scope: Scope, depth: int) -> BspSplit:
+    """The cheapest split; where none is cheaper than a leaf, axis < 0."""
+    best = BspSplit()
+    best.axis = -1
+    best.cost = tools.options.cost_intersection * wp.float64(scope.end - scope.begin)
+    if depth < tools.options.max_depth and scope.area > wp.float64(0.0) and wp.isfinite(scope.area):
+        best = best_across(tools, scope, best)
+        best = best_plane(tools, scope, best)
+    return best
+
+
+@wp.func
+def link(output: BspOutput, task: BspTask, first: int, count: int):
+    """Tell the parent what became of a child."""
+    if task.parent < 0:
+        output.results[ROOT_FIRST] = first
+        output.results[ROOT_COUNT] = count
+        return
+    node = output.nodes[task.parent]
+    if task.side == 0:
+        node.first_0 = first
+        node.count_0 = count
+    else:
+        node.first_1 = first
+        node.count_1 = count
+    output.nodes[task.parent] = node
+
+
+@wp.func
+def write_leaf(tools: BspTools, output: BspOutput, task: BspTask):
+    n = output.results[N_ORDER]
+    for i in range(task.begin, task.end):
+        output.order[n + i - task.begin] = tools.pieces.prim_id[i]
+    link(output, task, n, task.end - task.begin)
+    output.results[N_ORDER] = n + task.end - task.begin
+    output.results[LEAVES] += 1
+
+
+@wp.func
+def write_node(output: BspOutput, task: BspTask, split: BspSplit, tolerance: float) -> int:
+    """An inner node, whose children are empty until they link themselves."""
+    index = output.results[N_NODES]
+    node = BspNode()
+    node.normal = wp.vec3(split.normal)
+    node.offset = float(split.offset)
+    node.tolerance = tolerance
+    node.axis = split.axis
+    output.nodes[index] = node
+    link(output, task, index, INNER)
+    output.results[N_NODES] = index + 1
+    return index
+
+
+@wp.func
+def count_below(tools: BspTools, task: BspTask, split: BspSplit) -> int:
+    """How many pieces are listed below the plane."""
+    n = int(0)
+    for i in range(task.begin, task.end):
+        sides = sides_of(extent_on(tools.pieces, i, split), split)
+        if (sides & 1) == 1 or (sides == 0 and split.low_flat):
+            n = n + 1
+    return n
+
+
+@wp.func
+def divide(tools: BspTools, task: BspTask, split: BspSplit, base: int, middle: int, size: int) -> wp.vec2i:
+    """Write the pieces of the part below from `base` and those of the part above from `middle`, clipped, with new points from
+    `size`: where both end, or (-1, -1) where there is no room for the points."""
+    pieces = tools.pieces
+    low = int(base)
+    high = int(middle)
+    for i in range(task.begin, task.end):
+        sides = sides_of(extent_on(pieces, i, split), split)
+        if sides == 3:
+            if size + 2 * MAX_CORNERS > pieces.points.shape[0]:
+                return wp.vec2i(-1, -1)
+            size = clip_piece(pieces, i, low, size, split, 0)
+            size = clip_piece(pieces, i, high, size, split, 1)
+            low = low + 1
+            high = high + 1
+        elif sides == 1 or (sides == 0 and split.low_flat):
+            copy_piece(pieces, i, pieces, low)
+            low = low + 1
+        else:
+            copy_piece(pieces, i, pieces, high)
+            high = high + 1
+    return wp.vec2i(high, size)
+
+
+@wp.func
+def start_pieces(source: Pieces, begin: int, end: int, target: Pieces) -> int:
+    """Copy pieces with their points to the front of `target`; how many points there are, or -1 without room for them."""
+    size = int(0)
+    for i in range(begin, end):
+        count = source.count[i]
+        if i - begin >= target.prim_id.shape[0] or size + count > target.points.shape[0]:
+            return -1
+        copy_piece(source, i, target, i - begin)
+        for k in range(count):
+            target.points[size + k] = source.points[source.first[i] + k]
+        target.first[i - begin] = size
+        size = size + count
+    return size
+
+
+@kernel
+def build_cells(source: Pieces, tasks: wp.array(dtype=BspTask), cells: Cells, which: int, tools: BspTools,
+                stack: wp.array(dtype=BspTask), output: BspOutput):
+    """Build the subtree of tasks[which], which is in slot `which` of `cells`; at depth 0 the cell is the root box."""
+    keep = tools.options.keep
+    root = tasks[which]
+    size = start_pieces(source, root.begin, root.end, tools.pieces)
+    if size < 0:
+        output.results[FULL] = 1
+        return
+    box_cell(tools.cells, 0, tools.options.lo, tools.options.hi)
+    root_area = cell_area(tools.cells, 0)
+    if root.depth > 0:
+        copy_cell(cells, which, tools.cells, 0)
+    root.end = root.end - root.begin
+    root.begin = 0
+    root.points_end = size
+    root.parent = -1
+    stack[0] = root
+    waiting = int(1)
+    used = int(root.end)
+    while waiting > 0:
+        waiting = waiting - 1
+        task = stack[waiting]
+        output.results[DEPTH] = wp.max(output.results[DEPTH], task.depth)
+        n = task.end - task.begin
+        left = output.results[N_LEFT_OVER]
+        if n <= keep and left < output.left_over.shape[0]:
+            output.left_over[left] = task
+            copy_cell(tools.cells, waiting, output.left_cells, left)
+            link(output, task, left, LEFT_OVER)
+            output.results[N_LEFT_OVER] = left + 1
+            continue
+        copy_cell(tools.cells, waiting, tools.cells, HAND)
+        scope = scope_of(tools, task, HAND)
+        share = wp.where(root_area > wp.float64(0.0), scope.area / root_area, wp.float64(1.0))
+        split = choose(tools, scope, task.depth)
+        if split.axis < 0:
+            if output.results[N_ORDER] + n > output.order.shape[0]:
+                output.results[FULL] = 1
+                return
+            output.cost[0] += share * wp.float64(n)
+            write_leaf(tools, output, task)
+            continue
+
+        # The pieces of cells that are left over must stay; else what lies beyond this cell's own has been dealt with.
+        base = wp.where(keep > 0, used, task.end)
+        if keep == 0:
+            size = task.points_end
+        if base + 2 * n > tools.pieces.prim_id.shape[0] or output.results[N_NODES] == output.nodes.shape[0]:
+            output.results[FULL] = 1
+            return
+        middle = base + count_below(tools, task, split)
+        ends = divide(tools, task, split, base, middle, size)
+        if ends[0] < 0:
+            output.results[FULL] = 1
+            return
+        used = ends[0]
+        size = ends[1]
+        output.cost[0] += share
+        index = write_node(output, task, split, plane_tolerance(split, scope))
+        for side in range(2):
+            child = BspTask()
+            child.begin = wp.where(side == 0, base, middle)
+            child.end = wp.where(side == 0, middle, used)
+            child.points_end = size
+            child.parent = index
+            child.side = side
+            child.depth = task.depth + 1
+            if child.end > child.begin:
+                sign = wp.where(side == 0, wp.float64(-1.0), wp.float64(1.0))
+                clip_cell(tools.cells, HAND, waiting, sign * split.normal, sign * split.offset, split.pad)
+                stack[waiting] = child
+                waiting = waiting + 1

@@ -1,0 +1,237 @@
+"""The cells of a BSP tree while it is built: convex polyhedra in float64, their surface, and what a plane makes of them.
+
+A cell is a list of faces, each a convex polygon of points that run counterclockwise seen from outside. Cells steer the surface
+area heuristic only: where a primitive is listed, and so which hits are found, never depends on them. Rounding in a sliver of a
+cell, or a cell with more faces than there is room for, costs quality and no hit.
+"""
+
+import warp as wp
+
+MAX_FACES = wp.constant(48)
+MAX_POINTS = wp.constant(288)  # a convex polyhedron of f faces has at most 6 f - 12 corners of faces
+
+
+@wp.struct
+class Cells:
+    """Cells in slots. Of slot s: n_faces[s]; face f has the points first[s * (MAX_FACES + 1) + f] up to that of f + 1, counted
+    from s * MAX_POINTS; area[s * MAX_FACES + f] is the face's."""
+
+    n_faces: wp.array(dtype=wp.int32)
+    first: wp.array(dtype=wp.int32)
+    points: wp.array(dtype=wp.vec3d)
+    area: wp.array(dtype=wp.float64)
+
+
+@wp.func
+def plane_side(n: wp.vec3d, d: wp.float64, p: wp.vec3d) -> wp.float64:
+    """n . p + d: above 0 on the side that the normal points to."""
+    return n[0] * p[0] + n[1] * p[1] + n[2] * p[2] + d
+
+
+@wp.func
+def snapped_side(n: wp.vec3d, d: wp.float64, eps: wp.float64, p: wp.vec3d) -> wp.float64:
+    """As plane_side, but 0 within eps of the plane: a face of the cell that lies in the plane does so with all its corners."""
+    s = plane_side(n, d, p)
+    return wp.where(wp.abs(s) > eps, s, wp.float64(0.0))
+
+
+@wp.func
+def crossing(p: wp.vec3d, q: wp.vec3d, s_p: wp.float64, s_q: wp.float64) -> wp.vec3d:
+    """Where the segment from p to q meets the plane; s_p and s_q are of opposite sign."""
+    return p + (s_p / (s_p - s_q)) * (q - p)
+
+
+@wp.func
+def box_cell(cells: Cells, slot: int, lo: wp.vec3d, hi: wp.vec3d):
+    """Write a box to a slot: six quads."""
+    for face in range(6):
+        axis = face / 2
+        a = (axis + 1) % 3
+        b = (axis + 2) % 3
+        for k in range(4):
+            # The square (0,0), (1,0), (1,1), (0,1) runs counterclockwise about +axis; the low face runs the other way.
+            i = wp.where(face % 2 == 1, k, 3 - k)
+            p = wp.vec3d()
+            p[axis] = wp.where(face % 2 == 1, hi[axis], lo[axis])
+            p[a] = wp.where(i == 1 or i == 2, hi[a], lo[a])
+            p[b] = wp.where(i >= 2, hi[b], lo[b])
+            cells.points[slot * MAX_POINTS + face * 4 + k] = p
+    for face in range(7):
+        cells.first[slot * (MAX_FACES + 1) + face] = 4 * face
+    cells.n_faces[slot] = 6
+    measure_cell(cells, slot)
+
+
+@wp.func
+def measure_cell(cells: Cells, slot: int):
+    """Fill in the areas of the faces."""
+    for face in range(cells.n_faces[slot]):
+        begin = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face]
+        end = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face + 1]
+        origin = cells.points[begin]
+        total = wp.vec3d()
+        for i in range(begin + 1, end - 1):
+            total += wp.cross(cells.points[i] - origin, cells.points[i + 1] - origin)
+        cells.area[slot * MAX_FACES + face] = wp.float64(0.5) * wp.length(total)
+
+
+@wp.func
+def cell_area(cells: Cells, slot: int) -> wp.float64:
+    """The surface of a cell."""
+    total = wp.float64(0.0)
+    for face in range(cells.n_faces[slot]):
+        total += cells.area[slot * MAX_FACES + face]
+    return total
+
+
+@wp.func
+def copy_cell(source: Cells, slot: int, target: Cells, to: int):
+    for face in range(source.n_faces[slot]):
+        target.area[to * MAX_FACES + face] = source.area[slot * MAX_FACES + face]
+    for face in range(source.n_faces[slot] + 1):
+        target.first[to * (MAX_FACES + 1) + face] = source.first[slot * (MAX_FACES + 1) + face]
+    for i in range(source.first[slot * (MAX_FACES + 1) + source.n_faces[slot]]):
+        target.points[to * MAX_POINTS + i] = source.points[slot * MAX_POINTS + i]
+    target.n_faces[to] = source.n_faces[slot]
+
+
+@wp.func
+def split_areas(cells: Cells, slot: int, n: wp.vec3d, d: wp.float64, eps: wp.float64) -> wp.vec2d:
+    """The surfaces of the parts of a cell below and above a plane, each with the cut itself.
+
+    The cut is a convex polygon with one edge for each face that the plane meets; its area is the sum of the triangles that
+    these edges make with one of its points, in whatever order they come. A plane in a face of the cell, or a cell without
+    volume, leaves a part without volume: both sides of the cut.
+    """
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    below = wp.float64(0.0)
+    above = wp.float64(0.0)
+    closing = wp.float64(0.0)
+    within = wp.float64(0.0)  # faces in the plane
+    cut = wp.vec3d()
+    on_cut = wp.vec3d()
+    met = bool(False)
+    for face in range(cells.n_faces[slot]):
+        begin = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face]
+        end = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face + 1]
+        p = cells.points[end - 1]
+        s_p = snapped_side(n, d, eps, p)
+        first = p
+        part = wp.vec3d()  # twice the area vector of what is above
+        down = p
+        up = p
+        crossed = bool(False)
+        highest = zero
+        lowest = zero
+        for i in range(begin, end):
+            q = cells.points[i]
+            s_q = snapped_side(n, d, eps, q)
+            highest = wp.max(highest, s_q)
+            lowest = wp.min(lowest, s_q)
+            if s_p >= zero and s_q >= zero:
+                part += wp.cross(p - first, q - first)
+            elif s_p >= zero:
+                down = crossing(p, q, s_p, s_q)
+                part += wp.cross(p - first, down - first)
+                crossed = True
+            elif s_q >= zero:
+                up = crossing(p, q, s_p, s_q)
+                part += wp.cross(up - first, q - first)
+                crossed = True
+            p = q
+            s_p = s_q
+        area = cells.area[slot * MAX_FACES + face]
+        if crossed:
+            part += wp.cross(down - first, up - first)
+            high = wp.min(half * wp.length(part), area)
+            above += high
+            below += area - high
+            if not met:
+                on_cut = down
+                met = True
+            cut += wp.cross(down - on_cut, up - on_cut)
+        elif highest > zero:
+            above += area
+        elif lowest < zero:
+            below += area
+        else:
+            closing = wp.max(closing, area)
+            within += area
+    closing = wp.max(closing, half * wp.length(cut))
+    within = wp.max(within, closing)
+    return wp.vec2d(wp.max(below + within, closing + closing), wp.max(above + within, closing + closing))
+
+
+@wp.func
+def clip_cell(cells: Cells, slot: int, to: int, n: wp.vec3d, d: wp.float64, eps: wp.float64):
+    """The part of a cell where n . p + d >= 0, to another slot. Where that is full, the whole cell."""
+    zero = wp.float64(0.0)
+    rim = wp.zeros(shape=48, dtype=wp.vec3d)
+    n_rim = int(0)
+    faces = int(0)
+    size = int(0)
+    base = to * MAX_POINTS
+    full = bool(False)
+    center = wp.vec3d()
+    for face in range(cells.n_faces[slot]):
+        begin = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face]
+        end = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face + 1]
+        start = int(size)
+        if size + (end - begin) + 2 > MAX_POINTS:
+            full = True
+            break
+        p = cells.points[end - 1]
+        s_p = snapped_side(n, d, eps, p)
+        leaves = int(0)
+        for i in range(begin, end):
+            q = cells.points[i]
+            s_q = snapped_side(n, d, eps, q)
+            if (s_p >= zero) != (s_q >= zero):
+                c = crossing(p, q, s_p, s_q)
+                if s_p != zero and s_q != zero:  # else one of the two is the crossing
+                    cells.points[base + size] = c
+                    size = size + 1
+                if s_p >= zero and leaves == 0 and n_rim < MAX_FACES:
+                    rim[n_rim] = c  # each corner of the cut is where one face leaves the kept side and another comes to it
+                    center += c
+                    n_rim = n_rim + 1
+                    leaves = 1
+            if s_q >= zero:
+                cells.points[base + size] = q
+                size = size + 1
+            p = q
+            s_p = s_q
+        if size - start >= 3:
+            cells.first[to * (MAX_FACES + 1) + faces] = start
+            faces = faces + 1
+        else:
+            size = start
+    if full or faces + 1 > MAX_FACES or size + n_rim > MAX_POINTS:
+        copy_cell(cells, slot, cells, to)
+        return
+
+    if n_rim >= 3:
+        # The cut closes the cell: its corners by their angle, counterclockwise about -n.
+        center = center / wp.float64(n_rim)
+        x_axis = wp.normalize(rim[0] - center)
+        y_axis = wp.cross(x_axis, n)
+        angle = wp.zeros(shape=48, dtype=wp.float64)
+        for i in range(n_rim):
+            c = rim[i]
+            a = wp.atan2(wp.dot(c - center, y_axis), wp.dot(c - center, x_axis))
+            k = int(i)
+            while k > 0 and angle[wp.max(k - 1, 0)] > a:
+                angle[k] = angle[k - 1]
+                rim[k] = rim[k - 1]
+                k = k - 1
+            angle[k] = a
+            rim[k] = c
+        cells.first[to * (MAX_FACES + 1) + faces] = size
+        for i in range(n_rim):
+            cells.points[base + size + i] = rim[i]
+        size = size + n_rim
+        faces = faces + 1
+    cells.first[to * (MAX_FACES + 1) + faces] = size
+    cells.n_faces[to] = faces
+    measure_cell(cells, to)

@@ -1,0 +1,248 @@
+"""The BSP builder's inner loop: planes through faces and edges beside those across an axis, on the CPU backend.
+
+Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree": of each triangle in a cell the plane of its face and, at right angles
+to it, the planes through its edges are tried, and the planes across an axis at the ends of what is in the cell. The one
+that costs least by the surface area heuristic over the parts of the (convex) cell is taken. Triangles are clipped to their cells.
+
+Everything is float64 but the planes, which are rounded to float32 before they are tried: what a plane does here is exactly
+what it does in the traversal unit, whose derivation of why no hit is lost says what the tolerances must be.
+"""
+
+import warp as wp
+
+from wrt.kernels.build_bsp_cell import Cells, plane_side, split_areas
+from wrt.kernels.traverse_bsp import PLANE, SMALLEST
+
+EXACT = wp.constant(24)  # up to so many primitives, planes across an axis are tried at the ends of each; above, at
+STEPS = wp.constant(32)  # so many even steps
+U = wp.constant(wp.float64(2.0**-24))
+OUTWARDS = wp.constant(wp.float64(1.0 + 2.0**-20))  # for what float64 or a conversion to float32 may have rounded down
+NO_SIZE = wp.constant(wp.float64(1e-200))
+NO_AREA = wp.constant(wp.float64(1e-30))  # of a triangle, relative to the square of its extent
+
+
+@wp.struct
+class Pieces:
+    """Primitives clipped to cells. Piece i is of primitive prim_id[i]: the convex polygon of the points first[i] ..
+    first[i] + count[i] - 1, or a whole sphere (count = 0); ball[i]: one around it (center, radius); extent[i]: of the whole
+    primitive, along an axis."""
+
+    prim_id: wp.array(dtype=wp.int32)
+    first: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    lo: wp.array(dtype=wp.vec3d)
+    hi: wp.array(dtype=wp.vec3d)
+    ball: wp.array(dtype=wp.vec4d)
+    extent: wp.array(dtype=wp.float64)
+    points: wp.array(dtype=wp.vec3d)
+
+
+@wp.struct
+class BspOptions:
+    """Costs of the heuristic; empty_bonus: factor on the cost of a plane that cuts off empty space; samples: triangles of a
+    cell whose planes are tried; keep: if not 0, cells of at most so many pieces are left over for later launches."""
+
+    cost_intersection: wp.float64
+    cost_axis: wp.float64
+    cost_plane: wp.float64
+    empty_bonus: wp.float64
+    samples: int
+    max_depth: int
+    keep: int
+    lo: wp.vec3d
+    hi: wp.vec3d
+
+
+@wp.struct
+class BspTools:
+    """What splits are tried with; corners: of all triangles, three each."""
+
+    pieces: Pieces
+    cells: Cells
+    corners: wp.array(dtype=wp.vec3d)
+    options: BspOptions
+
+
+@wp.struct
+class BspSplit:
+    """A plane, and what it costs; pad: what is within it of the plane need not be listed on that side; low_flat: what lies in
+    the plane goes below."""
+
+    normal: wp.vec3d
+    offset: wp.float64
+    axis: int
+    pad: wp.float64
+    low_flat: bool
+    cost: wp.float64
+
+
+@wp.struct
+class Scope:
+    """A cell to be split: pieces begin .. end - 1, their box, the farthest coordinates and the largest extent; the slot of the
+    cell, and its surface."""
+
+    begin: int
+    end: int
+    lo: wp.vec3d
+    hi: wp.vec3d
+    far: wp.vec3d
+    extent: wp.float64
+    slot: int
+    area: wp.float64
+
+
+@wp.func
+def plane_noise(split: BspSplit, far: wp.vec3d) -> wp.float64:
+    """sum |n_i| far_i + |d|: what the rounding of the plane's numbers and of values of it is relative to."""
+    return wp.dot(wp.abs(split.normal), far) + wp.abs(split.offset)
+
+
+@wp.func
+def plane_tolerance(split: BspSplit, scope: Scope) -> float:
+    """Half of the plane's thickness in the traversal unit: the builder's own pad, 8 u sqrt(3) of the longest extent, and 4 u of
+    the noise; a little more for the rounding of this."""
+    noise = plane_noise(split, scope.far)
+    total = split.pad + wp.float64(14.0) * U * scope.extent + wp.float64(4.0) * U * noise
+    return float(total * OUTWARDS) + SMALLEST
+
+
+@wp.func
+def extent_on(pieces: Pieces, i: int, split: BspSplit) -> wp.vec2d:
+    """Lowest and highest value of the plane on a piece; of its ball only where that is enough to tell the side."""
+    if split.axis < wp.static(PLANE):
+        return wp.vec2d(pieces.lo[i][split.axis] + split.offset, pieces.hi[i][split.axis] + split.offset)
+    ball = pieces.ball[i]
+    s = plane_side(split.normal, split.offset, wp.vec3d(ball[0], ball[1], ball[2]))
+    low = s - ball[3]
+    high = s + ball[3]
+    count = pieces.count[i]
+    if low >= -split.pad or high <= split.pad or count == 0:
+        return wp.vec2d(low, high)
+    first = pieces.first[i]
+    low = plane_side(split.normal, split.offset, pieces.points[first])
+    high = low
+    for k in range(first + 1, first + count):
+        s = plane_side(split.normal, split.offset, pieces.points[k])
+        low = wp.min(low, s)
+        high = wp.max(high, s)
+        if low < -split.pad and high > split.pad:
+            break
+    return wp.vec2d(low, high)
+
+
+@wp.func
+def sides_of(extent: wp.vec2d, split: BspSplit) -> int:
+    """On which sides a piece is listed: 1 below, 2 above, 3 both, 0 in the plane."""
+    return wp.where(extent[0] < -split.pad, 1, 0) + wp.where(extent[1] > split.pad, 2, 0)
+
+
+@wp.func
+def cheaper(tools: BspTools, scope: Scope, trial: BspSplit, best: BspSplit) -> BspSplit:
+    """The cheaper of two splits; counting stops where the rest cannot save the trial."""
+    if not wp.isfinite(trial.offset):
+        return best
+    trial.pad = wp.float64(2.0) * U * plane_noise(trial, scope.far)
+    areas = split_areas(tools.cells, scope.slot, trial.normal, trial.offset, trial.pad)
+    below = tools.options.cost_intersection * wp.min(areas[0] / scope.area, wp.float64(1.0))
+    above = tools.options.cost_intersection * wp.min(areas[1] / scope.area, wp.float64(1.0))
+    least = wp.min(below, above)
+    cost = wp.where(trial.axis < wp.static(PLANE), tools.options.cost_axis, tools.options.cost_plane)
+    cost += least * wp.float64(scope.end - scope.begin)
+    n_below = int(0)
+    n_above = int(0)
+    n_flat = int(0)
+    for i in range(scope.begin, scope.end):
+        sides = sides_of(extent_on(tools.pieces, i, trial), trial)
+        if sides == 3:
+            cost += below + above - least
+        elif sides == 1:
+            cost += below - least
+        elif sides == 2:
+            cost += above - least
+        else:
+            n_flat += 1
+        n_below += sides & 1
+        n_above += sides / 2
+        if cost * tools.options.empty_bonus >= best.cost:
+            return best
+    trial.low_flat = below <= above
+    if trial.low_flat:
+        n_below += n_flat
+    else:
+        n_above += n_flat
+    if n_below == 0 or n_above == 0:
+        cost = cost * tools.options.empty_bonus
+    if not cost < best.cost:
+        return best
+    trial.cost = cost
+    return trial
+
+
+@wp.func
+def across_axis(axis: int, position: wp.float64) -> BspSplit:
+    split = BspSplit()
+    split.normal[axis] = wp.float64(1.0)
+    split.offset = wp.float64(float(-position))
+    split.axis = axis
+    return split
+
+
+@wp.func
+def best_across(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
+    """The cheapest of `best` and planes across an axis: at the ends of every piece, or where there are many, at even steps."""
+    for axis in range(3):
+        if scope.end - scope.begin <= EXACT:
+            for i in range(scope.begin, scope.end):
+                low = across_axis(axis, tools.pieces.lo[i][axis])
+                high = across_axis(axis, tools.pieces.hi[i][axis])
+                best = cheaper(tools, scope, low, best)
+                if low.offset != high.offset:
+                    best = cheaper(tools, scope, high, best)
+        else:
+            step = (scope.hi[axis] - scope.lo[axis]) / wp.float64(STEPS)
+            for k in range(int(STEPS) + 1):
+                best = cheaper(tools, scope, across_axis(axis, scope.lo[axis] + wp.float64(k) * step), best)
+    return best
+
+
+@wp.func
+def plane_through(n: wp.vec3d, p: wp.vec3d) -> BspSplit:
+    """The plane at right angles to n (not 0) through p, as float32 holds it."""
+    split = BspSplit()
+    unit = wp.normalize(n)
+    split.normal = wp.vec3d(wp.vec3(unit))
+    split.offset = wp.float64(float(-wp.dot(split.normal, p)))
+    split.axis = wp.static(PLANE)
+    return split
+
+
+@wp.func
+def best_plane(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
+    """The cheapest of `best` and the planes of some triangles, evenly spread over the cell's list: face, and three edges."""
+    n = scope.end - scope.begin
+    tried = wp.min(n, tools.options.samples)
+    for k in range(tried):
+        i = scope.begin + int((wp.int64(k) * wp.int64(n)) / wp.int64(tried))
+        if tools.pieces.count[i] == 0:
+            continue
+        corner = 3 * tools.pieces.prim_id[i]
+        # Scaled to 1, so that no product over- or underflows.
+        scale = wp.float64(1.0) / wp.max(tools.pieces.extent[i], NO_SIZE)
+        edge_0 = (tools.corners[corner + 1] - tools.corners[corner]) * scale
+        edge_1 = (tools.corners[corner + 2] - tools.corners[corner + 1]) * scale
+        normal = wp.cross(edge_0, edge_1)
+        length = wp.length(normal)
+        if not length > NO_AREA:
+            continue
+        normal = normal / length
+        for side in range(4):
+            n_plane = normal
+            if side > 0:
+                edge = wp.where(side == 1, edge_0, wp.where(side == 2, edge_1, -edge_0 - edge_1))
+                if not wp.dot(edge, edge) > NO_AREA:
+                    continue
+                n_plane = wp.cross(normal, edge)
+            split = plane_through(n_plane, tools.corners[corner + side % 3])
+            if wp.max(wp.abs(split.normal)) < wp.float64(1.0):
+                best = cheaper(tools, scope, split, best)
+    return best

@@ -1,0 +1,242 @@
+"""The BSP tree: options, its shape, where primitives are listed, and rays for which planes of any orientation are hard."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
+import warp as wp
+
+import wrt.accel.bsp as module
+from tests.kernels.test_traverse import GEOMETRIES, assert_same_hits, rays_for, soup, triangles
+from wrt.accel import Geometry, build
+from wrt.accel.base import HitArrays
+from wrt.accel.bsp import Bsp
+from wrt.errors import InputError
+from wrt.kernels.query import make_closest_hit_kernel
+from wrt.kernels.structs import Surfaces
+from wrt.kernels.traverse_bsp import PLANE, STACK_SIZE
+from wrt.shapes import icosphere
+
+
+@pytest.mark.parametrize(("option", "value"), [
+    ("cost_intersection", 0.0), ("cost_axis", -1.0), ("cost_plane", np.inf), ("empty_bonus", 0.0), ("empty_bonus", 1.5),
+    ("samples", -1), ("max_depth", -1), ("max_depth", 61), ("max_depth", 3.5)])
+def test_options_out_of_range_are_refused(option: str, value: float) -> None:
+    with pytest.raises(InputError, match=option):
+        build(icosphere(0), "bsp", **{option: value})
+
+
+def test_a_mesh_that_is_too_large_is_refused_with_a_way_out() -> None:
+    with pytest.raises(InputError, match=r"max_triangles=19 .* 20: take another"):
+        build(icosphere(0), "bsp", max_triangles=19)
+    assert len(build(icosphere(0), "bsp", max_triangles=20).geometry) == 20
+
+
+def test_progress_rises_to_one() -> None:
+    seen: list[float] = []
+    build(icosphere(3), "bsp", progress=seen.append)
+    assert len(seen) > 2 and seen == sorted(seen) and seen[-1] == 1.0
+
+
+def test_an_error_of_progress_ends_the_build() -> None:
+    def stop(done: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        build(icosphere(3), "bsp", progress=stop)
+
+
+def test_threads_and_room_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def arrays() -> list[np.ndarray]:
+        built = build(icosphere(3), "bsp", threads=threads).built
+        return [*built.arrays.values(), built.order]
+
+    threads = 1
+    first = arrays()
+    threads = 2
+    monkeypatch.setattr(module, "ROOM", 1)  # doubled until it is enough
+    monkeypatch.setattr(module, "SPARE", 0)
+    for one, other in zip(first, arrays(), strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_more_subtrees_than_there_is_room_for_are_built_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "LEFT_OVERS", 2)
+    rng = np.random.default_rng(0)
+    geometry = soup(rng, 3000)
+    origin, direction = rays_for(geometry, rng, 2000)
+    assert_same_hits(build(geometry, "bsp").closest_hit(origin, direction), build(geometry, "bvh2").closest_hit(origin, direction))
+
+
+def test_samples_decide_whether_there_are_tilted_planes() -> None:
+    geometry = soup(np.random.default_rng(1), 400)
+    tree, kd = build(geometry, "bsp"), build(geometry, "bsp", samples=0)
+    assert (tree.built.arrays["nodes"]["axis"] == PLANE).mean() > 0.3
+    assert (kd.built.arrays["nodes"]["axis"] < PLANE).all()
+    assert tree.stats.sah_cost < kd.stats.sah_cost and tree.stats.references < kd.stats.references
+
+
+@pytest.mark.parametrize("kind", ["all_equal", "coincident", "progression", "flat", "tiny_and_huge", "long_thin"])
+def test_depth_is_bounded(kind: str) -> None:
+    for options in ({}, {"cost_plane": 1e-3, "cost_axis": 1e-3, "empty_bonus": 0.5}, {"max_depth": 3}):
+        stats = build(GEOMETRIES[kind](np.random.default_rng(2)), "bsp", **options).stats
+        assert stats.depth <= options.get("max_depth", STACK_SIZE - 4) + 1
+
+
+# --- where primitives are listed --------------------------------------------------------------------------------------
+
+
+def leaves_of(tree: Bsp, point: np.ndarray) -> set[int]:
+    """Primitives of all leaves that a point is in, by no more than the tolerance of a plane; in float64."""
+    arrays, order = tree.built.arrays, tree.built.order
+    todo, found = [(int(arrays["first"][0]), int(arrays["count"][0]))], set()
+    while todo:
+        first, count = todo.pop()
+        if count >= 0:
+            found |= set(order[first : first + count].tolist())
+            continue
+        node = arrays["nodes"][first]
+        axis = int(node["axis"])
+        value = point[axis] if axis < PLANE else np.dot(node["normal"].astype(np.float64), point)
+        value += float(node["offset"])
+        if value <= node["tolerance"]:
+            todo.append((int(node["first_0"]), int(node["count_0"])))
+        if value >= -node["tolerance"]:
+            todo.append((int(node["first_1"]), int(node["count_1"])))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["soup", "long_thin", "coincident", "flat", "progression", "tiny_and_huge", "mixed"])
+def test_every_point_of_a_primitive_is_in_a_leaf_that_lists_it(kind: str) -> None:
+    rng = np.random.default_rng(3)
+    geometry = GEOMETRIES[kind](rng)
+    tree = build(geometry, "bsp")
+    assert isinstance(tree, Bsp)
+    for _ in range(400):
+        i = int(rng.integers(len(geometry)))
+        if i < len(geometry.faces):
+            weights = rng.dirichlet(np.full(3, 0.3))
+            if rng.random() < 0.4:  # on an edge, or at a corner
+                weights = np.roll([1.0 - (s := rng.choice([0.0, rng.random()])), s, 0.0], rng.integers(3))
+            point = weights @ geometry.vertices[geometry.faces[i]].astype(np.float64)
+        else:
+            sphere = geometry.spheres[i - len(geometry.faces)].astype(np.float64)
+            point = sphere[:3] + sphere[3] * unit(rng.normal(size=3))
+        assert i in leaves_of(tree, point)
+
+
+# --- rays for which such a tree is hard -------------------------------------------------------------------------------
+
+
+def rays_in_planes(geometry: Geometry, rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays within the planes of faces, along edges and towards corners: where the tree has its planes."""
+    corner = geometry.vertices[geometry.faces].astype(np.float64)[rng.integers(len(geometry.faces), size=n)]
+    a, b, c = (corner[np.arange(n), (rng.integers(3, size=n) + k) % 3] for k in range(3))
+    inside = np.einsum("ni,nij->nj", rng.dirichlet(np.ones(3), n), corner)
+    kind = (np.arange(n) % 4)[:, None]
+    target = np.where(kind == 0, inside, np.where(kind == 1, a + rng.random((n, 1)) * (b - a), a))
+    along = np.where(kind == 2, b - a, rng.normal(size=(n, 1)) * (b - a) + rng.normal(size=(n, 1)) * (c - a))
+    along = np.where(kind == 3, rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(-9, 0, (n, 3)), along)
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    along = along / np.where(length > 0.0, length, 1.0) * (np.abs(geometry.vertices).max() + 1e-30)
+    origin = rounded(target - along * rng.choice([0.0, 0.3, 3.0], (n, 1)))
+    direction = rounded(np.where(rng.random((n, 1)) < 0.5, along, target + along - origin))
+    direction[~direction.any(axis=1), 0] = 1.0
+    return origin, direction
+
+
+def turned_grid(rng: np.random.Generator) -> Geometry:
+    """A curved sheet of squares, turned out of the axes: neighbours share corners, and nearly planes."""
+    n = 12
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    vertices = np.stack([i, j, 0.02 * (i - j) ** 2], axis=-1).reshape(-1, 3) / n
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    first = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1, 1)
+    faces = np.concatenate([first + np.array([0, n, n + 1]), first + np.array([0, n + 1, 1])])
+    return triangles((vertices @ turn.T)[faces])
+
+
+HARD = {**{kind: GEOMETRIES[kind] for kind in ("soup", "long_thin", "flat", "progression", "tiny_and_huge")},
+        "turned_grid": turned_grid, "ball": lambda rng: Geometry.of(icosphere(3))}
+
+
+@pytest.mark.parametrize("kind", HARD)
+def test_rays_within_the_trees_planes_lose_nothing(kind: str) -> None:
+    rng = np.random.default_rng(4)
+    geometry = HARD[kind](rng)
+    tree, brute = build(geometry, "bsp"), build(geometry, "brute_force")
+    origin, direction = rays_in_planes(geometry, rng, 8000)
+    expected = brute.closest_hit(origin, direction)
+    assert_same_hits(tree.closest_hit(origin, direction), expected)
+    # A segment that begins and ends at the hit: the tree may not cut off the cell where the hit's triangle is listed.
+    on = expected.prim_id >= 0
+    t = expected.t[on]
+    assert on.sum() > 100
+    assert_same_hits(tree.closest_hit(origin[on], direction[on], t, t), brute.closest_hit(origin[on], direction[on], t, t))
+    assert tree.any_hit(origin[on], direction[on], t, t).all()
+
+
+# --- cost -------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def never(surfaces: Surfaces, prim_id: int, u: float, v: float) -> bool:
+    return False
+
+
+@cache
+def refusing_kernel():
+    """Counts, and refuses every hit: a ray goes all the way."""
+    structure = build(icosphere(0), "bsp").structure
+    structure = structure._replace(units=structure.units._replace(counters=True))
+    return make_closest_hit_kernel(structure.struct, structure.traversal(any_hit=False, accepts=never))
+
+
+def lines_through(lo: np.ndarray, hi: np.ndarray, rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform random lines that meet a box, as rays from outside."""
+    center, radius = 0.5 * (lo + hi), 0.5 * np.linalg.norm(hi - lo)
+    direction = unit(rng.normal(size=(n, 3)))
+    x = unit(np.cross(direction, rng.normal(size=(n, 3))))
+    angle, r = 2.0 * np.pi * rng.random((n, 1)), radius * np.sqrt(rng.random((n, 1)))
+    origin = center + r * (np.cos(angle) * x + np.sin(angle) * np.cross(direction, x)) - 2.0 * radius * direction
+    with np.errstate(divide="ignore"):
+        t = (np.stack([lo, hi])[:, None] - origin) / direction
+    meets = t.min(axis=0).max(axis=1) <= t.max(axis=0).min(axis=1)
+    return origin[meets].astype(np.float32), direction[meets].astype(np.float32)
+
+
+@pytest.mark.parametrize("options", [{}, {"cost_intersection": 1.0, "cost_axis": 1.0, "cost_plane": 1.0}, {"samples": 0}])
+@pytest.mark.parametrize("kind", ["soup", "ball", "turned_grid"])
+def test_random_lines_cost_what_the_heuristic_says(kind: str, options: dict[str, float]) -> None:
+    rng = np.random.default_rng(5)
+    tree = build(HARD[kind](rng), "bsp", **options)
+    lo, hi = (np.array(tree.built.arrays[name], np.float64) for name in ("lo", "hi"))
+    rays, _ = tree._rays(*lines_through(lo, hi, rng, 40_000), 0.0, np.inf)
+    hits = HitArrays()
+    hits.t, hits.u, hits.v = (wp.zeros(len(rays.t_min), dtype=wp.float32, device="cpu") for _ in range(3))
+    hits.prim_id = wp.zeros(len(rays.t_min), dtype=wp.int32, device="cpu")
+    counts = tree._counted(lambda structure: refusing_kernel(), rays, hits, False, None).counts
+    steps = counts["nodes"] + counts["primitives"]
+    assert abs(steps.mean() - tree.stats.sah_cost) < 3.0 * steps.std() / np.sqrt(len(steps))
+
+
+# --- what comes from a file -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("field", "row", "value", "message"), [
+    ("first_0", 0, 0, "leads out"), ("first_1", 0, 10**8, "leads out"), ("count_0", 0, -2, "leads out"), ("axis", 2, 4, "no tree"),
+    ("axis", 2, -1, "no tree"), ("count_1", 0, 0, "no tree"), ("first_0", 0, 2, "no tree")])
+def test_a_damaged_tree_is_refused(field: str, row: int, value: int, message: str) -> None:
+    tree = build(icosphere(2), "bsp")
+    nodes = tree.built.arrays["nodes"].copy()
+    assert nodes["count_0"][0] == nodes["count_1"][0] == -1
+    nodes[field][row] = value
+    spoiled = replace(tree.built, arrays=tree.built.arrays | {"nodes": nodes})
+    with pytest.raises(InputError, match=message):
+        Bsp.restore(spoiled, tree.geometry)
+    assert isinstance(Bsp.restore(tree.built, tree.geometry), Bsp)

@@ -1,0 +1,238 @@
+"""The BSP tree: cells cut by planes of any orientation (the loops are Warp kernels, kernels/build_bsp*.py)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Accelerator, Built, Geometry
+from wrt.device import load_kernel, records, run_all, start, upload
+from wrt.errors import InputError
+from wrt.kernels import build_bsp
+from wrt.kernels import traverse_bsp as kernels
+from wrt.kernels.build_bsp_cell import MAX_FACES, MAX_POINTS, Cells
+from wrt.kernels.build_bsp_split import BspOptions, BspTools, Pieces
+
+MAX_DEPTH = 60  # below the traversal unit's stack
+ROOM = 8  # pieces at a time, nodes and references for each primitive; more where that is not enough
+SPARE = 1024
+LEFT_OVERS = 1024  # subtrees at most that are built on their own
+PIECE = {"prim_id": (wp.int32, ()), "first": (wp.int32, ()), "count": (wp.int32, ()), "lo": (wp.vec3d, (3,)),
+         "hi": (wp.vec3d, (3,)), "ball": (wp.vec4d, (4,)), "extent": (wp.float64, ())}
+
+
+class Bsp(Accelerator):
+    """Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Slow to build: a subset of all triangles' planes is tried.
+
+    Options: cost_intersection, cost_axis, cost_plane (of one primitive, of a node across an axis, of any other; the defaults
+    are those of the Manta renderer); empty_bonus (0 to 1: factor on the cost of a plane that cuts off empty space); samples
+    (0 or more: so many triangles of a cell, evenly spread over its list, give their four planes as candidates; 0: a k-d tree);
+    max_depth (1 to 60; 0: 16 + 2 log2 of the number of primitives); max_triangles (more primitives are refused); progress:
+    called with the fraction that is done, 0 to 1, from the thread that builds.
+    """
+
+    name = "bsp"
+    kernels = kernels
+
+    def _build(self, cost_intersection: float = 75.0, cost_axis: float = 10.0, cost_plane: float = 20.0, empty_bonus: float = 1.0,
+               samples: int = 32, max_depth: int = 0, max_triangles: int = 200_000,
+               progress: Callable[[float], None] | None = None) -> Built:
+        n = len(self.geometry)
+        for name, value in (("cost_intersection", cost_intersection), ("cost_axis", cost_axis), ("cost_plane", cost_plane)):
+            if not 0.0 < value < math.inf:
+                raise InputError(f"{name} must be above 0 and finite, got {value}")
+        if not 0.0 < empty_bonus <= 1.0:
+            raise InputError(f"empty_bonus must be above 0 and at most 1, got {empty_bonus}")
+        if samples < 0:
+            raise InputError(f"samples must be 0 or more, got {samples}")
+        if not 0 <= max_depth <= MAX_DEPTH:
+            raise InputError(f"max_depth must be 0 to {MAX_DEPTH}, got {max_depth}")
+        if n > max_triangles:
+            raise InputError(f"bsp is slow to build, and takes up to max_triangles={max_triangles} primitives; there are {n}: take "
+                             "another structure (kdtree, bvh), or raise max_triangles")
+        if n == 0:
+            return Built({"nodes": records(kernels.BspNode, 0), "lo": np.full(3, np.inf), "hi": np.full(3, -np.inf),
+                          "first": np.zeros(1, np.int32), "count": np.zeros(1, np.int32)}, np.zeros(0, np.int32), sah_cost=0.0)
+        lo, hi = (bound.astype(np.float64) for bound in self.geometry.bounds())
+        options = BspOptions()
+        options.cost_intersection, options.cost_axis, options.cost_plane = cost_intersection, cost_axis, cost_plane
+        options.empty_bonus, options.samples, options.max_depth = empty_bonus, samples, max_depth or automatic_depth(n)
+        options.lo, options.hi = wp.vec3d(lo.min(axis=0)), wp.vec3d(hi.max(axis=0))
+        builder = Builder(self.geometry, options, self.threads, progress or (lambda done: None))
+        return builder.build()
+
+    def _check(self, built: Built) -> None:
+        check_planes(built)
+
+
+def automatic_depth(n: int) -> int:
+    """The depth at which cells of n primitives are split no more, whatever the heuristic would like."""
+    return min(MAX_DEPTH, 16 + 2 * math.ceil(math.log2(n)))
+
+
+class Launch:
+    """One launch of the kernel with room for so many pieces; `results`, `nodes`, `order` and `cost` are its outcome."""
+
+    def __init__(self, corners: Any, options: Any, room: int, left_overs: int) -> None:
+        self.cpu = start("cpu")
+        self.room = room
+        self.tools = BspTools()
+        self.tools.pieces = pieces_of(room, 6 * room + 1024)
+        self.tools.cells = cells_of(build_bsp.CELL_SLOTS)
+        self.tools.corners, self.tools.options = corners, options
+        self.stack = wp.empty(build_bsp.CELL_SLOTS, dtype=build_bsp.BspTask, device=self.cpu)
+        self.output = build_bsp.BspOutput()
+        self.output.nodes = wp.empty(room, dtype=kernels.BspNode, device=self.cpu)
+        self.output.order = wp.empty(room, dtype=wp.int32, device=self.cpu)
+        self.output.left_over = wp.empty(left_overs, dtype=build_bsp.BspTask, device=self.cpu)
+        self.output.left_cells = cells_of(left_overs)
+        self.output.results = wp.zeros(build_bsp.N_RESULTS, dtype=wp.int32, device=self.cpu)
+        self.output.cost = wp.zeros(1, dtype=wp.float64, device=self.cpu)
+
+    def run(self, source: Any, tasks: Any, cells: Any, which: int) -> bool:
+        """False where there was no room."""
+        wp.launch(build_bsp.build_cells, dim=1, device=self.cpu,
+                  inputs=[source, tasks, cells, which, self.tools, self.stack, self.output])
+        self.results = self.output.results.numpy().copy()
+        self.nodes = self.output.nodes.numpy()[: self.results[build_bsp.N_NODES]].copy()
+        self.order = self.output.order.numpy()[: self.results[build_bsp.N_ORDER]].copy()
+        self.cost = float(self.output.cost.numpy()[0])
+        return not self.results[build_bsp.FULL]
+
+
+class Subtree:
+    """What is kept of a launch that built one subtree."""
+
+    def __init__(self, launch: Launch) -> None:
+        self.results, self.nodes, self.order, self.cost = launch.results, launch.nodes, launch.order, launch.cost
+
+
+class Builder:
+    """The top of the tree in one launch, then the cells that it leaves over, largest first, on all threads."""
+
+    def __init__(self, geometry: Geometry, options: Any, threads: int, progress: Callable[[float], None]) -> None:
+        self.options, self.threads, self.progress = options, threads, progress
+        self.source, corners = start_pieces(geometry)
+        self.n = len(geometry)
+        self.corners = upload(corners, wp.vec3d, start("cpu"))
+        self.done = 0
+
+    def launch(self, source: Any, tasks: Any, cells: Any, which: int, n: int, keep: int) -> Launch:
+        """Launch with more and more room until it is enough."""
+        room = ROOM * n + SPARE
+        self.options.keep = keep
+        while True:
+            launch = Launch(self.corners, self.options, room, LEFT_OVERS if keep else 0)
+            if launch.run(source, tasks, cells, which):
+                return launch
+            room *= 2
+
+    def build(self) -> Built:
+        load_kernel(build_bsp.build_cells, start("cpu"))
+        keep = max(self.n // 64, 512)
+        root = records(build_bsp.BspTask, 1)
+        root["end"] = self.n
+        top = self.launch(self.source, upload(root, build_bsp.BspTask, start("cpu")), cells_of(0), 0, self.n,
+                          keep if self.n > keep else 0)
+        tasks = top.output.left_over.numpy()[: top.results[build_bsp.N_LEFT_OVER]]
+        size = tasks["end"] - tasks["begin"]
+        subtrees: list[Subtree | None] = [None] * len(tasks)
+
+        def job(i: int) -> None:
+            subtrees[i] = Subtree(self.launch(top.tools.pieces, top.output.left_over, top.output.left_cells, i, int(size[i]), 0))
+            self.done += int(size[i])
+            self.progress(self.done / max(int(size.sum()), 1))
+
+        run_all([partial(job, int(i)) for i in np.argsort(-size, kind="stable")], self.threads)
+        return self.join(top, [subtree for subtree in subtrees if subtree is not None])
+
+    def join(self, top: Launch, subtrees: list[Subtree]) -> Built:
+        """One array of nodes, the top first, and one of primitives."""
+        parts = [Subtree(top), *subtrees]
+        first_node = np.cumsum([0] + [len(part.nodes) for part in parts])
+        first_primitive = np.cumsum([0] + [len(part.order) for part in parts])
+        for k, part in enumerate(parts):
+            for side in ("0", "1"):
+                first, count = part.nodes["first_" + side], part.nodes["count_" + side]
+                moved = np.where(count == kernels.INNER, first_node[k], np.where(count > 0, first_primitive[k], 0))
+                first += moved.astype(np.int32)
+        roots = np.array([part.results[[build_bsp.ROOT_FIRST, build_bsp.ROOT_COUNT]] for part in parts])
+        roots[:, 0] += np.where(roots[:, 1] == kernels.INNER, first_node[:-1], first_primitive[:-1])
+        for side in ("0", "1"):
+            nodes = parts[0].nodes
+            left = np.nonzero(nodes["count_" + side] == build_bsp.LEFT_OVER)[0]
+            root = roots[1 + nodes["first_" + side][left]]
+            nodes["first_" + side][left], nodes["count_" + side][left] = root[:, 0], root[:, 1]
+        arrays = {"nodes": np.concatenate([part.nodes for part in parts]), "first": roots[0, :1], "count": roots[0, 1:],
+                  "lo": np.array(self.options.lo), "hi": np.array(self.options.hi)}
+        results = np.array([part.results for part in parts])
+        return Built(arrays, np.concatenate([part.order for part in parts]), int(first_node[-1]),
+                     int(results[:, build_bsp.LEAVES].sum()), int(results[:, build_bsp.DEPTH].max()) + 1,
+                     sum(part.cost for part in parts))
+
+
+def pieces_of(n: int, points: int) -> Any:
+    """Room for n pieces with so many points together."""
+    pieces = Pieces()
+    for name, (dtype, _) in PIECE.items():
+        setattr(pieces, name, wp.empty(n, dtype=dtype, device=start("cpu")))
+    pieces.points = wp.empty(points, dtype=wp.vec3d, device=start("cpu"))
+    return pieces
+
+
+def cells_of(slots: int) -> Any:
+    cells, cpu = Cells(), start("cpu")
+    cells.n_faces = wp.zeros(slots, dtype=wp.int32, device=cpu)
+    cells.first = wp.zeros(slots * (MAX_FACES + 1), dtype=wp.int32, device=cpu)
+    cells.points = wp.zeros(slots * MAX_POINTS, dtype=wp.vec3d, device=cpu)
+    cells.area = wp.zeros(slots * MAX_FACES, dtype=wp.float64, device=cpu)
+    return cells
+
+
+def start_pieces(geometry: Geometry) -> tuple[Any, np.ndarray]:
+    """Every primitive as a piece, and the corners of the triangles, (3 F, 3) float64."""
+    n, triangles = len(geometry), len(geometry.faces)
+    corners = geometry.vertices[geometry.faces].astype(np.float64)
+    spheres = geometry.spheres.astype(np.float64)
+    lo = np.concatenate([corners.min(axis=1, initial=np.inf), spheres[:, :3] - spheres[:, 3:]])
+    hi = np.concatenate([corners.max(axis=1, initial=-np.inf), spheres[:, :3] + spheres[:, 3:]])
+    middle = 0.5 * (lo + hi)
+    radius = np.concatenate([np.linalg.norm(corners - middle[:triangles, None], axis=2).max(axis=1, initial=0.0), spheres[:, 3]])
+    values = {"prim_id": np.arange(n), "first": 3 * np.arange(n), "count": np.where(np.arange(n) < triangles, 3, 0), "lo": lo,
+              "hi": hi, "ball": np.concatenate([middle, radius[:, None] * (1.0 + 2.0**-40)], axis=1),
+              "extent": (hi - lo).max(axis=1, initial=0.0)}
+    pieces, cpu = Pieces(), start("cpu")
+    for name, (dtype, shape) in PIECE.items():
+        setattr(pieces, name, upload(values[name].reshape(n, *shape), dtype, cpu))
+    pieces.points = upload(corners.reshape(-1, 3), wp.vec3d, cpu)
+    return pieces, corners.reshape(-1, 3)
+
+
+def check_planes(built: Built) -> None:
+    """Raise InputError unless the nodes are a tree, no deeper than the stack, over the primitives in `order`."""
+    nodes, root_first, root_count = (built.arrays[name] for name in ("nodes", "first", "count"))
+    n = len(nodes)
+    parents, children = np.zeros(n + 1, np.int64), []
+    for parent, first, count in ((np.array([-1]), root_first.reshape(1), root_count.reshape(1)),
+                                 *((np.arange(n), nodes[f"first_{side}"], nodes[f"count_{side}"]) for side in "01")):
+        first, inner = first.astype(np.int64), count == kernels.INNER
+        # A child stands behind its parent: no walk returns to where it was.
+        if ((count < 0) & ~inner).any() or (inner & ((first <= parent) | (first >= n))).any() or (
+                (count > 0) & ((first < 0) | (first + count > len(built.order)))).any():
+            raise InputError("is damaged: a node leads out of the tree")
+        parents += np.bincount(first[inner], minlength=n + 1)
+        children.append(np.where(inner, first, -1))
+    if (parents[:n] != 1).any() or ((nodes["axis"] < 0) | (nodes["axis"] > kernels.PLANE)).any():
+        raise InputError("is damaged: its nodes are no tree")
+    level, depth = children[0][children[0] >= 0], 0
+    while len(level):
+        depth += 1
+        if depth > kernels.STACK_SIZE:
+            raise InputError(f"is damaged: deeper than {kernels.STACK_SIZE}")
+        level = np.concatenate([child[level] for child in children[1:]])
+        level = level[level >= 0]
