@@ -42,7 +42,7 @@ N_RESULTS = 8
 @wp.struct
 class BspTask:
     """A cell to be built: pieces begin .. end - 1, whose points end before points_end; the link to it is that of `parent` to its
-    child `side` (parent < 0: the root's)."""
+    child `side` (parent < 0: the root's); budget: how many references its leaves may have together."""
 
     begin: int
     end: int
@@ -50,6 +50,7 @@ class BspTask:
     parent: int
     side: int
     depth: int
+    budget: int
 
 
 @wp.struct
@@ -133,6 +134,7 @@ def scope_of(tools: BspTools, task: BspTask, slot: int) -> Scope:
         scope.extent = wp.max(scope.extent, tools.pieces.extent[i])
     scope.far = wp.max(wp.abs(scope.lo), wp.abs(scope.hi))
     scope.slot = slot
+    scope.budget = task.budget
     scope.area = cell_area(tools.cells, slot)
     return scope
 
@@ -312,6 +314,7 @@ def build_cells(source: Pieces, tasks: wp.array(dtype=BspTask), cells: Cells, wh
             child.parent = index
             child.side = side
             child.depth = task.depth + 1
+            child.budget = int(wp.int64(task.budget) * wp.int64(child.end - child.begin) / wp.int64(used - base))
             if child.end > child.begin:
                 sign = wp.where(side == 0, wp.float64(-1.0), wp.float64(1.0))
                 clip_cell(tools.cells, HAND, waiting, sign * split.normal, sign * split.offset, split.pad)

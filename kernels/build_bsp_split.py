@@ -17,6 +17,7 @@ EXACT = wp.constant(24)  # up to so many primitives, planes across an axis are t
 STEPS = wp.constant(32)  # so many even steps
 U = wp.constant(wp.float64(2.0**-24))
 OUTWARDS = wp.constant(wp.float64(1.0 + 2.0**-20))  # for what float64 or a conversion to float32 may have rounded down
+FLAT = wp.constant(wp.float64(2.0**-16))  # what is within so much of its cell's size of a plane lies in it
 NO_SIZE = wp.constant(wp.float64(1e-200))
 NO_AREA = wp.constant(wp.float64(1e-30))  # of a triangle, relative to the square of its extent
 
@@ -79,7 +80,7 @@ class BspSplit:
 @wp.struct
 class Scope:
     """A cell to be split: pieces begin .. end - 1, their box, the farthest coordinates and the largest extent; the slot of the
-    cell, and its surface."""
+    cell, its surface, and how many references its subtree may have."""
 
     begin: int
     end: int
@@ -89,6 +90,7 @@ class Scope:
     extent: wp.float64
     slot: int
     area: wp.float64
+    budget: int
 
 
 @wp.func
@@ -141,7 +143,9 @@ def cheaper(tools: BspTools, scope: Scope, trial: BspSplit, best: BspSplit) -> B
     """The cheaper of two splits; counting stops where the rest cannot save the trial."""
     if not wp.isfinite(trial.offset):
         return best
-    trial.pad = wp.float64(2.0) * U * plane_noise(trial, scope.far)
+    # Slivers thinner than the traversal unit tells apart are visited together: a plane that makes some gains nothing.
+    size = scope.hi - scope.lo
+    trial.pad = wp.max(FLAT * wp.max(size), wp.float64(2.0) * U * plane_noise(trial, scope.far))
     areas = split_areas(tools.cells, scope.slot, trial.normal, trial.offset, trial.pad)
     below = tools.options.cost_intersection * wp.min(areas[0] / scope.area, wp.float64(1.0))
     above = tools.options.cost_intersection * wp.min(areas[1] / scope.area, wp.float64(1.0))
@@ -170,6 +174,8 @@ def cheaper(tools: BspTools, scope: Scope, trial: BspSplit, best: BspSplit) -> B
         n_below += n_flat
     else:
         n_above += n_flat
+    if n_below + n_above > scope.budget:
+        return best
     if n_below == 0 or n_above == 0:
         cost = cost * tools.options.empty_bonus
     if not cost < best.cost:

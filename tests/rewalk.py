@@ -367,9 +367,10 @@ def bsp(accel, ray: WalkRay) -> Walk:
 
 REWALK: dict[str, Callable[..., Walk]] = {
     "brute_force": brute_force,
-    "bvh2": bvh2, "bsp": bsp,
+    "bvh2": bvh2,
     "bvh4": wide,
     "bvh8": wide,
     "kdtree": kdtree,
+    "bsp": bsp,
     "grid": grid,
 }

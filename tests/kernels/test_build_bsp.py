@@ -1,5 +1,7 @@
 """The BSP builder's geometry: cells cut by planes, and triangles clipped to cells, against convex hulls and areas."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -44,7 +46,7 @@ def cut(lo, hi, normals, offsets, eps=1e-12):
 def faces_of(cells, slot):
     first = cells.first.numpy()[slot * (MAX_FACES + 1) :][: cells.n_faces.numpy()[slot] + 1]
     points = cells.points.numpy()[slot * MAX_POINTS :]
-    return [points[a:b] for a, b in zip(first[:-1], first[1:], strict=True)]
+    return [points[a:b] for a, b in pairwise(first)]
 
 
 def test_a_cube_by_planes_whose_cuts_are_known():

@@ -25,7 +25,7 @@ from wrt.shapes import icosphere
 
 @pytest.mark.parametrize(("option", "value"), [
     ("cost_intersection", 0.0), ("cost_axis", -1.0), ("cost_plane", np.inf), ("empty_bonus", 0.0), ("empty_bonus", 1.5),
-    ("samples", -1), ("max_depth", -1), ("max_depth", 61), ("max_depth", 3.5)])
+    ("samples", -1), ("max_depth", -1), ("max_depth", 61), ("max_depth", 3.5), ("max_growth", 0.5), ("max_growth", np.nan)])
 def test_options_out_of_range_are_refused(option: str, value: float) -> None:
     with pytest.raises(InputError, match=option):
         build(icosphere(0), "bsp", **{option: value})
@@ -86,6 +86,14 @@ def test_depth_is_bounded(kind: str) -> None:
     for options in ({}, {"cost_plane": 1e-3, "cost_axis": 1e-3, "empty_bonus": 0.5}, {"max_depth": 3}):
         stats = build(GEOMETRIES[kind](np.random.default_rng(2)), "bsp", **options).stats
         assert stats.depth <= options.get("max_depth", STACK_SIZE - 4) + 1
+
+
+@pytest.mark.parametrize("max_growth", [1.0, 2.5, 16.0])
+def test_references_are_bounded(max_growth: float) -> None:
+    # Each point is covered by many triangles, so that more and more splits seem to pay.
+    geometry = GEOMETRIES["flat"](np.random.default_rng(2))
+    stats = build(geometry, "bsp", max_growth=max_growth).stats
+    assert len(geometry) <= stats.references <= max_growth * len(geometry)
 
 
 # --- where primitives are listed --------------------------------------------------------------------------------------

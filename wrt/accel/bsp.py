@@ -32,7 +32,8 @@ class Bsp(Accelerator):
     Options: cost_intersection, cost_axis, cost_plane (of one primitive, of a node across an axis, of any other; the defaults
     are those of the Manta renderer); empty_bonus (0 to 1: factor on the cost of a plane that cuts off empty space); samples
     (0 or more: so many triangles of a cell, evenly spread over its list, give their four planes as candidates; 0: a k-d tree);
-    max_depth (1 to 60; 0: 16 + 2 log2 of the number of primitives); max_triangles (more primitives are refused); progress:
+    max_depth (1 to 60; 0: 16 + 2 log2 of the number of primitives); max_growth (1 to 1000: references in all leaves for
+    each primitive; a cell may use up its share of them, by how many it has); max_triangles (more primitives are refused); progress:
     called with the fraction that is done, 0 to 1, from the thread that builds.
     """
 
@@ -40,7 +41,7 @@ class Bsp(Accelerator):
     kernels = kernels
 
     def _build(self, cost_intersection: float = 75.0, cost_axis: float = 10.0, cost_plane: float = 20.0, empty_bonus: float = 1.0,
-               samples: int = 32, max_depth: int = 0, max_triangles: int = 200_000,
+               samples: int = 32, max_depth: int = 0, max_growth: float = 16.0, max_triangles: int = 200_000,
                progress: Callable[[float], None] | None = None) -> Built:
         n = len(self.geometry)
         for name, value in (("cost_intersection", cost_intersection), ("cost_axis", cost_axis), ("cost_plane", cost_plane)):
@@ -52,6 +53,8 @@ class Bsp(Accelerator):
             raise InputError(f"samples must be 0 or more, got {samples}")
         if not 0 <= max_depth <= MAX_DEPTH:
             raise InputError(f"max_depth must be 0 to {MAX_DEPTH}, got {max_depth}")
+        if not 1.0 <= max_growth <= 1000.0:
+            raise InputError(f"max_growth must be 1 to 1000, got {max_growth}")
         if n > max_triangles:
             raise InputError(f"bsp is slow to build, and takes up to max_triangles={max_triangles} primitives; there are {n}: take "
                              "another structure (kdtree, bvh), or raise max_triangles")
@@ -63,7 +66,7 @@ class Bsp(Accelerator):
         options.cost_intersection, options.cost_axis, options.cost_plane = cost_intersection, cost_axis, cost_plane
         options.empty_bonus, options.samples, options.max_depth = empty_bonus, samples, max_depth or automatic_depth(n)
         options.lo, options.hi = wp.vec3d(lo.min(axis=0)), wp.vec3d(hi.max(axis=0))
-        builder = Builder(self.geometry, options, self.threads, progress or (lambda done: None))
+        builder = Builder(self.geometry, options, self.threads, int(max_growth * n), progress or (lambda done: None))
         return builder.build()
 
     def _check(self, built: Built) -> None:
@@ -115,8 +118,8 @@ class Subtree:
 class Builder:
     """The top of the tree in one launch, then the cells that it leaves over, largest first, on all threads."""
 
-    def __init__(self, geometry: Geometry, options: Any, threads: int, progress: Callable[[float], None]) -> None:
-        self.options, self.threads, self.progress = options, threads, progress
+    def __init__(self, geometry: Geometry, options: Any, threads: int, budget: int, progress: Callable[[float], None]) -> None:
+        self.options, self.threads, self.budget, self.progress = options, threads, budget, progress
         self.source, corners = start_pieces(geometry)
         self.n = len(geometry)
         self.corners = upload(corners, wp.vec3d, start("cpu"))
@@ -136,7 +139,7 @@ class Builder:
         load_kernel(build_bsp.build_cells, start("cpu"))
         keep = max(self.n // 64, 512)
         root = records(build_bsp.BspTask, 1)
-        root["end"] = self.n
+        root["end"], root["budget"] = self.n, self.budget
         top = self.launch(self.source, upload(root, build_bsp.BspTask, start("cpu")), cells_of(0), 0, self.n,
                           keep if self.n > keep else 0)
         tasks = top.output.left_over.numpy()[: top.results[build_bsp.N_LEFT_OVER]]
