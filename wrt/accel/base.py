@@ -279,6 +279,20 @@ class Accelerator(ABC):
         self._take(built, begin)
         return Refit(self.stats.build_seconds, growth, rebuilt)
 
+    def _children(self, built: Built) -> Any:
+        """A hierarchy of boxes as kernels.end_point_overlap.Children."""
+        raise InputError(f"a {self.name} has no end-point overlap: it is no hierarchy of boxes")
+
+    def epo(self) -> float:
+        """End-point overlap of a BVH: nodes and primitives visited for nothing at a random point of the surface (wrt.accel.epo).
+
+        It tells of rays that end, as stats.sah_cost does of lines that nothing stops; it takes about as long as a build. Raises
+        InputError for structures that are no BVH.
+        """
+        from wrt.accel.epo import end_point_overlap
+
+        return end_point_overlap(self._children(self.built), self.geometry, self.threads)
+
     def _upload(self, built: Built) -> Any:
         data = self.structure.struct()
         types = {name: field.type for name, field in data._cls.vars.items()}

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 from wrt.accel.base import Accelerator, Built
 from wrt.accel.bvh_build import BvhOptions, build_binary, sah_cost
@@ -30,3 +33,11 @@ class Bvh2(Accelerator):
     def _refit(self, built: Built) -> Built:
         nodes = refit_nodes(built.arrays["nodes"], built.order, self.geometry)
         return replace(built, arrays={"nodes": nodes}, sah_cost=sah_cost(nodes))
+
+    def _children(self, built: Built) -> Any:
+        from wrt.accel.epo import children
+
+        nodes = built.arrays["nodes"]
+        lo, hi, first, count = (np.stack([nodes[part + "_0"], nodes[part + "_1"]], axis=1)
+                                for part in ("lo", "hi", "first", "count"))
+        return children(lo, hi, first, np.where(lo[..., 0] > hi[..., 0], -1, count), built.order)

@@ -11,7 +11,8 @@ from wrt.accel.base import Accelerator, Built
 from wrt.accel.bvh_build import BvhOptions, build_binary
 from wrt.accel.wide_tree import WideTree, check_wide, collapse, lanes_of, refit, small_tree
 from wrt.errors import InputError
-from wrt.kernels.traverse_wide import NODE_ROWS, WideTraversal
+from wrt.kernels.lanes import EMPTY
+from wrt.kernels.traverse_wide import LEAF_RANGE, NODE_ROWS, WideTraversal
 
 
 def aligned(array: np.ndarray) -> np.ndarray:
@@ -76,6 +77,16 @@ class WideBvh(Accelerator):
     def _refit(self, built: Built) -> Built:
         tree = refit(self._tree(built), self.geometry)
         return replace(built, arrays=self._arrays(tree), sah_cost=tree.sah_cost())
+
+    def _children(self, built: Built) -> Any:
+        from wrt.accel.epo import children
+
+        tree = self._tree(built)
+        leaf = tree.children < 0
+        code = -1 - tree.children.astype(np.int64)
+        first = np.where(leaf, code // LEAF_RANGE * self.width, tree.children)
+        count = np.where(leaf, code % LEAF_RANGE + 1, np.where(tree.children == EMPTY, -1, 0))
+        return children(tree.lo, tree.hi, first, count, tree.order)
 
 
 class Bvh4(WideBvh):

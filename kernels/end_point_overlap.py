@@ -1,0 +1,141 @@
+"""The end-point overlap of a bounding volume hierarchy, triangle by triangle, on the CPU backend.
+
+Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies": a ray that ends at a point of the surface visits
+every node whose box holds the point, for nothing where the point's triangle is not below. How much of each triangle lies in such
+boxes is found by clipping it to them (Sutherland and Hodgman 1974), in float64.
+"""
+
+import warp as wp
+
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse_bvh2 import STACK_SIZE
+
+MAX_CORNERS = 12  # a triangle, and one more for each of the six planes; rounding may add some
+
+
+@wp.struct
+class Children:
+    """Children of all nodes, `width` a node, the root's first. count > 0: a leaf with the primitives order[first] to
+    order[first + count - 1]; 0: the inner node `first`; below 0: none. lo, hi: their boxes."""
+
+    width: int
+    lo: wp.array(dtype=wp.vec3)
+    hi: wp.array(dtype=wp.vec3)
+    first: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    order: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Corners:
+    v0: wp.vec3d
+    v1: wp.vec3d
+    v2: wp.vec3d
+
+
+@wp.func
+def area_inside(triangle: Corners, lo: wp.vec3d, hi: wp.vec3d) -> wp.float64:
+    """The area of what of the triangle lies in the closed box; below 0 where it does not even touch it."""
+    low = wp.min(wp.min(triangle.v0, triangle.v1), triangle.v2)
+    high = wp.max(wp.max(triangle.v0, triangle.v1), triangle.v2)
+    for axis in range(3):
+        if not (low[axis] <= hi[axis] and high[axis] >= lo[axis]):
+            return wp.float64(-1.0)
+    polygon = wp.zeros(shape=wp.static(MAX_CORNERS), dtype=wp.vec3d)
+    clipped = wp.zeros(shape=wp.static(MAX_CORNERS), dtype=wp.vec3d)
+    polygon[0] = triangle.v0
+    polygon[1] = triangle.v1
+    polygon[2] = triangle.v2
+    n = int(3)
+    planes = int(6)
+    for plane in range(planes):
+        axis = plane / 2
+        sign = wp.where(plane % 2 == 0, wp.float64(1.0), wp.float64(-1.0))
+        wall = wp.where(plane % 2 == 0, lo[axis], hi[axis])
+        if wp.where(plane % 2 == 0, low[axis] < wall, high[axis] > wall):
+            m = int(0)
+            last = polygon[n - 1]
+            last_inside = sign * (last[axis] - wall)
+            for i in range(n):
+                corner = polygon[i]
+                inside = sign * (corner[axis] - wall)
+                if (inside < wp.float64(0.0)) != (last_inside < wp.float64(0.0)) and m < wp.static(MAX_CORNERS):
+                    cut = last + (last_inside / (last_inside - inside)) * (corner - last)
+                    cut[axis] = wall
+                    clipped[m] = cut
+                    m = m + 1
+                if inside >= wp.float64(0.0) and m < wp.static(MAX_CORNERS):
+                    clipped[m] = corner
+                    m = m + 1
+                last = corner
+                last_inside = inside
+            if m == 0:
+                return wp.float64(-1.0)
+            n = m
+            for i in range(n):
+                polygon[i] = clipped[i]
+    doubled = wp.vec3d()
+    for i in range(1, n - 1):
+        doubled = doubled + wp.cross(polygon[i] - polygon[0], polygon[i + 1] - polygon[0])
+    return wp.float64(0.5) * wp.length(doubled)
+
+
+@wp.func
+def belongs(tree: Children, child: int, prim_id: int) -> int:
+    """1 where the primitive is in this leaf, else 0."""
+    for i in range(tree.first[child], tree.first[child] + tree.count[child]):
+        if tree.order[i] == prim_id:
+            return 1
+    return 0
+
+
+@kernel
+def end_point_overlap(tree: Children, vertices: wp.array(dtype=wp.vec3), faces: wp.array(dtype=wp.vec3i), first: int,
+                      out: wp.array(dtype=wp.float64)):
+    """out[i]: the area of triangle i in the boxes of inner nodes that it is not below, and in those of leaves that it is not
+    in, times the primitives there.
+
+    The walk goes depth first through all boxes that the triangle meets; a node's share is known when it is left for good.
+    """
+    i = first + wp.tid()
+    face = faces[i]
+    triangle = Corners()
+    triangle.v0 = wp.vec3d(vertices[face[0]])
+    triangle.v1 = wp.vec3d(vertices[face[1]])
+    triangle.v2 = wp.vec3d(vertices[face[2]])
+    lane = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)
+    end = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)
+    below = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)  # whether the triangle was met below
+    area = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.float64)
+    end[0] = tree.width
+    level = int(0)
+    cost = wp.float64(0.0)
+    while level >= 0:
+        child = lane[level]
+        if child == end[level]:
+            if level > 0:  # the root is visited for nothing by nobody
+                if below[level] == 0:
+                    cost = cost + area[level]
+                else:
+                    below[level - 1] = 1
+            level = level - 1
+            continue
+        lane[level] = child + 1
+        count = tree.count[child]
+        if count < 0:
+            continue
+        inside = area_inside(triangle, wp.vec3d(tree.lo[child]), wp.vec3d(tree.hi[child]))
+        if inside < wp.float64(0.0):
+            continue
+        if count > 0:
+            if belongs(tree, child, i) == 1:
+                below[level] = 1
+            else:
+                cost = cost + inside * wp.float64(count)
+            continue
+        level = level + 1
+        lane[level] = tree.first[child] * tree.width
+        end[level] = lane[level] + tree.width
+        below[level] = 0
+        area[level] = inside
+    out[i] = cost
