@@ -24,12 +24,16 @@ def make_traversals(features, structure):
 
 
 def make_render_kernel(features, structure):
-    """A kernel that adds samples to the pixels of a tile; it holds only the code that `features` asks for."""
+    """A kernel that adds samples to the pixels of a tile; it holds only the code that `features` asks for.
+
+    Where the structure's units count, it must be a wrt.kernels.ray_log one, and every ray is logged.
+    """
     accel_struct = structure.struct
     closest_hit, any_hit = make_traversals(features, structure)
     sample_2d = make_sample_2d(features)
     camera_ray = make_camera_ray(features.lens, features.blades)
-    radiance = make_radiance(features, accel_struct, closest_hit, any_hit)
+    counting = structure.units.counters
+    radiance = make_radiance(features, accel_struct, closest_hit, any_hit, counting)
 
     @kernel
     def render(
@@ -42,6 +46,8 @@ def make_render_kernel(features, structure):
         tile: Tile,
     ):
         tid = wp.tid()
+        if wp.static(counting):
+            accel.row = tid
         x = tile.x + tid % tile.width
         y = tile.y + tid / tile.width
         pixel = y * film.width + x

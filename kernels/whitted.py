@@ -5,6 +5,8 @@ and onward through what is partly transparent. Those wait on a stack with what t
 cut at max_depth bounces, after MAX_TRANSPARENT surfaces that it went straight through, or below min_throughput, and counted.
 """
 
+from functools import cache
+
 import warp as wp
 
 from wrt.kernels.lights import (
@@ -16,6 +18,7 @@ from wrt.kernels.lights import (
     shadow_ray,
 )
 from wrt.kernels.materials import BLEND, Scatter, make_is_solid, make_scatter, make_shade
+from wrt.kernels.ray_log import label
 from wrt.kernels.sampling import hash_pair, make_sample_2d
 from wrt.kernels.shadows import MAX_TRANSPARENT, OUTSIDE, Shadow, attenuation, make_transmittance
 from wrt.kernels.structs import Lighting, Limits, Material, Ray, Surfaces
@@ -24,20 +27,28 @@ from wrt.kernels.surface import Surface, spawn_point
 UNKNOWN = wp.constant(-2)  # where a camera ray begins: within glass, or not
 
 
-@wp.struct
-class Path:
-    """A pending ray: how much its light counts, how many bounces it has behind it and how many surfaces in a row it went
-    straight through, which solid glass it is in (a material, OUTSIDE or UNKNOWN), its samples' key, and the triangle that it
-    starts on."""
+@cache
+def make_path(counting):
+    """A pending ray; `counting`: it also knows what kind of ray it is."""
 
-    origin: wp.vec3
-    direction: wp.vec3
-    throughput: wp.vec3
-    depth: int
-    passed: int
-    medium: int
-    exclude: int
-    key: wp.uint32
+    @wp.struct
+    class Path:
+        """How much its light counts, how many bounces it has behind it and how many surfaces in a row it went straight
+        through, which solid glass it is in (a material, OUTSIDE or UNKNOWN), its samples' key, the triangle that it starts on,
+        and where rays are counted the branch that made it (0: the camera)."""
+
+        origin: wp.vec3
+        direction: wp.vec3
+        throughput: wp.vec3
+        depth: int
+        passed: int
+        medium: int
+        exclude: int
+        key: wp.uint32
+        if counting:
+            branch: int
+
+    return Path
 
 
 @wp.struct
@@ -113,8 +124,9 @@ def make_direct_light(features, accel_struct, closest_hit, any_hit):
     return direct_light
 
 
-def make_radiance(features, accel_struct, closest_hit, any_hit):
-    """The whole tree of rays behind one camera ray. `features`: wrt.features.Features."""
+def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
+    """The whole tree of rays behind one camera ray. `features`: wrt.features.Features; counting: rays carry a label."""
+    Path = make_path(counting)
     sample_2d = make_sample_2d(features)
     surface_at, resolve, shading_normal = make_shade(features)
     background_radiance = make_background(features)
@@ -133,6 +145,8 @@ def make_radiance(features, accel_struct, closest_hit, any_hit):
         out.medium = path.medium
         out.exclude = s.exclude
         out.key = hash_pair(path.key, wp.uint32(branch))
+        if wp.static(counting):
+            out.branch = branch
         return out
 
     @wp.func
@@ -208,6 +222,8 @@ def make_radiance(features, accel_struct, closest_hit, any_hit):
             ray.t_min = 0.0
             ray.t_max = float(wp.inf)
             ray.exclude = path.exclude
+            if wp.static(counting):
+                ray.slot = label(path.branch, path.depth)
             out.rays += 1
             hit = closest_hit(accel, surfaces, ray)
             if hit.prim_id < 0:

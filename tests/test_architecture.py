@@ -15,7 +15,7 @@ from tests.data import ROOT
 KERNELS = sorted((ROOT / "kernels").glob("*.py"))
 HOST = sorted((ROOT / "wrt").rglob("*.py"))
 ALLOWED = {"warp", "functools", "typing"}
-USE_KERNELS = ("accel/", "device.py", "device_film.py", "device_scene.py", "driver.py", "rtcore.py", "bench/")
+USE_KERNELS = ("accel/", "device.py", "device_film.py", "device_scene.py", "driver.py", "profiler.py", "rtcore.py", "bench/")
 
 
 def imports(path: Path) -> set[str]:

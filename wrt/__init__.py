@@ -26,6 +26,7 @@ _PUBLIC = {
     "Options": "wrt.driver",
     "Progress": "wrt.driver",
     "Film": "wrt.film",
+    "profile": "wrt.profiler",
     "Camera": "wrt.scene",
     "Checkerboard": "wrt.scene",
     "ConstantBackground": "wrt.scene",

@@ -1,12 +1,22 @@
 """The counters: exactly what a walk in plain Python counts, for every structure, and no code where they are off."""
 
+import inspect
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
+import warp as wp
 
 from tests.data import data_path
 from tests.kernel_tools import rounded
 from tests.rewalk import PRIMITIVE_BYTES, REWALK, rays
-from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.accel import ACCELERATORS, Geometry, Structure, build
+from wrt.cubin import read_cubin
+from wrt.kernels.counters import Counts, Recorder
+from wrt.kernels.query import make_closest_hit_kernel
+from wrt.kernels.structs import NO_HIT, Hit, Ray
+from wrt.kernels.traverse import Units
 from wrt.mesh import Mesh, load_mesh
 from wrt.shapes import icosphere
 
@@ -81,3 +91,43 @@ def test_counting_changes_no_hit(name):
 def test_no_rays_cost_nothing(name):
     counters = build(icosphere(1), name).closest_hit(np.zeros((0, 3)), np.zeros((0, 3)), trace=True).counters
     assert len(counters.counts) == len(counters.address) == 0
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_counting_off_leaves_nothing_in_the_machine_code(name, monkeypatch, tmp_path):
+    """For Turing, it is that of a source whose counters do nothing, to the last byte."""
+
+    @wp.func
+    def fetch_node(recorder: Recorder, ray: Ray, counts: Counts, index: int, boxes: int) -> Counts:
+        return counts
+
+    @wp.func
+    def fetch_primitive(recorder: Recorder, ray: Ray, counts: Counts, index: int) -> Counts:
+        return counts
+
+    @wp.func
+    def push(counts: Counts, size: int) -> Counts:
+        return counts
+
+    @wp.func
+    def finish(recorder: Recorder, ray: Ray, counts: Counts, best: Hit) -> Hit:
+        if best.prim_id == NO_HIT:
+            best.t = float(wp.inf)
+            best.prim_id = -1
+        return best
+
+    structure = Structure(ACCELERATORS[name])
+    codes = []
+    for i, counting in enumerate((False, False, True) if name == "bvh2" else (False, False)):
+        units = Structure(ACCELERATORS[name], Units(counters=counting))
+        kernel = make_closest_hit_kernel(structure.struct, units.traversal(any_hit=False))
+        (binary,) = wp.compile_aot_module(kernel.module, arch=75, module_dir=tmp_path / str(i))
+        (code,) = read_cubin(Path(binary).read_bytes()).values()
+        codes.append((code.code, code.registers, code.stack))
+        if i == 0:
+            unit = structure.accel.kernels
+            module = unit if inspect.ismodule(unit) else sys.modules[type(unit).__module__]
+            monkeypatch.setattr(module, "make_counters", lambda *_: (fetch_node, fetch_primitive, push, finish))
+        else:
+            monkeypatch.undo()
+    assert len(codes[0][0]) > 1000 and codes[0] == codes[1] and (len(codes) == 2 or codes[2] != codes[0])

@@ -1,0 +1,171 @@
+"""Profiles: every ray of a render, no more and no less, with its kind, its depth and exactly its cost."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+
+import wrt
+from tests.rewalk import REWALK, rays
+from wrt.accel import ACCELERATORS, Structure
+from wrt.cubin import read_cubin
+from wrt.driver import render_kernel
+from wrt.errors import InputError
+from wrt.features import features_of
+from wrt.kernels.traverse import Units
+from wrt.profiler import COUNTERS, KINDS, PICTURES, Profile, profile
+from wrt.scene import Scene
+
+# Left, a matte wall under one lamp; right, two mirrors that face each other with the camera between them.
+MIRRORS = """
+[settings]
+size = [16, 8]
+max_depth = 5
+min_throughput = 0.0
+filter = "box"
+[cameras.main]
+position = [0, 0, 0]
+target = [0, 0, -1]
+fov_y = 20
+[materials.mirror]
+kind = "mirror"
+albedo = 1.0
+[materials.matte]
+albedo = 0.5
+[[lights]]
+type = "point"
+position = [-1, 0, 0]
+intensity = 1
+[[quads]]
+corner = [-900, -900, -2]
+edge_u = [1800, 0, 0]
+edge_v = [0, 1800, 0]
+material = "mirror"
+[[quads]]
+corner = [-900, -900, 2]
+edge_u = [1800, 0, 0]
+edge_v = [0, 1800, 0]
+material = "mirror"
+[[quads]]
+corner = [-9, -9, -1]
+edge_u = [9, 0, 0]
+edge_v = [0, 18, 0]
+material = "matte"
+"""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    path = tmp_path_factory.mktemp("scene") / "mirrors.toml"
+    path.write_text(MIRRORS)
+    return wrt.load_scene(path)
+
+
+@pytest.fixture(scope="module")
+def measured(scene: Scene) -> Profile:
+    return profile(scene, spp=3)
+
+
+def test_every_ray_has_its_kind_and_depth(measured: Profile) -> None:
+    found = {(row["kind"], row["depth"]): (row["probes"], row["hits"]) for row in measured.by_depth()}
+    half = 8 * 8 * 3
+    assert found == {("primary", 0): (2 * half, 2 * half), ("shadow", 0): (half, 0)} | {
+        ("reflection", depth): (half, half) for depth in range(1, 6)}
+    assert set(measured.maps) == set(PICTURES)
+    left, right = (measured.maps[f"probes_{kind}"] for kind in ("shadow", "reflection"))
+    assert (left[:, :8] == 1.0).all() and (left[:, 8:] == 0.0).all()
+    assert (right[:, :8] == 0.0).all() and (right[:, 8:] == 5.0).all()
+
+
+def test_a_profile_renders_the_same_picture_with_the_same_rays(scene: Scene, measured: Profile) -> None:
+    film = wrt.render(scene, spp=3)
+    np.testing.assert_array_equal(film.pixels, measured.pixels)
+    assert film.stats["rays"] == len(measured.rays) == measured.rays.counts["probes"].sum()
+
+
+def test_tiles_and_threads_change_nothing(scene: Scene, measured: Profile) -> None:
+    other = profile(scene, spp=3, tile_size=5, threads=1)
+    order, there = (np.argsort(each.rays.pixel, kind="stable") for each in (measured, other))
+    for name in ("rays", "counts", "pixel", "kind", "depth", "lines"):
+        np.testing.assert_array_equal(getattr(measured.rays, name)[order], getattr(other.rays, name)[there])
+    for name, picture in measured.maps.items():
+        np.testing.assert_array_equal(picture, other.maps[name])
+
+
+def test_costs_are_those_of_a_walk_in_python(measured: Profile) -> None:
+    """Also of rays that start on a surface."""
+    table, accel = measured.rays, measured.accel
+    accel.name = "bvh2"
+    walk_of = REWALK["bvh2"]
+    first = dict(zip(table.trace_rows.tolist(), table.trace_first.tolist(), strict=False))
+    chosen = np.flatnonzero(table.rays["any_hit"] == 0)[::7]
+    assert set(table.kind[chosen]) == {KINDS.index("primary"), KINDS.index("reflection")}
+    entries = table.rays[chosen]
+    for row, entry, ray in zip(chosen, entries, rays(accel.geometry, entries["origin"], entries["direction"]), strict=True):
+        ray.hits.pop(int(entry["exclude"]), None)
+        walk = walk_of(accel, ray)
+        names = [name for name in COUNTERS if hasattr(walk, name)]
+        assert {name: int(table.counts[name][row]) for name in names} == {name: getattr(walk, name) for name in names}
+        part = slice(first[row], first[row] + len(walk.trace))
+        assert list(zip(table.address[part].tolist(), table.size[part].tolist(), strict=True)) == walk.trace
+        lines = {line for at, size in walk.trace for line in range(at // 128, (at + size - 1) // 128 + 1)}
+        assert table.lines[row] == len(lines)
+
+
+def test_a_crop_is_a_part(scene: Scene, measured: Profile) -> None:
+    part = profile(scene, spp=3, crop=(6, 2, 12, 7))
+    assert part.size == (6, 5)
+    for name, picture in part.maps.items():
+        np.testing.assert_array_equal(picture, measured.maps[name][2:7, 6:12])
+
+
+def test_what_a_profile_cannot_do_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("aov", "nonsense"):
+        with pytest.raises(InputError, match=f"no argument '{name}'"):
+            profile(scene, **{name: "depth"})
+    monkeypatch.setattr("wrt.profiler.memory_size", lambda device: 1000.0)
+    with pytest.raises(InputError, match="million rays"):
+        profile(scene)
+
+
+def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None:
+    """The machine code for Turing is that of a source without a word on counting, to the last byte."""
+    features, structure = features_of(scene, scene.camera(None)), Structure(ACCELERATORS["bvh"], Units())
+    folder = Path(wrt.__file__).parent.parent / "kernels"
+    modules = {}
+    for name in ("whitted", "render"):
+        text = without_counting((folder / f"{name}.py").read_text())
+        (tmp_path / f"{name}.py").write_text(text.replace("wrt.kernels.whitted", "wrt.kernels.bare_whitted"))
+        spec = importlib.util.spec_from_file_location(f"wrt.kernels.bare_{name}", tmp_path / f"{name}.py")
+        assert spec is not None and spec.loader is not None and "counting" not in text
+        modules[name] = importlib.util.module_from_spec(spec)
+        sys.modules[spec.name] = modules[name]
+        spec.loader.exec_module(modules[name])
+    codes = []
+    for kernel in (render_kernel(features, structure), modules["render"].make_render_kernel(features, structure)):
+        (binary,) = wp.compile_aot_module(kernel.module, arch=75, module_dir=tmp_path / str(len(codes)))
+        (code,) = read_cubin(Path(binary).read_bytes()).values()
+        codes.append((code.code, code.registers, code.stack))
+    assert len(codes[0][0]) > 10_000 and codes[0] == codes[1]
+
+
+def without_counting(text: str) -> str:
+    """The source without the blocks that `counting` guards, and without that argument."""
+    out, depth = [], None
+    for line in text.splitlines():
+        indent = len(line) - len(line.lstrip())
+        if depth is not None and indent > depth:
+            continue
+        depth = indent if line.strip() in ("if counting:", "if wp.static(counting):") else None
+        if depth is None:
+            out.append(line)
+    bare = "\n".join(out) + "\n"
+    for old, new in ((", counting=False", ""), (", counting)", ")"), ("make_path(counting)", "make_path()"),
+                     ("    counting = structure.units.counters\n", "")):
+        bare = bare.replace(old, new)
+    return "".join(line + "\n" for line in bare.splitlines() if "counting" not in line)

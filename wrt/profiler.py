@@ -1,0 +1,251 @@
+"""What a picture costs: every ray that it takes, with its counters and the addresses that it fetches."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from wrt.accel import Structure
+from wrt.cache_sim import distinct_lines
+from wrt.device import memory_size, run_all, upload
+from wrt.device_film import DeviceFilm
+from wrt.driver import OPTIONS, Options, Renderer
+from wrt.errors import InputError
+from wrt.kernels import ray_log
+from wrt.kernels.counters import SIZE_RANGE, Counts, Recorder
+from wrt.mesh import Mesh
+from wrt.scene import SETTINGS, Scene
+from wrt.scene_file import as_scene
+
+KINDS = ("primary", "reflection", "refraction", "straight", "shadow")
+COUNTERS = tuple(Counts.vars)
+PICTURES = (*COUNTERS, "lines", *(f"probes_{kind}" for kind in KINDS))
+LEFT_OUT = ("aov", "time_limit", "target_error", "progress", "pass_size")  # options of a render that a profile has no use for
+TILE_SIZE = 64
+BYTES_OF_RAY = 200  # with what is made of it
+TRACE_LIMIT = 12_000_000  # fetches that are kept
+
+Rectangle = tuple[int, int, int, int]
+
+
+class LoggedStructure(NamedTuple):
+    """A structure with a log before it. Hashable, as Structure."""
+
+    inner: Structure
+
+    @property
+    def units(self) -> Any:
+        return self.inner.units
+
+    @property
+    def struct(self) -> Any:
+        return ray_log.make_struct(self.inner.struct)
+
+    def traversal(self, *, any_hit: bool, accepts: Any = None) -> Any:
+        return ray_log.make_traversal(self.inner.struct, self.inner.traversal(any_hit=any_hit, accepts=accepts), any_hit)
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Every ray of a picture, (N,) each, tile by tile and pixel by pixel, in the order in which each pixel traced them.
+
+    rays: as kernels.ray_log.LoggedRay; counts: as kernels.counters.Counts; pixel: row * width + column; kind: index in KINDS
+    ("straight": goes on unbent through a blended surface); depth: bounces behind it (a shadow ray's: of the ray whose hit it
+    starts from); lines: distinct cache lines. trace_rows: the rays whose fetches were kept, trace_first: where each one's
+    begin; address, size: of each fetch, in bytes, as in wrt.accel.base.Counters.
+    """
+
+    rays: np.ndarray
+    counts: np.ndarray
+    pixel: np.ndarray
+    kind: np.ndarray
+    depth: np.ndarray
+    lines: np.ndarray
+    trace_rows: np.ndarray
+    trace_first: np.ndarray
+    address: np.ndarray
+    size: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.pixel)
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """What `profile` gives: size (width, height); pixels (H, W, 3), the picture; rays; accel, the structure; seconds by part."""
+
+    scene: str
+    size: tuple[int, int]
+    spp: int
+    pixels: np.ndarray
+    rays: Rays
+    accel: Any
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Profile({self.scene!r}, {self.size[0]}x{self.size[1]}, {self.spp} spp, {len(self.rays)} rays)"
+
+    @cached_property
+    def maps(self) -> dict[str, np.ndarray]:
+        """PICTURES, (H, W) float64 each, row 0 on top: of each pixel the mean over its samples of a counter summed over all
+        rays of a sample (`stack`: the deepest of all), and the rays of each kind."""
+        rays, n = self.rays, self.size[0] * self.size[1]
+        sums = {name: np.bincount(rays.pixel, rays.counts[name], n) / self.spp for name in COUNTERS}
+        sums["stack"] = np.zeros(n)
+        np.maximum.at(sums["stack"], rays.pixel, rays.counts["stack"])
+        sums["lines"] = np.bincount(rays.pixel, rays.lines, n) / self.spp
+        for i, kind in enumerate(KINDS):
+            sums[f"probes_{kind}"] = np.bincount(rays.pixel, rays.kind == i, n) / self.spp
+        return {name: value.reshape(self.size[1], self.size[0]) for name, value in sums.items()}
+
+    def by_depth(self) -> list[dict[str, Any]]:
+        """One row for each kind of ray at each depth: depth, kind, hits, and every counter summed (stack: the deepest)."""
+        rays, rows = self.rays, []
+        for depth in np.unique(rays.depth):
+            for i, kind in enumerate(KINDS):
+                chosen = (rays.depth == depth) & (rays.kind == i)
+                if chosen.any():
+                    counts = rays.counts[chosen]
+                    sums = {name: int(counts[name].sum(dtype=np.int64)) for name in COUNTERS}
+                    sums |= {"stack": int(counts["stack"].max()), "lines": int(rays.lines[chosen].sum(dtype=np.int64))}
+                    rows.append({"depth": int(depth), "kind": kind, "hits": int(rays.rays["hit"][chosen].sum()), **sums})
+        return rows
+
+
+def profile(scene: Scene | Mesh | str | os.PathLike[str], **options: Any) -> Profile:
+    """Render a scene and keep what every ray of it costs, and of evenly chosen tiles also what it fetches (TRACE_LIMIT).
+
+    Arguments: scene as for `wrt.render`; options: fields of Settings and of Options but LEFT_OUT. The rays are exactly those of
+    that render. Raises InputError for what cannot be rendered, and where that many rays do not fit into memory.
+    """
+    changes = {name: options.pop(name) for name in SETTINGS if name in options}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    for name in options:
+        if name in LEFT_OUT or name not in OPTIONS:
+            raise InputError(f"a profile has no argument {name!r}")
+    chosen = Options(**{"tile_size": TILE_SIZE, **options})
+    return Profiler(as_scene(scene).with_settings(**changes), chosen).measure()
+
+
+@dataclass
+class _Tile:
+    """used: rays of each pixel; fetches: of the whole tile; then what each of its rays is and costs, and the trace if kept."""
+
+    rectangle: Rectangle
+    used: np.ndarray
+    fetches: int
+    rays: Any = None
+    counts: Any = None
+    lines: Any = None
+    trace: np.ndarray | None = None
+
+
+class Profiler(Renderer):
+    """Three runs a tile: how many rays each pixel takes, those rays with their counters, and what they fetch."""
+
+    def _structure(self, structure: Any) -> Any:
+        self.logged = LoggedStructure(structure._replace(units=structure.units._replace(counters=True)))
+        return self.logged
+
+    def measure(self) -> Profile:
+        begin = time.perf_counter()
+        settings = self.scene.settings
+        self.limits = self._limits(self.options.seed)
+        # The same samples three times over: only one film is looked at.
+        self.films = [DeviceFilm(settings, self.crop, self.device, self.options.seed) for _ in range(3)]
+        tiles: list[_Tile] = []
+        self._over(lambda rectangle: tiles.append(self._count(rectangle)), list(self._tiles()))
+        tiles.sort(key=lambda tile: tile.rectangle[1::-1])
+        total = sum(int(tile.used.sum(dtype=np.int64)) for tile in tiles)
+        if total * BYTES_OF_RAY > 0.5 * memory_size(self.device):
+            raise InputError(f"a profile of {total / 1e6:.0f} million rays takes {total * BYTES_OF_RAY / 2**30:.0f} GiB;"
+                             " take a smaller size, fewer samples or a crop")
+        step = max(1, -(-sum(tile.fetches for tile in tiles) // TRACE_LIMIT))
+        self._over(self._record, [(tile, i % step == step // 2) for i, tile in enumerate(tiles)])
+        pixels = self.films[0].pixels_and_variance()[0]
+        self.seconds["trace"] = time.perf_counter() - begin
+        x0, y0, x1, y1 = self.crop
+        return Profile(self.scene.name, (x1 - x0, y1 - y0), settings.spp, pixels, self._gather(tiles), self.accel, self.seconds)
+
+    def _over(self, work: Callable[[Any], Any], items: list[Any]) -> None:
+        def task(item: Any) -> Callable[[], None]:
+            return lambda: work(item)
+
+        run_all([task(item) for item in items], 1 if self.device.is_cuda else self.threads)
+
+    def _run(self, tile: Rectangle, film: int, recorder: Any, log: Any) -> None:
+        data = self.logged.inner.struct()  # a copy, since every tile has a recorder of its own
+        for name in data._cls.vars:
+            setattr(data, name, getattr(self.accel.data, name))
+        data.recorder = recorder
+        accel = self.logged.struct()
+        accel.accel, accel.log = data, log
+        world = [accel, self.device_scene.surfaces, self.device_scene.lighting, self.device_camera, self.limits]
+        self._launch(self.kernels[0], [*world, self.films[film].groups[0]], tile, (0, self.scene.settings.spp))
+
+    def _zeros(self, n: int, dtype: Any) -> Any:
+        return wp.zeros(n, dtype=dtype, device=self.device)
+
+    def _count(self, rectangle: Rectangle) -> _Tile:
+        n = rectangle[2] * rectangle[3]
+        recorder, log = Recorder(), ray_log.RayLog()
+        recorder.counts, log.used = self._zeros(n, Counts), self._zeros(n, wp.int32)
+        self._run(rectangle, 0, recorder, log)
+        counts = recorder.counts.numpy()
+        fetches = int(counts["nodes"].sum(dtype=np.int64) + counts["primitives"].sum(dtype=np.int64))
+        return _Tile(rectangle, log.used.numpy().copy(), fetches)
+
+    def _record(self, job: tuple[_Tile, bool]) -> None:
+        tile, keep = job
+        first = np.cumsum(tile.used, dtype=np.int64) - tile.used
+        n = int(tile.used.sum(dtype=np.int64))
+
+        def run(film: int, recorder: Any) -> Any:
+            recorder.counts = self._zeros(n, Counts)
+            log = ray_log.RayLog()
+            log.used = self._zeros(len(tile.used), wp.int32)
+            log.first, log.rays = upload(first, wp.int64, self.device), self._zeros(n, ray_log.LoggedRay)
+            self._run(tile.rectangle, film, recorder, log)
+            return log
+
+        recorder = Recorder()
+        tile.rays = run(1, recorder).rays.numpy().copy()
+        tile.counts = recorder.counts.numpy().copy()
+        length = tile.counts["nodes"].astype(np.int64) + tile.counts["primitives"]
+        at = np.concatenate([[0], np.cumsum(length)])
+        recorder = Recorder()
+        recorder.first, recorder.fetches = upload(at, wp.int64, self.device), self._zeros(int(at[-1]), wp.int64)
+        run(2, recorder)
+        trace = recorder.fetches.numpy()
+        tile.lines = distinct_lines(at, trace // int(SIZE_RANGE), trace % int(SIZE_RANGE))
+        tile.trace = trace.copy() if keep else None
+
+    def _gather(self, tiles: list[_Tile]) -> Rays:
+        rays = np.concatenate([tile.rays for tile in tiles])
+        counts = np.concatenate([tile.counts for tile in tiles])
+        pixel = np.concatenate([np.repeat(self._pixels(tile.rectangle), tile.used) for tile in tiles])
+        label = rays["label"]
+        path = np.maximum.accumulate(np.where(label > 0, np.arange(len(rays)), 0))  # a shadow ray's: the one before it
+        shadow = KINDS.index("shadow")
+        kind = np.where(label > 0, (label - 1) % int(ray_log.BRANCHES), shadow).astype(np.int8)
+        depth = (label[path] - 1) // int(ray_log.BRANCHES)
+        trace = [tile.trace for tile in tiles if tile.trace is not None]
+        kept = np.concatenate([np.full(len(tile.rays), tile.trace is not None) for tile in tiles])
+        length = counts["nodes"][kept].astype(np.int64) + counts["primitives"][kept]
+        fetches = np.concatenate(trace) if trace else np.zeros(0, np.int64)
+        return Rays(rays, counts, pixel, kind, depth, np.concatenate([tile.lines for tile in tiles]), np.flatnonzero(kept),
+                    np.concatenate([[0], np.cumsum(length)]), fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
+
+    def _pixels(self, rectangle: Rectangle) -> np.ndarray:
+        """The pixels of a tile, row by row, as numbers within the crop."""
+        x0, y0, x1, _ = self.crop
+        x, y, width, height = rectangle
+        column, row = np.meshgrid(np.arange(x - x0, x - x0 + width), np.arange(y - y0, y - y0 + height))
+        return (row * (x1 - x0) + column).ravel().astype(np.int64)
