@@ -53,7 +53,7 @@ def test_nothing_imports_the_command_line(path: Path) -> None:
 def test_units_come_before_traversals_before_the_integrator() -> None:
     layers = [("structs",), ("ray_", "sampling", "camera"), ("counters", "lanes", "triangle_cell", "cell_ray"),
               ("textures", "surface", "materials", "traverse", "lights"),
-              ("shadows", "whitted", "query", "build_", "refit_", "peers"), ("render", "rasterize", "primary_rays")]
+              ("shadows", "whitted", "query", "build_", "refit_", "end_point_overlap", "peers"), ("render", "rasterize", "primary_rays")]
 
     def layer(name: str) -> int:
         return next(i for i, starts in enumerate(layers) if name.startswith(starts))
