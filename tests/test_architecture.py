@@ -15,7 +15,8 @@ from tests.data import ROOT
 KERNELS = sorted((ROOT / "kernels").glob("*.py"))
 HOST = sorted((ROOT / "wrt").rglob("*.py"))
 ALLOWED = {"warp", "functools", "typing"}
-USE_KERNELS = ("accel/", "device.py", "device_film.py", "device_scene.py", "driver.py", "profiler.py", "rtcore.py", "bench/")
+USE_KERNELS = ("accel/", "device.py", "device_film.py", "device_scene.py", "driver.py", "profiler.py",
+               "cache_sim.py", "rtcore.py", "bench/")
 
 
 def imports(path: Path) -> set[str]:
@@ -53,7 +54,8 @@ def test_nothing_imports_the_command_line(path: Path) -> None:
 def test_units_come_before_traversals_before_the_integrator() -> None:
     layers = [("structs",), ("ray_", "sampling", "camera"), ("counters", "lanes", "triangle_cell", "cell_ray"),
               ("textures", "surface", "materials", "traverse", "lights"),
-              ("shadows", "whitted", "query", "build_", "refit_", "end_point_overlap", "peers"), ("render", "rasterize", "primary_rays")]
+              ("shadows", "whitted", "query", "build_", "refit_", "cache_lru", "end_point_overlap", "peers"),
+              ("render", "rasterize", "primary_rays")]
 
     def layer(name: str) -> int:
         return next(i for i, starts in enumerate(layers) if name.startswith(starts))
