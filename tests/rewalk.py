@@ -246,6 +246,59 @@ def grid(accel, ray: WalkRay) -> Walk:
     return walk
 
 
+def octree(accel, ray: WalkRay) -> Walk:
+    """Down from the root by recursion; the planes of a cell are handed down as numbers of the finest cells."""
+    walk, data = Walk(boxes=1, box_operations=1), accel.data
+    mailbox, nodes, references, seen, entries = int(data.mailbox) > 0, data.nodes.numpy(), data.references.numpy(), [0] * 8, [0]
+    slack, n = cell_slack(accel, ray), 1 << int(data.levels)
+    begin = earlier(ray.t_min) - slack
+    lo, hi = np.array(data.lo, np.float32), np.array(data.hi, np.float32)
+    backwards = ray.inv_dir < 0.0
+
+    def planes(at: np.ndarray) -> np.ndarray:
+        return np.minimum(lo + at.astype(np.float32) * np.float32(data.size), hi)
+
+    def enter(low: np.ndarray, size: int) -> np.float32:
+        """Where the ray enters a cell; inf where it passes by, or after its best hit."""
+        ends = planes(low), planes(low + size)
+        with np.errstate(invalid="ignore", over="ignore"):
+            near, far = ((np.where(backwards, a, b) - ray.origin) * ray.inv_dir for a, b in (ends[::-1], ends))
+        t = np.fmax.reduce(near, initial=begin)
+        return t if t <= later(np.fmin.reduce(far)) and t <= later(ray.best[0]) + slack else INF
+
+    def visit(index: int, low: np.ndarray, size: int) -> None:
+        walk.node(index, nodes.itemsize, 0)
+        first, count = int(nodes[index]["first"]), int(nodes[index]["count"])
+        if count >= 0:
+            walk.leaves += 1
+            walk.box_operations -= 1  # a leaf has no planes
+            for primitive in references[first : first + count].tolist():
+                if not mailbox or seen[primitive % 8] != primitive + 1:
+                    seen[primitive % 8] = primitive + 1
+                    ray.test(walk, accel, primitive)
+            return
+        octants = [k for k in range(8) if -count >> k & 1]
+        walk.boxes += len(octants)
+        half = size // 2
+        corners = [low + half * (k >> np.arange(3) & 1) for k in octants]
+        # In the order of the ray: by halves, the z axis first to tell.
+        met = [(int(((corner > low) != backwards) @ [1, 2, 4]), first + i, corner)
+               for i, corner in enumerate(corners) if enter(corner, half) < INF]
+        met.sort(key=lambda child: child[0])
+        if len(met) > 1:
+            entries[0] += 1
+            walk.push(entries[0])
+        for i, (_, child, corner) in enumerate(met):
+            walk.pops += i > 0
+            entries[0] -= i > 0 and i == len(met) - 1
+            if i == 0 or enter(corner, half) < INF:
+                visit(child, corner, half)
+
+    if enter(np.zeros(3, np.int64), n) < INF:
+        visit(0, np.zeros(3, np.int64), n)
+    return walk
+
+
 def later(t: np.ndarray) -> np.ndarray:
     return np.maximum(t * np.float32(FAR_PAD), t * np.float32(2.0 - FAR_PAD))
 
@@ -373,4 +426,5 @@ REWALK: dict[str, Callable[..., Walk]] = {
     "kdtree": kdtree,
     "bsp": bsp,
     "grid": grid,
+    "octree": octree,
 }

@@ -5,33 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.kernel_tools import rounded  # isort: skip (starts Warp)
-
-from wrt.accel import Geometry, build
+from tests.cell_cases import CASES, points_of, random_lines, segments, triangles
+from wrt.accel import build
 from wrt.accel import grid as module
 from wrt.errors import InputError
-from wrt.mesh import Mesh
 from wrt.shapes import icosphere
-
-NO_SPHERES = np.zeros((0, 4), np.float32)
-
-
-def triangles(corners, spheres=NO_SPHERES):
-    corners = np.asarray(corners, np.float32).reshape(-1, 3)
-    return Geometry(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3), np.asarray(spheres, np.float32))
-
-
-CASES = {
-    "soup": lambda rng: triangles(rng.uniform(-1.0, 1.0, (500, 1, 3)) + 0.2 * rng.normal(size=(500, 3, 3))),
-    "flat": lambda rng: triangles(np.insert(rng.uniform(-1.0, 1.0, (500, 3, 2)), 1, 0.25, axis=2)),
-    "line": lambda rng: triangles(rng.uniform(-1.0, 1.0, (200, 3, 1)) * [1.0, 0.0, 0.0]),
-    "point": lambda rng: triangles(np.ones((50, 3, 3))),
-    "far": lambda rng: triangles(1000.0 + rng.uniform(-1.0, 1.0, (300, 3, 3))),
-    "huge": lambda rng: triangles(rng.uniform(-3e38, 3e38, (100, 3, 3))),
-    "subnormal": lambda rng: triangles(rng.uniform(-1e-40, 1e-40, (100, 3, 3))),
-    "spheres": lambda rng: triangles(np.zeros((0, 3, 3)), rng.uniform([-1, -1, -1, 0.1], [1, 1, 1, 0.3], (50, 4))),
-    "none": lambda rng: triangles(np.zeros((0, 3, 3))),
-}
 
 
 def lists(grid):
@@ -58,14 +36,8 @@ def test_points_of_a_primitive_are_in_cells_that_list_it(case):
     listed = set(zip(*where.T.tolist(), reference.tolist(), strict=True))
     assert len(listed) == len(reference) == grid.stats.references  # none is there twice in a cell
     layout = grid.data
-    n = len(geometry.faces)
     for _ in range(20):
-        weight = rng.dirichlet([0.3, 0.3, 0.3], n)
-        point = (weight[:, :, None] * geometry.vertices[geometry.faces].astype(np.float64)).sum(axis=1)
-        if len(geometry.spheres):
-            around = rng.normal(size=(len(geometry.spheres), 3))
-            around *= geometry.spheres[:, 3:] / np.linalg.norm(around, axis=1, keepdims=True)
-            point = np.concatenate([point, geometry.spheres[:, :3] + around])
+        point = points_of(geometry, rng)
         cell = [np.clip(np.searchsorted(planes(layout, a), point[:, a], "right") - 1, 0, layout.n[a] - 1) for a in range(3)]
         assert all(entry in listed for entry in zip(*(c.tolist() for c in cell), range(len(point)), strict=True))
 
@@ -127,26 +99,11 @@ def test_densities_that_are_refused(density):
 
 
 def test_random_lines_cost_what_the_statistics_expect():
-    # Triangles without area are listed where they are, and are never hit: the whole line is walked.
     rng = np.random.default_rng(5)
-    ends = rng.uniform(-1.0, 1.0, (400, 2, 3)) * [1.0, 0.5, 2.0]
-    segments = Mesh(ends.reshape(-1, 3), np.stack([2 * np.arange(400), 2 * np.arange(400) + 1, 2 * np.arange(400)], axis=1))
-    grid = build(Geometry.of(segments), "grid", mailbox=False, density=5.0)
+    grid = build(segments(rng), "grid", mailbox=False, density=5.0)
     lo, hi = np.array(grid.data.lo, np.float64), np.array(grid.data.hi, np.float64)
     n = 40_000
-    # Uniform lines: a point on the surface, by area, and a direction inwards by the cosine.
-    extent = hi - lo
-    area = np.array([extent[1] * extent[2], extent[2] * extent[0], extent[0] * extent[1]])
-    axis = rng.choice(3, n, p=area / area.sum())
-    side = rng.integers(0, 2, n)
-    point = lo + rng.random((n, 3)) * extent
-    point[np.arange(n), axis] = np.where(side == 0, lo[axis], hi[axis])
-    r, phi = np.sqrt(rng.random(n)), 2.0 * np.pi * rng.random(n)
-    direction = np.empty((n, 3))
-    direction[np.arange(n), axis] = np.where(side == 0, 1.0, -1.0) * np.sqrt(1.0 - r**2)
-    direction[np.arange(n), (axis + 1) % 3] = r * np.cos(phi)
-    direction[np.arange(n), (axis + 2) % 3] = r * np.sin(phi)
-    hits = grid.closest_hit(rounded(point - direction), rounded(direction), counters=True)
+    hits = grid.closest_hit(*random_lines(lo, hi, n, rng), counters=True)
     assert (hits.prim_id < 0).all()
     cost = hits.counters.nodes + hits.counters.primitives
     assert abs(cost.mean() - grid.stats.sah_cost) < 3.0 * cost.std() / np.sqrt(n)

@@ -11,6 +11,7 @@ from wrt.accel.bvh2 import Bvh2
 from wrt.accel.bvh_wide import Bvh4, Bvh8
 from wrt.accel.grid import Grid
 from wrt.accel.kdtree import KdTree
+from wrt.accel.octree import Octree
 from wrt.accel.store import build_cached, load_accel
 from wrt.errors import InputError
 from wrt.mesh import Mesh
@@ -27,6 +28,7 @@ ACCELERATORS: dict[str, type[Accelerator]] = {
     "bsp": Bsp,
     "brute_force": BruteForce,
     "grid": Grid,
+    "octree": Octree,
 }
 
 

@@ -1,0 +1,90 @@
+"""The octree builder's inner loops, on the CPU backend: one level at a time, which octants does each reference meet?
+
+Octants are found over ranges of references on all cores; cells are counted and filled in the order of the references, so that
+the tree does not depend on the number of threads.
+"""
+
+import warp as wp
+
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse_octree import OctreeLayout, octant_corner, octree_planes
+from wrt.kernels.triangle_cell import CellSource, meets_cell, triangle_cell
+
+
+@wp.func
+def octants_of_box(lo: wp.vec3, hi: wp.vec3, middle: wp.vec3, end: wp.vec3) -> int:
+    """Mask of the octants, as closed boxes, that a box meets which meets their cell. middle: the planes between them; end: those
+    of the root's cell; an upper half that begins there has nothing in it that is not in the lower."""
+    mask = int(0xFF)
+    for axis in range(3):
+        upper = wp.where(axis == 0, 0xAA, wp.where(axis == 1, 0xCC, 0xF0))
+        if lo[axis] > middle[axis]:
+            mask = mask & upper
+        elif hi[axis] < middle[axis] or middle[axis] >= end[axis]:
+            mask = mask & ~upper
+    return mask
+
+
+@kernel
+def find_octants(
+    source: CellSource,
+    layout: OctreeLayout,
+    first: int,
+    half: int,
+    corners: wp.array(dtype=wp.vec3i),
+    cell_of: wp.array(dtype=wp.int32),
+    references: wp.array(dtype=wp.int32),
+    masks: wp.array(dtype=wp.int32),
+):
+    """Reference first + tid, of a primitive in a cell that is to be split: the octants that it meets."""
+    r = first + wp.tid()
+    i = references[r]
+    corner = corners[cell_of[r]]
+    lo = source.lo[i]
+    hi = source.hi[i]
+    mask = octants_of_box(lo, hi, octree_planes(layout, corner + wp.vec3i(half, half, half)), layout.hi)
+    if i < source.faces.shape[0] and (mask & (mask - 1)) != 0:
+        face = source.faces[i]
+        triangle = triangle_cell(source.vertices[face[0]], source.vertices[face[1]], source.vertices[face[2]], lo, hi)
+        exact = int(0)
+        for octant in range(8):
+            if (mask & (1 << octant)) != 0:
+                low = corner + octant_corner(octant, half)
+                if meets_cell(triangle, octree_planes(layout, low), octree_planes(layout, low + wp.vec3i(half, half, half))):
+                    exact = exact | (1 << octant)
+        mask = exact
+    masks[r] = mask
+
+
+@kernel
+def count_octants(
+    first: int,
+    begin: wp.array(dtype=wp.int32),
+    masks: wp.array(dtype=wp.int32),
+    count: wp.array2d(dtype=wp.int32),
+):
+    """Cell first + tid, with the references begin[cell] .. begin[cell + 1] - 1: how many of them each octant has."""
+    cell = first + wp.tid()
+    for r in range(begin[cell], begin[cell + 1]):
+        for octant in range(8):
+            count[cell, octant] += (masks[r] >> octant) & 1
+
+
+@kernel
+def fill_octants(
+    first: int,
+    begin: wp.array(dtype=wp.int32),
+    masks: wp.array(dtype=wp.int32),
+    references: wp.array(dtype=wp.int32),
+    room: wp.array2d(dtype=wp.int32),
+    out: wp.array(dtype=wp.int32),
+):
+    """Cell first + tid: its references to its octants, those of octant k from room[cell, k] on (below 0: it is not split)."""
+    cell = first + wp.tid()
+    if room[cell, 0] < 0:
+        return
+    for r in range(begin[cell], begin[cell + 1]):
+        for octant in range(8):
+            if ((masks[r] >> octant) & 1) != 0:
+                out[room[cell, octant]] = references[r]
+                room[cell, octant] += 1

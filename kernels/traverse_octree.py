@@ -1,0 +1,233 @@
+"""The traversal unit of the octree: from the root down to the octants that the ray meets, front to back, with an early stop.
+
+Glassner 1984, "Space Subdivision for Fast Ray Tracing"; the stack of one entry a level, with the octants that are left in a
+mask, as in Laine and Karras 2010, "Efficient Sparse Voxel Octrees". The distances to all planes are taken afresh from their
+coordinates, so that no error adds up, and an octant is entered exactly where the conservative box test would enter it. Octants
+without primitives have no record and are never looked at.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from wrt.kernels.cell_ray import cell_slack, earlier, later
+from wrt.kernels.counters import Counts, Recorder, make_counters
+from wrt.kernels.ray_aabb import BoxRay, slab_interval
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
+
+MAILBOX_SIZE = 8
+
+# Corners of cells are whole numbers of the finest cell, exact in float32; the stack has one entry a level.
+MAX_LEVELS = 20
+
+
+@wp.struct
+class OctreeNode:
+    """8 bytes. A leaf (count >= 0): the references first .. first + count - 1. An inner node: -count is the mask of the octants
+    that have a record (bit 0: the lower half in x, y and z; 1, 2, 4 for the upper half in x, y, z), and these stand one after
+    another from `first` on."""
+
+    first: int
+    count: int
+
+
+@wp.struct
+class OctreeLayout:
+    """The root's cell from lo to hi; 2^levels of the finest cells, cubes of this size, reach from lo to hi or beyond."""
+
+    lo: wp.vec3
+    hi: wp.vec3
+    size: float
+    levels: int
+
+
+@wp.func
+def octree_planes(layout: OctreeLayout, corner: wp.vec3i) -> wp.vec3:
+    """The planes of these numbers, in finest cells, across x, y and z; monotone in each, and nowhere beyond the root's cell, whose
+    last planes are hi. The builder and the traversal call this one function."""
+    return wp.min(layout.lo + layout.size * wp.vec3(float(corner[0]), float(corner[1]), float(corner[2])), layout.hi)
+
+
+@wp.func
+def octant_corner(octant: int, half: int) -> wp.vec3i:
+    """The lowest corner of an octant, from that of the cell whose half is `half`."""
+    return half * wp.vec3i(octant & 1, (octant >> 1) & 1, (octant >> 2) & 1)
+
+
+@wp.func
+def distances(layout: OctreeLayout, ray: BoxRay, corner: wp.vec3i) -> wp.vec3:
+    """Where the ray meets these planes; NaN where it lies in one."""
+    return wp.cw_mul(octree_planes(layout, corner) - ray.origin, ray.inv_dir)
+
+
+@wp.func
+def latest(t: wp.vec3, begin: float) -> float:
+    """The largest, where NaN says nothing."""
+    out = wp.where(t[0] > begin, t[0], begin)
+    out = wp.where(t[1] > out, t[1], out)
+    return wp.where(t[2] > out, t[2], out)
+
+
+@wp.func
+def earliest(t: wp.vec3, end: float) -> float:
+    out = wp.where(t[0] < end, t[0], end)
+    out = wp.where(t[1] < out, t[1], out)
+    return wp.where(t[2] < out, t[2], out)
+
+
+@wp.func
+def in_order(mask: int, flip: int) -> int:
+    """Bit k of the result is bit k ^ flip of an 8-bit mask."""
+    out = mask
+    out = wp.where((flip & 1) != 0, ((out & 0x55) << 1) | ((out >> 1) & 0x55), out)
+    out = wp.where((flip & 2) != 0, ((out & 0x33) << 2) | ((out >> 2) & 0x33), out)
+    return wp.where((flip & 4) != 0, ((out & 0x0F) << 4) | ((out >> 4) & 0x0F), out)
+
+
+@wp.func
+def octants_met(occupied: int, enter: float, middle: wp.vec3, leave: float) -> int:
+    """Mask of those octants that the ray meets, of a cell that it meets from `enter` to `leave` (widened).
+
+    All in the order of the ray: bit 1, 2, 4 of an octant's number is its half in x, y, z, 0 for the nearer one. An octant is met
+    unless it begins, on one axis, after it ends on another: what the box test of each octant would say, to the last bit.
+    """
+    met = occupied
+    x = later(middle[0])
+    y = later(middle[1])
+    z = later(middle[2])
+    met = wp.where(enter > x, met & 0xAA, met)
+    met = wp.where(enter > y, met & 0xCC, met)
+    met = wp.where(enter > z, met & 0xF0, met)
+    met = wp.where(middle[0] > leave, met & 0x55, met)
+    met = wp.where(middle[1] > leave, met & 0x33, met)
+    met = wp.where(middle[2] > leave, met & 0x0F, met)
+    met = wp.where(middle[0] > y, met & ~0x22, met)
+    met = wp.where(middle[0] > z, met & ~0x0A, met)
+    met = wp.where(middle[1] > x, met & ~0x44, met)
+    met = wp.where(middle[1] > z, met & ~0x0C, met)
+    met = wp.where(middle[2] > x, met & ~0x50, met)
+    return wp.where(middle[2] > y, met & ~0x30, met)
+
+
+@cache
+def make_struct(record):
+    """The structure over records of this kind, in the order of prim_id. nodes[0] is the root; lo, hi, size, levels: the
+    OctreeLayout; pad, extent: the largest of any triangle's box; mailbox: 1 to remember what was tested; references: indices of
+    primitives."""
+
+    @wp.struct
+    class Octree:
+        lo: wp.vec3
+        hi: wp.vec3
+        size: float
+        levels: int
+        pad: float
+        extent: float
+        mailbox: int
+        nodes: wp.array(dtype=OctreeNode)
+        references: wp.array(dtype=wp.int32)
+        primitives: wp.array(dtype=record)
+        recorder: Recorder
+
+    return Octree
+
+
+def make_traversal(units: Units, any_hit: bool, accepts=None):
+    """The closest hit, or any (the first that is found). The box test is the walk's own, whatever `units` says."""
+    probe_of = make_probe(units)
+    intersect = make_intersect(units, accepts)
+    fetch_node, fetch_primitive, push, finish = make_counters(units, OctreeNode.numpy_dtype()["itemsize"])
+    struct = make_struct(units.triangle_test.record)
+
+    @wp.func
+    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+        probe = probe_of(ray)
+        best = no_hit(ray)
+        counts = Counts()
+        counts.boxes += 1  # the root's cell, which comes with the structure
+        counts.box_operations += 1
+        layout = OctreeLayout()
+        layout.lo = accel.lo
+        layout.hi = accel.hi
+        layout.size = accel.size
+        layout.levels = accel.levels
+        slack = cell_slack(probe.box, accel.pad, accel.extent)
+        interval = slab_interval(probe.box, layout.lo, layout.hi)
+        begin = earlier(ray.t_min) - slack
+        enter = wp.max(interval[0], begin)
+        if not (enter <= later(interval[1]) and enter <= later(best.t) + slack and enter < wp.inf):
+            return finish(accel.recorder, ray, counts, best)
+        backwards = wp.vec3i(wp.where(probe.box.inv_dir[0] < 0.0, 1, 0), wp.where(probe.box.inv_dir[1] < 0.0, 1, 0),
+                             wp.where(probe.box.inv_dir[2] < 0.0, 1, 0))
+        flip = backwards[0] + 2 * backwards[1] + 4 * backwards[2]
+        forwards = wp.vec3i(1, 1, 1) - backwards
+        mailbox = wp.zeros(shape=wp.static(MAILBOX_SIZE), dtype=wp.int32)  # primitive + 1, or 0
+        stack_first = wp.zeros(shape=wp.static(MAX_LEVELS), dtype=wp.int32)
+        stack_occupied = wp.zeros(shape=wp.static(MAX_LEVELS), dtype=wp.int32)
+        stack_left = wp.zeros(shape=wp.static(MAX_LEVELS), dtype=wp.int32)
+        level = int(0)
+        entries = int(0)
+        index = int(0)
+        size = 1 << layout.levels
+        corner = wp.vec3i()
+        while True:
+            node = accel.nodes[index]
+            counts = fetch_node(accel.recorder, ray, counts, index, 0)
+            left = int(0)
+            if node.count < 0:
+                counts.boxes += wp.bit_count(-node.count)
+                leave = later(earliest(distances(layout, probe.box, corner + size * forwards), float(wp.inf)))
+                limit = later(best.t) + slack
+                size = size >> 1
+                middle = distances(layout, probe.box, corner + wp.vec3i(size, size, size))
+                left = octants_met(in_order(-node.count, flip), enter, middle, wp.where(limit < leave, limit, leave))
+                if left != 0:
+                    stack_first[level] = node.first
+                    stack_occupied[level] = -node.count
+                    stack_left[level] = left
+                    level += 1
+                    if (left & (left - 1)) != 0:
+                        entries += 1
+                        counts = push(counts, entries)
+            else:
+                counts.leaves += 1
+                counts.box_operations -= 1  # a leaf has no planes
+                for i in range(node.first, node.first + node.count):
+                    primitive = accel.references[i]
+                    slot = primitive % wp.static(MAILBOX_SIZE)
+                    if accel.mailbox > 0 and mailbox[slot] == primitive + 1:
+                        continue
+                    mailbox[slot] = primitive + 1
+                    best = intersect(probe, surfaces, accel.primitives[primitive], best)
+                    counts = fetch_primitive(accel.recorder, ray, counts, primitive)
+                    if wp.static(any_hit):
+                        if best.prim_id != NO_HIT:
+                            return finish(accel.recorder, ray, counts, best)
+            # The first octant that was just met, or the next that is left, unless it begins where no better hit can be.
+            fresh = left != 0
+            found = bool(False)
+            while level > 0 and not found:
+                left = stack_left[level - 1]
+                if left == 0:
+                    level -= 1
+                else:
+                    octant = wp.bit_count((left & -left) - 1) ^ flip
+                    left = left & (left - 1)
+                    stack_left[level - 1] = left
+                    size = (1 << layout.levels) >> level
+                    mask = -2 * size
+                    corner = wp.vec3i(corner[0] & mask, corner[1] & mask, corner[2] & mask) + octant_corner(octant, size)
+                    if not fresh:
+                        counts.pops += 1
+                        if left == 0:
+                            entries -= 1
+                    enter = latest(distances(layout, probe.box, corner + size * backwards), begin)
+                    found = fresh or enter <= later(best.t) + slack
+                    index = stack_first[level - 1] + wp.bit_count(stack_occupied[level - 1] & ((1 << octant) - 1))
+                    fresh = False
+            if not found:
+                break
+        return finish(accel.recorder, ray, counts, best)
+
+    return traverse

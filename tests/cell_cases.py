@@ -1,0 +1,82 @@
+"""What is hard for structures that cut space into cells: geometries without height, far away, huge; rays that graze; lines."""
+
+import numpy as np
+
+from wrt.accel import Geometry
+from wrt.mesh import Mesh
+
+NO_SPHERES = np.zeros((0, 4), np.float32)
+
+
+def triangles(corners, spheres=NO_SPHERES):
+    corners = np.asarray(corners, np.float32).reshape(-1, 3)
+    return Geometry(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3), np.asarray(spheres, np.float32))
+
+
+CASES = {
+    "soup": lambda rng: triangles(rng.uniform(-1.0, 1.0, (500, 1, 3)) + 0.2 * rng.normal(size=(500, 3, 3))),
+    "flat": lambda rng: triangles(np.insert(rng.uniform(-1.0, 1.0, (500, 3, 2)), 1, 0.25, axis=2)),
+    "line": lambda rng: triangles(rng.uniform(-1.0, 1.0, (200, 3, 1)) * [1.0, 0.0, 0.0]),
+    "point": lambda rng: triangles(np.ones((50, 3, 3))),
+    "far": lambda rng: triangles(1000.0 + rng.uniform(-1.0, 1.0, (300, 3, 3))),
+    "huge": lambda rng: triangles(rng.uniform(-3e38, 3e38, (100, 3, 3))),
+    "subnormal": lambda rng: triangles(rng.uniform(-1e-40, 1e-40, (100, 3, 3))),
+    "spheres": lambda rng: triangles(np.zeros((0, 3, 3)), rng.uniform([-1, -1, -1, 0.1], [1, 1, 1, 0.3], (50, 4))),
+    "none": lambda rng: triangles(np.zeros((0, 3, 3))),
+}
+
+
+def points_of(geometry, rng):
+    """A random point of each primitive (N, 3) float64."""
+    weight = rng.dirichlet([0.3, 0.3, 0.3], len(geometry.faces))
+    point = (weight[:, :, None] * geometry.vertices[geometry.faces].astype(np.float64)).sum(axis=1)
+    around = rng.normal(size=(len(geometry.spheres), 3))
+    around *= geometry.spheres[:, 3:] / np.linalg.norm(around, axis=1, keepdims=True)
+    return np.concatenate([point, geometry.spheres[:, :3] + around])
+
+
+def soup(rng, n=600, size=0.15):
+    """Triangles, and 40 spheres."""
+    corners = rng.uniform(-1.0, 1.0, (n, 1, 3)) + size * rng.normal(size=(n, 3, 3))
+    return triangles(corners, np.concatenate([rng.uniform(-1.0, 1.0, (40, 3)), rng.uniform(0.02, 0.3, (40, 1))], axis=1))
+
+
+def grazing(rng, n):
+    """Long thin triangles in three planes, on top of each other, and rays that all but lie in the planes."""
+    corners = rng.uniform(-1.0, 1.0, (200, 3, 3))
+    corners[:, :, 1] = rng.choice([0.0, 1e-7, 1e-6], (200, 1))
+    corners[:, 2] = corners[:, 1] + 0.01 * rng.normal(size=(200, 3)) * [1.0, 0.0, 1.0]
+    target = rng.uniform(-1.0, 1.0, (n, 3)) * [1.0, 0.0, 1.0]
+    direction = rng.normal(size=(n, 3))
+    direction[:, 1] = rng.choice([-1.0, 1.0], n) * 10.0 ** rng.uniform(-9, -4, n)
+    origin = target - direction * rng.uniform(0.0, 2.0, (n, 1))
+    return triangles(corners), origin.astype(np.float32), direction.astype(np.float32)
+
+
+def segments(rng, n=400):
+    """Triangles without area: they are listed where they are, and never hit, so that a line is walked to its end."""
+    ends = rng.uniform(-1.0, 1.0, (n, 2, 3)) * [1.0, 0.5, 2.0]
+    first = 2 * np.arange(n)
+    return Geometry.of(Mesh(ends.reshape(-1, 3), np.stack([first, first + 1, first], axis=1)))
+
+
+def random_lines(lo, hi, n, rng):
+    """Uniform lines through a box: a point on its surface, by area, and a direction inwards by the cosine."""
+    extent = hi - lo
+    area = np.array([extent[1] * extent[2], extent[2] * extent[0], extent[0] * extent[1]])
+    axis = rng.choice(3, n, p=area / area.sum())
+    side = rng.integers(0, 2, n)
+    point = lo + rng.random((n, 3)) * extent
+    point[np.arange(n), axis] = np.where(side == 0, lo[axis], hi[axis])
+    r, phi = np.sqrt(rng.random(n)), 2.0 * np.pi * rng.random(n)
+    direction = np.empty((n, 3))
+    direction[np.arange(n), axis] = np.where(side == 0, 1.0, -1.0) * np.sqrt(1.0 - r**2)
+    direction[np.arange(n), (axis + 1) % 3] = r * np.cos(phi)
+    direction[np.arange(n), (axis + 2) % 3] = r * np.sin(phi)
+    return (point - direction).astype(np.float32), direction.astype(np.float32)
+
+
+def assert_same(found, expected):
+    for name in ("prim_id", "t", "u", "v"):
+        a, b = getattr(found, name).view(np.int32), getattr(expected, name).view(np.int32)
+        assert np.array_equal(a, b), f"{(a != b).sum()} of {len(a)} rays differ in {name}"

@@ -1,0 +1,70 @@
+"""The octree's walk where it is hard: rays in the planes and through the corners of cells, and how much it visits."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
+
+from tests import rewalk
+from tests.cell_cases import assert_same, soup
+from wrt.accel import build
+from wrt.shapes import icosphere
+
+
+@pytest.mark.parametrize("mailbox", [True, False])
+def test_rays_in_faces_and_through_edges_and_corners_of_cells(mailbox):
+    rng = np.random.default_rng(1)
+    geometry = soup(rng)
+    octree, brute = build(geometry, "octree", mailbox=mailbox), build(geometry, "brute_force")
+    lo, hi = np.array(octree.data.lo, np.float32), np.array(octree.data.hi, np.float32)
+    size = np.float32(octree.data.size) * np.float32(1 << int(octree.data.levels) - 4)
+    n = 1000
+    corner = np.minimum(lo + rng.integers(0, 17, (n, 3)).astype(np.float32) * size, hi)
+    for d in product([-1.0, -0.0, 0.0, 1.0], repeat=3):
+        if not np.any(d):
+            continue
+        direction = np.broadcast_to(np.array(d) * size, (n, 3)).astype(np.float32)  # diagonals of the cells: corner to corner
+        origin = (corner - 8 * direction).astype(np.float32)
+        origin[: n // 2] = corner[: n // 2]
+        assert_same(octree.closest_hit(origin, direction), brute.closest_hit(origin, direction))
+        assert np.array_equal(octree.any_hit(origin, direction, 0.1, 3.0), brute.any_hit(origin, direction, 0.1, 3.0))
+
+
+def test_rays_in_planes_visit_the_cells_that_the_box_test_enters():
+    rng = np.random.default_rng(2)
+    geometry = soup(rng, 200)
+    octree = build(geometry, "octree", max_leaf=2)
+    lo, size = np.array(octree.data.lo, np.float32), np.float32(octree.data.size)
+    corner = lo + (rng.integers(0, 17, (80, 3)) * (1 << int(octree.data.levels) - 4)).astype(np.float32) * size
+    direction = rng.choice([-1.0, -0.0, 0.0, 1.0], (80, 3))
+    direction[~direction.any(axis=1), 0] = 1.0
+    origin = rounded(corner - 0.5 * direction)
+    counters = octree.closest_hit(origin, direction, counters=True).counters
+    for i, ray in enumerate(rewalk.rays(geometry, origin, direction)):
+        walk = rewalk.octree(octree, ray)
+        assert [counters.nodes[i], counters.primitives[i], counters.pops[i]] == [walk.nodes, walk.primitives, walk.pops]
+    assert counters.nodes.mean() > 10
+
+
+def test_mailboxing_saves_tests_and_no_cells():
+    rng = np.random.default_rng(4)
+    geometry = soup(rng, 300, 0.6)
+    origin = rounded(4.0 * unit(rng.normal(size=(2000, 3))))
+    direction = rounded(rng.uniform(-0.5, 0.5, (2000, 3)) - origin)
+    with_it, without = (build(geometry, "octree", mailbox=m).closest_hit(origin, direction, counters=True) for m in (True, False))
+    assert_same(with_it, without)
+    assert np.array_equal(with_it.counters.nodes, without.counters.nodes)
+    assert (with_it.counters.primitives <= without.counters.primitives).all()
+    assert with_it.counters.primitives.sum() < 0.95 * without.counters.primitives.sum()
+
+
+def test_the_walk_ends_at_the_hit_and_at_t_max_and_passes_over_empty_space():
+    ball = build(icosphere(4), "octree")
+    depth = ball.stats.depth
+    outside = ball.closest_hit([[-5.0, 0.01, 0.02]], [[1.0, 0.0, 0.0]], counters=True).counters
+    through = ball.closest_hit([[-0.5, 0.01, 0.02]], [[1.0, 0.0, 0.0]], counters=True).counters
+    assert outside.nodes[0] <= depth + 2 and through.nodes[0] <= 2 * depth and outside.leaves[0] <= 2
+    near = ball.closest_hit([[-0.5, 0.01, 0.02]], [[1.0, 0.0, 0.0]], 0.0, 0.001, counters=True).counters
+    assert near.leaves[0] == 0 and near.nodes[0] <= 3

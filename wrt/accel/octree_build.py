@@ -1,0 +1,201 @@
+"""The builder of octrees: level by level from the root down, all cells of a level at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Geometry
+from wrt.accel.cells import cell_source
+from wrt.device import load_kernel, records, run_all, start, upload
+from wrt.errors import InputError
+from wrt.kernels import build_octree
+from wrt.kernels.ray_aabb import PAD_EXTENT
+from wrt.kernels.traverse_octree import MAX_LEVELS, OctreeLayout, OctreeNode
+
+REFERENCES_PER_LAUNCH = 16384
+CELLS_PER_LAUNCH = 4096
+MAX_REFERENCES = 1 << 27
+OCTANTS = np.arange(8)[:, None] >> np.arange(3) & 1  # (8, 3): which half, in x, y, z
+
+
+@dataclass(frozen=True)
+class OctreeOptions:
+    """As in wrt.accel.octree.Octree. Raises InputError."""
+
+    max_leaf: int
+    max_depth: int
+    by_cost: bool
+    max_growth: float
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.max_leaf <= 1 << 20:
+            raise InputError(f"max_leaf must be 1 to {1 << 20}, got {self.max_leaf}")
+        if not 0 <= self.max_depth <= MAX_LEVELS:
+            raise InputError(f"max_depth must be 0 to {MAX_LEVELS}, got {self.max_depth}")
+        if not 1.0 <= self.max_growth <= 1e4:
+            raise InputError(f"max_growth must be 1 to 1e4 references a primitive, got {self.max_growth}")
+
+
+@dataclass
+class Cells:
+    """The cells of one level: lowest corners (M, 3) int32 in finest cells; the primitives of cell i are references[begin[i]] ..
+    references[begin[i + 1] - 1]."""
+
+    corner: np.ndarray
+    begin: np.ndarray
+    references: np.ndarray
+
+    @property
+    def count(self) -> np.ndarray:
+        return np.diff(self.begin)
+
+    def part(self, chosen: np.ndarray) -> Cells:
+        """The chosen cells, (M,) bool."""
+        count = self.count
+        references = self.references[np.repeat(chosen, count)]
+        return Cells(self.corner[chosen], np.concatenate([[0], np.cumsum(count[chosen])]).astype(np.int32), references)
+
+
+@dataclass
+class Tree:
+    """nodes: records of OctreeNode, breadth first; references: of all leaves; depth: levels, the root's included; cost: expected
+    nodes and primitives of a random line through the root's cell."""
+
+    layout: Any
+    nodes: np.ndarray = field(default_factory=lambda: records(OctreeNode, 0))
+    references: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    depth: int = 0
+    cost: float = 0.0
+
+
+def root_cell(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> Any:
+    """The layout around these boxes: a cube from the lowest corner, cut off at the highest one."""
+    layout = OctreeLayout()
+    low, high = lo.min(axis=0, initial=np.inf), hi.max(axis=0, initial=-np.inf)
+    layout.lo, layout.hi, layout.size, layout.levels = wp.vec3(*low), wp.vec3(*high), 0.0, 0
+    edge = float((high.astype(np.float64) - low).max())
+    if not 0.0 < edge < 1e37:
+        return layout
+    # A cell is not so small that the rounding of its planes matters, or that float32 has no such number.
+    finest = max(float(np.abs([low, high]).max()) * PAD_EXTENT, 1e-37)
+    layout.levels = min(max_depth, max(int(np.log2(edge / finest)), 0))
+    size = np.float32(edge / (1 << layout.levels))
+    while not (low + np.float32(1 << layout.levels) * size >= high).all():
+        size = np.nextafter(size, np.float32(np.inf))
+    layout.size = float(size)
+    return layout
+
+
+def planes(layout: Any, corner: np.ndarray) -> np.ndarray:
+    """Coordinates (..., 3) of planes by their numbers, float64, to within rounding those of the kernels."""
+    lo, hi = np.array(layout.lo, np.float64), np.array(layout.hi, np.float64)
+    return np.minimum(lo + corner * float(layout.size), hi)
+
+
+def areas(layout: Any, corner: np.ndarray, size: int) -> np.ndarray:
+    """Half the surface of the cells (..., 3) of this size."""
+    e = planes(layout, corner + size) - planes(layout, corner)
+    return e[..., 0] * e[..., 1] + e[..., 1] * e[..., 2] + e[..., 2] * e[..., 0]
+
+
+def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Tree:
+    """Split the cells that have more than max_leaf primitives, where that pays, until none is left to split."""
+    bounds = geometry.bounds()
+    tree = Tree(root_cell(*bounds, options.max_depth))
+    n, levels = len(geometry), tree.layout.levels
+    split = _Splitter(geometry, bounds, tree.layout, threads)
+    cells = Cells(np.zeros((1, 3), np.int32), np.array([0, n], np.int32), np.arange(n, dtype=np.int32))
+    whole = float(areas(tree.layout, cells.corner, 1 << levels)[0]) if levels else 0.0
+    room = int(min(options.max_growth * n, MAX_REFERENCES)) - n  # references that may still be added
+    nodes, references, n_nodes, n_references = [], [], 0, 0
+    while len(cells.corner):
+        half = (1 << levels - tree.depth) >> 1
+        tree.depth += 1
+        chosen, count, children = choose(cells, split, half, options, room)
+        room -= int(count.sum() - cells.count[chosen].sum())
+        level = records(OctreeNode, len(cells.corner))
+        occupied = (count > 0).sum(axis=1)
+        level["count"] = cells.count
+        level["count"][chosen] = -((count > 0) << np.arange(8)).sum(axis=1)
+        leaves = cells.part(~chosen)
+        level["first"][~chosen] = n_references + leaves.begin[:-1]
+        n_nodes += len(level)
+        level["first"][chosen] = n_nodes + np.cumsum(occupied) - occupied
+        area = areas(tree.layout, cells.corner, 2 * half or 1) if whole > 0.0 else np.ones(len(level))
+        tree.cost += float((area * (1 + np.where(chosen, 0, cells.count))).sum() / (whole if whole > 0.0 else 1.0))
+        nodes.append(level)
+        references.append(leaves.references)
+        n_references += len(leaves.references)
+        cells = children
+    tree.nodes, tree.references = np.concatenate(nodes), np.concatenate(references)
+    return tree
+
+
+def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions,
+           room: int) -> tuple[np.ndarray, np.ndarray, Cells]:
+    """Which cells of the level to split, (M,) bool; how much each octant of those has, (K, 8); and the cells of the next level."""
+    chosen = cells.count > options.max_leaf if half else np.zeros(len(cells.corner), bool)
+    large = cells.part(chosen)
+    count = split.count(large, half)
+    # What a ray through the cell is expected to cost, in cells fetched and primitives tested, as one cell and as octants.
+    corner = large.corner[:, None] + half * OCTANTS
+    area, whole = areas(split.layout, corner, half), areas(split.layout, large.corner, 2 * half)
+    gain = whole * large.count - (area * (count + (count > 0))).sum(axis=1)
+    pays = gain > 0.0 if options.by_cost else np.ones(len(gain), bool)
+    more = count.sum(axis=1) - large.count
+    order = np.argsort(-gain, kind="stable")
+    order = order[pays[order]]
+    keep = np.zeros(len(gain), bool)
+    keep[order[np.cumsum(np.maximum(more[order], 0)) <= room]] = True
+    chosen[chosen] = keep
+    return chosen, count[keep], split.fill(large, corner, count, keep)
+
+
+class _Splitter:
+    """The kernels of kernels.build_octree over one geometry."""
+
+    def __init__(self, geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: Any, threads: int) -> None:
+        self.cpu, self.layout, self.threads = start("cpu"), layout, threads
+        self.source = cell_source(geometry, bounds)
+        for kernel in (build_octree.find_octants, build_octree.count_octants, build_octree.fill_octants):
+            load_kernel(kernel, self.cpu)
+
+    def _launch(self, kernel: Any, n: int, step: int, *inputs: Any) -> None:
+        """Over ranges of `step`; `first` is the input that is None."""
+        def job(first: int) -> None:
+            wp.launch(kernel, dim=min(step, n - first), device=self.cpu, inputs=[first if x is None else x for x in inputs])
+
+        run_all([partial(job, first) for first in range(0, n, step)], self.threads)
+
+    def _int32(self, array: np.ndarray) -> Any:
+        return upload(np.ascontiguousarray(array, np.int32), wp.int32, self.cpu)
+
+    def count(self, cells: Cells, half: int) -> np.ndarray:
+        """How many references each octant of each cell has, (M, 8)."""
+        m, n = len(cells.corner), len(cells.references)
+        self.begin, self.references = self._int32(cells.begin), self._int32(cells.references)
+        self.masks = wp.zeros(n, dtype=wp.int32, device=self.cpu)
+        count = wp.zeros((m, 8), dtype=wp.int32, device=self.cpu)
+        cell_of = self._int32(np.repeat(np.arange(m), cells.count))
+        corner = upload(np.ascontiguousarray(cells.corner, np.int32), wp.vec3i, self.cpu)
+        self._launch(build_octree.find_octants, n, REFERENCES_PER_LAUNCH, self.source, self.layout, None, half, corner, cell_of,
+                     self.references, self.masks)
+        self._launch(build_octree.count_octants, m, CELLS_PER_LAUNCH, None, self.begin, self.masks, count)
+        return count.numpy()
+
+    def fill(self, cells: Cells, corner: np.ndarray, count: np.ndarray, keep: np.ndarray) -> Cells:
+        """The octants that have something, of the cells to keep, one cell after another; `count` was called just before."""
+        count = np.where(keep[:, None], count, 0)
+        begin = np.concatenate([[0], np.cumsum(count.ravel())])
+        room = np.where(keep[:, None], begin[:-1].reshape(-1, 8), -1)
+        out = wp.zeros(int(begin[-1]), dtype=wp.int32, device=self.cpu)
+        self._launch(build_octree.fill_octants, len(cells.corner), CELLS_PER_LAUNCH, None, self.begin, self.masks, self.references,
+                     upload(np.ascontiguousarray(room, np.int32).reshape(-1, 8), wp.int32, self.cpu), out)
+        has = count > 0
+        return Cells(corner[has].astype(np.int32), np.concatenate([begin[:-1][has.ravel()], begin[-1:]]).astype(np.int32),
+                     out.numpy())
