@@ -37,8 +37,8 @@ def test_the_registry_names_what_it_holds() -> None:
 
 
 def test_unknown_names_and_devices_are_refused() -> None:
-    with pytest.raises(InputError, match=r"no structure 'octree'.*bvh2"):
-        build(BALL, "octree")
+    with pytest.raises(InputError, match=r"no structure 'quadtree'.*bvh2"):
+        build(BALL, "quadtree")
     with pytest.raises(InputError, match=r"no device 'tpu'.*cpu"):
         build(BALL, device="tpu")
     with pytest.raises(InputError, match="brute_force has no option 'max_leaf'"):
