@@ -40,13 +40,12 @@ class Pieces:
 
 @wp.struct
 class BspOptions:
-    """Costs of the heuristic; empty_bonus: factor on the cost of a plane that cuts off empty space; samples: triangles of a
-    cell whose planes are tried; keep: if not 0, cells of at most so many pieces are left over for later launches."""
+    """Costs of the heuristic; samples: triangles of a cell whose planes are tried; keep: if not 0, cells of at most so many
+    pieces are left over for later launches."""
 
     cost_intersection: wp.float64
     cost_axis: wp.float64
     cost_plane: wp.float64
-    empty_bonus: wp.float64
     samples: int
     max_depth: int
     keep: int
@@ -167,7 +166,7 @@ def cheaper(tools: BspTools, scope: Scope, trial: BspSplit, best: BspSplit) -> B
             n_flat += 1
         n_below += sides & 1
         n_above += sides / 2
-        if cost * tools.options.empty_bonus >= best.cost:
+        if cost >= best.cost:
             return best
     trial.low_flat = below <= above
     if trial.low_flat:
@@ -176,8 +175,6 @@ def cheaper(tools: BspTools, scope: Scope, trial: BspSplit, best: BspSplit) -> B
         n_above += n_flat
     if n_below + n_above > scope.budget:
         return best
-    if n_below == 0 or n_above == 0:
-        cost = cost * tools.options.empty_bonus
     if not cost < best.cost:
         return best
     trial.cost = cost

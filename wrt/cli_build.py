@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import say, say_json, warnings_told
+from wrt.cli_common import now_and_then, say, say_json, warnings_told
 from wrt.errors import InputError
 
 
@@ -34,7 +34,7 @@ class Setting(click.ParamType):
 @click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
 @click.option("--set", "settings", type=Setting(), multiple=True, help="An option of the structure, such as max_leaf=8; repeatable")
 @click.option("--threads", type=int, help="Threads to build with  [default: all cores]")
-@click.option("-q", "--quiet", is_flag=True, help="No warnings")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print the statistics as JSON")
 def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any], ...], threads: int | None, quiet: bool,
           as_json: bool) -> None:
@@ -42,11 +42,16 @@ def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any],
     from dataclasses import asdict
 
     import wrt
+    from wrt.accel import tells_progress
     from wrt.accel.store import check_target
 
     check_target(output)
+    options = settled(settings)
+    if tells_progress(accel):
+        tell = now_and_then(quiet)
+        options["progress"] = lambda done: tell(f"{accel}: {100.0 * done:.0f} % built")
     with warnings_told(quiet):
-        structure = wrt.build(mesh, accel, threads=threads, **settled(settings))
+        structure = wrt.build(mesh, accel, threads=threads, **options)
     structure.save(output)
     if as_json:
         say_json({"output": output, "accel": structure.name, **asdict(structure.stats)})
@@ -60,7 +65,7 @@ def settled(settings: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
     """Options by name; InputError where one is set twice or belongs to another flag."""
     out: dict[str, Any] = {}
     for name, value in settings:
-        if name in out or name in ("mesh", "accel", "device", "threads"):
+        if name in out or name in ("mesh", "accel", "device", "threads", "progress"):
             raise InputError(f"--set {name}: {'set twice' if name in out else 'has a flag of its own'}")
         out[name] = value
     return out

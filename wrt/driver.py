@@ -8,14 +8,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, fields
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 import wrt
-from wrt.accel import ACCELERATORS, Structure, build
+from wrt.accel import ACCELERATORS, Structure, build, tells_progress
 from wrt.accel.base import check_units
 from wrt.arguments import as_integer, as_names, as_one, as_tuple, shown, unknown
 from wrt.device import load_kernel, memory_size, start, thread_count
@@ -36,7 +36,7 @@ AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 TILE_SIZE = 32
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
 MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
-COMPILE_TOLD = 1.0  # seconds of waiting for the compiler before `progress` is told of it
+PREPARING_TOLD = 1.0  # seconds of compiling and building before `progress` is told of it
 MAX_SPP = 1 << 16  # where a target error asks for more than anybody said
 
 
@@ -44,7 +44,8 @@ MAX_SPP = 1 << 16  # where a target error asks for more than anybody said
 class Progress:
     """How far a render is: samples done and to do (summed over pixels), rays so far, seconds of tracing.
 
-    stage: "trace"; or, once and before anything is done, "compile", where compiling takes longer than COMPILE_TOLD.
+    stage: "trace"; or before anything is traced, where that takes longer than PREPARING_TOLD: "compile", once, or "build", with
+    done of total steps of a structure that is slow to build.
     """
 
     done: int
@@ -163,6 +164,7 @@ class Renderer:
         self.seconds: dict[str, float] = {}
         self.threads = thread_count(options.threads)
         self.interrupts: list[int] = []
+        self.fraction_built = 0.0
         self.device = start(options.device)
         self.camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
         self.features = features_of(scene, self.camera)
@@ -204,14 +206,16 @@ class Renderer:
         pool = ThreadPoolExecutor(2)
         compiling = pool.submit(self._compile)
         jobs: set[Future[None]] = {compiling, pool.submit(self._build)}
-        begin, tell = time.perf_counter(), self.options.progress
+        begin, tell, told = time.perf_counter(), self.options.progress, ("", 0.0)
         try:
             while jobs:
                 finished, jobs = wait(jobs, timeout=0.1, return_when=FIRST_EXCEPTION)
-                if tell is not None and compiling in jobs and time.perf_counter() - begin >= COMPILE_TOLD:
-                    area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
-                    tell(Progress(0, area * self.scene.settings.spp, 0, 0.0, stage="compile"))
-                    tell = None
+                seconds = time.perf_counter() - begin
+                state = ("build", self.fraction_built) if self.fraction_built > 0.0 else ("compile", 0.0)
+                if tell is not None and jobs and seconds >= PREPARING_TOLD and state != told and (
+                        state[0] == "build" or compiling in jobs):
+                    tell(Progress(int(100.0 * state[1]), 100, 0, seconds, stage=state[0]))
+                    told = state
                 for job in finished:
                     job.result()
         finally:
@@ -227,8 +231,10 @@ class Renderer:
         begin = time.perf_counter()
         self.device_scene = upload_scene(self.scene, self.device)
         self.seconds["upload"] = time.perf_counter() - begin
-        self.accel = build(self.device_scene.world.geometry, self.options.accel, self.options.device, self.threads,
-                           triangle=self.options.triangle, box=self.options.box, **self.options.accel_options)
+        options = {"triangle": self.options.triangle, "box": self.options.box, **self.options.accel_options}
+        if tells_progress(self.options.accel):
+            options = {"progress": partial(setattr, self, "fraction_built"), **options}
+        self.accel = build(self.device_scene.world.geometry, self.options.accel, self.options.device, self.threads, **options)
         self.seconds["build"] = self.accel.stats.build_seconds
 
     def run(self, *, seed: int | None = None, spp: int | None = None) -> Film:

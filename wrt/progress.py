@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from wrt.driver import Progress
 
 COMPILING = "compiling kernels (first time for this kind of scene) ..."
+BUILDING = "building the structure"
 LINE_EVERY = 10.0  # seconds between lines where stderr is no terminal
 
 
@@ -59,7 +60,9 @@ def _bar() -> Iterator[Callable[[Progress], None]]:
         if progress.stage == "compile":
             bar.update(task, description=COMPILING)
             return
-        bar.update(task, completed=progress.done, total=progress.total, note=describe(progress), description="render")
+        building = progress.stage == "build"
+        bar.update(task, completed=progress.done, total=progress.total, note="" if building else describe(progress),
+                   description=BUILDING if building else "render")
 
     bar.start()
     try:
@@ -70,15 +73,15 @@ def _bar() -> Iterator[Callable[[Progress], None]]:
 
 
 def _lines() -> Callable[[Progress], None]:
-    due = LINE_EVERY
+    due = {"build": LINE_EVERY, "trace": LINE_EVERY}
 
     @_while_there_is_a_terminal
     def report(progress: Progress) -> None:
-        nonlocal due
         if progress.stage == "compile":
             print(COMPILING, file=sys.stderr, flush=True)
-        elif progress.seconds >= due:
-            due = progress.seconds + LINE_EVERY
-            print(f"{100.0 * progress.done / progress.total:.0f} %, {describe(progress)}", file=sys.stderr, flush=True)
+        elif progress.seconds >= due[progress.stage]:
+            due[progress.stage] = progress.seconds + LINE_EVERY
+            what = BUILDING if progress.stage == "build" else describe(progress)
+            print(f"{100.0 * progress.done / progress.total:.0f} %, {what}", file=sys.stderr, flush=True)
 
     return report

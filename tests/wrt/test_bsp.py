@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import warp as wp
 
 import wrt.accel.bsp as module
 from tests.kernels.test_traverse import GEOMETRIES, assert_same_hits, rays_for, soup, triangles
-from wrt.accel import Geometry, build
+from wrt.accel import Geometry, build, build_cached
 from wrt.accel.base import HitArrays
 from wrt.accel.bsp import Bsp
 from wrt.errors import InputError
@@ -24,8 +25,8 @@ from wrt.shapes import icosphere
 
 
 @pytest.mark.parametrize(("option", "value"), [
-    ("cost_intersection", 0.0), ("cost_axis", -1.0), ("cost_plane", np.inf), ("empty_bonus", 0.0), ("empty_bonus", 1.5),
-    ("samples", -1), ("max_depth", -1), ("max_depth", 61), ("max_depth", 3.5), ("max_growth", 0.5), ("max_growth", np.nan)])
+    ("cost_intersection", 0.0), ("cost_axis", -1.0), ("cost_plane", np.inf), ("samples", -1), ("max_depth", -1), ("max_depth", 61),
+    ("max_depth", 3.5), ("max_growth", 0.5), ("max_growth", np.nan), ("progress", 1)])
 def test_options_out_of_range_are_refused(option: str, value: float) -> None:
     with pytest.raises(InputError, match=option):
         build(icosphere(0), "bsp", **{option: value})
@@ -41,6 +42,14 @@ def test_progress_rises_to_one() -> None:
     seen: list[float] = []
     build(icosphere(3), "bsp", progress=seen.append)
     assert len(seen) > 2 and seen == sorted(seen) and seen[-1] == 1.0
+
+
+def test_progress_is_no_part_of_what_is_cached(tmp_path: Path) -> None:
+    seen: list[float] = []
+    first = build_cached(tmp_path, icosphere(0), "bsp", progress=seen.append)
+    assert seen
+    again = build_cached(tmp_path, icosphere(0), "bsp")
+    assert len(list(tmp_path.iterdir())) == 1 and np.array_equal(first.built.order, again.built.order)
 
 
 def test_an_error_of_progress_ends_the_build() -> None:
@@ -83,7 +92,7 @@ def test_samples_decide_whether_there_are_tilted_planes() -> None:
 
 @pytest.mark.parametrize("kind", ["all_equal", "coincident", "progression", "flat", "tiny_and_huge", "long_thin"])
 def test_depth_is_bounded(kind: str) -> None:
-    for options in ({}, {"cost_plane": 1e-3, "cost_axis": 1e-3, "empty_bonus": 0.5}, {"max_depth": 3}):
+    for options in ({}, {"cost_plane": 1e-3, "cost_axis": 1e-3}, {"max_depth": 3}):
         stats = build(GEOMETRIES[kind](np.random.default_rng(2)), "bsp", **options).stats
         assert stats.depth <= options.get("max_depth", STACK_SIZE - 4) + 1
 

@@ -472,7 +472,7 @@ def test_progress_is_told_once_of_a_compiler_that_takes_long(monkeypatch: pytest
         load(kernel, device)
 
     load = driver.load_kernel
-    monkeypatch.setattr(driver, "COMPILE_TOLD", 0.2)
+    monkeypatch.setattr(driver, "PREPARING_TOLD", 0.2)
     seen: list[Progress] = []
     render(SCENE, spp=2, progress=seen.append)
     quick = len([each for each in seen if each.stage == "compile"])
@@ -480,6 +480,22 @@ def test_progress_is_told_once_of_a_compiler_that_takes_long(monkeypatch: pytest
     render(SCENE, spp=2, progress=seen.append)
     told = [each for each in seen if each.stage == "compile"]
     assert len(told) == quick + 1 and (told[-1].done, told[-1].rays) == (0, 0) and seen[-1].stage == "trace"
+
+
+def test_progress_is_told_of_a_structure_that_is_slow_to_build(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(geometry: Any, accel: str, device: str, threads: int, *, progress: Any, **options: Any) -> Any:
+        for fraction in (0.25, 0.5, 1.0):
+            progress(fraction)
+            sleep(0.3)
+        return make(geometry, accel, device, threads, **options)
+
+    make = driver.build
+    monkeypatch.setattr(driver, "PREPARING_TOLD", 0.0)
+    monkeypatch.setattr(driver, "build", slow)
+    seen: list[Progress] = []
+    render(SCENE, spp=1, accel="bsp", progress=seen.append)
+    told = [(each.done, each.total) for each in seen if each.stage == "build"]
+    assert told == [(25, 100), (50, 100), (100, 100)] and seen[-1].stage == "trace"
 
 
 def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from tests.command_line import BOX_OBJ, wrt
 from wrt.driver import Progress
-from wrt.progress import COMPILING, LINE_EVERY, describe, progress_reporter
+from wrt.progress import BUILDING, COMPILING, LINE_EVERY, describe, progress_reporter
 
 
 def at(seconds: float, done: int = 50) -> Progress:
@@ -64,6 +64,18 @@ def test_compiling_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
         assert report is not None
         report(Progress(0, 200, 0, 0.0, stage="compile"))
     assert stderr.getvalue() == f"{COMPILING}\n"
+
+
+def test_building_is_told_in_lines_with_a_clock_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    stderr = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stderr)
+    with progress_reporter(False) as report:
+        assert report is not None
+        for second in range(1, 15):
+            report(Progress(2 * second, 100, 0, float(second), stage="build"))
+        for second in range(1, 11):
+            report(at(float(second)))
+    assert stderr.getvalue().splitlines() == [f"20 %, {BUILDING}", "25 %, 4.0 Mray/s, 0:30 left"]
 
 
 def test_a_terminal_that_is_gone_is_no_reason_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:

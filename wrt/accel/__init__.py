@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from typing import Any
 
 from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
@@ -17,7 +18,7 @@ from wrt.errors import InputError
 from wrt.mesh import Mesh
 
 __all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "Structure", "build", "build_cached",
-           "load_accel"]
+           "load_accel", "tells_progress"]
 
 ACCELERATORS: dict[str, type[Accelerator]] = {
     "bvh": Bvh2,  # the default: the best one there is
@@ -30,6 +31,11 @@ ACCELERATORS: dict[str, type[Accelerator]] = {
     "grid": Grid,
     "octree": Octree,
 }
+
+
+def tells_progress(accel: str) -> bool:
+    """Whether the structure is so slow to build that it has the option `progress`: called with the fraction done, 0 to 1."""
+    return accel in ACCELERATORS and "progress" in signature(ACCELERATORS[accel]._build).parameters
 
 
 def build(mesh: Mesh | Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None,

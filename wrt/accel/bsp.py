@@ -30,31 +30,30 @@ class Bsp(Accelerator):
     """Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Slow to build: a subset of all triangles' planes is tried.
 
     Options: cost_intersection, cost_axis, cost_plane (of one primitive, of a node across an axis, of any other; the defaults
-    are those of the Manta renderer); empty_bonus (0 to 1: factor on the cost of a plane that cuts off empty space); samples
-    (0 or more: so many triangles of a cell, evenly spread over its list, give their four planes as candidates; 0: a k-d tree);
-    max_depth (1 to 60; 0: 16 + 2 log2 of the number of primitives); max_growth (1 to 1000: references in all leaves for
-    each primitive; a cell may use up its share of them, by how many it has); max_triangles (more primitives are refused); progress:
-    called with the fraction that is done, 0 to 1, from the thread that builds.
+    are those of the Manta renderer); samples (0 or more: so many triangles of a cell, evenly spread over its list, give their
+    four planes as candidates; 0: a k-d tree); max_depth (1 to 60; 0: 16 + 2 log2 of the number of primitives); max_growth (1 to
+    1000: references in all leaves for each primitive; a cell may use up its share of them, by how many it has); max_triangles
+    (more primitives are refused); progress: called with the fraction that is done, 0 to 1, from the threads that build.
     """
 
     name = "bsp"
     kernels = kernels
 
-    def _build(self, cost_intersection: float = 75.0, cost_axis: float = 10.0, cost_plane: float = 20.0, empty_bonus: float = 1.0,
-               samples: int = 32, max_depth: int = 0, max_growth: float = 16.0, max_triangles: int = 200_000,
+    def _build(self, cost_intersection: float = 75.0, cost_axis: float = 10.0, cost_plane: float = 20.0, samples: int = 128,
+               max_depth: int = 0, max_growth: float = 16.0, max_triangles: int = 200_000,
                progress: Callable[[float], None] | None = None) -> Built:
         n = len(self.geometry)
         for name, value in (("cost_intersection", cost_intersection), ("cost_axis", cost_axis), ("cost_plane", cost_plane)):
             if not 0.0 < value < math.inf:
                 raise InputError(f"{name} must be above 0 and finite, got {value}")
-        if not 0.0 < empty_bonus <= 1.0:
-            raise InputError(f"empty_bonus must be above 0 and at most 1, got {empty_bonus}")
         if samples < 0:
             raise InputError(f"samples must be 0 or more, got {samples}")
         if not 0 <= max_depth <= MAX_DEPTH:
             raise InputError(f"max_depth must be 0 to {MAX_DEPTH}, got {max_depth}")
         if not 1.0 <= max_growth <= 1000.0:
             raise InputError(f"max_growth must be 1 to 1000, got {max_growth}")
+        if progress is not None and not callable(progress):
+            raise InputError(f"progress must be a function of one number, got {progress!r}")
         if n > max_triangles:
             raise InputError(f"bsp is slow to build, and takes up to max_triangles={max_triangles} primitives; there are {n}: take "
                              "another structure (kdtree, bvh), or raise max_triangles")
@@ -64,7 +63,7 @@ class Bsp(Accelerator):
         lo, hi = (bound.astype(np.float64) for bound in self.geometry.bounds())
         options = BspOptions()
         options.cost_intersection, options.cost_axis, options.cost_plane = cost_intersection, cost_axis, cost_plane
-        options.empty_bonus, options.samples, options.max_depth = empty_bonus, samples, max_depth or automatic_depth(n)
+        options.samples, options.max_depth = samples, max_depth or automatic_depth(n)
         options.lo, options.hi = wp.vec3d(lo.min(axis=0)), wp.vec3d(hi.max(axis=0))
         builder = Builder(self.geometry, options, self.threads, int(max_growth * n), progress or (lambda done: None))
         return builder.build()
@@ -152,6 +151,8 @@ class Builder:
             self.progress(self.done / max(int(size.sum()), 1))
 
         run_all([partial(job, int(i)) for i in np.argsort(-size, kind="stable")], self.threads)
+        if not len(tasks):
+            self.progress(1.0)
         return self.join(top, [subtree for subtree in subtrees if subtree is not None])
 
     def join(self, top: Launch, subtrees: list[Subtree]) -> Built:

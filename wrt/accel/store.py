@@ -140,7 +140,8 @@ def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: s
     from wrt.accel import build
 
     geometry = Geometry.of(mesh) if isinstance(mesh, Mesh) else mesh
-    key = json.dumps([geometry.digest(), accel, options, wrt.__version__], sort_keys=True)
+    chosen = {name: value for name, value in options.items() if name != "progress"}
+    key = json.dumps([geometry.digest(), accel, chosen, wrt.__version__], sort_keys=True)
     path = Path(folder) / f"{sha256(key.encode()).hexdigest()[:32]}.accel"
     if path.is_file():
         try:
