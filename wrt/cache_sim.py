@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import heapq
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from wrt.device import load_kernel, run_all, start, thread_count, upload
 from wrt.errors import InputError
-from wrt.kernels.cache_lru import Caches, replay_lru
+from wrt.kernels.cache_lru import Caches, Missed, Trace, replay_lru, replay_warps
 from wrt.kernels.counters import PRIMITIVE_SPACE
 
 LINE = 128  # bytes: of a cache line on NVIDIA's GPUs since Volta
@@ -33,15 +34,23 @@ class Cache:
 
 
 @dataclass(frozen=True, eq=False)
-class Stream:
-    """Accesses to cache lines, those of each SM one after another (SM s: first[s] to first[s + 1]) and in the order of time.
+class Warps:
+    """Recorded rays in the order of warps and lanes. warp: (N,) of each ray, 0 to W - 1, ascending, 32 rays at most in one; ray i
+    has the fetches first[i] to first[i + 1]; address, size: of each, in bytes."""
 
-    line: number of the line; time: the round in which it is asked for (a warp makes one fetch a lane and round).
-    """
+    warp: np.ndarray
+    first: np.ndarray
+    address: np.ndarray
+    size: np.ndarray
 
+
+@dataclass(frozen=True, eq=False)
+class Level1:
+    """accesses: of all L1s; line, time: of those that miss, SM after SM, and the round in which they are made."""
+
+    accesses: int
     line: np.ndarray
     time: np.ndarray
-    first: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -72,71 +81,64 @@ def distinct_lines(first: np.ndarray, address: np.ndarray, size: np.ndarray) -> 
     return np.bincount(both // count, minlength=len(first) - 1)
 
 
-def replay(first: np.ndarray, line: np.ndarray, cache: Cache) -> np.ndarray:
-    """Whether each access finds its line, (M,) bool; every stream first[s] to first[s + 1] has a cache of its own, empty at
-    the beginning, which drops the least recently used line of a full set. A line belongs in set `line modulo sets`."""
-    streams, cpu = len(first) - 1, start("cpu")
+def replay(line: np.ndarray, cache: Cache) -> np.ndarray:
+    """Whether each access finds its line, (M,) bool, in a cache that is empty at the beginning and drops the least recently used
+    line of a full set. A line belongs in set `line modulo sets`."""
+    cpu = start("cpu")
     hit = wp.zeros(len(line), dtype=wp.int8, device=cpu)
     load_kernel(replay_lru, cpu)
-    begins, lines = upload(first, wp.int64, cpu), upload(line, wp.int64, cpu)
-
-    def job(s: int) -> None:  # each with tags of its own: two SMs never write to the same memory
-        own = Caches()
-        own.sets, own.ways = cache.sets, cache.ways
-        own.tags = wp.full(cache.sets * cache.ways, wp.int64(-1), dtype=wp.int64, device=cpu)
-        wp.launch(replay_lru, dim=1, inputs=[own, begins[s:s + 2], lines, hit], device=cpu)
-
-    run_all([lambda s=s: job(s) for s in range(streams)], thread_count(None))  # type: ignore[misc]
+    wp.launch(replay_lru, dim=1, inputs=[caches_of(cache, 1), upload(line, wp.int64, cpu), hit], device=cpu)
     return hit.numpy().astype(bool)
 
 
-def starts(length: np.ndarray, sms: int, slots: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """When and where warps run: round of the first fetch, SM, and slot; (W,) each. length: rounds that each warp takes.
-
-    Warps go to the SMs by turns. An SM has so many slots; a warp begins when one is free.
-    """
-    begin, slot = np.zeros(len(length), np.int64), np.zeros(len(length), np.int64)
-    for sm in range(min(sms, len(length))):
-        free = [(0, s) for s in range(slots)]
-        for warp in range(sm, len(length), sms):
-            begin[warp], slot[warp] = free[0]
-            heapq.heapreplace(free, (int(begin[warp] + length[warp]), int(slot[warp])))
-    return begin, np.arange(len(length)) % sms, slot
+def caches_of(cache: Cache, count: int) -> Any:
+    """So many empty ones, on the device."""
+    out = Caches()
+    out.sets, out.ways = cache.sets, cache.ways
+    out.tags = wp.full(count * cache.sets * cache.ways, wp.int64(-1), dtype=wp.int64, device=start("cpu"))
+    return out
 
 
-def warp_stream(warp: np.ndarray, first: np.ndarray, address: np.ndarray, size: np.ndarray, sms: int, slots: int) -> Stream:
-    """Fetches in the order in which SMs make them. warp: (N,) of each ray, 0 to W - 1; ray i has the fetches first[i] to
-    first[i + 1].
+def first_level(warps: Warps, sms: int, slots: int, l1: Cache) -> Level1:
+    """What misses in the L1s, one an SM. Warps go to the SMs by turns; an SM has so many slots, and a warp begins when one is
+    free. In each round every lane of a warp makes its next fetch, and each line that they touch is asked for once: nothing waits
+    for memory, so that the order of warps is that of their lengths."""
+    cpu = start("cpu")
+    # In one memory the primitives stand behind the nodes.
+    space, node = int(PRIMITIVE_SPACE), warps.address < int(PRIMITIVE_SPACE)
+    behind = LINE * -(-int((warps.address + warps.size)[node].max(initial=0)) // LINE)
+    address = np.where(node, warps.address, warps.address - space + behind)
+    touched = (address + warps.size - 1) // LINE - address // LINE + 1
+    count = int(warps.warp[-1]) + 1 if len(warps.warp) else 0
+    warp_first = np.searchsorted(warps.warp, np.arange(count + 1))
+    most = np.diff(np.concatenate([[0], np.cumsum(touched)])[warps.first[warp_first]])  # lines, a warp
+    room = np.concatenate([[0], np.cumsum([int(most[sm::sms].sum()) for sm in range(sms)])])
+    trace = Trace()
+    trace.sms, trace.slots = sms, slots
+    trace.warp_first, trace.first = upload(warp_first, wp.int64, cpu), upload(warps.first, wp.int64, cpu)
+    trace.address, trace.size = upload(address, wp.int64, cpu), upload(warps.size, wp.int64, cpu)
+    out = Missed()
+    out.room = upload(room, wp.int64, cpu)
+    out.line, out.time = (wp.empty(int(room[-1]), dtype=wp.int64, device=cpu) for _ in range(2))
+    out.accesses, out.misses = (wp.zeros(sms, dtype=wp.int64, device=cpu) for _ in range(2))
+    out.slot_warp = wp.full(sms * slots, -1, dtype=wp.int32, device=cpu)
+    out.slot_round = wp.zeros(sms * slots, dtype=wp.int64, device=cpu)
+    out.seen_size = 32 * int(touched.max(initial=1))
+    out.seen = wp.zeros(sms * out.seen_size, dtype=wp.int64, device=cpu)
+    caches = caches_of(l1, sms)
+    load_kernel(replay_warps, cpu)
 
-    In each round every lane of a warp makes its next fetch, and each line that they touch is asked for once: nothing waits for
-    memory, so the order of warps is that of their lengths. Raises InputError where it is too long to be sorted.
-    """
-    fetches = np.diff(first)
-    length = np.zeros(int(warp.max(initial=-1)) + 1, np.int64)
-    np.maximum.at(length, warp, fetches)
-    begin, sm, slot = starts(length, sms, slots)
-    line, fetch = lines_of(address, size)
-    ray = np.repeat(np.arange(len(warp)), fetches)[fetch]
-    time = begin[warp[ray]] + fetch - first[ray]
-    # The primitives' lines stand behind the nodes': fewer bits, so that one number holds all that is sorted by.
-    base = int(PRIMITIVE_SPACE) // LINE
-    nodes = int(line[line < base].max(initial=-1)) + 1
-    line = np.where(line >= base, line - base + nodes, line)
-    radix = [int(time.max(initial=0)) + 1, slots, int(line.max(initial=0)) + 1]
-    if sms * radix[0] * radix[1] * radix[2] >= 1 << 63:
-        raise InputError("the trace is too long for the cache simulation; take fewer rays")
-    key = ((sm[warp[ray]] * radix[0] + time) * radix[1] + slot[warp[ray]]) * radix[2] + line
-    key = np.unique(key)
-    line, key = key % radix[2], key // (radix[2] * radix[1])
-    return Stream(line, key % radix[0], np.searchsorted(key // radix[0], np.arange(sms + 1)))
+    def run(sm: int) -> Callable[[], None]:
+        return lambda: wp.launch(replay_warps, dim=1, inputs=[trace, caches, out, sm], device=cpu)
+
+    run_all([run(sm) for sm in range(sms)], thread_count(None))
+    used = np.concatenate([np.arange(a, a + n) for a, n in zip(room, out.misses.numpy(), strict=False)])
+    return Level1(int(out.accesses.numpy().sum()), out.line.numpy()[used], out.time.numpy()[used])
 
 
-def simulate(stream: Stream, l1: Cache, l2: Cache, warm: bool = False) -> Misses:
-    """What misses in the L1s (one an SM) and, in the order of time, in the L2 behind all of them. warm: the L2 has seen the same
-    stream once before."""
-    missed = ~replay(stream.first, stream.line, l1)
-    line, time = stream.line[missed], stream.time[missed]
-    line = line[np.argsort(time, kind="stable")]
+def second_level(missed: Level1, l2: Cache, warm: bool = False) -> Misses:
+    """What misses in the L2 behind all L1s, in the order of time. warm: it has seen the same accesses once before."""
+    line = missed.line[np.argsort(missed.time, kind="stable")]
     again = np.concatenate([line, line]) if warm else line
-    hit = replay(np.array([0, len(again)]), again, l2)[-len(line):] if len(line) else np.zeros(0, bool)
-    return Misses(len(stream.line), len(line), int((~hit).sum()), len(np.unique(stream.line)))
+    hit = replay(again, l2)[len(again) - len(line):]
+    return Misses(missed.accesses, len(line), int((~hit).sum()), len(np.unique(line)))

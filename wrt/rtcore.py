@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.base import Accelerator, Counters
-from wrt.cache_sim import LINE, Misses, Stream, simulate, warp_stream
+from wrt.cache_sim import LINE, Level1, Misses, Warps, first_level, second_level
 from wrt.errors import InputError
 from wrt.rtcore_parameters import BASE, SWEEPS, Core, Gpu
 from wrt.simt import WARP, by_coherence, efficiency, longest_of, packed
@@ -52,14 +52,15 @@ class Work:
         """What misses in the caches of that GPU."""
         key = (gpu.sms, gpu.l1, gpu.l2, core.warps, core.warm)
         if key not in self._simulated:
-            self._simulated[key] = simulate(self._stream(gpu.sms, core.warps), gpu.l1, gpu.l2, core.warm)
+            self._simulated[key] = second_level(self._first_level(gpu, core), gpu.l2, core.warm)
         return self._simulated[key]
 
-    def _stream(self, sms: int, warps: int) -> Stream:
-        if (sms, warps) not in self._simulated:
+    def _first_level(self, gpu: Gpu, core: Core) -> Level1:
+        key = (gpu.sms, gpu.l1, core.warps)
+        if key not in self._simulated:
             c = self.counters
-            self._simulated[sms, warps] = warp_stream(self.warp, c.first, c.address, c.size, sms, warps)
-        return self._simulated[sms, warps]
+            self._simulated[key] = first_level(Warps(self.warp, c.first, c.address, c.size), gpu.sms, core.warps, gpu.l1)
+        return self._simulated[key]
 
 
 @dataclass(frozen=True)
