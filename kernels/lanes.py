@@ -10,17 +10,24 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import RAY_AABB, BoxRay
+from wrt.kernels.ray_aabb import FAR_PAD, RAY_AABB, BoxRay
 
 EMPTY = wp.constant(0)  # a child that does not exist: the root is nobody's child
 
 
+# The lanes' far distances are widened by way of the reciprocals, in one product instead of two: 8 u more than FAR_PAD outweigh
+# the four roundings by which the two ways may differ, so that no box is left out that the box unit enters.
+LANE_PAD = wp.constant(FAR_PAD * (1.0 + 8.0 * 2.0**-24))
+
+
 @wp.struct
 class LaneRay:
-    """A ray as the rows are met. box: for the box unit, t_min never -0; near_x, near_y, near_z: which row (0 .. 5: lo_x, hi_x,
-    lo_y ...) is met first on each axis; kx, ky, kz, shear_x, shear_y: as in TriangleRay; origin: in the order kx, ky, kz."""
+    """A ray as the rows are met. box: for the box unit, t_min never -0; far_inv_dir: reciprocals for far planes; near_x, near_y,
+    near_z: which row (0 .. 5: lo_x, hi_x, lo_y ...) is met first on each axis; kx, ky, kz, shear_x, shear_y: as in TriangleRay;
+    origin: in the order kx, ky, kz."""
 
     box: BoxRay
+    far_inv_dir: wp.vec3
     near_x: int
     near_y: int
     near_z: int
@@ -33,9 +40,10 @@ class LaneRay:
 
 
 class Lanes(NamedTuple):
-    """entries(rows, first, ray, t_max, pad) -> row: where the segment enters the boxes whose six rows begin at `first`, inf
-    where it misses; pad widens the far distances. entered(row) -> mask of the lanes below inf. candidates(rows, first, ray) ->
-    mask of the triangles whose nine rows begin at `first`, without those that the watertight unit refuses in float32.
+    """entries(rows, first, ray) -> row: where the line enters the boxes whose six rows begin at `first`, at least t_min.
+    entered(rows, first, ray, t_max) -> mask of those that it enters before it leaves them, and at or before t_max, a finite number.
+    candidates(rows, first, ray) -> mask of the triangles whose nine rows begin at `first`, without those that the watertight unit
+    refuses in float32.
     lowest(mask) -> its lowest lane. value(rows, i) -> rows[i]; bits(rows, i) -> the int32 that is kept there.
     prefetch(rows, first): their next use is near."""
 
@@ -61,50 +69,58 @@ ENTRIES = """
     wp::vec_t<WIDTH, wp::float32> out;
     const float* p = rows.data + (long long)first;
     for (int j = 0; j < WIDTH; ++j) {
-        float e = (p[WIDTH * ray.near_x + j] - o[0]) * d[0], l = (p[WIDTH * (ray.near_x ^ 1) + j] - o[0]) * d[0], f;
+        float e = (p[WIDTH * ray.near_x + j] - o[0]) * d[0], f;
         e = e > ray.box.t_min ? e : ray.box.t_min;
         f = (p[WIDTH * ray.near_y + j] - o[1]) * d[1]; e = f > e ? f : e;
         f = (p[WIDTH * ray.near_z + j] - o[2]) * d[2]; e = f > e ? f : e;
-        l = l < __int_as_float(0x7f800000) ? l : __int_as_float(0x7f800000);
-        f = (p[WIDTH * (ray.near_y ^ 1) + j] - o[1]) * d[1]; l = f < l ? f : l;
-        f = (p[WIDTH * (ray.near_z ^ 1) + j] - o[2]) * d[2]; l = f < l ? f : l;
-        l = l * pad;
-        l = l < t_max ? l : t_max;
-        out[j] = e <= l ? e : __int_as_float(0x7f800000);
+        out[j] = e;
     }
     return out;
 #else
     HEAD
-    const F inf = (F)(__builtin_inff()), begin = (F)(ray.box.t_min), end = (F)(t_max);
-    F e = (ROW(ray.near_x) - o[0]) * d[0], l = (ROW(ray.near_x ^ 1) - o[0]) * d[0], f;
+    NEAR
+    wp::vec_t<WIDTH, wp::float32> result;
+    __builtin_memcpy(&result, &e, sizeof(result));
+    return result;
+#endif
+    #undef ROW
+"""
+
+NEAR = """
+    const F begin = (F)(ray.box.t_min);
+    F e = (ROW(ray.near_x) - o[0]) * d[0], f;
     e = e > begin ? e : begin;
     f = (ROW(ray.near_y) - o[1]) * d[1]; e = f > e ? f : e;
     f = (ROW(ray.near_z) - o[2]) * d[2]; e = f > e ? f : e;
-    l = l < inf ? l : inf;
-    f = (ROW(ray.near_y ^ 1) - o[1]) * d[1]; l = f < l ? f : l;
-    f = (ROW(ray.near_z ^ 1) - o[2]) * d[2]; l = f < l ? f : l;
-    l = l * pad;
-    l = l < end ? l : end;
-    #undef ROW
-    F out = e <= l ? e : inf;
-    wp::vec_t<WIDTH, wp::float32> result;
-    __builtin_memcpy(&result, &out, sizeof(result));
-    return result;
-#endif
 """
 
 ENTERED = """
+    const wp::vec_t<3, wp::float32> o = ray.box.origin, d = ray.box.inv_dir, q = ray.far_inv_dir;
 #if defined(__CUDA_ARCH__)
     int mask = 0;
-    for (int j = 0; j < WIDTH; ++j) mask |= (t[j] < __int_as_float(0x7f800000)) << j;
+    const float* p = rows.data + (long long)first;
+    for (int j = 0; j < WIDTH; ++j) {
+        float e = (p[WIDTH * ray.near_x + j] - o[0]) * d[0], l = t_max, f;
+        e = e > ray.box.t_min ? e : ray.box.t_min;
+        f = (p[WIDTH * ray.near_y + j] - o[1]) * d[1]; e = f > e ? f : e;
+        f = (p[WIDTH * ray.near_z + j] - o[2]) * d[2]; e = f > e ? f : e;
+        f = (p[WIDTH * (ray.near_x ^ 1) + j] - o[0]) * q[0]; l = f < l ? f : l;
+        f = (p[WIDTH * (ray.near_y ^ 1) + j] - o[1]) * q[1]; l = f < l ? f : l;
+        f = (p[WIDTH * (ray.near_z ^ 1) + j] - o[2]) * q[2]; l = f < l ? f : l;
+        mask |= (e <= l) << j;
+    }
     return mask;
 #else
-    typedef float F __attribute__((ext_vector_type(WIDTH)));
+    HEAD
+    NEAR
     typedef bool B __attribute__((ext_vector_type(WIDTH)));
-    F x;
-    __builtin_memcpy(&x, &t, sizeof(x));
-    return __builtin_bit_cast(unsigned char, __builtin_convertvector(x < __builtin_inff(), B)) & ((1 << WIDTH) - 1);
+    F l = (F)(t_max);
+    f = (ROW(ray.near_x ^ 1) - o[0]) * q[0]; l = f < l ? f : l;
+    f = (ROW(ray.near_y ^ 1) - o[1]) * q[1]; l = f < l ? f : l;
+    f = (ROW(ray.near_z ^ 1) - o[2]) * q[2]; l = f < l ? f : l;
+    return __builtin_bit_cast(unsigned char, __builtin_convertvector(e <= l, B)) & ((1 << WIDTH) - 1);
 #endif
+    #undef ROW
 """
 
 CANDIDATES = """
@@ -152,7 +168,7 @@ BITS = "int value; memcpy(&value, rows.data + (long long)i, 4); return value;"
 PREFETCH = """
 #if !defined(__CUDA_ARCH__)
     const char* p = (const char*)(rows.data + (long long)first);
-    __builtin_prefetch(p); __builtin_prefetch(p + 64); __builtin_prefetch(p + 128); __builtin_prefetch(p + 192);
+    __builtin_prefetch(p); __builtin_prefetch(p + 64);
 #endif
 """
 
@@ -169,13 +185,13 @@ def make_lanes(width: int) -> Lanes:
     row = row_type(width)
 
     def source(snippet):
-        return snippet.replace("HEAD", HEAD).replace("WIDTH", str(width))
+        return snippet.replace("HEAD", HEAD).replace("NEAR", NEAR).replace("WIDTH", str(width))
 
     @wp.func_native(source(ENTRIES))
-    def entries(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float, pad: float) -> row: ...
+    def entries(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row: ...
 
     @wp.func_native(source(ENTERED))
-    def entered(t: row) -> int: ...
+    def entered(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int: ...
 
     @wp.func_native(source(CANDIDATES))
     def candidates(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int: ...
@@ -196,10 +212,9 @@ def make_lanes(width: int) -> Lanes:
 
 
 @cache
-def make_twins(width: int, box: str = "conservative") -> Lanes:
-    """The same functions in plain Warp, lane by lane with the scalar units; entries: of any box test (pad is then its own)."""
+def make_twins(width: int) -> Lanes:
+    """The same functions in plain Warp, lane by lane."""
     row = row_type(width)
-    ray_aabb = RAY_AABB[box]
 
     @wp.func
     def bits(rows: wp.array(dtype=wp.float32), i: int) -> int:
@@ -210,20 +225,36 @@ def make_twins(width: int, box: str = "conservative") -> Lanes:
         return rows[i]
 
     @wp.func
-    def entries(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float, pad: float) -> row:
-        out = row()
-        for j in range(width):
-            i = first + j
-            lo = wp.vec3(rows[i], rows[i + 2 * width], rows[i + 4 * width])
-            hi = wp.vec3(rows[i + width], rows[i + 3 * width], rows[i + 5 * width])
-            out[j] = ray_aabb(ray.box, lo, hi, t_max)
+    def enters(rows: wp.array(dtype=wp.float32), i: int, ray: LaneRay) -> float:
+        """The lane whose six planes are at i, i + width, ..."""
+        out = float(ray.box.t_min)
+        for axis in range(3):
+            near = wp.where(axis == 0, ray.near_x, wp.where(axis == 1, ray.near_y, ray.near_z))
+            t = (rows[i + width * near] - ray.box.origin[axis]) * ray.box.inv_dir[axis]
+            out = wp.where(t > out, t, out)
         return out
 
     @wp.func
-    def entered(t: row) -> int:
+    def leaves(rows: wp.array(dtype=wp.float32), i: int, ray: LaneRay, t_max: float) -> float:
+        out = float(t_max)
+        for axis in range(3):
+            near = wp.where(axis == 0, ray.near_x, wp.where(axis == 1, ray.near_y, ray.near_z))
+            t = (rows[i + width * (near ^ 1)] - ray.box.origin[axis]) * ray.far_inv_dir[axis]
+            out = wp.where(t < out, t, out)
+        return out
+
+    @wp.func
+    def entries(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row:
+        out = row()
+        for j in range(width):
+            out[j] = enters(rows, first + j, ray)
+        return out
+
+    @wp.func
+    def entered(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int:
         mask = int(0)
         for j in range(width):
-            if t[j] < wp.inf:
+            if enters(rows, first + j, ray) <= leaves(rows, first + j, ray, t_max):
                 mask = mask | (1 << j)
         return mask
 
@@ -260,3 +291,33 @@ def make_twins(width: int, box: str = "conservative") -> Lanes:
         pass
 
     return Lanes(row, entries, entered, candidates, lowest, value, bits, prefetch)
+
+
+@cache
+def make_scalar_boxes(width: int, box: str):
+    """entries and entered by the scalar unit of that name in RAY_AABB: for a box test that has no form in rows."""
+    row = row_type(width)
+    ray_aabb = RAY_AABB[box]
+
+    @wp.func
+    def enters(rows: wp.array(dtype=wp.float32), i: int, ray: LaneRay, t_max: float) -> float:
+        lo = wp.vec3(rows[i], rows[i + 2 * width], rows[i + 4 * width])
+        hi = wp.vec3(rows[i + width], rows[i + 3 * width], rows[i + 5 * width])
+        return ray_aabb(ray.box, lo, hi, t_max)
+
+    @wp.func
+    def entries(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row:
+        out = row()
+        for j in range(width):
+            out[j] = enters(rows, first + j, ray, float(wp.inf))
+        return out
+
+    @wp.func
+    def entered(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int:
+        mask = int(0)
+        for j in range(width):
+            if enters(rows, first + j, ray, t_max) < wp.inf:
+                mask = mask | (1 << j)
+        return mask
+
+    return entries, entered

@@ -33,7 +33,9 @@ def direction_scale(direction: wp.vec3) -> float:
 
     Scaling by it is exact. What is left is between 2^-64 and 2^64, also of a direction that is denormal.
     """
-    longest = wp.max(wp.max(wp.abs(direction[0]), wp.abs(direction[1])), wp.abs(direction[2]))
+    longest = wp.abs(direction[0])
+    longest = wp.where(wp.abs(direction[1]) > longest, wp.abs(direction[1]), longest)
+    longest = wp.where(wp.abs(direction[2]) > longest, wp.abs(direction[2]), longest)
     short = wp.where(longest < wp.static(2.0**-64), wp.static(2.0**96), 1.0)
     return wp.where(longest > wp.static(2.0**64), wp.static(2.0**-96), short)
 
@@ -42,11 +44,12 @@ def direction_scale(direction: wp.vec3) -> float:
 def load_ray(rays: RayArrays, i: int) -> Ray:
     """Ray i in units of its scaled direction: t times `direction_scale` is in the caller's."""
     scale = direction_scale(rays.direction[i])
+    inverse = wp.where(scale > 1.0, wp.static(2.0**-96), wp.where(scale < 1.0, wp.static(2.0**96), 1.0))
     ray = Ray()
     ray.origin = rays.origin[i]
     ray.direction = scale * rays.direction[i]
-    ray.t_min = rays.t_min[i] / scale
-    ray.t_max = rays.t_max[i] / scale
+    ray.t_min = rays.t_min[i] * inverse
+    ray.t_max = rays.t_max[i] * inverse
     ray.exclude = -1
     ray.slot = i
     return ray
@@ -58,8 +61,9 @@ def make_closest_hit_kernel(accel_struct, traverse):
     @kernel
     def closest_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, hits: HitArrays, first: int):
         i = first + wp.tid()
+        scale = direction_scale(rays.direction[i])
         hit = traverse(accel, surfaces, load_ray(rays, i))
-        t = hit.t * direction_scale(rays.direction[i])
+        t = hit.t * scale
         hits.t[i] = t
         hits.u[i] = hit.u
         hits.v[i] = hit.v

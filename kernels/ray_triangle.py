@@ -27,24 +27,31 @@ class TriangleRay:
 
 
 @wp.func
+def component(v: wp.vec3, k: int) -> float:
+    """v[k] by selection: an index that is not known when compiling would send v through memory."""
+    return wp.where(k == 0, v[0], wp.where(k == 1, v[1], v[2]))
+
+
+@wp.func
 def triangle_ray(ray: Ray) -> TriangleRay:
     """Set-up, once a ray."""
     d = ray.direction
     out = TriangleRay()
     kz = int(0)
-    if wp.abs(d[1]) > wp.abs(d[kz]):
+    if wp.abs(d[1]) > wp.abs(d[0]):
         kz = int(1)
-    if wp.abs(d[2]) > wp.abs(d[kz]):
+    if wp.abs(d[2]) > wp.abs(component(d, kz)):
         kz = int(2)
     kx = wp.where(kz == 2, 0, kz + 1)
     ky = wp.where(kx == 2, 0, kx + 1)
+    d_z = component(d, kz)
     # Swapping x and y where the ray runs against the axis keeps the winding.
-    out.kx = wp.where(d[kz] < 0.0, ky, kx)
-    out.ky = wp.where(d[kz] < 0.0, kx, ky)
+    out.kx = wp.where(d_z < 0.0, ky, kx)
+    out.ky = wp.where(d_z < 0.0, kx, ky)
     out.kz = kz
-    out.shear_x = d[out.kx] / d[kz]
-    out.shear_y = d[out.ky] / d[kz]
-    out.shear_z = 1.0 / d[kz]
+    out.shear_x = component(d, out.kx) / d_z
+    out.shear_y = component(d, out.ky) / d_z
+    out.shear_z = 1.0 / d_z
     return out
 
 
@@ -67,15 +74,15 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
     a = v0 - origin
     b = v1 - origin
     c = v2 - origin
-    a_z = a[shear.kz]
-    b_z = b[shear.kz]
-    c_z = c[shear.kz]
-    a_x = a[shear.kx] - shear.shear_x * a_z
-    a_y = a[shear.ky] - shear.shear_y * a_z
-    b_x = b[shear.kx] - shear.shear_x * b_z
-    b_y = b[shear.ky] - shear.shear_y * b_z
-    c_x = c[shear.kx] - shear.shear_x * c_z
-    c_y = c[shear.ky] - shear.shear_y * c_z
+    a_z = component(a, shear.kz)
+    b_z = component(b, shear.kz)
+    c_z = component(c, shear.kz)
+    a_x = component(a, shear.kx) - shear.shear_x * a_z
+    a_y = component(a, shear.ky) - shear.shear_y * a_z
+    b_x = component(b, shear.kx) - shear.shear_x * b_z
+    b_y = component(b, shear.ky) - shear.shear_y * b_z
+    c_x = component(c, shear.kx) - shear.shear_x * c_z
+    c_y = component(c, shear.ky) - shear.shear_y * c_z
 
     area_0 = c_x * b_y - c_y * b_x
     area_1 = a_x * c_y - a_y * c_x
@@ -97,6 +104,17 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
     hit.v = float(w_2 / area)
     hit.prim_id = 0
     return hit
+
+
+@wp.func
+def lower(a: wp.vec3, b: wp.vec3) -> wp.vec3:
+    """wp.min without its care for NaN, which costs more than the comparison."""
+    return wp.vec3(wp.where(b[0] < a[0], b[0], a[0]), wp.where(b[1] < a[1], b[1], a[1]), wp.where(b[2] < a[2], b[2], a[2]))
+
+
+@wp.func
+def upper(a: wp.vec3, b: wp.vec3) -> wp.vec3:
+    return wp.vec3(wp.where(b[0] > a[0], b[0], a[0]), wp.where(b[1] > a[1], b[1], a[1]), wp.where(b[2] > a[2], b[2], a[2]))
 
 
 @wp.func
@@ -134,7 +152,7 @@ def ray_triangle(box: BoxRay, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: 
     """The default unit: watertight, with t held to the triangle's own box."""
     hit = watertight(box.origin, shear, v0, v1, v2)
     if hit.prim_id != NO_HIT:
-        hit.t = within_bounds(box, hit.t, wp.min(wp.min(v0, v1), v2), wp.max(wp.max(v0, v1), v2))
+        hit.t = within_bounds(box, hit.t, lower(lower(v0, v1), v2), upper(upper(v0, v1), v2))
         if not wp.abs(hit.t) < wp.inf:
             hit.prim_id = NO_HIT
     return hit

@@ -12,8 +12,8 @@ from functools import cache
 import warp as wp
 
 from wrt.kernels.counters import Counts, Recorder, make_counters
-from wrt.kernels.lanes import EMPTY, LaneRay, make_lanes, make_twins
-from wrt.kernels.ray_aabb import FAR_PAD
+from wrt.kernels.lanes import EMPTY, LANE_PAD, LaneRay, make_lanes, make_scalar_boxes
+from wrt.kernels.ray_triangle import component
 from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray, Surfaces
 from wrt.kernels.traverse import Probe, Units, make_intersect, make_probe, no_hit
 
@@ -24,6 +24,8 @@ STACK_SIZE = 64
 NODE_ROWS = 8
 # A reference is EMPTY, an inner node's index, or ~(LEAF_RANGE * (first row of primitives) + number of primitives - 1).
 LEAF_RANGE = 64
+# Where an endless ray ends for the boxes: one that is entered at infinity is not entered.
+MAX_T = wp.constant(3.4028234663852886e38)
 
 
 @cache
@@ -38,6 +40,19 @@ def make_struct(record):
         recorder: Recorder
 
     return WideBvh
+
+
+stack_type = wp.types.vector(STACK_SIZE, wp.uint64)
+
+# Warp sets every new vector to 0: of these 512 bytes most rays use a few.
+EMPTY_STACK = """
+    alignas(wp::vec_t<64, wp::uint64>) char memory[sizeof(wp::vec_t<64, wp::uint64>)];
+    return *(wp::vec_t<64, wp::uint64>*)memory;
+"""
+
+
+@wp.func_native(EMPTY_STACK)
+def empty_stack() -> stack_type: ...
 
 
 @wp.func
@@ -57,11 +72,12 @@ def t_of(key: wp.uint64) -> float:
 
 
 @wp.func
-def lane_ray(probe: Probe) -> LaneRay:
-    """Set-up, once a ray."""
+def lane_ray(probe: Probe, pad: float) -> LaneRay:
+    """Set-up, once a ray. pad: what widens the far distances."""
     out = LaneRay()
     out.box = probe.box
     out.box.t_min = probe.box.t_min + 0.0  # not -0: entries are sorted by their bits
+    out.far_inv_dir = pad * probe.box.inv_dir
     out.near_x = wp.where(probe.box.inv_dir[0] < 0.0, 1, 0)
     out.near_y = wp.where(probe.box.inv_dir[1] < 0.0, 3, 2)
     out.near_z = wp.where(probe.box.inv_dir[2] < 0.0, 5, 4)
@@ -71,7 +87,7 @@ def lane_ray(probe: Probe) -> LaneRay:
     out.shear_x = probe.triangle.shear_x
     out.shear_y = probe.triangle.shear_y
     origin = probe.ray.origin
-    out.origin = wp.vec3(origin[out.kx], origin[out.ky], origin[out.kz])
+    out.origin = wp.vec3(component(origin, out.kx), component(origin, out.ky), component(origin, out.kz))
     return out
 
 
@@ -130,24 +146,23 @@ def make_row_test(units: Units, any_hit, accepts, width):
 
 
 def make_box_test(box, width):
-    """The unit that tests the boxes of one node: (rows, first, ray, t_max) -> row of entry distances."""
+    """entries and entered of kernels.lanes for a name in RAY_AABB, and by how much far distances are widened."""
     if box == "plain":
-        return make_twins(width, box).entries, 1.0
-    return make_lanes(width).entries, FAR_PAD if box == "conservative" else 1.0
+        return *make_scalar_boxes(width, box), 1.0
+    return make_lanes(width).entries, make_lanes(width).entered, LANE_PAD if box == "conservative" else 1.0
 
 
 def make_traversal(units: Units, any_hit: bool, accepts, width: int):
     """The closest hit, or any (the first that is found), in a tree of nodes of `width` children."""
     lanes = make_lanes(width)
-    lowest, bits, entered, prefetch = lanes.lowest, lanes.bits, lanes.entered, lanes.prefetch
-    entries, pad = make_box_test(units.box, width)
+    lowest, bits, prefetch = lanes.lowest, lanes.bits, lanes.prefetch
+    entries, entered, pad = make_box_test(units.box, width)
     probe_of = make_probe(units)
     test_row = make_row_test(units, any_hit, accepts, width)
     fetch_node, fetch_primitive, push, finish = make_counters(units, 4 * NODE_ROWS * width)
     struct = make_struct(units.triangle_test.record)
     node_size = NODE_ROWS * width
     row_size = units.triangle_test.record.numpy_dtype()["itemsize"] // 4 * width
-    stack_type = wp.types.vector(STACK_SIZE, wp.uint64)
 
     @wp.func
     def child(accel: struct, at: int) -> int:
@@ -170,35 +185,55 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int):
         return counts
 
     @wp.func
+    def test_leaf(accel: struct, surfaces: Surfaces, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
+        block = (-1 - reference) / LEAF_RANGE
+        count = (-1 - reference) % LEAF_RANGE + 1
+        while count > 0:
+            best = test_row(accel.primitives, block * wp.static(row_size), wp.min(count, width), surfaces, probe, rows, best)
+            if wp.static(any_hit):
+                if best.prim_id != NO_HIT:
+                    return best
+            count = count - width
+            block = block + 1
+        return best
+
+    @wp.func
+    def count_leaf(accel: struct, ray: Ray, counts: Counts, reference: int) -> Counts:
+        if wp.static(units.counters):
+            first = (-1 - reference) / LEAF_RANGE * width
+            counts.leaves += 1
+            for j in range((-1 - reference) % LEAF_RANGE + 1):
+                counts = fetch_primitive(accel.recorder, ray, counts, first + j)
+        return counts
+
+    @wp.func
+    def count_pop(counts: Counts) -> Counts:
+        if wp.static(units.counters):
+            counts.pops += 1
+        return counts
+
+    @wp.func
     def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
         probe = probe_of(ray)
-        rows = lane_ray(probe)
+        rows = lane_ray(probe, wp.static(float(pad)))
         best = no_hit(ray)
+        best.t = wp.where(best.t < MAX_T, best.t, MAX_T)
         counts = Counts()
-        stack = stack_type()
+        stack = empty_stack()
         size = int(0)
         reference = int(0)
         while True:
             if reference < 0:
-                counts.leaves += 1
-                block = (-1 - reference) / LEAF_RANGE
-                count = (-1 - reference) % LEAF_RANGE + 1
-                while count > 0:
-                    n = wp.min(count, width)
-                    best = test_row(accel.primitives, block * wp.static(row_size), n, surfaces, probe, rows, best)
-                    if wp.static(units.counters):
-                        for j in range(n):
-                            counts = fetch_primitive(accel.recorder, ray, counts, block * width + j)
-                    if wp.static(any_hit):
-                        if best.prim_id != NO_HIT:
-                            return finish(accel.recorder, ray, counts, best)
-                    count = count - width
-                    block = block + 1
+                best = test_leaf(accel, surfaces, reference, probe, rows, best)
+                counts = count_leaf(accel, ray, counts, reference)
+                if wp.static(any_hit):
+                    if best.prim_id != NO_HIT:
+                        return finish(accel.recorder, ray, counts, best)
             else:
                 first = reference * wp.static(node_size)
                 counts = count_node(accel, ray, counts, reference)
-                t = entries(accel.nodes, first, rows, best.t, wp.static(pad))
-                mask = entered(t)
+                t = entries(accel.nodes, first, rows)
+                mask = entered(accel.nodes, first, rows, best.t)
                 if mask != 0:
                     first = first + 6 * width
                     lane = lowest(mask)
@@ -230,7 +265,7 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int):
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
-                counts.pops += 1
+                counts = count_pop(counts)
                 key = stack[size]
                 if t_of(key) <= best.t:
                     reference = reference_of(key)

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from wrt.device import load_kernel, upload
+from wrt.kernels.lanes import LANE_PAD
 from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
 from wrt.kernels.ray_aabb import FAR_PAD
 from wrt.kernels.traverse_kdtree import HELD_GRAZING, HELD_RELATIVE, NEAR_PAD
@@ -330,7 +331,7 @@ def wide(accel, ray: WalkRay) -> Walk:
             walk.node(current, nodes[0].nbytes, int((references[current] != 0).sum()))
             boxes = nodes[current, :6].T
             entered = [(t, int(references[current, k])) for k in range(width)
-                       if (t := ray.enter(boxes[k, 0::2], boxes[k, 1::2])) < INF]
+                       if (t := enter_lane(ray, boxes[k, 0::2], boxes[k, 1::2])) < INF]
             if entered:
                 current = visit_order(walk, stack, entered)
                 continue
@@ -341,6 +342,16 @@ def wide(accel, ray: WalkRay) -> Walk:
             if t <= ray.best[0]:
                 current = reference
     return walk
+
+
+def enter_lane(ray: WalkRay, lo: np.ndarray, hi: np.ndarray) -> np.float32:
+    """As WalkRay.enter, with far planes by widened reciprocals, and no box beyond float32."""
+    backwards = ray.inv_dir < 0.0
+    with np.errstate(invalid="ignore", over="ignore"):
+        near = (np.where(backwards, hi, lo) - ray.origin) * ray.inv_dir
+        far = (np.where(backwards, lo, hi) - ray.origin) * (ray.inv_dir * np.float32(LANE_PAD))
+    enter = np.fmax.reduce(near, initial=ray.t_min)
+    return enter if enter <= np.fmin.reduce(far, initial=min(ray.best[0], np.finfo(np.float32).max)) else INF
 
 
 def visit_order(walk: Walk, stack: list[tuple[np.float32, int]], entered: list[tuple[np.float32, int]]) -> int:
