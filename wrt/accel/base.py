@@ -75,6 +75,8 @@ class Geometry:
 
     def primitives(self, units: Units, order: np.ndarray | None = None) -> np.ndarray:
         """What the triangle test of `units` reads, in the given order of prim_id, or in their own."""
+        if order is not None and len(order) > len(self):  # what stands more than once is made once
+            return self.primitives(units)[order]
         prim_id = np.arange(len(self), dtype=np.int32) if order is None else order
         out = records(units.triangle_test.record, len(prim_id))
         out["prim_id"] = prim_id
