@@ -23,8 +23,9 @@ import wrt
 from wrt.cli_bench import bench, stability
 from wrt.cli_build import build
 from wrt.cli_common import Crop, Duration, Names, Size, load, naming, say, say_json, warnings_told
+from wrt.cli_save import check_room, checkpoint_options, save_film
 from wrt.errors import InputError
-from wrt.interrupt import Interrupted, exit_code, held_interrupts, raise_on_termination
+from wrt.interrupt import Interrupted, exit_code, raise_on_termination
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -63,6 +64,9 @@ cli.add_command(build)
 @click.option("--target-error", type=float,
               help="Stop when the picture's estimated error is no larger: the root mean square, over pixels and channels, of"
                    " the standard error in linear radiance (noise alone); --spp is then the most to take  [default: 65536]")
+@click.option("--checkpoint", "every", type=Duration(), help="Save the work so far this often, for --resume")
+@click.option("--checkpoint-file", type=click.Path(path_type=Path), help="Where to  [default: the picture's name + .checkpoint]")
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint; without one, from the beginning")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print the statistics as JSON")
 def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
@@ -83,23 +87,30 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
     settings = {"filter": options.pop("filter_name")}
     settings |= {name: options.pop(name) for name in (
         "spp", "size", "max_depth", "min_throughput", "fresnel", "sampler", "tonemap", "exposure")}
+    options |= checkpoint_options(output, options.pop("every"), options.pop("checkpoint_file"), options.pop("resume"))
     Scene().with_settings(**settings)
     Options(**options)
     layers = aov if output.suffix.lower() != ".exr" else None  # in an EXR file they are channels, all of them
     for name in layers or ():
         check_writable(aov_path(output, name))
     clock = {"import": time.perf_counter() - begin}
-    loaded = load(scene, quiet, clock)
+    loaded = load(scene, quiet, clock).with_settings(**settings)
+    check_room(output, loaded.settings.size, bits)
+    checkpoint = options.get("checkpoint")
+    if checkpoint is not None and options["resume"] and not (os.path.lexists(checkpoint) or quiet):
+        say(f"{checkpoint}: no checkpoint yet, rendering from the beginning")
 
     with warnings_told(quiet), progress_reporter(quiet) as progress:
         with naming(scene):
-            film = render_scene(loaded.with_settings(**settings), spp=settings["spp"], progress=progress, **options)
+            film = render_scene(loaded, spp=settings["spp"], progress=progress, **options)
         if not film.stats["samples"]:
             raise Interrupted(film.stats["signal"] or signal.SIGINT)  # there is nothing to keep
         begin = time.perf_counter()
         film.metadata["scene"] = plain_text(scene.name)
-        with held_interrupts() as late:  # a picture that is there is written in any case
-            paths = film.save(output, bits=bits, aov=layers)
+        paths, late, misplaced = save_film(film, output, bits, layers)
+    if checkpoint is not None and not (misplaced or film.stats["interrupted"] or film.stats["timed_out"]):
+        checkpoint.unlink(missing_ok=True)  # it has done its work
+        film.stats["checkpoint"] = None
     if late:
         film.stats |= {"interrupted": True, "signal": film.stats["signal"] or late[0]}
     film.stats["seconds"] = clock | film.stats["seconds"] | {"write": time.perf_counter() - begin}
@@ -110,6 +121,8 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
             click.echo(path)
     if not quiet:
         say(_summary(film))
+    if misplaced:
+        raise InputError(f"{misplaced}; the picture was written to {paths[0]} instead")
     if film.stats["interrupted"]:
         raise SystemExit(exit_code(film.stats["signal"]))
 
@@ -119,14 +132,17 @@ def _summary(film: Any) -> str:
     seconds = ", ".join(f"{name} {value:.2f}" for name, value in s["seconds"].items())
     cut = f"cut: {s['cut_by_depth']} rays by depth, {s['cut_by_throughput']} by throughput"
     note = " (interrupted)" if s["interrupted"] else " (time limit)" if s["timed_out"] else ""
+    if s.get("resumed"):
+        note += f", {s['resumed']['samples']} of them from the checkpoint"
     if film.samples.min() == 0:
         note = f" (interrupted: {(film.samples == 0).mean():.0%} of the pixels are still black)"
     lost = f"; {s['not_finite']} samples were not finite and count as black" if s["not_finite"] else ""
     if s.get("target_error") is not None:
         note += f", estimated error {s['estimated_error']:.3g}"
         note += "" if s["target_reached"] else f" (above the target of {s['target_error']:g})"
+    kept = f"\n{s['checkpoint']}: go on from it with --resume" if s.get("checkpoint") else ""
     return (f"{film.metadata['spp']} spp{note}, {s['rays'] / 1e6:.2f} M rays, {s['rays_per_second'] / 1e6:.2f} Mray/s; "
-            f"{cut}, lost throughput {s['lost_throughput_per_sample']:.2g} a sample{lost}\nseconds: {seconds}")
+            f"{cut}, lost throughput {s['lost_throughput_per_sample']:.2g} a sample{lost}\nseconds: {seconds}{kept}")
 
 
 @cli.command()

@@ -45,16 +45,32 @@ class DeviceFilm:
                 setattr(film, name, array)
             self.groups.append(film)
 
+    def arrays(self) -> list[tuple[str, Any]]:
+        """Everything that samples change, by name: the shared arrays, then those of each group."""
+        own = [(f"{name} of group {i}", getattr(film, name)) for i, film in enumerate(self.groups) for name in OF_A_GROUP]
+        return [(name, getattr(self.groups[0], name)) for name in SHARED] + own
+
+    def put(self, array: Any, values: np.ndarray) -> None:
+        """Write values, (H, W) or (H, W, 3), into the crop of a device array that is 0 elsewhere."""
+        x0, y0, x1, y1 = self.crop
+        pixels = np.zeros((self.size[1], self.size[0], *values.shape[2:]), values.dtype)
+        pixels[y0:y1, x0:x1] = values
+        array.assign(pixels.reshape(array.shape[0], *values.shape[2:]))
+
     @property
     def rays(self) -> int:
         """Rays so far, over the whole picture."""
         return int(self.groups[0].rays.numpy().sum())
 
-    def picture(self, array: Any) -> np.ndarray:
-        """A device array of one entry a pixel as (H, W) or (H, W, 3), cropped."""
+    def view(self, array: Any) -> np.ndarray:
+        """A device array of one entry a pixel as (H, W) or (H, W, 3), cropped; on the CPU without a copy."""
         x0, y0, x1, y1 = self.crop
         pixels = array.numpy()
-        return pixels.reshape(self.size[1], self.size[0], *pixels.shape[1:])[y0:y1, x0:x1].copy()
+        return pixels.reshape(self.size[1], self.size[0], *pixels.shape[1:])[y0:y1, x0:x1]
+
+    def picture(self, array: Any) -> np.ndarray:
+        """A copy of `view`."""
+        return self.view(array).copy()
 
     def count(self, name: str) -> int:
         """The sum over the pixels of a shared count."""

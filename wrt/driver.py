@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, field, fields
+from contextlib import nullcontext
+from dataclasses import asdict
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +19,8 @@ import warp as wp
 
 import wrt
 from wrt.accel import ACCELERATORS, Structure, build, tells_progress
-from wrt.accel.base import check_units
-from wrt.arguments import as_integer, as_names, as_one, as_tuple, shown, unknown
+from wrt.arguments import unknown
+from wrt.checkpoint import Checkpoint
 from wrt.device import load_kernel, memory_size, start, thread_count
 from wrt.device_film import BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS, DeviceFilm
 from wrt.device_scene import camera_struct, upload_scene
@@ -29,98 +32,17 @@ from wrt.kernels import render as kernels
 from wrt.kernels import structs
 from wrt.kernels.traverse import Units
 from wrt.mesh import Mesh
+from wrt.options import AOVS as AOVS
+from wrt.options import OPTIONS, Options, Progress
 from wrt.scene import SETTINGS, Camera, Scene
+from wrt.scene_digest import camera_digest, scene_digest
 from wrt.scene_file import as_scene
+from wrt.tiles import Rectangle, Work, tiles, work_left
 
-AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
-TILE_SIZE = 32
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
 MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
 PREPARING_TOLD = 1.0  # seconds of compiling and building before `progress` is told of it
 MAX_SPP = 1 << 16  # where a target error asks for more than anybody said
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a render is: samples done and to do (summed over pixels), rays so far, seconds of tracing.
-
-    stage: "trace"; or before anything is traced, where that takes longer than PREPARING_TOLD: "compile", once, or "build", with
-    done of total steps of a structure that is slow to build.
-    """
-
-    done: int
-    total: int
-    rays: int
-    seconds: float
-    stage: str = "trace"
-
-    @property
-    def rays_per_second(self) -> float:
-        return self.rays / self.seconds if self.seconds > 0.0 else 0.0
-
-    @property
-    def seconds_left(self) -> float:
-        return self.seconds * (self.total - self.done) / self.done if self.done else float("inf")
-
-
-@dataclass
-class Options:
-    """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once; never change a
-    pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always taken.
-
-    target_error: stop when the estimated error of the picture is no larger: the root mean square, over its pixels and
-    channels, of the standard error in linear radiance. It is noise alone: what max_depth and min_throughput cut off is not
-    in it. A pixel's samples are then split over GROUPS independent sequences (wrt.device_film), and spp is the most to take
-    (rounded down to a multiple of GROUPS; one a group at least). The estimate is looked at when a group has 1, 2, 4, 8 ...
-    samples: only then is its sequence as even as it can be."""
-
-    seed: int = 0
-    device: str = "cpu"
-    accel: str = "bvh"
-    threads: int | None = None
-    camera: str | int | Camera | None = None
-    crop: tuple[int, int, int, int] | None = None
-    aov: Sequence[str] = ()
-    time_limit: float | None = None
-    target_error: float | None = None
-    tile_size: int = TILE_SIZE
-    pass_size: int | None = None
-    progress: Callable[[Progress], None] | None = None
-    triangle: str = "watertight"
-    box: str = "conservative"
-    accel_options: dict[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for name in ("accel", "device", "triangle", "box"):
-            as_one(getattr(self, name), str, name)
-        if self.accel not in ACCELERATORS:
-            raise InputError(f"no structure {self.accel!r}; there is {', '.join(ACCELERATORS)}")
-        check_units(self.triangle, self.box)
-        self.aov = as_names(self.aov, "aov")
-        no_aov = sorted(set(self.aov) - set(AOVS))
-        if no_aov:
-            raise InputError(f"no AOV {', '.join(no_aov)}; there is {', '.join(AOVS)}")
-        for name in ("time_limit", "target_error"):
-            as_one(getattr(self, name), (int, float, np.number, type(None)), name)
-        if self.time_limit is not None and not self.time_limit > 0.0:
-            raise InputError(f"time_limit must be more than 0 seconds, got {self.time_limit}")
-        if self.target_error is not None and not 0.0 < self.target_error < math.inf:
-            raise InputError(f"target_error must be more than 0 and finite, got {self.target_error}")
-        self.tile_size = as_integer(self.tile_size, "tile_size", 1, 1 << 15)
-        self.pass_size = None if self.pass_size is None else as_integer(self.pass_size, "pass_size", 1, 1 << 24)
-        self.seed = as_integer(self.seed, "seed", 0, 2**32 - 1)
-        if self.crop is not None and len(as_tuple(self.crop, (int, np.integer), "crop")) != 4:
-            raise InputError(f"crop must be x0, y0, x1, y1 in pixels, got {self.crop!r}")
-        if not (self.progress is None or callable(self.progress)):
-            raise InputError(f"progress must be a function of a Progress, got {shown(self.progress)}")
-        as_one(self.camera, (str, int, np.integer, Camera, type(None)), "camera")
-        as_one(self.accel_options, dict, "accel_options")
-        as_one(self.threads, (int, np.integer, type(None)), "threads")
-        thread_count(self.threads)
-        start(self.device)
-
-
-OPTIONS = tuple(each.name for each in fields(Options))
 
 
 def render(scene: Scene | Mesh | str | os.PathLike[str], *, spp: int | None = None,
@@ -133,7 +55,8 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], *, spp: int | None = No
     time_limit, target_error, progress ...
     With target_error the scene's own spp is no limit, but MAX_SPP is, unless spp is given.
     The same arguments give the same pixels, bit for bit, for any threads, tile_size and pass_size. Interrupted by Ctrl-C, it
-    returns what it has, with stats["interrupted"] set. Raises InputError for anything that cannot be rendered.
+    returns what it has, with stats["interrupted"] set. checkpoint, checkpoint_every, resume: a render that survives the end of
+    its process (Options). Raises InputError for anything that cannot be rendered.
     """
     if options.get("target_error") is not None and spp is None:
         spp = MAX_SPP
@@ -156,6 +79,11 @@ def aov_kernel(features: Features, structure: Structure) -> Any:
     return kernels.make_aov_kernel(features, structure)
 
 
+def kernel_hash(kernel: Any, device: Any) -> str:
+    """Of the kernel's whole code, the same in every process."""
+    return str(kernel.module.get_module_hash(1 if device.is_cpu else None).hex())
+
+
 class Renderer:
     """One scene made ready to render: kernel and structure. `run` takes the samples, and can do so again with another seed."""
 
@@ -176,6 +104,7 @@ class Renderer:
         self.kernels = [render_kernel(self.features, structure)]
         if options.aov:
             self.kernels.append(aov_kernel(self.features, structure))
+        self.checkpoint = None if options.checkpoint is None else self._checkpoint()
         self._prepare()
         self.device_camera = camera_struct(self.camera, scene.settings.size)
 
@@ -199,6 +128,25 @@ class Renderer:
         if needed > there:
             raise InputError(f"a picture of {width}x{height} takes {needed / 2**30:.1f} GiB of memory;"
                              f" {self.options.device} has {there / 2**30:.1f}")
+
+    def _checkpoint(self) -> Checkpoint:
+        """The file to save to, which says what must be the same to go on with it. Errors of it are told before the work."""
+        options, settings, device = self.options, asdict(self.scene.settings), self.device
+        identity = {name: settings[name] for name in SETTINGS if name not in ("spp", "exposure", "tonemap")}
+        identity |= {name: getattr(options, name) for name in ("seed", "accel", "accel_options", "triangle", "box")}
+        identity |= {
+            "crop": self.crop, "groups of samples": self.groups, "scene": scene_digest(self.scene),
+            "camera": camera_digest(self.camera), "device": f"cuda, sm_{device.arch}" if device.is_cuda else "cpu",
+            "version": wrt.__version__, "kernels": kernel_hash(self.kernels[0], device),
+        }
+        area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
+        file = Checkpoint(Path(options.checkpoint or ""), options.checkpoint_every, identity, area=area, groups=self.groups,
+                          resume=options.resume)
+        spp = max(1, settings["spp"] // self.groups)
+        if file.saved is not None and file.saved.samples[1] > spp:
+            raise InputError(f"holds {file.saved.samples[1] * self.groups} samples a pixel already; spp is {settings['spp']}",
+                             file.path)
+        return file
 
     def _prepare(self) -> None:
         """Compile, which takes longest, and build the structure meanwhile. Neither Ctrl-C nor an error waits for the
@@ -240,47 +188,70 @@ class Renderer:
     def run(self, *, seed: int | None = None, spp: int | None = None) -> Film:
         """Take all samples (or as many as time allows, or as the target error needs) and return the film.
 
-        seed, spp: in place of the options' and the scene's.
+        seed, spp: in place of the options' and the scene's; not with a checkpoint.
         """
+        if self.checkpoint is not None and not seed is spp is None:
+            raise InputError("a render with a checkpoint has the seed and spp that it was made with")
         self.seed = self.options.seed if seed is None else seed
         self.spp = max(1, (spp or self.scene.settings.spp) // self.groups)  # a group
         self.film = DeviceFilm(self.scene.settings, self.crop, self.device, self.seed, self.groups)
         self.expected_spp, self.timed_out, interrupted = self.spp, False, False
+        self.seconds_before, self.fewest, self.most = 0.0, 0, 0
+        self._restore()
         aov: dict[str, np.ndarray] = {}
-        begin = time.perf_counter()
-        with held_interrupts() as self.interrupts:
+        begin = self.begin = time.perf_counter()
+        with held_interrupts() as self.interrupts, self.checkpoint.held() if self.checkpoint else nullcontext():
             try:
                 if self.options.aov:
                     aov = self._aovs()
                     self.seconds["aov"] = time.perf_counter() - begin
-                begin = time.perf_counter()
-                for first, count in self._passes(begin):
-                    self._run_pass(first, count, begin)
+                begin = self.begin = time.perf_counter()
+                for first, count in self._passes():
+                    self._run_pass(first, count)
             except KeyboardInterrupt:  # from _each_tile, or from a progress callback that wants the end
                 interrupted = True
-            self.seconds["trace"] = time.perf_counter() - begin
+            self.seconds["trace"] = self.seconds_before + time.perf_counter() - begin
+            if self.checkpoint is not None:
+                self.checkpoint.save(self.film, self.seconds["trace"])
+                if self.checkpoint.problem:
+                    warnings.warn(self.checkpoint.problem, RuntimeWarning, stacklevel=3)
             return self._result(aov, interrupted or bool(self.interrupts))
 
-    def _passes(self, begin: float) -> Iterator[tuple[int, int]]:
+    def _restore(self) -> None:
+        """Go on where the checkpoint ends, if there is one."""
+        if self.checkpoint is not None and self.checkpoint.saved is not None:
+            self.checkpoint.restore(self.film)
+            self.fewest, self.most = self.checkpoint.saved.samples
+            self.seconds_before = self.checkpoint.saved.seconds
+
+    def _passes(self) -> Iterator[tuple[int, int]]:
         """First sample and number of samples (of each group) of each pass: 1, 1, 2, 4 ..., so that a first picture comes soon.
 
-        A time limit counts from `begin`: a pass takes no more samples than are likely to be done by then, but for the
-        first of each pixel, which is always taken.
+        A time limit counts from self.begin: a pass takes no more samples than are likely to be done by then, but for the
+        first of each pixel, which is always taken; nor, where a launch is the whole picture, more than until the next
+        checkpoint. A render that was saved within a pass begins with the pixels that are behind.
         """
-        spp, limit = self.spp, self.options.time_limit
-        first, count = 0, self.options.pass_size or 1
-        while first < spp and not self._precise_enough(first):
-            count = min(count, spp - first)
+        spp, limit = self.spp, self.options.time_limit or math.inf
+        every = self.checkpoint.every if self.checkpoint is not None and self.device.is_cuda else math.inf
+        first = known = self.fewest  # the speed is that of the samples since `known`, when `since`
+        since = self.begin
+        count = self.options.pass_size or min(max(first, 1), MAX_PASS // self.groups)
+        while first < spp and (first < self.most or not self._precise_enough(first)):
+            count = min(count, (self.most if first < self.most else spp) - first)
             if self.options.target_error is not None:
                 count = min(count, (1 << first.bit_length()) - first)  # no farther than to the next power of 2
-            if first > 0 and limit is not None:
-                elapsed = time.perf_counter() - begin
-                if elapsed >= limit:
+            if first > 0 and min(limit, every) < math.inf:
+                now = time.perf_counter()
+                left = limit - (now - self.begin)
+                if left <= 0.0:
                     self.timed_out = True
                     return
-                count = max(1, min(count, int(min((limit - elapsed) / elapsed * first, spp))))
+                likely = min(left, every) / (now - since) * (first - known) if first > known else 1.0
+                count = max(1, min(count, int(min(likely, spp))))
             yield first, count
             first += count
+            if first == self.most:
+                known, since = first, time.perf_counter()
             count = self.options.pass_size or min(first, MAX_PASS // self.groups)
 
     def _precise_enough(self, taken: int) -> bool:
@@ -294,31 +265,32 @@ class Renderer:
             self.expected_spp = min(self.spp, taken << steps)
         return error <= target
 
-    def _tiles(self) -> Iterator[tuple[int, int, int, int]]:
+    def _tiles(self) -> Iterator[Rectangle]:
         x0, y0, x1, y1 = self.crop
-        step = max(x1 - x0, y1 - y0) if self.device.is_cuda else self.options.tile_size
-        for y in range(y0, y1, step):
-            for x in range(x0, x1, step):
-                yield x, y, min(step, x1 - x), min(step, y1 - y)
+        return tiles(self.crop, max(x1 - x0, y1 - y0) if self.device.is_cuda else self.options.tile_size)
 
-    def _launch(self, kernel: Any, arguments: list[Any], rectangle: tuple[int, int, int, int], samples: tuple[int, int],
-                rest: Sequence[Any] = ()) -> None:
+    def _launch(self, kernel: Any, arguments: list[Any], work: Work, rest: Sequence[Any] = ()) -> None:
         tile = structs.Tile()
-        tile.x, tile.y, tile.width = rectangle[:3]
-        tile.first_sample, tile.n_samples = samples
-        wp.launch(kernel, dim=rectangle[2] * rectangle[3], inputs=[*arguments, tile, *rest], device=self.device)
+        tile.x, tile.y, tile.width, height = work.rectangle
+        tile.first_sample, tile.n_samples = work.first, work.n
+        wp.launch(kernel, dim=tile.width * height, inputs=[*arguments, tile, *rest], device=self.device)
 
-    def _run_pass(self, first: int, count: int, begin: float) -> None:
+    def _run_pass(self, first: int, count: int) -> None:
+        """Bring every pixel from `first` to `first + count` samples a group, where it is not there already."""
         world = [self.accel.data, self.device_scene.surfaces, self.device_scene.lighting, self.device_camera]
         groups = [[*world, self._limits(seed), film] for seed, film in zip(self.film.seeds, self.film.groups, strict=True)]
         area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
+        work, before = [Work(tile, first, count) for tile in self._tiles()], first * area
+        if first < self.most:  # of a resumed render
+            samples = self.film.view(self.film.groups[0].samples)
+            work, before = work_left(work, samples, self.crop), int(samples.sum(dtype=np.int64))
 
-        def trace(rectangle: tuple[int, int, int, int]) -> int:
+        def trace(job: Work) -> int:
             for arguments in groups:
-                self._launch(self.kernels[0], arguments, rectangle, (first, count))
-            return rectangle[2] * rectangle[3]
+                self._launch(self.kernels[0], arguments, job)
+            return job.total
 
-        self._each_tile(trace, lambda done: self._report(first * area + done * count, area, begin))
+        self._each_tile(work, trace, lambda done: self._report(before + done, area))
 
     def _limits(self, seed: int) -> Any:
         limits = structs.Limits()
@@ -326,23 +298,32 @@ class Renderer:
         limits.seed = seed
         return limits
 
-    def _each_tile(self, trace: Callable[[tuple[int, int, int, int]], int], report: Callable[[int], None]) -> None:
-        """Trace every tile on all threads; `report` gets the number of pixels done, now and then. KeyboardInterrupt where
-        Ctrl-C came: tiles that run come to their end, so that a pixel is never half done."""
+    def _each_tile(self, work: list[Work], trace: Callable[[Work], int], report: Callable[[int], None]) -> None:
+        """Trace every tile on all threads; `report` gets the sum of what `trace` gives, now and then. KeyboardInterrupt where
+        Ctrl-C came: tiles that run come to their end, so that a pixel is never half done. So they do for a checkpoint."""
         if self.interrupts:
             raise KeyboardInterrupt
         if self.device.is_cuda:
-            done = sum(trace(tile) for tile in self._tiles())
+            done = sum(trace(job) for job in work)
             wp.synchronize_device(self.device)
             report(done)
+            self._save_if_due()
             return
         with ThreadPoolExecutor(self.threads) as pool:
-            pending: set[Future[int]] = {pool.submit(trace, tile) for tile in self._tiles()}
+            pending = {pool.submit(trace, job): job for job in work}
             done = 0
             try:
                 while pending:
-                    finished, pending = wait(pending, timeout=0.1)
-                    done += sum(future.result() for future in finished)
+                    finished, _ = wait(pending, timeout=0.1)
+                    if self.checkpoint is not None and self.checkpoint.due():
+                        waiting = [future for future in pending if future.cancel()]
+                        finished = pending.keys() - set(waiting)
+                        done += sum(future.result() for future in finished)
+                        self._save_if_due()
+                        pending = {pool.submit(trace, pending[future]): pending[future] for future in waiting}
+                    else:
+                        done += sum(future.result() for future in finished)
+                        pending = {future: job for future, job in pending.items() if future not in finished}
                     report(done)
                     if self.interrupts and pending:
                         raise KeyboardInterrupt
@@ -351,11 +332,20 @@ class Renderer:
                     future.cancel()
                 raise
 
-    def _report(self, done: int, area: int, begin: float) -> None:
+    def _save_if_due(self) -> None:
+        if self.checkpoint is not None and self.checkpoint.due():
+            self.checkpoint.save(self.film, self._seconds())
+
+    def _seconds(self) -> float:
+        """Of tracing, those before the last resume too."""
+        return self.seconds_before + time.perf_counter() - self.begin
+
+    def _report(self, done: int, area: int) -> None:
         if self.options.progress is None:
             return
         total = area * self.expected_spp * self.groups
-        self.options.progress(Progress(done * self.groups, total, self.film.rays, time.perf_counter() - begin))
+        note = "" if self.checkpoint is None else self.checkpoint.problem
+        self.options.progress(Progress(done * self.groups, total, self.film.rays, self._seconds(), note=note))
 
     def _aovs(self) -> dict[str, np.ndarray]:
         width, height = self.scene.settings.size
@@ -365,11 +355,11 @@ class Renderer:
             setattr(film, name, wp.zeros(width * height, dtype=dtype, device=self.device))
         arguments = [self.accel.data, self.device_scene.surfaces, self.device_camera, film]
 
-        def trace(rectangle: tuple[int, int, int, int]) -> int:
-            self._launch(self.kernels[1], arguments, rectangle, (0, 1), [width, height])
-            return rectangle[2] * rectangle[3]
+        def trace(job: Work) -> int:
+            self._launch(self.kernels[1], arguments, job, [width, height])
+            return job.total
 
-        self._each_tile(trace, lambda done: None)
+        self._each_tile([Work(tile, 0, 1) for tile in self._tiles()], trace, lambda done: None)
         return {name: self.film.picture(getattr(film, name)) for name in self.options.aov}
 
     def _result(self, aov: dict[str, np.ndarray], interrupted: bool) -> Film:
@@ -391,6 +381,10 @@ class Renderer:
             error = film.error()
             stats |= {"estimated_error": error, "target_error": self.options.target_error,
                       "target_reached": error <= self.options.target_error and int(samples.min()) > 0}
+        if self.checkpoint is not None:
+            saved = self.checkpoint.saved
+            stats |= {"checkpoint": None if self.checkpoint.problem else str(self.checkpoint.path), "resumed": None if saved is None
+                      else {"samples": saved.samples[0] * self.groups, "seconds": saved.seconds}}
         settings = self.scene.settings
         metadata = {
             "scene": plain_text(self.scene.name), "camera": plain_text(self.camera.name), "spp": int(samples.max()),

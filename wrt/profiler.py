@@ -23,16 +23,17 @@ from wrt.kernels.counters import SIZE_RANGE, Counts, Recorder
 from wrt.mesh import Mesh
 from wrt.scene import SETTINGS, Scene
 from wrt.scene_file import as_scene
+from wrt.tiles import Rectangle, Work
 
 KINDS = ("primary", "reflection", "refraction", "straight", "shadow")
 COUNTERS = tuple(Counts.vars)
 PICTURES = (*COUNTERS, "lines", *(f"probes_{kind}" for kind in KINDS))
-LEFT_OUT = ("aov", "time_limit", "target_error", "progress", "pass_size")  # options of a render that a profile has no use for
+LEFT_OUT = ("aov", "time_limit", "target_error", "progress", "pass_size", "checkpoint", "checkpoint_every",
+            "resume")  # options of a render that a profile has no use for
 TILE_SIZE = 64
 BYTES_OF_RAY = 200  # with what is made of it
 TRACE_LIMIT = 12_000_000  # fetches that are kept
 
-Rectangle = tuple[int, int, int, int]
 
 
 class LoggedStructure(NamedTuple):
@@ -188,7 +189,7 @@ class Profiler(Renderer):
         accel = self.logged.struct()
         accel.accel, accel.log = data, log
         world = [accel, self.device_scene.surfaces, self.device_scene.lighting, self.device_camera, self.limits]
-        self._launch(self.kernels[0], [*world, self.films[film].groups[0]], tile, (0, self.scene.settings.spp))
+        self._launch(self.kernels[0], [*world, self.films[film].groups[0]], Work(tile, 0, self.scene.settings.spp))
 
     def _zeros(self, n: int, dtype: Any) -> Any:
         return wp.zeros(n, dtype=dtype, device=self.device)

@@ -17,10 +17,11 @@ LINE_EVERY = 10.0  # seconds between lines where stderr is no terminal
 
 
 def describe(progress: Progress) -> str:
-    """Rays a second, and the time left."""
+    """Rays a second, the time left, and what goes wrong."""
     left = progress.seconds_left
     time_left = f"{int(left // 60)}:{int(left % 60):02d} left" if left < 1e6 else "?"
-    return f"{progress.rays_per_second / 1e6:.1f} Mray/s, {time_left}"
+    note = f"; {progress.note}" if progress.note else ""
+    return f"{progress.rays_per_second / 1e6:.1f} Mray/s, {time_left}{note}"
 
 
 @contextmanager

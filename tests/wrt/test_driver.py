@@ -219,7 +219,7 @@ def passes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[list[int], Fi
     def taken(spp: int, seconds: float = 1.0, **options: Any) -> tuple[list[int], Film]:
         sizes: list[int] = []
 
-        def run_pass(self: Renderer, first: int, count: int, begin: float) -> None:
+        def run_pass(self: Renderer, first: int, count: int) -> None:
             assert first == sum(sizes)
             sizes.append(count)
             clock.now += count * seconds

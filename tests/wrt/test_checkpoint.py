@@ -1,0 +1,350 @@
+"""Checkpoints: going on is as if nothing had happened, and no file is lost, damaged or taken for another."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wrt
+from wrt import checkpoint as module
+from wrt.checked_file import read_checked, write_checked
+from wrt.checkpoint import MAGIC, Checkpoint, read
+from wrt.driver import Options, Progress, Renderer, render
+from wrt.errors import InputError
+from wrt.film import Film
+from wrt.scene import Camera, DirectionalLight, GradientBackground, Material, Object, Scene, Settings
+from wrt.shapes import box, quad
+
+# The features are those of test_driver.py's scene: its kernel serves.
+SCENE = Scene(
+    objects=(Object(box(), (Material(albedo=(0.7, 0.6, 0.5)),)),
+             Object(quad((-4, -1, -4), (0, 0, 8), (8, 0, 0)), (Material(albedo=(0.2, 0.4, 0.8)),))),
+    lights=(DirectionalLight((-1, -2, -1.5), (1.5, 1.4, 1.3)),), cameras=(Camera.look_at((2, 2, 4), (0, 0, 0)),),
+    background=GradientBackground(), settings=Settings(size=(61, 34), spp=24),
+)
+COUNTS = ("rays", "rays_per_sample", "cut_by_depth", "cut_by_throughput", "lost_throughput_per_sample", "not_finite", "samples")
+
+
+def same(a: Film, b: Film) -> bool:
+    """Bit for bit, with the counts."""
+    layers = {"pixels": a.pixels, **a.layers}, {"pixels": b.pixels, **b.layers}
+    return layers[0].keys() == layers[1].keys() and all(
+        layers[0][name].tobytes() == layers[1][name].tobytes() for name in layers[0]) and [
+        a.stats[name] for name in COUNTS] == [b.stats[name] for name in COUNTS]
+
+
+@pytest.fixture(scope="module")
+def whole() -> Film:
+    return render(SCENE, aov="depth")
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "a.checkpoint"
+
+
+def stop_at(share: float) -> Callable[[Progress], None]:
+    def stop(progress: Progress) -> None:
+        if progress.done > share * progress.total:
+            raise KeyboardInterrupt
+
+    return stop
+
+
+def files(path: Path) -> list[str]:
+    return sorted(each.name for each in path.parent.iterdir())
+
+
+# --- going on ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("first", "then"), [
+    ({"pass_size": 24, "tile_size": 4}, {}),
+    ({"pass_size": 5, "tile_size": 7}, {"pass_size": 3, "tile_size": 11, "threads": 1}),
+    ({"tile_size": 3, "threads": 1}, {"pass_size": 24}),
+    ({"pass_size": 1}, {"tile_size": 1}),
+], ids=str)
+def test_a_resumed_render_is_that_of_one_go(first: dict[str, Any], then: dict[str, Any], path: Path, whole: Film,
+                                            monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Renderer, "_each_tile", slowly(Renderer._each_tile))
+    part = render(SCENE, checkpoint=path, progress=stop_at(0.3), aov="depth", **first)
+    assert part.stats["interrupted"] and part.stats["checkpoint"] == str(path) and part.stats["resumed"] is None
+    assert 0 < part.stats["samples"] < whole.stats["samples"] and files(path) == [path.name]
+    saved = read(path)
+    assert saved.samples == (part.samples.min(), part.samples.max()) and 0.0 < saved.seconds <= part.stats["seconds"]["trace"]
+
+    again = render(SCENE, checkpoint=path, resume=True, aov="depth", **then)
+    assert same(again, whole) and not again.stats["interrupted"] and files(path) == [path.name]
+    assert again.stats["resumed"] == {"samples": saved.samples[0], "seconds": saved.seconds}
+    assert again.stats["seconds"]["trace"] > saved.seconds and read(path).samples == (24, 24)
+
+
+def slowly(each_tile: Any) -> Any:
+    """_each_tile with reports after a tile or two, not after tenths of a second: an interruption falls within a pass."""
+
+    def traced(self: Renderer, work: list[Any], trace: Any, report: Any) -> None:
+        done = 0
+        for i in range(0, len(work), 3):
+            each_tile(self, work[i : i + 3], trace, lambda n, done=done: report(done + n))
+            done += sum(job.total for job in work[i : i + 3])
+
+    return traced
+
+
+def test_an_interruption_within_a_pass_leaves_differing_pixels(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Renderer, "_each_tile", slowly(Renderer._each_tile))  # what the test above rests on
+    part = render(SCENE, checkpoint=path, progress=stop_at(0.3), pass_size=24, tile_size=4)
+    assert set(np.unique(part.samples)) == {0, 24} and read(path).samples == (0, 24)
+
+
+def test_saving_all_the_time_changes_nothing(path: Path, whole: Film) -> None:
+    film = render(SCENE, checkpoint=path, checkpoint_every=1e-9, tile_size=5, aov="depth")
+    assert same(film, whole) and files(path) == [path.name]
+
+
+def test_many_resumes_with_a_target_error(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options: dict[str, Any] = {"target_error": 0.012, "tile_size": 8}
+    expected = render(SCENE, **options)
+    assert expected.stats["target_reached"] and expected.metadata["spp"] > 8
+    monkeypatch.setattr(Renderer, "_each_tile", slowly(Renderer._each_tile))
+    shares = iter((0.05, 0.1, 0.4))
+    film = render(SCENE, checkpoint=path, progress=stop_at(next(shares)), **options)
+    while film.stats["interrupted"]:
+        film = render(SCENE, checkpoint=path, resume=True, progress=stop_at(next(shares, 2.0)), **options)
+    assert same(film, expected) and film.stats["estimated_error"] == expected.stats["estimated_error"]
+    finer = render(SCENE, checkpoint=path, resume=True, target_error=0.006)
+    assert same(finer, render(SCENE, target_error=0.006)) and finer.stats["samples"] > film.stats["samples"]
+
+
+def test_more_samples_go_on_from_a_finished_render(path: Path, whole: Film) -> None:
+    render(SCENE, spp=10, checkpoint=path)
+    assert same(render(SCENE, checkpoint=path, resume=True, aov="depth"), whole)
+    again = render(SCENE, checkpoint=path, resume=True, aov="depth")
+    assert same(again, whole) and again.stats["resumed"]["samples"] == 24
+    with pytest.raises(InputError, match="holds 24 samples a pixel already; spp is 23"):
+        render(SCENE, spp=23, checkpoint=path, resume=True)
+
+
+def test_time_limits_one_after_another(path: Path) -> None:
+    options: dict[str, Any] = {"spp": 1 << 20, "checkpoint": path, "time_limit": 0.15}
+    films = [render(SCENE, **options)] + [render(SCENE, resume=True, **options) for _ in range(2)]
+    samples = [int(film.samples.min()) for film in films]
+    assert samples == sorted(set(samples)) and all(film.stats["timed_out"] for film in films)
+    before = [(film.stats["resumed"] or {"seconds": 0.0})["seconds"] for film in films]
+    assert all(0.1 < film.stats["seconds"]["trace"] - earlier < 2.0 for film, earlier in zip(films, before, strict=True))
+    assert same(films[-1], render(SCENE, spp=samples[-1]))
+
+
+def test_a_crop_and_groups(path: Path) -> None:
+    options: dict[str, Any] = {"crop": (7, 3, 50, 30), "target_error": 1e-9, "spp": 16, "seed": 3}
+    render(SCENE, checkpoint=path, **{**options, "spp": 4})
+    assert same(render(SCENE, checkpoint=path, resume=True, **options), render(SCENE, **options))
+
+
+def test_ctrl_c_before_anything_keeps_what_was_there(path: Path, whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:
+    render(SCENE, spp=10, checkpoint=path)
+    with monkeypatch.context() as patch:
+        patch.setattr(Renderer, "_aovs", lambda self: signal.raise_signal(signal.SIGINT) or {})
+        film = render(SCENE, checkpoint=path, resume=True, aov="depth")
+    assert film.stats["interrupted"] and (film.samples == 10).all() and read(path).samples == (10, 10)
+    assert same(render(SCENE, checkpoint=path, resume=True, aov="depth"), whole)
+
+
+def test_resume_begins_anew_where_there_is_nothing(path: Path, whole: Film) -> None:
+    film = render(SCENE, checkpoint=path, resume=True, aov="depth")
+    assert same(film, whole) and film.stats["resumed"] is None
+
+
+def test_progress_counts_what_was_done_before(path: Path) -> None:
+    render(SCENE, spp=12, checkpoint=path)
+    told: list[Progress] = []
+    film = render(SCENE, checkpoint=path, resume=True, progress=told.append)
+    assert told[0].done >= film.stats["samples"] // 2 and told[-1].done == told[-1].total == film.stats["samples"]
+    assert told[0].seconds >= film.stats["resumed"]["seconds"] and told[-1].rays == film.stats["rays"]
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+def refuses(message: str, path: Path, **options: Any) -> None:
+    before = path.read_bytes() if path.is_file() else None
+    there = files(path)
+    scene = options.pop("scene", SCENE)
+    with pytest.raises(InputError, match=message):
+        render(scene, checkpoint=path, **options)
+    assert files(path) == there and (path.read_bytes() if path.is_file() else None) == before
+
+
+def test_a_file_that_is_there_is_never_overwritten(path: Path) -> None:
+    path.write_bytes(b"a diary")
+    refuses("a.checkpoint: is there already: resume it", path)
+    refuses("a.checkpoint: is no checkpoint of this version", path, resume=True)
+    path.write_bytes(pickle.dumps({"seconds": 0}))
+    refuses("is no checkpoint", path, resume=True)
+    path.unlink()
+    path.mkdir()
+    refuses("is there already", path)
+    refuses("Is a directory|Permission denied", path, resume=True)
+
+
+def test_a_checkpoint_of_another_render_is_refused(path: Path) -> None:
+    render(SCENE, spp=1, checkpoint=path)
+    refuses("is there already", path)
+    refuses("of another render: seed was 0, is 1$", path, resume=True, seed=1)
+    refuses("of another render: max_depth was 8, is 3$", path, resume=True, max_depth=3)
+    refuses("accel was bvh, is brute-force|accel was bvh, is brute_force", path, resume=True, accel=next(
+        name for name in wrt.ACCELERATORS if "brute" in name))
+    refuses(r"crop was \[0, 0, 61, 34\], is \[0, 0, 61, 33\]", path, resume=True, crop=(0, 0, 61, 33))
+    refuses("groups of samples was 1, is 4", path, resume=True, target_error=0.1)
+    refuses("the camera is another", path, resume=True, camera=Camera.look_at((2, 2, 4.1), (0, 0, 0)))
+    refuses("of another render: the scene is another$", path, resume=True, scene=replace(SCENE, ambient=(0.1, 0.1, 0.1)))
+    render(replace(SCENE, name="another name"), spp=2, checkpoint=path, resume=True, threads=1, tile_size=5, exposure=2.0)
+
+
+def test_a_stale_checkpoint_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    render(SCENE, spp=1, checkpoint=path)
+    with monkeypatch.context() as patch:
+        patch.setattr("wrt.driver.kernel_hash", lambda kernel, device: "0" * 64)
+        refuses("the kernels are another version", path, resume=True)
+    monkeypatch.setattr(wrt, "__version__", "99.0")
+    refuses(r"version was .*, is 99\.0", path, resume=True)
+
+
+def test_any_damage_is_noticed(path: Path) -> None:
+    render(SCENE, spp=1, size=(8, 6), checkpoint=path)
+    good = path.read_bytes()
+    rng = np.random.default_rng(0)
+    places = {len(MAGIC), len(good) - 1, len(good) - 40, *rng.integers(len(MAGIC), len(good), 60).tolist()}
+    for place in places:
+        bad = bytearray(good)
+        bad[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bad)
+        with pytest.raises(InputError, match="is damaged: its checksum does not fit"):
+            read(path)
+    for end in {0, 1, len(MAGIC), len(good) - 1, *rng.integers(0, len(good), 20).tolist()}:
+        path.write_bytes(good[:end])
+        with pytest.raises(InputError, match=r"is damaged|is no checkpoint"):
+            read(path)
+    path.write_bytes(good + b"\0")
+    refuses("is damaged", path, resume=True, size=(8, 6))
+
+
+def forged(path: Path, body_change: Callable[[bytes], bytes] = bytes, **changes: Any) -> None:
+    """A file with a right checksum and wrong contents."""
+    header, body = read_checked(path, MAGIC, "checkpoint")
+    with open(path.with_suffix(".new"), "wb") as file:
+        write_checked(file, MAGIC, header | changes, [body_change(bytes(body))])
+    os.replace(path.with_suffix(".new"), path)
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"samples": [1]}, "is no checkpoint"), ({"samples": "ab"}, "is no checkpoint"), ({"samples": [-1, 1]}, "do not fit"),
+    ({"samples": [0, 1]}, "samples do not fit"), ({"seconds": None}, "is no checkpoint"), ({"identity": 5}, "is no checkpoint"),
+    ({"identity": {}}, "of another render"), ({"body_change": lambda body: body[:-4]}, "arrays do not fit"),
+    ({"body_change": lambda body: body + bytes(4)}, "arrays do not fit"),
+    ({"body_change": lambda body: bytes(len(body))}, "do not fit"),
+], ids=range(10))
+def test_a_forged_file_is_refused(changes: dict[str, Any], message: str, path: Path) -> None:
+    render(SCENE, spp=1, checkpoint=path)
+    forged(path, **changes)
+    refuses(message, path, resume=True)
+
+
+def test_a_header_that_is_no_object(path: Path) -> None:
+    for header in (b"[]", b"nonsense", b"[" * 60000, b'{"a": 1}' + b" " * 70000):
+        data = MAGIC + header + b"\n"
+        path.write_bytes(data + sha256(data).digest())
+        with pytest.raises(InputError, match=r"is no checkpoint|is damaged"):
+            read(path)
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"resume": True}, "resume needs a checkpoint"), ({"checkpoint": 5}, "checkpoint must be a path, got 5"),
+    ({"checkpoint": "a", "checkpoint_every": 0}, "checkpoint_every must be more than 0"),
+    ({"checkpoint": "a", "checkpoint_every": float("nan")}, "checkpoint_every must be more than 0"),
+    ({"checkpoint": "a", "checkpoint_every": "60s"}, "checkpoint_every must be"),
+    ({"checkpoint": "a", "resume": 1}, "resume must be"),
+    ({"checkpoint": "nowhere/a"}, "nowhere/a: its folder does not exist"),
+], ids=str)
+def test_wrong_options(options: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=message):
+        render(SCENE, **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_checkpoint_is_of_one_seed(path: Path) -> None:
+    renderer = Renderer(SCENE, Options(checkpoint=path))
+    with pytest.raises(InputError, match="the seed and spp that it was made with"):
+        renderer.run(seed=1)
+
+
+# --- the disk ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_full_disk_is_told_before_the_work(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*arguments: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("the work began"))
+    monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
+    refuses("a checkpoint cannot be written: No space left on device", path)
+
+
+def test_a_disk_that_fills_up_costs_neither_the_render_nor_the_last_checkpoint(path: Path, whole: Film,
+                                                                              monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[Progress] = []
+    failures = iter([False, True, True, True])
+
+    def sometimes(descriptor: int) -> None:
+        if not os.path.isdir(f"/proc/self/fd/{descriptor}") and next(failures, False):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module.os, "fsync", sometimes)
+    monkeypatch.setattr(Renderer, "_each_tile", slowly(Renderer._each_tile))
+    film = render(SCENE, checkpoint=path, checkpoint_every=1e-9, aov="depth", progress=told.append)
+    notes = {progress.note for progress in told}
+    assert same(film, whole) and notes == {"", f"{path}: the checkpoint cannot be written: No space left on device"}
+    assert told[-1].note == "" and film.stats["checkpoint"] == str(path) and files(path) == [path.name]
+
+    failures = iter([True] * 10000)
+    saved = path.read_bytes()
+    with pytest.warns(RuntimeWarning, match="the checkpoint cannot be written: No space left on device"):
+        film = render(SCENE, spp=30, checkpoint=path, resume=True)
+    assert (film.samples == 30).all() and film.stats["checkpoint"] is None
+    assert path.read_bytes() == saved and files(path) == [path.name]
+
+
+def test_two_renders_do_not_write_one_file(path: Path) -> None:
+    pytest.importorskip("fcntl")
+    with Checkpoint(path, 60.0, {}, area=1, groups=1, resume=False).held():
+        refuses("another render is writing it", path)
+    render(SCENE, spp=1, checkpoint=path)
+
+
+def test_what_a_killed_render_left_is_no_hindrance(path: Path) -> None:
+    path.with_name(f".{path.name}.part").write_bytes(b"x" * (1 << 20))
+    render(SCENE, spp=1, checkpoint=path)
+    assert files(path) == [path.name] and read(path).samples == (1, 1) and path.stat().st_size < 1 << 18
+
+
+def test_when_the_next_is_due(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So early that what it takes to write falls within the interval, but never more than half of the time for writing."""
+    now = 100.0
+    monkeypatch.setattr(module.time, "monotonic", lambda: now)
+    with Checkpoint(path, 60.0, {}, area=1, groups=1, resume=False).held() as file:
+        for cost, expected in ((0.0, 60.0), (10.0, 50.0), (200.0, 30.0)):
+            file._last, file._cost = now, cost
+            now += expected - 0.01
+            assert not file.due()
+            now += 0.02
+            assert file.due()

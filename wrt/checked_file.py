@@ -1,0 +1,51 @@
+"""Files of arrays that are checked when they are read: a line that says what it is, a line of JSON, the arrays' bytes one after
+another, and the SHA-256 of all that. Nothing in them is evaluated or unpickled."""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+from collections.abc import Iterable
+from hashlib import sha256
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from wrt.errors import InputError
+
+DIGEST_BYTES = 32
+MAX_HEADER = 1 << 16
+
+
+def write_checked(file: BinaryIO, magic: bytes, header: dict[str, Any], parts: Iterable[bytes | np.ndarray]) -> None:
+    """Write it all to an open file. magic: the first line, with its end; header: at most MAX_HEADER bytes of JSON; parts: bytes,
+    or arrays, of which the values count. OSError comes through."""
+    digest = sha256()
+    for part in (magic, json.dumps(header).encode() + b"\n", *parts):
+        view = part if isinstance(part, bytes) else np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
+        digest.update(view)
+        file.write(view)
+    file.write(digest.digest())
+
+
+def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> tuple[dict[str, Any], memoryview]:
+    """The header and the bytes of the arrays, mapped from the file. Raises InputError, which calls it `what`, where it is
+    missing, foreign or damaged."""
+    try:
+        with open(path, "rb") as file:
+            if os.fstat(file.fileno()).st_size < len(magic) + DIGEST_BYTES or file.read(len(magic)) != magic:
+                raise InputError(f"is no {what} of this version", path)
+            data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    except OSError as error:
+        raise InputError(error.strerror or str(error), path) from error
+    end = bytes(data[: len(magic) + MAX_HEADER]).find(b"\n", len(magic))
+    if end < 0 or sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
+        raise InputError("is damaged: its checksum does not fit", path)
+    try:
+        header = json.loads(bytes(data[len(magic):end]))
+    except (ValueError, RecursionError):
+        header = None
+    if not isinstance(header, dict):
+        raise InputError(f"is no {what} of this version", path)
+    return header, data[end + 1:-DIGEST_BYTES]

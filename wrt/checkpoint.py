@@ -1,0 +1,201 @@
+"""Long renders that survive: the film in a file, written aside, brought to the disk and renamed, so that the file is always whole.
+
+A checkpoint is a checked file (wrt.checked_file): who made it (IDENTITY: everything that can change a pixel), how far it is, and
+the film's arrays. How many samples each pixel has is one of them: rendering goes on from any state in which each pixel is done
+whole. Beside the file lies `.NAME.part`, which is locked while a render runs, and holds the room that the next one needs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrt.checked_file import DIGEST_BYTES, MAX_HEADER, read_checked, write_checked
+from wrt.device_film import OF_A_GROUP, SHARED, DeviceFilm
+from wrt.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # no POSIX: nothing keeps two renders from one file
+    fcntl = None  # type: ignore[assignment]
+
+MAGIC = b"wrt checkpoint 1\n"
+# What is told of a value that differs: the rest are told with both values.
+OTHER = {"scene": "the scene is another", "camera": "the camera is another", "kernels": "the kernels are another version"}
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What a checkpoint holds. samples: the fewest and the most of a pixel (of each group); seconds of tracing."""
+
+    samples: tuple[int, int]
+    seconds: float
+    identity: dict[str, Any]
+    body: memoryview
+
+
+def read(path: str | os.PathLike[str]) -> Saved:
+    """Raises InputError where the file is missing, foreign, damaged or of another version."""
+    header, body = read_checked(path, MAGIC, "checkpoint")
+    try:
+        low, high = map(int, header["samples"])
+        return Saved((low, high), float(header["seconds"]), dict(header["identity"]), body)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"is no checkpoint of this version ({type(error).__name__}: {error})", path) from error
+
+
+class Checkpoint:
+    """The file of one render. identity: what must be the same for going on, as JSON has it; area: pixels; groups: of samples.
+
+    With `resume` a file that is there is read, and refused where it is not of this render; without, any file that is there is
+    refused. Both, and whether there is room for two (the old one stays until the new one is whole), are told before the work.
+    """
+
+    def __init__(self, path: Path, every: float, identity: dict[str, Any], *, area: int, groups: int, resume: bool) -> None:
+        self.path, self.every = Path(os.path.realpath(path)), every
+        self.part = self.path.with_name(f".{self.path.name}.part")
+        self.identity = json.loads(json.dumps(identity, default=str))
+        pixel = sum(_bytes(kind) for kind in SHARED.values()) + groups * sum(_bytes(kind) for kind in OF_A_GROUP.values())
+        self.body_bytes = area * pixel
+        self.bytes = self.body_bytes + len(MAGIC) + MAX_HEADER + DIGEST_BYTES
+        self.saved: Saved | None = None
+        self.problem = ""
+        self._file: Any = None
+        if not self.path.parent.is_dir():
+            raise InputError("its folder does not exist", path)
+        if os.path.lexists(self.path):
+            if not resume:
+                raise InputError("is there already: resume it (--resume, resume=True), or remove it first", path)
+            self.saved = self._checked(read(self.path))
+        with self.held():
+            pass
+
+    def _checked(self, saved: Saved) -> Saved:
+        differ = [name for name in {**self.identity, **saved.identity} if self.identity.get(name) != saved.identity.get(name)]
+        if differ != ["kernels"]:
+            differ = [name for name in differ if name != "kernels"]  # other settings can need other kernels
+        told = [OTHER.get(name, f"{name} was {saved.identity.get(name)}, is {self.identity.get(name)}") for name in differ]
+        if told:
+            raise InputError(f"is a checkpoint of another render: {'; '.join(told)}", self.path)
+        if len(saved.body) != self.body_bytes or not 0 <= saved.samples[0] <= saved.samples[1]:
+            raise InputError("is damaged: its arrays do not fit", self.path)
+        return saved
+
+    # --- writing ------------------------------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[Checkpoint]:
+        """Keep the part file, its lock and its room during the block. Raises InputError where the system refuses."""
+        try:
+            self._reserve(2 * self.bytes)
+        except OSError as error:
+            self._release()
+            raise InputError(f"a checkpoint cannot be written: {_reason(error)}", self.path) from error
+        self._last, self._cost = time.monotonic(), 0.0
+        try:
+            yield self
+        finally:
+            self._release()
+
+    def _reserve(self, room: int) -> None:
+        """Open and lock the part file, and take the room on the disk; at least so many bytes must be there."""
+        while True:
+            self._file = open(os.open(self.part, os.O_RDWR | os.O_CREAT, 0o666), "wb")
+            if fcntl is not None:
+                try:
+                    fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    self._file.close()
+                    self._file = None
+                    raise InputError("another render is writing it", self.path) from None
+                except OSError:
+                    pass  # a file system without locks
+            if os.path.exists(self.part) and os.path.samestat(os.fstat(self._file.fileno()), os.stat(self.part)):
+                break  # else another render has just renamed it
+            self._file.close()
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(self._file.fileno(), 0, room)
+        elif shutil.disk_usage(self.part.parent).free < room:
+            raise OSError(f"no room for {room / 2**20:.0f} MiB")
+        os.ftruncate(self._file.fileno(), min(room, self.bytes))
+
+    def _release(self) -> None:
+        if self._file is not None:
+            self.part.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # what a full disk did not take of a file that is gone
+                self._file.close()
+            self._file = None
+
+    def due(self) -> bool:
+        """Whether it is time: a new file is to be there `every` seconds after the state that the last one holds."""
+        return time.monotonic() - self._last >= max(self.every - self._cost, 0.5 * self.every)
+
+    def save(self, film: DeviceFilm, seconds: float) -> None:
+        """Write the film. Where the system refuses, the old file stays, `problem` says why, and the render goes on in memory."""
+        begin = time.monotonic()
+        samples = film.view(film.groups[0].samples)
+        header = {"samples": [int(samples.min()), int(samples.max())], "seconds": seconds, "identity": self.identity}
+        try:
+            if self._file is None:
+                self._reserve(self.bytes)
+            self._file.seek(0)
+            write_checked(self._file, MAGIC, header, (film.view(array) for _, array in film.arrays()))
+            self._file.truncate()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            os.replace(self.part, self.path)
+            self.problem = ""
+            written, self._file = self._file, None
+            _sync_folder(self.path.parent)
+            with contextlib.suppress(OSError, InputError):  # then the next one says so
+                self._reserve(self.bytes)
+            written.close()
+        except (OSError, InputError) as error:
+            self.problem = f"{self.path}: the checkpoint cannot be written: {_reason(error)}"
+            self._release()
+        self._last, self._cost = begin, time.monotonic() - begin
+
+    # --- reading ------------------------------------------------------------------------------------------------------
+
+    def restore(self, film: DeviceFilm) -> None:
+        """Put what was read into an empty film."""
+        assert self.saved is not None
+        at = 0
+        for _, array in film.arrays():
+            there = film.view(array)
+            values = np.frombuffer(self.saved.body[at:at + there.nbytes], there.dtype).reshape(there.shape)
+            film.put(array, values)
+            at += there.nbytes
+        samples = [film.view(group.samples) for group in film.groups]
+        if any((each != samples[0]).any() for each in samples) or (samples[0].min(), samples[0].max()) != self.saved.samples:
+            raise InputError("is damaged: its samples do not fit", self.path)
+        self.saved = replace(self.saved, body=memoryview(b""))  # the file may go now
+
+
+def _bytes(kind: Any) -> int:
+    import warp as wp
+
+    return int(wp.types.type_size_in_bytes(kind))
+
+
+def _reason(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
+def _sync_folder(folder: Path) -> None:
+    """A rename is on the disk only when its folder is."""
+    with contextlib.suppress(OSError):  # not every system opens folders
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,119 @@
+"""What a render is asked for beyond the scene, and what it tells of itself while it runs."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from wrt.accel import ACCELERATORS
+from wrt.accel.base import check_units
+from wrt.arguments import as_integer, as_names, as_one, as_path, as_tuple, shown
+from wrt.device import start, thread_count
+from wrt.errors import InputError
+from wrt.scene import Camera
+
+AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
+TILE_SIZE = 32
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a render is: samples done and to do (summed over pixels), rays so far, seconds of tracing.
+
+    Of a resumed render, what was done before counts in all four. stage: "trace"; or before anything is traced, where that takes
+    longer than driver.PREPARING_TOLD: "compile", once, or "build", with done of total steps of a structure that is slow to build.
+    note: what goes wrong meanwhile; "" is nothing.
+    """
+
+    done: int
+    total: int
+    rays: int
+    seconds: float
+    stage: str = "trace"
+    note: str = ""
+
+    @property
+    def rays_per_second(self) -> float:
+        return self.rays / self.seconds if self.seconds > 0.0 else 0.0
+
+    @property
+    def seconds_left(self) -> float:
+        return self.seconds * (self.total - self.done) / self.done if self.done else float("inf")
+
+
+@dataclass
+class Options:
+    """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once; never change a
+    pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always taken.
+
+    target_error: stop when the estimated error of the picture is no larger: the root mean square, over its pixels and
+    channels, of the standard error in linear radiance. It is noise alone: what max_depth and min_throughput cut off is not
+    in it. A pixel's samples are then split over GROUPS independent sequences (wrt.device_film), and spp is the most to take
+    (rounded down to a multiple of GROUPS; one a group at least). The estimate is looked at when a group has 1, 2, 4, 8 ...
+    samples: only then is its sequence as even as it can be.
+
+    checkpoint: a file that the work so far is written to every `checkpoint_every` seconds, and when a render ends early or is
+    done; it stays. A file that is there already is refused, unless `resume` says to go on with it: the picture is then that of
+    an uninterrupted render, bit for bit. Where there is none, `resume` begins anew (wrt.checkpoint)."""
+
+    seed: int = 0
+    device: str = "cpu"
+    accel: str = "bvh"
+    threads: int | None = None
+    camera: str | int | Camera | None = None
+    crop: tuple[int, int, int, int] | None = None
+    aov: Sequence[str] = ()
+    time_limit: float | None = None
+    target_error: float | None = None
+    tile_size: int = TILE_SIZE
+    pass_size: int | None = None
+    progress: Callable[[Progress], None] | None = None
+    triangle: str = "watertight"
+    box: str = "conservative"
+    accel_options: dict[str, Any] = field(default_factory=dict)
+    checkpoint: str | os.PathLike[str] | None = None
+    checkpoint_every: float = 60.0
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("accel", "device", "triangle", "box"):
+            as_one(getattr(self, name), str, name)
+        if self.accel not in ACCELERATORS:
+            raise InputError(f"no structure {self.accel!r}; there is {', '.join(ACCELERATORS)}")
+        check_units(self.triangle, self.box)
+        self.aov = as_names(self.aov, "aov")
+        no_aov = sorted(set(self.aov) - set(AOVS))
+        if no_aov:
+            raise InputError(f"no AOV {', '.join(no_aov)}; there is {', '.join(AOVS)}")
+        for name in ("time_limit", "target_error"):
+            as_one(getattr(self, name), (int, float, np.number, type(None)), name)
+        if self.time_limit is not None and not self.time_limit > 0.0:
+            raise InputError(f"time_limit must be more than 0 seconds, got {self.time_limit}")
+        if self.target_error is not None and not 0.0 < self.target_error < math.inf:
+            raise InputError(f"target_error must be more than 0 and finite, got {self.target_error}")
+        as_one(self.checkpoint_every, (int, float, np.number), "checkpoint_every")
+        if not self.checkpoint_every > 0.0:
+            raise InputError(f"checkpoint_every must be more than 0 seconds, got {self.checkpoint_every}")
+        self.checkpoint = None if self.checkpoint is None else as_path(self.checkpoint, "checkpoint")
+        if as_one(self.resume, bool, "resume") and self.checkpoint is None:
+            raise InputError("resume needs a checkpoint to go on with")
+        self.tile_size = as_integer(self.tile_size, "tile_size", 1, 1 << 15)
+        self.pass_size = None if self.pass_size is None else as_integer(self.pass_size, "pass_size", 1, 1 << 24)
+        self.seed = as_integer(self.seed, "seed", 0, 2**32 - 1)
+        if self.crop is not None and len(as_tuple(self.crop, (int, np.integer), "crop")) != 4:
+            raise InputError(f"crop must be x0, y0, x1, y1 in pixels, got {self.crop!r}")
+        if not (self.progress is None or callable(self.progress)):
+            raise InputError(f"progress must be a function of a Progress, got {shown(self.progress)}")
+        as_one(self.camera, (str, int, np.integer, Camera, type(None)), "camera")
+        as_one(self.accel_options, dict, "accel_options")
+        as_one(self.threads, (int, np.integer, type(None)), "threads")
+        thread_count(self.threads)
+        start(self.device)
+
+
+OPTIONS = tuple(each.name for each in fields(Options))

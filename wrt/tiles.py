@@ -1,0 +1,55 @@
+"""How a picture is divided: tiles, and the samples that each still needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+Rectangle = tuple[int, int, int, int]  # x, y, width, height
+
+
+class Work(NamedTuple):
+    """Samples `first` to `first + n` of each pixel of a rectangle."""
+
+    rectangle: Rectangle
+    first: int
+    n: int
+
+    @property
+    def total(self) -> int:
+        """Samples in all."""
+        return self.rectangle[2] * self.rectangle[3] * self.n
+
+
+def tiles(crop: tuple[int, int, int, int], step: int) -> Iterator[Rectangle]:
+    """Squares of side `step`, smaller at the right and the bottom, that make up the rectangle x0, y0, x1, y1; row by row."""
+    x0, y0, x1, y1 = crop
+    for y in range(y0, y1, step):
+        for x in range(x0, x1, step):
+            yield x, y, min(step, x1 - x), min(step, y1 - y)
+
+
+def work_left(work: list[Work], samples: np.ndarray, crop: tuple[int, int, int, int]) -> list[Work]:
+    """What is left of the work where pixels have samples already: samples, (H, W) of the crop, `first` or more.
+
+    A rectangle with differing pixels is halved until each part has equally many: they differ by whole old tiles.
+    """
+    out = []
+    stack = work[::-1]
+    while stack:
+        (x, y, width, height), first, n = stack.pop()
+        there = samples[y - crop[1] : y - crop[1] + height, x - crop[0] : x - crop[0] + width]
+        low, high = int(there.min()), int(there.max())
+        goal = first + n
+        if low == high:
+            if low < goal:
+                out.append(Work((x, y, width, height), low, goal - low))
+        elif low < goal:
+            if width >= height:
+                parts = [(x, y, width // 2, height), (x + width // 2, y, width - width // 2, height)]
+            else:
+                parts = [(x, y, width, height // 2), (x, y + height // 2, width, height - height // 2)]
+            stack += [Work(part, first, n) for part in parts[::-1]]
+    return out
