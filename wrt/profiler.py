@@ -35,7 +35,6 @@ BYTES_OF_RAY = 200  # with what is made of it
 TRACE_LIMIT = 12_000_000  # fetches that are kept
 
 
-
 class LoggedStructure(NamedTuple):
     """A structure with a log before it. Hashable, as Structure."""
 
