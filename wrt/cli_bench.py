@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -214,3 +215,44 @@ def error(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tu
     click.echo(report.text(result))
     for path in paths.values():
         click.echo(path)
+
+
+@bench.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--spp", type=int, default=64, show_default=True, help="wrt's samples a pixel; its error is what Mitsuba must reach")
+@click.option("--size", type=Size(), default="320x180", show_default=True, help="Pixels")
+@click.option("--repeats", type=int, default=7, show_default=True, help="Pictures of each, alternating, each with its own seed")
+@click.option("--reference-spp", type=int, help="Samples of each of the reference's 8 seeds  [default: 8 times --spp]")
+@click.option("--rival-limit", "rival_seconds", type=Duration(), default="60s", show_default=True,
+              help="No picture of Mitsuba's takes longer")
+@click.option("--integrator", default="auto", show_default=True, help="Mitsuba's: path, volpath, direct or whitted (in Python)")
+@click.option("--matte", is_flag=True, help="Make every surface diffuse, for the integrator direct, which draws the same light")
+@click.option("--starts", type=int, default=3, show_default=True, help="How often to time whole processes; 0: not at all")
+@click.option("--camera", help="A camera's name or number  [default: the first]")
+@click.option("--seed", type=int, default=0, show_default=True, help="Decides on all seeds")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the table as Markdown (.md)")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def mitsuba(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tuple[int, int], matte: bool,
+            camera: str | None, **options: Any) -> None:
+    """SCENE by wrt and by Mitsuba 3 (scalar_rgb), on all threads: time to equal error, process start included and excluded."""
+    from wrt.bench import equal_error
+    from wrt.driver import Options
+
+    if matte and options["integrator"] == "auto":
+        options["integrator"] = "direct"
+    plan = equal_error.Plan(**options)
+    if output is not None and (output.suffix.lower() != ".md" or not output.parent.is_dir()):
+        raise InputError("the report is a .md file in a folder that is there", output)
+    loaded = load(scene, quiet).with_settings(size=size)
+    with tempfile.TemporaryDirectory() as folder, warnings_told(quiet), naming(scene):
+        command = ["render", str(scene), "--spp", "1", "--size", f"{size[0]}x{size[1]}", "-q", "-o", f"{folder}/start.png"]
+        result = equal_error.run(equal_error.matte(loaded) if matte else loaded, plan, Options(camera=camera), command,
+                                 now_and_then(quiet))
+    told = equal_error.text(result)
+    if output is not None:
+        output.write_text(told + "\n", encoding="utf-8")
+    if as_json:
+        say_json({**result.as_dict(), "output": output})
+        return
+    click.echo(told)

@@ -144,10 +144,12 @@ class Reference:
                 "mean": float(self.pixels.mean())}
 
 
-def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int]) -> Reference:
-    """Exact Fresnel, the even sampler, the default tests and structure, deep and with a low cut-off; float64 over the seeds."""
+def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int], depth: int | None = None) -> Reference:
+    """Exact Fresnel, the even sampler, the default tests and structure, deep (REFERENCE_DEPTH at least, or just `depth`) and
+    with a low cut-off; float64 over the seeds."""
     settings = scene.settings
-    depth, throughput = max(settings.max_depth, REFERENCE_DEPTH), min(settings.min_throughput, REFERENCE_THROUGHPUT)
+    depth = max(settings.max_depth, REFERENCE_DEPTH) if depth is None else depth
+    throughput = min(settings.min_throughput, REFERENCE_THROUGHPUT)
     scene = scene.with_settings(max_depth=depth, min_throughput=throughput, fresnel="exact", sampler="sobol")
     renderer = Renderer(scene, Options(device=options.device, threads=options.threads, camera=options.camera))
     begin = time.perf_counter()
