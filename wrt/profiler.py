@@ -32,7 +32,7 @@ LEFT_OUT = ("aov", "time_limit", "target_error", "progress", "pass_size", "check
             "resume")  # options of a render that a profile has no use for
 TILE_SIZE = 64
 BYTES_OF_RAY = 200  # with what is made of it
-TRACE_LIMIT = 12_000_000  # fetches that are kept
+TRACE_LIMIT = 4_000_000  # fetches that are kept
 
 
 class LoggedStructure(NamedTuple):

@@ -80,7 +80,7 @@ def test_a_structure_on_a_gpu() -> None:
     origins = np.stack([x.ravel(), y.ravel(), np.full(4096, 3.0)], axis=1)[rng.permutation(4096)]
     directions = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
     work = trace_rays(build(icosphere(5), "bvh2"), "shuffled", origins, directions)
-    found = simt(work, origins, directions)
+    found = simt(work.counters.counts, work.warp, origins, directions)
     assert 0.0 < found["as they come"] == found["packed"] < found["sorted"] <= 1.0
     assert lanes_busy(work) == 1.0
     prediction = predict(work, GPUS["rtx2080ti"])
