@@ -9,7 +9,8 @@ import pytest
 
 import wrt
 from tests.data import data_path
-from wrt.accel import ACCELERATORS, Hits, build
+from wrt.accel import ACCELERATORS, Geometry, Hits, build
+from wrt.bench.hard_cases import HARD_CASES, HardCase, generate
 from wrt.errors import InputError
 
 SMALL = ["meshes/small/suzanne.obj", "meshes/small/cow.obj", "meshes/small/teapot.obj", "meshes/small/legocar.obj",
@@ -17,6 +18,7 @@ SMALL = ["meshes/small/suzanne.obj", "meshes/small/cow.obj", "meshes/small/teapo
 LARGE = ["meshes/medium/rocker-arm.obj", "meshes/medium/stanford_bunny.ply", "meshes/medium/sponza_dabrovic.obj"]
 LARGEST = ["meshes/large/conference_331k.ply", "meshes/large/dragon_871k.ply"]
 STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()} - {"brute_force"})
+HARD = ["D_without_area_wide", "D_huge", "D_tiny", "E_grid", "F_slivers", "F_edge_on", "H_exact_ends", "I_underflow", "I_denormal"]
 TESTS = 60_000_000  # ray-triangle tests that brute force may take in the quick run
 
 
@@ -86,3 +88,35 @@ def test_same_hits_as_the_bvh_on_a_million_rays(structure: str, name: str) -> No
         for field in ("prim_id", "t", "u", "v"):
             np.testing.assert_array_equal(getattr(hits, field), getattr(truth, field), err_msg=f"{field} of {name}")
         np.testing.assert_array_equal(accel.any_hit(origins, directions), truth.prim_id >= 0)
+
+
+@cache
+def expected_of_case(name: str, n: int) -> tuple[HardCase, Hits]:
+    case = generate(name, n, seed=5)
+    structure = "brute_force" if n * len(case.geometry.faces) <= TESTS else "bvh2"
+    return case, build(geometry_of(case), structure).closest_hit(case.origins, case.directions, case.t_min, case.t_max)
+
+
+def geometry_of(case: HardCase) -> Geometry:
+    return case.geometry if isinstance(case.geometry, Geometry) else Geometry.of(case.geometry)
+
+
+def check_case(structure: str, name: str, n: int) -> None:
+    case, truth = expected_of_case(name, n)
+    hits = build(geometry_of(case), structure).closest_hit(case.origins, case.directions, case.t_min, case.t_max)
+    for field in ("prim_id", "t", "u", "v"):
+        np.testing.assert_array_equal(getattr(hits, field), getattr(truth, field), err_msg=f"{field} of {name}")
+
+
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_same_hits_on_hard_cases(structure: str) -> None:
+    for name in HARD:
+        check_case(structure, name, 1000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in HARD_CASES if "not_finite" not in name])
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_same_hits_on_every_hard_case(structure: str, name: str) -> None:
+    # Every triangle of the fan is at its vertex.
+    check_case(structure, name, 1000 if name == "G_fan_vertices" else 20_000)
