@@ -67,7 +67,9 @@ class Case:
 CASES: dict[str, list[Case]] = {
     "brute_force": [Case(lines=lambda accel, n, seed: lines_through_box(accel, 64, seed))],  # each line takes as many steps
     "bvh2": [Case({"builder": builder}) for builder in BVH_BUILDERS],
-    "grid": [Case({"mailbox": False})],  # the SAH knows of no primitive that is not tested again
+    # The SAH knows of no primitive that is not tested again.
+    "grid": [Case({"mailbox": False})],
+    "octree": [Case({"mailbox": False})],
     "kdtree": [Case(options, inner=lambda counters: counters.nodes - counters.leaves)  # a leaf is fetched as a node
                for options in ({}, {"clip": False, "empty_bonus": 0.8}, {"max_leaf": 8, "perfect_below": 1024})],
 }
