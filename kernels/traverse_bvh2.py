@@ -1,16 +1,19 @@
 """The traversal unit of the binary BVH: front to back, with a stack, and an early stop.
 
-A node holds the boxes of both its children, so that one fetch feeds two box tests. The nearer child is visited at once and
-the farther one pushed; a popped node that begins beyond the closest hit is dropped.
+A node holds the volumes of both its children, so that one fetch feeds two tests. The nearer child is visited at once and the
+farther one pushed; a popped node that begins beyond the closest hit is dropped. The volumes are boxes here; other kinds
+(traverse_bvh2_sphere, traverse_bvh2_kdop) share the walk.
 """
 
 from functools import cache
+from typing import Any, NamedTuple
 
 import warp as wp
 
 from wrt.kernels.counters import Counts, Recorder, make_counters
+from wrt.kernels.ray_aabb import BoxRay
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
-from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse import Probe, Units, make_intersect, make_probe, no_hit
 
 # Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
 STACK_SIZE = 64
@@ -46,17 +49,48 @@ def make_struct(record):
     return Bvh2
 
 
+class Volumes(NamedTuple):
+    """A kind of bounding volume: struct: of the structure; node: of a node, with first_0, count_0, first_1 and count_1 as in
+    Bvh2Node; set_up(accel, probe): what the test needs of a ray; enter(what, node, t_max): the distances at which the ray enters
+    both children (vec2), inf where it misses, never beyond a hit in them."""
+
+    struct: Any
+    node: Any
+    set_up: Any
+    enter: Any
+
+
+@cache
+def box_volumes(record, box_test) -> Volumes:
+    struct = make_struct(record)
+
+    @wp.func
+    def set_up(accel: struct, probe: Probe) -> BoxRay:
+        return probe.box
+
+    @wp.func
+    def enter(box: BoxRay, node: Bvh2Node, t_max: float) -> wp.vec2:
+        return wp.vec2(box_test(box, node.lo_0, node.hi_0, t_max), box_test(box, node.lo_1, node.hi_1, t_max))
+
+    return Volumes(struct, Bvh2Node, set_up, enter)
+
+
 def make_traversal(units: Units, any_hit: bool, accepts=None):
     """The closest hit, or any (the first that is found)."""
+    return make_binary_traversal(units, box_volumes(units.triangle_test.record, units.box_test), any_hit, accepts)
+
+
+def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts=None):
+    """As make_traversal, over a tree with volumes of another kind."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
-    ray_aabb = units.box_test
-    fetch_node, fetch_primitive, push, finish = make_counters(units, Bvh2Node.numpy_dtype()["itemsize"])
-    struct = make_struct(units.triangle_test.record)
+    struct, set_up, enter = volumes.struct, volumes.set_up, volumes.enter
+    fetch_node, fetch_primitive, push, finish = make_counters(units, volumes.node.numpy_dtype()["itemsize"])
 
     @wp.func
     def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
         probe = probe_of(ray)
+        prepared = set_up(accel, probe)
         best = no_hit(ray)
         counts = Counts()
         stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
@@ -77,8 +111,9 @@ def make_traversal(units: Units, any_hit: bool, accepts=None):
             else:
                 node = accel.nodes[first]
                 counts = fetch_node(accel.recorder, ray, counts, first, 2)
-                t_0 = ray_aabb(probe.box, node.lo_0, node.hi_0, best.t)
-                t_1 = ray_aabb(probe.box, node.lo_1, node.hi_1, best.t)
+                entry = enter(prepared, node, best.t)
+                t_0 = entry[0]
+                t_1 = entry[1]
                 hit_0 = t_0 < wp.inf
                 hit_1 = t_1 < wp.inf
                 if hit_0 and hit_1:

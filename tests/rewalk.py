@@ -15,6 +15,8 @@ from wrt.device import load_kernel, upload
 from wrt.kernels.lanes import LANE_PAD
 from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
 from wrt.kernels.ray_aabb import FAR_PAD
+from wrt.kernels.ray_bounding_sphere import SMALLEST, SPHERE_PAD
+from wrt.kernels.ray_kdop import RAY_PAD
 from wrt.kernels.traverse_kdtree import HELD_GRAZING, HELD_RELATIVE, NEAR_PAD
 
 INF = np.float32(np.inf)
@@ -124,6 +126,11 @@ def brute_force(accel, ray: WalkRay) -> Walk:
 
 
 def bvh2(accel, ray: WalkRay) -> Walk:
+    return binary(accel, ray, lambda node, k: ray.enter(node[f"lo_{k}"], node[f"hi_{k}"]))
+
+
+def binary(accel, ray: WalkRay, enter: Callable[[np.void, int], np.float32]) -> Walk:
+    """enter(node, k): where the ray enters child k before its best hit, or inf."""
     walk, nodes, stack = Walk(), accel.data.nodes.numpy(), [(np.float32(0.0), 0, 0)]
     first_visit = True
     while stack:
@@ -141,7 +148,7 @@ def bvh2(accel, ray: WalkRay) -> Walk:
                 break
             node = nodes[first]
             walk.node(first, nodes.itemsize, 2)
-            near = sorted((t, k) for k in (0, 1) if (t := ray.enter(node[f"lo_{k}"], node[f"hi_{k}"])) < INF)
+            near = sorted((t, k) for k in (0, 1) if (t := enter(node, k)) < INF)
             if not near:
                 break
             if len(near) == 2:
@@ -151,6 +158,52 @@ def bvh2(accel, ray: WalkRay) -> Walk:
             k = near[0][1]
             first, count = int(node[f"first_{k}"]), int(node[f"count_{k}"])
     return walk
+
+
+def bvh2_sphere(accel, ray: WalkRay) -> Walk:
+    d = ray.direction.astype(np.float64)
+    length = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    unit, inv_length = (d / length).astype(np.float32), np.float32(1.0 / length)
+
+    def enter(node: np.void, k: int) -> np.float32:
+        sphere = node[f"sphere_{k}"]
+        f = ray.origin - sphere[:3]
+        size = abs(f[0]) + abs(f[1]) + abs(f[2]) + sphere[3]
+        middle = -(f[0] * unit[0] + f[1] * unit[1] + f[2] * unit[2])
+        f = f + middle * unit
+        radius = sphere[3] + (np.float32(SPHERE_PAD) * size + np.float32(SMALLEST))
+        square = radius * radius - (f[0] * f[0] + f[1] * f[1] + f[2] * f[2])
+        if sphere[3] < 0.0 or square < 0.0:
+            return INF
+        half = np.sqrt(square)
+        t = max((middle - half) * inv_length, ray.t_min)
+        return t if t <= min((middle + half) * inv_length, ray.best[0]) else INF
+
+    return binary(accel, ray, enter)
+
+
+def bvh2_kdop(accel, ray: WalkRay) -> Walk:
+    def project(v: np.ndarray) -> np.ndarray:
+        return np.array([v[0] + v[1] + v[2], v[1] - v[0] + v[2], v[0] - v[1] + v[2], v[0] + v[1] - v[2]])
+
+    from_middle = ray.origin - np.array(accel.data.middle, np.float32)
+    origin, pad = project(from_middle), np.float32(RAY_PAD) * (abs(from_middle[0]) + abs(from_middle[1]) + abs(from_middle[2]))
+    with np.errstate(divide="ignore"):
+        inverse = np.float32(1.0) / project(ray.direction)
+
+    def line(lo: np.ndarray, hi: np.ndarray, from_: np.ndarray, inv: np.ndarray, pad: np.float32) -> tuple[np.float32, np.float32]:
+        with np.errstate(invalid="ignore"):
+            ends = ((lo - from_) - pad) * inv, ((hi - from_) + pad) * inv
+        near, far = np.where(inv < 0.0, ends[::-1], ends)
+        return np.fmax.reduce(near, initial=-INF), np.fmin.reduce(far, initial=INF)
+
+    def enter(node: np.void, k: int) -> np.float32:
+        near, far = line(node[f"lo_{k}"], node[f"hi_{k}"], ray.origin, ray.inv_dir, np.float32(0.0))
+        askew = line(node[f"cut_lo_{k}"], node[f"cut_hi_{k}"], origin, inverse, pad)
+        passes_by = max(near, askew[0]) > min(far * np.float32(FAR_PAD), askew[1])
+        return INF if passes_by else ray.enter(node[f"lo_{k}"], node[f"hi_{k}"])
+
+    return binary(accel, ray, enter)
 
 
 def widened(t: np.float32) -> tuple[np.float32, np.float32]:
@@ -432,6 +485,8 @@ def bsp(accel, ray: WalkRay) -> Walk:
 REWALK: dict[str, Callable[..., Walk]] = {
     "brute_force": brute_force,
     "bvh2": bvh2,
+    "bvh2_sphere": bvh2_sphere,
+    "bvh2_kdop": bvh2_kdop,
     "bvh4": wide,
     "bvh8": wide,
     "kdtree": kdtree,

@@ -9,6 +9,7 @@ from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
 from wrt.accel.brute_force import BruteForce
 from wrt.accel.bsp import Bsp
 from wrt.accel.bvh2 import Bvh2
+from wrt.accel.bvh2_volumes import Bvh2Kdop, Bvh2Sphere
 from wrt.accel.bvh_wide import Bvh4, Bvh8
 from wrt.accel.grid import Grid
 from wrt.accel.kdtree import KdTree
@@ -25,6 +26,8 @@ ACCELERATORS: dict[str, type[Accelerator]] = {
     "bvh2": Bvh2,
     "bvh4": Bvh4,
     "bvh8": Bvh8,
+    "bvh2_sphere": Bvh2Sphere,
+    "bvh2_kdop": Bvh2Kdop,
     "kdtree": KdTree,
     "bsp": Bsp,
     "brute_force": BruteForce,

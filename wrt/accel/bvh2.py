@@ -25,7 +25,11 @@ class Bvh2(Accelerator):
                cost_intersection: float = 1.0, split_alpha: float = 1e-5, split_budget: float = 0.5) -> Built:
         options = BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget)
         tree = build_binary(self.geometry, options, self.threads)
-        return Built({"nodes": tree.nodes}, tree.order, len(tree.nodes), tree.leaves, tree.depth, sah_cost(tree.nodes))
+        return self._around(tree.nodes, tree.order, tree.leaves, tree.depth)
+
+    def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
+        """The structure over a tree with boxes: Bvh2Node records."""
+        return Built({"nodes": nodes}, order, len(nodes), leaves, depth, sah_cost(nodes))
 
     def _check(self, built: Built) -> None:
         check_binary(built.arrays["nodes"], len(built.order), kernels.STACK_SIZE)

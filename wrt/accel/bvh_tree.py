@@ -69,17 +69,24 @@ def squeeze(nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
     return out
 
 
+def half_areas(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """Half the surfaces of boxes, (N,) float64; 0 for empty ones."""
+    e = np.clip(hi.astype(np.float64) - lo.astype(np.float64), 0.0, 1e39)
+    return np.asarray(e[:, 0] * e[:, 1] + e[:, 1] * e[:, 2] + e[:, 2] * e[:, 0])
+
+
+def root_area(nodes: np.ndarray) -> float:
+    """Half the surface of the box around the whole tree."""
+    return float(half_areas(np.minimum(nodes["lo_0"][:1], nodes["lo_1"][:1]), np.maximum(nodes["hi_0"][:1], nodes["hi_1"][:1]))[0])
+
+
 def sah_cost(nodes: np.ndarray) -> float:
     """Expected node visits plus triangle tests of a random line that meets the root box (both costing 1)."""
-    def area(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-        e = np.clip(hi.astype(np.float64) - lo.astype(np.float64), 0.0, 1e39)
-        return e[:, 0] * e[:, 1] + e[:, 1] * e[:, 2] + e[:, 2] * e[:, 0]
-
-    root = area(np.minimum(nodes["lo_0"][:1], nodes["lo_1"][:1]), np.maximum(nodes["hi_0"][:1], nodes["hi_1"][:1]))[0]
+    root = root_area(nodes)
     if not root > 0.0:
         return float(nodes["count_0"].sum() + nodes["count_1"].sum())
     total = root  # the root itself is visited
     for side in ("0", "1"):
-        areas = area(nodes["lo_" + side], nodes["hi_" + side])
+        areas = half_areas(nodes["lo_" + side], nodes["hi_" + side])
         total += float((areas * np.where(nodes["count_" + side] > 0, nodes["count_" + side], 1.0)).sum())
     return total / root

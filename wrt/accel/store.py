@@ -156,11 +156,16 @@ def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: s
 
 def check_binary(nodes: np.ndarray, n_primitives: int, max_depth: int) -> None:
     """Raise InputError unless these Bvh2Node records are a tree from node 0 over primitives 0 .. n - 1, no deeper than that."""
+    check_links(nodes, [(nodes["lo_" + side] == np.inf).all(axis=1) & (nodes["hi_" + side] == -np.inf).all(axis=1)
+                        for side in ("0", "1")], n_primitives, max_depth)
+
+
+def check_links(nodes: np.ndarray, empties: list[np.ndarray], n_primitives: int, max_depth: int) -> None:
+    """As check_binary, of any records with its links; empties: which of their two children do not exist, (N,) bool each."""
     n = len(nodes)
     parents, children = np.zeros(n, np.int64), []
-    for side in ("0", "1"):
+    for side, empty in zip(("0", "1"), empties, strict=True):
         first, count = nodes["first_" + side].astype(np.int64), nodes["count_" + side].astype(np.int64)
-        empty = (nodes["lo_" + side] == np.inf).all(axis=1) & (nodes["hi_" + side] == -np.inf).all(axis=1)
         leaf = count > 0
         inner = ~leaf & ~empty
         # A child stands behind its parent: no walk returns to where it was.

@@ -1,0 +1,113 @@
+"""The inner loops that fit volumes other than boxes to a finished binary tree, on the CPU backend."""
+
+import warp as wp
+
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse_bvh2 import Bvh2Node
+from wrt.kernels.traverse_bvh2_kdop import KdopNode
+from wrt.kernels.traverse_bvh2_sphere import SphereNode
+
+ROUNDS = wp.constant(8)
+ROUND_UP = wp.constant(wp.float64(1.0 + 2.0**-22))
+
+
+@wp.struct
+class Spans:
+    """Of each child: the records order[begin] .. order[end - 1] in its subtree; nodes[i]'s are entries 2 i and 2 i + 1."""
+
+    begin: wp.array(dtype=wp.int32)
+    end: wp.array(dtype=wp.int32)
+
+
+@kernel
+def find_spans(nodes: wp.array(dtype=Bvh2Node), spans: Spans):
+    """Launched with dim = 1. Children stand behind their parents, and the records of a subtree next to each other."""
+    n = nodes.shape[0]
+    for k in range(n):
+        i = n - 1 - k
+        for side in range(2):
+            first = wp.where(side == 0, nodes[i].first_0, nodes[i].first_1)
+            count = wp.where(side == 0, nodes[i].count_0, nodes[i].count_1)
+            lo = wp.where(side == 0, nodes[i].lo_0, nodes[i].lo_1)
+            at = 2 * i + side
+            spans.begin[at] = first
+            spans.end[at] = first + count
+            if count == 0 and lo[0] < wp.inf:
+                spans.begin[at] = wp.min(spans.begin[2 * first], spans.begin[2 * first + 1])
+                spans.end[at] = wp.max(spans.end[2 * first], spans.end[2 * first + 1])
+
+
+@wp.func
+def farthest(lo: wp.vec3, hi: wp.vec3, center: wp.vec3d) -> wp.vec3d:
+    """From the center to the corner of a box that is farthest from it."""
+    a = wp.vec3d(lo) - center
+    b = wp.vec3d(hi) - center
+    out = b
+    for axis in range(3):
+        if wp.abs(a[axis]) > wp.abs(b[axis]):
+            out[axis] = a[axis]
+    return out
+
+
+@kernel
+def fit_spheres(nodes: wp.array(dtype=Bvh2Node), spans: Spans, order: wp.array(dtype=wp.int32), lo: wp.array(dtype=wp.vec3),
+                hi: wp.array(dtype=wp.vec3), out: wp.array(dtype=SphereNode), first: int):
+    """Spheres around the boxes lo, hi (by prim_id) below each child of out[first + tid].
+
+    Badoiu and Clarkson 2003, "Smaller core-sets for balls": from the middle of the box, the center goes a part 1 / (i + 1) of the
+    way to the farthest corner, in round i; the best of the rounds counts. The radius is rounded up.
+    """
+    i = first + wp.tid()
+    for side in range(2):
+        node_lo = wp.where(side == 0, nodes[i].lo_0, nodes[i].lo_1)
+        node_hi = wp.where(side == 0, nodes[i].hi_0, nodes[i].hi_1)
+        best = wp.vec4(0.0, 0.0, 0.0, -1.0)
+        if node_lo[0] < wp.inf:
+            # What is not finite has no middle: the sphere is all of space.
+            best = wp.vec4(0.0, 0.0, 0.0, wp.inf)
+            center = 0.5 * node_lo + 0.5 * node_hi
+            for r in range(ROUNDS + 1):
+                way = wp.vec3d()
+                square = wp.float64(-1.0)
+                for k in range(spans.begin[2 * i + side], spans.end[2 * i + side]):
+                    d = farthest(lo[order[k]], hi[order[k]], wp.vec3d(center))
+                    if wp.dot(d, d) > square:
+                        square = wp.dot(d, d)
+                        way = d
+                radius = float(wp.sqrt(square) * ROUND_UP)
+                if radius < best[3]:
+                    best = wp.vec4(center[0], center[1], center[2], radius)
+                center = wp.vec3(wp.vec3d(center) + way / wp.float64(r + 2))
+        if side == 0:
+            out[i].sphere_0 = best
+        else:
+            out[i].sphere_1 = best
+
+
+@kernel
+def fit_kdops(spans: Spans, order: wp.array(dtype=wp.int32), cut_lo: wp.array(dtype=wp.vec4), cut_hi: wp.array(dtype=wp.vec4),
+              out: wp.array(dtype=KdopNode)):
+    """Launched with dim = 1. Planes askew around those of the primitives (cut_lo, cut_hi, by prim_id), from the leaves up.
+
+    `out` has its boxes and links. A child that does not exist gets no planes.
+    """
+    n = out.shape[0]
+    for k in range(n):
+        i = n - 1 - k
+        for side in range(2):
+            first = wp.where(side == 0, out[i].first_0, out[i].first_1)
+            count = wp.where(side == 0, out[i].count_0, out[i].count_1)
+            low = wp.vec4(wp.inf, wp.inf, wp.inf, wp.inf)
+            high = wp.vec4(-wp.inf, -wp.inf, -wp.inf, -wp.inf)
+            if count == 0 and spans.end[2 * i + side] > spans.begin[2 * i + side]:
+                low = wp.min(out[first].cut_lo_0, out[first].cut_lo_1)
+                high = wp.max(out[first].cut_hi_0, out[first].cut_hi_1)
+            for j in range(first, first + count):
+                low = wp.min(low, cut_lo[order[j]])
+                high = wp.max(high, cut_hi[order[j]])
+            if side == 0:
+                out[i].cut_lo_0 = low
+                out[i].cut_hi_0 = high
+            else:
+                out[i].cut_lo_1 = low
+                out[i].cut_hi_1 = high

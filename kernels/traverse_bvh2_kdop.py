@@ -1,0 +1,63 @@
+"""The traversal unit of the binary BVH whose volumes are 14-DOPs: boxes with their corners cut off, 56 bytes each."""
+
+from functools import cache
+
+import warp as wp
+
+from wrt.kernels.counters import Recorder
+from wrt.kernels.ray_kdop import KdopRay, kdop_ray, ray_kdop
+from wrt.kernels.traverse import Probe, Units
+from wrt.kernels.traverse_bvh2 import STACK_SIZE, Volumes, make_binary_traversal  # noqa: F401 (STACK_SIZE: for the host)
+
+
+@wp.struct
+class KdopNode:
+    """As Bvh2Node, and the planes askew of both children: cut_lo <= project(x - middle) <= cut_hi."""
+
+    lo_0: wp.vec3
+    hi_0: wp.vec3
+    lo_1: wp.vec3
+    hi_1: wp.vec3
+    cut_lo_0: wp.vec4
+    cut_hi_0: wp.vec4
+    cut_lo_1: wp.vec4
+    cut_hi_1: wp.vec4
+    first_0: int
+    count_0: int
+    first_1: int
+    count_1: int
+
+
+@cache
+def make_struct(record):
+    """middle: what the planes askew are relative to."""
+
+    @wp.struct
+    class Bvh2Kdop:
+        nodes: wp.array(dtype=KdopNode)
+        middle: wp.vec3
+        primitives: wp.array(dtype=record)
+        recorder: Recorder
+
+    return Bvh2Kdop
+
+
+@cache
+def kdop_volumes(record) -> Volumes:
+    struct = make_struct(record)
+
+    @wp.func
+    def set_up(accel: struct, probe: Probe) -> KdopRay:
+        return kdop_ray(probe.ray, probe.box, accel.middle)
+
+    @wp.func
+    def enter(ray: KdopRay, node: KdopNode, t_max: float) -> wp.vec2:
+        return wp.vec2(ray_kdop(ray, node.lo_0, node.hi_0, node.cut_lo_0, node.cut_hi_0, t_max),
+                       ray_kdop(ray, node.lo_1, node.hi_1, node.cut_lo_1, node.cut_hi_1, t_max))
+
+    return Volumes(struct, KdopNode, set_up, enter)
+
+
+def make_traversal(units: Units, any_hit: bool, accepts=None):
+    """The closest hit, or any (the first that is found). The box test of `units` is for primitives only."""
+    return make_binary_traversal(units, kdop_volumes(units.triangle_test.record), any_hit, accepts)

@@ -1,0 +1,143 @@
+"""Trees with other volumes: they hold what is below them, are as tight as they should be, and cost what lines pay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull, HalfspaceIntersection
+
+from tests.kernels.test_traverse import GEOMETRIES
+from wrt.accel import Geometry, build
+from wrt.accel.bvh2_volumes import cuts, project
+from wrt.accel.kdop_area import kdop_area
+from wrt.errors import InputError
+from wrt.shapes import icosphere
+
+BALL = icosphere(3)
+KINDS = ["soup", "coincident", "flat", "progression", "mixed", "only_spheres", "one", "one_sphere"]
+
+
+def below(nodes: np.ndarray, order: np.ndarray) -> list[tuple[int, str, np.ndarray]]:
+    """(node, side, the primitives in that subtree) of every child that exists."""
+    out, inside = [], {}
+    for i in reversed(range(len(nodes))):
+        for side in "01":
+            first, count = int(nodes[i]["first_" + side]), int(nodes[i]["count_" + side])
+            members = order[first : first + count] if count else np.concatenate([inside.get((first, s), []) for s in "01"])
+            if first > i or count:
+                inside[i, side] = members.astype(int)
+                out.append((i, side, inside[i, side]))
+    return out
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("builder", ["binned", "sbvh"])
+def test_spheres_hold_the_boxes_below_them(kind: str, builder: str) -> None:
+    geometry = GEOMETRIES[kind](np.random.default_rng(1))
+    accel = build(geometry, "bvh2_sphere", builder=builder)
+    lo, hi = (b.astype(np.float64) for b in geometry.bounds())
+    nodes = accel.built.arrays["nodes"]
+    for i, side, members in below(nodes, accel.built.order):
+        sphere = nodes[i]["sphere_" + side].astype(np.float64)
+        farthest = np.maximum(np.abs(lo[members] - sphere[:3]), np.abs(hi[members] - sphere[:3]))
+        assert np.sqrt((farthest**2).sum(axis=1)).max() <= sphere[3]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_planes_hold_the_triangles_and_spheres_below_them(kind: str) -> None:
+    geometry = GEOMETRIES[kind](np.random.default_rng(1))
+    accel = build(geometry, "bvh2_kdop")
+    nodes, middle = accel.built.arrays["nodes"], accel.built.arrays["middle"].astype(np.float64)
+    corners = project(geometry.vertices - middle)[geometry.faces]
+    centers, reach = project(geometry.spheres[:, :3] - middle), np.sqrt(3.0) * geometry.spheres[:, 3:].astype(np.float64)
+    lo, hi = np.concatenate([corners.min(axis=1), centers - reach]), np.concatenate([corners.max(axis=1), centers + reach])
+    for i, side, members in below(nodes, accel.built.order):
+        assert (nodes[i]["cut_lo_" + side] < lo[members].min(axis=0)).all()
+        assert (nodes[i]["cut_hi_" + side] > hi[members].max(axis=0)).all()
+
+
+def test_a_sphere_around_a_ball_is_hardly_larger_than_the_ball() -> None:
+    # Half of it each: the smallest sphere around half a ball is the ball's own.
+    nodes = build(icosphere(4), "bvh2_sphere").built.arrays["nodes"]
+    for side in "01":
+        assert 0.98 < nodes[0]["sphere_" + side][3] < 1.06
+
+
+def test_the_surface_of_a_14_dop_is_that_of_the_polytope() -> None:
+    rng = np.random.default_rng(2)
+    normals = np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1]], float)
+    for _ in range(100):
+        points = rng.normal(size=(rng.integers(4, 30), 3)) * rng.uniform(0.05, 1.0, 3)
+        lo, hi, cut = points.min(axis=0), points.max(axis=0), project(points)
+        planes = np.concatenate([np.c_[np.eye(3), -hi], np.c_[-np.eye(3), lo], np.c_[normals, -cut.max(axis=0)],
+                                 np.c_[-normals, cut.min(axis=0)]])
+        polytope = ConvexHull(HalfspaceIntersection(planes, points.mean(axis=0)).intersections)
+        found = kdop_area(lo[None], hi[None], cut.min(axis=0)[None], cut.max(axis=0)[None])[0]
+        assert found == pytest.approx(polytope.area, rel=1e-12)
+
+
+def test_the_surface_of_a_14_dop_that_cuts_nothing_is_the_box_and_of_a_flat_one_both_its_sides() -> None:
+    lo, hi = np.zeros((2, 3)), np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 0.0]])
+    assert kdop_area(lo, hi, np.full((2, 4), -np.inf), np.full((2, 4), np.inf)) == pytest.approx([22.0, 4.0])
+
+
+def test_the_cost_is_that_of_random_lines() -> None:
+    # Lines through the root's box: the 14-DOPs cost them what their surfaces say, nodes and primitives counted, all hits taken.
+    rng = np.random.default_rng(3)
+    corners = rng.uniform(-1.0, 1.0, (300, 1, 3)) + 0.1 * rng.normal(size=(300, 3, 3))
+    geometry = Geometry(corners.reshape(-1, 3).astype(np.float32), np.arange(900, dtype=np.int32).reshape(-1, 3),
+                        np.zeros((0, 4), np.float32))
+    boxes, kdops, spheres = (build(geometry, name) for name in ("bvh2", "bvh2_kdop", "bvh2_sphere"))
+    assert kdops.stats.sah_cost < 0.9 * boxes.stats.sah_cost < boxes.stats.sah_cost < spheres.stats.sah_cost
+    lo, hi = geometry.bounds()
+    lo, hi = lo.min(axis=0), hi.max(axis=0)
+    radius = 0.51 * np.linalg.norm(hi - lo)
+    n = 30_000
+    ends = rng.normal(size=(2, n, 3))  # a line between two random points of a sphere is uniform
+    a, b = 0.5 * (lo + hi) + radius * ends / np.linalg.norm(ends, axis=2, keepdims=True)
+    d = b - a
+    with np.errstate(divide="ignore"):
+        t = np.sort([(lo - a) / d, (hi - a) / d], axis=0)
+    a, d = (v[t[0].max(axis=1) < t[1].min(axis=1)].astype(np.float32) for v in (a, d))
+    nodes = kdops.built.arrays["nodes"]
+    planes = [np.concatenate([nodes["lo_" + s] - kdops.built.arrays["middle"], nodes["cut_lo_" + s]], axis=1) for s in "01"]
+    ceilings = [np.concatenate([nodes["hi_" + s] - kdops.built.arrays["middle"], nodes["cut_hi_" + s]], axis=1) for s in "01"]
+    a = a - kdops.built.arrays["middle"]
+    origin, inverse = np.concatenate([a, project(a)], axis=1), 1.0 / np.concatenate([d, project(d)], axis=1)
+    total = np.ones(len(a))
+    for side in (0, 1):
+        for i in range(len(nodes)):
+            t_0, t_1 = (planes[side][i] - origin) * inverse, (ceilings[side][i] - origin) * inverse
+            meets = np.minimum(t_0, t_1).max(axis=1) <= np.maximum(t_0, t_1).min(axis=1)
+            total += meets * max(int(nodes[i][f"count_{side}"]), 1)
+    error = total.std() / np.sqrt(len(total))
+    assert abs(total.mean() - kdops.stats.sah_cost) < 3.0 * error < 0.3
+
+
+@pytest.mark.parametrize("name", ["bvh2_sphere", "bvh2_kdop"])
+def test_refit_follows_the_vertices(name: str) -> None:
+    rng = np.random.default_rng(4)
+    geometry = Geometry(BALL.vertices, BALL.faces, np.array([[0.0, 0.0, 3.0, 0.5]], np.float32))
+    accel = build(geometry, name)
+    assert accel.refit(BALL.vertices).growth == pytest.approx(1.0)
+    moved = (BALL.vertices * [1.0, 0.5, 2.0] + 0.1 * rng.normal(size=BALL.vertices.shape)).astype(np.float32)
+    accel.refit(moved)
+    origins, directions = rng.normal(size=(2, 3000, 3)).astype(np.float32)
+    truth = build(Geometry(moved, BALL.faces, geometry.spheres), "brute_force").closest_hit(origins, directions)
+    hits = accel.closest_hit(origins, directions)
+    for field in ("prim_id", "t", "u", "v"):
+        np.testing.assert_array_equal(getattr(hits, field), getattr(truth, field))
+
+
+def test_planes_beyond_float32_keep_nothing_out() -> None:
+    corners = np.array([[3e37, 0, 0], [0, 3e37, 0], [0, 0, 3e37]], np.float32)
+    geometry = Geometry(corners, np.array([[0, 1, 2]], np.int32), np.zeros((0, 4), np.float32))
+    lo, hi = cuts(geometry, np.array([-3e38, -3e38, -3e38], np.float32))
+    assert (lo == -np.inf).all() and (hi == np.inf).all()
+
+
+@pytest.mark.parametrize("name", ["bvh2_sphere", "bvh2_kdop"])
+def test_options_are_those_of_the_binary_tree(name: str) -> None:
+    assert build(BALL, name, max_leaf=1).stats.leaves == len(BALL.faces)
+    with pytest.raises(InputError, match="no builder"):
+        build(BALL, name, builder="guess")

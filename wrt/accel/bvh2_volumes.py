@@ -1,0 +1,171 @@
+"""Binary BVHs whose bounding volumes are no boxes: the same trees, with spheres or 14-DOPs around what is below each node."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Accelerator, Built, Geometry
+from wrt.accel.bvh2 import Bvh2
+from wrt.accel.bvh_tree import NODE_DTYPE, root_area
+from wrt.accel.kdop_area import kdop_areas
+from wrt.accel.refit import refit_nodes
+from wrt.accel.store import check_links
+from wrt.device import load_kernel, records, run_all, start, upload
+from wrt.kernels import build_volumes as fits
+from wrt.kernels import traverse_bvh2_kdop, traverse_bvh2_sphere
+from wrt.kernels.ray_kdop import KDOP_PAD
+from wrt.kernels.traverse_bvh2 import Bvh2Node
+
+LINKS = ("first_0", "count_0", "first_1", "count_1")
+NODES_PER_LAUNCH = 512
+SQRT_3 = np.float32(1.7320510)  # rounded up
+
+
+class Bvh2Sphere(Bvh2):
+    """Bounding spheres around the primitives' padded boxes. Options: those of bvh2."""
+
+    name = "bvh2_sphere"
+    kernels = traverse_bvh2_sphere
+    _children = Accelerator._children  # there is no end-point overlap of spheres
+
+    def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
+        spheres = fit_spheres(nodes, order, self.geometry, self.threads)
+        radius = np.stack([spheres["sphere_0"][:, 3], spheres["sphere_1"][:, 3]]).astype(np.float64)
+        areas = np.where(radius >= 0.0, 4.0 * np.pi * radius * radius, 0.0)
+        return Built({"nodes": spheres}, order, len(nodes), leaves, depth, cost_of(nodes, areas))
+
+    def _check(self, built: Built) -> None:
+        nodes = built.arrays["nodes"]
+        empty = [nodes[f"sphere_{side}"][:, 3] < 0.0 for side in "01"]
+        check_links(nodes, empty, len(built.order), self.kernels.STACK_SIZE)
+
+    def _refit(self, built: Built) -> Built:
+        return self._around(boxes_around(built, [built.arrays["nodes"][f"sphere_{side}"][:, 3] >= 0.0 for side in "01"],
+                                         self.geometry), built.order, built.leaves, built.depth)
+
+
+class Bvh2Kdop(Bvh2):
+    """14-DOPs: the boxes of bvh2, cut by eight planes askew. Options: those of bvh2.
+
+    k-DOPs rather than oriented boxes: their planes are the same everywhere, so that they are fitted from the leaves up without a
+    search, a ray is prepared once for all of them, and three slabs are the box, whose distances a traversal must keep to.
+    """
+
+    name = "bvh2_kdop"
+    kernels = traverse_bvh2_kdop
+    _children = Accelerator._children
+
+    def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
+        middle = middle_of(nodes)
+        kdops = fit_kdops(nodes, order, self.geometry, middle)
+        return Built({"nodes": kdops, "middle": middle}, order, len(nodes), leaves, depth,
+                     cost_of(nodes, kdop_areas(kdops, middle)))
+
+    def _refit(self, built: Built) -> Built:
+        there = [built.arrays["nodes"][f"lo_{side}"][:, 0] < np.inf for side in "01"]
+        return self._around(boxes_around(built, there, self.geometry), built.order, built.leaves, built.depth)
+
+
+def boxes_around(built: Built, there: list[np.ndarray], geometry: Geometry) -> np.ndarray:
+    """Bvh2Node records with the links of other nodes, and boxes that fit the geometry; there: which children exist."""
+    nodes = np.zeros(len(built.arrays["nodes"]), NODE_DTYPE)
+    for name in LINKS:
+        nodes[name] = built.arrays["nodes"][name]
+    for side, exists in zip("01", there, strict=True):
+        nodes[f"lo_{side}"] = np.where(exists[:, None], 0.0, np.inf)
+        nodes[f"hi_{side}"] = np.where(exists[:, None], 0.0, -np.inf)
+    return refit_nodes(nodes, built.order, geometry)
+
+
+def cost_of(nodes: np.ndarray, areas: np.ndarray) -> float:
+    """As wrt.accel.bvh_tree.sah_cost, of lines that meet the root's box, for volumes with these surfaces, (2, N). Where volumes
+    stick out of the root's box, lines that pass it by count too."""
+    root = 2.0 * root_area(nodes)
+    weight = np.stack([np.maximum(nodes["count_0"], 1), np.maximum(nodes["count_1"], 1)])
+    if not root > 0.0:
+        return float(nodes["count_0"].sum() + nodes["count_1"].sum())
+    return 1.0 + float((areas * weight).sum() / root)
+
+
+def spans_of(nodes: np.ndarray) -> Any:
+    """fits.Spans of Bvh2Node records."""
+    cpu = start("cpu")
+    spans = fits.Spans()
+    spans.begin = wp.empty(2 * len(nodes), dtype=wp.int32, device=cpu)
+    spans.end = wp.empty(2 * len(nodes), dtype=wp.int32, device=cpu)
+    load_kernel(fits.find_spans, cpu)
+    wp.launch(fits.find_spans, dim=1, device=cpu, inputs=[upload(nodes, Bvh2Node, cpu), spans])
+    return spans
+
+
+def with_links(struct: Any, nodes: np.ndarray) -> np.ndarray:
+    """Records of another kind of node with what they share with Bvh2Node records."""
+    out = records(struct, len(nodes))
+    for name in out.dtype.names or ():
+        if name in (nodes.dtype.names or ()):
+            out[name] = nodes[name]
+    return out
+
+
+def fit_spheres(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, threads: int) -> np.ndarray:
+    """SphereNode records around the padded boxes of the geometry below each Bvh2Node record."""
+    cpu = start("cpu")
+    lo, hi = geometry.bounds()
+    out = upload(with_links(traverse_bvh2_sphere.SphereNode, nodes), traverse_bvh2_sphere.SphereNode, cpu)
+    inputs = [upload(nodes, Bvh2Node, cpu), spans_of(nodes), upload(order.copy(), wp.int32, cpu), upload(lo, wp.vec3, cpu),
+              upload(hi, wp.vec3, cpu), out]
+    load_kernel(fits.fit_spheres, cpu)
+
+    def fit(first: int) -> None:
+        count = min(NODES_PER_LAUNCH, len(nodes) - first)
+        wp.launch(fits.fit_spheres, dim=count, device=cpu, inputs=[*inputs, first])
+
+    run_all([partial(fit, first) for first in range(0, len(nodes), NODES_PER_LAUNCH)], threads)
+    return np.asarray(out.numpy())
+
+
+def middle_of(nodes: np.ndarray) -> np.ndarray:
+    """The middle of the root's box, (3,) float32; 0 along an axis where that is not finite."""
+    lo, hi = np.minimum(nodes["lo_0"][0], nodes["lo_1"][0]), np.maximum(nodes["hi_0"][0], nodes["hi_1"][0])
+    with np.errstate(invalid="ignore", over="ignore"):
+        middle = (np.float32(0.5) * lo + np.float32(0.5) * hi).astype(np.float32)
+    return np.where(np.isfinite(middle), middle, np.float32(0.0))
+
+
+def cuts(geometry: Geometry, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where every primitive lies along the four diagonals, padded, relative to `middle`: two (N, 4) float32."""
+    n = len(geometry.faces)
+    lo, hi = np.empty((len(geometry), 4), np.float32), np.empty((len(geometry), 4), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        vertices, centers = project(geometry.vertices - middle), project(geometry.spheres[:, :3] - middle)
+        corners = [vertices[geometry.faces[:, i]] for i in range(3)]
+        lo[:n] = np.minimum(np.minimum(corners[0], corners[1]), corners[2])
+        hi[:n] = np.maximum(np.maximum(corners[0], corners[1]), corners[2])
+        reach = SQRT_3 * geometry.spheres[:, 3:]
+        lo[n:], hi[n:] = centers - reach, centers + reach
+        box_lo, box_hi = geometry.bounds()
+        size = np.maximum(np.abs(box_lo - middle), np.abs(box_hi - middle)).sum(axis=1, keepdims=True)
+        lo, hi = lo - np.float32(KDOP_PAD) * size, hi + np.float32(KDOP_PAD) * size
+    finite = np.isfinite(lo) & np.isfinite(hi)
+    return np.where(finite, lo, np.float32(-np.inf)), np.where(finite, hi, np.float32(np.inf))
+
+
+def project(v: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 -> (N, 4), as kernels.ray_kdop.project."""
+    x, y, z = v[:, 0], v[:, 1], v[:, 2]
+    return np.stack([x + y + z, y - x + z, x - y + z, x + y - z], axis=1)
+
+
+def fit_kdops(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, middle: np.ndarray) -> np.ndarray:
+    """KdopNode records around the geometry below each Bvh2Node record."""
+    cpu = start("cpu")
+    cut_lo, cut_hi = cuts(geometry, middle)
+    out = upload(with_links(traverse_bvh2_kdop.KdopNode, nodes), traverse_bvh2_kdop.KdopNode, cpu)
+    load_kernel(fits.fit_kdops, cpu)
+    wp.launch(fits.fit_kdops, dim=1, device=cpu, inputs=[spans_of(nodes), upload(order.copy(), wp.int32, cpu),
+                                                         upload(cut_lo, wp.vec4, cpu), upload(cut_hi, wp.vec4, cpu), out])
+    return np.asarray(out.numpy())
