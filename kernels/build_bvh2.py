@@ -11,9 +11,11 @@ import warp as wp
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
 
-BINS = wp.constant(16)
+BIN_COUNT = 32
+BINS = wp.constant(BIN_COUNT)
 # Up to here a range is swept, not binned: that is better, and no slower.
-SMALL = wp.constant(8)
+SMALL_COUNT = 16
+SMALL = wp.constant(SMALL_COUNT)
 # From here on a range is halved by number, which takes ceil(log2(n)) more levels, whatever the SAH would like.
 MAX_DEPTH = wp.constant(STACK_SIZE - 2)
 
@@ -136,10 +138,10 @@ def binned_split(data: BuildData, task: BuildTask, bins: wp.vec3) -> Split:
     Cost: the sum over both sides of half area x count, in units of area_scale.
     """
     scale = area_scale(task)
-    count = wp.zeros(shape=48, dtype=wp.int32)
-    lo = wp.zeros(shape=48, dtype=wp.vec3)
-    hi = wp.zeros(shape=48, dtype=wp.vec3)
-    right_cost = wp.zeros(shape=16, dtype=wp.float32)
+    count = wp.zeros(shape=wp.static(3 * BIN_COUNT), dtype=wp.int32)
+    lo = wp.zeros(shape=wp.static(3 * BIN_COUNT), dtype=wp.vec3)
+    hi = wp.zeros(shape=wp.static(3 * BIN_COUNT), dtype=wp.vec3)
+    right_cost = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.float32)
     for b in range(3 * BINS):
         lo[b] = wp.vec3(wp.inf, wp.inf, wp.inf)
         hi[b] = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
@@ -200,7 +202,7 @@ def sort_by(records: wp.array(dtype=BuildRecord), begin: int, end: int, axis: in
 def choose_small(data: BuildData, task: BuildTask) -> int:
     """The cheapest of all splits of a range of up to SMALL records by their order along an axis."""
     scale = area_scale(task)
-    right_cost = wp.zeros(shape=8, dtype=wp.float32)
+    right_cost = wp.zeros(shape=wp.static(SMALL_COUNT), dtype=wp.float32)
     best_axis = int(0)
     best_cost = float(wp.inf)
     best = int(task.begin + (task.end - task.begin) / 2)

@@ -8,6 +8,7 @@ which is shared between its sides in proportion, so that subtrees can be built o
 import warp as wp
 
 from wrt.kernels.build_bvh2 import (
+    BIN_COUNT,
     BINS,
     MAX_DEPTH,
     SMALL,
@@ -152,12 +153,12 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
     for axis in range(3):
         extent = task.hi[axis] - task.lo[axis]
         if extent > 0.0 and wp.isfinite(extent):
-            enter = wp.zeros(shape=16, dtype=wp.int32)
-            leave = wp.zeros(shape=16, dtype=wp.int32)
-            lo = wp.zeros(shape=16, dtype=wp.vec3)
-            hi = wp.zeros(shape=16, dtype=wp.vec3)
-            right_cost = wp.zeros(shape=16, dtype=wp.float32)
-            right_count = wp.zeros(shape=16, dtype=wp.int32)
+            enter = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.int32)
+            leave = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.int32)
+            lo = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.vec3)
+            hi = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.vec3)
+            right_cost = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.float32)
+            right_count = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.int32)
             for b in range(BINS):
                 lo[b] = wp.vec3(wp.inf, wp.inf, wp.inf)
                 hi[b] = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
