@@ -10,6 +10,9 @@ before it is held to X's box (`within_bounds`), and reported as t. Let P = origi
 2. |t - t'| <= reach := 2^-19 D_box / min|direction_i| over the components that are not 0, D_box being the longest distance along
    an axis from the origin to the root box (so that D <= D_box and E <= 2 D_box): P is within 24 u D_box of X's box, the slab
    distances carry 3 u D_box, and t' is moved no farther than to the plane that it is beyond; 27 u < 2^-19 = 32 u.
+   Nor is it moved out of the slab of X's padded box across the longest component m of the direction, which holds t' but for
+   24 u D_box, and t but for 3 u D_box and FAR_PAD's 14 u: reach <= (E_padded + 2^-18 D_box) / |direction_m|. That is what
+   counts for a ray nearly along an axis. The smaller of the two is taken, with the largest E_padded of all primitives.
    So the segment that is walked reaches `reach` beyond t_min and the best hit at either end; it is cut by the root box, grown
    by 2^-19 D_box.
 3. The builder lists each X, clipped to the cell, on a side that Q is in, or out of by at most node.tolerance's share of the
@@ -69,7 +72,7 @@ class Reach:
 
 
 @wp.func
-def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3) -> Reach:
+def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3, extent: float) -> Reach:
     """Set-up, once a ray (2. above). t_0 > t_1, or NaN, where the ray passes by the root box."""
     corner = wp.max(wp.abs(lo - ray.origin), wp.abs(hi - ray.origin))
     grow = REACH * wp.max(wp.max(corner[0], corner[1]), corner[2]) + SMALLEST
@@ -79,9 +82,10 @@ def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3) -> R
     smallest = float(wp.inf)
     for axis in range(3):
         smallest = wp.where(size[axis] > 0.0, wp.min(smallest, size[axis]), smallest)
+    largest = wp.max(wp.max(size[0], size[1]), size[2])
     out = Reach()
-    out.beyond = grow / smallest
-    out.drift = REACH * wp.max(wp.max(size[0], size[1]), size[2])
+    out.beyond = wp.min(grow / smallest, (extent + 2.0 * grow) / largest)
+    out.drift = REACH * largest
     out.t_0 = wp.max(interval[0], ray.t_min - out.beyond)
     out.t_1 = wp.min(interval[1], t_max + out.beyond)
     return out
@@ -89,12 +93,14 @@ def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3) -> R
 
 @cache
 def make_struct(record):
-    """lo, hi: the root box; the root itself is the child (first, count), as in a node."""
+    """lo, hi: the root box; extent: the longest side of a primitive's padded box; the root itself is the child (first, count),
+    as in a node."""
 
     @wp.struct
     class Bsp:
         lo: wp.vec3
         hi: wp.vec3
+        extent: float
         first: int
         count: int
         nodes: wp.array(dtype=BspNode)
@@ -116,7 +122,7 @@ def make_traversal(units: Units, any_hit: bool, accepts=None):
         probe = probe_of(ray)
         best = no_hit(ray)
         counts = Counts()
-        reach = reach_of(probe.box, ray, best.t, accel.lo, accel.hi)
+        reach = reach_of(probe.box, ray, best.t, accel.lo, accel.hi, accel.extent)
         stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_t_0 = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)

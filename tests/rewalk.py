@@ -431,7 +431,7 @@ def bsp_reach(accel, ray: WalkRay) -> tuple[np.float32, ...]:
         near = (np.where(backwards, hi + grow, lo - grow) - ray.origin) * ray.inv_dir
         far = (np.where(backwards, lo - grow, hi + grow) - ray.origin) * ray.inv_dir
     size = np.abs(ray.direction)
-    beyond = grow / size[size > 0.0].min()
+    beyond = min(grow / size[size > 0.0].min(), (np.float32(accel.data.extent) + np.float32(2.0) * grow) / size.max())
     return (np.maximum(np.fmax.reduce(near), ray.t_min - beyond), np.minimum(np.fmin.reduce(far), ray.t_max + beyond), beyond,
             REACH * size.max())
 

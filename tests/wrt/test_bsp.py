@@ -256,4 +256,6 @@ def test_a_damaged_tree_is_refused(field: str, row: int, value: int, message: st
     spoiled = replace(tree.built, arrays=tree.built.arrays | {"nodes": nodes})
     with pytest.raises(InputError, match=message):
         Bsp.restore(spoiled, tree.geometry)
+    with pytest.raises(InputError, match="one root"):
+        Bsp.restore(replace(tree.built, arrays=tree.built.arrays | {"first": np.zeros(2, np.int32)}), tree.geometry)
     assert isinstance(Bsp.restore(tree.built, tree.geometry), Bsp)

@@ -59,7 +59,8 @@ class Bsp(Accelerator):
                              "another structure (kdtree, bvh), or raise max_triangles")
         if n == 0:
             return Built({"nodes": records(kernels.BspNode, 0), "lo": np.full(3, np.inf), "hi": np.full(3, -np.inf),
-                          "first": np.zeros(1, np.int32), "count": np.zeros(1, np.int32)}, np.zeros(0, np.int32), sah_cost=0.0)
+                          "extent": np.zeros(1, np.float32), "first": np.zeros(1, np.int32), "count": np.zeros(1, np.int32)},
+                         np.zeros(0, np.int32), sah_cost=0.0)
         lo, hi = (bound.astype(np.float64) for bound in self.geometry.bounds())
         options = BspOptions()
         options.cost_intersection, options.cost_axis, options.cost_plane = cost_intersection, cost_axis, cost_plane
@@ -120,6 +121,9 @@ class Builder:
     def __init__(self, geometry: Geometry, options: Any, threads: int, budget: int, progress: Callable[[float], None]) -> None:
         self.options, self.threads, self.budget, self.progress = options, threads, budget, progress
         self.source, corners = start_pieces(geometry)
+        lo, hi = geometry.bounds()
+        with np.errstate(over="ignore"):
+            self.extent = np.nextafter((hi - lo).max(), np.float32(np.inf)).reshape(1)
         self.n = len(geometry)
         self.corners = upload(corners, wp.vec3d, start("cpu"))
         self.done = 0
@@ -173,7 +177,7 @@ class Builder:
             root = roots[1 + nodes["first_" + side][left]]
             nodes["first_" + side][left], nodes["count_" + side][left] = root[:, 0], root[:, 1]
         arrays = {"nodes": np.concatenate([part.nodes for part in parts]), "first": roots[0, :1], "count": roots[0, 1:],
-                  "lo": np.array(self.options.lo), "hi": np.array(self.options.hi)}
+                  "lo": np.array(self.options.lo), "hi": np.array(self.options.hi), "extent": self.extent}
         results = np.array([part.results for part in parts])
         return Built(arrays, np.concatenate([part.order for part in parts]), int(first_node[-1]),
                      int(results[:, build_bsp.LEAVES].sum()), int(results[:, build_bsp.DEPTH].max()) + 1,
@@ -219,6 +223,8 @@ def start_pieces(geometry: Geometry) -> tuple[Any, np.ndarray]:
 
 def check_planes(built: Built) -> None:
     """Raise InputError unless the nodes are a tree, no deeper than the stack, over the primitives in `order`."""
+    if any(built.arrays[name].size != size for name, size in (("lo", 3), ("hi", 3), ("extent", 1), ("first", 1), ("count", 1))):
+        raise InputError("is damaged: a tree has one root")
     nodes, root_first, root_count = (built.arrays[name] for name in ("nodes", "first", "count"))
     n = len(nodes)
     parents, children = np.zeros(n + 1, np.int64), []
