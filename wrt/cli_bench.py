@@ -141,6 +141,7 @@ def units(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> No
 @click.option("--builds", type=int, default=1, show_default=True, help="Builds of each structure")
 @click.option("--max-triangles", type=int, default=1_000_000, show_default=True, help="Without meshes, the terrain grows to this")
 @click.option("--threads", type=int, default=1, show_default=True, help="Threads to search with (builds use all cores)")
+@click.option("--stadium", is_flag=True, help="Each mesh in a stadium a thousand times its size, with the rays it has alone")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for a report with plots")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")

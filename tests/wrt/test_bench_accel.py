@@ -48,6 +48,14 @@ def test_rows_hold_what_the_structures_say(box) -> None:
     assert set(rows[0].as_dict()) >= {"mrays_median", "build_median", "wrong"}
 
 
+def test_in_a_stadium_the_rays_are_those_of_the_mesh_alone(box) -> None:
+    (row,) = run(plan(box, stadium=True, structures=("bvh2",), kinds=("primary",), rays=100, runs=1))
+    (alone,) = run(plan(box, structures=("bvh2",), kinds=("primary",), rays=100, runs=1))
+    assert isinstance(row, Row) and isinstance(alone, Row)
+    assert row.mesh == "box.obj in a stadium" and row.triangles == 12 + 80_002 and row.wrong == row.differ == 0
+    assert alone.primitives < row.primitives < alone.primitives + 12.0
+
+
 def test_a_structure_that_loses_rays_is_told(box, monkeypatch) -> None:
     class Losing(ACCELERATORS["bvh2"]):  # type: ignore[misc, name-defined]
         name = "losing"

@@ -13,9 +13,8 @@ from wrt.kernels import traverse_octree as kernels
 
 class Octree(Accelerator):
     """Options: max_leaf (cells with so many primitives are not split), max_depth (splits from the root down, 0 to MAX_LEVELS),
-    by_cost (stop also where the octants cost a ray as much as the cell), max_growth (at most so many references for each
-    primitive: cells that gain most are split first), mailbox (whether a primitive that spans several cells is tested once
-    where it can be).
+    by_cost (stop also where the octants cost a ray as much as the cell), max_growth (in every part of the tree, at most so many
+    references for each primitive), mailbox (whether a primitive that spans several cells is tested once where it can be).
 
     Spheres are listed wherever their box is. The `box` test is not used.
     """
@@ -23,7 +22,7 @@ class Octree(Accelerator):
     name = "octree"
     kernels = kernels
 
-    def _build(self, max_leaf: int = 8, max_depth: int = kernels.MAX_LEVELS, by_cost: bool = True, max_growth: float = 8.0,
+    def _build(self, max_leaf: int = 8, max_depth: int = kernels.MAX_LEVELS, by_cost: bool = True, max_growth: float = 16.0,
                mailbox: bool = True) -> Built:
         tree = build_tree(self.geometry, OctreeOptions(max_leaf, max_depth, by_cost, max_growth), self.threads)
         layout, nodes = tree.layout, tree.nodes

@@ -25,7 +25,7 @@ OCTANTS = np.arange(8)[:, None] >> np.arange(3) & 1  # (8, 3): which half, in x,
 
 @dataclass(frozen=True)
 class OctreeOptions:
-    """As in wrt.accel.octree.Octree. Raises InputError."""
+    """As in wrt.accel.octree.Octree; with max_growth there are never more than MAX_REFERENCES either. Raises InputError."""
 
     max_leaf: int
     max_depth: int
@@ -44,11 +44,12 @@ class OctreeOptions:
 @dataclass
 class Cells:
     """The cells of one level: lowest corners (M, 3) int32 in finest cells; the primitives of cell i are references[begin[i]] ..
-    references[begin[i + 1] - 1]."""
+    references[begin[i + 1] - 1]; growth: (M,) by how much those in the leaves below may be more than these."""
 
     corner: np.ndarray
     begin: np.ndarray
     references: np.ndarray
+    growth: np.ndarray
 
     @property
     def count(self) -> np.ndarray:
@@ -58,7 +59,8 @@ class Cells:
         """The chosen cells, (M,) bool."""
         count = self.count
         references = self.references[np.repeat(chosen, count)]
-        return Cells(self.corner[chosen], np.concatenate([[0], np.cumsum(count[chosen])]).astype(np.int32), references)
+        begin = np.concatenate([[0], np.cumsum(count[chosen])]).astype(np.int32)
+        return Cells(self.corner[chosen], begin, references, self.growth[chosen])
 
 
 @dataclass
@@ -109,15 +111,14 @@ def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Tree
     tree = Tree(root_cell(*bounds, options.max_depth))
     n, levels = len(geometry), tree.layout.levels
     split = _Splitter(geometry, bounds, tree.layout, threads)
-    cells = Cells(np.zeros((1, 3), np.int32), np.array([0, n], np.int32), np.arange(n, dtype=np.int32))
+    cells = Cells(np.zeros((1, 3), np.int32), np.array([0, n], np.int32), np.arange(n, dtype=np.int32),
+                  np.array([min(options.max_growth, MAX_REFERENCES / max(n, 1))]))
     whole = float(areas(tree.layout, cells.corner, 1 << levels)[0]) if levels else 0.0
-    room = int(min(options.max_growth * n, MAX_REFERENCES)) - n  # references that may still be added
     nodes, references, n_nodes, n_references = [], [], 0, 0
     while len(cells.corner):
         half = (1 << levels - tree.depth) >> 1
         tree.depth += 1
-        chosen, count, children = choose(cells, split, half, options, room)
-        room -= int(count.sum() - cells.count[chosen].sum())
+        chosen, count, children = choose(cells, split, half, options)
         level = records(OctreeNode, len(cells.corner))
         occupied = (count > 0).sum(axis=1)
         level["count"] = cells.count
@@ -136,24 +137,21 @@ def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Tree
     return tree
 
 
-def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions,
-           room: int) -> tuple[np.ndarray, np.ndarray, Cells]:
+def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) -> tuple[np.ndarray, np.ndarray, Cells]:
     """Which cells of the level to split, (M,) bool; how much each octant of those has, (K, 8); and the cells of the next level."""
     chosen = cells.count > options.max_leaf if half else np.zeros(len(cells.corner), bool)
     large = cells.part(chosen)
     count = split.count(large, half)
-    # What a ray through the cell is expected to cost, in cells fetched and primitives tested, as one cell and as octants.
+    # Every cell has room of its own, in proportion to what is in it, so that a small thing is not left with none by large ones.
+    growth = large.growth * large.count / np.maximum(count.sum(axis=1), 1)
+    keep = growth >= 1.0
     corner = large.corner[:, None] + half * OCTANTS
-    area, whole = areas(split.layout, corner, half), areas(split.layout, large.corner, 2 * half)
-    gain = whole * large.count - (area * (count + (count > 0))).sum(axis=1)
-    pays = gain > 0.0 if options.by_cost else np.ones(len(gain), bool)
-    more = count.sum(axis=1) - large.count
-    order = np.argsort(-gain, kind="stable")
-    order = order[pays[order]]
-    keep = np.zeros(len(gain), bool)
-    keep[order[np.cumsum(np.maximum(more[order], 0)) <= room]] = True
+    if options.by_cost:
+        # What a ray through the cell is expected to cost, in cells fetched and primitives tested, as one cell and as octants.
+        area, whole = areas(split.layout, corner, half), areas(split.layout, large.corner, 2 * half)
+        keep &= (area * (count + (count > 0))).sum(axis=1) < whole * large.count
     chosen[chosen] = keep
-    return chosen, count[keep], split.fill(large, corner, count, keep)
+    return chosen, count[keep], split.fill(large, corner, np.where(keep[:, None], count, 0), growth)
 
 
 class _Splitter:
@@ -188,14 +186,13 @@ class _Splitter:
         self._launch(build_octree.count_octants, m, CELLS_PER_LAUNCH, None, self.begin, self.masks, count)
         return count.numpy()
 
-    def fill(self, cells: Cells, corner: np.ndarray, count: np.ndarray, keep: np.ndarray) -> Cells:
-        """The octants that have something, of the cells to keep, one cell after another; `count` was called just before."""
-        count = np.where(keep[:, None], count, 0)
+    def fill(self, cells: Cells, corner: np.ndarray, count: np.ndarray, growth: np.ndarray) -> Cells:
+        """The octants that have something, one cell after another; those of other cells are 0. `count` was called just before."""
         begin = np.concatenate([[0], np.cumsum(count.ravel())])
-        room = np.where(keep[:, None], begin[:-1].reshape(-1, 8), -1)
+        room = np.where(count.any(axis=1, keepdims=True), begin[:-1].reshape(-1, 8), -1)
         out = wp.zeros(int(begin[-1]), dtype=wp.int32, device=self.cpu)
         self._launch(build_octree.fill_octants, len(cells.corner), CELLS_PER_LAUNCH, None, self.begin, self.masks, self.references,
                      upload(np.ascontiguousarray(room, np.int32).reshape(-1, 8), wp.int32, self.cpu), out)
         has = count > 0
         return Cells(corner[has].astype(np.int32), np.concatenate([begin[:-1][has.ravel()], begin[-1:]]).astype(np.int32),
-                     out.numpy())
+                     out.numpy(), np.repeat(growth, has.sum(axis=1)))

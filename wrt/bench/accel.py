@@ -12,6 +12,7 @@ import numpy as np
 
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
 from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
+from wrt.bench.stadium import in_stadium
 from wrt.bench.visibility import TERRAINS, fit, terrain
 from wrt.device import thread_count
 from wrt.errors import InputError
@@ -25,7 +26,8 @@ COUNTED_RAYS = 20_000
 @dataclass(frozen=True)
 class Plan:
     """What to measure: mesh files (none: a terrain that grows up to max_triangles), structures (none: all but brute force), kinds
-    of ray, rays of each kind, runs of each, builds of each. Raises InputError."""
+    of ray, rays of each kind, runs of each, builds of each; stadium: each mesh stands in a stadium a thousand times its size, and
+    the rays are those that it has alone. Raises InputError."""
 
     meshes: Sequence[str | Path] = ()
     structures: Sequence[str] = ()
@@ -36,6 +38,7 @@ class Plan:
     max_triangles: int = 1_000_000
     threads: int = 1
     seed: int = 0
+    stadium: bool = False
 
     def __post_init__(self) -> None:
         for name, low, high in (("rays", 1, 2**28), ("runs", 1, 1000), ("builds", 1, 100), ("max_triangles", 1000, 2**28)):
@@ -123,9 +126,11 @@ class _Bench:
     """One mesh, all structures, all kinds of ray."""
 
     def __init__(self, plan: Plan, mesh: Mesh) -> None:
-        self.plan, self.name, self.geometry = plan, Path(mesh.name or "mesh").name, Geometry.of(mesh)
-        self.yardstick = build(self.geometry, YARDSTICK)
-        self.rays = {kind: rays for kind, rays in ray_sets(self.yardstick, plan.rays, plan.seed).items() if kind in plan.kinds}
+        self.plan, alone = plan, build(Geometry.of(mesh), YARDSTICK)
+        self.rays = {kind: rays for kind, rays in ray_sets(alone, plan.rays, plan.seed).items() if kind in plan.kinds}
+        mesh = in_stadium(mesh) if plan.stadium else mesh
+        self.name, self.geometry = Path(mesh.name or "mesh").name, Geometry.of(mesh)
+        self.yardstick = build(self.geometry, YARDSTICK) if plan.stadium else alone
         self.checked = max(min(BRUTE_FORCE_TESTS // max(len(self.geometry), 1), plan.rays), 1)
 
     def rows(self) -> Iterator[Row | Refused]:
