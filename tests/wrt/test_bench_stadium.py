@@ -34,7 +34,7 @@ def test_a_uniform_grid_is_not_enough_and_an_adaptive_one_is() -> None:
             hits = build(mesh, name).closest_hit(rays.origins, rays.directions, counters=True)
             assert (hits.prim_id[hits.prim_id >= 0] < len(ball.faces)).mean() > 0.3
             tests[name, where] = hits.counters.primitives.mean()
-    assert tests["grid", "stadium"] > 0.9 * len(ball.faces) > 50.0 * tests["grid", "alone"]
+    assert tests["grid", "stadium"] > 0.4 * len(ball.faces) > 30.0 * tests["grid", "alone"]
     for name in ("octree", "bvh2"):
         assert tests[name, "stadium"] < 5.0 * tests[name, "alone"] + 5.0
 
