@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import FAR_PAD, RAY_AABB, BoxRay
+from wrt.kernels.ray_aabb import FAR_PAD, BoxRay
 
 EMPTY = wp.constant(0)  # a child that does not exist: the root is nobody's child
 
@@ -40,16 +40,10 @@ class LaneRay:
 
 
 class Lanes(NamedTuple):
-    """entries(rows, first, ray) -> row: where the line enters the boxes whose six rows begin at `first`, at least t_min.
-    entered(rows, first, ray, t_max) -> mask of those that it enters before it leaves them, and at or before t_max, a finite number.
-    candidates(rows, first, ray) -> mask of the triangles whose nine rows begin at `first`, without those that the watertight unit
-    refuses in float32.
-    lowest(mask) -> its lowest lane. value(rows, i) -> rows[i]; bits(rows, i) -> the int32 that is kept there.
+    """candidates(rows, first, ray) -> mask of the triangles whose nine rows begin at `first`, without those that the watertight
+    unit refuses in float32. lowest(mask) -> its lowest lane. value(rows, i) -> rows[i]; bits(rows, i) -> the int32 that is there.
     prefetch(rows, first): their next use is near."""
 
-    row: Any
-    entries: Any
-    entered: Any
     candidates: Any
     lowest: Any
     value: Any
@@ -61,66 +55,6 @@ HEAD = """
     typedef float F __attribute__((ext_vector_type(WIDTH), aligned(4)));
     const float* p = rows.data + (long long)first;
     #define ROW(k) (*(const F*)(p + WIDTH * (k)))
-"""
-
-ENTRIES = """
-    const wp::vec_t<3, wp::float32> o = ray.box.origin, d = ray.box.inv_dir;
-#if defined(__CUDA_ARCH__)
-    wp::vec_t<WIDTH, wp::float32> out;
-    const float* p = rows.data + (long long)first;
-    for (int j = 0; j < WIDTH; ++j) {
-        float e = (p[WIDTH * ray.near_x + j] - o[0]) * d[0], f;
-        e = e > ray.box.t_min ? e : ray.box.t_min;
-        f = (p[WIDTH * ray.near_y + j] - o[1]) * d[1]; e = f > e ? f : e;
-        f = (p[WIDTH * ray.near_z + j] - o[2]) * d[2]; e = f > e ? f : e;
-        out[j] = e;
-    }
-    return out;
-#else
-    HEAD
-    NEAR
-    wp::vec_t<WIDTH, wp::float32> result;
-    __builtin_memcpy(&result, &e, sizeof(result));
-    return result;
-#endif
-    #undef ROW
-"""
-
-NEAR = """
-    const F begin = (F)(ray.box.t_min);
-    F e = (ROW(ray.near_x) - o[0]) * d[0], f;
-    e = e > begin ? e : begin;
-    f = (ROW(ray.near_y) - o[1]) * d[1]; e = f > e ? f : e;
-    f = (ROW(ray.near_z) - o[2]) * d[2]; e = f > e ? f : e;
-"""
-
-ENTERED = """
-    const wp::vec_t<3, wp::float32> o = ray.box.origin, d = ray.box.inv_dir, q = ray.far_inv_dir;
-#if defined(__CUDA_ARCH__)
-    int mask = 0;
-    const float* p = rows.data + (long long)first;
-    for (int j = 0; j < WIDTH; ++j) {
-        float e = (p[WIDTH * ray.near_x + j] - o[0]) * d[0], l = t_max, f;
-        e = e > ray.box.t_min ? e : ray.box.t_min;
-        f = (p[WIDTH * ray.near_y + j] - o[1]) * d[1]; e = f > e ? f : e;
-        f = (p[WIDTH * ray.near_z + j] - o[2]) * d[2]; e = f > e ? f : e;
-        f = (p[WIDTH * (ray.near_x ^ 1) + j] - o[0]) * q[0]; l = f < l ? f : l;
-        f = (p[WIDTH * (ray.near_y ^ 1) + j] - o[1]) * q[1]; l = f < l ? f : l;
-        f = (p[WIDTH * (ray.near_z ^ 1) + j] - o[2]) * q[2]; l = f < l ? f : l;
-        mask |= (e <= l) << j;
-    }
-    return mask;
-#else
-    HEAD
-    NEAR
-    typedef bool B __attribute__((ext_vector_type(WIDTH)));
-    F l = (F)(t_max);
-    f = (ROW(ray.near_x ^ 1) - o[0]) * q[0]; l = f < l ? f : l;
-    f = (ROW(ray.near_y ^ 1) - o[1]) * q[1]; l = f < l ? f : l;
-    f = (ROW(ray.near_z ^ 1) - o[2]) * q[2]; l = f < l ? f : l;
-    return __builtin_bit_cast(unsigned char, __builtin_convertvector(e <= l, B)) & ((1 << WIDTH) - 1);
-#endif
-    #undef ROW
 """
 
 CANDIDATES = """
@@ -182,16 +116,9 @@ def row_type(width: int):
 @cache
 def make_lanes(width: int) -> Lanes:
     """The native functions for rows of 4 or 8."""
-    row = row_type(width)
 
     def source(snippet):
-        return snippet.replace("HEAD", HEAD).replace("NEAR", NEAR).replace("WIDTH", str(width))
-
-    @wp.func_native(source(ENTRIES))
-    def entries(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row: ...
-
-    @wp.func_native(source(ENTERED))
-    def entered(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int: ...
+        return snippet.replace("HEAD", HEAD).replace("WIDTH", str(width))
 
     @wp.func_native(source(CANDIDATES))
     def candidates(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int: ...
@@ -208,13 +135,12 @@ def make_lanes(width: int) -> Lanes:
     @wp.func_native(PREFETCH)
     def prefetch(rows: wp.array(dtype=wp.float32), first: int): ...
 
-    return Lanes(row, entries, entered, candidates, lowest, value, bits, prefetch)
+    return Lanes(candidates, lowest, value, bits, prefetch)
 
 
 @cache
 def make_twins(width: int) -> Lanes:
     """The same functions in plain Warp, lane by lane."""
-    row = row_type(width)
 
     @wp.func
     def bits(rows: wp.array(dtype=wp.float32), i: int) -> int:
@@ -223,40 +149,6 @@ def make_twins(width: int) -> Lanes:
     @wp.func
     def value(rows: wp.array(dtype=wp.float32), i: int) -> float:
         return rows[i]
-
-    @wp.func
-    def enters(rows: wp.array(dtype=wp.float32), i: int, ray: LaneRay) -> float:
-        """The lane whose six planes are at i, i + width, ..."""
-        out = float(ray.box.t_min)
-        for axis in range(3):
-            near = wp.where(axis == 0, ray.near_x, wp.where(axis == 1, ray.near_y, ray.near_z))
-            t = (rows[i + width * near] - ray.box.origin[axis]) * ray.box.inv_dir[axis]
-            out = wp.where(t > out, t, out)
-        return out
-
-    @wp.func
-    def leaves(rows: wp.array(dtype=wp.float32), i: int, ray: LaneRay, t_max: float) -> float:
-        out = float(t_max)
-        for axis in range(3):
-            near = wp.where(axis == 0, ray.near_x, wp.where(axis == 1, ray.near_y, ray.near_z))
-            t = (rows[i + width * (near ^ 1)] - ray.box.origin[axis]) * ray.far_inv_dir[axis]
-            out = wp.where(t < out, t, out)
-        return out
-
-    @wp.func
-    def entries(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row:
-        out = row()
-        for j in range(width):
-            out[j] = enters(rows, first + j, ray)
-        return out
-
-    @wp.func
-    def entered(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int:
-        mask = int(0)
-        for j in range(width):
-            if enters(rows, first + j, ray) <= leaves(rows, first + j, ray, t_max):
-                mask = mask | (1 << j)
-        return mask
 
     @wp.func
     def sheared(rows: wp.array(dtype=wp.float32), i: int, ray: LaneRay) -> wp.vec2:
@@ -290,34 +182,4 @@ def make_twins(width: int) -> Lanes:
     def prefetch(rows: wp.array(dtype=wp.float32), first: int):
         pass
 
-    return Lanes(row, entries, entered, candidates, lowest, value, bits, prefetch)
-
-
-@cache
-def make_scalar_boxes(width: int, box: str):
-    """entries and entered by the scalar unit of that name in RAY_AABB: for a box test that has no form in rows."""
-    row = row_type(width)
-    ray_aabb = RAY_AABB[box]
-
-    @wp.func
-    def enters(rows: wp.array(dtype=wp.float32), i: int, ray: LaneRay, t_max: float) -> float:
-        lo = wp.vec3(rows[i], rows[i + 2 * width], rows[i + 4 * width])
-        hi = wp.vec3(rows[i + width], rows[i + 3 * width], rows[i + 5 * width])
-        return ray_aabb(ray.box, lo, hi, t_max)
-
-    @wp.func
-    def entries(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row:
-        out = row()
-        for j in range(width):
-            out[j] = enters(rows, first + j, ray, float(wp.inf))
-        return out
-
-    @wp.func
-    def entered(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int:
-        mask = int(0)
-        for j in range(width):
-            if enters(rows, first + j, ray, t_max) < wp.inf:
-                mask = mask | (1 << j)
-        return mask
-
-    return entries, entered
+    return Lanes(candidates, lowest, value, bits, prefetch)

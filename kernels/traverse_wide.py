@@ -12,17 +12,15 @@ from functools import cache
 import warp as wp
 
 from wrt.kernels.counters import Counts, Recorder, make_counters
-from wrt.kernels.lanes import EMPTY, LANE_PAD, LaneRay, make_lanes, make_scalar_boxes
+from wrt.kernels.lanes import EMPTY, LaneRay, make_lanes
 from wrt.kernels.ray_triangle import component
 from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray, Surfaces
 from wrt.kernels.traverse import Probe, Units, make_intersect, make_probe, no_hit
+from wrt.kernels.wide_nodes import first_reference, make_box_test, node_size
 
 # The builder lets no walk have more entries than this (kernels.build_wide.collapse).
 STACK_SIZE = 64
-# A node of width w is NODE_ROWS rows of w float32: lo_x, hi_x, lo_y, hi_y, lo_z, hi_z, the references of its children (int32),
-# and one that is not used, so that nodes begin where cache lines do.
-NODE_ROWS = 8
-# A reference is EMPTY, an inner node's index, or ~(LEAF_RANGE * (first row of primitives) + number of primitives - 1).
+# A reference is EMPTY, an inner node's index, or -1 - (LEAF_RANGE * (where its primitives begin) + number of primitives - 1).
 LEAF_RANGE = 64
 # Where an endless ray ends for the boxes: one that is entered at infinity is not entered.
 MAX_T = wp.constant(3.4028234663852886e38)
@@ -30,8 +28,9 @@ MAX_T = wp.constant(3.4028234663852886e38)
 
 @cache
 def make_struct(record):
-    """nodes: rows as above, nodes[0] the root. primitives: rows too: every number of `record` has one, of as many primitives
-    as a node has children; leaves begin with a row of their own."""
+    """nodes: as in kernels.wide_nodes, the root first. primitives: rows of as many primitives as a node has children: first the
+    first number of `record` of all of them, then the second ... Leaves begin with a row of their own, and their references count
+    rows; where nodes are compressed, leaves follow each other without a gap, and references count primitives."""
 
     @wp.struct
     class WideBvh:
@@ -122,16 +121,15 @@ def make_gather(record, width):
 
 
 def make_row_test(units: Units, any_hit, accepts, width):
-    """The unit that tests one row of primitives, whose numbers begin at `first`."""
+    """The unit that tests those primitives of a row that are in the mask; its numbers begin at `first`."""
     intersect = make_intersect(units, accepts)
     gather = make_gather(units.triangle_test.record, width)
     candidates, lowest = make_lanes(width).candidates, make_lanes(width).lowest
     sifted = units.triangle == "watertight"
 
     @wp.func
-    def test_row(rows: wp.array(dtype=wp.float32), first: int, count: int, surfaces: Surfaces, probe: Probe, ray: LaneRay,
+    def test_row(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces, probe: Probe, ray: LaneRay,
                  best: Hit) -> Hit:
-        mask = (2 << (count - 1)) - 1
         if wp.static(sifted):
             mask = mask & candidates(rows, first, ray)
         while mask != 0:
@@ -145,23 +143,18 @@ def make_row_test(units: Units, any_hit, accepts, width):
     return test_row
 
 
-def make_box_test(box, width):
-    """entries and entered of kernels.lanes for a name in RAY_AABB, and by how much far distances are widened."""
-    if box == "plain":
-        return *make_scalar_boxes(width, box), 1.0
-    return make_lanes(width).entries, make_lanes(width).entered, LANE_PAD if box == "conservative" else 1.0
-
-
-def make_traversal(units: Units, any_hit: bool, accepts, width: int):
+def make_traversal(units: Units, any_hit: bool, accepts, width: int, compressed: bool):
     """The closest hit, or any (the first that is found), in a tree of nodes of `width` children."""
     lanes = make_lanes(width)
     lowest, bits, prefetch = lanes.lowest, lanes.bits, lanes.prefetch
-    entries, entered, pad = make_box_test(units.box, width)
+    entries, entered, pad = make_box_test(units.box, width, compressed)
     probe_of = make_probe(units)
     test_row = make_row_test(units, any_hit, accepts, width)
-    fetch_node, fetch_primitive, push, finish = make_counters(units, 4 * NODE_ROWS * width)
+    fetch_node, fetch_primitive, push, finish = make_counters(units, 4 * node_size(width, compressed))
     struct = make_struct(units.triangle_test.record)
-    node_size = NODE_ROWS * width
+    size_of_node = node_size(width, compressed)
+    references = first_reference(width, compressed)
+    unit = 1 if compressed else width  # of primitives, in which references count
     row_size = units.triangle_test.record.numpy_dtype()["itemsize"] // 4 * width
 
     @wp.func
@@ -169,9 +162,9 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int):
         """The reference at `at`; what it refers to is called into the cache, as it is needed soon."""
         reference = bits(accel.nodes, at)
         if reference >= 0:
-            prefetch(accel.nodes, reference * wp.static(node_size))
+            prefetch(accel.nodes, reference * wp.static(size_of_node))
         else:
-            prefetch(accel.primitives, (-1 - reference) / LEAF_RANGE * wp.static(row_size))
+            prefetch(accel.primitives, (-1 - reference) / LEAF_RANGE * unit / width * wp.static(row_size))
         return reference
 
     @wp.func
@@ -179,28 +172,33 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int):
         if wp.static(units.counters):
             boxes = int(0)
             for j in range(width):
-                if bits(accel.nodes, index * wp.static(node_size) + 6 * width + j) != EMPTY:
+                if bits(accel.nodes, index * wp.static(size_of_node) + references + j) != EMPTY:
                     boxes += 1
             return fetch_node(accel.recorder, ray, counts, index, boxes)
         return counts
 
     @wp.func
     def test_leaf(accel: struct, surfaces: Surfaces, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
-        block = (-1 - reference) / LEAF_RANGE
-        count = (-1 - reference) % LEAF_RANGE + 1
-        while count > 0:
-            best = test_row(accel.primitives, block * wp.static(row_size), wp.min(count, width), surfaces, probe, rows, best)
+        begin = (-1 - reference) / LEAF_RANGE * unit
+        end = begin + (-1 - reference) % LEAF_RANGE + 1
+        while begin < end:
+            row = begin / width
+            lane = int(0)
+            if wp.static(compressed):
+                lane = begin - row * width
+            n = wp.min(width - lane, end - begin)
+            mask = ((2 << (n - 1)) - 1) << lane
+            best = test_row(accel.primitives, row * wp.static(row_size), mask, surfaces, probe, rows, best)
             if wp.static(any_hit):
                 if best.prim_id != NO_HIT:
                     return best
-            count = count - width
-            block = block + 1
+            begin = begin + n
         return best
 
     @wp.func
     def count_leaf(accel: struct, ray: Ray, counts: Counts, reference: int) -> Counts:
         if wp.static(units.counters):
-            first = (-1 - reference) / LEAF_RANGE * width
+            first = (-1 - reference) / LEAF_RANGE * unit
             counts.leaves += 1
             for j in range((-1 - reference) % LEAF_RANGE + 1):
                 counts = fetch_primitive(accel.recorder, ray, counts, first + j)
@@ -230,12 +228,12 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int):
                     if best.prim_id != NO_HIT:
                         return finish(accel.recorder, ray, counts, best)
             else:
-                first = reference * wp.static(node_size)
+                first = reference * wp.static(size_of_node)
                 counts = count_node(accel, ray, counts, reference)
                 t = entries(accel.nodes, first, rows)
                 mask = entered(accel.nodes, first, rows, best.t)
                 if mask != 0:
-                    first = first + 6 * width
+                    first = first + references
                     lane = lowest(mask)
                     mask = mask & (mask - 1)
                     near = key_of(t[lane], child(accel, first + lane))
@@ -278,13 +276,14 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int):
 
 
 class WideTraversal:
-    """What wrt.accel takes for the traversal's module, for one width."""
+    """What wrt.accel takes for the traversal's module, for one layout of nodes."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, compressed: bool = False) -> None:
         self.width = width
+        self.compressed = compressed
 
     def make_struct(self, record):
         return make_struct(record)
 
     def make_traversal(self, units: Units, any_hit: bool, accepts=None):
-        return make_traversal(units, any_hit, accepts, self.width)
+        return make_traversal(units, any_hit, accepts, self.width, self.compressed)

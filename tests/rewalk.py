@@ -369,22 +369,21 @@ def cell_slack(accel, ray: WalkRay) -> np.float32:
 
 
 def wide(accel, ray: WalkRay) -> Walk:
-    """A child's reference is 0 for none, an inner node, or ~(64 * (first row) + primitives - 1)."""
+    """A child's reference is 0 for none, an inner node, or ~(64 * begin + primitives - 1); begin counts rows, or primitives."""
     walk, stack, width = Walk(), [], accel.width
-    nodes = accel.data.nodes.numpy().reshape(-1, 8, width)
-    references = nodes[:, 6].copy().view(np.int32)
+    tree, references = accel._tree(accel.built), accel._references(accel.built)
+    unit, size = (1, 96) if accel.compressed else (width, 32 * width)
     current: int | None = 0
     while current is not None:
         if current < 0:
             walk.leaves += 1
             first, count = -1 - current >> 6, (-1 - current & 63) + 1
-            for i in range(first * width, first * width + count):
+            for i in range(first * unit, first * unit + count):
                 ray.test(walk, accel, i)
         else:
-            walk.node(current, nodes[0].nbytes, int((references[current] != 0).sum()))
-            boxes = nodes[current, :6].T
+            walk.node(current, size, int((references[current] != 0).sum()))
             entered = [(t, int(references[current, k])) for k in range(width)
-                       if (t := enter_lane(ray, boxes[k, 0::2], boxes[k, 1::2])) < INF]
+                       if (t := enter_lane(ray, tree.lo[current, k], tree.hi[current, k])) < INF]
             if entered:
                 current = visit_order(walk, stack, entered)
                 continue
@@ -489,6 +488,7 @@ REWALK: dict[str, Callable[..., Walk]] = {
     "bvh2_kdop": bvh2_kdop,
     "bvh4": wide,
     "bvh8": wide,
+    "bvh8c": wide,
     "kdtree": kdtree,
     "bsp": bsp,
     "grid": grid,

@@ -52,7 +52,7 @@ def test_nothing_imports_the_command_line(path: Path) -> None:
 
 
 def test_units_come_before_traversals_before_the_integrator() -> None:
-    layers = [("structs",), ("ray_", "sampling", "camera"), ("counters", "lanes", "triangle_cell", "cell_ray"),
+    layers = [("structs",), ("ray_", "sampling", "camera"), ("counters", "lanes", "wide_nodes", "triangle_cell", "cell_ray"),
               ("textures", "surface", "materials", "traverse", "lights"),
               ("shadows", "whitted", "query", "build_", "refit_", "cache_lru", "end_point_overlap", "peers"),
               ("render", "rasterize", "primary_rays")]

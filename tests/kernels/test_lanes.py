@@ -8,18 +8,22 @@ import pytest
 from tests.kernel_tools import CPU, floats, ints, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
+from wrt.accel.wide_compress import compress
 from wrt.kernels.lanes import LANE_PAD, make_lanes, make_twins, row_type
+from wrt.kernels.query import RayArrays, load_ray
 from wrt.kernels.ray_aabb import FAR_PAD, box_ray, ray_aabb
 from wrt.kernels.structs import Ray, kernel
 from wrt.kernels.traverse import Units, make_probe
 from wrt.kernels.traverse_wide import lane_ray
+from wrt.kernels.wide_nodes import make_nodes, node_size
+from wrt.kernels.wide_nodes import make_twins as node_twins
 
 WIDTHS = (4, 8)
 
 
 @cache
-def both_kernel(width):
-    """Each function by its native form and by its twin: entries and candidates of row i of `rows` for ray i."""
+def both_kernel(width, compressed):
+    """Each function by its native form and by its twin: of node i of `nodes` and block i of `rows` for ray i."""
     native, twin = make_lanes(width), make_twins(width)
     row = row_type(width)
     probe_of = make_probe(Units())
@@ -33,21 +37,19 @@ def both_kernel(width):
         value: wp.array(dtype=wp.float32)
         bits: wp.array(dtype=wp.int32)
 
-    def make(unit):
+    def make(unit, nodes_unit):
+        entries, entered = nodes_unit
+
         @kernel
-        def run(rows: wp.array(dtype=wp.float32), origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.vec3),
-                t_min: wp.array(dtype=wp.float32), t_max: wp.array(dtype=wp.float32), out: Out):
+        def run(nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32), rays: RayArrays, out: Out):
             i = wp.tid()
-            ray = Ray()
-            ray.origin = origin[i]
-            ray.direction = direction[i]
-            ray.t_min = t_min[i]
-            ray.t_max = t_max[i]
+            ray = load_ray(rays, i)
             lanes = lane_ray(probe_of(ray), LANE_PAD)
             first = i * wp.static(9 * width)
+            node = i * wp.static(node_size(width, compressed))
             unit.prefetch(rows, first)
-            out.entries[i] = unit.entries(rows, first, lanes)
-            mask = unit.entered(rows, first, lanes, t_max[i])
+            out.entries[i] = entries(nodes, node, lanes)
+            mask = entered(nodes, node, lanes, ray.t_max)
             out.entered[i] = mask
             if mask != 0:
                 out.lowest[i] = unit.lowest(mask)
@@ -57,11 +59,14 @@ def both_kernel(width):
 
         return run
 
-    return Out, make(native), make(twin)
+    return Out, make(native, make_nodes(width, compressed)), make(twin, node_twins(width, compressed))
 
 
-def results(width, rows, origin, direction, t_min, t_max):
-    out_type, *kernels = both_kernel(width)
+def results(width, compressed, nodes, rows, rays):
+    out_type, *kernels = both_kernel(width, compressed)
+    origin, direction, t_min, t_max = rays
+    arrays = RayArrays()
+    arrays.origin, arrays.direction, arrays.t_min, arrays.t_max = vec3s(origin), vec3s(direction), floats(t_min), floats(t_max)
     answers = []
     for run in kernels:
         n = len(origin)
@@ -70,9 +75,28 @@ def results(width, rows, origin, direction, t_min, t_max):
         for name in ("entered", "candidates", "lowest", "bits"):
             setattr(out, name, zeros(n, wp.int32))
         out.value = zeros(n)
-        launch(run, n, floats(rows.reshape(-1)), vec3s(origin), vec3s(direction), floats(t_min), floats(t_max), out)
+        launch(run, n, floats(nodes.reshape(-1)), floats(rows.reshape(-1)), arrays, out)
         answers.append({name: getattr(out, name).numpy() for name in out._cls.vars})
     return answers
+
+
+def plain_nodes(lo, hi):
+    """(n, W, 3) boxes as nodes."""
+    n, width, _ = lo.shape
+    nodes = np.zeros((n, 8, width), np.float32)
+    nodes[:, 0:6:2], nodes[:, 1:6:2] = lo.transpose(0, 2, 1), hi.transpose(0, 2, 1)
+    return nodes
+
+
+def compressed_nodes(rng, n, width, origins):
+    """Nodes of random bytes, of all exponents where a step is between 2^-20 and 2^20, and some of their ends."""
+    nodes = np.zeros((n, node_size(width, True)), np.float32)
+    nodes[:, :3] = origins
+    exponents = np.where(rng.random((n, 3)) < 0.1, rng.choice([1, 2, 253, 254], (n, 3)), rng.integers(107, 147, (n, 3)))
+    word = (exponents << np.array([0, 8, 16])).sum(axis=1) | rng.integers(0, 1 << width, n) << 24
+    nodes[:, 3] = word.astype(np.uint32).view(np.float32)
+    nodes[:, 4 : 4 + 6 * width // 4] = rng.integers(0, 256, (n, 6 * width), dtype=np.uint8).view(np.float32)
+    return nodes
 
 
 def assert_same(native, twin):
@@ -80,29 +104,39 @@ def assert_same(native, twin):
         np.testing.assert_array_equal(native[name].view(np.int32), twin[name].view(np.int32), err_msg=name)
 
 
+@pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("width", WIDTHS)
-def test_native_functions_equal_their_twins_on_random_rows(width):
+def test_native_functions_equal_their_twins_on_random_rows(width, compressed):
     rng = np.random.default_rng(width)
     n = 20_000
-    rows = rng.normal(size=(n, 9, width))
-    rows[:, 1:6:2] = rows[:, 0:6:2] + np.abs(rng.normal(size=(n, 3, width)))
+    rows, lo = rng.normal(size=(n, 9, width)), rng.normal(size=(n, width, 3))
+    hi = lo + np.abs(rng.normal(size=lo.shape))
+    nodes = plain_nodes(lo, hi)
+    if compressed:
+        nodes = np.zeros((n, node_size(width, True)), np.float32)
+        nodes[:, :-width] = compress(lo.astype(np.float32), hi.astype(np.float32), rng.random((n, width)) < 0.8)
     t_min = np.where(rng.random(n) < 0.5, 0.0, rng.random(n))
-    native, twin = results(width, rows, rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), t_min, t_min + rng.exponential(3.0, n))
+    rays = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), t_min, t_min + rng.exponential(3.0, n)
+    native, twin = results(width, compressed, nodes, rows, rays)
     assert_same(native, twin)
     for name in ("entered", "candidates"):
-        assert 0.02 < np.unpackbits(native[name].astype(np.uint8)).sum() / (n * width) < 0.98
+        assert 0.01 < np.unpackbits(native[name].astype(np.uint8)).sum() / (n * width) < 0.98
 
 
+@pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("width", WIDTHS)
-def test_native_functions_equal_their_twins_where_numbers_are_special(width):
+def test_native_functions_equal_their_twins_where_numbers_are_special(width, compressed):
     # Planes through the origin, directions with +-0, empty boxes, denormals, overflow, infinities and NaN.
     rng = np.random.default_rng(10 + width)
     n = 40_000
     special = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, -1e-40, 3e38, -3e38, np.inf, -np.inf, np.nan], np.float32)
-    rows = rng.choice(special, (n, 9, width))
-    origin, direction = rng.choice(special[:9], (n, 3)), rng.choice(special[:8], (n, 3))
+    nodes = (compressed_nodes(rng, n, width, rng.choice(special, (n, 3))) if compressed
+             else plain_nodes(rng.choice(special, (n, width, 3)), rng.choice(special, (n, width, 3))))
     ends = np.array([0.0, -0.0, 0.5, 1.0, 1e30, 3.4e38, -np.inf], np.float32)
-    native, twin = results(width, rows, origin, direction, rng.choice(ends[:4], n), rng.choice(ends, n))
+    direction = rng.choice(special[:5], (n, 3))
+    direction[~direction.any(axis=1)] = 1.0
+    rays = rng.choice(special[:9], (n, 3)), direction, rng.choice(ends[:4], n), rng.choice(ends, n)
+    native, twin = results(width, compressed, nodes, rng.choice(special, (n, 9, width)), rays)
     assert_same(native, twin)
     assert 0 < native["entered"].astype(bool).mean() < 1
 
@@ -131,7 +165,7 @@ def scalar_boxes(rows: wp.array(dtype=wp.float32), origin: wp.array(dtype=wp.vec
     ray = Ray()
     ray.origin = origin[i]
     ray.direction = direction[i]
-    k = i * 72 + j
+    k = i * 64 + j
     lo = wp.vec3(rows[k], rows[k + 16], rows[k + 32])
     t[i * 8 + j] = ray_aabb(box_ray(ray), lo, wp.vec3(rows[k + 8], rows[k + 24], rows[k + 40]), t_max)
 
@@ -146,11 +180,11 @@ def test_rows_of_boxes_leave_out_none_that_the_box_unit_enters():
     point = origin[:, None] + direction[:, None] * rng.random((n, 8, 1)).astype(np.float32)
     lo = point + np.where(rng.random((n, 8, 3)) < 0.4, 0.0, -rng.random((n, 8, 3)))
     hi = point + np.where(rng.random((n, 8, 3)) < 0.4, 0.0, rng.random((n, 8, 3)))
-    rows = np.zeros((n, 9, 8), np.float32)
-    rows[:, 0:6:2], rows[:, 1:6:2] = lo.transpose(0, 2, 1), hi.transpose(0, 2, 1)
-    native, _ = results(8, rows, origin, direction, np.zeros(n), np.full(n, t_max))
+    nodes = plain_nodes(lo, hi)
+    rays = origin, direction, np.zeros(n), np.full(n, t_max)
+    native, _ = results(8, False, nodes, np.zeros((n, 9, 8)), rays)
     t = zeros(8 * n)
-    wp.launch(scalar_boxes, dim=(n, 8), inputs=[floats(rows.reshape(-1)), vec3s(origin), vec3s(direction), t_max, t], device=CPU)
+    wp.launch(scalar_boxes, dim=(n, 8), inputs=[floats(nodes.reshape(-1)), vec3s(origin), vec3s(direction), t_max, t], device=CPU)
     t = t.numpy().reshape(n, 8)
     entered = (native["entered"][:, None] >> np.arange(8) & 1).astype(bool)
     assert entered[np.isfinite(t)].all() and 0.02 < np.isinf(t).mean() < 0.98

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from wrt.accel import Geometry, build
-from wrt.accel.wide_tree import check_wide, lanes_of
+from wrt.accel.wide_compress import compress, decompress
+from wrt.accel.wide_tree import check_wide, lanes_of, packed
 from wrt.errors import InputError
 from wrt.shapes import icosphere
 
-WIDE = {"bvh4": 4, "bvh8": 8}
+WIDE = {"bvh4": 4, "bvh8": 8, "bvh8c": 8}
 BALL = icosphere(3)
 
 
@@ -47,7 +48,8 @@ def test_refit_follows_vertices_that_move(name: str, builder: str) -> None:
 def test_arrays_of_a_file_are_checked(name: str) -> None:
     width = WIDE[name]
     accel = build(BALL, name)
-    children = accel._tree(accel.built).children
+    children = accel._tree(accel.built).children  # in units of rows
+    accel._check(accel.built)
     check_wide(children, len(BALL.faces), width)
     inner = np.argwhere(children > 0)
     leaf = np.argwhere(children < 0)
@@ -102,3 +104,55 @@ def test_options_out_of_range_are_refused(options, message: str) -> None:
 def test_nodes_and_rows_begin_where_cache_lines_do(name: str) -> None:
     data = build(BALL, name).data
     assert data.nodes.ptr % 64 == 0 and data.primitives.ptr % 64 == 0
+
+
+def test_references_are_packed_by_rows_or_without_gaps() -> None:
+    children = np.array([[0, 1, -1 - (64 + 8), -1 - 0], [0, 0, -1 - (3 * 64 + 7), -1 - (4 * 64 + 2)]], np.int32)  # 9, 1, 8 and 3
+    dense = packed(children, 1)
+    assert dense.tolist() == [[0, 1, -1 - (64 + 8), -1 - 0], [0, 0, -1 - (10 * 64 + 7), -1 - (18 * 64 + 2)]]
+    check_wide(dense, 21, 1)
+    np.testing.assert_array_equal(packed(dense, 8), children)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-3, 1.0, 1e30])
+def test_compressed_boxes_contain_what_they_held_and_little_more(scale: float) -> None:
+    rng = np.random.default_rng(4)
+    n = 3000
+    center = np.float32(scale) * rng.normal(size=(n, 1, 3)) * 10.0 ** rng.uniform(-3, 3, (n, 1, 3))  # far from the origin, or near
+    corner = center + np.float32(scale) * rng.normal(size=(n, 8, 3))
+    there = rng.random((n, 8)) < 0.7
+    extent = np.where(rng.random((n, 8, 3)) < 0.3, 0.0, scale * rng.exponential(size=(n, 8, 3)))
+    lo = np.where(there[..., None], corner, np.inf).astype(np.float32)
+    hi = np.where(there[..., None], lo + extent, -np.inf).astype(np.float32)
+    out_lo, out_hi = decompress(compress(lo, hi, there), 8)
+    assert (out_lo <= lo).all() and (out_hi >= hi).all() and np.array_equal((out_lo <= out_hi).all(axis=2), there)
+    boxes = ((lo, 1e38), (hi, -1e38), (out_lo, 1e38), (out_hi, -1e38))
+    lo, hi, out_lo, out_hi = (np.where(there[..., None], box, empty) for box, empty in boxes)
+    whole_lo, whole_hi = lo.min(axis=1, keepdims=True), hi.max(axis=1, keepdims=True)
+    some = there.any(axis=1)
+    step = 2.0 * (whole_hi - whole_lo)[some] / 255.0 + 4.0 * 2.0**-23 * np.abs(whole_hi)[some]
+    lost = np.maximum(lo - out_lo, out_hi - hi, where=there[..., None], out=np.zeros_like(lo))[some]
+    assert (lost <= 1.01 * step).all() and (lost > 0.0).mean() > 0.1
+
+
+def test_boxes_that_8_bits_cannot_tell_hold_nothing_back() -> None:
+    lo, hi = np.full((1, 8, 3), np.inf, np.float32), np.full((1, 8, 3), -np.inf, np.float32)
+    there = np.arange(8)[None] >= 5
+    lo[0, 5:], hi[0, 5:] = [[-np.inf, 0.0, 1.0]], [[3.0, 0.0, np.inf]]
+    lo[0, 6, 0], hi[0, 7, 1] = -3e38, 3.4e38
+    out_lo, out_hi = decompress(compress(lo, hi, there), 8)
+    assert (out_lo <= lo).all() and (out_hi >= hi).all() and np.array_equal((out_lo <= out_hi).all(axis=2), there)
+
+
+def test_compressed_takes_less_memory() -> None:
+    ball = icosphere(5)
+    sizes = {name: build(ball, name).stats.bytes / len(ball.faces) for name in ("bvh2", "bvh8", "bvh8c")}
+    assert 40.0 < sizes["bvh8c"] < 44.0 < 0.7 * sizes["bvh8"] < sizes["bvh2"]
+
+
+def test_a_node_that_tells_of_other_children_is_refused() -> None:
+    accel = build(BALL, "bvh8c")
+    nodes = accel.built.arrays["nodes"].reshape(-1, 24)
+    nodes[3, 3:4].view(np.uint32)[0] ^= np.uint32(1 << 31)
+    with pytest.raises(InputError, match="children that it does not have"):
+        accel._check(accel.built)

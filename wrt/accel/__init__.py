@@ -10,7 +10,7 @@ from wrt.accel.brute_force import BruteForce
 from wrt.accel.bsp import Bsp
 from wrt.accel.bvh2 import Bvh2
 from wrt.accel.bvh2_volumes import Bvh2Kdop, Bvh2Sphere
-from wrt.accel.bvh_wide import Bvh4, Bvh8
+from wrt.accel.bvh_wide import Bvh4, Bvh8, Bvh8c
 from wrt.accel.grid import Grid
 from wrt.accel.kdtree import KdTree
 from wrt.accel.octree import Octree
@@ -28,6 +28,7 @@ ACCELERATORS: dict[str, type[Accelerator]] = {
     "bvh8": Bvh8,
     "bvh2_sphere": Bvh2Sphere,
     "bvh2_kdop": Bvh2Kdop,
+    "bvh8c": Bvh8c,
     "kdtree": KdTree,
     "bsp": Bsp,
     "brute_force": BruteForce,

@@ -9,10 +9,12 @@ import numpy as np
 
 from wrt.accel.base import Accelerator, Built
 from wrt.accel.bvh_build import BvhOptions, build_binary
-from wrt.accel.wide_tree import WideTree, check_wide, collapse, lanes_of, refit, small_tree
+from wrt.accel.wide_compress import children_there, compress, decompress
+from wrt.accel.wide_tree import MAX_PLACES, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
 from wrt.errors import InputError
 from wrt.kernels.lanes import EMPTY
-from wrt.kernels.traverse_wide import LEAF_RANGE, NODE_ROWS, WideTraversal
+from wrt.kernels.traverse_wide import LEAF_RANGE, WideTraversal
+from wrt.kernels.wide_nodes import first_reference, node_size
 
 
 def aligned(array: np.ndarray) -> np.ndarray:
@@ -30,6 +32,7 @@ class WideBvh(Accelerator):
     split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
 
     width: ClassVar[int]
+    compressed: ClassVar[bool] = False
 
     def _build(self, builder: str = "binned", max_leaf: int | None = None, cost_traversal: float = 1.0,
                cost_intersection: float = 1.0, split_alpha: float = 1e-5, split_budget: float = 0.5) -> Built:
@@ -39,44 +42,71 @@ class WideBvh(Accelerator):
         binary = build_binary(self.geometry, options, self.threads)
         tree = (collapse(binary, self.width, max_leaf, cost_traversal, cost_intersection) if len(binary.order) > 1
                 else small_tree(binary, self.width))
-        return Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth, tree.sah_cost())
+        if self.compressed and len(binary.order) > MAX_PLACES:
+            raise InputError(f"a {self.name} holds at most {MAX_PLACES} primitives, and there are {len(binary.order)}; take bvh8")
+        built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
+        return replace(built, sah_cost=self._tree(built).sah_cost())
+
+    @property
+    def _unit(self) -> int:
+        """Primitives, in which references to leaves count."""
+        return 1 if self.compressed else self.width
+
+    def _nodes(self, built: Built) -> np.ndarray:
+        return built.arrays["nodes"].reshape(-1, node_size(self.width, self.compressed))
+
+    def _references(self, built: Built) -> np.ndarray:
+        """(N, width) int32 of all children."""
+        first = first_reference(self.width, self.compressed)
+        return np.ascontiguousarray(self._nodes(built)[:, first : first + self.width]).view(np.int32)
 
     def _arrays(self, tree: WideTree) -> dict[str, np.ndarray]:
-        """The node rows of kernels.traverse_wide."""
-        n = len(tree.children)
-        nodes = np.zeros((n, NODE_ROWS, self.width), np.float32)
-        nodes[:, 0:6:2], nodes[:, 1:6:2] = tree.lo.transpose(0, 2, 1), tree.hi.transpose(0, 2, 1)
-        nodes[:, 6] = tree.children.view(np.float32)
+        """The node rows of kernels.wide_nodes."""
+        n, size, first = len(tree.children), node_size(self.width, self.compressed), first_reference(self.width, self.compressed)
+        nodes = np.zeros((n, size), np.float32)
+        nodes[:, first : first + self.width] = packed(tree.children, self._unit).view(np.float32)
+        if self.compressed:
+            nodes[:, :first] = compress(tree.lo, tree.hi, tree.children != EMPTY)
+        else:
+            planes = nodes[:, :first].reshape(n, 6, self.width)
+            planes[:, 0::2], planes[:, 1::2] = tree.lo.transpose(0, 2, 1), tree.hi.transpose(0, 2, 1)
         return {"nodes": nodes.reshape(-1)}
 
     def _tree(self, built: Built) -> WideTree:
-        """The tree that _arrays laid out."""
-        nodes = built.arrays["nodes"].reshape(-1, NODE_ROWS, self.width)
-        lo, hi = (np.ascontiguousarray(nodes[:, first:6:2].transpose(0, 2, 1)) for first in range(2))
-        children = np.ascontiguousarray(nodes[:, 6]).view(np.int32)
+        """The tree that _arrays laid out; compressed boxes as a ray meets them."""
+        head = self._nodes(built)[:, : first_reference(self.width, self.compressed)]
+        if self.compressed:
+            lo, hi = decompress(head, self.width)
+        else:
+            planes = head.reshape(-1, 6, self.width)
+            lo, hi = (np.ascontiguousarray(planes[:, end::2].transpose(0, 2, 1)) for end in range(2))
+        children = packed(self._references(built), self.width)
         return WideTree(lo, hi, children, lanes_of(children, built.order, self.width), built.leaves, built.depth, 0)
 
     def _primitives(self, built: Built) -> np.ndarray:
         """What the triangle test reads, number by number in rows; lanes without a primitive hold the first one, untested."""
-        order = self._tree(built).order
+        order = built.order if self.compressed else self._tree(built).order.reshape(-1)
+        order = np.append(order, np.zeros(-len(order) % self.width, np.int32))
         if not order.size:
             return np.zeros(0, np.float32)
-        records = self.geometry.primitives(self.structure.units, np.maximum(order, 0).reshape(-1))
-        numbers = records.view(np.float32).reshape(len(order), self.width, -1)
+        records = self.geometry.primitives(self.structure.units, np.maximum(order, 0))
+        numbers = records.view(np.float32).reshape(-1, self.width, records.itemsize // 4)
         return aligned(numbers.transpose(0, 2, 1).reshape(-1))
 
     def _upload(self, built: Built) -> Any:
         return super()._upload(replace(built, arrays={name: aligned(array) for name, array in built.arrays.items()}))
 
     def _check(self, built: Built) -> None:
-        nodes = built.arrays["nodes"]
-        if len(nodes) % (NODE_ROWS * self.width):
+        if len(built.arrays["nodes"]) % node_size(self.width, self.compressed):
             raise InputError("is damaged: its nodes are no whole ones")
-        check_wide(nodes.reshape(-1, NODE_ROWS, self.width)[:, 6].view(np.int32), len(built.order), self.width)
+        references = self._references(built)
+        check_wide(references, len(built.order), self._unit)
+        if self.compressed and (children_there(self._nodes(built), self.width) != (references != EMPTY)).any():
+            raise InputError("is damaged: a node tells of children that it does not have")
 
     def _refit(self, built: Built) -> Built:
-        tree = refit(self._tree(built), self.geometry)
-        return replace(built, arrays=self._arrays(tree), sah_cost=tree.sah_cost())
+        built = replace(built, arrays=self._arrays(refit(self._tree(built), self.geometry)))
+        return replace(built, sah_cost=self._tree(built).sah_cost())
 
     def _children(self, built: Built) -> Any:
         from wrt.accel.epo import children
@@ -103,3 +133,13 @@ class Bvh8(WideBvh):
     name = "bvh8"
     width = 8
     kernels = WideTraversal(8)
+
+
+class Bvh8c(WideBvh):
+    """As bvh8, with the same options, for less memory: boxes in 8 bits a plane (Ylitie, Karras and Laine 2017), rounded so that
+    they hold what they held, and leaves without gaps."""
+
+    name = "bvh8c"
+    width = 8
+    compressed = True
+    kernels = WideTraversal(8, compressed=True)

@@ -16,7 +16,7 @@ from wrt.kernels.lanes import EMPTY
 from wrt.kernels.traverse_bvh2 import Bvh2Node
 from wrt.kernels.traverse_wide import LEAF_RANGE, STACK_SIZE
 
-MAX_ROWS = 2**31 // LEAF_RANGE  # of primitives: what a reference can tell
+MAX_PLACES = 2**31 // LEAF_RANGE  # of leaves' beginnings: what a reference can tell
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +70,8 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
     out.count = wp.zeros(5, dtype=wp.int32, device=cpu)
     wp.launch(build_wide.collapse, dim=1, device=cpu, inputs=[nodes, order, options, trees, out])
     n_nodes, rows, leaves, depth, stack = out.count.numpy().tolist()
-    if rows > MAX_ROWS:
-        raise InputError(f"a wide BVH holds at most {MAX_ROWS} rows of primitives, and these need {rows}; take accel='bvh2'")
+    if rows > MAX_PLACES:
+        raise InputError(f"a wide BVH holds at most {MAX_PLACES} rows of primitives, and these need {rows}; take accel='bvh2'")
     code = out.boxes.numpy()[: n_nodes * width].reshape(-1, width)
     lo, hi = (np.stack([tree.nodes[f"{end}_0"], tree.nodes[f"{end}_1"]], axis=1).reshape(-1, 3)[code] for end in ("lo", "hi"))
     lo[code < 0], hi[code < 0] = np.inf, -np.inf
@@ -112,9 +112,23 @@ def refit(tree: WideTree, geometry: Geometry) -> WideTree:
     return replace(tree, lo=lo.numpy().reshape(-1, width, 3), hi=hi.numpy().reshape(-1, width, 3))
 
 
+def packed(children: np.ndarray, unit: int) -> np.ndarray:
+    """The same references with leaves one after another in units of so many primitives; kernels count rows, or primitives."""
+    leaf = children < 0
+    reference = -1 - children[leaf].astype(np.int64)
+    begin, count = np.divmod(reference, LEAF_RANGE)
+    units = -(-(count + 1) // unit)
+    place = np.empty(len(begin), np.int64)
+    in_order = np.argsort(begin, kind="stable")
+    place[in_order] = np.cumsum(units[in_order]) - units[in_order]
+    out = children.copy()
+    out[leaf] = -1 - (LEAF_RANGE * place + count)
+    return out
+
+
 def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
-    """Which record stands in each lane of the leaves' rows: (rows, width), -1 where there is none. children: the references of all
-    nodes; order: (R,) the prim_id of every record, leaf after leaf as their rows are."""
+    """Which primitive stands in each lane of the leaves' rows: (rows, width), -1 where there is none. children: references in
+    units of `width`; order: (R,) the prim_id of every record, leaf after leaf as their rows are."""
     leaf = np.sort(-1 - children[children < 0].astype(np.int64))
     row, count = leaf // LEAF_RANGE, leaf % LEAF_RANGE + 1
     rows = int(row[-1] + -(-count[-1] // width)) if len(leaf) else 0
@@ -124,9 +138,9 @@ def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
     return out.reshape(rows, width)
 
 
-def check_wide(children: np.ndarray, n_primitives: int, width: int) -> None:
-    """Raise InputError unless (N, width) references are a tree from node 0 whose leaves have n rows one after another, and whose
-    walks fit on a traversal's stack."""
+def check_wide(children: np.ndarray, n_primitives: int, unit: int) -> None:
+    """Raise InputError unless (N, width) references are a tree from node 0 whose leaves hold n primitives one after another, in
+    units of so many, and whose walks fit on a traversal's stack."""
     n = len(children)
     inner = children > 0
     if n == 0 or (children[inner] >= n).any() or (children <= np.arange(n)[:, None])[inner].any():
@@ -135,10 +149,10 @@ def check_wide(children: np.ndarray, n_primitives: int, width: int) -> None:
         raise InputError("is damaged: its nodes are no tree")
     leaf = np.sort(-1 - children[children < 0].astype(np.int64))
     count = leaf % LEAF_RANGE + 1
-    rows = -(-count // width)
-    if (leaf // LEAF_RANGE != np.cumsum(rows) - rows).any() or count.sum() != n_primitives:
+    units = -(-count // unit)
+    if (leaf // LEAF_RANGE != np.cumsum(units) - units).any() or count.sum() != n_primitives:
         raise InputError("is damaged: a leaf leads to other primitives")
-    if n and stack_need(children) > STACK_SIZE:
+    if stack_need(children) > STACK_SIZE:
         raise InputError(f"is damaged: a walk needs more than {STACK_SIZE} entries")
 
 
