@@ -45,7 +45,7 @@ class WideBvh(Accelerator):
         if self.compressed and len(binary.order) > MAX_PLACES:
             raise InputError(f"a {self.name} holds at most {MAX_PLACES} primitives, and there are {len(binary.order)}; take bvh8")
         built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
-        return replace(built, sah_cost=self._tree(built).sah_cost())
+        return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
 
     @property
     def _unit(self) -> int:
@@ -105,8 +105,9 @@ class WideBvh(Accelerator):
             raise InputError("is damaged: a node tells of children that it does not have")
 
     def _refit(self, built: Built) -> Built:
-        built = replace(built, arrays=self._arrays(refit(self._tree(built), self.geometry)))
-        return replace(built, sah_cost=self._tree(built).sah_cost())
+        tree = refit(self._tree(built), self.geometry)
+        built = replace(built, arrays=self._arrays(tree))
+        return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
 
     def _children(self, built: Built) -> Any:
         from wrt.accel.epo import children

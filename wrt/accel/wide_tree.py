@@ -39,11 +39,16 @@ class WideTree:
         e = np.clip(self.hi.astype(np.float64) - self.lo, 0.0, 1e39)
         return e[..., 0] * e[..., 1] + e[..., 1] * e[..., 2] + e[..., 2] * e[..., 0]
 
-    def sah_cost(self) -> float:
-        """Expected node visits plus primitives tested of a random line that meets the root box (both costing 1)."""
-        count = np.where(self.children < 0, (-1 - self.children) % LEAF_RANGE + 1, 1)
+    @property
+    def root_area(self) -> float:
+        """Half the surface of the box around all."""
         e = np.clip(self.hi[0].max(axis=0).astype(np.float64) - self.lo[0].min(axis=0), 0.0, 1e39)
-        root = e[0] * e[1] + e[1] * e[2] + e[2] * e[0]
+        return float(e[0] * e[1] + e[1] * e[2] + e[2] * e[0])
+
+    def sah_cost(self, root: float) -> float:
+        """Expected node visits plus primitives tested of a random line that meets a root box with this half of its surface (both
+        costing 1)."""
+        count = np.where(self.children < 0, (-1 - self.children) % LEAF_RANGE + 1, 1)
         if not root > 0.0:
             return float((self.order >= 0).sum())
         return 1.0 + float((self.areas * np.where(self.children == EMPTY, 0, count)).sum() / root)
