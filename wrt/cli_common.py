@@ -92,10 +92,12 @@ def warnings_told(quiet: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """What is found wrong with a scene after it was read is told with its file."""
+    """What is found wrong with a scene after it was read is told with its file; what is wrong with another file names that."""
     try:
         yield
     except InputError as error:
+        if error.path is not None:
+            raise
         raise InputError(str(error), path) from error
 
 

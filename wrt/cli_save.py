@@ -73,7 +73,7 @@ def save_film(film: Any, output: Path, bits: int | None, layers: Any) -> tuple[l
 
 def _another_place(problem: InputError) -> Path | None:
     """What somebody at the terminal answers; None where nobody is there, or has no answer."""
-    if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr)):
+    if not _at_a_terminal():
         return None
     say(f"error: {problem}")
     try:
@@ -82,3 +82,7 @@ def _another_place(problem: InputError) -> Path | None:
     except (click.Abort, KeyboardInterrupt, OSError):
         return None
     return Path(answer) if answer.strip() else None
+
+
+def _at_a_terminal() -> bool:
+    return all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr))

@@ -12,6 +12,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str, path: str | os.PathLike[str] | None = None, place: str | None = None) -> None:
+        self.path = path
         parts = [os.fspath(path) if path is not None else None, place, message]
         super().__init__(": ".join(part for part in parts if part))
 

@@ -1,0 +1,269 @@
+"""Renders that are killed, and the command line around them: nothing is lost that could be kept."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.command_line import BOX_OBJ
+from tests.command_line import wrt as run
+from tests.data import ROOT
+from wrt import cli_save, film
+from wrt.checkpoint import read
+from wrt.driver import Renderer
+from wrt.errors import InputError
+from wrt.image import read_channels, read_image
+
+SMALL = ("--size", "32x18", "--spp", 4)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Each test works in a folder of its own, with a box in it, and so do those who look for a place for temporary files."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    Path("box.obj").write_text(BOX_OBJ)
+    return tmp_path
+
+
+def new_files() -> set[str]:
+    return {path.name for path in Path().iterdir()} - {"box.obj", "tmp"}
+
+
+def channels(name: str) -> dict[str, bytes]:
+    return {channel: array.tobytes() for channel, array in read_channels(name).items()}
+
+
+# --- kill -9 ----------------------------------------------------------------------------------------------------------
+
+RENDER = ("render", "box.obj", "--size", "160x90", "--spp", 400, "-o", "a.exr", "--aov", "depth")
+# Tells of each look at the tiles, a tenth of a second apart: seconds of tracing so far.
+TELLING = """
+import sys, wrt.progress
+from contextlib import contextmanager
+@contextmanager
+def reporter(quiet):
+    yield lambda progress: print(progress.stage, progress.seconds, file=sys.stderr, flush=True)
+wrt.progress.progress_reporter = reporter
+from wrt.cli import main
+main()
+"""
+
+
+def started(*arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-c", TELLING, *map(str, arguments)], text=True, stderr=subprocess.PIPE,
+                            stdout=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": str(ROOT)})
+
+
+def killed_when(traced: float, *arguments: object) -> list[str]:
+    """Run the command, end it by kill -9 when it has traced for so many seconds, and return its lines on stderr."""
+    running = started(*arguments)
+    assert running.stderr is not None
+    lines = []
+    for line in running.stderr:
+        lines.append(line)
+        if line.startswith("trace ") and float(line.split()[1]) >= traced:
+            running.kill()
+    running.wait()
+    return lines
+
+
+def killed_after(seconds: float, *arguments: object) -> list[str]:
+    """Run the command, end it by kill -9 after so many seconds (or let it end before), and return its lines on stderr."""
+    running = started(*arguments)
+    try:
+        _, err = running.communicate(timeout=seconds)
+        assert running.returncode == 0, err
+    except subprocess.TimeoutExpired:
+        running.kill()
+        _, err = running.communicate()
+    return err.splitlines()
+
+
+def lost_seconds(lines: list[str]) -> float:
+    """Seconds of tracing that are neither in the picture nor in the checkpoint; reading that fails where it is not whole."""
+    told = [float(line.split()[1]) for line in lines if line.startswith("trace ")]
+    if not told or Path("a.exr").exists():
+        return 0.0
+    saved = read("a.exr.checkpoint").seconds if Path("a.exr.checkpoint").exists() else 0.0
+    return max(told[-1] - saved, 0.0)
+
+
+def whole_render() -> tuple[dict[str, bytes], float, float]:
+    """The picture of one go, seconds until tracing begins, and seconds of tracing, both in a process of its own."""
+    assert run(*RENDER).code == 0  # the kernel is compiled
+    begin = time.monotonic()
+    lines = killed_after(600.0, *RENDER)
+    took = time.monotonic() - begin
+    traced = max(float(line.split()[1]) for line in lines if line.startswith("trace "))
+    picture = channels("a.exr")
+    Path("a.exr").unlink()
+    return picture, max(took - traced, 0.0), traced
+
+
+def test_kills_lose_little_and_change_nothing() -> None:
+    assert run(*RENDER).code == 0
+    expected = channels("a.exr")
+    Path("a.exr").unlink()
+    rng = random.Random(7)
+    options = (*RENDER, "--checkpoint", "0.2s", "--resume")
+    for i in range(3):
+        lines = killed_when(0.4 * i + 0.4 * rng.random(), *options)  # of a second or two
+        assert lost_seconds(lines) < 0.2 + 1.0  # the machine may be busy; the slow test measures it
+        assert new_files() <= {"a.exr.checkpoint", ".a.exr.checkpoint.part"}
+    assert run(*options).code == 0
+    assert channels("a.exr") == expected and new_files() == {"a.exr"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", [(), ("--target-error", "1e-4")], ids=["spp", "target-error"])
+def test_twenty_kills_at_random_moments(extra: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "RENDER", (*RENDER, *extra))
+    expected, start, traced = whole_render()
+    rng = random.Random(20)
+    options = (*RENDER, "--checkpoint", "0.5s", "--resume")
+    losses, files, resumed, early = [], 0, 0, 0
+    for i in range(20):
+        lines = killed_after(rng.uniform(0.0, start + traced), *options)
+        losses.append(lost_seconds(lines))
+        files += len(new_files())
+        early += not any(line.startswith("trace ") for line in lines)
+        if Path("a.exr").exists():
+            assert channels("a.exr") == expected, i  # done before the kill
+        result = run(*options, "--json")
+        assert result.code == 0 and channels("a.exr") == expected and new_files() == {"a.exr"}, i
+        resumed += json.loads(result.out)["resumed"] is not None
+        Path("a.exr").unlink()
+    print(f"20 kills ({early} before tracing, {resumed} with a checkpoint), {files} files, all readable; 20 resumes, bit-identical")
+    print(f"interval 0.5 s: seconds of tracing lost, largest {max(losses):.2f}, mean {np.mean(losses):.2f}; in one go {traced:.1f}")
+    assert resumed >= 5 and early >= 1 and max(losses) < 0.5 + 0.5
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+def test_a_finished_render_leaves_no_checkpoint() -> None:
+    plain = run("render", "box.obj", *SMALL, "-o", "a.exr")
+    assert plain.code == 0
+    result = run("render", "box.obj", *SMALL, "-o", "b.exr", "--checkpoint", "60s")
+    assert (result.code, result.out) == (0, "b.exr\n") and new_files() == {"a.exr", "b.exr"} and "--resume" not in result.err
+    assert channels("a.exr") == channels("b.exr")
+
+
+def test_time_limits_and_resumes(folder: Path) -> None:
+    options = ("render", "box.obj", "--size", "64x36", "--time-limit", "0.2s", "-o", "a.exr", "--checkpoint-file", "b")
+    first = run(*options, "--spp", 1 << 20)
+    assert first.code == 0 and f"{folder.resolve() / 'b'}: go on from it with --resume" in first.err
+    assert new_files() == {"a.exr", "b"}
+    before = int(read_channels("a.exr")["samples"].max())
+    again = run(*options, "--spp", 1 << 20, "--resume")
+    assert again.code == 0 and f"{before} of them from the checkpoint" in again.err
+    after = read_channels("a.exr")["samples"]
+    assert before < after.min() == after.max()
+    whole = run("render", "box.obj", "--size", "64x36", "--spp", int(after.max()), "-o", "c.exr")
+    assert whole.code == 0 and channels("a.exr") == channels("c.exr")
+
+
+def test_resume_without_a_checkpoint_says_that_it_begins() -> None:
+    result = run("render", "box.obj", *SMALL, "--resume")
+    assert result.code == 0 and "box.png.checkpoint: no checkpoint yet, rendering from the beginning\n" in result.err
+    assert run("render", "box.obj", *SMALL, "--resume", "-q").err == ""
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["--checkpoint", "soon"], "write 30s, 5m or 1h"), (["--checkpoint", "0s"], "checkpoint_every must be more than 0"),
+    (["--checkpoint-file", "./a.png"], "a.png: is the picture; a checkpoint needs a file of its own"),
+    (["--checkpoint-file", "nowhere/c"], "nowhere/c: its folder does not exist"),
+    (["--checkpoint-file", "box.obj"], "box.obj: is there already: resume it (--resume"),
+    (["--checkpoint-file", "box.obj", "--resume"], "box.obj: is no checkpoint of this version"),
+])
+def test_what_is_refused_before_the_work(arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("the work began"))
+    result = run("render", "box.obj", *SMALL, "-o", "a.png", *arguments)
+    assert result.code == 2 and message in result.err and result.out == "" and new_files() == set()
+    assert "error: box.obj: /" not in result.err  # the scene has no part in it
+    assert Path("box.obj").read_text() == BOX_OBJ
+
+
+# --- a place for the picture ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures can be written below tmp/ and roomy/ only: the disk fills up while a render runs."""
+    (folder / "roomy").mkdir()
+    save = film.Film.save
+
+    def failing(self: film.Film, path: Any, **options: Any) -> list[Path]:
+        if Path(path).resolve().parent == folder.resolve():
+            raise InputError("cannot be written: No space left on device", path)
+        return save(self, path, **options)
+
+    monkeypatch.setattr(film.Film, "save", failing)
+
+
+@pytest.mark.usefixtures("full")
+def test_a_picture_that_cannot_be_written_is_kept_elsewhere() -> None:
+    result = run("render", "box.obj", *SMALL, "-o", "a.exr", "--aov", "depth", "--checkpoint", "60s")
+    place = Path(result.out.strip())
+    assert result.code == 2 and place.parent.parent == Path("tmp").resolve() and place.name == "a.exr"
+    error = f"error: a.exr: cannot be written: No space left on device; the picture was written to {place} instead"
+    assert result.errors == [error]
+    assert {"R", "depth.Z"} <= read_channels(str(place)).keys() and place.parent.stat().st_mode & 0o077 == 0
+    assert new_files() == {"roomy", "a.exr.checkpoint"} and read("a.exr.checkpoint").samples == (4, 4)  # it can still be resumed
+
+
+@pytest.mark.usefixtures("full")
+def test_the_home_folder_is_the_last_resort(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(folder / "roomy"))
+    monkeypatch.setattr("tempfile.tempdir", str(folder / "nowhere"))
+    result = run("render", "box.obj", *SMALL)
+    assert result.code == 2 and Path(result.out.strip()).parent.parent == folder / "roomy"
+    monkeypatch.setenv("HOME", str(folder / "nowhere"))
+    result = run("render", "box.obj", *SMALL)
+    assert result.code == 2 and result.out == "" and result.errors == ["error: box.png: cannot be written: No space left on device"]
+
+
+@pytest.mark.usefixtures("full")
+def test_on_a_terminal_another_place_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = iter(["b.png", "roomy/c.png"])
+    asked = []
+    monkeypatch.setattr(cli_save, "_at_a_terminal", lambda: True)
+    monkeypatch.setattr("click.prompt", lambda text, **options: asked.append(text) or next(answers))
+    result = run("render", "box.obj", *SMALL, "-o", "a.png")
+    assert (result.code, result.out) == (0, "roomy/c.png\n") and len(asked) == 2
+    assert [line.split(":")[1].strip() for line in result.errors] == ["a.png", "b.png"]
+    assert read_image("roomy/c.png").shape == (18, 32, 3)
+
+
+@pytest.mark.usefixtures("full")
+@pytest.mark.parametrize("answer", ["", KeyboardInterrupt])
+def test_no_answer_is_no_loss(answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def prompt(text: str, **options: Any) -> str:
+        if answer == "":
+            return ""
+        raise answer
+
+    monkeypatch.setattr(cli_save, "_at_a_terminal", lambda: True)
+    monkeypatch.setattr("click.prompt", prompt)
+    result = run("render", "box.obj", *SMALL, "-o", "a.png")
+    assert result.code == 2 and Path(result.out.strip()).parent.parent == Path("tmp").resolve()
+
+
+def test_a_disk_without_room_for_the_picture_is_told_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("the work began"))
+    usage = cli_save.shutil.disk_usage(".")
+    monkeypatch.setattr("shutil.disk_usage", lambda path: usage._replace(free=100_000))
+    result = run("render", "box.obj", "--size", "640x480", "-o", "a.exr")
+    assert result.code == 2 and len(result.errors) == 1 and new_files() == set()
+    assert "a.exr: cannot be written: its disk has 0.1 MiB left, and a picture of 640x480 takes 0.9 or more" in result.err
