@@ -345,7 +345,13 @@ class Renderer:
             return
         total = area * self.expected_spp * self.groups
         note = "" if self.checkpoint is None else self.checkpoint.problem
-        self.options.progress(Progress(done * self.groups, total, self.film.rays, self._seconds(), note=note))
+        rays, seconds = self.film.rays, self._seconds()
+        self.options.progress(Progress(done * self.groups, total, rays, seconds, note=note, picture=self._picture))
+
+    def _picture(self) -> Film:
+        """What there is so far."""
+        settings = self.scene.settings
+        return Film(*self.film.pixels_and_variance(), self.film.samples(), exposure=settings.exposure, tonemap=settings.tonemap)
 
     def _aovs(self) -> dict[str, np.ndarray]:
         width, height = self.scene.settings.size

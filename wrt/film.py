@@ -47,6 +47,7 @@ class Film:
         "material_id" (H, W) int32: index into `scene.materials`; -1 on a miss.
     stats: counts and seconds of the render. metadata: what a file says about it (scene, spp, seed, seconds, version).
     exposure (stops) and tonemap (a name in wrt.tonemap.TONEMAPS): how it wants to be shown.
+    np.asarray(film), `from_dlpack(film)` of any library, film.numpy() and film.warp() are the pixels, not a copy of them.
     """
 
     pixels: np.ndarray
@@ -83,6 +84,27 @@ class Film:
     def to_srgb8(self) -> np.ndarray:
         """As shown: exposed, tone-mapped, sRGB-encoded, (H, W, 3) uint8; NaN is black."""
         return to_codes(self.pixels, self.exposure, self.tonemap)
+
+    def numpy(self) -> np.ndarray:
+        """The pixels themselves, (H, W, 3) float32."""
+        return self.pixels
+
+    def warp(self) -> Any:
+        """The pixels as a Warp array, (H, W) vec3, of the same memory."""
+        import warp as wp
+
+        from wrt.exchange import to_warp
+
+        return to_warp(self.pixels, wp.vec3)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.pixels, dtype=dtype, copy=copy)
+
+    def __dlpack__(self, **options: Any) -> Any:
+        return self.pixels.__dlpack__(**options)
+
+    def __dlpack_device__(self) -> Any:
+        return self.pixels.__dlpack_device__()
 
     def _repr_png_(self) -> bytes:
         return encode_png(self.to_srgb8(), self.metadata)

@@ -15,6 +15,7 @@ import numpy as np
 from wrt.arguments import LARGEST, as_array, as_path
 from wrt.errors import InputError, SceneWarning
 from wrt.mesh_clean import clean
+from wrt.tables import html_facts
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +91,15 @@ class Mesh:
         if len(self.vertices):
             parts.append(f"from {_corner(self.vertices.min(axis=0))} to {_corner(self.vertices.max(axis=0))}")
         return f"Mesh({', '.join(parts)})"
+
+    def _repr_html_(self) -> str:
+        facts: dict[str, object] = {"vertices": len(self.vertices), "faces": len(self.faces)}
+        facts |= {name: "yes" if getattr(self, name) is not None else "no" for name in ("normals", "uvs")}
+        facts |= {"groups": ", ".join(self.groups)} if self.groups else {}
+        facts |= {"faces without area, left out": self.dropped} if self.dropped else {}
+        if len(self.vertices):
+            facts |= {"from": _corner(self.vertices.min(axis=0)), "to": _corner(self.vertices.max(axis=0))}
+        return html_facts(f"Mesh {self.name}", facts)
 
 
 def _corner(point: np.ndarray) -> str:

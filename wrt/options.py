@@ -15,6 +15,7 @@ from wrt.accel.base import check_units
 from wrt.arguments import as_integer, as_names, as_one, as_path, as_tuple, shown
 from wrt.device import start, thread_count
 from wrt.errors import InputError
+from wrt.film import Film
 from wrt.scene import Camera
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
@@ -27,7 +28,8 @@ class Progress:
 
     Of a resumed render, what was done before counts in all four. stage: "trace"; or before anything is traced, where that takes
     longer than driver.PREPARING_TOLD: "compile", once, or "build", with done of total steps of a structure that is slow to build.
-    note: what goes wrong meanwhile; "" is nothing.
+    note: what goes wrong meanwhile; "" is nothing. picture: makes a Film of what there is (pixels, variance, samples), while
+    it is traced; tiles that run are half done in it.
     """
 
     done: int
@@ -36,6 +38,7 @@ class Progress:
     seconds: float
     stage: str = "trace"
     note: str = ""
+    picture: Callable[[], Film] | None = field(default=None, compare=False, repr=False)
 
     @property
     def rays_per_second(self) -> float:

@@ -23,6 +23,7 @@ from wrt.kernels.counters import SIZE_RANGE, Counts, Recorder
 from wrt.mesh import Mesh
 from wrt.scene import SETTINGS, Scene
 from wrt.scene_file import as_scene
+from wrt.tables import html_table
 from wrt.tiles import Rectangle, Work
 
 KINDS = ("primary", "reflection", "refraction", "straight", "shadow")
@@ -91,6 +92,10 @@ class Profile:
 
     def __repr__(self) -> str:
         return f"Profile({self.scene!r}, {self.size[0]}x{self.size[1]}, {self.spp} spp, {len(self.rays)} rays)"
+
+    def _repr_html_(self) -> str:
+        rows = self.by_depth()
+        return html_table(repr(self), tuple(rows[0]) if rows else (), [tuple(row.values()) for row in rows])
 
     @cached_property
     def maps(self) -> dict[str, np.ndarray]:

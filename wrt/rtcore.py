@@ -20,6 +20,7 @@ from wrt.cache_sim import LINE, Level1, Misses, Warps, first_level, second_level
 from wrt.errors import InputError
 from wrt.rtcore_parameters import BASE, SWEEPS, Core, Gpu
 from wrt.simt import WARP, by_coherence, efficiency, longest_of, packed
+from wrt.tables import html_table
 
 TERMS = ("box", "triangle", "L1", "L2", "DRAM", "latency")
 
@@ -71,6 +72,12 @@ class Prediction:
     gpu: Gpu
     core: Core
     terms: dict[str, float]
+
+    def _repr_html_(self) -> str:
+        busy = self.utilisation
+        rows = [(name, value, f"{busy[name]:.0%}") for name, value in self.terms.items()]
+        title = f"{self.work} on {self.gpu.name}: {self.rays_per_second / 1e9:.3g} Gray/s, bound by {self.bottleneck}"
+        return html_table(title, ("part", "clocks a ray", "busy"), rows)
 
     @property
     def clocks(self) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 from wrt.arguments import LARGEST, as_array, as_integer, as_one, as_size, as_tuple, at_thing, unknown
 from wrt.errors import InputError
 from wrt.mesh import Mesh
+from wrt.tables import html_facts, html_table
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
@@ -546,6 +547,20 @@ class Scene:
             low, high = ("({})".format(", ".join(f"{value:.4g}" for value in corner)) for corner in self.bounds())
             parts.append(f"from {low} to {high}")
         return f"Scene({', '.join([repr(self.name)] * bool(self.name) + parts)})"
+
+    def _repr_html_(self) -> str:
+        things = [(thing.name, "mesh", len(thing.mesh.faces), ", ".join(m.name or m.kind for m in thing.materials))
+                  for thing in self.objects]
+        things += [(sphere.name, "sphere", 1, sphere.material.name or sphere.material.kind) for sphere in self.spheres]
+        lights = [(light.name, type(light).__name__) for light in self.lights]
+        lights += [(m.name, "emissive material") for m in self.materials if m.lights_others]
+        lights.append(("", type(self.background).__name__))
+        cameras = [(each.name, f"{math.degrees(each.fov_y):.4g} degrees high", each.aperture_radius) for each in self.cameras]
+        settings = {each.name: getattr(self.settings, each.name) for each in fields(Settings)}
+        settings["size"] = f"{self.settings.size[0]}x{self.settings.size[1]}"
+        return html_table(repr(self), ("shape", "kind", "primitives", "materials"), things) + html_table(
+            "", ("light", "kind"), lights) + html_table("", ("camera", "angle of view", "aperture radius"), cameras) + html_facts(
+            "Settings", settings)
 
     @property
     def materials(self) -> tuple[Material, ...]:

@@ -128,8 +128,8 @@ def test_kills_lose_little_and_change_nothing() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("extra", [(), ("--target-error", "1e-4")], ids=["spp", "target-error"])
-def test_twenty_kills_at_random_moments(extra: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("extra", [("--spp", 1600), ("--spp", 1600, "--target-error", 1e-5)], ids=["spp", "target-error"])
+def test_twenty_kills_at_random_moments(extra: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules[__name__], "RENDER", (*RENDER, *extra))
     expected, start, traced = whole_render()
     rng = random.Random(20)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import time
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from hashlib import sha256
 from inspect import signature
@@ -17,6 +18,7 @@ import warp as wp
 from wrt.accel.triangle_data import TRIANGLE_DATA
 from wrt.device import load_kernel, records, run_all, start, thread_count, upload
 from wrt.errors import InputError
+from wrt.exchange import taken, to_numpy, to_warp
 from wrt.kernels.counters import SIZE_RANGE, Counts, Recorder
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
 from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT, RAY_AABB
@@ -24,6 +26,7 @@ from wrt.kernels.ray_triangle import RAY_TRIANGLE
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse import Units
 from wrt.mesh import Mesh
+from wrt.tables import html_facts, html_table
 
 RAYS_PER_LAUNCH = 16384
 # By the annotations of _build.
@@ -101,6 +104,9 @@ class AccelStats:
     bytes: int
     sah_cost: float
 
+    def _repr_html_(self) -> str:
+        return html_facts("Structure", asdict(self))
+
 
 @dataclass(frozen=True, eq=False)
 class Built:
@@ -130,6 +136,9 @@ class Refit:
     growth: float
     rebuilt: bool
 
+    def _repr_html_(self) -> str:
+        return html_facts("Refit", asdict(self))
+
 
 @dataclass(frozen=True, eq=False)
 class Counters:
@@ -150,6 +159,12 @@ class Counters:
         means = ", ".join(f"{name} {self.counts[name].mean():.2f}" for name in self.counts.dtype.names or ())
         return f"Counters({len(self.counts)} rays; a ray: {means})" if len(self.counts) else "Counters(0 rays)"
 
+    def _repr_html_(self) -> str:
+        names = (self.counts.dtype.names or ()) if len(self.counts) else ()
+        rows = [(name, float(self.counts[name].mean()), int(self.counts[name].max()), int(self.counts[name].sum(dtype=np.int64)))
+                for name in names]
+        return html_table(f"Counters of {len(self.counts)} rays", ("", "a ray", "largest", "sum"), rows)
+
 
 @dataclass(frozen=True, eq=False)
 class Hits:
@@ -168,6 +183,25 @@ class Hits:
 
     def __repr__(self) -> str:
         return f"Hits({len(self)} rays)"
+
+    def _repr_html_(self) -> str:
+        hits = self.numpy()
+        t = hits.t[hits.prim_id >= 0]
+        facts: dict[str, Any] = {"rays": len(self), "hits": len(t), "misses": len(self) - len(t)}
+        if len(t):
+            facts |= {"nearest t": float(t.min()), "farthest t": float(t.max())}
+        return html_facts("Hits", facts) + (self.counters._repr_html_() if self.counters else "")
+
+    def numpy(self) -> Hits:
+        """The same with NumPy arrays; of hits on the CPU they share the memory."""
+        return self._each(to_numpy)
+
+    def warp(self) -> Hits:
+        """The same with Warp arrays; of hits on the CPU they share the memory."""
+        return self._each(to_warp)
+
+    def _each(self, convert: Callable[[Any], Any]) -> Hits:
+        return replace(self, **{name: convert(getattr(self, name)) for name in ("t", "u", "v", "prim_id")})
 
 
 def check_units(triangle: str, box: str) -> None:
@@ -320,6 +354,11 @@ class Accelerator(ABC):
         return (f"{type(self).__name__}({len(self.geometry)} primitives, {s.nodes} nodes, depth {s.depth}, "
                 f"{s.bytes / 1e6:.1f} MB, SAH {s.sah_cost:.1f}, built in {s.build_seconds:.3f} s)")
 
+    def _repr_html_(self) -> str:
+        units = self.structure.units
+        return html_facts(type(self).__name__, {"primitives": len(self.geometry), "triangle test": units.triangle,
+                                                "box test": units.box, "device": str(self.device), **asdict(self.stats)})
+
     def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                     threads: int | None = None, *, counters: bool = False, trace: bool = False) -> Hits:
         """The closest hit of each ray in the closed segment [t_min, t_max]; at equal t the lowest prim_id.
@@ -388,6 +427,7 @@ class Accelerator(ABC):
         run_all([job(first) for first in range(0, n, RAYS_PER_LAUNCH)], thread_count(threads))
 
     def _rays(self, origins: Any, directions: Any, t_min: Any, t_max: Any) -> tuple[RayArrays, bool]:
+        origins, directions = taken(origins, "origins"), taken(directions, "directions")
         as_warp = isinstance(origins, wp.array) or isinstance(directions, wp.array)
         rays = RayArrays()
         if as_warp:

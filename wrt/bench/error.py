@@ -27,6 +27,7 @@ from wrt.film import Film
 from wrt.kernels.ray_aabb import RAY_AABB
 from wrt.kernels.ray_triangle import RAY_TRIANGLE
 from wrt.scene import SAMPLERS, Scene
+from wrt.tables import html_table
 
 REFERENCE_SEEDS = 8
 REFERENCE_DEPTH, REFERENCE_THROUGHPUT = 32, 1e-5
@@ -301,6 +302,12 @@ class Sweep:
             if row.variant.knob:
                 same[row.variant.label] = same.get(row.variant.label, True) and row.digest == base.get(row.spp)
         return [label for label, equal in same.items() if equal]
+
+    def _repr_html_(self) -> str:
+        from wrt.bench.error_report import COLUMNS, SLOPE_COLUMNS, cells, slope_cells
+
+        return html_table(f"Speed against error: {self.scene}", COLUMNS, map(cells, self.rows)) + html_table(
+            "How fast the error falls", SLOPE_COLUMNS, map(slope_cells, self.slopes))
 
     def as_dict(self) -> dict[str, Any]:
         return {"scene": self.scene, "size": list(self.size), "repeats": self.repeats, "seed": self.seed,

@@ -23,6 +23,7 @@ from wrt.kernels.query import HitList, RayArrays, Respawn, make_all_hits_kernel,
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.surface import make_surface_at
 from wrt.kernels.traverse import Units
+from wrt.tables import html_table
 
 ALL_HITS_TESTS = 20_000_000  # ray-primitive tests that a case's all-hits check may take
 ALL_HITS_RAYS = 2000
@@ -84,6 +85,11 @@ class Result:
     speeds: dict[str, Speed] = field(default_factory=dict)
     missing: tuple[str, ...] = ()
     seconds: float = 0.0
+
+    def _repr_html_(self) -> str:
+        from wrt.bench.stability_report import COLUMNS, cells
+
+        return html_table("Stability", COLUMNS, map(cells, self.rows))
 
     def as_dict(self) -> dict[str, Any]:
         return {"seconds": self.seconds, "not_installed": self.missing,

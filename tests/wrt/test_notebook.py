@@ -1,0 +1,209 @@
+"""What a notebook shows: pictures in place while they are rendered, and tables of what things are."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import signal
+import sys
+import types
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import wrt
+from tests.wrt.test_checkpoint import SCENE
+from wrt.accel.base import AccelStats, Refit
+from wrt.errors import InputError
+from wrt.notebook import LiveView
+from wrt.options import Progress
+from wrt.scene import Material, Object, Scene, Sphere
+from wrt.shapes import box, quad
+from wrt.tables import SHOWN_ROWS, html_facts, html_table, number
+
+# --- the picture so far -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, str]]]:
+    """All that was displayed: how ("new" or "update"), and the page. Stands in for IPython, installed or not."""
+    pages: list[tuple[str, str]] = []
+
+    class Handle:
+        def update(self, page: Any) -> None:
+            pages.append(("update", page))
+
+    def display(page: Any, *, display_id: bool) -> Handle:
+        assert display_id
+        pages.append(("new", page))
+        return Handle()
+
+    module = types.ModuleType("IPython.display")
+    module.HTML, module.display = str, display  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
+    monkeypatch.setitem(sys.modules, "IPython.display", module)
+    yield pages
+
+
+def picture_of(page: str) -> np.ndarray:
+    data = re.search(r'src="data:image/png;base64,([^"]+)"', page)
+    assert data is not None, page[:200]
+    with Image.open(io.BytesIO(base64.b64decode(data[1]))) as image:
+        return np.asarray(image)
+
+
+def test_a_render_is_shown_in_place_and_finished_in_the_end(shown: list[tuple[str, str]]) -> None:
+    film = wrt.render(SCENE, spp=8, progress=LiveView(every=0.0))
+    assert [how for how, _ in shown] == ["new"] + ["update"] * (len(shown) - 1) and len(shown) >= 1
+    assert np.array_equal(picture_of(shown[-1][1]), film.to_srgb8()) and "100%" in shown[-1][1]
+
+
+def test_an_interrupt_keeps_what_there_is(shown: list[tuple[str, str]]) -> None:
+    view = LiveView(every=0.0)
+
+    def progress(p: Progress) -> None:
+        view(p)
+        if p.done > 0:
+            signal.raise_signal(signal.SIGINT)  # what a notebook's stop button sends
+
+    film = wrt.render(SCENE, spp=1 << 20, progress=progress)
+    assert film.stats["interrupted"] and 0 < film.samples.max() < 1 << 20
+    assert picture_of(shown[-1][1]).shape == (34, 61, 3) and film._repr_png_().startswith(b"\x89PNG")
+
+
+def test_showing_leaves_time_for_rendering(shown: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+
+    def show(self: LiveView, progress: Progress) -> None:
+        nonlocal now
+        shown.append(("", ""))
+        now += 2.0  # a large picture
+
+    monkeypatch.setattr("wrt.notebook.time.monotonic", lambda: now)
+    monkeypatch.setattr(LiveView, "_show", show)
+    view = LiveView(every=0.5)
+    for _ in range(50):
+        view(Progress(1, 2, 0, 0.0))
+        now += 1.0
+    assert len(shown) == 3  # 2 of 22 seconds
+
+
+def test_before_tracing_there_is_only_text(shown: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.notebook.SHARE", 1e9)
+    view = LiveView(every=0.0)
+    view(Progress(0, 10, 0, 0.0, stage="compile"))
+    view(Progress(3, 10, 0, 1.0, stage="build"))
+    view(Progress(1, 10, 5, 1.0, note="<b>the disk is full</b>"))
+    assert all("<img" not in page for _, page in shown) and "compiling" in shown[0][1] and "30% build" in shown[1][1]
+    assert "&lt;b&gt;the disk is full" in shown[2][1]
+
+
+def test_without_a_notebook_there_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "IPython", None)
+    monkeypatch.setitem(sys.modules, "IPython.display", None)
+    with pytest.raises(InputError, match="IPython is not installed"):
+        LiveView()
+
+
+def test_the_picture_in_progress_is_that_of_the_samples_so_far() -> None:
+    taken = []
+
+    def progress(p: Progress) -> None:
+        assert p.picture is not None
+        film = p.picture()
+        if int(film.samples.min()) == int(film.samples.max()) == p.done / film.samples.size:  # no tile is running
+            taken.append(film)
+
+    wrt.render(SCENE, spp=2, progress=progress)
+    assert taken and np.array_equal(taken[-1].pixels, wrt.render(SCENE, spp=int(taken[-1].samples.max())).pixels)
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+class Tables(HTMLParser):
+    """The text of all cells, row by row; fails on a tag that no table of ours has."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.rows: list[list[str]] = []
+        self.open: list[str] = []
+        self.feed(page)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        assert tag in ("b", "table", "tr", "td", "th", "p") and dict(attrs).keys() <= {"style"}
+        self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] in ("td", "th"):
+            self.rows[-1][-1] += data
+
+
+EVIL = "<script>alert('\"&')</script>"
+
+
+def test_nothing_in_a_table_is_markup() -> None:
+    assert Tables(html_table(EVIL, (EVIL,), [(EVIL,), (1,)])).rows == [[EVIL], [EVIL], ["1"]]
+    material = Material(name=EVIL, emission=(1.0, 1.0, 1.0))
+    mesh = wrt.Mesh(box().vertices, box().faces, groups=(EVIL,), name=EVIL)
+    scene = Scene(objects=(Object(mesh, (material,), name=EVIL),), spheres=(Sphere((0, 0, 0), 1.0, material, name=EVIL),),
+                  cameras=SCENE.cameras, name=EVIL)
+    rows = Tables(scene._repr_html_()).rows
+    assert [EVIL, "mesh", "12", EVIL] in rows and [EVIL, "sphere", "1", EVIL] in rows and [EVIL, "emissive material"] in rows
+    assert ["groups", EVIL] in Tables(mesh._repr_html_()).rows
+
+
+def test_numbers_and_long_tables() -> None:
+    assert [number(x) for x in (1234567, 0.123456, np.float32(2.5), np.int64(4000), True, "a", None, float("nan"))] == [
+        "1,234,567", "0.1235", "2.5", "4,000", "True", "a", "None", "nan"]
+    page = html_table("", ("i",), ((i,) for i in range(SHOWN_ROWS + 7)))
+    assert len(Tables(page).rows) == SHOWN_ROWS + 1 and "and 7 more" in page
+    assert Tables(html_facts("t", {"a": 1.5, "b": "x"})).rows == [["a", "1.5"], ["b", "x"]]
+
+
+def test_a_structure_and_what_it_found_as_tables() -> None:
+    accel = wrt.build(box(), "bvh")
+    rows = dict(row for row in Tables(accel._repr_html_()).rows if len(row) == 2)
+    assert rows.items() >= {"primitives": "12", "nodes": str(accel.stats.nodes), "triangle test": "watertight"}.items()
+    assert ["nodes", str(accel.stats.nodes)] in Tables(accel.stats._repr_html_()).rows
+    directions = np.array([(0, 0, -1), (0, 0, 1), (0, 1, 0)], np.float32)
+    hits = accel.closest_hit(np.full((3, 3), (0.1, 0.2, 5.0), np.float32), directions, counters=True)
+    rows3 = Tables(hits._repr_html_()).rows
+    assert ["rays", "3"] in rows3 and ["hits", "1"] in rows3 and ["misses", "2"] in rows3 and ["nearest t", "4.5"] in rows3
+    assert hits.counters is not None
+    nodes = hits.counters.counts["nodes"]
+    assert ["nodes", number(float(nodes.mean())), str(nodes.max()), str(nodes.sum())] in rows3
+    empty = accel.closest_hit(np.zeros((0, 3)), np.zeros((0, 3)), counters=True)
+    assert ["rays", "0"] in Tables(empty._repr_html_()).rows
+    assert ["growth", "1.5"] in Tables(Refit(0.1, 1.5, False)._repr_html_()).rows
+    assert len(Tables(AccelStats(0.0, 1, 1, 1, 1, 1, float("nan"))._repr_html_()).rows) == 7
+
+
+def test_every_shipped_kind_of_scene_has_a_table() -> None:
+    rows = Tables(SCENE._repr_html_()).rows
+    assert ["spp", "24"] in rows and ["size", "61x34"] in rows and ["", "GradientBackground"] in rows
+    assert Tables(Scene()._repr_html_()).rows and Tables(quad((0, 0, 0), (1, 0, 0), (0, 1, 0))._repr_html_()).rows
+
+
+def test_reports_are_tables() -> None:
+    from wrt.bench import stability
+    from wrt.profiler import profile
+
+    result = stability.Result(rows=[stability.Row("A_case", EVIL)])
+    assert Tables(result._repr_html_()).rows[1][:2] == ["A_case", EVIL]
+    rows = Tables(profile(SCENE, size=(16, 9), spp=1)._repr_html_()).rows
+    assert rows[0][:2] == ["depth", "kind"] and rows[1][1] == "primary"
