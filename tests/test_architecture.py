@@ -55,7 +55,7 @@ def test_units_come_before_traversals_before_the_integrator() -> None:
     layers = [("structs",), ("ray_", "sampling", "camera"), ("counters", "lanes", "wide_nodes", "triangle_cell", "cell_ray"),
               ("textures", "surface", "materials", "traverse", "lights"),
               ("shadows", "whitted", "query", "build_", "refit_", "cache_lru", "end_point_overlap", "peers"),
-              ("render", "rasterize", "primary_rays")]
+              ("render", "rasterize", "primary_rays", "unit_probes")]
 
     def layer(name: str) -> int:
         return next(i for i, starts in enumerate(layers) if name.startswith(starts))

@@ -1,4 +1,4 @@
-"""`python -m wrt profile`: what a picture costs, ray by ray, and what a model of the RT core makes of it."""
+"""Commands of the model of the RT core: `profile`, `bench rtcore`, `bench instructions`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import Crop, Size, load, naming, say_json, warnings_told
+from wrt.cli_bench import bench
+from wrt.cli_common import Crop, Names, Size, load, naming, say, say_json, warnings_told
 from wrt.errors import InputError
 
 
@@ -48,3 +49,65 @@ def profile(scene: Path, output: Path | None, gpu: str, quiet: bool, as_json: bo
     click.echo(text)
     for path in paths:
         click.echo(path)
+
+
+def check_report(output: Path | None) -> None:
+    """Raise InputError where a Markdown file cannot be written there, before any work is done for it."""
+    if output is not None and (output.suffix.lower() != ".md" or not output.parent.is_dir()):
+        raise InputError("the report is a .md file in a folder that is there", output)
+
+
+@bench.command()
+@click.argument("meshes", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--structures", type=Names(), default=(), help="Which, by name  [default: every BVH]")
+@click.option("--kinds", type=Names(), default=("primary", "diffuse"), help="Of rays: primary, shadow, diffuse, random")
+@click.option("--rays", type=int, default=2**16, show_default=True, help="Rays of each kind")
+@click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
+@click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the tables as Markdown (.md)")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def rtcore(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+    """The model of the RT core on MESHES: what limits it, rays a second as ranges, and which assumption moves them most."""
+    from wrt.bench import rtcore as bench_rtcore
+    from wrt.bench.rtcore_report import LEGEND, cells, parameter_table
+
+    plan = bench_rtcore.Plan(meshes, **options)
+    check_report(output)
+
+    def told(row: Any) -> None:
+        if not quiet:
+            say("  ".join((row.mesh, row.structure, *cells(row.row))))
+
+    with warnings_told(quiet):
+        rows = bench_rtcore.run(plan, told)
+    text = f"{bench_rtcore.markdown(rows)}\n{LEGEND}\n\n{parameter_table()}"
+    if output is not None:
+        output.write_text(f"{text}\n", encoding="utf-8")
+    if as_json:
+        say_json({"rows": [{"mesh": row.mesh, "triangles": row.triangles, "structure": row.structure, "bytes": row.bytes,
+                            **row.row.as_dict()} for row in rows], "output": output})
+        return
+    click.echo(text)
+
+
+@bench.command()
+@click.option("--structures", type=Names(), default=("bvh2",), show_default=True, help="Closest-hit kernels to look at, by name")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def instructions(structures: tuple[str, ...], as_json: bool) -> None:
+    """The units in machine code for Turing: instructions of each box and triangle test; registers and code of traversals."""
+    from wrt.accel import ACCELERATORS
+    from wrt.bench import instructions as bench_instructions
+
+    for name in structures:
+        if name not in ACCELERATORS:
+            raise InputError(f"no structure {name!r}; there is {', '.join(ACCELERATORS)}")
+    units, codes = bench_instructions.units(), bench_instructions.traversals(structures)
+    if as_json:
+        say_json({"units": [{"unit": each.unit, "test": each.test, "instructions": each.instructions, **each.classes}
+                            for each in units],
+                  "traversals": {name: {"registers": code.registers, "stack": code.stack, "code_bytes": len(code.code),
+                                        **code.classes()} for name, code in codes.items()}})
+        return
+    click.echo(f"{bench_instructions.unit_table(units)}\n\n{bench_instructions.traversal_table(codes)}\n\n"
+               f"{bench_instructions.SOFTWARE_LEGEND}")

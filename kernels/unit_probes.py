@@ -1,0 +1,69 @@
+"""Kernels that hold one unit a number of times and little else: what a unit is in machine code is the difference between two."""
+
+from functools import cache
+
+import warp as wp
+
+from wrt.kernels.ray_aabb import RAY_AABB, BoxRay
+from wrt.kernels.ray_triangle import RAY_TRIANGLE, TriangleRay
+from wrt.kernels.structs import Ray, kernel
+
+
+@wp.struct
+class ProbeRay:
+    """A ray with the set-up of both units."""
+
+    ray: Ray
+    box: BoxRay
+    triangle: TriangleRay
+
+
+@cache
+def make_box_probe(test, count):
+    """`count` box tests by RAY_AABB[test], whose results are added up; without a test (None), the six planes are."""
+    unit = RAY_AABB[test] if test is not None else None
+
+    @kernel
+    def box_probe(rays: wp.array(dtype=ProbeRay), lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3),
+                  out: wp.array(dtype=wp.float32)):
+        i = wp.tid()
+        ray = rays[i]
+        total = float(0.0)
+        for j in range(wp.static(count)):
+            a = lo[wp.static(count) * i + j]
+            b = hi[wp.static(count) * i + j]
+            if wp.static(unit is not None):
+                total += wp.static(unit)(ray.box, a, b, ray.ray.t_max)
+            else:
+                total += a[0] + a[1] + a[2] + b[0] + b[1] + b[2]
+        out[i] = total
+
+    return box_probe
+
+
+@cache
+def make_triangle_probe(test, count, adding=False):
+    """`count` triangle tests by RAY_TRIANGLE[test], whose t are added up; `adding`: the numbers of the record are instead."""
+    unit = RAY_TRIANGLE[test].intersect
+    record = RAY_TRIANGLE[test].record
+    planes = "a" in record.vars
+
+    @kernel
+    def triangle_probe(rays: wp.array(dtype=ProbeRay), primitives: wp.array(dtype=record), out: wp.array(dtype=wp.float32)):
+        i = wp.tid()
+        ray = rays[i]
+        total = float(0.0)
+        for j in range(wp.static(count)):
+            p = primitives[wp.static(count) * i + j]
+            if wp.static(not adding):
+                hit = wp.static(unit)(ray.box, ray.triangle, ray.ray, p)
+                total += wp.where(hit.prim_id == 0, hit.t + hit.u + hit.v, 0.0)
+            elif wp.static(planes):
+                a = p.a + p.b + p.c
+                total += a[0] + a[1] + a[2] + a[3]
+            else:
+                a = p.v0 + p.v1 + p.v2
+                total += a[0] + a[1] + a[2]
+        out[i] = total
+
+    return triangle_probe

@@ -1,0 +1,57 @@
+"""Machine code for Turing: operations are called by their names, and a unit is what it is made of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from wrt.bench.instructions import box_unit, compiled, of_one, unit_table
+from wrt.cubin import CLASSES, OPERATIONS, read_cubin
+from wrt.errors import InputError
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def floats(a: wp.array(dtype=wp.float32), b: wp.array(dtype=wp.float32), n: wp.array(dtype=wp.int32)):  # type: ignore[valid-type]
+    i = wp.tid()
+    a[i] = wp.min(a[i] * b[i], 3.0) + wp.sqrt(b[i] * 2.0 + a[i])
+    n[i] = wp.min(n[i] ^ 21, 7) + int(b[i] * 1.5)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def doubles(a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64)):  # type: ignore[valid-type]
+    i = wp.tid()
+    a[i] = wp.where(a[i] < b[i], a[i] * b[i], a[i] * a[i] + b[i]) + b[i]
+
+
+def test_operations_have_their_names() -> None:
+    single, double = compiled(floats).operations(), compiled(doubles).operations()
+    for name in ("FMUL", "FMNMX", "FADD", "FFMA", "MUFU", "LOP3", "IMNMX", "F2I", "LDG", "STG", "EXIT"):
+        assert single[name] > 0, name
+    assert not any(name.startswith("D") for name in single)
+    for name in ("DMUL", "DFMA", "DADD", "DSETP"):
+        assert double[name] > 0, name
+    assert not any(name.startswith("0x") for name in (*single, *double))
+    assert len(OPERATIONS) == sum(len(each) for each in CLASSES.values())  # no number in two classes
+
+
+def test_a_box_test_is_six_differences_and_seven_products() -> None:
+    """Six planes, each (plane - origin) * inv_dir, one product for the pad; no branch, no division, nothing in float64."""
+    unit = box_unit("conservative")
+    assert 13 <= unit.classes["fp32"] < 60 and abs(unit.instructions - unit.classes["fp32"]) < 1.0  # a move now and then
+    assert unit.classes["control"] == unit.classes["fp64"] == unit.classes["special"] == 0.0
+    assert "conservative" in unit_table([unit])
+
+
+def test_a_kernel_whose_body_stands_twice_is_refused() -> None:
+    twice = compiled(floats)
+    assert twice.operations()["STG"] > 1
+    with pytest.raises(InputError, match="cannot be told apart"):
+        of_one(twice, twice)
+
+
+def test_classes_are_of_all_instructions(tmp_path: Path) -> None:
+    (binary,) = wp.compile_aot_module(doubles.module, arch=75, module_dir=tmp_path)
+    (code,) = read_cubin(Path(binary).read_bytes()).values()
+    assert sum(code.classes().values()) == len(code.opcodes()) <= len(code.code) // 16

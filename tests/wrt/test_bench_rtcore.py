@@ -1,0 +1,56 @@
+"""`bench rtcore`: rays in the order of warps, rows that hold what was counted, and a command that prints them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.command_line import BOX_OBJ
+from tests.command_line import wrt as command
+from wrt.accel import build
+from wrt.bench.rays import ray_sets
+from wrt.bench.rtcore import Plan, bvhs, in_warps, markdown, run
+from wrt.errors import InputError
+from wrt.shapes import icosphere
+
+
+def test_rays_stand_in_blocks_of_the_picture() -> None:
+    accel = build(icosphere(3), "bvh2")
+    plain = ray_sets(accel, 32 * 32)
+    ordered = in_warps(accel, plain)
+    for kind, rays in plain.items():
+        assert sorted(map(tuple, rays.directions.tolist())) == sorted(map(tuple, ordered[kind].directions.tolist()))
+    row_of = {tuple(d): i for i, d in enumerate(plain["primary"].directions.tolist())}
+    pixels = np.array([row_of[tuple(d)] for d in ordered["primary"].directions.tolist()])
+    for warp in pixels.reshape(-1, 32):
+        y, x = np.divmod(warp, 32)
+        assert np.ptp(x) == 7 and np.ptp(y) == 3
+    spread = [np.ptp(sets["diffuse"].origins.reshape(-1, 32, 3), axis=1).mean() for sets in (plain, ordered)]
+    assert spread[1] < spread[0]  # rays of a warp start closer to each other
+
+
+def test_rows_and_command(tmp_path: Path) -> None:
+    mesh, report = tmp_path / "box.obj", tmp_path / "out.md"
+    mesh.write_text(BOX_OBJ)
+    rows = run(Plan((mesh,), ("bvh2",), ("primary",), 1024))
+    assert [(row.structure, row.row.name, row.triangles, row.row.rays) for row in rows] == [("bvh2", "primary", 12, 1024)]
+    assert rows[0].row.boxes == pytest.approx(2.0 * rows[0].row.nodes)
+    assert rows[0].row.low <= rows[0].row.prediction.rays_per_second <= rows[0].row.high
+    assert "box.obj, 12 triangles" in markdown(rows) and {"bvh2", "bvh4"} <= set(bvhs())
+    arguments = ("bench", "rtcore", str(mesh), "--structures", "bvh2", "--kinds", "primary", "--rays", "1024", "-q")
+    result = command(*arguments, "-o", str(report))
+    assert result.code == 0 and "published" in result.out and report.read_text().startswith("## box.obj")
+    told = json.loads(command(*arguments, "--json").out)["rows"][0]
+    assert told["nodes"] == rows[0].row.nodes and told["limit"] in told["clocks"]
+
+
+def test_what_there_is_not_is_refused(tmp_path: Path) -> None:
+    for wrong, words in (({"structures": ("x",)}, "no structure"), ({"kinds": ("x",)}, "no kind"), ({"gpu": "x"}, "no GPU"),
+                         ({"rays": 0}, "rays must be")):
+        with pytest.raises(InputError, match=words):
+            Plan((tmp_path / "box.obj",), **wrong)  # type: ignore[arg-type]
+    assert command("bench", "rtcore", str(tmp_path / "none.obj")).code == 2
+    assert command("bench", "rtcore", str(tmp_path / "none.obj"), "-o", str(tmp_path / "a.txt")).errors[0].count(".md") == 1

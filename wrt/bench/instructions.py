@@ -1,0 +1,108 @@
+"""The units in machine code for Turing: instructions of a box test and of a triangle test, registers and code of traversals.
+
+Read from the binary, without a GPU. The counts are static: of the code that there is, not of what a ray runs through.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from wrt.accel import ACCELERATORS, Structure
+from wrt.accel.base import closest_hit_kernel
+from wrt.bench.visibility_report import table
+from wrt.cubin import CLASSES, INSTRUCTION, KernelCode, read_cubin
+from wrt.device import start
+from wrt.errors import InputError
+from wrt.kernels.ray_aabb import RAY_AABB
+from wrt.kernels.ray_triangle import RAY_TRIANGLE
+from wrt.kernels.unit_probes import make_box_probe, make_triangle_probe
+
+ARCH = 75
+FEW, MANY = 8, 16  # so many that the compiler holds the body once, and does not unroll the loop over the grid around it
+# Additions of a kernel that only adds up what it reads, less those that one with the unit has for its own results.
+SCALAR_ADDS = {"box": 5, "watertight": 5, "moeller_trumbore": 5, "baldwin_weber": 8, "plane": 8}
+
+
+@dataclass(frozen=True)
+class UnitCode:
+    """unit: "box" or "triangle"; test: its name in the table; classes: instructions by class (cubin.CLASSES), fetching the box or
+    the record from memory and its address left out."""
+
+    unit: str
+    test: str
+    classes: dict[str, float]
+
+    @property
+    def instructions(self) -> float:
+        return sum(self.classes.values())
+
+
+def compiled(kernel: Any) -> KernelCode:
+    """The kernel's machine code for Turing."""
+    start("cpu")
+    with tempfile.TemporaryDirectory() as folder:
+        (binary,) = wp.compile_aot_module(kernel.module, arch=ARCH, module_dir=folder)
+        (code,) = read_cubin(Path(binary).read_bytes()).values()
+    return code
+
+
+def of_one(few: KernelCode, many: KernelCode) -> dict[str, float]:
+    """What one unit more adds to a kernel, by class. Raises InputError where the compiler holds the body more than once."""
+    if few.operations()["STG"] != 1 or many.operations()["STG"] != 1:
+        raise InputError("this compiler unrolls the kernels that hold the units: their instructions cannot be told apart")
+    a, b = few.classes(), many.classes()
+    return {name: (b[name] - a[name]) / (MANY - FEW) for name in (*CLASSES, "other")}
+
+
+def box_unit(test: str) -> UnitCode:
+    unit = of_one(compiled(make_box_probe(test, FEW)), compiled(make_box_probe(test, MANY)))
+    adding = of_one(compiled(make_box_probe(None, FEW)), compiled(make_box_probe(None, MANY)))
+    return UnitCode("box", test, less(unit, adding, SCALAR_ADDS["box"]))
+
+
+def triangle_unit(test: str) -> UnitCode:
+    unit = of_one(compiled(make_triangle_probe(test, FEW)), compiled(make_triangle_probe(test, MANY)))
+    adding = of_one(compiled(make_triangle_probe(test, FEW, True)), compiled(make_triangle_probe(test, MANY, True)))
+    return UnitCode("triangle", test, less(unit, adding, SCALAR_ADDS[test]))
+
+
+def less(unit: dict[str, float], adding: dict[str, float], adds: int) -> dict[str, float]:
+    """The unit without what a kernel that only reads the same numbers has too; `adds`: its own additions, which stay."""
+    return {name: unit[name] - adding[name] + (adds if name == "fp32" else 0) for name in unit}
+
+
+def units() -> list[UnitCode]:
+    """Every box test and triangle test of the tables; compiles two kernels for each, which takes half a minute."""
+    return [box_unit(test) for test in RAY_AABB] + [triangle_unit(test) for test in RAY_TRIANGLE]
+
+
+def traversals(names: Sequence[str]) -> dict[str, KernelCode]:
+    """The closest-hit kernel of each structure."""
+    return {name: compiled(closest_hit_kernel(Structure(ACCELERATORS[name]))) for name in names}
+
+
+SOFTWARE_LEGEND = """\
+Static counts of the code that there is: the watertight test refuses most triangles before its fp64 part, which comes at 1/32 of the
+rate of fp32 on Turing. Fetching the box or the triangle, the stack and the loop are left out."""
+
+
+def unit_table(rows: Sequence[UnitCode]) -> str:
+    shown = [name for name in (*CLASSES, "other") if any(abs(row.classes[name]) > 0.01 for row in rows)]
+    return table(("unit", "test", "instructions", *shown), [
+        (row.unit, row.test, f"{row.instructions:.0f}", *(f"{row.classes[name]:.0f}" for name in shown)) for row in rows])
+
+
+def traversal_table(codes: dict[str, KernelCode]) -> str:
+    rows = []
+    for name, code in codes.items():
+        classes: Counter[str] = code.classes()
+        rows.append((name, f"{code.registers}", f"{code.stack}", f"{len(code.opcodes()) * INSTRUCTION}",
+                     *(f"{classes[each]}" for each in (*CLASSES, "other"))))
+    return table(("closest hit", "registers", "stack bytes", "code bytes", *CLASSES, "other"), rows)

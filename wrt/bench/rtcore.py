@@ -1,0 +1,120 @@
+"""The model of the RT core on meshes: primary and diffuse rays through every structure, against what was published."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrt.accel import ACCELERATORS, Accelerator, Geometry, build
+from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
+from wrt.bench.rtcore_report import COLUMNS, ModelRow, cells, model_row
+from wrt.bench.visibility_report import table
+from wrt.errors import InputError
+from wrt.mesh import load_mesh
+from wrt.rtcore import Work, simt, trace_rays
+from wrt.rtcore_parameters import GPUS
+from wrt.simt import WARP, blocks
+
+
+@dataclass(frozen=True)
+class Plan:
+    """meshes: files; structures: names (none: all BVHs of the registry); kinds: of ray; rays: of each kind; gpu: a name in GPUS.
+    Raises InputError."""
+
+    meshes: Sequence[str | Path]
+    structures: Sequence[str] = ()
+    kinds: Sequence[str] = ("primary", "diffuse")
+    rays: int = 2**16
+    gpu: str = "rtx2080ti"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.rays <= 2**22:
+            raise InputError(f"rays must be 1 to {2**22}, got {self.rays}")
+        tables: tuple[tuple[str, Sequence[str], Any], ...] = (
+            ("structure", self.structures, ACCELERATORS), ("kind of ray", self.kinds, RAY_KINDS), ("GPU", [self.gpu], GPUS))
+        for what, names, known in tables:
+            for name in names:
+                if name not in known:
+                    raise InputError(f"no {what} {name!r}; there is {', '.join(known)}")
+
+    @property
+    def names(self) -> list[str]:
+        """Structures, each once."""
+        return list(dict.fromkeys(self.structures)) or bvhs()
+
+
+def bvhs() -> list[str]:
+    """Every BVH of the registry by its own name."""
+    return [name for name, cls in ACCELERATORS.items() if name == cls.name and name.startswith("bvh")]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One mesh, structure and kind of ray; row: what the model says; bytes: of the structure."""
+
+    mesh: str
+    triangles: int
+    structure: str
+    bytes: int
+    row: ModelRow
+
+
+def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
+    """The same rays in the order of warps and lanes: blocks of 8 x 4 pixels of the camera's picture; a ray that starts at a hit
+    is where its pixel is, and rays between random points stay as they are."""
+    primary = sets["primary"]
+    side = round(len(primary) ** 0.5)
+    warp, lane = blocks(side, side)
+    place = warp * WARP + lane
+    pixels = np.flatnonzero(accel.closest_hit(primary.origins, primary.directions).prim_id >= 0)
+    started = pixels[np.arange(len(primary)) * len(pixels) // len(primary)] if len(pixels) else np.arange(len(primary))
+    orders = {"primary": np.argsort(place), "random": np.arange(len(primary))}
+    starts_at_hits = np.argsort(place[started], kind="stable")
+    return {kind: rays.part(orders.get(kind, starts_at_hits)) for kind, rays in sets.items()}  # type: ignore[arg-type]
+
+
+def work_of(accel: Accelerator, rays: RaySet) -> Work:
+    """Closest hits, also of shadow rays: what any hit costs is a question of its own."""
+    return trace_rays(accel, rays.kind, rays.origins, rays.directions, t_max=rays.t_max)
+
+
+def run(plan: Plan, tell: Callable[[Row], None] = lambda row: None) -> list[Row]:
+    """Every row in turn; `tell` gets each when it is there. Raises InputError for a mesh that cannot be read."""
+    rows = []
+    for path in plan.meshes:
+        for row in _mesh_rows(plan, Path(path)):
+            tell(row)
+            rows.append(row)
+    return rows
+
+
+def _mesh_rows(plan: Plan, path: Path) -> Iterator[Row]:
+    geometry = Geometry.of(load_mesh(path))
+    if not len(geometry):
+        raise InputError("has no triangles", path)
+    sets = None
+    for name in plan.names:
+        accel = build(geometry, name)
+        sets = sets or in_warps(accel, ray_sets(accel, plan.rays, plan.seed))
+        for kind in plan.kinds:
+            rays = sets[kind]
+            work = work_of(accel, rays)
+            efficiencies = simt(work.counters.counts, work.warp, rays.origins, rays.directions)
+            yield Row(path.name, len(geometry), name, accel.stats.bytes, model_row(work, GPUS[plan.gpu], efficiencies))
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """A table for each mesh, with the structures' memory."""
+    parts = []
+    for mesh in dict.fromkeys(row.mesh for row in rows):
+        group = [row for row in rows if row.mesh == mesh]
+        lines = [(row.structure, row.row.name, f"{row.bytes / row.triangles:.0f}", *cells(row.row)[1:],
+                  *(f"{row.row.simt[name]:.0%}" for name in ("as they come", "sorted"))) for row in group]
+        columns = ("structure", "kind", "B/triangle", *COLUMNS[1:], "SIMT", "sorted")
+        parts.append(f"## {mesh}, {group[0].triangles} triangles\n\n{table(columns, lines)}\n")
+    return "\n".join(parts)
