@@ -56,16 +56,19 @@ def lines_through_box(accel: Accelerator, n: int, seed: int) -> tuple[np.ndarray
 @dataclass(frozen=True)
 class Case:
     """What a structure is asked for: options; inner: the inner nodes among what it counted; lines: those that meet its root
-    region, if that is not the box of the geometry."""
+    region, if that is not the box of the geometry; exact: whether each node's region lies in its parent's. If not, the cost is
+    only a bound: a line that meets a node and not its parent never comes there."""
 
     options: dict[str, Any] = field(default_factory=dict)
     inner: Callable[[Counters], np.ndarray] = lambda counters: counters.nodes
     lines: Callable[[Accelerator, int, int], tuple[np.ndarray, np.ndarray]] = lines_through_box
+    exact: bool = True
 
 
 # Structures that are not here are asked for as they are by default.
 CASES: dict[str, list[Case]] = {
     "brute_force": [Case(lines=lambda accel, n, seed: lines_through_box(accel, 64, seed))],  # each line takes as many steps
+    "bvh2_sphere": [Case(exact=False)],
     "bvh2": [Case({"builder": builder}) for builder in BVH_BUILDERS],
     # The SAH knows of no primitive that is not tested again.
     "grid": [Case({"mailbox": False})],
@@ -107,7 +110,8 @@ def check(geometry: Geometry, name: str, case: Case, n: int, most: float) -> Non
     told = f"SAH cost {cost:.4f}, measured {mean:.4f}, sigma {sigma:.4f} ({(mean - cost) / max(sigma, 1e-30):+.2f} sigma)"
     print(told)
     assert sigma <= most * cost, told
-    assert abs(mean - cost) <= 2.0 * sigma + 1e-6 * cost, told
+    assert mean <= cost + 2.0 * sigma + 1e-6 * cost, told
+    assert mean >= (cost - 2.0 * sigma - 1e-6 * cost if case.exact else 0.8 * cost), told
 
 
 def soup() -> Geometry:
