@@ -35,19 +35,40 @@ class Counts:
 
 @wp.struct
 class Recorder:
-    """counts: one row a Ray.slot; first, fetches: the trace of slot i begins at fetches[first[i]] (length 0: no trace)."""
+    """counts: one row a Ray.slot; first, fetches: the trace of slot i begins at fetches[first[i]] (length 0: no trace).
+    base: added to all addresses: where a structure begins that is one of several."""
 
     counts: wp.array(dtype=Counts)
     first: wp.array(dtype=wp.int64)
     fetches: wp.array(dtype=wp.int64)
+    base: wp.int64
 
 
 @wp.func
 def write_fetch(recorder: Recorder, slot: int, counts: Counts, address: wp.int64, size: int):
     """Append to the trace; `counts` are those before this fetch. The ray alone writes to its part."""
     if recorder.first.shape[0] > 0:
-        recorder.fetches[recorder.first[slot] + wp.int64(counts.nodes + counts.primitives)] = (
-            address * SIZE_RANGE + wp.int64(size))
+        before = recorder.counts[slot]  # of what the ray met before this structure
+        place = recorder.first[slot] + wp.int64(before.nodes + before.primitives + counts.nodes + counts.primitives)
+        recorder.fetches[place] = (recorder.base + address) * SIZE_RANGE + wp.int64(size)
+
+
+@wp.func
+def add_counts(recorder: Recorder, slot: int, counts: Counts):
+    """Add to the slot's row, where `stack` is the most that any has had."""
+    total = recorder.counts[slot]
+    total.probes += counts.probes
+    total.nodes += counts.nodes
+    total.boxes += counts.boxes
+    total.box_operations += counts.box_operations
+    total.primitives += counts.primitives
+    total.leaves += counts.leaves
+    total.pushes += counts.pushes
+    total.pops += counts.pops
+    total.stack = wp.max(total.stack, counts.stack)
+    total.node_bytes += counts.node_bytes
+    total.primitive_bytes += counts.primitive_bytes
+    recorder.counts[slot] = total
 
 
 def make_counters(units, node_bytes):
@@ -90,19 +111,9 @@ def make_counters(units, node_bytes):
     def finish(recorder: Recorder, ray: Ray, counts: Counts, best: Hit) -> Hit:
         """The answer to the outside, and the counts to the recorder: a miss has t = inf and prim_id = -1."""
         if wp.static(on):
-            total = recorder.counts[ray.slot]
-            total.probes += 1
-            total.nodes += counts.nodes
-            total.boxes += counts.boxes
-            total.box_operations += counts.box_operations
-            total.primitives += counts.primitives
-            total.leaves += counts.leaves
-            total.pushes += counts.pushes
-            total.pops += counts.pops
-            total.stack = wp.max(total.stack, counts.stack)
-            total.node_bytes += counts.node_bytes
-            total.primitive_bytes += counts.primitive_bytes
-            recorder.counts[ray.slot] = total
+            if wp.static(not units.instances):  # else the ray is that of the structure over all
+                counts.probes += 1
+            add_counts(recorder, ray.slot, counts)
         if best.prim_id == NO_HIT:
             best.t = float(wp.inf)
             best.prim_id = -1

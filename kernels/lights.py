@@ -7,10 +7,14 @@ from wrt.kernels.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, hash_pa
 from wrt.kernels.structs import Background, Light, Lighting, Material, Ray, Surfaces, gamma
 from wrt.kernels.surface import (
     Surface,
+    make_place_of,
     spawn_point,
     triangle_normal,
     triangle_point,
     triangle_point_error,
+    world_error,
+    world_normal,
+    world_point,
 )
 
 LIGHT_POINT = 0
@@ -138,32 +142,44 @@ def spot_falloff(light: Light, cos_angle: float) -> float:
     return ramp * ramp
 
 
-@wp.func
-def mesh_light_sample(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
+def make_mesh_light_sample(features):
     """A point on the emitters of one light, by power and then uniformly by area."""
-    chosen = search_cdf(lighting.emitter_cdf, light.first, light.count, xi[0])
-    emitter = lighting.emitters[light.first + chosen]
-    share = share_of_row(lighting.emitter_cdf, light.first, chosen)
-    left = lighting.emitter_cdf[light.first + chosen] - xi[0]
-    within = wp.clamp(1.0 - left / wp.max(share, 1.0e-30), 0.0, 0.99999994)
-    b = triangle(wp.vec2(within, xi[1]))
-    point = triangle_point(surfaces, emitter.prim_id, b[0], b[1])
-    n = triangle_normal(surfaces, emitter.prim_id)
-    material = surfaces.materials[surfaces.prim_material[emitter.prim_id]]
-    sample = LightSample()
-    way = point - s.point
-    distance2 = wp.dot(way, way)
-    sample.wi = way / wp.sqrt(wp.max(distance2, 1.0e-36))
-    cos_light = -wp.dot(sample.wi, n)
-    if material.two_sided != 0:
-        cos_light = wp.abs(cos_light)
-    if cos_light > 0.0 and distance2 > 0.0:
-        sample.weight = material.emission * (cos_light / (distance2 * emitter.pdf_area))
-    # The way ends just before the light: its own surface must not shade it.
-    error = triangle_point_error(surfaces, emitter.prim_id, b[0], b[1])
-    sample.end = spawn_point(point, error, n, s.point - point)
-    sample.area = 1
-    return sample
+    place_of = make_place_of(features.instances)
+
+    @wp.func
+    def mesh_light_sample(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
+        chosen = search_cdf(lighting.emitter_cdf, light.first, light.count, xi[0])
+        emitter = lighting.emitters[light.first + chosen]
+        share = share_of_row(lighting.emitter_cdf, light.first, chosen)
+        left = lighting.emitter_cdf[light.first + chosen] - xi[0]
+        within = wp.clamp(1.0 - left / wp.max(share, 1.0e-30), 0.0, 0.99999994)
+        b = triangle(wp.vec2(within, xi[1]))
+        place = place_of(surfaces, emitter.prim_id)
+        point = triangle_point(surfaces, place.face, b[0], b[1])
+        n = triangle_normal(surfaces, place.face)
+        error = triangle_point_error(surfaces, place.face, b[0], b[1])
+        if wp.static(features.instances):
+            instance = surfaces.instances[place.instance]
+            local = point
+            point = world_point(instance, local)
+            n = world_normal(instance, n)
+            error = world_error(instance, local, error, point)
+        material = surfaces.materials[place.material]
+        sample = LightSample()
+        way = point - s.point
+        distance2 = wp.dot(way, way)
+        sample.wi = way / wp.sqrt(wp.max(distance2, 1.0e-36))
+        cos_light = -wp.dot(sample.wi, n)
+        if material.two_sided != 0:
+            cos_light = wp.abs(cos_light)
+        if cos_light > 0.0 and distance2 > 0.0:
+            sample.weight = material.emission * (cos_light / (distance2 * emitter.pdf_area))
+        # The way ends just before the light: its own surface must not shade it.
+        sample.end = spawn_point(point, error, n, s.point - point)
+        sample.area = 1
+        return sample
+
+    return mesh_light_sample
 
 
 @wp.func
@@ -227,6 +243,7 @@ def sphere_light_sample(light: Light, s: Surface, xi: wp.vec2) -> LightSample:
 
 def make_light_sample(features):
     """One sample of one light, as seen from a surface."""
+    mesh_light_sample = make_mesh_light_sample(features)
 
     @wp.func
     def light_sample(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:

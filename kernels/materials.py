@@ -4,7 +4,7 @@ import warp as wp
 
 from wrt.kernels.sampling import PI, ggx_normal, ggx_visible_share
 from wrt.kernels.structs import Material, Surfaces
-from wrt.kernels.surface import Surface, make_surface_at
+from wrt.kernels.surface import Surface, make_place_of, make_surface_at
 from wrt.kernels.textures import make_sample_texture
 
 DIFFUSE = 0
@@ -131,16 +131,18 @@ def make_resolve(features, sample_texture):
 def make_cutout(features):
     """Cut-outs: a hit on a masked texture's clear part is none. For the traversal units, which call it at every hit."""
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
+    place_of = make_place_of(features.instances)
 
     @wp.func
     def accepts(surfaces: Surfaces, prim_id: int, u: float, v: float) -> bool:
-        m = surfaces.materials[surfaces.prim_material[prim_id]]
+        place = place_of(surfaces, prim_id)
+        m = surfaces.materials[place.material]
         if m.alpha_mode != wp.static(MASK):
             return True
         alpha = m.alpha
         if wp.static(features.textures or features.checkerboards):
             if prim_id < surfaces.n_triangles:
-                face = surfaces.faces[prim_id]
+                face = surfaces.faces[place.face]
                 uv = (1.0 - u - v) * surfaces.uvs[face[0]] + u * surfaces.uvs[face[1]] + v * surfaces.uvs[face[2]]
                 alpha = alpha * sample_texture(surfaces, m.albedo_texture, uv)[3]
         return alpha >= m.alpha_cutoff
@@ -177,7 +179,7 @@ def make_shade(features):
     """Surface and material at a hit, and the scattering there: shared by the integrator, shadow rays and AOVs."""
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
     uvs = features.textures or features.checkerboards
-    surface_at = make_surface_at(features.spheres, features.smooth, uvs, features.normal_maps)
+    surface_at = make_surface_at(features.spheres, features.smooth, uvs, features.normal_maps, features.instances)
     resolve = make_resolve(features, sample_texture)
     bump = make_bump(features, sample_texture)
 

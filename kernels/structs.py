@@ -34,7 +34,8 @@ class Ray:
     """The points origin + t * direction for t_min <= t <= t_max; direction need not be of unit length.
 
     exclude: a triangle that is not hit, because the ray starts on it (a plane is crossed once), or -1. slot: the row of the
-    counters that this ray adds to, where they are compiled in.
+    counters that this ray adds to, where they are compiled in. first_prim: what an instance adds to its primitives' numbers,
+    where there are instances.
     """
 
     origin: wp.vec3
@@ -43,6 +44,7 @@ class Ray:
     t_max: float
     exclude: int
     slot: int
+    first_prim: int
 
 
 @wp.struct
@@ -140,11 +142,35 @@ class Material:
 
 
 @wp.struct
+class Instance:
+    """A mesh in one place: the primitives from first_prim up to the next instance's.
+
+    first_face: where its faces begin in Surfaces.faces; first_material: likewise in Surfaces.prim_material, and
+    material_step: 1, or 0 where it is all of one material. world_x, world_y, world_z: the rows of the affine map of its
+    vertices to the world; normal_x ..: the columns of the inverse, up to a positive factor, by which normals go; handedness: -1
+    where it is mirrored, else 1.
+    """
+
+    first_prim: int
+    first_face: int
+    first_material: int
+    material_step: int
+    world_x: wp.vec4d
+    world_y: wp.vec4d
+    world_z: wp.vec4d
+    normal_x: wp.vec3
+    normal_y: wp.vec3
+    normal_z: wp.vec3
+    handedness: float
+
+
+@wp.struct
 class Surfaces:
     """What there is to know about a primitive beyond where it is hit.
 
     normals and uvs are per vertex (length 1 and unread where the scene has none); n_triangles: primitives from here on are
-    spheres (center, radius).
+    spheres (center, radius). instances: in the order of first_prim; then vertices, normals and faces are those of each mesh in
+    its own space, once. Without any (length 0), they are in the world, and face and material are numbered as primitives are.
     """
 
     n_triangles: int
@@ -153,6 +179,7 @@ class Surfaces:
     normals: wp.array(dtype=wp.vec3)
     uvs: wp.array(dtype=wp.vec2)
     spheres: wp.array(dtype=wp.vec4)
+    instances: wp.array(dtype=Instance)
     prim_material: wp.array(dtype=wp.int32)
     materials: wp.array(dtype=Material)
     textures: wp.array(dtype=Texture)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from wrt.kernels.sampling import PI, TWO_PI, frame_x
-from wrt.kernels.structs import Hit, Ray, Surfaces, gamma
+from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma
 
 
 @wp.struct
@@ -49,10 +49,80 @@ def spawn_point(point: wp.vec3, error: wp.vec3, normal: wp.vec3, direction: wp.v
     return wp.vec3(next_away(p[0], offset[0]), next_away(p[1], offset[1]), next_away(p[2], offset[2]))
 
 
+@wp.struct
+class Place:
+    """Where a primitive's data are: its face in Surfaces.faces (of a sphere: unread), its material, and its instance."""
+
+    face: int
+    material: int
+    instance: int
+
+
+def make_place_of(instances: bool):
+    """From a prim_id to its data."""
+
+    @wp.func
+    def place_of(surfaces: Surfaces, prim_id: int) -> Place:
+        place = Place()
+        if wp.static(instances):
+            low = int(0)
+            high = int(surfaces.instances.shape[0])
+            while high - low > 1:  # the last one that does not begin behind it
+                middle = (low + high) / 2
+                if surfaces.instances[middle].first_prim <= prim_id:
+                    low = middle
+                else:
+                    high = middle
+            instance = surfaces.instances[low]
+            local = prim_id - instance.first_prim
+            place.instance = low
+            place.face = instance.first_face + local
+            place.material = surfaces.prim_material[instance.first_material + instance.material_step * local]
+        else:
+            place.face = prim_id
+            place.material = surfaces.prim_material[prim_id]
+        return place
+
+    return place_of
+
+
 @wp.func
-def triangle_point(surfaces: Surfaces, prim_id: int, u: float, v: float) -> wp.vec3:
-    """The point with these barycentrics."""
-    face = surfaces.faces[prim_id]
+def transformed(row_x: wp.vec4d, row_y: wp.vec4d, row_z: wp.vec4d, v: wp.vec3, w: float) -> wp.vec3:
+    """A point (w = 1) or a direction (w = 0) under an affine map: float64, rounded once."""
+    p = wp.vec4d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]), wp.float64(w))
+    return wp.vec3(float(wp.dot(row_x, p)), float(wp.dot(row_y, p)), float(wp.dot(row_z, p)))
+
+
+@wp.func
+def world_point(i: Instance, p: wp.vec3) -> wp.vec3:
+    return transformed(i.world_x, i.world_y, i.world_z, p, 1.0)
+
+
+@wp.func
+def world_direction(i: Instance, d: wp.vec3) -> wp.vec3:
+    return transformed(i.world_x, i.world_y, i.world_z, d, 0.0)
+
+
+@wp.func
+def world_normal(i: Instance, n: wp.vec3) -> wp.vec3:
+    """Unit length; the outside stays outside, also of a mirrored instance. Zero stays zero."""
+    return wp.normalize(n[0] * i.normal_x + n[1] * i.normal_y + n[2] * i.normal_z)
+
+
+@wp.func
+def world_error(i: Instance, p: wp.vec3, error: wp.vec3, world: wp.vec3) -> wp.vec3:
+    """Bound on the error of `world`, the image of p, which is off by `error`; per axis.
+
+    Two more roundings in the mesh's space are for the next ray, whose origin is taken back there and rounded.
+    """
+    e = error + gamma(2.0) * wp.abs(p)
+    return transformed(wp.abs(i.world_x), wp.abs(i.world_y), wp.abs(i.world_z), e, 0.0) + gamma(2.0) * wp.abs(world)
+
+
+@wp.func
+def triangle_point(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec3:
+    """The point of face `index` with these barycentrics, in the space of its vertices."""
+    face = surfaces.faces[index]
     return (1.0 - u - v) * surfaces.vertices[face[0]] + u * surfaces.vertices[face[1]] + v * surfaces.vertices[face[2]]
 
 
@@ -63,14 +133,14 @@ def largest(v: wp.vec3) -> float:
 
 
 @wp.func
-def triangle_point_error(surfaces: Surfaces, prim_id: int, u: float, v: float) -> wp.vec3:
+def triangle_point_error(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec3:
     """How far a ray that starts at triangle_point must stand off to be clear of the triangle's plane, per axis.
 
     Two parts: the rounding of the point itself, seven roundings in a row (PBR, section 6.8.5), and that of the next ray's
     distance to a neighbour in the same plane, which grows with the triangle's size and not with its coordinates: a floor at
     y = 0 has none of the first.
     """
-    face = surfaces.faces[prim_id]
+    face = surfaces.faces[index]
     v0 = surfaces.vertices[face[0]]
     v1 = surfaces.vertices[face[1]]
     v2 = surfaces.vertices[face[2]]
@@ -80,28 +150,30 @@ def triangle_point_error(surfaces: Surfaces, prim_id: int, u: float, v: float) -
 
 
 @wp.func
-def triangle_normal(surfaces: Surfaces, prim_id: int) -> wp.vec3:
-    """Unit normal on the counter-clockwise side.
+def triangle_normal(surfaces: Surfaces, index: int) -> wp.vec3:
+    """Unit normal of face `index` on the counter-clockwise side, in the space of its vertices.
 
     The edges are scaled to about 1 first: a triangle of size 1e-20 would otherwise have a normal of length 0.
     """
-    face = surfaces.faces[prim_id]
+    face = surfaces.faces[index]
     e1 = surfaces.vertices[face[1]] - surfaces.vertices[face[0]]
     e2 = surfaces.vertices[face[2]] - surfaces.vertices[face[0]]
     return wp.normalize(wp.cross(e1 / largest(e1), e2 / largest(e2)))
 
 
-def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool):
+def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False):
     """Interpolation at a hit, with only those attributes that the scene has."""
+    place_of = make_place_of(instances)
 
     @wp.func
-    def on_triangle(surfaces: Surfaces, ray: Ray, hit: Hit) -> Surface:
+    def on_triangle(surfaces: Surfaces, hit: Hit, place: Place) -> Surface:
+        """In the space of the triangle's vertices."""
         s = Surface()
-        face = surfaces.faces[hit.prim_id]
+        face = surfaces.faces[place.face]
         w = 1.0 - hit.u - hit.v
-        s.point = triangle_point(surfaces, hit.prim_id, hit.u, hit.v)
-        s.error = triangle_point_error(surfaces, hit.prim_id, hit.u, hit.v)
-        s.geometric = triangle_normal(surfaces, hit.prim_id)
+        s.point = triangle_point(surfaces, place.face, hit.u, hit.v)
+        s.error = triangle_point_error(surfaces, place.face, hit.u, hit.v)
+        s.geometric = triangle_normal(surfaces, place.face)
         s.shading = s.geometric
         if wp.static(smooth):
             n = w * surfaces.normals[face[0]] + hit.u * surfaces.normals[face[1]] + hit.v * surfaces.normals[face[2]]
@@ -120,6 +192,19 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool):
             along_u = -s.bitangent_sign * (t2[1] * e1 - t1[1] * e2)
             length = wp.length(along_u)
             s.tangent = wp.where(length > 0.0, along_u / length, frame_x(s.geometric))
+        return s
+
+    @wp.func
+    def in_world(local: Surface, instance: Instance) -> Surface:
+        """Everything is computed in the mesh's space and taken to the world once."""
+        s = local
+        s.point = world_point(instance, local.point)
+        s.error = world_error(instance, local.point, local.error, s.point)
+        s.geometric = world_normal(instance, local.geometric)
+        s.shading = world_normal(instance, local.shading)
+        if wp.static(tangents):
+            s.bitangent_sign = local.bitangent_sign * instance.handedness
+            s.tangent = wp.normalize(world_direction(instance, local.tangent))
         return s
 
     @wp.func
@@ -145,15 +230,20 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool):
     @wp.func
     def surface_at(surfaces: Surfaces, ray: Ray, hit: Hit) -> Surface:
         """The surface that `ray` meets at `hit` (which must be one: prim_id >= 0)."""
+        place = place_of(surfaces, hit.prim_id)
         s = Surface()
         if wp.static(spheres):
             if hit.prim_id >= surfaces.n_triangles:
                 s = on_sphere(surfaces, ray, hit)
             else:
-                s = on_triangle(surfaces, ray, hit)
+                s = on_triangle(surfaces, hit, place)
+                if wp.static(instances):
+                    s = in_world(s, surfaces.instances[place.instance])
         else:
-            s = on_triangle(surfaces, ray, hit)
-        s.material = surfaces.prim_material[hit.prim_id]
+            s = on_triangle(surfaces, hit, place)
+            if wp.static(instances):
+                s = in_world(s, surfaces.instances[place.instance])
+        s.material = place.material
         s.exclude = wp.where(hit.prim_id < surfaces.n_triangles, hit.prim_id, -1)
         s.front = 1
         # A smooth normal belongs to the outside, which the winding defines: both are turned together, and a normal that

@@ -11,12 +11,14 @@ from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
 
 
 class Units(NamedTuple):
-    """What a traversal unit is made of: names in RAY_TRIANGLE and RAY_AABB, whether there are spheres, and whether it counts."""
+    """What a traversal unit is made of: names in RAY_TRIANGLE and RAY_AABB, whether there are spheres, whether it counts, and
+    whether it walks instances (Ray.first_prim is then added to each prim_id)."""
 
     triangle: str = "watertight"
     box: str = "conservative"
     spheres: bool = False
     counters: bool = False
+    instances: bool = False
 
     @property
     def triangle_test(self) -> Any:
@@ -76,10 +78,13 @@ def make_intersect(units: Units, accepts=None):
     @wp.func
     def intersect(probe: Probe, surfaces: Surfaces, primitive: record, best: Hit) -> Hit:
         """The closer of `best` and this primitive's hit in [t_min, best.t]; at equal t the lower prim_id."""
+        prim_id = primitive.prim_id
+        if wp.static(units.instances):
+            prim_id = primitive.prim_id + probe.ray.first_prim
         hit = Hit()
         if wp.static(units.spheres):
-            if primitive.prim_id >= surfaces.n_triangles:
-                sphere = surfaces.spheres[primitive.prim_id - surfaces.n_triangles]
+            if prim_id >= surfaces.n_triangles:
+                sphere = surfaces.spheres[prim_id - surfaces.n_triangles]
                 hit = ray_sphere(probe.box, probe.ray, wp.vec3(sphere[0], sphere[1], sphere[2]), sphere[3])
             else:
                 hit = ray_triangle(probe.box, probe.triangle, probe.ray, primitive)
@@ -87,14 +92,14 @@ def make_intersect(units: Units, accepts=None):
             hit = ray_triangle(probe.box, probe.triangle, probe.ray, primitive)
         if hit.prim_id == NO_HIT or not (hit.t >= probe.ray.t_min and hit.t <= best.t):
             return best
-        if hit.t == best.t and primitive.prim_id > best.prim_id:
+        if hit.t == best.t and prim_id > best.prim_id:
             return best
-        if primitive.prim_id == probe.ray.exclude:
+        if prim_id == probe.ray.exclude:
             return best
         if wp.static(accepts is not None):
-            if not accepts(surfaces, primitive.prim_id, hit.u, hit.v):
+            if not accepts(surfaces, prim_id, hit.u, hit.v):
                 return best
-        hit.prim_id = primitive.prim_id
+        hit.prim_id = prim_id
         return hit
 
     return intersect

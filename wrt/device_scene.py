@@ -1,4 +1,4 @@
-"""From a scene to the device's records: one world-space mesh, tables of materials, textures and lights."""
+"""From a scene to the device's records: its world, tables of materials, textures and lights."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel import Geometry
 from wrt.device import records, upload
 from wrt.errors import InputError, SceneWarning
 from wrt.kernels import lights, structs, textures
-from wrt.mesh_clean import flip_collinear
 from wrt.scene import (
     ALPHA_MODES,
     MATERIAL_KINDS,
@@ -24,88 +22,17 @@ from wrt.scene import (
     DirectionalLight,
     GradientBackground,
     Material,
-    Object,
     PointLight,
     Scene,
     SpotLight,
     Texture,
 )
+from wrt.world import Placed, World, world_of
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 # More area lights than this are sampled as one, by power: a shadow ray to each would cost more than it tells.
 MAX_MESH_LIGHTS = 16
 WRAPS = {"repeat": textures.WRAP_REPEAT, "clamp": textures.WRAP_CLAMP, "mirror": textures.WRAP_MIRROR}
-
-
-@dataclass(frozen=True, eq=False)
-class WorldMesh:
-    """All objects in one, in world space; normals (V, 3) and uvs (V, 2) are zero where an object has none."""
-
-    geometry: Geometry
-    normals: np.ndarray | None
-    uvs: np.ndarray
-    prim_material: np.ndarray
-
-
-def world_mesh(scene: Scene) -> WorldMesh:
-    """Transform and join all objects. Positions are computed in float64 and rounded once.
-
-    prim_id counts the faces of all objects in their order; of faces whose corners rounding put on a line, see
-    `wrt.mesh_clean.flip_collinear`.
-    """
-    index = {id(material): i for i, material in enumerate(scene.materials)}
-    vertices: list[np.ndarray] = []
-    faces: list[np.ndarray] = []
-    normals: list[np.ndarray] = []
-    uvs: list[np.ndarray] = []
-    material: list[np.ndarray] = []
-    first = 0
-    for thing in scene.objects:
-        v, f, n, t = _transformed(thing)
-        vertices.append(v)
-        faces.append(f + np.int32(first))
-        normals.append(n)
-        uvs.append(t)
-        table = np.array([index[id(m)] for m in thing.materials], np.int32)
-        material.append(np.full(len(f), table[0]) if thing.face_material is None else table[thing.face_material])
-        first += len(v)
-    of_spheres = np.array([index[id(s.material)] for s in scene.spheres], np.int32)
-    if first > 2**31 - 1 or sum(len(f) for f in faces) > 2**31 - 2:
-        raise InputError("the scene has more than 2^31 vertices or faces")
-    smooth = any(thing.mesh.normals is not None for thing in scene.objects)
-
-    def join(parts: list[np.ndarray], width: int, dtype: Any) -> np.ndarray:
-        return np.concatenate(parts) if parts else np.zeros((0, width), dtype)
-
-    # Far from 0, rounding puts corners on a line that were on none. All at once: a call for each of many boxes takes long.
-    corners = join(vertices, 3, np.float32)
-    triangles, source = flip_collinear(corners, join(faces, 3, np.int32))
-    of_triangles = np.concatenate([np.zeros(0, np.int32), *material])[source]
-    spheres = np.array([(*s.center, s.radius) for s in scene.spheres], np.float32).reshape(-1, 4)
-    return WorldMesh(Geometry(corners, triangles, spheres), join(normals, 3, np.float32) if smooth else None,
-                     join(uvs, 2, np.float32), np.concatenate([of_triangles, of_spheres]).astype(np.int32))
-
-
-def _transformed(thing: Object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    mesh, matrix = thing.mesh, thing.transform
-    faces = mesh.faces
-    normals = np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals
-    uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
-    if np.array_equal(matrix, np.eye(4)):
-        return mesh.vertices, faces, normals, uvs
-    linear = matrix[:3, :3]
-    vertices = (mesh.vertices.astype(np.float64) @ linear.T + matrix[:3, 3]).astype(np.float32)
-    # Normals go by the cofactors: the inverse transpose times the determinant, which exists for flat objects too. Its sign
-    # turns them inwards where the object is mirrored, and so it is taken out; the faces are turned round instead.
-    mirrored = np.linalg.det(linear) < 0.0
-    if mirrored:
-        faces = faces[:, [0, 2, 1]]
-    if mesh.normals is not None:
-        cofactors = np.stack([np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])])
-        turned = normals.astype(np.float64) @ cofactors.T * (-1.0 if mirrored else 1.0)
-        length = np.linalg.norm(turned, axis=1, keepdims=True)
-        normals = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0.0).astype(np.float32)
-    return vertices, faces, normals, uvs
 
 
 class TextureTable:
@@ -171,7 +98,7 @@ def material_records(materials: tuple[Material, ...], table: TextureTable) -> np
     return out
 
 
-def light_records(scene: Scene, world: WorldMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def light_records(scene: Scene, world: World) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lights, emitters and the emitters' cdf (float32). Each object with emissive faces is one light; beyond
     MAX_MESH_LIGHTS all are one together."""
     rows: list[dict[str, Any]] = []
@@ -207,25 +134,27 @@ def light_records(scene: Scene, world: WorldMesh) -> tuple[np.ndarray, np.ndarra
     return out[: len(rows)], np.concatenate(parts), np.concatenate(cdfs)
 
 
-def _emissive_groups(scene: Scene, world: WorldMesh) -> list[np.ndarray]:
+def _emissive_groups(scene: Scene, world: World) -> list[np.ndarray]:
     """prim_ids of the faces that light, object by object."""
     lit = np.array([m.lights_others for m in scene.materials], bool)
     groups = []
     first = 0
     for thing in scene.objects:
         n = len(thing.mesh.faces)
-        prim_id = first + np.nonzero(lit[world.prim_material[first : first + n]])[0]
-        if len(prim_id):
-            groups.append(prim_id)
+        if any(m.lights_others for m in thing.materials):
+            prim_id = np.arange(first, first + n)
+            prim_id = prim_id[lit[world.materials(prim_id)]]
+            if len(prim_id):
+                groups.append(prim_id)
         first += n
     return groups
 
 
-def _emitters(scene: Scene, world: WorldMesh, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _emitters(scene: Scene, world: World, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The emitters of one light and their cdf; both empty where they have no power."""
-    corner = world.geometry.vertices[world.geometry.faces[prim_id]].astype(np.float64)
+    corner = world.corners(prim_id)
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-    power = np.array([LUMINANCE @ np.array(m.emission) for m in scene.materials])[world.prim_material[prim_id]] * area
+    power = np.array([LUMINANCE @ np.array(m.emission) for m in scene.materials])[world.materials(prim_id)] * area
     total = power.sum()
     if not total > 0.0:
         return records(structs.Emitter, 1)[:0], np.zeros(0, np.float32)
@@ -267,15 +196,29 @@ def background_struct(scene: Scene, device: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class DeviceScene:
-    """What the kernels take: surfaces and lighting, and the world-space geometry to build a structure over."""
+    """What the kernels take: surfaces and lighting, and the world with the geometry to build a structure over."""
 
-    world: WorldMesh
+    world: World
     surfaces: Any
     lighting: Any
 
 
-def upload_scene(scene: Scene, device: Any) -> DeviceScene:
-    """Put a scene on a device (a Warp device). Raises InputError where the scene cannot be rendered."""
+def instance_records(placed: Placed) -> np.ndarray:
+    out = records(structs.Instance, len(placed.first_prim))
+    for name in ("first_prim", "first_face", "first_material", "material_step"):
+        out[name] = getattr(placed, name)
+    linear = placed.to_world[:, :, :3]
+    inverse = np.linalg.inv(linear)
+    inverse /= np.abs(inverse).max(axis=(1, 2), keepdims=True)  # a factor changes no direction, and its square is a float32
+    for i, axis in enumerate("xyz"):
+        out[f"world_{axis}"], out[f"normal_{axis}"] = placed.to_world[:, i], inverse[:, i]
+    out["handedness"] = np.where(np.linalg.det(linear) < 0.0, -1.0, 1.0)
+    return out
+
+
+def upload_scene(scene: Scene, device: Any, instancing: str = "auto") -> DeviceScene:
+    """Put a scene on a device (a Warp device); instancing: see wrt.instancing. Raises InputError where the scene cannot be
+    rendered."""
     for sphere in scene.spheres:
         if sphere.material.alpha_mode == "mask" and sphere.material.albedo_texture is not None:
             raise InputError(f"sphere {sphere.name!r}: a cut-out texture needs a mesh; material {sphere.material.name!r}")
@@ -289,17 +232,18 @@ def upload_scene(scene: Scene, device: Any) -> DeviceScene:
     if unreached:
         warnings.warn("emission that is seen but lights nothing, since a texture or alpha says where it is: materials"
                       f" {', '.join(unreached)} (emits_light = false says that it is meant)", SceneWarning, stacklevel=2)
-    world = world_mesh(scene)
-    geometry = world.geometry
+    world = world_of(scene, instancing)
     table = TextureTable()
     materials = material_records(scene.materials, table)
     s = structs.Surfaces()
-    s.n_triangles = len(geometry.faces)
-    s.vertices = upload(geometry.vertices, wp.vec3, device)
-    s.faces = upload(geometry.faces, wp.vec3i, device)
+    s.n_triangles = world.geometry.n_triangles
+    s.vertices = upload(world.vertices, wp.vec3, device)
+    s.faces = upload(world.faces, wp.vec3i, device)
     s.normals = upload(np.zeros((1, 3)) if world.normals is None else world.normals, wp.vec3, device)
     s.uvs = upload(world.uvs, wp.vec2, device)
-    s.spheres = upload(geometry.spheres, wp.vec4, device)
+    s.spheres = upload(world.geometry.spheres, wp.vec4, device)
+    if world.placed is not None:
+        s.instances = upload(instance_records(world.placed), structs.Instance, device)
     s.prim_material = upload(world.prim_material, wp.int32, device)
     s.materials = upload(materials, structs.Material, device)
     s.textures = upload(table.records(), structs.Texture, device)

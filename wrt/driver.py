@@ -95,11 +95,11 @@ class Renderer:
         self.fraction_built = 0.0
         self.device = start(options.device)
         self.camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
-        self.features = features_of(scene, self.camera)
+        self.features = features_of(scene, self.camera, options.instancing)
         self.groups = 1 if options.target_error is None else GROUPS
         self.crop = self._crop()
         self._check_memory()
-        units = Units(options.triangle, options.box, self.features.spheres)
+        units = Units(options.triangle, options.box, self.features.spheres, instances=self.features.instances)
         structure = self._structure(Structure(ACCELERATORS[options.accel], units))
         self.kernels = [render_kernel(self.features, structure)]
         if options.aov:
@@ -177,7 +177,7 @@ class Renderer:
 
     def _build(self) -> None:
         begin = time.perf_counter()
-        self.device_scene = upload_scene(self.scene, self.device)
+        self.device_scene = upload_scene(self.scene, self.device, self.options.instancing)
         self.seconds["upload"] = time.perf_counter() - begin
         options = {"triangle": self.options.triangle, "box": self.options.box, **self.options.accel_options}
         if tells_progress(self.options.accel):
@@ -379,7 +379,8 @@ class Renderer:
             "cut_by_depth": film.count("cut_depth"), "cut_by_throughput": film.count("cut_throughput"),
             "lost_throughput_per_sample": film.lost() / total,
             "not_finite": film.count("not_finite"), "samples": int(samples.sum()),
-            "triangles": len(self.accel.geometry.faces), "spheres": len(self.accel.geometry.spheres),
+            "triangles": self.accel.geometry.n_triangles, "stored_triangles": len(self.device_scene.world.faces),
+            "spheres": len(self.accel.geometry.spheres),
             "accel": {"name": self.options.accel, **asdict(self.accel.stats)}, "interrupted": interrupted,
             "signal": int(self.interrupts[0]) if self.interrupts else None, "timed_out": self.timed_out and not interrupted,
         }

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from wrt.instancing import instanced_meshes
 from wrt.scene import (
     Camera,
     Checkerboard,
@@ -29,16 +30,17 @@ STACK_STEP = 16
 class Features:
     """Everything that changes the code of a kernel; what is False leaves no trace in it.
 
-    lens, blades, filter: the camera's; independent: the samples are random numbers; spheres, smooth, textures, checkerboards,
-    normal_maps, cutout, blend: the surfaces'; mirror .. rough: the materials'; lights .. tinted_shadows: the lighting;
-    derived: reflection, refraction, transmission, transparent_shadows, sky_light, highlight. stack_size: room for the rays
-    that can be pending, in whole STACK_STEPs, so that neighbouring depths share a kernel.
+    lens, blades, filter: the camera's; independent: the samples are random numbers; instances, spheres, smooth, textures,
+    checkerboards, normal_maps, cutout, blend: the surfaces'; mirror .. rough: the materials'; lights .. tinted_shadows: the
+    lighting; derived: reflection, refraction, transmission, transparent_shadows, sky_light, highlight. stack_size: room for
+    the rays that can be pending, in whole STACK_STEPs, so that neighbouring depths share a kernel.
     """
 
     lens: bool = False
     blades: bool = False
     filter: bool = False
     independent: bool = False
+    instances: bool = False
     spheres: bool = False
     smooth: bool = False
     textures: bool = False
@@ -86,7 +88,7 @@ def is_rough(material: Material) -> bool:
     return material.roughness > 0.01 and material.kind in ("conductor", "glass", "metallic_roughness")
 
 
-def features_of(scene: Scene, camera: Camera) -> Features:
+def features_of(scene: Scene, camera: Camera, instancing: str = "auto") -> Features:
     """The features that this scene needs through this camera, with its settings."""
     settings, materials = scene.settings, scene.materials
     textures = [texture for material in materials for texture in material.textures]
@@ -120,6 +122,7 @@ def features_of(scene: Scene, camera: Camera) -> Features:
         blades=camera.aperture_radius > 0.0 and camera.blades > 0,
         filter=settings.filter != "box",
         independent=settings.sampler == "independent",
+        instances=bool(instanced_meshes(scene, instancing)),
         spheres=bool(scene.spheres),
         smooth=any(thing.mesh.normals is not None for thing in scene.objects),
         textures=any(isinstance(texture, Texture) for texture in textures),

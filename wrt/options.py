@@ -16,6 +16,7 @@ from wrt.arguments import as_integer, as_names, as_one, as_path, as_tuple, shown
 from wrt.device import start, thread_count
 from wrt.errors import InputError
 from wrt.film import Film
+from wrt.instancing import INSTANCING
 from wrt.scene import Camera
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
@@ -53,6 +54,7 @@ class Progress:
 class Options:
     """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once; never change a
     pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always taken.
+    instancing: which meshes that several objects share are kept once (wrt.instancing).
 
     target_error: stop when the estimated error of the picture is no larger: the root mean square, over its pixels and
     channels, of the standard error in linear radiance. It is noise alone: what max_depth and min_throughput cut off is not
@@ -78,17 +80,20 @@ class Options:
     progress: Callable[[Progress], None] | None = None
     triangle: str = "watertight"
     box: str = "conservative"
+    instancing: str = "auto"
     accel_options: dict[str, Any] = field(default_factory=dict)
     checkpoint: str | os.PathLike[str] | None = None
     checkpoint_every: float = 60.0
     resume: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("accel", "device", "triangle", "box"):
+        for name in ("accel", "device", "triangle", "box", "instancing"):
             as_one(getattr(self, name), str, name)
         if self.accel not in ACCELERATORS:
             raise InputError(f"no structure {self.accel!r}; there is {', '.join(ACCELERATORS)}")
         check_units(self.triangle, self.box)
+        if self.instancing not in INSTANCING:
+            raise InputError(f"instancing must be one of {', '.join(INSTANCING)}, got {self.instancing!r}")
         self.aov = as_names(self.aov, "aov")
         no_aov = sorted(set(self.aov) - set(AOVS))
         if no_aov:

@@ -9,12 +9,13 @@ from tests.kernel_tools import CPU, directions, floats, ints, launch, rounded, u
 import warp as wp
 
 from wrt.accel import build
-from wrt.device_scene import upload_scene, world_mesh
+from wrt.device_scene import upload_scene
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 from wrt.kernels.surface import Surface, make_surface_at, next_away, spawn_point
 from wrt.mesh import Mesh
 from wrt.scene import Material, Object, Scene, Sphere
 from wrt.shapes import icosphere
+from wrt.world import world_mesh
 
 
 @cache

@@ -18,7 +18,6 @@ from wrt.device_scene import (
     material_records,
     srgb_table,
     upload_scene,
-    world_mesh,
 )
 from wrt.errors import InputError, SceneWarning
 from wrt.kernels import lights
@@ -41,6 +40,7 @@ from wrt.scene import (
     Texture,
 )
 from wrt.shapes import box, icosphere, quad
+from wrt.world import world_mesh
 
 GREY = Material()
 

@@ -13,7 +13,6 @@ import pytest
 
 from tests.data import data_path
 from tests.gltf_files import one_triangle
-from wrt.device_scene import world_mesh
 from wrt.errors import InputError, SceneWarning
 from wrt.scene import (
     CONDUCTORS,
@@ -28,6 +27,7 @@ from wrt.scene import (
     Texture,
 )
 from wrt.scene_file import load_scene, schema
+from wrt.world import world_mesh
 
 CAMERA = "[cameras.main]\nposition = [0, 0, 5]\ntarget = [0, 0, 0]\n"
 SUN = '[[lights]]\ntype = "directional"\ndirection = [0, -1, 0]\nirradiance = 1\n'

@@ -12,14 +12,15 @@ from wrt.accel.bvh2 import Bvh2
 from wrt.accel.bvh2_volumes import Bvh2Kdop, Bvh2Sphere
 from wrt.accel.bvh_wide import Bvh4, Bvh8, Bvh8c
 from wrt.accel.grid import Grid
+from wrt.accel.instances import InstancedGeometry, Instances
 from wrt.accel.kdtree import KdTree
 from wrt.accel.octree import Octree
 from wrt.accel.store import build_cached, load_accel
 from wrt.errors import InputError
 from wrt.mesh import Mesh
 
-__all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "Structure", "build", "build_cached",
-           "load_accel", "tells_progress"]
+__all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "InstancedGeometry", "Instances", "Structure", "build",
+           "build_cached", "load_accel", "tells_progress"]
 
 ACCELERATORS: dict[str, type[Accelerator]] = {
     "bvh": Bvh2,  # the default: the best one there is
@@ -42,14 +43,17 @@ def tells_progress(accel: str) -> bool:
     return accel in ACCELERATORS and "progress" in signature(ACCELERATORS[accel]._build).parameters
 
 
-def build(mesh: Mesh | Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None,
+def build(mesh: Mesh | Geometry | InstancedGeometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None,
           **options: Any) -> Accelerator:
     """A structure over a mesh. accel: a name in ACCELERATORS; options: `triangle` and `box`, the intersection tests (names in
-    kernels.ray_triangle.RAY_TRIANGLE and kernels.ray_aabb.RAY_AABB), and the structure's own (see its class).
+    kernels.ray_triangle.RAY_TRIANGLE and kernels.ray_aabb.RAY_AABB), and the structure's own (see its class). Over instances, it
+    is a tree over such structures, one for each mesh.
 
     Raises InputError for an unknown name or device.
     """
     if accel not in ACCELERATORS:
         raise InputError(f"no structure {accel!r}; there is {', '.join(ACCELERATORS)}")
+    if isinstance(mesh, InstancedGeometry):
+        return Instances(ACCELERATORS[accel], mesh, device, threads, **options)
     geometry = Geometry.of(mesh) if isinstance(mesh, Mesh) else mesh
     return ACCELERATORS[accel](geometry, device=device, threads=threads, **options)

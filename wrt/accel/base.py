@@ -19,6 +19,7 @@ from wrt.accel.triangle_data import TRIANGLE_DATA
 from wrt.device import load_kernel, records, run_all, start, thread_count, upload
 from wrt.errors import InputError
 from wrt.exchange import taken, to_numpy, to_warp
+from wrt.kernels import traverse_instances
 from wrt.kernels.counters import SIZE_RANGE, Counts, Recorder
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
 from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT, RAY_AABB
@@ -50,6 +51,10 @@ class Geometry:
 
     def __len__(self) -> int:
         return len(self.faces) + len(self.spheres)
+
+    @property
+    def n_triangles(self) -> int:
+        return len(self.faces)
 
     def digest(self) -> str:
         """SHA-256 of the arrays: the same for the same geometry, whatever file it came from."""
@@ -212,7 +217,8 @@ def check_units(triangle: str, box: str) -> None:
 
 
 class Structure(NamedTuple):
-    """A kind of structure together with the units that walk it: what a kernel is made from. Hashable."""
+    """A kind of structure together with the units that walk it: what a kernel is made from. Hashable. Where the units walk
+    instances, it is a tree over structures of this kind (wrt.accel.instances)."""
 
     accel: type[Accelerator]
     units: Units = Units()
@@ -220,11 +226,21 @@ class Structure(NamedTuple):
     @property
     def struct(self) -> Any:
         """The Warp struct of the structure's arrays."""
+        if self.units.instances:
+            return traverse_instances.make_struct(self.bottom)
+        return self.bottom
+
+    @property
+    def bottom(self) -> Any:
+        """The struct of one structure, also where there are instances of several."""
         return self.accel.kernels.make_struct(self.units.triangle_test.record)
 
     def traversal(self, *, any_hit: bool, accepts: Any = None) -> Any:
         """The traversal unit as a Warp function (accel, surfaces, ray) -> Hit."""
-        return self.accel.kernels.make_traversal(self.units, any_hit, accepts)
+        traverse = self.accel.kernels.make_traversal(self.units, any_hit, accepts)
+        if self.units.instances:
+            return traverse_instances.make_traversal(self.units, any_hit, traverse, self.bottom)
+        return traverse
 
 
 class Accelerator(ABC):

@@ -1,0 +1,194 @@
+"""The traversal unit of two levels: a binary BVH over placed structures, each in a space of its own.
+
+The lower level is any traversal unit: it gets the ray in its structure's space and says what it always says, so that a closed
+mesh is as tight as it was before it was placed. The direction is not normalised, and so t is the same in both spaces. What
+is left for this level is never to pass by a structure in which a hit would have been found: see `enter`.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from wrt.kernels.counters import Counts, Recorder, add_counts, make_counters
+from wrt.kernels.ray_aabb import FAR_PAD, BoxRay, box_ray, slab_interval
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.traverse import Units, no_hit
+from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
+
+
+@wp.struct
+class Placement:
+    """A structure in one place. bottom: which one; first_prim: what its primitives' numbers begin with in the scene;
+    local_x, local_y, local_z: the rows of the affine map from the world to the structure's space."""
+
+    bottom: int
+    first_prim: int
+    local_x: wp.vec4d
+    local_y: wp.vec4d
+    local_z: wp.vec4d
+
+
+@cache
+def make_struct(bottom):
+    """Two levels over structures of this kind: nodes[0] is the root, whose leaves are rows of `placements`. slack: see `enter`;
+    bases: where each structure begins in the space of addresses."""
+
+    @wp.struct
+    class Instances:
+        nodes: wp.array(dtype=Bvh2Node)
+        placements: wp.array(dtype=Placement)
+        bottoms: wp.array(dtype=bottom)
+        bases: wp.array(dtype=wp.int64)
+        slack: float
+        recorder: Recorder
+
+    return Instances
+
+
+@wp.func
+def enter(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, slack: float, t_max: float) -> float:
+    """As ray_aabb, with the box widened by slack times the distance to its farthest corner.
+
+    The ray in the structure's space is rounded to float32: its point at t is off by u (|o| + t |d|) there, per axis, and a hit
+    may be u 17 t |d| outside of its primitive's box (3 for the slabs, 14 for FAR_PAD). Taken back to the world that is at most
+    u (2 + 17) |A| |A^-1| times the distance, besides u |A| times the coordinates there, which the box has from its builder
+    (wrt.accel.instances); 4 more are for the rounding of this test. slack = 32 u max |A| |A^-1| (sums of rows) covers it, and
+    so this distance is never larger than that of a hit within: no hit is passed by, whatever the order of the visits.
+    """
+    if lo[0] > hi[0]:
+        return float(wp.inf)  # widened, an empty box would be no longer empty
+    to_lo = wp.abs(lo - ray.origin)
+    to_hi = wp.abs(hi - ray.origin)
+    pad = slack * wp.max(wp.max(to_lo), wp.max(to_hi))
+    widening = wp.vec3(pad, pad, pad)
+    interval = slab_interval(ray, lo - widening, hi + widening)
+    begin = wp.where(interval[0] > ray.t_min, interval[0], ray.t_min)
+    end = interval[1] * FAR_PAD
+    end = wp.where(end < t_max, end, t_max)
+    return wp.where(begin <= end, begin, float(wp.inf))
+
+
+@wp.func
+def power_of_two(longest: wp.float64) -> wp.float64:
+    """What brings a number > 0 to where a direction's longest component must be, between 2^-64 and 2^64; 1 for most."""
+    scale = wp.float64(1.0)
+    x = longest
+    for _ in range(16):  # enough for all float64
+        if x > wp.float64(wp.static(2.0**64)):
+            x = x * wp.float64(wp.static(2.0**-96))
+            scale = scale * wp.float64(wp.static(2.0**-96))
+        elif x < wp.float64(wp.static(2.0**-64)):
+            x = x * wp.float64(wp.static(2.0**96))
+            scale = scale * wp.float64(wp.static(2.0**96))
+    return scale
+
+
+@wp.func
+def local_scale(place: Placement, direction: wp.vec3) -> wp.float64:
+    """The power of two by which the direction is scaled in the structure's space; t there times it is t in the world."""
+    d = wp.vec4d(wp.float64(direction[0]), wp.float64(direction[1]), wp.float64(direction[2]), wp.float64(0.0))
+    return power_of_two(
+        wp.max(wp.max(wp.abs(wp.dot(place.local_x, d)), wp.abs(wp.dot(place.local_y, d))), wp.abs(wp.dot(place.local_z, d)))
+    )
+
+
+@wp.func
+def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
+    """The ray in the structure's space: float64, rounded once. scale: `local_scale`."""
+    o = wp.vec4d(wp.float64(ray.origin[0]), wp.float64(ray.origin[1]), wp.float64(ray.origin[2]), wp.float64(1.0))
+    d = wp.vec4d(wp.float64(ray.direction[0]), wp.float64(ray.direction[1]), wp.float64(ray.direction[2]), wp.float64(0.0))
+    out = Ray()
+    out.origin = wp.vec3(float(wp.dot(place.local_x, o)), float(wp.dot(place.local_y, o)), float(wp.dot(place.local_z, o)))
+    out.direction = wp.vec3(
+        float(scale * wp.dot(place.local_x, d)), float(scale * wp.dot(place.local_y, d)), float(scale * wp.dot(place.local_z, d))
+    )
+    out.t_min = float(wp.float64(ray.t_min) / scale)
+    out.t_max = float(wp.float64(ray.t_max) / scale)
+    out.exclude = ray.exclude
+    out.slot = ray.slot
+    out.first_prim = place.first_prim
+    return out
+
+
+def make_traversal(units: Units, any_hit: bool, bottom, bottom_struct):
+    """The closest hit, or any, among all placed structures. bottom: the lower level's traversal, made with these units."""
+    fetch_node, _, push, finish = make_counters(units._replace(instances=False), Bvh2Node.numpy_dtype()["itemsize"])
+    struct = make_struct(bottom_struct)
+
+    @wp.func
+    def visit(accel: struct, surfaces: Surfaces, ray: Ray, index: int, best: Hit) -> Hit:
+        """The better of `best` and the hit in one placed structure; at equal t the lower prim_id."""
+        place = accel.placements[index]
+        structure = accel.bottoms[place.bottom]
+        if wp.static(units.counters):
+            structure.recorder = accel.recorder
+            structure.recorder.base = accel.bases[place.bottom]
+        scale = local_scale(place, ray.direction)
+        near = ray
+        near.t_max = best.t
+        hit = bottom(structure, surfaces, local_ray(place, near, scale))
+        hit.t = float(wp.float64(hit.t) * scale)
+        if hit.prim_id < 0 or hit.t > best.t or (hit.t == best.t and hit.prim_id > best.prim_id):
+            return best
+        return hit
+
+    @wp.func
+    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+        box = box_ray(ray)
+        best = no_hit(ray)
+        counts = Counts()
+        stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
+        stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
+        stack_t = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
+        size = int(0)
+        first = int(0)
+        count = int(0)
+        while True:
+            if count > 0:
+                counts.leaves += 1
+                if wp.static(units.counters):
+                    add_counts(accel.recorder, ray.slot, counts)
+                    counts = Counts()
+                for i in range(first, first + count):
+                    best = visit(accel, surfaces, ray, i, best)
+                    if wp.static(any_hit):
+                        if best.prim_id != NO_HIT:
+                            return finish(accel.recorder, ray, counts, best)
+            else:
+                node = accel.nodes[first]
+                counts = fetch_node(accel.recorder, ray, counts, first, 2)
+                t_0 = enter(box, node.lo_0, node.hi_0, accel.slack, best.t)
+                t_1 = enter(box, node.lo_1, node.hi_1, accel.slack, best.t)
+                hit_0 = t_0 < wp.inf
+                hit_1 = t_1 < wp.inf
+                if hit_0 and hit_1:
+                    swap = t_1 < t_0
+                    stack_first[size] = wp.where(swap, node.first_0, node.first_1)
+                    stack_count[size] = wp.where(swap, node.count_0, node.count_1)
+                    stack_t[size] = wp.where(swap, t_0, t_1)
+                    size = size + 1
+                    counts = push(counts, size)
+                    first = wp.where(swap, node.first_1, node.first_0)
+                    count = wp.where(swap, node.count_1, node.count_0)
+                    continue
+                if hit_0:
+                    first = node.first_0
+                    count = node.count_0
+                    continue
+                if hit_1:
+                    first = node.first_1
+                    count = node.count_1
+                    continue
+            found = bool(False)
+            while size > 0 and not found:
+                size = size - 1
+                counts.pops += 1
+                if stack_t[size] <= best.t:
+                    first = stack_first[size]
+                    count = stack_count[size]
+                    found = True
+            if not found:
+                break
+        return finish(accel.recorder, ray, counts, best)
+
+    return traverse

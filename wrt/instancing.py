@@ -1,0 +1,50 @@
+"""Which meshes are kept once, with a place for each object, and which are copied into the world."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+
+from wrt.errors import InputError
+from wrt.scene import Object, Scene
+
+INSTANCING = ("auto", "always", "never")
+# Copies of one mesh with so many triangles together are worth a second level (docs/acceleration.md, "Instances").
+MIN_SAVED = 100_000
+# Sum of |A| |A^-1| over a row, 3 at most for turned and scaled meshes. Beyond, rounding in the mesh's space is much in the world.
+MAX_SPREAD = 1e4
+
+
+def instanced_meshes(scene: Scene, instancing: str = "auto") -> frozenset[int]:
+    """The id() of each mesh that is kept once: where the copies that this saves have MIN_SAVED triangles or more ("auto"), or
+    wherever two or more objects share a mesh ("always").
+
+    Objects whose transform flattens or shears too much (MAX_SPREAD) are always copied: see `is_instance`.
+    Raises InputError for an unknown choice.
+    """
+    if instancing not in INSTANCING:
+        raise InputError(f"instancing must be one of {', '.join(INSTANCING)}, got {instancing!r}")
+    if instancing == "never":
+        return frozenset()
+    users: dict[int, list[Object]] = defaultdict(list)
+    for thing in scene.objects:
+        users[id(thing.mesh)].append(thing)
+    least = MIN_SAVED if instancing == "auto" else 1
+    return frozenset(key for key, things in users.items() if len(things) > 1
+                     and (sum(map(is_invertible, things)) - 1) * len(things[0].mesh.faces) >= least)
+
+
+def is_instance(thing: Object, meshes: frozenset[int]) -> bool:
+    return id(thing.mesh) in meshes and is_invertible(thing)
+
+
+def is_invertible(thing: Object) -> bool:
+    """Whether rays can be taken to the object's own space without much loss."""
+    linear = thing.transform[:3, :3]
+    with np.errstate(all="ignore"):
+        try:
+            spread = (np.abs(linear) @ np.abs(np.linalg.inv(linear))).sum(axis=1).max()
+        except np.linalg.LinAlgError:
+            return False
+    return bool(spread <= MAX_SPREAD)

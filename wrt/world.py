@@ -1,0 +1,237 @@
+"""All shapes of a scene as arrays: triangles that stand in one place in the world, meshes with many places in their own space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from wrt.accel import Geometry
+from wrt.accel.instances import InstancedGeometry, NumberedGeometry
+from wrt.errors import InputError
+from wrt.instancing import instanced_meshes, is_instance
+from wrt.mesh import Mesh
+from wrt.mesh_clean import flip_collinear
+from wrt.scene import Object, Scene
+
+MOST = 2**31 - 2  # faces, and vertices
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """The scene's primitives in runs of one mesh in one place, in the order of prim_id; the last run may be all spheres.
+
+    (I,) int64 each: first_prim, first_face (into World.faces), first_material (into World.prim_material), material_step (1, or 0
+    where all are of one material); to_world: (I, 3, 4) float64.
+    """
+
+    first_prim: np.ndarray
+    first_face: np.ndarray
+    first_material: np.ndarray
+    material_step: np.ndarray
+    to_world: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """All shapes of a scene. prim_id counts the faces of all objects in their order, then the spheres.
+
+    geometry: what is hit; vertices (V, 3), faces (F, 3), normals (V, 3) or None, uvs (V, 2), the last two zero where an object
+    has none; prim_material: index into the scene's materials. Without `placed`, all is in world space and numbered as
+    primitives are; with it, meshes with several places are there once, in their own space.
+    """
+
+    geometry: Geometry | InstancedGeometry
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None
+    uvs: np.ndarray
+    prim_material: np.ndarray
+    placed: Placed | None = None
+
+    def materials(self, prim_id: np.ndarray) -> np.ndarray:
+        """The material of each primitive, (N,) int32."""
+        if self.placed is None:
+            return self.prim_material[prim_id]
+        run, local = self._run(prim_id)
+        return self.prim_material[self.placed.first_material[run] + self.placed.material_step[run] * local]
+
+    def corners(self, prim_id: np.ndarray) -> np.ndarray:
+        """The corners of triangles in world space, (N, 3, 3) float64."""
+        if self.placed is None:
+            return self.vertices[self.faces[prim_id]].astype(np.float64)
+        run, local = self._run(prim_id)
+        corners = self.vertices[self.faces[self.placed.first_face[run] + local]].astype(np.float64)
+        to_world = self.placed.to_world[run]
+        return corners @ to_world[:, :, :3].transpose(0, 2, 1) + to_world[:, None, :, 3]
+
+    def _run(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        assert self.placed is not None
+        run = np.searchsorted(self.placed.first_prim, prim_id, side="right") - 1
+        return run, prim_id - self.placed.first_prim[run]
+
+
+def world_of(scene: Scene, instancing: str = "auto") -> World:
+    """The world of a scene, with instances where they are worth it: see `wrt.instancing.instanced_meshes`."""
+    meshes = instanced_meshes(scene, instancing)
+    return instanced_world(scene, meshes) if meshes else world_mesh(scene)
+
+
+def world_mesh(scene: Scene) -> World:
+    """Transform and join all objects. Positions are computed in float64 and rounded once.
+
+    Of faces whose corners rounding put on a line, see `wrt.mesh_clean.flip_collinear`.
+    """
+    index = {id(material): i for i, material in enumerate(scene.materials)}
+    joined = _joined(scene.objects, index)
+    _require_room(len(joined.vertices), len(joined.faces))
+    geometry = Geometry(joined.vertices, joined.faces, _spheres(scene))
+    return World(geometry, joined.vertices, joined.faces, joined.normals if _is_smooth(scene) else None, joined.uvs,
+                 np.concatenate([joined.material, _sphere_materials(scene, index)]))
+
+
+def instanced_world(scene: Scene, meshes: frozenset[int]) -> World:
+    """As world_mesh, with the meshes of those id()s kept once. The rest is joined in world space, as part 0 of the geometry."""
+    index = {id(material): i for i, material in enumerate(scene.materials)}
+    flat = _joined(tuple(thing for thing in scene.objects if not is_instance(thing, meshes)), index)
+    parts = {0: flat}  # then by id of the mesh
+    materials: dict[tuple[int, ...], tuple[int, np.ndarray]] = {(): (0, flat.material)}
+    n_material = len(flat.material)
+    rows: list[tuple[int, int, int, int, np.ndarray]] = []  # first_prim, part, first material, step, to_world
+    numbers: list[np.ndarray] = []
+    first_prim = n_flat = 0
+    for thing in scene.objects:
+        count = len(thing.mesh.faces)
+        if not is_instance(thing, meshes):
+            if not rows or rows[-1][1] != 0:  # else the last run goes on
+                rows.append((first_prim, 0, n_flat, 1, np.eye(4)))
+            numbers.append(np.arange(first_prim, first_prim + count, dtype=np.int64))
+            n_flat += count
+        else:
+            part = parts.setdefault(id(thing.mesh), _own_space(thing.mesh))
+            table = np.array([index[id(m)] for m in thing.materials], np.int32)
+            key = (id(thing.face_material), *table.tolist()) if thing.face_material is not None else (0, int(table[0]))
+            if key not in materials:
+                each = table[:1] if thing.face_material is None else table[thing.face_material][part.source]
+                materials[key] = (n_material, each)
+                n_material += len(each)
+            rows.append((first_prim, id(thing.mesh), materials[key][0], int(thing.face_material is not None), thing.transform))
+        first_prim += count
+    _require_room(sum(len(part.vertices) for part in parts.values()), first_prim)
+    return _placed_world(scene, index, parts, rows, materials, numbers, first_prim)
+
+
+def _placed_world(scene: Scene, index: dict[int, int], parts: dict[int, _Joined], rows: list[tuple[int, int, int, int, np.ndarray]],
+                  materials: dict[tuple[int, ...], tuple[int, np.ndarray]], numbers: list[np.ndarray], n_triangles: int) -> World:
+    """The arrays of `instanced_world`, put together."""
+    spheres = _spheres(scene)
+    of_spheres = _sphere_materials(scene, index)
+    numbers.append(np.arange(n_triangles, n_triangles + len(spheres), dtype=np.int64))
+    prim_material = np.concatenate([*(each for _, each in materials.values()), of_spheres]).astype(np.int32)
+    place = {key: i for i, key in enumerate(parts)}
+    first_vertex = np.cumsum([0, *(len(part.vertices) for part in parts.values())])
+    first_face = np.cumsum([0, *(len(part.faces) for part in parts.values())])
+    joined = list(parts.values())
+    flat = joined[0]
+    geometries = (NumberedGeometry(flat.vertices, flat.faces, spheres, np.concatenate(numbers).astype(np.int32)),
+                  *(Geometry(part.vertices, part.faces, spheres[:0]) for part in joined[1:]))
+    instances = [(place[key], matrix[:3], first) for first, key, _, _, matrix in rows if key]
+    if len(geometries[0]):
+        instances.insert(0, (0, np.eye(4)[:3], 0))
+    geometry = InstancedGeometry(geometries, np.array([i[0] for i in instances], np.int32), np.array([i[1] for i in instances]),
+                                 np.array([i[2] for i in instances], np.int64), n_triangles)
+    # A flat object's faces are where its materials are: both are numbered in the order of part 0.
+    runs = [(first, material if key == 0 else int(first_face[place[key]]), material, step, matrix[:3])
+            for first, key, material, step, matrix in rows]
+    runs.append((n_triangles, 0, len(prim_material) - len(spheres), 1, np.eye(4)[:3]))
+    columns = [np.array([run[i] for run in runs], np.int64) for i in range(4)]
+    return World(geometry, np.concatenate([part.vertices for part in joined]),
+                 np.concatenate([part.faces + np.int32(first) for part, first in zip(joined, first_vertex, strict=False)]),
+                 np.concatenate([part.normals for part in joined]) if _is_smooth(scene) else None,
+                 np.concatenate([part.uvs for part in joined]), prim_material,
+                 Placed(columns[0], columns[1], columns[2], columns[3], np.array([run[4] for run in runs], np.float64)))
+
+
+def _is_smooth(scene: Scene) -> bool:
+    return any(thing.mesh.normals is not None for thing in scene.objects)
+
+
+def _spheres(scene: Scene) -> np.ndarray:
+    return np.array([(*s.center, s.radius) for s in scene.spheres], np.float32).reshape(-1, 4)
+
+
+def _sphere_materials(scene: Scene, index: dict[int, int]) -> np.ndarray:
+    return np.array([index[id(s.material)] for s in scene.spheres], np.int32)
+
+
+def _require_room(vertices: int, faces: int) -> None:
+    if vertices > MOST or faces > MOST:
+        raise InputError("the scene has more than 2^31 vertices or faces")
+
+
+@dataclass(frozen=True, eq=False)
+class _Joined:
+    """Objects in one, or a mesh by itself; source: (F,) of which face each one is a part."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    uvs: np.ndarray
+    source: np.ndarray
+    material: np.ndarray
+
+
+def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
+    """All objects in world space; material: of each face, by `index` of its id()."""
+    vertices, faces, normals, uvs = [], [], [], []
+    material = [np.zeros(0, np.int32)]
+    first = 0
+    for thing in objects:
+        v, f, n, t = _transformed(thing)
+        vertices.append(v)
+        faces.append(f + np.int32(first))
+        normals.append(n)
+        uvs.append(t)
+        table = np.array([index[id(m)] for m in thing.materials], np.int32)
+        material.append(np.full(len(f), table[0]) if thing.face_material is None else table[thing.face_material])
+        first += len(v)
+        _require_room(first, 0)
+
+    def join(parts: list[np.ndarray], width: int, dtype: Any) -> np.ndarray:
+        return np.concatenate(parts) if parts else np.zeros((0, width), dtype)
+
+    # Far from 0, rounding puts corners on a line that were on none. All at once: a call for each of many boxes takes long.
+    corners = join(vertices, 3, np.float32)
+    triangles, source = flip_collinear(corners, join(faces, 3, np.int32))
+    return _Joined(corners, triangles, join(normals, 3, np.float32), join(uvs, 2, np.float32), source,
+                   np.concatenate(material)[source])
+
+
+def _own_space(mesh: Mesh) -> _Joined:
+    faces, source = flip_collinear(mesh.vertices, mesh.faces)
+    normals = np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals
+    uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
+    return _Joined(mesh.vertices, faces, normals, uvs, source, np.zeros(0, np.int32))
+
+
+def _transformed(thing: Object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    mesh, matrix = thing.mesh, thing.transform
+    faces = mesh.faces
+    normals = np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals
+    uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
+    if np.array_equal(matrix, np.eye(4)):
+        return mesh.vertices, faces, normals, uvs
+    linear = matrix[:3, :3]
+    vertices = (mesh.vertices.astype(np.float64) @ linear.T + matrix[:3, 3]).astype(np.float32)
+    # Normals go by the cofactors: the inverse transpose times the determinant, which exists for flat objects too. Its sign
+    # turns them inwards where the object is mirrored, and so it is taken out; the faces are turned round instead.
+    mirrored = np.linalg.det(linear) < 0.0
+    if mirrored:
+        faces = faces[:, [0, 2, 1]]
+    if mesh.normals is not None:
+        cofactors = np.stack([np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])])
+        turned = normals.astype(np.float64) @ cofactors.T * (-1.0 if mirrored else 1.0)
+        length = np.linalg.norm(turned, axis=1, keepdims=True)
+        normals = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0.0).astype(np.float32)
+    return vertices, faces, normals, uvs
