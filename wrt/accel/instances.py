@@ -32,6 +32,8 @@ class NumberedGeometry(Geometry):
     numbers: np.ndarray
 
     def primitives(self, units: Units, order: np.ndarray | None = None) -> np.ndarray:
+        if order is not None and len(order) > len(self):
+            return self.primitives(units)[order]
         out = super().primitives(units, order)
         out["prim_id"] = self.numbers[out["prim_id"]]
         return out
