@@ -4,7 +4,6 @@ another, and the SHA-256 of all that. Nothing in them is evaluated or unpickled.
 from __future__ import annotations
 
 import json
-import mmap
 import os
 from collections.abc import Iterable
 from hashlib import sha256
@@ -29,14 +28,19 @@ def write_checked(file: BinaryIO, magic: bytes, header: dict[str, Any], parts: I
     file.write(digest.digest())
 
 
-def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> tuple[dict[str, Any], memoryview]:
-    """The header and the bytes of the arrays, mapped from the file. Raises InputError, which calls it `what`, where it is
-    missing, foreign or damaged."""
+def read_checked(path: str | os.PathLike[str], magic: bytes, what: str,
+                 largest: int | None = None) -> tuple[dict[str, Any], memoryview]:
+    """The header and the bytes of the arrays. Raises InputError, which calls it `what`, where it is missing, foreign, damaged,
+    or has more than `largest` bytes, of which none is read then."""
     try:
         with open(path, "rb") as file:
-            if os.fstat(file.fileno()).st_size < len(magic) + DIGEST_BYTES or file.read(len(magic)) != magic:
+            if file.read(len(magic)) != magic:
                 raise InputError(f"is no {what} of this version", path)
-            data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+            size = os.fstat(file.fileno()).st_size
+            if largest is not None and size > largest:
+                raise InputError(f"is damaged: it has {size} bytes, and cannot have more than {largest}", path)
+            file.seek(0)
+            data = memoryview(file.read())
     except OSError as error:
         raise InputError(error.strerror or str(error), path) from error
     end = bytes(data[: len(magic) + MAX_HEADER]).find(b"\n", len(magic))

@@ -43,9 +43,9 @@ class Saved:
     body: memoryview
 
 
-def read(path: str | os.PathLike[str]) -> Saved:
-    """Raises InputError where the file is missing, foreign, damaged or of another version."""
-    header, body = read_checked(path, MAGIC, "checkpoint")
+def read(path: str | os.PathLike[str], largest: int | None = None) -> Saved:
+    """Raises InputError where the file is missing, foreign, damaged, of another version or larger than so many bytes."""
+    header, body = read_checked(path, MAGIC, "checkpoint", largest)
     try:
         low, high = map(int, header["samples"])
         return Saved((low, high), float(header["seconds"]), dict(header["identity"]), body)
@@ -75,7 +75,7 @@ class Checkpoint:
         if os.path.lexists(self.path):
             if not resume:
                 raise InputError("is there already: resume it (--resume, resume=True), or remove it first", path)
-            self.saved = self._checked(read(self.path))
+            self.saved = self._checked(read(self.path, self.bytes))
         with self.held():
             pass
 

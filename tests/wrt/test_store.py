@@ -15,7 +15,8 @@ import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from wrt.accel import ACCELERATORS, Geometry, build, build_cached
-from wrt.accel.store import DIGEST_BYTES, MAGIC, load_accel
+from wrt.accel.store import MAGIC, load_accel
+from wrt.checked_file import DIGEST_BYTES
 from wrt.errors import InputError
 from wrt.shapes import icosphere
 

@@ -1,8 +1,7 @@
 """Structures in files, to be built once: `wrt build`, `wrt.load_accel`, and a cache keyed by geometry and options.
 
-A file is the line MAGIC, a line of JSON (what is in it and over which geometry), the arrays' bytes one after another, and the
-SHA-256 of all that. Nothing in it is evaluated; types come from the structure's class, and indices are checked before a ray
-follows them.
+A file is a checked one (wrt.checked_file), whose header says what is in it and over which geometry. Types come from the
+structure's class, and indices are checked before a ray follows them.
 """
 
 from __future__ import annotations
@@ -18,13 +17,12 @@ import warp as wp
 
 import wrt
 from wrt.accel.base import Accelerator, Built, Geometry
+from wrt.checked_file import read_checked, write_checked
 from wrt.errors import InputError
 from wrt.image import replacing
 from wrt.mesh import Mesh
 
 MAGIC = b"wrt acceleration structure 1\n"
-DIGEST_BYTES = 32
-MAX_HEADER = 1 << 16
 STATS = ("nodes", "leaves", "depth", "sah_cost")
 
 
@@ -70,12 +68,8 @@ def save(accel: Accelerator, path: str | os.PathLike[str]) -> None:
     header = {"accel": accel.name, "triangle": units.triangle, "box": units.box, "wrt": wrt.__version__,
               "geometry": accel.geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
               "order": len(built.order)} | {name: getattr(built, name) for name in STATS}
-    digest = sha256()
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        for part in (MAGIC, json.dumps(header).encode() + b"\n", *body):
-            digest.update(part)
-            file.write(part)
-        file.write(digest.digest())
+        write_checked(file, MAGIC, header, body)
 
 
 def load_accel(path: str | os.PathLike[str], mesh: Mesh | Geometry, device: str = "cpu", threads: int | None = None) -> Accelerator:
@@ -84,13 +78,8 @@ def load_accel(path: str | os.PathLike[str], mesh: Mesh | Geometry, device: str 
     from wrt.accel import ACCELERATORS
 
     geometry = Geometry.of(mesh) if isinstance(mesh, Mesh) else mesh
+    header, body = read_checked(path, MAGIC, "acceleration structure")
     try:
-        with open(path, "rb") as file:
-            data = file.read()
-    except OSError as error:
-        raise InputError(error.strerror or str(error), path) from error
-    try:
-        header, body = parse(data)
         cls = ACCELERATORS.get(header["accel"])
         if cls is None:
             raise InputError(f"holds a structure {header['accel']!r} that this version does not know")
@@ -102,19 +91,6 @@ def load_accel(path: str | os.PathLike[str], mesh: Mesh | Geometry, device: str 
         if isinstance(error, InputError):
             raise InputError(str(error), path) from error
         raise InputError(f"is no structure of this version ({type(error).__name__}: {error})", path) from error
-
-
-def parse(data: bytes) -> tuple[dict[str, Any], memoryview]:
-    """The header and the bytes of the arrays. Raises InputError where the file is foreign or damaged."""
-    if not data.startswith(MAGIC):
-        raise InputError("is no acceleration structure of this version")
-    end = data.find(b"\n", len(MAGIC), len(MAGIC) + MAX_HEADER)
-    if end < 0 or sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
-        raise InputError("is damaged: its checksum does not fit")
-    header = json.loads(data[len(MAGIC):end])
-    if not isinstance(header, dict):
-        raise InputError("is no acceleration structure of this version")
-    return header, memoryview(data)[end + 1:-DIGEST_BYTES]
 
 
 def read_arrays(cls: type[Accelerator], header: dict[str, Any], body: memoryview) -> Built:
