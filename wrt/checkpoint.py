@@ -130,7 +130,8 @@ class Checkpoint:
 
     def _release(self) -> None:
         if self._file is not None:
-            self.part.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a folder that is gone, a disk that has become read-only
+                self.part.unlink()
             with contextlib.suppress(OSError):  # what a full disk did not take of a file that is gone
                 self._file.close()
             self._file = None
@@ -159,7 +160,7 @@ class Checkpoint:
             with contextlib.suppress(OSError, InputError):  # then the next one says so
                 self._reserve(self.bytes)
             written.close()
-        except (OSError, InputError) as error:
+        except (OSError, InputError, MemoryError) as error:
             self.problem = f"{self.path}: the checkpoint cannot be written: {_reason(error)}"
             self._release()
         self._last, self._cost = begin, time.monotonic() - begin

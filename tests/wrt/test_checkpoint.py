@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -327,6 +328,18 @@ def test_a_disk_that_fills_up_costs_neither_the_render_nor_the_last_checkpoint(p
         film = render(SCENE, spp=30, checkpoint=path, resume=True)
     assert (film.samples == 30).all() and film.stats["checkpoint"] is None
     assert path.read_bytes() == saved and files(path) == [path.name]
+
+
+def test_a_folder_that_is_taken_away_costs_nothing_but_the_checkpoint(tmp_path: Path, whole: Film) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+
+    def take(progress: Progress) -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+
+    with pytest.warns(RuntimeWarning, match="the checkpoint cannot be written: No such file or directory"):
+        film = render(SCENE, checkpoint=folder / "a", aov="depth", progress=take)
+    assert same(film, whole) and film.stats["checkpoint"] is None and not folder.exists()
 
 
 def test_two_renders_do_not_write_one_file(path: Path) -> None:
