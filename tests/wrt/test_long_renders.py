@@ -152,7 +152,8 @@ def test_twenty_kills_at_random_moments(extra: tuple[Any, ...], every: float, mo
         resumed += json.loads(result.out)["resumed"] is not None
         Path("a.exr").unlink()
     print(f"20 kills ({early} before tracing, {resumed} with a checkpoint), {files} files, all readable; 20 resumes, bit-identical")
-    print(f"interval {every} s: tracing lost, in seconds: at most {max(losses):.2f}, mean {np.mean(losses):.2f}; all of it {traced:.1f}")
+    lost = f"at most {max(losses):.2f}, mean {np.mean(losses):.2f}, of {traced:.1f}"
+    print(f"seconds of tracing lost at an interval of {every} s: {lost}")
     assert resumed >= 10 and max(losses) < 1.0
 
 
