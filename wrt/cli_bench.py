@@ -179,6 +179,38 @@ def accel(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: b
 
 
 @bench.command()
+@click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--builders", type=Names(), default=(), help="Which, by name  [default: all]")
+@click.option("--rays", type=int, default=2**18, show_default=True, help="Rays into each mesh")
+@click.option("--builds", type=int, default=3, show_default=True, help="Builds of each builder, after the first")
+@click.option("--runs", type=int, default=7, show_default=True, help="Runs of each volume, alternating")
+@click.option("--threads", type=int, help="Threads to build with  [default: all cores]")
+@click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def bvh(meshes: tuple[Path, ...], quiet: bool, as_json: bool, **options: Any) -> None:
+    """Builders of binary BVHs over MESHES: quality, time and memory; and boxes, spheres and 14-DOPs around the same tree."""
+    from dataclasses import asdict
+
+    from wrt.bench import bvh as bench_bvh
+
+    plan = bench_bvh.Plan(meshes, **options)
+    told = bench_bvh.machine()
+
+    def progress(row: Any) -> None:
+        if not quiet:
+            say(f"{row.mesh}: {'  '.join(row.cells())}")
+
+    with warnings_told(quiet):
+        rows = bench_bvh.run(plan, progress)
+    if as_json:
+        say_json({"machine": told, "builders": [asdict(row) for row in rows if isinstance(row, bench_bvh.BuilderRow)],
+                  "volumes": [asdict(row) for row in rows if isinstance(row, bench_bvh.VolumeRow)]})
+        return
+    click.echo(f"{told}\n\n{bench_bvh.markdown(rows)}\n{bench_bvh.LEGEND}")
+
+
+@bench.command()
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--knobs", type=Names(), default=(),
               help="Which to turn: sampler, max_depth, triangle ... (a wrong name lists them)  [default: all]")

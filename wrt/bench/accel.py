@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
+from wrt.bench.memory import peak_bytes
 from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.bench.stadium import in_stadium
 from wrt.bench.visibility import TERRAINS, fit, terrain
@@ -62,7 +64,8 @@ class Plan:
 class Row:
     """One structure, mesh and kind of ray. build: seconds of each build; seconds: of each run over `rays` rays; nodes, boxes,
     primitives: fetched and tested, a ray (mean; of any-hit rays: as if the closest hit were asked); differ: rays whose prim_id or
-    bits of t are not the yardstick's; checked, wrong: rays given to brute force, and those that it contradicts."""
+    bits of t are not the yardstick's; checked, wrong: rays given to brute force, and those that it contradicts; peak_bytes: what
+    the process grew by at the first build (NaN where the system does not tell)."""
 
     mesh: str
     triangles: int
@@ -81,6 +84,7 @@ class Row:
     differ: int
     checked: int
     wrong: int
+    peak_bytes: float = float("nan")
 
     @property
     def mrays(self) -> np.ndarray:
@@ -135,9 +139,11 @@ class _Bench:
 
     def rows(self) -> Iterator[Row | Refused]:
         built: dict[str, tuple[Accelerator, tuple[float, ...]]] = {}
+        peaks: dict[str, float] = {}
         for name in self.plan.names:
             try:
-                accels = [build(self.geometry, name) for _ in range(self.plan.builds)]
+                first, peaks[name] = peak_bytes(partial(build, self.geometry, name))
+                accels = [first, *(build(self.geometry, name) for _ in range(self.plan.builds - 1))]
             except InputError as error:
                 yield Refused(self.name, name, str(error))
                 continue
@@ -149,8 +155,9 @@ class _Bench:
             exact = answer(brute_force, few, None)
             seconds = self._timed({name: accel for name, (accel, _) in built.items()}, rays)
             for name, (accel, build_seconds) in built.items():
-                yield self._row(name, accel, build_seconds, rays, seconds[name],
+                row = self._row(name, accel, build_seconds, rays, seconds[name],
                                 differing(answer(accel, rays, None), truth), len(few), differing(answer(accel, few, None), exact))
+                yield replace(row, peak_bytes=peaks[name])
 
     def _timed(self, accels: dict[str, Accelerator], rays: RaySet) -> dict[str, list[float]]:
         """The runs of all structures alternate, and their order turns: what else the machine does meets all alike."""

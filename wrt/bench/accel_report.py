@@ -18,14 +18,15 @@ from wrt.image import check_writable, write_codes
 
 REPORT = "accel.md"
 PLOTS = ("accel-build.png", "accel-memory.png", "accel-growth.png")
-COLUMNS = ("structure", "rays", "build ms", "B/triangle", "SAH", "depth", "refs", "nodes", "boxes", "triangles", "Mray/s",
+COLUMNS = ("structure", "rays", "build ms", "B/triangle", "peak B", "SAH", "depth", "refs", "nodes", "boxes", "triangles", "Mray/s",
            "/ first", "differ", "wrong")
 LEGEND = f"""\
-build: median of the builds, all cores. B/triangle: of the whole structure, triangles included. SAH: expected nodes and triangles of
-a random line through the root, costing 1 each. refs: primitives in all leaves over triangles. nodes, boxes, triangles: fetched and
-tested, a ray (closest hit). Mray/s: median of the alternating runs, the middle half of them in brackets; / first: over that of the
-first structure of the table, run by run. differ: rays with another prim_id or another bit of t than {YARDSTICK}, of all; wrong:
-the same against brute force, of as many rays as 2e8 tests allow. Both must be 0."""
+build: median of the builds, all cores. B/triangle: of the whole structure, triangles included; peak B: what the process grew by
+at the first build, a triangle. SAH: expected nodes and triangles of a random line through the root, costing 1 each. refs:
+primitives in all leaves over triangles. nodes, boxes, triangles: fetched and tested, a ray (closest hit). Mray/s: median of the
+alternating runs, the middle half of them in brackets; / first: over that of the first structure of the table, run by run. differ:
+rays with another prim_id or another bit of t than {YARDSTICK}, of all; wrong: the same against brute force, of as many rays as
+2e8 tests allow. Both must be 0."""
 
 
 def machine(plan: Plan) -> str:
@@ -38,7 +39,8 @@ def machine(plan: Plan) -> str:
 def cells(row: Row, first: Row) -> tuple[str, ...]:
     """One line of the table, as COLUMNS names it."""
     return (row.structure, row.kind, f"{1e3 * float(np.median(row.build)):.3g}", f"{row.bytes_per_triangle:.0f}",
-            f"{row.sah_cost:.3g}", f"{row.depth}", f"{row.references / row.triangles:.2f}", f"{row.nodes:.3g}", f"{row.boxes:.3g}",
+            f"{row.peak_bytes / row.triangles:.0f}", f"{row.sah_cost:.3g}", f"{row.depth}",
+            f"{row.references / row.triangles:.2f}", f"{row.nodes:.3g}", f"{row.boxes:.3g}",
             f"{row.primitives:.3g}", spread(row.mrays, 1.0), f"{np.median(row.mrays / first.mrays):.2f}", f"{row.differ}",
             f"{row.wrong} of {row.checked}")
 
