@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import shutil
 import time
@@ -48,8 +49,11 @@ def read(path: str | os.PathLike[str], largest: int | None = None) -> Saved:
     header, body = read_checked(path, MAGIC, "checkpoint", largest)
     try:
         low, high = map(int, header["samples"])
-        return Saved((low, high), float(header["seconds"]), dict(header["identity"]), body)
-    except (KeyError, TypeError, ValueError) as error:
+        seconds = float(header["seconds"])
+        if not 0.0 <= seconds < math.inf:
+            raise ValueError(f"{seconds} seconds")
+        return Saved((low, high), seconds, dict(header["identity"]), body)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"is no checkpoint of this version ({type(error).__name__}: {error})", path) from error
 
 

@@ -102,8 +102,8 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
     if checkpoint is not None and options["resume"] and not (os.path.lexists(checkpoint) or quiet):
         say(f"{checkpoint}: no checkpoint yet, rendering from the beginning")
 
-    with warnings_told(quiet), progress_reporter(quiet) as progress:
-        with naming(scene):
+    with warnings_told(quiet):
+        with progress_reporter(quiet) as progress, naming(scene):
             film = render_scene(loaded, spp=settings["spp"], progress=progress, **options)
         if not film.stats["samples"]:
             raise Interrupted(film.stats["signal"] or signal.SIGINT)  # there is nothing to keep
