@@ -167,16 +167,23 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
 
     @wp.func
     def on_triangle(surfaces: Surfaces, hit: Hit, place: Place) -> Surface:
-        """In the space of the triangle's vertices."""
+        """In the space of the triangle's vertices, but for the shading normal, which is in the world (0: that of the triangle)."""
         s = Surface()
         face = surfaces.faces[place.face]
         w = 1.0 - hit.u - hit.v
         s.point = triangle_point(surfaces, place.face, hit.u, hit.v)
         s.error = triangle_point_error(surfaces, place.face, hit.u, hit.v)
         s.geometric = triangle_normal(surfaces, place.face)
-        s.shading = s.geometric
         if wp.static(smooth):
-            n = w * surfaces.normals[face[0]] + hit.u * surfaces.normals[face[1]] + hit.v * surfaces.normals[face[2]]
+            n0 = surfaces.normals[face[0]]
+            n1 = surfaces.normals[face[1]]
+            n2 = surfaces.normals[face[2]]
+            if wp.static(instances):  # each by itself: an interpolated one would turn elsewhere
+                instance = surfaces.instances[place.instance]
+                n0 = world_normal(instance, n0)
+                n1 = world_normal(instance, n1)
+                n2 = world_normal(instance, n2)
+            n = w * n0 + hit.u * n1 + hit.v * n2
             length = wp.length(n)
             if length > 0.0:  # corners without a normal are zero: flat there
                 s.shading = n / length
@@ -196,12 +203,11 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
 
     @wp.func
     def in_world(local: Surface, instance: Instance) -> Surface:
-        """Everything is computed in the mesh's space and taken to the world once."""
+        """What is computed in the mesh's space is taken to the world once."""
         s = local
         s.point = world_point(instance, local.point)
         s.error = world_error(instance, local.point, local.error, s.point)
         s.geometric = world_normal(instance, local.geometric)
-        s.shading = world_normal(instance, local.shading)
         if wp.static(tangents):
             s.bitangent_sign = local.bitangent_sign * instance.handedness
             s.tangent = wp.normalize(world_direction(instance, local.tangent))
@@ -243,6 +249,8 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
             s = on_triangle(surfaces, hit, place)
             if wp.static(instances):
                 s = in_world(s, surfaces.instances[place.instance])
+        if not wp.dot(s.shading, s.shading) > 0.0:
+            s.shading = s.geometric
         s.material = place.material
         s.exclude = wp.where(hit.prim_id < surfaces.n_triangles, hit.prim_id, -1)
         s.front = 1

@@ -250,7 +250,16 @@ class _Builder:
             of_group = np.zeros(len(mesh.groups), dtype=np.int32)
             of_group[used] = [names.index(str(name)) for name in wanted]
             face_material = of_group[mesh.face_group]
-        return [Object(mesh, tuple(materials), transform(table.transform), face_material, table.name or place)]
+        whole, name = transform(table.transform), table.name or place
+        each = [np.eye(4)] if table.instances is None else [self.placed(one, i) for i, one in enumerate(table.instances)]
+        return [Object(mesh, tuple(materials), whole @ matrix, face_material, name) for matrix in each]
+
+    @staticmethod
+    def placed(table: tables.TransformTable, index: int) -> np.ndarray:
+        try:
+            return transform(table)
+        except InputError as error:
+            raise InputError(f"instances[{index}]: {error}") from None
 
     def mesh(self, table: tables.MeshTable) -> Mesh:
         key: tuple[Any, ...]

@@ -257,6 +257,8 @@ class MeshTable(Table):
     smooth: bool | None = Field(None, description="true: make vertex normals where the mesh has none; false: flat, "
                                 "even where it has some (default: as it is)")
     transform: TransformTable | None = Field(None, description="object to world")
+    instances: Annotated[list[TransformTable], Field(min_length=1)] | None = Field(
+        None, description="the mesh once for each, placed so before `transform` places all of them; kept once in memory")
     name: str = Field("", description="for messages")
 
     @model_validator(mode="after")

@@ -234,6 +234,19 @@ def test_no_more_than_twenty_mistakes_are_told(tmp_path: Path) -> None:
     assert head.endswith("35 errors") and len(lines) == 21 and lines[-1] == "and 15 more"
 
 
+def test_instances_of_a_mesh_are_placed_before_its_transform(tmp_path: Path) -> None:
+    table = '[materials.m]\n[[meshes]]\nshape = { kind = "prism" }\nmaterial = "m"\n'
+    scene = load(tmp_path, CAMERA + SUN + table + "transform = { rotate = [0, 90, 0] }\n"
+                 "instances = [{ translate = [1, 0, 0] }, { scale = 2 }, {}]\n")
+    assert len({id(thing.mesh) for thing in scene.objects}) == 1
+    images = [thing.transform @ [1, 0, 0, 1] for thing in scene.objects]
+    np.testing.assert_allclose(images, [[0, 0, -2, 1], [0, 0, -2, 1], [0, 0, -1, 1]], atol=1e-12)
+    with pytest.raises(InputError, match=r"meshes\[0\]: instances\[1\]: the transform's matrix is singular"):
+        load(tmp_path, CAMERA + SUN + table + "instances = [{}, { matrix = [1,0,0,0, 0,1,0,0, 0,0,0,0, 0,0,0,1] }]\n")
+    with pytest.raises(InputError, match="instances"):
+        load(tmp_path, CAMERA + SUN + table + "instances = []\n")
+
+
 def including(folder: Path, transform: str) -> tuple[Scene, Scene]:
     """A glTF file with a moved triangle, a camera and lights of each kind: alone, and included under a transform."""
     file = one_triangle()

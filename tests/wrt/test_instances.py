@@ -1,0 +1,173 @@
+"""Pictures with instances: what is seen is what is seen when every mesh is copied, and new rays leave surfaces as clearly."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import wrt
+from tests.data import data_path
+from tests.gltf_files import GltfFile
+from wrt.accel import build
+from wrt.accel.instances import Instances, place
+from wrt.bench.rasterizer import Rasterizer
+from wrt.bench.visibility_check import compare
+from wrt.errors import InputError
+from wrt.film import Film
+from wrt.mesh import Mesh
+from wrt.scene import Camera, ConstantBackground, Material, Object, Scene, Settings, Sphere, Texture
+from wrt.shapes import icosphere, quad
+from wrt.smooth import smooth
+from wrt.world import world_mesh
+
+AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
+SIZE = (160, 120)
+
+
+def turned(seed: int, scale: object, *move: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.random(random_state=seed).as_matrix() @ np.diag(np.broadcast_to(np.asarray(scale), 3))
+    matrix[:3, 3] = move
+    return matrix
+
+
+def picture(seed: int, alpha: bool) -> Texture:
+    rng = np.random.default_rng(seed)
+    image = rng.integers(60, 255, (8, 8, 4), dtype=np.uint8)
+    image[..., 3] = np.where(rng.random((8, 8)) < 0.5, 0, 255) if alpha else 255
+    image[..., 2] = np.maximum(image[..., 2], 180)  # as a normal map: upwards
+    return Texture(image, srgb=alpha)
+
+
+def everything() -> Scene:
+    """Cut-outs, normal maps on mirrored meshes, glass that absorbs, smooth meshes, area lights, spheres, and materials by face;
+    all but the floor share meshes, under maps that stretch, turn and mirror."""
+    ball, pane = smooth(icosphere(2)), quad()
+    uvs = np.stack([np.arctan2(ball.vertices[:, 2], ball.vertices[:, 0]) / (2.0 * math.pi), ball.vertices[:, 1]], axis=1)
+    ball = Mesh(ball.vertices, ball.faces, ball.normals, uvs.astype(np.float32))
+    flat = Mesh(ball.vertices, ball.faces)
+    lamp = Material(name="lamp", albedo=(0.0, 0.0, 0.0), emission=(12.0, 11.0, 9.0))
+    grey, red = Material(name="grey"), Material(name="red", albedo=(0.7, 0.1, 0.1))
+    leaf = Material(name="leaf", alpha_mode="mask", albedo_texture=picture(1, True))
+    bumpy = Material(name="bumpy", normal_texture=picture(2, False))
+    glass = Material(name="glass", kind="glass", absorption=(0.8, 0.2, 0.1))
+    by_face = (np.arange(len(flat.faces)) % 2).astype(np.int32)
+    floor = np.diag([20.0, 20.0, 1.0, 1.0])
+    floor[:3, :3] = Rotation.from_euler("x", -90, degrees=True).as_matrix() @ floor[:3, :3]
+    objects = (
+        Object(quad(), (grey,), floor),
+        Object(ball, (bumpy,), turned(1, (1.0, 0.6, 1.2), -2.6, 1.0, 0.0)),
+        Object(ball, (bumpy,), turned(2, (-0.8, 0.8, 0.8), 0.0, 0.8, -1.0)),
+        Object(ball, (glass,), turned(3, (0.9, 0.7, 0.8), 0.3, 0.9, 1.6)), Object(ball, (leaf,), turned(4, 0.9, 2.4, 1.0, 0.4)),
+        Object(flat, (red, grey), turned(5, (0.5, 0.5, -0.9), -1.2, 0.8, 1.9), by_face),
+        Object(flat, (red,), turned(6, (0.3, 0.6, 0.3), 1.4, 0.6, 2.0)),
+        Object(pane, (lamp,), turned(7, 1.5, -3.0, 5.0, 1.0)), Object(pane, (lamp,), turned(9, (2.0, 1.0, 1.0), 3.0, 5.0, 2.0)),
+        Object(pane, (leaf,), turned(8, 1.3, -0.6, 1.4, 0.3)),
+    )
+    return Scene(objects, (Sphere((1.2, 0.4, 0.9), 0.4, red),), (), (Camera.look_at((0.0, 2.4, 7.0), (0.0, 0.9, 0.0)),),
+                 ConstantBackground((0.2, 0.25, 0.3)), settings=Settings(size=SIZE, spp=64, max_depth=5))
+
+
+@cache
+def both() -> tuple[Film, Film]:
+    return tuple(wrt.render(everything(), instancing=mode, aov=AOVS) for mode in ("never", "always"))  # type: ignore[return-value]
+
+
+def test_the_same_is_seen_through_instances() -> None:
+    copied, shared = both()
+    same = copied.aov["prim_id"] == shared.aov["prim_id"]
+    assert (~same).mean() < 2e-4  # at an outline, by rounding
+    assert len(np.unique(copied.aov["prim_id"])) > 500 and len(np.unique(copied.aov["material_id"])) == 6
+    np.testing.assert_array_equal(shared.aov["material_id"][same], copied.aov["material_id"][same])
+    hit = same & np.isfinite(copied.aov["depth"])
+    np.testing.assert_allclose(shared.aov["depth"][hit], copied.aov["depth"][hit], rtol=2e-5)
+    np.testing.assert_allclose(shared.aov["albedo"][hit], copied.aov["albedo"][hit], atol=2e-3)
+    off = np.abs(shared.aov["normal"] - copied.aov["normal"])[hit].max(axis=-1)
+    assert off.max() < 2e-3
+
+
+def test_the_same_light_is_seen_through_instances() -> None:
+    """Each picture's noise is known, and the two use the same samples: what differs is a small part of it."""
+    copied, shared = both()
+    error = np.sqrt(copied.variance.mean())
+    assert np.sqrt(((copied.pixels - shared.pixels) ** 2).mean()) < 0.05 * error
+    np.testing.assert_allclose(shared.pixels.mean(axis=(0, 1)), copied.pixels.mean(axis=(0, 1)), rtol=2e-3)
+    assert shared.stats["not_finite"] == 0
+    assert abs(shared.stats["rays"] / copied.stats["rays"] - 1.0) < 2e-3
+
+
+def test_stats_tell_what_is_kept() -> None:
+    copied, shared = both()
+    assert copied.stats["triangles"] == shared.stats["triangles"] == copied.stats["stored_triangles"]
+    # The copied floor, and the two balls and the pane once each.
+    assert shared.stats["stored_triangles"] == 2 + 320 + 320 + 2
+    assert shared.stats["accel"]["bytes"] < 0.5 * copied.stats["accel"]["bytes"]
+
+
+def test_the_rasterizer_sees_the_same() -> None:
+    """Visibility by the z-buffer of the copied triangles against rays through the instances."""
+    scene = Scene(tuple(thing for thing in everything().objects if thing.materials[0].alpha_mode == "opaque"),
+                  cameras=everything().cameras, settings=Settings(size=SIZE, spp=1))
+    film = wrt.render(scene, instancing="always", aov=("depth", "prim_id"))
+    geometry = world_mesh(scene).geometry
+    found = compare(Rasterizer(geometry), film.aov["depth"], film.aov["prim_id"], geometry, scene.cameras[0], SIZE)
+    assert found.covered > 10_000 and found.unexplained == 0 and found.differ < 10
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_no_new_ray_meets_the_surface_it_leaves(scale: float) -> None:
+    """A white furnace: on a closed convex mesh of albedo 1 under a sky of 1 every sample is 1, unless its shadow ray meets the
+    surface that it left. Far from the origin, stretched and turned, and the mesh itself far from its own origin."""
+    ball = icosphere(3)
+    white = Material(albedo=(1.0, 1.0, 1.0))
+    aside = Mesh(ball.vertices + np.float32(30.0), ball.faces)
+    center, objects = scale * np.array([23.0, 23.0, 20.0]), []
+    for away in (0.0, 1e3 * scale):  # the second is behind the camera
+        matrix = turned(1, scale * np.array([1.0, 0.5, 1.3]), *center)
+        matrix[:3, 3] -= matrix[:3, :3] @ np.full(3, 30.0) - np.array([0.0, 0.0, away])
+        objects.append(Object(aside, (white,), matrix))
+    scene = Scene(tuple(objects), cameras=(Camera.look_at(center + np.array([0.0, 0.0, 4.0 * scale]), center),),
+                  background=ConstantBackground((1.0, 1.0, 1.0)), settings=Settings(size=(96, 96), spp=32, max_depth=0))
+    film = wrt.render(scene, instancing="always", aov=("prim_id",))
+    assert (film.aov["prim_id"] >= 0).mean() > 0.15
+    assert np.abs(film.pixels - 1.0).max() < 1e-4
+
+
+def test_nodes_and_instances_of_a_gltf_file_share_their_mesh(tmp_path) -> None:
+    file = GltfFile()
+    ball = icosphere(2)
+    mesh = file.mesh(file.primitive(ball.vertices, ball.faces.reshape(-1)))
+    file.node(mesh=mesh, translation=[0, 3, 0])
+    file.node(mesh=mesh, scale=[1, -1, 1])
+    moves = file.accessor([[float(3 * i), 0.0, 4.0] for i in range(5)])
+    file.node(mesh=mesh, extensions={"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": moves}}})
+    file.json["scenes"] = [{"nodes": [0, 1, 2]}]
+    file.json["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
+    with pytest.warns(wrt.SceneWarning):
+        scene = wrt.load_scene(file.write(tmp_path))
+    film = wrt.render(scene, size=(64, 48), spp=1, instancing="always")
+    assert film.stats["triangles"] == 7 * 320 and film.stats["stored_triangles"] == 320
+
+
+def test_instances_have_neither_files_nor_refit(tmp_path) -> None:
+    ball = icosphere(1)
+    accel = build(place(*((wrt.accel.Geometry.of(ball), np.eye(4)),) * 2), "bvh")
+    assert isinstance(accel, Instances) and "160 primitives in 1 instances" not in repr(accel)
+    with pytest.raises(InputError, match="cannot be written"):
+        accel.save(tmp_path / "x.accel")
+    with pytest.raises(InputError, match="cannot follow"):
+        accel.refit(ball.vertices)
+    with pytest.raises(InputError, match="no option"):
+        build(accel.geometry, "bvh", nonsense=1)
+
+
+@pytest.mark.slow
+def test_a_million_triangles_of_shared_spheres_take_a_hundredth_of_the_memory() -> None:
+    scene = wrt.load_scene(data_path("scenes/gltf/MetalRoughSpheresNoTextures.glb"))
+    copied, shared = (wrt.render(scene, size=(160, 120), spp=4, instancing=mode) for mode in ("never", "auto"))
+    assert shared.stats["accel"]["bytes"] < 0.02 * copied.stats["accel"]["bytes"]
+    assert np.sqrt(((copied.pixels - shared.pixels) ** 2).mean()) < 0.1 * np.sqrt(copied.variance.mean())
