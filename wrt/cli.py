@@ -23,7 +23,7 @@ import wrt
 from wrt.cli_bench import bench, stability
 from wrt.cli_build import build
 from wrt.cli_common import Crop, Duration, Names, Size, load, naming, say, say_json, warnings_told
-from wrt.cli_profile import profile
+from wrt.cli_profile import profile, whatif
 from wrt.cli_save import check_room, checkpoint_options, save_film
 from wrt.errors import InputError
 from wrt.interrupt import Interrupted, exit_code, raise_on_termination
@@ -39,6 +39,7 @@ cli.add_command(stability)
 cli.add_command(bench)
 cli.add_command(build)
 cli.add_command(profile)
+cli.add_command(whatif)
 
 
 @cli.command()

@@ -1,4 +1,4 @@
-"""Commands of the model of the RT core: `profile`, `bench rtcore`, `bench instructions`."""
+"""Commands of the model of the RT core: `profile`, `whatif`, `bench rtcore`, `bench instructions`."""
 
 from __future__ import annotations
 
@@ -49,6 +49,48 @@ def profile(scene: Path, output: Path | None, gpu: str, quiet: bool, as_json: bo
     click.echo(text)
     for path in paths:
         click.echo(path)
+
+
+STUDIES = ("width", "stack", "planes", "order", "sorting", "rates")
+
+
+@click.command()
+@click.argument("study", type=click.Choice(STUDIES))
+@click.argument("mesh", type=click.Path(path_type=Path))
+@click.option("--kinds", type=Names(), default=("primary", "diffuse"), help="Of rays: primary, shadow, diffuse, random")
+@click.option("--rays", type=int, default=2**15, show_default=True, help="Rays of each kind")
+@click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
+@click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the table as Markdown (.md)")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def whatif(study: str, mesh: Path, output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+    """Change one thing of the RT core's design, and count the same rays through MESH again.
+
+    STUDY: width (node width, format and volume), stack (entries, with restarts), planes (bits of a box plane), order (nearer
+    child first, early stop), sorting (of rays), rates (boxes a clock against triangles a clock).
+    """
+    from wrt.bench import whatif as studies
+
+    plan = studies.Plan("width" if study == "rates" else study, mesh, **options)
+    check_report(output)
+    tell = say if not quiet else lambda line: None
+    with warnings_told(quiet):
+        if study == "rates":
+            rates = studies.rates(plan, tell)
+            text = studies.rates_markdown(rates)
+            data = [{"structure": row.structure, "kind": row.kind, "boxes": row.boxes, "triangles": row.triangles,
+                     "rays_per_second": row.prediction.rays_per_second, "limit": row.prediction.bottleneck,
+                     "clocks": row.prediction.terms, "doubled": row.doubled} for row in rates]
+        else:
+            rows = studies.run(plan, lambda row: tell("  ".join(studies.cells(row))))
+            text, data = studies.markdown(rows), [row.as_dict() for row in rows]
+    if output is not None:
+        output.write_text(f"# What if: {study}, {mesh.name}\n\n{text}\n", encoding="utf-8")
+    if as_json:
+        say_json({"study": study, "mesh": mesh.name, "rows": data, "output": output})
+        return
+    click.echo(text)
 
 
 def check_report(output: Path | None) -> None:

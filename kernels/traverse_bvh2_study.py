@@ -1,0 +1,200 @@
+"""Traversals of the binary BVH as a design would have them, to be counted: without order, without an early stop, or with a stack of
+few entries. All give the same hits as the one in use.
+
+A short stack forgets its oldest entries; when it runs out, the walk starts again at the root and follows a trail of one bit a
+level: which levels are done but for their last child (Laine 2010, "Restart Trail for Stackless BVH Traversal"; Vaidyanathan et
+al. 2019, "Wide BVH Traversal with a Short Stack").
+"""
+
+from typing import NamedTuple
+
+import warp as wp
+
+from wrt.kernels.counters import Counts, make_counters
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node, make_struct
+
+LEVELS = 62  # of the tree, that a trail has bits for
+TOP = wp.constant(wp.uint64(1 << 63))
+NONE = wp.constant(wp.uint64(0))
+
+
+class Study(NamedTuple):
+    """entries: of the stack, STACK_SIZE for all that it needs; ordered: the nearer child first; early: boxes and entries beyond
+    the best hit are dropped. A short stack needs both. Stands where a structure names its traversal's module."""
+
+    entries: int = STACK_SIZE
+    ordered: bool = True
+    early: bool = True
+
+    def make_struct(self, record):
+        return make_struct(record)
+
+    def make_traversal(self, units: Units, any_hit: bool, accepts=None):
+        if self.entries < STACK_SIZE:
+            return make_short_stack(units, self.entries, any_hit, accepts)
+        return make_full_stack(units, self, any_hit, accepts)
+
+
+def make_full_stack(units: Units, study: Study, any_hit: bool, accepts=None):
+    """As traverse_bvh2, with or without order and early stop."""
+    probe_of = make_probe(units)
+    intersect = make_intersect(units, accepts)
+    ray_aabb = units.box_test
+    fetch_node, fetch_primitive, push, finish = make_counters(units, Bvh2Node.numpy_dtype()["itemsize"])
+    struct = make_struct(units.triangle_test.record)
+
+    @wp.func
+    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+        probe = probe_of(ray)
+        best = no_hit(ray)
+        counts = Counts()
+        end = best.t
+        stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
+        stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
+        stack_t = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
+        size = int(0)
+        first = int(0)
+        count = int(0)
+        while True:
+            if count > 0:
+                counts.leaves += 1
+                for i in range(first, first + count):
+                    best = intersect(probe, surfaces, accel.primitives[i], best)
+                    counts = fetch_primitive(accel.recorder, ray, counts, i)
+                    if wp.static(any_hit):
+                        if best.prim_id != NO_HIT:
+                            return finish(accel.recorder, ray, counts, best)
+                if wp.static(study.early):
+                    end = best.t
+            else:
+                node = accel.nodes[first]
+                counts = fetch_node(accel.recorder, ray, counts, first, 2)
+                t_0 = ray_aabb(probe.box, node.lo_0, node.hi_0, end)
+                t_1 = ray_aabb(probe.box, node.lo_1, node.hi_1, end)
+                hit_0 = t_0 < wp.inf
+                hit_1 = t_1 < wp.inf
+                if hit_0 and hit_1:
+                    swap = bool(False)
+                    if wp.static(study.ordered):
+                        swap = t_1 < t_0
+                    stack_first[size] = wp.where(swap, node.first_0, node.first_1)
+                    stack_count[size] = wp.where(swap, node.count_0, node.count_1)
+                    stack_t[size] = wp.where(swap, t_0, t_1)
+                    size = size + 1
+                    counts = push(counts, size)
+                    first = wp.where(swap, node.first_1, node.first_0)
+                    count = wp.where(swap, node.count_1, node.count_0)
+                    continue
+                if hit_0:
+                    first = node.first_0
+                    count = node.count_0
+                    continue
+                if hit_1:
+                    first = node.first_1
+                    count = node.count_1
+                    continue
+            found = bool(False)
+            while size > 0 and not found:
+                size = size - 1
+                counts.pops += 1
+                if stack_t[size] <= end:
+                    first = stack_first[size]
+                    count = stack_count[size]
+                    found = True
+            if not found:
+                break
+        return finish(accel.recorder, ray, counts, best)
+
+    return traverse
+
+
+def make_short_stack(units: Units, entries: int, any_hit: bool, accepts=None):
+    """The closest hit, or any, with so many entries (0: none, each pop starts again at the root). The tree has LEVELS at most."""
+    probe_of = make_probe(units)
+    intersect = make_intersect(units, accepts)
+    ray_aabb = units.box_test
+    fetch_node, fetch_primitive, push, finish = make_counters(units, Bvh2Node.numpy_dtype()["itemsize"])
+    struct = make_struct(units.triangle_test.record)
+    room = max(entries, 1)
+
+    @wp.func
+    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+        probe = probe_of(ray)
+        best = no_hit(ray)
+        counts = Counts()
+        stack_first = wp.zeros(shape=wp.static(room), dtype=wp.int32)
+        stack_count = wp.zeros(shape=wp.static(room), dtype=wp.int32)
+        stack_t = wp.zeros(shape=wp.static(room), dtype=wp.float32)
+        top = int(0)  # entries ever pushed less those popped; the newest is at (top - 1) modulo room
+        size = int(0)
+        first = int(0)
+        count = int(0)
+        trail = wp.uint64(0)
+        level = TOP  # one bit, lower for each step down
+        resumed = wp.uint64(0)  # the level whose last child is to be visited
+        while True:
+            if count > 0:
+                counts.leaves += 1
+                for i in range(first, first + count):
+                    best = intersect(probe, surfaces, accel.primitives[i], best)
+                    counts = fetch_primitive(accel.recorder, ray, counts, i)
+                    if wp.static(any_hit):
+                        if best.prim_id != NO_HIT:
+                            return finish(accel.recorder, ray, counts, best)
+            else:
+                node = accel.nodes[first]
+                counts = fetch_node(accel.recorder, ray, counts, first, 2)
+                t_0 = ray_aabb(probe.box, node.lo_0, node.hi_0, best.t)
+                t_1 = ray_aabb(probe.box, node.lo_1, node.hi_1, best.t)
+                hit_0 = t_0 < wp.inf
+                hit_1 = t_1 < wp.inf
+                if hit_0 or hit_1:
+                    level = level >> wp.uint64(1)
+                    second = t_1 < t_0  # which is nearer; a miss is at infinity
+                    go = bool(True)
+                    if hit_0 and hit_1:
+                        if (trail & level) != NONE:
+                            second = not second
+                        elif wp.static(entries > 0):
+                            at = top % wp.static(room)
+                            stack_first[at] = wp.where(second, node.first_0, node.first_1)
+                            stack_count[at] = wp.where(second, node.count_0, node.count_1)
+                            stack_t[at] = wp.where(second, t_0, t_1)
+                            top = top + 1
+                            size = wp.min(size + 1, wp.static(room))
+                            counts = push(counts, size)
+                    elif level != resumed:
+                        trail = trail | level
+                    else:
+                        go = bool(False)  # only the first child is left in reach, and that is done
+                    if go:
+                        first = wp.where(second, node.first_1, node.first_0)
+                        count = wp.where(second, node.count_1, node.count_0)
+                        continue
+            # On to the deepest level that has a child left: carry over those that have none.
+            found = bool(False)
+            while not found:
+                trail = (trail & ((~level) + wp.uint64(1))) + level
+                if trail >= TOP:
+                    return finish(accel.recorder, ray, counts, best)
+                resumed = trail & ((~trail) + wp.uint64(1))
+                if size > 0:
+                    size = size - 1
+                    top = top - 1
+                    at = top % wp.static(room)
+                    counts.pops += 1
+                    level = resumed
+                    if stack_t[at] <= best.t:
+                        first = stack_first[at]
+                        count = stack_count[at]
+                        found = True
+                else:
+                    first = int(0)
+                    count = int(0)
+                    level = TOP
+                    found = True
+        return finish(accel.recorder, ray, counts, best)
+
+    return traverse
