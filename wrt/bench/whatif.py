@@ -239,4 +239,4 @@ def rates_markdown(rows: Sequence[Rate]) -> str:
               row.prediction.bottleneck, *(f"{row.prediction.terms[name]:.3g}" for name in TERMS), f"{row.doubled:.2f}x")
              for row in rows]
     return (f"{table(columns, lines)}\n\n{', '.join(TERMS)}: clocks a ray and RT core, with {MANY_WARPS.warps} warps at a time and"
-            " an L2 that has seen the same rays before; twice the triangles: rays a second with twice the triangle rate, over these.")
+            " an L2 that has seen the same rays before; twice the triangles: rays a second with twice that rate, over these.")
