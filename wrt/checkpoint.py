@@ -101,6 +101,9 @@ class Checkpoint:
         """Keep the part file, its lock and its room during the block. Raises InputError where the system refuses."""
         try:
             self._reserve(2 * self.bytes)
+            if self.saved is None and os.path.lexists(self.path):  # another render was faster
+                self._release()
+                raise InputError("is there already", self.path)
         except OSError as error:
             self._release()
             raise InputError(f"a checkpoint cannot be written: {_reason(error)}", self.path) from error

@@ -43,6 +43,9 @@ BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, wit
 MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
 PREPARING_TOLD = 1.0  # seconds of compiling and building before `progress` is told of it
 MAX_SPP = 1 << 16  # where a target error asks for more than anybody said
+# What may change between a checkpoint and going on with it; and the camera and the device, which are compared by what they are.
+NO_PIXEL = ("spp", "exposure", "tonemap", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size", "progress",
+            "checkpoint", "checkpoint_every", "resume", "camera", "device")
 
 
 def render(scene: Scene | Mesh | str | os.PathLike[str], *, spp: int | None = None,
@@ -131,9 +134,9 @@ class Renderer:
 
     def _checkpoint(self) -> Checkpoint:
         """The file to save to, which says what must be the same to go on with it. Errors of it are told before the work."""
-        options, settings, device = self.options, asdict(self.scene.settings), self.device
-        identity = {name: settings[name] for name in SETTINGS if name not in ("spp", "exposure", "tonemap")}
-        identity |= {name: getattr(options, name) for name in ("seed", "accel", "accel_options", "triangle", "box")}
+        options, settings, device = self.options, self.scene.settings, self.device
+        identity = {name: getattr(settings, name) for name in SETTINGS if name not in NO_PIXEL}
+        identity |= {name: getattr(options, name) for name in OPTIONS if name not in NO_PIXEL}
         identity |= {
             "crop": self.crop, "groups of samples": self.groups, "scene": scene_digest(self.scene),
             "camera": camera_digest(self.camera), "device": f"cuda, sm_{device.arch}" if device.is_cuda else "cpu",
@@ -142,10 +145,9 @@ class Renderer:
         area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
         file = Checkpoint(Path(options.checkpoint or ""), options.checkpoint_every, identity, area=area, groups=self.groups,
                           resume=options.resume)
-        spp = max(1, settings["spp"] // self.groups)
-        if file.saved is not None and file.saved.samples[1] > spp:
-            raise InputError(f"holds {file.saved.samples[1] * self.groups} samples a pixel already; spp is {settings['spp']}",
-                             file.path)
+        taken = 0 if file.saved is None else file.saved.samples[1]
+        if taken > max(1, settings.spp // self.groups):
+            raise InputError(f"holds {taken * self.groups} samples a pixel already; spp is {settings.spp}", file.path)
         return file
 
     def _prepare(self) -> None:
@@ -190,7 +192,7 @@ class Renderer:
 
         seed, spp: in place of the options' and the scene's; not with a checkpoint.
         """
-        if self.checkpoint is not None and not seed is spp is None:
+        if self.checkpoint is not None and (seed is not None or spp is not None):
             raise InputError("a render with a checkpoint has the seed and spp that it was made with")
         self.seed = self.options.seed if seed is None else seed
         self.spp = max(1, (spp or self.scene.settings.spp) // self.groups)  # a group

@@ -205,6 +205,8 @@ def test_a_checkpoint_of_another_render_is_refused(path: Path) -> None:
     refuses("accel was bvh, is brute-force|accel was bvh, is brute_force", path, resume=True, accel=next(
         name for name in wrt.ACCELERATORS if "brute" in name))
     refuses(r"crop was \[0, 0, 61, 34\], is \[0, 0, 61, 33\]", path, resume=True, crop=(0, 0, 61, 33))
+    refuses("instancing was auto, is never$", path, resume=True, instancing="never")
+    refuses("triangle was watertight, is ", path, resume=True, triangle="moeller_trumbore")
     refuses("groups of samples was 1, is 4", path, resume=True, target_error=0.1)
     refuses("the camera is another", path, resume=True, camera=Camera.look_at((2, 2, 4.1), (0, 0, 0)))
     refuses("of another render: the scene is another$", path, resume=True, scene=replace(SCENE, ambient=(0.1, 0.1, 0.1)))
@@ -349,6 +351,14 @@ def test_two_renders_do_not_write_one_file(path: Path) -> None:
     with Checkpoint(path, 60.0, {}, area=1, groups=1, resume=False).held():
         refuses("another render is writing it", path)
     render(SCENE, spp=1, checkpoint=path)
+
+
+def test_a_checkpoint_that_appears_while_kernels_are_compiled_is_not_overwritten(path: Path) -> None:
+    renderer = Renderer(SCENE, Options(checkpoint=path))
+    path.write_bytes(b"of another render")
+    with pytest.raises(InputError, match="is there already"):
+        renderer.run()
+    assert path.read_bytes() == b"of another render" and files(path) == [path.name]
 
 
 def test_what_a_killed_render_left_is_no_hindrance(path: Path) -> None:

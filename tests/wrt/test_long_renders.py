@@ -129,7 +129,7 @@ def test_kills_lose_little_and_change_nothing() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("extra", "every"), [
-    (("--spp", 1600), 0.5), (("--spp", 1600, "--target-error", 1e-5), 0.5), (("--spp", 1600), 0.001),
+    (("--spp", 800), 0.5), (("--spp", 800, "--target-error", 1e-5), 0.5), (("--spp", 800), 0.001),
 ], ids=["spp", "target-error", "saving all the time"])
 def test_twenty_kills_at_random_moments(extra: tuple[Any, ...], every: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules[__name__], "RENDER", (*RENDER, *extra))
