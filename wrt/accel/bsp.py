@@ -40,7 +40,7 @@ class Bsp(Accelerator):
     kernels = kernels
 
     def _build(self, cost_intersection: float = 75.0, cost_axis: float = 10.0, cost_plane: float = 20.0, samples: int = 128,
-               max_depth: int = 0, max_growth: float = 16.0, max_triangles: int = 200_000,
+               max_depth: int = 0, max_growth: float = 16.0, max_triangles: int = 500_000,
                progress: Callable[[float], None] | None = None) -> Built:
         n = len(self.geometry)
         for name, value in (("cost_intersection", cost_intersection), ("cost_axis", cost_axis), ("cost_plane", cost_plane)):
