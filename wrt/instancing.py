@@ -11,7 +11,7 @@ from wrt.scene import Object, Scene
 
 INSTANCING = ("auto", "always", "never")
 # Copies of one mesh with so many triangles together are worth a second level (docs/acceleration.md, "Instances").
-MIN_SAVED = 100_000
+MIN_SAVED = 250_000
 # Sum of |A| |A^-1| over a row, 3 at most for turned and scaled meshes. Beyond, rounding in the mesh's space is much in the world.
 MAX_SPREAD = 1e4
 

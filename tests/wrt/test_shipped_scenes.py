@@ -47,7 +47,7 @@ def test_every_feature_has_a_scene_that_needs_it(name: str) -> None:
 def test_every_feature_changes_the_code_of_a_scene_that_needs_it(name: str) -> None:
     start("cpu")
     needed = next(f for path in SCENES for f in features(path) if getattr(f, name))
-    codes = [render_kernel(f, Structure(ACCELERATORS["bvh"], Units(spheres=f.spheres))).module.hash_module()
+    codes = [render_kernel(f, Structure(ACCELERATORS["bvh"], Units(spheres=f.spheres, instances=f.instances))).module.hash_module()
              for f in (needed, replace(needed, **{name: False}))]
     assert codes[0] != codes[1]
 
@@ -70,7 +70,7 @@ def test_a_scene_renders(path: Path) -> None:
 def test_kernels_compile_for_turing_and_hopper(path: Path, tmp_path: Path) -> None:
     start("cpu")
     for variant in features(path):
-        kernel = render_kernel(variant, Structure(ACCELERATORS["bvh"], Units(spheres=variant.spheres)))
+        kernel = render_kernel(variant, Structure(ACCELERATORS["bvh"], Units(spheres=variant.spheres, instances=variant.instances)))
         binaries = wp.compile_aot_module(kernel.module, arch=[75, 90], module_dir=tmp_path)
         assert [Path(binary).stat().st_size > 10_000 for binary in binaries] == [True, True]
 
