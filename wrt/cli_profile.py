@@ -61,6 +61,7 @@ STUDIES = ("width", "stack", "planes", "order", "sorting", "rates")
 @click.option("--rays", type=int, default=2**15, show_default=True, help="Rays of each kind")
 @click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@click.option("--inside", is_flag=True, help="The camera stands in the middle of the mesh's box, as in a room")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the table as Markdown (.md)")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
@@ -106,12 +107,15 @@ def check_report(output: Path | None) -> None:
 @click.option("--rays", type=int, default=2**16, show_default=True, help="Rays of each kind")
 @click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@click.option("--inside", is_flag=True, help="The camera stands in the middle of the mesh's box, as in a room")
+@click.option("--software", is_flag=True, help="Also what the same rays take in software on a GTX 1080 Ti (compiles for Turing)")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the tables as Markdown (.md)")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def rtcore(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+def rtcore(meshes: tuple[Path, ...], software: bool, output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
     """The model of the RT core on MESHES: what limits it, rays a second as ranges, and which assumption moves them most."""
     from wrt.bench import rtcore as bench_rtcore
+    from wrt.bench.instructions import software_table
     from wrt.bench.rtcore_report import LEGEND, cells, parameter_table
 
     plan = bench_rtcore.Plan(meshes, **options)
@@ -124,11 +128,16 @@ def rtcore(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: 
     with warnings_told(quiet):
         rows = bench_rtcore.run(plan, told)
     text = f"{bench_rtcore.markdown(rows)}\n{LEGEND}\n\n{parameter_table()}"
+    in_software = bench_rtcore.in_software(rows) if software else []
+    if software:
+        text += f"\n\n{bench_rtcore.SOFTWARE_TITLE}\n\n{software_table(in_software)}"
     if output is not None:
         output.write_text(f"{text}\n", encoding="utf-8")
     if as_json:
         say_json({"rows": [{"mesh": row.mesh, "triangles": row.triangles, "structure": row.structure, "bytes": row.bytes,
-                            **row.row.as_dict()} for row in rows], "output": output})
+                            **row.row.as_dict()} for row in rows], "output": output,
+                  "software": [{"name": each.name, "instructions": each.instructions, "rays_per_second": each.rays_per_second}
+                               for each in in_software]})
         return
     click.echo(text)
 

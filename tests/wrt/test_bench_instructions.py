@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from wrt.bench.instructions import box_unit, compiled, of_one, unit_table
+from wrt.bench.instructions import UnitCode, box_unit, compiled, of_one, software, software_table, unit_table
 from wrt.cubin import CLASSES, OPERATIONS, read_cubin
 from wrt.errors import InputError
 
@@ -55,3 +55,11 @@ def test_classes_are_of_all_instructions(tmp_path: Path) -> None:
     (binary,) = wp.compile_aot_module(doubles.module, arch=75, module_dir=tmp_path)
     (code,) = read_cubin(Path(binary).read_bytes()).values()
     assert sum(code.classes().values()) == len(code.opcodes()) <= len(code.code) // 16
+
+
+def test_software_by_hand() -> None:
+    """100 boxes of 30 instructions and 5 triangles of 200, with half of the lanes waiting: 8000 of a lane a ray."""
+    codes = UnitCode("box", "b", {"fp32": 30.0}), UnitCode("triangle", "t", {"fp32": 150.0, "fp64": 50.0})
+    row = software("made", 100.0, 5.0, 0.5, codes)
+    assert row.instructions == 4000.0 and row.rays_per_second == pytest.approx(28 * 128 * 1.582e9 / 8000.0)
+    assert row.share == pytest.approx(8000.0 / 5155.0, rel=1e-3) and "8000" in software_table([row])

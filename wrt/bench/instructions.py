@@ -106,3 +106,39 @@ def traversal_table(codes: dict[str, KernelCode]) -> str:
         rows.append((name, f"{code.registers}", f"{code.stack}", f"{len(code.opcodes()) * INSTRUCTION}",
                      *(f"{classes[each]}" for each in (*CLASSES, "other"))))
     return table(("closest hit", "registers", "stack bytes", "code bytes", *CLASSES, "other"), rows)
+
+
+# --- what software needs for the same rays ----------------------------------------------------------------------------
+
+LANES_PER_SECOND = 28 * 128 * 1.582e9  # GTX 1080 Ti: instructions of a lane, see wrt.rtcore_parameters.PARAMETERS
+CLAIMED = 1.1e9  # rays a second that NVIDIA says it traces
+
+
+@dataclass(frozen=True)
+class Software:
+    """instructions: of both units, a ray; busy: SIMT efficiency; rays_per_second: at most, of a GTX 1080 Ti that does nothing
+    else; share: of the instructions that its claimed rays leave for each ray, lanes that wait counted in."""
+
+    name: str
+    instructions: float
+    busy: float
+
+    @property
+    def rays_per_second(self) -> float:
+        return LANES_PER_SECOND * self.busy / self.instructions
+
+    @property
+    def share(self) -> float:
+        return CLAIMED / self.rays_per_second
+
+
+def software(name: str, boxes: float, triangles: float, busy: float, codes: tuple[UnitCode, UnitCode]) -> Software:
+    """boxes, triangles: tests a ray; codes: of the box unit and of the triangle unit. The triangle test is counted as a whole,
+    although most triangles are refused early: an upper bound; fetching, stack and loop are not: together a rough figure."""
+    return Software(name, boxes * codes[0].instructions + triangles * codes[1].instructions, busy)
+
+
+def software_table(rows: Sequence[Software]) -> str:
+    columns = ("rays", "instructions", "SIMT", "of a lane, with those that wait", "of what 1.1 Grays/s leave", "Grays/s at most")
+    return table(columns, [(row.name, f"{row.instructions:.0f}", f"{row.busy:.0%}", f"{row.instructions / row.busy:.0f}",
+                            f"{row.share:.0%}", f"{row.rays_per_second / 1e9:.2f}") for row in rows])

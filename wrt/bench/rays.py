@@ -95,9 +95,10 @@ RAY_KINDS: dict[str, Callable[[_View, int], RaySet]] = {
     "primary": primary, "shadow": shadow, "diffuse": diffuse, "random": random}
 
 
-def ray_sets(accel: Accelerator, n: int, seed: int = 0) -> dict[str, RaySet]:
+def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) -> dict[str, RaySet]:
     """About n rays of every kind (the square number below it for primary ones) through the geometry of a structure, which
-    finds what the camera sees. The same for the same geometry, n and seed."""
+    finds what the camera sees. The same for the same geometry, n and seed. inside: the camera stands in the middle of the
+    mesh's box, as in a room, and not before it."""
     g = accel.geometry
     lo, hi = g.bounds()
     lo, hi = lo.min(axis=0).astype(np.float64), hi.max(axis=0).astype(np.float64)
@@ -106,7 +107,7 @@ def ray_sets(accel: Accelerator, n: int, seed: int = 0) -> dict[str, RaySet]:
     eye = center + 1.5 * radius * unit(np.array([0.6, 0.35, 0.8]))
     seen = _camera(eye, center, n)
     hits = accel.closest_hit(seen.origins, seen.directions)
-    if not (hits.prim_id >= 0).any():
+    if inside or not (hits.prim_id >= 0).any():
         eye = center
         seen = _camera(eye, center + np.array([0.3, 0.0, 1.0]), n)
         hits = accel.closest_hit(seen.origins, seen.directions)

@@ -40,7 +40,8 @@ than the first variant's; must be 0."""
 
 @dataclass(frozen=True)
 class Plan:
-    """study: a name in STUDIES; mesh: a file; kinds of ray, rays of each, gpu: a name in GPUS. Raises InputError."""
+    """study: a name in STUDIES; mesh: a file; kinds of ray, rays of each, gpu: a name in GPUS; inside: the camera is in
+    a room. Raises InputError."""
 
     study: str
     mesh: str | Path
@@ -48,6 +49,7 @@ class Plan:
     rays: int = 2**15
     gpu: str = "rtx2080ti"
     seed: int = 0
+    inside: bool = False
 
     def __post_init__(self) -> None:
         if not 1 <= self.rays <= 2**22:
@@ -174,7 +176,7 @@ def rays_of(plan: Plan) -> tuple[Geometry, dict[str, RaySet]]:
     if not len(geometry):
         raise InputError("has no triangles", plan.mesh)
     tree = base(geometry)
-    return geometry, in_warps(tree, ray_sets(tree, plan.rays, plan.seed))
+    return geometry, in_warps(tree, ray_sets(tree, plan.rays, plan.seed, plan.inside))
 
 
 def row_of(variant: Variant, first: Variant, kind: str, gpu: Gpu) -> Row:
