@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 import click
 
 import wrt
+from wrt.cli_animate import animate
 from wrt.cli_bench import bench, stability
 from wrt.cli_build import build
 from wrt.cli_common import Crop, Duration, Names, Size, load, naming, say, say_json, warnings_told
@@ -39,6 +40,7 @@ cli.add_command(stability)
 cli.add_command(bench)
 cli.add_command(build)
 cli.add_command(profile)
+cli.add_command(animate)
 cli.add_command(whatif)
 
 

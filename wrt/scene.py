@@ -18,6 +18,7 @@ import numpy as np
 from wrt.arguments import LARGEST, as_array, as_integer, as_one, as_size, as_tuple, at_thing, unknown
 from wrt.errors import InputError
 from wrt.mesh import Mesh
+from wrt.motion import Motion
 from wrt.tables import html_facts, html_table
 
 Color = tuple[float, float, float]
@@ -232,6 +233,7 @@ class Object:
 
     materials: one or more; face_material: (F,) int32 index into `materials` for each face, or None for all the first.
     transform: (4, 4), object to world. A negative determinant mirrors the mesh; its faces keep their outside outside.
+    motion: what `wrt animate` does with it; a picture by itself shows the object without.
     """
 
     mesh: Mesh
@@ -239,6 +241,7 @@ class Object:
     transform: np.ndarray = field(default_factory=lambda: np.eye(4), repr=False)
     face_material: np.ndarray | None = field(default=None, repr=False)
     name: str = ""
+    motion: Motion | None = None
 
     def __post_init__(self) -> None:
         at = at_thing("object", self.name)
@@ -258,6 +261,8 @@ class Object:
             if index.size and (index.min() < 0 or index.max() >= len(self.materials)):
                 raise InputError(at + f"face_material must index {len(self.materials)} materials")
             object.__setattr__(self, "face_material", index)
+        if self.motion is not None:
+            as_one(self.motion, Motion, at + "motion").check(self.mesh)
 
 
 @dataclass(frozen=True, eq=False)

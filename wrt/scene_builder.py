@@ -15,6 +15,7 @@ from wrt import shapes
 from wrt.arguments import unknown
 from wrt.errors import InputError
 from wrt.mesh import Mesh, load_mesh
+from wrt.motion import Motion
 from wrt.scene import (
     BLACK,
     CONDUCTORS,
@@ -252,7 +253,22 @@ class _Builder:
             face_material = of_group[mesh.face_group]
         whole, name = transform(table.transform), table.name or place
         each = [np.eye(4)] if table.instances is None else [self.placed(one, i) for i, one in enumerate(table.instances)]
-        return [Object(mesh, tuple(materials), whole @ matrix, face_material, name) for matrix in each]
+        motion = self.motion(table)
+        return [Object(mesh, tuple(materials), whole @ matrix, face_material, name, motion) for matrix in each]
+
+    def motion(self, table: tables.MeshTable) -> Motion | None:
+        if table.motion is None and table.morph is None:
+            return None
+        keys = None
+        if table.motion is not None:
+            keys = np.array([[key.translate, key.rotate, key.scale] for key in table.motion])
+        target = None
+        if table.morph is not None:
+            from wrt import scene_schema
+
+            given = {name: getattr(table.morph, name) for name in ("file", "shape")} | {"smooth": table.smooth}
+            target = self.mesh(scene_schema.MeshTable.model_construct(**given))
+        return Motion(keys, target)
 
     @staticmethod
     def placed(table: tables.TransformTable, index: int) -> np.ndarray:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from wrt.mesh import Mesh
-from wrt.scene import Camera, Scene
+from wrt.scene import Camera, Object, Scene
 
-NO_PIXEL = {Scene: ("cameras", "settings"), Mesh: ("groups", "face_group", "dropped")}  # what of them changes none, beside names
+# What of them changes no pixel, beside names.
+NO_PIXEL = {Scene: ("cameras", "settings"), Mesh: ("groups", "face_group", "dropped"), Object: ("motion",)}
 
 
 def scene_digest(scene: Scene) -> str:

@@ -245,6 +245,26 @@ class PartTable(Table):
     material: str = Field(description="name of a material")
 
 
+class MorphTable(Table):
+    """A mesh with the same faces, whose shape another one takes on and leaves again in the period of an animation."""
+
+    file: str | None = Field(None, description="mesh file, relative to the scene file")
+    shape: Shape | None = Field(None, description="in place of a file")
+
+    @model_validator(mode="after")
+    def _check(self) -> MorphTable:
+        require_one(self, ("file",), ("shape",))
+        return self
+
+
+class KeyTable(Table):
+    """Where a mesh is at a moment of an animation; between two moments, straight on. Scales, then rotates, then translates."""
+
+    translate: Vector = Field([0.0, 0.0, 0.0], description="last")
+    rotate: Vector = Field([0.0, 0.0, 0.0], description="about x, then y, then z (degrees); a full turn is from 0 to 360")
+    scale: Scale3 = Field([1.0, 1.0, 1.0], description="first; one number or one for each axis")
+
+
 class MeshTable(Table):
     """A mesh from a file (OBJ, PLY, STL) or made by a formula."""
 
@@ -259,6 +279,9 @@ class MeshTable(Table):
     transform: TransformTable | None = Field(None, description="object to world")
     instances: Annotated[list[TransformTable], Field(min_length=1)] | None = Field(
         None, description="the mesh once for each, placed so before `transform` places all of them; kept once in memory")
+    motion: Annotated[list[KeyTable], Field(min_length=2)] | None = Field(
+        None, description="of `wrt animate`: moments evenly spread over the period, before the mesh's instances and transform")
+    morph: MorphTable | None = Field(None, description="of `wrt animate`: another shape, and back")
     name: str = Field("", description="for messages")
 
     @model_validator(mode="after")

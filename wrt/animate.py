@@ -1,0 +1,150 @@
+"""Frame after frame: the camera goes round, meshes move, and the structure follows them."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrt.accel import Accelerator, Geometry
+from wrt.accel import build as build_structure
+from wrt.arguments import as_integer
+from wrt.device_scene import camera_struct, upload_scene
+from wrt.driver import Renderer
+from wrt.errors import InputError, SceneWarning
+from wrt.film import Film
+from wrt.image import replacing
+from wrt.motion import moves, scene_at
+from wrt.options import Options
+from wrt.scene import Camera, Scene, as_number
+
+REBUILD_AT = 1.5  # growth of the SAH cost by refits (docs/acceleration.md, "Moving meshes")
+MOVIES = {".gif": "GIF", ".png": "PNG", ".apng": "PNG"}
+
+
+@dataclass(frozen=True)
+class Animation:
+    """frames: how many, at times 0, 1 / frames, 2 / frames ... of the period, so that the last is followed by the first; degrees:
+    how far the camera goes round, likewise (None: once, or not at all where something moves); rebuild_at: from which growth of
+    the SAH cost on the structure is built anew rather than refitted. Raises InputError for values out of range."""
+
+    frames: int = 36
+    degrees: float | None = None
+    rebuild_at: float = REBUILD_AT
+
+    def __post_init__(self) -> None:
+        as_integer(self.frames, "frames", 1, 100_000)
+        if self.degrees is not None:
+            as_number(self.degrees, "degrees")
+        if not self.rebuild_at >= 1.0:
+            raise InputError(f"rebuild_at must be 1 or more, got {self.rebuild_at}")
+
+
+def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Film]:
+    """The frames, one by one, each with stats["frame"]: time, and what was done with the structure ("built", "kept", "refitted"
+    or "rebuilt"), in how many seconds, and the growth of its SAH cost. An interrupted frame is the last one.
+
+    Meshes that move are copied into the world (instancing "never"). Raises InputError where nothing would move.
+    """
+    degrees = animation.degrees if animation.degrees is not None else (0.0 if moves(scene) else 360.0)
+    if animation.frames > 1 and degrees == 0.0 and not moves(scene):
+        raise InputError("nothing moves: no object has a motion, and the camera goes round by 0 degrees")
+    if moves(scene):
+        options = replace(options, instancing="never")
+    renderer = Renderer(scene_at(scene, 0.0), options)
+    start, middle = renderer.camera, np.mean(scene.bounds(), axis=0)
+    told = {"structure": "built", "seconds": renderer.accel.stats.build_seconds, "growth": 1.0}
+    for frame in range(animation.frames):
+        time = frame / animation.frames
+        if frame and moves(scene):
+            told = follow(renderer, scene_at(scene, time), animation.rebuild_at)
+        elif frame:
+            told = {"structure": "kept", "seconds": 0.0, "growth": 1.0}
+        renderer.camera = orbited(start, middle, degrees * time)
+        renderer.device_camera = camera_struct(renderer.camera, scene.settings.size)
+        film = renderer.run()
+        film.stats["frame"] = {"number": frame, "time": time, **told}
+        yield film
+        if film.stats["interrupted"]:
+            return
+
+
+def orbited(camera: Camera, middle: np.ndarray, degrees: float) -> Camera:
+    """The camera turned about the vertical axis (+y) through the point of its line of view that is nearest to `middle` (3,)."""
+    if degrees == 0.0:
+        return camera
+    pose = camera.camera_to_world
+    origin, forward = pose[:3, 3], -pose[:3, 2]
+    pivot = origin + max(float((middle - origin) @ forward), 0.0) * forward
+    angle = math.radians(degrees)
+    turn = np.eye(4)
+    turn[0, 0] = turn[2, 2] = math.cos(angle)
+    turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
+    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
+    return replace(camera, camera_to_world=turn @ pose)
+
+
+def follow(renderer: Renderer, scene: Scene, rebuild_at: float) -> dict[str, Any]:
+    """Bring a renderer to a scene with the same objects in other places: its surfaces are uploaded anew, and its structure is
+    refitted, or where it cannot be, or has grown too costly, built anew."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SceneWarning)  # told of the first frame
+        renderer.device_scene = upload_scene(scene, renderer.device, renderer.options.instancing)
+    renderer.scene = scene
+    geometry: Any = renderer.device_scene.world.geometry
+    if can_refit(renderer.accel, geometry):
+        refit = asdict(renderer.accel.refit(geometry.vertices, rebuild_at))
+        return {"structure": "rebuilt" if refit["rebuilt"] else "refitted", "seconds": refit["seconds"], "growth": refit["growth"]}
+    options = renderer.options
+    renderer.accel = build_structure(geometry, options.accel, options.device, renderer.threads, triangle=options.triangle,
+                                     box=options.box, **options.accel_options)
+    return {"structure": "rebuilt", "seconds": renderer.accel.stats.build_seconds, "growth": float("nan")}
+
+
+def can_refit(accel: Accelerator, geometry: Geometry) -> bool:
+    """Whether it is a structure that follows vertices, over the same faces; rounding may have put a face's corners on a line."""
+    return (type(accel)._refit is not Accelerator._refit and np.array_equal(accel.geometry.faces, geometry.faces)
+            and accel.geometry.vertices.shape == geometry.vertices.shape)
+
+
+def check_output(path: str | os.PathLike[str]) -> Path:
+    """The path, if frames can be written there: a file of MOVIES, or a folder, which is made. Raises InputError if not."""
+    path = Path(path)
+    if path.suffix.lower() in MOVIES:
+        with replacing(path) as temporary:
+            temporary.touch()
+            temporary.unlink()
+        return path
+    if path.suffix and not path.is_dir():
+        raise InputError(f"frames go into a folder, or into a {', '.join(MOVIES)} file", path)
+    try:
+        path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made: {error.strerror}", path) from error
+    return path
+
+
+def frame_path(folder: Path, number: int, frames: int) -> Path:
+    """Names that sort as the frames do."""
+    return folder / f"frame_{number:0{max(len(str(frames - 1)), 3)}d}.png"
+
+
+def save_movie(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> None:
+    """Pictures, (H, W, 3) uint8 each, as one file that plays round and round: .gif (256 colours a frame, dithered, hundredths of
+    a second) or .png, .apng (all colours). Written whole or not at all. Raises InputError where the system refuses."""
+    from PIL import Image
+
+    kind = MOVIES[Path(path).suffix.lower()]
+    pictures = [Image.fromarray(frame) for frame in frames]
+    if kind == "GIF":
+        pictures = [picture.quantize(256, dither=Image.Dither.FLOYDSTEINBERG) for picture in pictures]
+    duration = 1000.0 / fps
+    with replacing(path) as temporary:
+        pictures[0].save(temporary, format=kind, save_all=True, append_images=pictures[1:], loop=0,
+                         duration=max(int(round(duration, -1)), 20) if kind == "GIF" else duration)

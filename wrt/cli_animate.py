@@ -1,0 +1,71 @@
+"""The command `animate`: frames of a scene, in a folder or as one moving picture."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wrt.cli_common import Size, load, naming, say, say_json, warnings_told
+from wrt.errors import InputError
+from wrt.interrupt import exit_code
+
+
+@click.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path),
+              help="A folder for PNG frames, or one file: .gif, .png or .apng (an animated PNG)")
+@click.option("--frames", type=int, default=36, show_default=True, help="How many")
+@click.option("--degrees", type=float, help="How far the camera goes round  [default: 360, or 0 where something moves]")
+@click.option("--fps", type=float, default=24.0, show_default=True, help="Frames a second, of one file")
+@click.option("--rebuild-at", type=float, default=1.5, show_default=True,
+              help="Growth of the structure's SAH cost from which it is built anew, not refitted")
+@click.option("--spp", type=int, help="Samples a pixel  [default: the scene's]")
+@click.option("--size", type=Size(), help="Pixels  [default: the scene's, 640x360]")
+@click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another noise, the same in all frames")
+@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
+@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
+@click.option("--camera", help="A camera's name or number  [default: the first]")
+@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print what each frame took as JSON")
+def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: float, rebuild_at: float, quiet: bool,
+            as_json: bool, **options: Any) -> None:
+    """A turntable of SCENE, or its motion (`motion` and `morph` of TOML scenes), frame by frame."""
+    from wrt import animate as animation
+    from wrt.options import Options
+
+    if not 0.1 <= fps <= 100.0:
+        raise InputError(f"fps must be 0.1 to 100, got {fps:g}")
+    plan = animation.Animation(frames, degrees, rebuild_at)
+    settings = {name: options.pop(name) for name in ("spp", "size")}
+    rendering = Options(**options)
+    target = animation.check_output(output)
+    loaded = load(scene, quiet).with_settings(**settings)
+    pictures, rows, signal = [], [], None
+    begin = time.perf_counter()
+    with warnings_told(quiet), naming(scene):
+        for film in animation.animate(loaded, plan, rendering):
+            if film.stats["interrupted"]:
+                signal = film.stats["signal"]
+                break
+            row = film.stats["frame"] | {"trace": film.stats["seconds"]["trace"]}
+            rows.append(row)
+            if target.is_dir():
+                film.save(animation.frame_path(target, row["number"], frames))
+            else:
+                pictures.append(film.to_srgb8())
+            if not quiet:
+                say(f"frame {row['number'] + 1} of {frames}: {row['structure']} in {row['seconds']:.3f} s,"
+                    f" traced in {row['trace']:.2f} s")
+    if pictures:
+        animation.save_movie(target, pictures, fps)
+    if as_json:
+        say_json({"output": str(target), "frames": rows, "seconds": time.perf_counter() - begin})
+    elif rows:
+        click.echo(target)
+    if len(rows) < frames:
+        say(f"interrupted after {len(rows)} of {frames} frames")
+        raise SystemExit(exit_code(signal))

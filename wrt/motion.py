@@ -1,0 +1,98 @@
+"""How an object moves within one period, and what a scene is at a moment of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from wrt.arguments import as_array, as_one
+from wrt.errors import InputError
+from wrt.mesh import Mesh
+
+if TYPE_CHECKING:
+    from wrt.scene import Object, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What happens to an object in a period, from time 0 to 1.
+
+    keys: (K, 3, 3) float64, K >= 2, or None: translation, rotation (degrees about x, then y, then z) and scale at times that are
+    evenly spread from 0 to 1, straight lines between them; they act before the object's transform. target: a mesh with the same
+    faces, or None: vertices go straight to their places in it and back, as (1 - cos 2 pi t) / 2.
+    Raises InputError for keys of another shape, that are not finite, or with a scale of 0.
+    """
+
+    keys: np.ndarray | None = field(default=None, repr=False)
+    target: Mesh | None = None
+
+    def __post_init__(self) -> None:
+        as_one(self.target, (Mesh, type(None)), "motion: target")
+        if self.keys is None:
+            return
+        keys = as_array(self.keys, np.float64, "motion: keys")
+        if keys.ndim != 3 or keys.shape[1:] != (3, 3) or len(keys) < 2 or not np.isfinite(keys).all():
+            raise InputError(f"motion: keys must be (K, 3, 3), finite, with two keys or more, got {keys.shape}")
+        if (keys[:, 2] == 0.0).any() or (np.sign(keys[:, 2]) != np.sign(keys[0, 2])).any():
+            raise InputError("motion: a scale must not be zero, also not between two keys")
+        object.__setattr__(self, "keys", keys)
+
+    def check(self, mesh: Mesh) -> None:
+        """Raise InputError where `mesh` cannot become the target."""
+        if self.target is None:
+            return
+        if len(self.target.vertices) != len(mesh.vertices) or not np.array_equal(self.target.faces, mesh.faces):
+            raise InputError(f"motion: the target must have the same faces; it has {len(self.target.vertices)} vertices and "
+                             f"{len(self.target.faces)} faces, the mesh {len(mesh.vertices)} and {len(mesh.faces)}")
+
+    def transform(self, time: float) -> np.ndarray:
+        """(4, 4) float64 at a time in [0, 1]; the identity without keys."""
+        matrix = np.eye(4)
+        if self.keys is not None:
+            place = min(max(time, 0.0), 1.0) * (len(self.keys) - 1)
+            first = min(int(place), len(self.keys) - 2)
+            share = place - first
+            translate, rotate, scale = (1.0 - share) * self.keys[first] + share * self.keys[first + 1]
+            x, y, z = (_turn(axis, angle) for axis, angle in enumerate(np.radians(rotate)))
+            matrix[:3, :3] = z @ y @ x * scale
+            matrix[:3, 3] = translate
+        return matrix
+
+    def mesh(self, mesh: Mesh, time: float) -> Mesh:
+        """What `mesh` is at that time: itself without a target."""
+        if self.target is None:
+            return mesh
+        share = 0.5 - 0.5 * math.cos(2.0 * math.pi * time)
+        vertices = ((1.0 - share) * mesh.vertices.astype(np.float64) + share * self.target.vertices).astype(np.float32)
+        normals = None
+        if mesh.normals is not None and self.target.normals is not None:
+            mixed = (1.0 - share) * mesh.normals.astype(np.float64) + share * self.target.normals
+            length = np.linalg.norm(mixed, axis=1, keepdims=True)
+            normals = np.divide(mixed, length, out=np.zeros_like(mixed), where=length > 1e-6).astype(np.float32)
+        elif mesh.normals is not None:
+            normals = np.zeros_like(mesh.vertices)  # flat, in a scene that has smooth meshes
+        return replace(mesh, vertices=vertices, normals=normals)
+
+
+def _turn(axis: int, angle: float) -> np.ndarray:
+    matrix, i, j = np.eye(3), (axis + 1) % 3, (axis + 2) % 3
+    matrix[i, i] = matrix[j, j] = math.cos(angle)
+    matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
+    return matrix
+
+
+def moves(scene: Scene) -> bool:
+    return any(thing.motion is not None for thing in scene.objects)
+
+
+def scene_at(scene: Scene, time: float) -> Scene:
+    """The scene at a time in [0, 1] of its period: the same objects, faces and materials, in other places."""
+    objects = (thing if thing.motion is None else _moved(thing, thing.motion, time) for thing in scene.objects)
+    return replace(scene, objects=tuple(objects))
+
+
+def _moved(thing: Object, motion: Motion, time: float) -> Object:
+    return replace(thing, mesh=motion.mesh(thing.mesh, time), transform=thing.transform @ motion.transform(time), motion=None)
