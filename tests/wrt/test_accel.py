@@ -223,3 +223,20 @@ def test_statistics(name: str) -> None:
     else:
         assert stats.nodes > 0 and stats.leaves > 0 and stats.depth >= 1 and 1.0 < stats.sah_cost < len(mesh.faces) / 4
     assert str(len(mesh.faces)) in repr(structure)
+
+
+def test_records_of_primitives_are_the_same_on_any_number_of_threads() -> None:
+    rng = np.random.default_rng(5)
+    n = 80_000  # more than one job
+    faces = rng.integers(0, n, (n, 3)).astype(np.int32)
+    geometry = Geometry(rng.random((n, 3), np.float32), faces, rng.random((500, 4), np.float32))
+    order = rng.permutation(len(geometry)).astype(np.int32)
+    units = Units(spheres=True)
+    records = geometry.primitives(units, order, threads=3)
+    assert records.tobytes() == geometry.primitives(units, order).tobytes()
+    np.testing.assert_array_equal(records["prim_id"], order)
+    triangle = order < n
+    assert triangle.sum() == n
+    corners = geometry.vertices[geometry.faces[order[triangle]]]
+    for i, name in enumerate(("v1", "v2"), 1):
+        np.testing.assert_array_equal(records[name][triangle], corners[:, i])

@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, partial
 from hashlib import sha256
 from inspect import signature
 from typing import Any, ClassVar, NamedTuple
@@ -30,6 +30,7 @@ from wrt.mesh import Mesh
 from wrt.tables import html_facts, html_table
 
 RAYS_PER_LAUNCH = 16384
+RECORDS_PER_JOB = 32768
 # By the annotations of _build.
 OPTION_TYPES: dict[str, Any] = {"int": int, "int | None": int | None, "float": int | float, "bool": bool, "str": str}
 
@@ -81,17 +82,22 @@ class Geometry:
             pad = np.float32(PAD_EXTENT) * extent.max(axis=1, keepdims=True, initial=0.0)
             return lo - (pad + np.float32(PAD_COORDINATE) * np.abs(lo)), hi + (pad + np.float32(PAD_COORDINATE) * np.abs(hi))
 
-    def primitives(self, units: Units, order: np.ndarray | None = None) -> np.ndarray:
+    def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
         """What the triangle test of `units` reads, in the given order of prim_id, or in their own."""
         if order is not None and len(order) > len(self):  # what stands more than once is made once
-            return self.primitives(units)[order]
+            return self.primitives(units, None, threads)[order]
         prim_id = np.arange(len(self), dtype=np.int32) if order is None else order
         out = records(units.triangle_test.record, len(prim_id))
         out["prim_id"] = prim_id
-        triangle = prim_id < len(self.faces) if units.spheres else slice(None)
-        part = out[triangle]
-        TRIANGLE_DATA[units.triangle](part, *(self.vertices[self.faces[prim_id[triangle], i]] for i in range(3)))
-        out[triangle] = part
+
+        def fill(first: int) -> None:
+            some = slice(first, first + RECORDS_PER_JOB)
+            triangle = prim_id[some] < len(self.faces) if units.spheres else slice(None)
+            part = out[some][triangle]
+            TRIANGLE_DATA[units.triangle](part, *(self.vertices[self.faces[part["prim_id"], i]] for i in range(3)))
+            out[some][triangle] = part
+
+        run_all([partial(fill, first) for first in range(0, len(prim_id), RECORDS_PER_JOB)], threads)
         return out
 
 
@@ -357,7 +363,7 @@ class Accelerator(ABC):
 
     def _primitives(self, built: Built) -> np.ndarray:
         """What the struct's `primitives` holds: the triangle test's records, in the order of the leaves."""
-        return self.geometry.primitives(self.structure.units, built.order)
+        return self.geometry.primitives(self.structure.units, built.order, self.threads)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the structure to a file (.accel) that wrt.load_accel reads. Raises InputError where the system refuses."""

@@ -31,10 +31,10 @@ class NumberedGeometry(Geometry):
 
     numbers: np.ndarray
 
-    def primitives(self, units: Units, order: np.ndarray | None = None) -> np.ndarray:
+    def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
         if order is not None and len(order) > len(self):
-            return self.primitives(units)[order]
-        out = super().primitives(units, order)
+            return self.primitives(units, None, threads)[order]
+        out = super().primitives(units, order, threads)
         out["prim_id"] = self.numbers[out["prim_id"]]
         return out
 
