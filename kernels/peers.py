@@ -25,3 +25,16 @@ def warp_mesh_query(
         t[i] = query.t
         u[i] = query.u
         v[i] = query.v
+
+
+@kernel
+def warp_mesh_any(
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    reach: wp.array(dtype=wp.float32),
+    dark: wp.array(dtype=wp.bool),
+):
+    """directions must be of unit length; whether there is anything within reach."""
+    i = wp.tid()
+    dark[i] = wp.mesh_query_ray_anyhit(mesh, origins[i], directions[i], reach[i])

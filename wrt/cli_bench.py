@@ -134,6 +134,44 @@ def units(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> No
 
 @bench.command()
 @click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--structures", type=Names(), default=("bvh",), help="Of wrt, by name; ratios are of the first  [default: bvh]")
+@click.option("--rivals", type=Names(), default=(), help="embree, warp, open3d  [default: those that are installed]")
+@click.option("--kinds", type=Names(), default=("primary", "shadow", "diffuse", "random"), help="Of rays  [default: all]")
+@click.option("--rays", type=int, default=100_000, show_default=True, help="Rays of each kind")
+@click.option("--runs", type=int, default=7, show_default=True, help="Runs of each, by turns")
+@click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the tables as Markdown (.md)")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def peers(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+    """wrt beside Embree and Warp's mesh_query_ray: the same rays on one thread by turns, with ratios and answers that differ.
+
+    MESHES: .obj, .ply or .stl files; without any, a sphere.
+    """
+    from wrt.bench import peers as bench_peers
+
+    plan = bench_peers.Plan(meshes, **options)
+    if output is not None and (output.suffix.lower() != ".md" or not output.parent.is_dir()):
+        raise InputError("the report is a .md file in a folder that is there", output)
+    told = bench_peers.machine(plan)
+
+    def progress(row: Any) -> None:
+        if not quiet:
+            say(f"{row.mesh}: {'  '.join(bench_peers.cells(row, row))}")
+
+    with warnings_told(quiet):
+        rows = bench_peers.run(plan, progress)
+    text = bench_peers.text(rows, told)
+    if output is not None:
+        output.write_text(text, encoding="utf-8")
+    if as_json:
+        say_json({"machine": told, "rows": [row.as_dict() for row in rows], "means": bench_peers.means(rows), "output": output})
+        return
+    click.echo(text)
+
+
+@bench.command()
+@click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--structures", type=Names(), default=(), help="Which, by name  [default: all but brute_force]")
 @click.option("--kinds", type=Names(), default=("primary", "shadow", "diffuse", "random"), help="Of rays  [default: all]")
 @click.option("--rays", type=int, default=100_000, show_default=True, help="Rays of each kind")

@@ -23,7 +23,7 @@ __all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "Ins
            "build_cached", "load_accel", "tells_progress"]
 
 ACCELERATORS: dict[str, type[Accelerator]] = {
-    "bvh": Bvh2,  # the default: the best one there is
+    "bvh": Bvh8,  # the default: the best one there is
     "bvh2": Bvh2,
     "bvh4": Bvh4,
     "bvh8": Bvh8,

@@ -115,7 +115,7 @@ class WarpMesh(Peer):
         length = np.linalg.norm(directions.astype(np.float64), axis=1)
         rays = [wp.array(np.ascontiguousarray(x, np.float32), dtype=wp.vec3, device=self.device)
                 for x in (origins, directions / length[:, None])]
-        t, u, v = (wp.empty(n, dtype=wp.float32, device=self.device) for _ in range(3))
+        t, u, v = (wp.zeros(n, dtype=wp.float32, device=self.device) for _ in range(3))  # a miss leaves u and v as they are
         prim_id = wp.empty(n, dtype=wp.int32, device=self.device)
         wp.launch(warp_mesh_query, dim=n, inputs=[self.mesh.id, *rays, t, u, v, prim_id], device=self.device)
         # Warp's u and v belong to the first two corners; wrt's to the last two.

@@ -1,0 +1,89 @@
+"""bench peers: rivals answer alike, differences are counted, ratios are of the same runs, and the command says it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.command_line import BOX_OBJ
+from tests.command_line import wrt as command
+from wrt.accel import Hits
+from wrt.bench import peers
+from wrt.bench.algorithms import PEERS
+from wrt.bench.peers import Plan, Row, differing, means, ratio, run
+from wrt.errors import InputError
+
+RIVALS = [name for name, peer in PEERS.items() if peer.is_installed()]
+
+
+def made(name: str, seconds: tuple[float, ...], mesh: str = "m", kind: str = "primary") -> Row:
+    return Row(mesh, 100, kind, 10**6, 0.5, name, 0.1, seconds, 0)
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Path:
+    (tmp_path / "box.obj").write_text(BOX_OBJ)
+    return tmp_path / "box.obj"
+
+
+def test_everybody_answers_alike_on_a_sphere() -> None:
+    rows = run(Plan(structures=("bvh", "bvh2"), rays=2000, runs=2))
+    names = ["wrt bvh8", "wrt bvh2", *(PEERS[name].name for name in RIVALS)]
+    assert [(row.kind, row.name) for row in rows] == [
+        (kind, name) for kind in ("primary", "shadow", "diffuse", "random") for name in names]
+    for row in rows:
+        assert row.triangles == 20480 and 0 < row.rays <= 2000 and len(row.seconds) == 2 and min(row.seconds) > 0.0
+        # wrt's own structures never differ; a rival may lose a ray that grazes.
+        assert row.differ == 0 if row.name.startswith("wrt") else row.differ <= 0.002 * row.rays
+    assert {row.kind: row.hit > 0.2 for row in rows}["primary"]
+
+
+def test_segments_end_where_they_end(box) -> None:
+    # Shadow rays end at the light; a rival that looked beyond would find other walls.
+    for row in run(Plan((box,), kinds=("shadow",), rays=2000, runs=1)):
+        assert row.kind == "shadow" and row.differ <= 2
+
+
+def test_differing_counts_misses_and_other_places_but_no_ties() -> None:
+    def hits(prim_id, t) -> Hits:
+        zero = np.zeros(len(prim_id), np.float32)
+        return Hits(np.array(t, np.float32), zero, zero, np.array(prim_id, np.int32))
+
+    truth = hits([1, 2, 3, -1, -1], [1.0, 1.0, 1.0, np.inf, np.inf])
+    assert differing(truth, truth) == 0
+    assert differing(hits([1, 7, 8, -1, 4], [9.0, 1.00001, 1.1, np.inf, 2.0]), truth) == 2  # a tie, another place, a false hit
+    assert differing(hits([-1, 2, 3, -1, -1], [np.inf, 1, 1, np.inf, np.inf]), truth) == 1
+    assert differing(np.array([True, False]), np.array([True, True])) == 1
+
+
+def test_ratios_are_medians_of_the_runs_and_means_are_geometric() -> None:
+    first, other = made("wrt", (1.0, 2.0, 4.0)), made("it", (2.0, 6.0, 4.0))
+    assert ratio(first, other) == 2.0
+    rows = [first, other, made("wrt", (1.0,), "n"), made("it", (8.0,), "n"), made("wrt", (1.0,), "n", "random"),
+            made("it", (0.5,), "n", "random")]
+    assert means(rows) == {"it": {"primary": pytest.approx(4.0), "random": pytest.approx(0.5)}}
+    text = peers.text(rows, "a machine")
+    assert text.startswith("a machine") and "| primary |" in text and "4.00" in text and "Geometric means over 2 meshes" in text
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"rays": 0}, "rays"), ({"runs": 0}, "runs"), ({"structures": ("x",)}, "no structure 'x'"), ({"structures": ()}, "structures"),
+    ({"rivals": ("x",)}, "no rival 'x'"), ({"kinds": ("x",)}, "no kind of ray 'x'"),
+])
+def test_wrong_plans_are_refused(options, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Plan(**options)
+
+
+def test_the_command_prints_and_writes(box, tmp_path) -> None:
+    done = command("bench", "peers", box, "--rays", 300, "--runs", 2, "--rivals", "warp", "--kinds", "random", "--json", "-q",
+                   "-o", tmp_path / "out.md")
+    assert done.code == 0, done.err
+    told = json.loads(done.out)
+    assert [row["name"] for row in told["rows"]] == ["wrt bvh8", "Warp mesh_query_ray"]
+    assert "Warp mesh_query_ray" in told["means"] and "differ" in (tmp_path / "out.md").read_text()
+    done = command("bench", "peers", box, "-o", tmp_path / "no" / "out.md")
+    assert done.code == 2 and "report" in done.err

@@ -1,0 +1,296 @@
+"""`python -m wrt bench peers`: wrt's structures beside Embree and Warp's mesh_query_ray; the same rays by turns on one thread."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter, thread_time
+from typing import Any
+
+import numpy as np
+
+import wrt
+from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
+from wrt.bench.algorithms import PEERS, Embree, Open3D, Peer, WarpMesh
+from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
+from wrt.bench.visibility_report import spread, table
+from wrt.device import describe_devices, load_kernel
+from wrt.errors import InputError
+from wrt.mesh import Mesh, load_mesh
+from wrt.shapes import icosphere
+
+SAME_T = 1e-4  # two triangles may meet a ray at the same place: another prim_id there is a tie
+COLUMNS = ("rays", "hit", "who", "Mray/s", "wrt / it", "differ")
+LEGEND = """\
+Mray/s: rays over the thread's CPU seconds, median of the runs by turns, the middle half of them in brackets; rays and results are
+in each library's own arrays. wrt / it: how many times as fast the first structure of the table is, run by run. differ: rays of
+which one says hit and the other miss, or another primitive at another t (more than 1e-4 of it away); any-hit rays: another yes
+or no."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to measure: mesh files (none: a sphere); structures of wrt, the first of which ratios are of; rivals (none: those that
+    are installed); kinds of ray, rays of each kind, runs of each. Raises InputError."""
+
+    meshes: Sequence[str | Path] = ()
+    structures: Sequence[str] = ("bvh",)
+    rivals: Sequence[str] = ()
+    kinds: Sequence[str] = tuple(RAY_KINDS)
+    rays: int = 100_000
+    runs: int = 7
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("rays", 1, 2**28), ("runs", 1, 1000)):
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name} must be {low} to {high}, got {getattr(self, name)}")
+        for what, names, known in (("structure", self.structures, ACCELERATORS), ("rival", self.rivals, PEERS),
+                                   ("kind of ray", self.kinds, RAY_KINDS)):
+            for name in names:
+                if name not in known:
+                    raise InputError(f"no {what} {name!r}; there is {', '.join(known)}")
+        for name in self.rivals:
+            if not PEERS[name].is_installed():
+                raise InputError(f'{name} is not installed: pip install "wrt[peers]"')
+        if not self.structures:
+            raise InputError("structures must name one or more")
+
+    @property
+    def chosen(self) -> list[str]:
+        return list(dict.fromkeys(self.rivals)) or [name for name, peer in PEERS.items() if peer.is_installed()]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One contestant, mesh and kind of ray. hit: share of the rays that hit; build: seconds, by the clock; seconds: the thread's
+    CPU time of each run over `rays` rays; differ: rays with another answer than the first structure's."""
+
+    mesh: str
+    triangles: int
+    kind: str
+    rays: int
+    hit: float
+    name: str
+    build: float
+    seconds: tuple[float, ...]
+    differ: int
+
+    @property
+    def mrays(self) -> np.ndarray:
+        """Million rays a second, run by run."""
+        return self.rays / np.array(self.seconds) / 1e6
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self) | {"mrays_median": float(np.median(self.mrays))}
+
+
+class Contestant(ABC):
+    """Somebody who finds hits. search: the work that is timed, with rays and results in arrays of the library's own kind."""
+
+    name: str
+    build: float
+
+    @abstractmethod
+    def search(self, rays: RaySet) -> Callable[[], Any]:
+        """A function of no argument; whatever it takes to convert the rays is done before."""
+
+    @abstractmethod
+    def told(self, rays: RaySet, out: Any) -> Hits | np.ndarray:
+        """The result of `search` as hits, or as yes or no for any-hit rays."""
+
+
+class Own(Contestant):
+    def __init__(self, name: str, geometry: Geometry) -> None:
+        self.name = f"wrt {ACCELERATORS[name].name}"
+        begin = perf_counter()
+        self.accel: Accelerator = build(geometry, name, threads=1)
+        self.build = perf_counter() - begin
+
+    def search(self, rays: RaySet) -> Callable[[], Any]:
+        import warp as wp
+
+        device = self.accel.device
+        origins, directions = (wp.array(a, dtype=wp.vec3, device=device) for a in (rays.origins, rays.directions))
+        t_max = wp.array(rays.t_max, dtype=wp.float32, device=device)
+        ask = self.accel.any_hit if rays.any_hit else self.accel.closest_hit
+        return lambda: ask(origins, directions, 0.0, t_max, threads=1)
+
+    def told(self, rays: RaySet, out: Any) -> Hits | np.ndarray:
+        return np.asarray(out.numpy()) if rays.any_hit else Hits(*(getattr(out, f).numpy() for f in ("t", "u", "v", "prim_id")))
+
+
+class Rival(Contestant):
+    """A library of wrt.bench.algorithms."""
+
+    def __init__(self, peer: Peer, geometry: Geometry) -> None:
+        self.peer, self.name = peer, peer.name
+        begin = perf_counter()
+        peer.prepare(geometry)
+        if isinstance(peer, Embree):  # it builds when it is first asked
+            peer.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+        self.build = perf_counter() - begin
+
+    def search(self, rays: RaySet) -> Callable[[], Any]:
+        peer, o, d = self.peer, np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)
+        if isinstance(peer, Embree):
+            if rays.any_hit:
+                return lambda: peer.scene.run(o, d, dists=rays.t_max, query="OCCLUDED")
+            return lambda: peer.scene.run(o, d, query="INTERSECT")
+        if isinstance(peer, WarpMesh):
+            return _warp_search(peer, rays)
+        assert isinstance(peer, Open3D)
+        bundle = peer.tensor(np.concatenate([o, d], axis=1))
+        if rays.any_hit:
+            return lambda: peer.scene.test_occlusions(bundle, tnear=0.0, tfar=1.0, nthreads=1)
+        return lambda: peer.scene.cast_rays(bundle, nthreads=1)
+
+    def told(self, rays: RaySet, out: Any) -> Hits | np.ndarray:
+        if not rays.any_hit:
+            return self.peer.closest(rays.origins, rays.directions, 0.0, rays.t_max)
+        if isinstance(self.peer, Embree):
+            return np.asarray(out) >= 0
+        return np.asarray(out.numpy()).astype(bool)
+
+
+def _warp_search(peer: WarpMesh, rays: RaySet) -> Callable[[], Any]:
+    """Warp wants unit directions, and its any-hit query a length beside them."""
+    import warp as wp
+
+    from wrt.kernels.peers import warp_mesh_any, warp_mesh_query
+
+    n, device = len(rays), peer.device
+    length = np.linalg.norm(rays.directions.astype(np.float64), axis=1)
+    o, d = (wp.array(a.astype(np.float32), dtype=wp.vec3, device=device) for a in (rays.origins, rays.directions / length[:, None]))
+    reach = wp.array(np.minimum(rays.t_max * length, 1e38).astype(np.float32), dtype=wp.float32, device=device)
+    load_kernel(warp_mesh_any if rays.any_hit else warp_mesh_query, device)
+
+    def any_hit() -> Any:
+        dark = wp.empty(n, dtype=wp.bool, device=device)
+        wp.launch(warp_mesh_any, dim=n, inputs=[peer.mesh.id, o, d, reach, dark], device=device)
+        return dark
+
+    def closest() -> Any:
+        t, u, v = (wp.empty(n, dtype=wp.float32, device=device) for _ in range(3))
+        prim_id = wp.empty(n, dtype=wp.int32, device=device)
+        wp.launch(warp_mesh_query, dim=n, inputs=[peer.mesh.id, o, d, t, u, v, prim_id], device=device)
+        return prim_id
+
+    return any_hit if rays.any_hit else closest
+
+
+def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
+    """Rays with another answer; another primitive at the same t is none."""
+    if isinstance(found, Hits) and isinstance(truth, Hits):
+        hit, expected = found.prim_id >= 0, truth.prim_id >= 0
+        both = hit & expected & (found.prim_id != truth.prim_id)
+        apart = np.abs(np.where(both, found.t, 0.0) - np.where(both, truth.t, 0.0)) > SAME_T * np.where(both, truth.t, 1.0)
+        return int(((hit != expected) | (both & apart)).sum())
+    return int((np.asarray(found) != np.asarray(truth)).sum())
+
+
+def meshes(plan: Plan) -> Iterator[Mesh]:
+    for path in plan.meshes:
+        mesh = load_mesh(path)
+        if not len(mesh.faces):
+            raise InputError("there are no triangles to hit", path)
+        yield mesh
+    if not plan.meshes:
+        yield icosphere(5)
+
+
+def run(plan: Plan, report: Callable[[Row], None] | None = None) -> list[Row]:
+    """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a structure)."""
+    out: list[Row] = []
+    for mesh in meshes(plan):
+        geometry, name = Geometry.of(mesh), Path(mesh.name or "mesh").name
+        own = [Own(structure, geometry) for structure in dict.fromkeys(plan.structures)]
+        everybody: list[Contestant] = [*own, *(Rival(PEERS[rival](), geometry) for rival in plan.chosen)]
+        for kind, rays in ray_sets(own[0].accel, plan.rays, plan.seed).items():
+            if kind not in plan.kinds:
+                continue
+            searches = [who.search(rays) for who in everybody]
+            told = [who.told(rays, search()) for who, search in zip(everybody, searches, strict=True)]  # this also warms up
+            hit = float((told[0].prim_id >= 0).mean() if isinstance(told[0], Hits) else np.mean(told[0]))
+            seconds = timed(searches, plan.runs)
+            for i, who in enumerate(everybody):
+                out.append(Row(name, len(mesh.faces), kind, len(rays), hit, who.name, who.build, tuple(seconds[i]),
+                               differing(told[i], told[0])))
+                if report is not None:
+                    report(out[-1])
+    return out
+
+
+def timed(searches: Sequence[Callable[[], Any]], runs: int) -> list[list[float]]:
+    """CPU seconds of this thread, run by run; the order turns, so that what else the machine does meets all alike."""
+    seconds: list[list[float]] = [[] for _ in searches]
+    n = len(searches)
+    for i in range(runs):
+        for j in range(n):
+            k = (i + j) % n
+            begin = thread_time()
+            searches[k]()
+            seconds[k].append(max(thread_time() - begin, 1e-9))
+    return seconds
+
+
+def groups(rows: Sequence[Row]) -> list[list[Row]]:
+    """Rows of the same rays, in their order; the first is what ratios are of."""
+    found: dict[tuple[str, int, str], list[Row]] = {}
+    for row in rows:
+        found.setdefault((row.mesh, row.triangles, row.kind), []).append(row)
+    return list(found.values())
+
+
+def ratio(first: Row, other: Row) -> float:
+    """How many times as fast the first one is: median over the runs."""
+    return float(np.median(np.array(other.seconds) / np.array(first.seconds)))
+
+
+def means(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Of each rival and kind of ray: the geometric mean over the meshes of how many times as fast the first structure is."""
+    logs: dict[str, dict[str, list[float]]] = {}
+    for group in groups(rows):
+        for row in group[1:]:
+            logs.setdefault(row.name, {}).setdefault(row.kind, []).append(np.log(ratio(group[0], row)))
+    return {name: {kind: float(np.exp(np.mean(values))) for kind, values in kinds.items()} for name, kinds in logs.items()}
+
+
+def machine(plan: Plan) -> str:
+    """Device, versions and how busy the machine is: without them no time means anything."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    versions = [f"wrt {wrt.__version__}"]
+    for package in ("warp-lang", "embreex", "open3d"):
+        try:
+            versions.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            continue
+    load = f"; load average {os.getloadavg()[0]:.1f} at the start" if hasattr(os, "getloadavg") else ""
+    return f"{describe_devices()[0]}, 1 used{load}; {', '.join(versions)}; {plan.runs} runs of {plan.rays} rays by turns"
+
+
+def cells(row: Row, first: Row) -> tuple[str, ...]:
+    """One line of the table, as COLUMNS names it."""
+    return row.kind, f"{row.hit:.0%}", row.name, spread(row.mrays, 1.0), f"{ratio(first, row):.2f}", f"{row.differ}"
+
+
+def text(rows: Sequence[Row], told: str) -> str:
+    """All tables as Markdown. told: the line of `machine`."""
+    parts = [told + "\n"]
+    by_mesh: dict[tuple[str, int], list[list[Row]]] = {}
+    for group in groups(rows):
+        by_mesh.setdefault((group[0].mesh, group[0].triangles), []).append(group)
+    for (mesh, triangles), parted in by_mesh.items():
+        built = ", ".join(f"{row.name} {row.build:.2f} s" for row in parted[0])
+        parts.append(f"## {mesh}, {triangles} triangles\n\nBuilt by the clock: {built}.\n\n"
+                     f"{table(COLUMNS, [cells(row, group[0]) for group in parted for row in group])}\n")
+    found = means(rows)
+    kinds = list(dict.fromkeys(row.kind for row in rows))
+    lines = [(name, *(f"{by_kind[kind]:.2f}" for kind in kinds)) for name, by_kind in found.items()]
+    if lines:
+        parts.append(f"## Geometric means over {len(by_mesh)} meshes of wrt / it\n\n{table(('who', *kinds), lines)}\n")
+    return "\n".join(parts) + f"\n{LEGEND}\n"
