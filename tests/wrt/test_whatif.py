@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.command_line import wrt as command
+from tests.data import ROOT
 from tests.kernel_tools import rounded
 from wrt.accel import Geometry, build
 from wrt.bench.whatif import MANY_WARPS, STUDIES, Plan, markdown, rates, rates_markdown, run
@@ -162,3 +165,19 @@ def test_what_there_is_not_is_refused(ball: Path) -> None:
         with_traversal(deep, Study(4))
     assert with_traversal(deep, Study(STACK_SIZE)).stats.nodes == deep.stats.nodes
     assert build(icosphere(1), "bvh2").stats.nodes == deep.stats.nodes
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[object] = []
+    display = types.ModuleType("IPython.display")
+    display.__dict__.update(Markdown=str, display=lambda *things: shown.extend(things))
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    (tmp_path / "notebooks").mkdir()
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    monkeypatch.chdir(tmp_path / "notebooks")
+    names: dict[str, object] = {}
+    for cell in json.loads((ROOT / "notebooks" / "rt_core.ipynb").read_text())["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    assert len(shown) == 3 + 1 + 2 + len(STUDIES) + 1 and not (tmp_path / "notebooks" / "terrain.obj").exists()
