@@ -109,7 +109,7 @@ def instanced_world(scene: Scene, meshes: frozenset[int]) -> World:
             numbers.append(np.arange(first_prim, first_prim + count, dtype=np.int64))
             n_flat += count
         else:
-            part = parts.setdefault(id(thing.mesh), _own_space(thing.mesh))
+            part = parts.get(id(thing.mesh)) or parts.setdefault(id(thing.mesh), _own_space(thing.mesh))
             table = np.array([index[id(m)] for m in thing.materials], np.int32)
             key = (id(thing.face_material), *table.tolist()) if thing.face_material is not None else (0, int(table[0]))
             if key not in materials:
