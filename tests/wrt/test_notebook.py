@@ -199,11 +199,17 @@ def test_every_shipped_kind_of_scene_has_a_table() -> None:
     assert Tables(Scene()._repr_html_()).rows and Tables(quad((0, 0, 0), (1, 0, 0), (0, 1, 0))._repr_html_()).rows
 
 
-def test_reports_are_tables() -> None:
+def test_reports_are_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     from wrt.bench import stability
-    from wrt.profiler import profile
+    from wrt.profiler import Profile
+    from wrt.rtcore import TERMS, Prediction
+    from wrt.rtcore_parameters import BASE, GPUS
 
     result = stability.Result(rows=[stability.Row("A_case", EVIL)])
     assert Tables(result._repr_html_()).rows[1][:2] == ["A_case", EVIL]
-    rows = Tables(profile(SCENE, size=(16, 9), spp=1)._repr_html_()).rows
-    assert rows[0][:2] == ["depth", "kind"] and rows[1][1] == "primary"
+    monkeypatch.setattr(Profile, "by_depth", lambda self: [{"depth": 0, "kind": "primary", "nodes": 1234}])
+    profile = Profile(EVIL, (16, 9), 1, np.zeros((9, 16, 3)), rays=(), accel=None)  # type: ignore[arg-type]
+    assert Tables(profile._repr_html_()).rows == [["depth", "kind", "nodes"], ["0", "primary", "1,234"]]
+    prediction = Prediction(EVIL, next(iter(GPUS.values())), BASE, {name: 1.0 + (name == "L2") for name in TERMS})
+    rows = Tables(prediction._repr_html_()).rows
+    assert ["L2", "2", "100%"] in rows and ["box", "1", "50%"] in rows and len(rows) == 1 + len(TERMS)
