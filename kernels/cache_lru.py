@@ -52,19 +52,24 @@ class Trace:
 
 @wp.struct
 class Missed:
-    """What the L1 of SM s misses: `misses[s]` of `accesses[s]`, from room[s] on, with the round in which it is asked for.
+    """What the L1 of SM s misses: `misses[s]` of `accesses[s]`, from room[s] on, with the round in which it is asked for and the
+    lanes that wait for it. wanted: lanes that asked for a line, each counted.
 
-    slot_warp, slot_round: (sms * slots,) what runs, -1: nothing; seen: (sms * seen_size,) the lines of a warp's round.
+    slot_warp, slot_round: (sms * slots,) what runs, -1: nothing; seen: (sms * seen_size,) the lines of a warp's round, and
+    seen_at: where each one missed, -1: it hit.
     """
 
     room: wp.array(dtype=wp.int64)
     line: wp.array(dtype=wp.int64)
     time: wp.array(dtype=wp.int64)
+    lanes: wp.array(dtype=wp.int64)
+    wanted: wp.array(dtype=wp.int64)
     accesses: wp.array(dtype=wp.int64)
     misses: wp.array(dtype=wp.int64)
     slot_warp: wp.array(dtype=wp.int32)
     slot_round: wp.array(dtype=wp.int64)
     seen: wp.array(dtype=wp.int64)
+    seen_at: wp.array(dtype=wp.int64)
     seen_size: int
 
 
@@ -81,19 +86,26 @@ def play_round(trace: Trace, caches: Caches, out: Missed, sm: int, warp: int, st
             line = trace.address[fetch] / LINE
             last = (trace.address[fetch] + trace.size[fetch] - wp.int64(1)) / LINE
             while line <= last:
-                new = bool(True)
+                out.wanted[sm] += wp.int64(1)
+                entry = int(-1)
                 for j in range(seen):
                     if out.seen[begin + seen - 1 - j] == line:
-                        new = False
+                        entry = begin + seen - 1 - j
                         break
-                if new:
-                    out.seen[begin + seen] = line
+                if entry < 0:
+                    entry = begin + seen
                     seen = seen + 1
+                    out.seen[entry] = line
+                    out.seen_at[entry] = wp.int64(-1)
                     if not access(caches, sm, line):
                         at = out.room[sm] + out.misses[sm]
                         out.line[at] = line
                         out.time[at] = time
+                        out.lanes[at] = wp.int64(0)
+                        out.seen_at[entry] = at
                         out.misses[sm] += wp.int64(1)
+                if out.seen_at[entry] >= wp.int64(0):
+                    out.lanes[out.seen_at[entry]] += wp.int64(1)
                 line = line + wp.int64(1)
     out.accesses[sm] += wp.int64(seen)
     return more

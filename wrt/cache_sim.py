@@ -46,21 +46,29 @@ class Warps:
 
 @dataclass(frozen=True, eq=False)
 class Level1:
-    """accesses: of all L1s; line, time: of those that miss, SM after SM, and the round in which they are made."""
+    """accesses: of all L1s; wanted: lanes that ask; line, time, lanes: of the accesses that miss, SM after SM, the round in which
+    they are made, and how many lanes wait."""
 
     accesses: int
+    wanted: int
     line: np.ndarray
     time: np.ndarray
+    lanes: np.ndarray
 
 
 @dataclass(frozen=True)
 class Misses:
-    """accesses: of the L1s; l1, l2: those that miss there (each reads one line from below); compulsory: different lines."""
+    """accesses: of the L1s; l1, l2: those that miss there (each reads one line from below); compulsory: different lines.
+    wanted, wait_l2, wait_dram: lanes that ask for a line, and those of them that wait for the L2, and for DRAM: lanes that share
+    an access count each."""
 
     accesses: int
     l1: int
     l2: int
     compulsory: int
+    wanted: int
+    wait_l2: int
+    wait_dram: int
 
 
 def lines_of(address: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,12 +127,12 @@ def first_level(warps: Warps, sms: int, slots: int, l1: Cache) -> Level1:
     trace.address, trace.size = upload(address, wp.int64, cpu), upload(warps.size, wp.int64, cpu)
     out = Missed()
     out.room = upload(room, wp.int64, cpu)
-    out.line, out.time = (wp.empty(int(room[-1]), dtype=wp.int64, device=cpu) for _ in range(2))
-    out.accesses, out.misses = (wp.zeros(sms, dtype=wp.int64, device=cpu) for _ in range(2))
+    out.line, out.time, out.lanes = (wp.empty(int(room[-1]), dtype=wp.int64, device=cpu) for _ in range(3))
+    out.accesses, out.misses, out.wanted = (wp.zeros(sms, dtype=wp.int64, device=cpu) for _ in range(3))
     out.slot_warp = wp.full(sms * slots, -1, dtype=wp.int32, device=cpu)
     out.slot_round = wp.zeros(sms * slots, dtype=wp.int64, device=cpu)
     out.seen_size = 32 * int(touched.max(initial=1))
-    out.seen = wp.zeros(sms * out.seen_size, dtype=wp.int64, device=cpu)
+    out.seen, out.seen_at = (wp.zeros(sms * out.seen_size, dtype=wp.int64, device=cpu) for _ in range(2))
     caches = caches_of(l1, sms)
     load_kernel(replay_warps, cpu)
 
@@ -133,12 +141,15 @@ def first_level(warps: Warps, sms: int, slots: int, l1: Cache) -> Level1:
 
     run_all([run(sm) for sm in range(sms)], thread_count(None))
     used = np.concatenate([np.arange(a, a + n) for a, n in zip(room, out.misses.numpy(), strict=False)])
-    return Level1(int(out.accesses.numpy().sum()), out.line.numpy()[used], out.time.numpy()[used])
+    return Level1(int(out.accesses.numpy().sum()), int(out.wanted.numpy().sum()), out.line.numpy()[used],
+                  out.time.numpy()[used], out.lanes.numpy()[used])
 
 
 def second_level(missed: Level1, l2: Cache, warm: bool = False) -> Misses:
     """What misses in the L2 behind all L1s, in the order of time. warm: it has seen the same accesses once before."""
-    line = missed.line[np.argsort(missed.time, kind="stable")]
+    order = np.argsort(missed.time, kind="stable")
+    line, lanes = missed.line[order], missed.lanes[order]
     again = np.concatenate([line, line]) if warm else line
     hit = replay(again, l2)[len(again) - len(line):]
-    return Misses(missed.accesses, len(line), int((~hit).sum()), len(np.unique(line)))
+    return Misses(missed.accesses, len(line), int((~hit).sum()), len(np.unique(line)), missed.wanted, int(lanes.sum()),
+                  int(lanes[~hit].sum()))

@@ -101,13 +101,13 @@ def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
     """The clocks that a ray takes of an RT core: at least what each unit needs for its tests, what each level of memory needs
     for its lines, and what a ray waits for, over the rays that wait together.
 
-    A ray waits, one after another, for each node or triangle (as long as the mean fetch takes) and each test. A warp holds its
-    place until its longest ray ends.
+    A ray waits, one after another, for each node or triangle (as long as a lane's mean fetch takes) and each test. A warp holds
+    its place until its longest ray ends.
     """
     n, counts, misses = len(work), work.counters.counts, work.misses(gpu, core)
     fetches = np.diff(work.counters.first)
-    l1_rate, l2_rate = misses.l1 / max(misses.accesses, 1), misses.l2 / max(misses.accesses, 1)
-    fetch = core.l1_latency + l1_rate * core.l2_latency + l2_rate * core.dram_latency
+    l2_share, dram_share = misses.wait_l2 / max(misses.wanted, 1), misses.wait_dram / max(misses.wanted, 1)
+    fetch = core.l1_latency + l2_share * core.l2_latency + dram_share * core.dram_latency
     wait = fetches * fetch + counts["box_operations"] * core.box_latency + counts["primitives"] * core.triangle_latency
     terms = {
         "box": boxes_of(work) / core.boxes,

@@ -90,14 +90,14 @@ def test_a_warp_asks_for_a_line_once_a_round() -> None:
     assert missed.accesses == 5 and missed.line.tolist() == [0, 1, 2, 3]  # the primitive's line stands behind the nodes' three
     assert missed.time.tolist() == [0, 1, 1, 2]
     machine = (1, 1, Cache(LINE, 1), Cache(8 * LINE, 8))
-    assert simulate(warps, machine) == Misses(accesses=5, l1=5, l2=4, compulsory=4)
+    assert simulate(warps, machine) == Misses(accesses=5, l1=5, l2=4, compulsory=4, wanted=6, wait_l2=6, wait_dram=5)
     assert simulate(warps, machine, warm=True).l2 == 0
 
 
 def test_no_rays() -> None:
     none = np.zeros(0, np.int64)
     machine = (4, 2, Cache(LINE, 1), Cache(LINE, 1))
-    assert simulate(Warps(none, np.zeros(1, np.int64), none, none), machine) == Misses(0, 0, 0, 0)
+    assert simulate(Warps(none, np.zeros(1, np.int64), none, none), machine) == Misses(0, 0, 0, 0, 0, 0, 0)
 
 
 def test_a_recorded_trace_in_the_order_of_warps() -> None:
@@ -112,7 +112,7 @@ def test_a_recorded_trace_in_the_order_of_warps() -> None:
     behind = LINE * (1 + int((counters.address + counters.size)[counters.address < space].max() - 1) // LINE)
     address = np.where(counters.address >= space, counters.address - space + behind, counters.address).tolist()
     fetches = [list(zip(address[i:j], counters.size[i:j].tolist(), strict=True)) for i, j in pairwise(counters.first)]
-    events = []
+    events, lanes = [], []
     for sm in range(sms):
         free = [0] * slots
         for w in range(sm, 10, sms):
@@ -122,15 +122,23 @@ def test_a_recorded_trace_in_the_order_of_warps() -> None:
                 touched = dict.fromkeys(
                     line for ray in rays if k < len(ray) for line in range(ray[k][0] // LINE, sum(ray[k], -1) // LINE + 1))
                 events += [(free[slot] + k, sm, slot, i, line) for i, line in enumerate(touched)]
+                lanes += [((free[slot] + k, sm, slot, line), 1) for ray in rays if k < len(ray)
+                          for line in range(ray[k][0] // LINE, sum(ray[k], -1) // LINE + 1)]
             free[slot] += max(map(len, rays))
     caches: list[list[int]] = [[event[4] for event in sorted(events) if event[1] == sm] for sm in range(sms)]
     hits = [plain_replay(lines, l1) for lines in caches]
     below = [(event, hit) for sm in range(sms)
              for event, hit in zip([e for e in sorted(events) if e[1] == sm], hits[sm], strict=True)]
     missed = [event[4] for event, hit in sorted(below, key=lambda each: each[0][:2]) if not hit]
+    waits = {(event[0], event[1], event[2], event[4]) for event, hit in below if not hit}
     found = simulate(Warps(warp, counters.first, counters.address, counters.size), (sms, slots, l1, l2))
     assert found.accesses == len(events) and found.compulsory == len({event[4] for event in events})
     assert found.l1 == len(missed) < len(events) and found.l2 == plain_replay(missed, l2).count(False) < len(missed)
+    assert found.wanted == len(lanes) > len(events) and found.wait_l2 == sum(key in waits for key, _ in lanes)
+    deep = [hit for hit in plain_replay(missed, l2)]
+    ordered = [event for event, hit in sorted(below, key=lambda each: each[0][:2]) if not hit]
+    dram = {(e[0], e[1], e[2], e[4]) for e, hit in zip(ordered, deep, strict=True) if not hit}
+    assert found.wait_dram == sum(key in dram for key, _ in lanes)
 
 
 def test_what_is_no_cache_is_refused() -> None:

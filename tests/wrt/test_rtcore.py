@@ -37,7 +37,8 @@ def test_every_term_by_hand() -> None:
     core = Core(boxes=4.0, triangles=0.5, warps=1, box_latency=5.0, triangle_latency=7.0, l1_latency=11.0, l2_latency=100.0,
                 dram_latency=200.0, l1_lines=2.0, l2_bytes=16.0)
     accesses, l1, l2 = 4 * 13, 2 * 13, 13
-    assert vars(work.misses(SMALL, core)) == {"accesses": accesses, "l1": l1, "l2": l2, "compulsory": 13}
+    assert vars(work.misses(SMALL, core)) == {"accesses": accesses, "l1": l1, "l2": l2, "compulsory": 13,
+                                              "wanted": 32 * accesses, "wait_l2": 32 * l1, "wait_dram": 32 * l2}
     fetch = 11.0 + 100.0 * l1 / accesses + 200.0 * l2 / accesses
     wait = 13 * fetch + 10 * 5.0 + 3 * 7.0
     expected = {"box": 20 / 4.0, "triangle": 3 / 0.5, "L1": accesses / 128 / 2.0, "L2": l1 * LINE / 128 / 16.0,
