@@ -35,6 +35,7 @@ _PUBLIC = {
     "EnvironmentBackground": "wrt.scene",
     "GradientBackground": "wrt.scene",
     "Material": "wrt.scene",
+    "Motion": "wrt.motion",
     "Object": "wrt.scene",
     "PointLight": "wrt.scene",
     "Scene": "wrt.scene",

@@ -7,17 +7,23 @@ from functools import cache
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 import wrt
 from tests.data import data_path
 from tests.gltf_files import GltfFile
-from wrt.accel import build
+from wrt.accel import ACCELERATORS, Structure, build
 from wrt.accel.instances import Instances, place
 from wrt.bench.rasterizer import Rasterizer
 from wrt.bench.visibility_check import compare
+from wrt.device import start, upload
+from wrt.device_scene import upload_scene
 from wrt.errors import InputError
 from wrt.film import Film
+from wrt.kernels.query import RayArrays, Respawn, make_respawn_kernel
+from wrt.kernels.surface import make_surface_at
+from wrt.kernels.traverse import Units
 from wrt.mesh import Mesh
 from wrt.scene import Camera, ConstantBackground, Material, Object, Scene, Settings, Sphere, Texture
 from wrt.shapes import icosphere, quad
@@ -118,23 +124,45 @@ def test_the_rasterizer_sees_the_same() -> None:
     assert found.covered > 10_000 and found.unexplained == 0 and found.differ < 10
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
-def test_no_new_ray_meets_the_surface_it_leaves(scale: float) -> None:
-    """A white furnace: on a closed convex mesh of albedo 1 under a sky of 1 every sample is 1, unless its shadow ray meets the
-    surface that it left. Far from the origin, stretched and turned, and the mesh itself far from its own origin."""
-    ball = icosphere(3)
-    white = Material(albedo=(1.0, 1.0, 1.0))
-    aside = Mesh(ball.vertices + np.float32(30.0), ball.faces)
-    center, objects = scale * np.array([23.0, 23.0, 20.0]), []
-    for away in (0.0, 1e3 * scale):  # the second is behind the camera
+@cache
+def respawn_kernel() -> object:
+    structure = Structure(ACCELERATORS["bvh"], Units(instances=True))
+    surface_at = make_surface_at(False, False, False, False, instances=True)
+    return make_respawn_kernel(structure.struct, structure.traversal(any_hit=False), surface_at)
+
+
+@pytest.mark.parametrize(("scale", "far", "aside"), [(1e-3, 20.0, 30.0), (1.0, 0.0, 300.0), (1e4, 300.0, 3.0)])
+def test_no_new_ray_meets_the_surface_it_leaves(scale: float, far: float, aside: float) -> None:
+    """From a closed convex mesh outwards, with the triangle that it starts on not left out: stretched and turned, `far` from the
+    world's origin, and `aside` from the mesh's own, in radii."""
+    ball, n, rng = icosphere(3), 40_000, np.random.default_rng(1)
+    moved = Mesh(ball.vertices + np.float32(aside), ball.faces)
+    center, objects = scale * far * np.array([1.1, 1.1, 1.0]), []
+    for away in (0.0, 1e3 * scale):
         matrix = turned(1, scale * np.array([1.0, 0.5, 1.3]), *center)
-        matrix[:3, 3] -= matrix[:3, :3] @ np.full(3, 30.0) - np.array([0.0, 0.0, away])
-        objects.append(Object(aside, (white,), matrix))
-    scene = Scene(tuple(objects), cameras=(Camera.look_at(center + np.array([0.0, 0.0, 4.0 * scale]), center),),
-                  background=ConstantBackground((1.0, 1.0, 1.0)), settings=Settings(size=(96, 96), spp=32, max_depth=0))
-    film = wrt.render(scene, instancing="always", aov=("prim_id",))
-    assert (film.aov["prim_id"] >= 0).mean() > 0.15
-    assert np.abs(film.pixels - 1.0).max() < 1e-4
+        matrix[:3, 3] -= matrix[:3, :3] @ np.full(3, aside) - np.array([0.0, 0.0, away])
+        objects.append(Object(moved, (Material(),), matrix))
+    device = start("cpu")
+    scene = upload_scene(Scene(tuple(objects)), device, "always")
+    accel = build(scene.world.geometry, "bvh")
+    origin = rng.normal(size=(n, 3))
+    origin *= 4.0 * scale / np.linalg.norm(origin, axis=1, keepdims=True)
+    target = 0.4 * scale * rng.normal(size=(n, 3))
+    rays, out = RayArrays(), Respawn()
+    for name, rows in (("origin", center + origin), ("direction", target - origin)):
+        setattr(rays, name, upload(rows, wp.vec3, device))
+    rays.t_min, rays.t_max = (upload(np.full(n, t, np.float32), wp.float32, device) for t in (0.0, np.inf))
+    # Outwards: back to where the ray came from, by more than the surface is tilted against it, or along the surface.
+    out.direction = upload(origin / scale + 2.0 * rng.normal(size=(n, 3)), wp.vec3, device)
+    out.first_prim_id, out.next_prim_id = (wp.zeros(n, dtype=wp.int32, device=device) for _ in range(2))
+    wp.launch(respawn_kernel(), dim=n, inputs=[accel.data, scene.surfaces, rays, out, 0], device=device)
+    first, following = out.first_prim_id.numpy(), out.next_prim_id.numpy()
+    hit = first >= 0
+    corners = scene.world.corners(first[hit])
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outward = (normal * out.direction.numpy()[hit]).sum(axis=1) > 0.0
+    assert outward.sum() > 10_000
+    assert (following[hit][outward] == -1).all()
 
 
 def test_nodes_and_instances_of_a_gltf_file_share_their_mesh(tmp_path) -> None:
