@@ -74,6 +74,12 @@ def test_threads_and_room_change_nothing(monkeypatch: pytest.MonkeyPatch) -> Non
         assert np.array_equal(one, other)
 
 
+def test_a_tree_beyond_the_range_of_indices_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_ROOM", 2000)
+    with pytest.raises(InputError, match="lower max_growth"):
+        build(icosphere(3), "bsp")
+
+
 def test_more_subtrees_than_there_is_room_for_are_built_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "LEFT_OVERS", 2)
     rng = np.random.default_rng(0)

@@ -21,6 +21,7 @@ from wrt.kernels.build_bsp_split import BspOptions, BspTools, Pieces
 MAX_DEPTH = 60  # below the traversal unit's stack
 ROOM = 8  # pieces at a time, nodes and references for each primitive; more where that is not enough
 SPARE = 1024
+MAX_ROOM = (2**31 - 1) // 6 - SPARE  # points of pieces are counted in int32, six for each
 LEFT_OVERS = 1024  # subtrees at most that are built on their own
 PIECE = {"prim_id": (wp.int32, ()), "first": (wp.int32, ()), "count": (wp.int32, ()), "lo": (wp.vec3d, (3,)),
          "hi": (wp.vec3d, (3,)), "ball": (wp.vec4d, (4,)), "extent": (wp.float64, ())}
@@ -133,6 +134,8 @@ class Builder:
         room = ROOM * n + SPARE
         self.options.keep = keep
         while True:
+            if room > MAX_ROOM:
+                raise InputError(f"a BSP tree of {n} primitives is too large; lower max_growth, or take another structure")
             launch = Launch(self.corners, self.options, room, LEFT_OVERS if keep else 0)
             if launch.run(source, tasks, cells, which):
                 return launch
