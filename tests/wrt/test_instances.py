@@ -195,7 +195,8 @@ def test_instances_have_neither_files_nor_refit(tmp_path) -> None:
 
 @pytest.mark.slow
 def test_a_million_triangles_of_shared_spheres_take_a_hundredth_of_the_memory() -> None:
-    scene = wrt.load_scene(data_path("scenes/gltf/MetalRoughSpheresNoTextures.glb"))
+    with pytest.warns(wrt.SceneWarning):  # it has no camera and no lights
+        scene = wrt.load_scene(data_path("scenes/gltf/MetalRoughSpheresNoTextures.glb"))
     copied, shared = (wrt.render(scene, size=(160, 120), spp=4, instancing=mode) for mode in ("never", "auto"))
     assert shared.stats["accel"]["bytes"] < 0.02 * copied.stats["accel"]["bytes"]
     assert np.sqrt(((copied.pixels - shared.pixels) ** 2).mean()) < 0.1 * np.sqrt(copied.variance.mean())
