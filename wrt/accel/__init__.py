@@ -6,15 +6,8 @@ from inspect import signature
 from typing import Any
 
 from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
-from wrt.accel.brute_force import BruteForce
-from wrt.accel.bsp import Bsp
-from wrt.accel.bvh2 import Bvh2
-from wrt.accel.bvh2_volumes import Bvh2Kdop, Bvh2Sphere
-from wrt.accel.bvh_wide import Bvh4, Bvh8, Bvh8c
-from wrt.accel.grid import Grid
 from wrt.accel.instances import InstancedGeometry, Instances
-from wrt.accel.kdtree import KdTree
-from wrt.accel.octree import Octree
+from wrt.accel.registry import Registry
 from wrt.accel.store import build_cached, load_accel
 from wrt.errors import InputError
 from wrt.mesh import Mesh
@@ -22,20 +15,20 @@ from wrt.mesh import Mesh
 __all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "InstancedGeometry", "Instances", "Structure", "build",
            "build_cached", "load_accel", "tells_progress"]
 
-ACCELERATORS: dict[str, type[Accelerator]] = {
-    "bvh": Bvh8,  # the default: the best one there is
-    "bvh2": Bvh2,
-    "bvh4": Bvh4,
-    "bvh8": Bvh8,
-    "bvh2_sphere": Bvh2Sphere,
-    "bvh2_kdop": Bvh2Kdop,
-    "bvh8c": Bvh8c,
-    "kdtree": KdTree,
-    "bsp": Bsp,
-    "brute_force": BruteForce,
-    "grid": Grid,
-    "octree": Octree,
-}
+ACCELERATORS: Registry[type[Accelerator]] = Registry({
+    "bvh": "wrt.accel.bvh_wide:Bvh8",  # the default: the best one there is
+    "bvh2": "wrt.accel.bvh2:Bvh2",
+    "bvh4": "wrt.accel.bvh_wide:Bvh4",
+    "bvh8": "wrt.accel.bvh_wide:Bvh8",
+    "bvh2_sphere": "wrt.accel.bvh2_volumes:Bvh2Sphere",
+    "bvh2_kdop": "wrt.accel.bvh2_volumes:Bvh2Kdop",
+    "bvh8c": "wrt.accel.bvh_wide:Bvh8c",
+    "kdtree": "wrt.accel.kdtree:KdTree",
+    "bsp": "wrt.accel.bsp:Bsp",
+    "brute_force": "wrt.accel.brute_force:BruteForce",
+    "grid": "wrt.accel.grid:Grid",
+    "octree": "wrt.accel.octree:Octree",
+})
 
 
 def tells_progress(accel: str) -> bool:

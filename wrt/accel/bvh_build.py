@@ -5,22 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from wrt.accel.base import Geometry
-from wrt.accel.bvh_ranges import build_binned, build_lbvh, build_median, build_sweep
-from wrt.accel.bvh_reinsertion import build_reinsertion
-from wrt.accel.bvh_spatial import build_sbvh
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions, sah_cost
+from wrt.accel.registry import Registry
 from wrt.errors import InputError
 
 __all__ = ["BVH_BUILDERS", "BinaryTree", "BvhOptions", "build_binary", "sah_cost"]
 
-BVH_BUILDERS: dict[str, Callable[[Geometry, BvhOptions, int], BinaryTree]] = {
-    "binned": build_binned,
-    "sweep": build_sweep,
-    "sbvh": build_sbvh,
-    "reinsertion": build_reinsertion,
-    "median": build_median,
-    "lbvh": build_lbvh,
-}
+BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Registry({
+    "binned": "wrt.accel.bvh_ranges:build_binned",
+    "sweep": "wrt.accel.bvh_ranges:build_sweep",
+    "sbvh": "wrt.accel.bvh_spatial:build_sbvh",
+    "reinsertion": "wrt.accel.bvh_reinsertion:build_reinsertion",
+    "median": "wrt.accel.bvh_ranges:build_median",
+    "lbvh": "wrt.accel.bvh_ranges:build_lbvh",
+})
 
 
 def build_binary(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:

@@ -1,0 +1,32 @@
+"""A registry imports what is asked for, and nothing else."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from wrt.accel.registry import Registry
+
+
+def test_entries_become_what_they_name() -> None:
+    table: Registry[type] = Registry({"fraction": "fractions:Fraction", "decimal": "decimal:Decimal"})
+    from decimal import Decimal
+    from fractions import Fraction
+
+    assert list(table) == ["fraction", "decimal"] and "decimal" in table and len(table) == 2
+    assert table["fraction"] is Fraction and table.get("decimal") is Decimal and table.get("float") is None
+    assert list(table.values()) == [Fraction, Decimal]
+    assert list(reversed(table.items())) == [("decimal", Decimal), ("fraction", Fraction)]
+    with pytest.raises(KeyError):
+        table["float"]
+
+
+def test_a_render_imports_only_its_own_structure() -> None:
+    code = ("import sys, wrt; from wrt.shapes import icosphere; wrt.build(icosphere(1)); "
+            "print(*(name for name in sys.modules if name.startswith('wrt.')))")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = done.stdout.split()
+    assert "wrt.accel.bvh_wide" in loaded
+    assert not {"wrt.accel.bsp", "wrt.accel.kdtree", "wrt.kernels.build_sbvh", "wrt.kernels.build_bsp"} & set(loaded)

@@ -1,0 +1,40 @@
+"""A table of names whose entries are imported when they are first asked for: a program pays for the structure that it takes."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+class Registry(dict[str, T]):
+    """Name -> thing. Given as "module:thing"; whoever asks gets the thing itself."""
+
+    def __init__(self, places: dict[str, str]) -> None:
+        super().__init__()
+        for name, place in places.items():
+            super().__setitem__(name, place)  # type: ignore[assignment]
+
+    def __getitem__(self, name: str) -> T:
+        thing: Any = super().__getitem__(name)
+        if isinstance(thing, str):
+            module, attribute = thing.split(":")
+            thing = getattr(importlib.import_module(module), attribute)
+            self[name] = thing
+        return thing
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if name in self else default
+
+    def values(self) -> Any:
+        self._import_all()
+        return super().values()
+
+    def items(self) -> Any:
+        self._import_all()
+        return super().items()
+
+    def _import_all(self) -> None:
+        for name in self:
+            self[name]
