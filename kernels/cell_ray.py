@@ -13,12 +13,13 @@ from wrt.kernels.ray_aabb import FAR_PAD, BoxRay
 
 @wp.func
 def later(t: float) -> float:
-    """t, not smaller for any rounding of plane distances (kernels.ray_aabb.FAR_PAD), whatever its sign. Monotone."""
+    """t, not smaller for any rounding of plane distances (kernels.ray_aabb.FAR_PAD), whatever its sign. Monotone; NaN stays."""
     return wp.max(t * FAR_PAD, t * wp.static(2.0 - float(FAR_PAD)))
 
 
 @wp.func
 def earlier(t: float) -> float:
+    """t, not larger, in the same way."""
     return wp.min(t * FAR_PAD, t * wp.static(2.0 - float(FAR_PAD)))
 
 

@@ -80,8 +80,9 @@ def make_traversal(units: Units, any_hit: bool, accepts=None):
     return make_binary_traversal(units, box_volumes(units.triangle_test.record, units.box_test), any_hit, accepts)
 
 
-def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts=None):
-    """As make_traversal, over a tree with volumes of another kind."""
+def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts=None, ordered: bool = True, early: bool = True):
+    """As make_traversal, over a tree with volumes of another kind. ordered: the nearer child first; early: nodes beyond the best
+    hit are dropped (what either is worth is for studies to tell)."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
     struct, set_up, enter = volumes.struct, volumes.set_up, volumes.enter
@@ -92,6 +93,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
         probe = probe_of(ray)
         prepared = set_up(accel, probe)
         best = no_hit(ray)
+        end = best.t
         counts = Counts()
         stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
@@ -108,16 +110,20 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
                     if wp.static(any_hit):
                         if best.prim_id != NO_HIT:
                             return finish(accel.recorder, ray, counts, best)
+                if wp.static(early):
+                    end = best.t
             else:
                 node = accel.nodes[first]
                 counts = fetch_node(accel.recorder, ray, counts, first, 2)
-                entry = enter(prepared, node, best.t)
+                entry = enter(prepared, node, end)
                 t_0 = entry[0]
                 t_1 = entry[1]
                 hit_0 = t_0 < wp.inf
                 hit_1 = t_1 < wp.inf
                 if hit_0 and hit_1:
-                    swap = t_1 < t_0
+                    swap = bool(False)
+                    if wp.static(ordered):
+                        swap = t_1 < t_0
                     stack_first[size] = wp.where(swap, node.first_0, node.first_1)
                     stack_count[size] = wp.where(swap, node.count_0, node.count_1)
                     stack_t[size] = wp.where(swap, t_0, t_1)
@@ -139,7 +145,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
             while size > 0 and not found:
                 size = size - 1
                 counts.pops += 1
-                if stack_t[size] <= best.t:
+                if stack_t[size] <= end:
                     first = stack_first[size]
                     count = stack_count[size]
                     found = True

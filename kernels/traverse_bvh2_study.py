@@ -13,7 +13,7 @@ import warp as wp
 from wrt.kernels.counters import Counts, make_counters
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
 from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
-from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node, make_struct
+from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node, box_volumes, make_binary_traversal, make_struct
 
 LEVELS = 62  # of the tree, that a trail has bits for
 TOP = wp.constant(wp.uint64(1 << 63))
@@ -34,80 +34,8 @@ class Study(NamedTuple):
     def make_traversal(self, units: Units, any_hit: bool, accepts=None):
         if self.entries < STACK_SIZE:
             return make_short_stack(units, self.entries, any_hit, accepts)
-        return make_full_stack(units, self, any_hit, accepts)
-
-
-def make_full_stack(units: Units, study: Study, any_hit: bool, accepts=None):
-    """As traverse_bvh2, with or without order and early stop."""
-    probe_of = make_probe(units)
-    intersect = make_intersect(units, accepts)
-    ray_aabb = units.box_test
-    fetch_node, fetch_primitive, push, finish = make_counters(units, Bvh2Node.numpy_dtype()["itemsize"])
-    struct = make_struct(units.triangle_test.record)
-
-    @wp.func
-    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
-        probe = probe_of(ray)
-        best = no_hit(ray)
-        counts = Counts()
-        end = best.t
-        stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
-        stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
-        stack_t = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
-        size = int(0)
-        first = int(0)
-        count = int(0)
-        while True:
-            if count > 0:
-                counts.leaves += 1
-                for i in range(first, first + count):
-                    best = intersect(probe, surfaces, accel.primitives[i], best)
-                    counts = fetch_primitive(accel.recorder, ray, counts, i)
-                    if wp.static(any_hit):
-                        if best.prim_id != NO_HIT:
-                            return finish(accel.recorder, ray, counts, best)
-                if wp.static(study.early):
-                    end = best.t
-            else:
-                node = accel.nodes[first]
-                counts = fetch_node(accel.recorder, ray, counts, first, 2)
-                t_0 = ray_aabb(probe.box, node.lo_0, node.hi_0, end)
-                t_1 = ray_aabb(probe.box, node.lo_1, node.hi_1, end)
-                hit_0 = t_0 < wp.inf
-                hit_1 = t_1 < wp.inf
-                if hit_0 and hit_1:
-                    swap = bool(False)
-                    if wp.static(study.ordered):
-                        swap = t_1 < t_0
-                    stack_first[size] = wp.where(swap, node.first_0, node.first_1)
-                    stack_count[size] = wp.where(swap, node.count_0, node.count_1)
-                    stack_t[size] = wp.where(swap, t_0, t_1)
-                    size = size + 1
-                    counts = push(counts, size)
-                    first = wp.where(swap, node.first_1, node.first_0)
-                    count = wp.where(swap, node.count_1, node.count_0)
-                    continue
-                if hit_0:
-                    first = node.first_0
-                    count = node.count_0
-                    continue
-                if hit_1:
-                    first = node.first_1
-                    count = node.count_1
-                    continue
-            found = bool(False)
-            while size > 0 and not found:
-                size = size - 1
-                counts.pops += 1
-                if stack_t[size] <= end:
-                    first = stack_first[size]
-                    count = stack_count[size]
-                    found = True
-            if not found:
-                break
-        return finish(accel.recorder, ray, counts, best)
-
-    return traverse
+        volumes = box_volumes(units.triangle_test.record, units.box_test)
+        return make_binary_traversal(units, volumes, any_hit, accepts, self.ordered, self.early)
 
 
 def make_short_stack(units: Units, entries: int, any_hit: bool, accepts=None):

@@ -14,8 +14,9 @@ from functools import cache
 
 import warp as wp
 
+from wrt.kernels.cell_ray import earlier, later
 from wrt.kernels.counters import Counts, Recorder, make_counters
-from wrt.kernels.ray_aabb import FAR_PAD, slab_interval
+from wrt.kernels.ray_aabb import slab_interval
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
 from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
 
@@ -25,7 +26,6 @@ STACK_SIZE = 64
 # Node.word is 4 * (left child, or first primitive of a leaf) + this or the axis of the plane.
 LEAF = wp.constant(3)
 
-NEAR_PAD = wp.constant(1.0 - 2.0 * (7.0 * 2.0**-24) / (1.0 - 7.0 * 2.0**-24))
 HELD_RELATIVE = wp.constant(1.0 + 2.0**-19)
 HELD_GRAZING = wp.constant(2.0**-20)
 
@@ -54,18 +54,6 @@ def make_struct(record):
         recorder: Recorder
 
     return KdTree
-
-
-@wp.func
-def earlier(t: float) -> float:
-    """t less the rounding of what it is compared with; NaN stays."""
-    return wp.min(t * NEAR_PAD, t * FAR_PAD)
-
-
-@wp.func
-def later(t: float) -> float:
-    """t and the rounding of what it is compared with; NaN stays."""
-    return wp.max(t * NEAR_PAD, t * FAR_PAD)
 
 
 @wp.func

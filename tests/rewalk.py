@@ -17,7 +17,7 @@ from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
 from wrt.kernels.ray_aabb import FAR_PAD
 from wrt.kernels.ray_bounding_sphere import SMALLEST, SPHERE_PAD
 from wrt.kernels.ray_kdop import RAY_PAD
-from wrt.kernels.traverse_kdtree import HELD_GRAZING, HELD_RELATIVE, NEAR_PAD
+from wrt.kernels.traverse_kdtree import HELD_GRAZING, HELD_RELATIVE
 
 INF = np.float32(np.inf)
 REACH = np.float32(2.0**-19)
@@ -208,7 +208,7 @@ def bvh2_kdop(accel, ray: WalkRay) -> Walk:
 
 def widened(t: np.float32) -> tuple[np.float32, np.float32]:
     """t less and t plus the rounding of what it is compared with."""
-    ends = t * np.float32(NEAR_PAD), t * np.float32(FAR_PAD)
+    ends = t * np.float32(2.0 - float(FAR_PAD)), t * np.float32(FAR_PAD)
     return np.minimum(*ends), np.maximum(*ends)
 
 

@@ -151,8 +151,7 @@ def instructions(structures: tuple[str, ...], as_json: bool) -> None:
     from wrt.bench import instructions as bench_instructions
 
     for name in structures:
-        if name not in ACCELERATORS:
-            raise InputError(f"no structure {name!r}; there is {', '.join(ACCELERATORS)}")
+        ACCELERATORS.check(name)
     units, codes = bench_instructions.units(), bench_instructions.traversals(structures)
     if as_json:
         say_json({"units": [{"unit": each.unit, "test": each.test, "instructions": each.instructions, **each.classes}

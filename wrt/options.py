@@ -89,8 +89,7 @@ class Options:
     def __post_init__(self) -> None:
         for name in ("accel", "device", "triangle", "box", "instancing"):
             as_one(getattr(self, name), str, name)
-        if self.accel not in ACCELERATORS:
-            raise InputError(f"no structure {self.accel!r}; there is {', '.join(ACCELERATORS)}")
+        ACCELERATORS.check(self.accel)
         check_units(self.triangle, self.box)
         if self.instancing not in INSTANCING:
             raise InputError(f"instancing must be one of {', '.join(INSTANCING)}, got {self.instancing!r}")

@@ -8,10 +8,11 @@ import sys
 import pytest
 
 from wrt.accel.registry import Registry
+from wrt.errors import InputError
 
 
 def test_entries_become_what_they_name() -> None:
-    table: Registry[type] = Registry({"fraction": "fractions:Fraction", "decimal": "decimal:Decimal"})
+    table: Registry[type] = Registry("number", {"fraction": "fractions:Fraction", "decimal": "decimal:Decimal"})
     from decimal import Decimal
     from fractions import Fraction
 
@@ -21,6 +22,9 @@ def test_entries_become_what_they_name() -> None:
     assert list(reversed(table.items())) == [("decimal", Decimal), ("fraction", Fraction)]
     with pytest.raises(KeyError):
         table["float"]
+    table.check("decimal")
+    with pytest.raises(InputError, match="no number 'float'; there is fraction, decimal"):
+        table.check("float")
 
 
 def test_a_render_imports_only_its_own_structure() -> None:

@@ -9,13 +9,12 @@ from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
 from wrt.accel.instances import InstancedGeometry, Instances
 from wrt.accel.registry import Registry
 from wrt.accel.store import build_cached, load_accel
-from wrt.errors import InputError
 from wrt.mesh import Mesh
 
 __all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "InstancedGeometry", "Instances", "Structure", "build",
            "build_cached", "load_accel", "tells_progress"]
 
-ACCELERATORS: Registry[type[Accelerator]] = Registry({
+ACCELERATORS: Registry[type[Accelerator]] = Registry("structure", {
     "bvh": "wrt.accel.bvh_wide:Bvh8",  # the default: the best one there is
     "bvh2": "wrt.accel.bvh2:Bvh2",
     "bvh4": "wrt.accel.bvh_wide:Bvh4",
@@ -44,8 +43,7 @@ def build(mesh: Mesh | Geometry | InstancedGeometry, accel: str = "bvh", device:
 
     Raises InputError for an unknown name or device.
     """
-    if accel not in ACCELERATORS:
-        raise InputError(f"no structure {accel!r}; there is {', '.join(ACCELERATORS)}")
+    ACCELERATORS.check(accel)
     if isinstance(mesh, InstancedGeometry):
         return Instances(ACCELERATORS[accel], mesh, device, threads, **options)
     geometry = Geometry.of(mesh) if isinstance(mesh, Mesh) else mesh

@@ -7,11 +7,10 @@ from collections.abc import Callable
 from wrt.accel.base import Geometry
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions, sah_cost
 from wrt.accel.registry import Registry
-from wrt.errors import InputError
 
 __all__ = ["BVH_BUILDERS", "BinaryTree", "BvhOptions", "build_binary", "sah_cost"]
 
-BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Registry({
+BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Registry("builder", {
     "binned": "wrt.accel.bvh_ranges:build_binned",
     "sweep": "wrt.accel.bvh_ranges:build_sweep",
     "sbvh": "wrt.accel.bvh_spatial:build_sbvh",
@@ -23,6 +22,5 @@ BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Regi
 
 def build_binary(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """A binary tree over the padded boxes of the geometry. Raises InputError for an unknown builder."""
-    if options.builder not in BVH_BUILDERS:
-        raise InputError(f"no builder {options.builder!r}; there is {', '.join(BVH_BUILDERS)}")
+    BVH_BUILDERS.check(options.builder)
     return BVH_BUILDERS[options.builder](geometry, options, threads)

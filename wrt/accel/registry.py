@@ -5,14 +5,17 @@ from __future__ import annotations
 import importlib
 from typing import Any, TypeVar
 
+from wrt.errors import InputError
+
 T = TypeVar("T")
 
 
 class Registry(dict[str, T]):
-    """Name -> thing. Given as "module:thing"; whoever asks gets the thing itself."""
+    """Name -> thing. Given as "module:thing"; whoever asks gets the thing itself. kind: what they are, for messages."""
 
-    def __init__(self, places: dict[str, str]) -> None:
+    def __init__(self, kind: str, places: dict[str, str]) -> None:
         super().__init__()
+        self.kind = kind
         for name, place in places.items():
             super().__setitem__(name, place)  # type: ignore[assignment]
 
@@ -23,6 +26,11 @@ class Registry(dict[str, T]):
             thing = getattr(importlib.import_module(module), attribute)
             self[name] = thing
         return thing
+
+    def check(self, name: str) -> None:
+        """Raise InputError where there is nothing of that name."""
+        if name not in self:
+            raise InputError(f"no {self.kind} {name!r}; there is {', '.join(self)}")
 
     def get(self, name: str, default: Any = None) -> Any:
         return self[name] if name in self else default

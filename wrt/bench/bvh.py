@@ -61,8 +61,7 @@ class Plan:
         if not self.meshes:
             raise InputError("name the meshes: .obj, .ply or .stl files")
         for name in self.builders:
-            if name not in BVH_BUILDERS:
-                raise InputError(f"no builder {name!r}; there is {', '.join(BVH_BUILDERS)}")
+            BVH_BUILDERS.check(name)
         for name, high in (("rays", 2**26), ("builds", 100), ("runs", 1000)):
             if not 1 <= getattr(self, name) <= high:
                 raise InputError(f"{name} must be 1 to {high}, got {getattr(self, name)}")

@@ -144,8 +144,7 @@ class RayCaster:
     """The same pictures by rays, one a pixel, through a structure that is built here; `build_seconds` tells how long."""
 
     def __init__(self, geometry: Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None) -> None:
-        if accel not in ACCELERATORS:
-            raise InputError(f"no structure {accel!r}; there is {', '.join(ACCELERATORS)}")
+        ACCELERATORS.check(accel)
         self.device, self.threads = start(device), thread_count(threads)
         self.accel = build(geometry, accel, device, threads)
         self.build_seconds = self.accel.stats.build_seconds

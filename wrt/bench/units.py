@@ -40,8 +40,7 @@ class Plan:
     def __post_init__(self) -> None:
         if self.rays < 1 or self.runs < 1:
             raise InputError(f"rays and runs must be 1 or more, got {self.rays} and {self.runs}")
-        if self.accel not in ACCELERATORS:
-            raise InputError(f"no structure {self.accel!r}; there is {', '.join(ACCELERATORS)}")
+        ACCELERATORS.check(self.accel)
 
 
 @dataclass(frozen=True)

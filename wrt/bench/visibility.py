@@ -46,8 +46,7 @@ class Plan:
         for name, low, high in (("size", 1, 16384), ("max_size", MIN_SIDE, 16384), ("max_triangles", 1, 2**30), ("runs", 1, 1000)):
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"{name} must be {low} to {high}, got {getattr(self, name)}")
-        if self.accel not in ACCELERATORS:
-            raise InputError(f"no structure {self.accel!r}; there is {', '.join(ACCELERATORS)}")
+        ACCELERATORS.check(self.accel)
         thread_count(self.threads)
         start(self.device)
 
