@@ -120,8 +120,9 @@ def test_kills_lose_little_and_change_nothing() -> None:
     rng = random.Random(7)
     options = (*RENDER, "--checkpoint", "0.2s", "--resume")
     for i in range(3):
-        lines = killed_when(0.2 * i + 0.2 * rng.random(), 0.1 * rng.random(), *options)  # of a second or two
-        assert lost_seconds(lines) >= 0.0  # what there is is whole; how much is lost, the slow test measures
+        killed_when(0.2 * i + 0.2 * rng.random(), 0.1 * rng.random(), *options)  # of a second or two
+        if Path("a.exr.checkpoint").exists():
+            assert read("a.exr.checkpoint").seconds > 0.0  # whole; how much is lost, the slow test measures
         if Path("a.exr").exists():  # a fast machine was done before the kill
             assert channels("a.exr") == expected
             Path("a.exr").unlink()
