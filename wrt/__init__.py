@@ -28,6 +28,7 @@ _PUBLIC = {
     "Progress": "wrt.options",
     "Film": "wrt.film",
     "profile": "wrt.profiler",
+    "camera_rays": "wrt.camera_rays",
     "Camera": "wrt.scene",
     "Checkerboard": "wrt.scene",
     "ConstantBackground": "wrt.scene",

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wrt.arguments import LARGEST, as_array, as_path
+from wrt.arguments import LARGEST, as_array, as_path, shown
 from wrt.errors import InputError, SceneWarning
 from wrt.mesh_clean import clean
 from wrt.tables import html_facts
@@ -181,6 +181,16 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
         dropped=cleaned.dropped + raw.incomplete,
         name=os.fspath(path),
     )
+
+
+def as_mesh(value: Mesh | str | os.PathLike[str]) -> Mesh:
+    """A Mesh as it is; the mesh of a file by its path (load_mesh). Raises InputError for anything else, or no triangles."""
+    if not isinstance(value, Mesh | str | os.PathLike):
+        raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(value)}")
+    mesh = value if isinstance(value, Mesh) else load_mesh(value)
+    if not len(mesh.faces):
+        raise InputError("there are no triangles to hit", None if isinstance(value, Mesh) else value)
+    return mesh
 
 
 def _part_groups(parts: Sequence[tuple[int, int]], faces: int, path: Path) -> tuple[tuple[str, ...], np.ndarray]:

@@ -110,6 +110,17 @@ class Profile:
             sums[f"probes_{kind}"] = np.bincount(rays.pixel, rays.kind == i, n) / self.spp
         return {name: value.reshape(self.size[1], self.size[0]) for name, value in sums.items()}
 
+    def heatmap(self, name: str) -> Any:
+        """One of `maps` as a picture with its scale, a PIL image, which a notebook shows. Raises InputError for another name."""
+        from PIL import Image
+
+        from wrt.bench.heatmap import heatmap
+        from wrt.bench.profile_report import TITLES
+
+        if name not in PICTURES:
+            raise InputError(f"no picture {name!r}; there is {', '.join(PICTURES)}")
+        return Image.fromarray(heatmap(self.maps[name], TITLES[name] + ("" if name == "stack" else " a sample")))
+
     def by_depth(self) -> list[dict[str, Any]]:
         """One row for each kind of ray at each depth: depth, kind, hits, and every counter summed (stack: the deepest)."""
         rays, rows = self.rays, []

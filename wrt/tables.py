@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
 
+T = TypeVar("T")
+NUMERIC = re.compile(r"[-<±]? ?\d+([.,]\d+)*(e[-+]?\d+)?[%xk]?( |$)")  # how a formatted number begins
 SHOWN_ROWS = 200  # of one table; more make a notebook slow
 
 
@@ -15,12 +18,23 @@ def html_table(title: str, head: Sequence[Any], rows: Iterable[Sequence[Any]]) -
     out = [f"<b>{html.escape(title)}</b>"] if title else []
     out.append("<table>")
     if head:
-        out.append(_row(head, "th"))
-    out += [_row(row, "td") for row in rows[:SHOWN_ROWS]]
+        out.append(_row(head, "th", rows[0] if rows else head))
+    out += [_row(row, "td", row) for row in rows[:SHOWN_ROWS]]
     out.append("</table>")
     if len(rows) > SHOWN_ROWS:
         out.append(f"<p>and {len(rows) - SHOWN_ROWS} more</p>")
     return "".join(out)
+
+
+class Rows(list[T]):
+    """The rows of a report: a list that a notebook shows as what `page` makes of it (HTML)."""
+
+    def __init__(self, rows: Iterable[T], page: Callable[[Sequence[T]], str]) -> None:
+        super().__init__(rows)
+        self._page = page
+
+    def _repr_html_(self) -> str:
+        return self._page(self)
 
 
 def html_facts(title: str, facts: Mapping[str, Any]) -> str:
@@ -35,8 +49,8 @@ def number(value: Any) -> str:
     return f"{value:,}" if hasattr(value, "__index__") else f"{value:.4g}"
 
 
-def _row(cells: Sequence[Any], tag: str) -> str:
-    # Jupyter draws text cells on the right; names are read from the left.
-    style = ' style="text-align:left"'
+def _row(cells: Sequence[Any], tag: str, below: Sequence[Any]) -> str:
+    """below: the cells that say on which side these stand. Jupyter draws all on the right, but names are read from the left."""
+    sides = (' style="text-align:left"' if isinstance(cell, str) and not NUMERIC.match(cell) else "" for cell in below)
     return "<tr>" + "".join(
-        f"<{tag}{style if isinstance(cell, str) else ''}>{html.escape(number(cell))}</{tag}>" for cell in cells) + "</tr>"
+        f"<{tag}{side}>{html.escape(number(cell))}</{tag}>" for cell, side in zip(cells, sides, strict=True)) + "</tr>"

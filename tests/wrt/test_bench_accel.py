@@ -16,6 +16,8 @@ from wrt.bench import accel as bench
 from wrt.bench import accel_report as report
 from wrt.bench.accel import Plan, Refused, Row, growth, run
 from wrt.errors import InputError
+from wrt.mesh import Mesh
+from wrt.shapes import icosphere
 
 
 @pytest.fixture
@@ -86,6 +88,18 @@ def test_a_structure_that_refuses_is_named_and_the_others_go_on(box, monkeypatch
     rows = run(plan(box, structures=("refusing", "bvh2"), kinds=("random",)))
     assert rows[0] == Refused("box.obj", "refusing", "more than 11 triangles") and rows[1].structure == "bvh2"
     assert "refusing over box.obj: more than 11 triangles" in report.markdown(rows)
+    assert "<td style=\"text-align:left\">more than 11 triangles</td>" in rows._repr_html_()
+
+
+def test_meshes_need_no_file_and_a_notebook_shows_tables(tmp_path) -> None:
+    rows = run(Plan((icosphere(1), icosphere(2)), ("bvh2",), ("primary",), rays=100, runs=1))
+    page = rows._repr_html_()
+    assert [row.triangles for row in rows] == [80, 320] and page.count("<table>") == 2 and "icosphere, 320 triangles" in page
+    assert "bench accel icosphere" in report.write_report(rows, Plan((icosphere(1),)), tmp_path, "")[0].read_text()
+    with pytest.raises(InputError, match="mesh must be a Mesh or the path"):
+        run(Plan((1,)))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="no triangles"):
+        run(Plan((Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)),)))
 
 
 def test_growth_fits_exponents() -> None:

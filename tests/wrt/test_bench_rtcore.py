@@ -39,6 +39,7 @@ def test_rows_and_command(tmp_path: Path) -> None:
     assert [(row.structure, row.row.name, row.triangles, row.row.rays) for row in rows] == [("bvh2", "primary", 12, 1024)]
     assert rows[0].row.boxes == pytest.approx(2.0 * rows[0].row.nodes)
     assert rows[0].row.low <= rows[0].row.prediction.rays_per_second <= rows[0].row.high
+    assert "<b>box.obj, 12 triangles</b>" in rows._repr_html_()
     assert "box.obj, 12 triangles" in markdown(rows) and {"bvh2", "bvh4"} <= set(bvhs())
     arguments = ("bench", "rtcore", str(mesh), "--structures", "bvh2", "--kinds", "primary", "--rays", "1024", "-q")
     result = command(*arguments, "-o", str(report))

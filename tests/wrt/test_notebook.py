@@ -24,7 +24,7 @@ from wrt.notebook import LiveView
 from wrt.options import Progress
 from wrt.scene import Material, Object, Scene, Sphere
 from wrt.shapes import box, quad
-from wrt.tables import SHOWN_ROWS, html_facts, html_table, number
+from wrt.tables import SHOWN_ROWS, Rows, html_facts, html_table, number
 
 # --- the picture so far -----------------------------------------------------------------------------------------------
 
@@ -197,6 +197,16 @@ def test_every_shipped_kind_of_scene_has_a_table() -> None:
     rows = Tables(SCENE._repr_html_()).rows
     assert ["spp", "24"] in rows and ["size", "61x34"] in rows and ["", "GradientBackground"] in rows
     assert Tables(Scene()._repr_html_()).rows and Tables(quad((0, 0, 0), (1, 0, 0), (0, 1, 0))._repr_html_()).rows
+
+
+def test_a_list_of_rows_is_a_list_with_a_page() -> None:
+    rows = Rows([2, 1], lambda rows: html_table("", ("n", "text"), [(n, f"{n}.5 ± 1") for n in rows]))
+    assert rows == [2, 1] and sorted(rows) == [1, 2] and rows[0] == 2
+    page = rows._repr_html_()
+    assert Tables(page).rows == [["n", "text"], ["2", "2.5 ± 1"], ["1", "1.5 ± 1"]]
+    assert "text-align" not in page  # formatted numbers stand on the right as well, and so does the head of their column
+    page = html_table("", ("name", "n"), [("bvh2", "1.2x"), ("1 of them", "1,000"), ("2nd", "< 3%")])
+    assert page.count("text-align:left") == 3  # "name", "bvh2", "2nd"
 
 
 def test_reports_are_tables(monkeypatch: pytest.MonkeyPatch) -> None:

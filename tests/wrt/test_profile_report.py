@@ -12,10 +12,13 @@ from tests.command_line import wrt as command
 from tests.wrt.test_profiler import MIRRORS
 from wrt.bench.heatmap import colors, heatmap, short, step_of, top_of
 from wrt.bench.histogram import bins, histograms
+from wrt.bench.profile_report import model_rows
 from wrt.bench.profile_work import GROUPS, warp_order, work_of
+from wrt.errors import InputError
 from wrt.image import read_channels, read_image
 from wrt.profiler import KINDS, PICTURES, Profile, profile
 from wrt.rtcore import lanes_busy
+from wrt.rtcore_parameters import GPUS
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +62,17 @@ def test_work_has_the_fetches_of_its_rays(measured: Profile) -> None:
     for i in (0, 17, len(rays) - 1):
         a, b = (slice(first[j], first[j + 1]) for first, j in ((everything.counters.first, i), (rays.trace_first, rows[i])))
         assert everything.counters.address[a].tolist() == rays.address[b].tolist()
+
+
+def test_a_notebook_shows_heat_maps_and_the_model(measured: Profile) -> None:
+    picture = measured.heatmap("nodes")
+    np.testing.assert_array_equal(np.asarray(picture), heatmap(measured.maps["nodes"], "nodes fetched a sample"))
+    with pytest.raises(InputError, match="no picture 'wings'; there is"):
+        measured.heatmap("wings")
+    rows = model_rows(measured, GPUS["rtx2080ti"])
+    page = rows._repr_html_()
+    assert len(rows) == len(GROUPS) and page.count("<table>") == 2 and "RTX 2080 Ti" in page
+    assert all(f">{row.prediction.bottleneck}</td>" in page for row in rows)
 
 
 def test_the_scale_of_a_heat_map() -> None:

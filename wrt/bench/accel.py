@@ -18,7 +18,8 @@ from wrt.bench.stadium import in_stadium
 from wrt.bench.visibility import TERRAINS, fit, terrain
 from wrt.device import thread_count
 from wrt.errors import InputError
-from wrt.mesh import Mesh, load_mesh
+from wrt.mesh import Mesh, as_mesh
+from wrt.tables import Rows
 
 YARDSTICK = "bvh2"  # every ray is compared with it, and as many as YARDSTICK_TESTS allow with brute force
 BRUTE_FORCE_TESTS = 200_000_000
@@ -27,11 +28,11 @@ COUNTED_RAYS = 20_000
 
 @dataclass(frozen=True)
 class Plan:
-    """What to measure: mesh files (none: a terrain that grows up to max_triangles), structures (none: all but brute force), kinds
-    of ray, rays of each kind, runs of each, builds of each; stadium: each mesh stands in a stadium a thousand times its size, and
-    the rays are those that it has alone. Raises InputError."""
+    """What to measure: meshes or their files (none: a terrain that grows up to max_triangles), structures (none: all but brute
+    force), kinds of ray, rays of each kind, runs of each, builds of each; stadium: each mesh stands in a stadium a thousand times
+    its size, and the rays are those that it has alone. Raises InputError."""
 
-    meshes: Sequence[str | Path] = ()
+    meshes: Sequence[Mesh | str | Path] = ()
     structures: Sequence[str] = ()
     kinds: Sequence[str] = tuple(RAY_KINDS)
     rays: int = 100_000
@@ -105,25 +106,23 @@ class Refused:
 
 
 def meshes(plan: Plan) -> Iterator[Mesh]:
-    for path in plan.meshes:
-        mesh = load_mesh(path)
-        if not len(mesh.faces):
-            raise InputError("there are no triangles to hit", path)
-        yield mesh
+    yield from map(as_mesh, plan.meshes)
     if not plan.meshes:
         cells = [n for k in range(14) for n in [TERRAINS[0] * 2**k] if 2 * n * n <= plan.max_triangles]
         yield from map(terrain, cells)
 
 
-def run(plan: Plan, report: Callable[[Row | Refused], None] | None = None) -> list[Row | Refused]:
+def run(plan: Plan, report: Callable[[Row | Refused], None] | None = None) -> Rows[Row | Refused]:
     """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a structure)."""
+    from wrt.bench.accel_report import page
+
     out: list[Row | Refused] = []
     for mesh in meshes(plan):
         for row in _Bench(plan, mesh).rows():
             out.append(row)
             if report is not None:
                 report(row)
-    return out
+    return Rows(out, page)
 
 
 class _Bench:

@@ -15,6 +15,8 @@ from wrt.bench.visibility_report import spread, table
 from wrt.device import describe_devices
 from wrt.errors import InputError
 from wrt.image import check_writable, write_codes
+from wrt.mesh import Mesh
+from wrt.tables import html_table
 
 REPORT = "accel.md"
 PLOTS = ("accel-build.png", "accel-memory.png", "accel-growth.png")
@@ -73,6 +75,16 @@ def markdown(rows: Sequence[Row | Refused], plots: bool = False) -> str:
     return "\n".join(parts)
 
 
+def page(rows: Sequence[Row | Refused]) -> str:
+    """The tables as HTML."""
+    parts = []
+    for (mesh, triangles), group in by_mesh(rows).items():
+        first = {row.kind: row for row in reversed(group)}
+        parts.append(html_table(f"{mesh}, {triangles} triangles", COLUMNS, [cells(row, first[row.kind]) for row in group]))
+    refused = [(row.mesh, row.structure, row.reason) for row in rows if isinstance(row, Refused)]
+    return "".join(parts) + (html_table("Not built", ("mesh", "structure", "reason"), refused) if refused else "")
+
+
 def plot(rows: Sequence[Row | Refused], name: str) -> LogLogPlot:
     """Time to build or memory against time to search (one point a mesh; the last kind of ray that was measured), or the cost of
     a ray as triangles grow."""
@@ -102,7 +114,7 @@ def check_folder(folder: Path) -> None:
 def write_report(rows: Sequence[Row | Refused], plan: Plan, folder: Path, told: str) -> list[Path]:
     """Markdown and plots; the paths. told: the line of `machine`. Raises InputError where the system refuses."""
     check_folder(folder)
-    names = [Path(path).name for path in plan.meshes]
+    names = [Path(mesh.name if isinstance(mesh, Mesh) else mesh).name for mesh in plan.meshes]
     command = " ".join(["python -m wrt bench accel", *names, f"--rays {plan.rays}", f"--runs {plan.runs}",
                         f"--threads {plan.threads}"])
     text = f"# Structures\n\nMachine: {told}\n\nTo repeat: `{command}`\n\n{LEGEND}\n\n{markdown(rows, plots=True)}"

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wrt.bench.heatmap import heatmap
 from wrt.bench.histogram import histograms
 from wrt.bench.profile_work import GROUPS, efficiency_rows, warp_order, work_of
-from wrt.bench.rtcore_report import LEGEND, ModelRow, model_row, model_table, simt_table
+from wrt.bench.rtcore_report import LEGEND, ModelRow, model_page, model_row, model_table, simt_table
 from wrt.bench.visibility_report import table
 from wrt.errors import InputError
 from wrt.image import check_writable, write_codes, write_exr
 from wrt.profiler import KINDS, PICTURES, Profile
 from wrt.rtcore import simt
 from wrt.rtcore_parameters import Gpu
+from wrt.tables import Rows
 
 TITLES = {
     "probes": "ray probes", "nodes": "nodes fetched", "boxes": "box tests", "box_operations": "operations of the box unit",
@@ -68,7 +69,7 @@ def percentile_table(profile: Profile) -> str:
     return table(columns, rows)
 
 
-def model_rows(profile: Profile, gpu: Gpu) -> list[ModelRow]:
+def model_rows(profile: Profile, gpu: Gpu) -> Rows[ModelRow]:
     """The model on the rays that were traced, by group; SIMT efficiency on all of them."""
     rows = []
     for group in GROUPS:
@@ -78,10 +79,10 @@ def model_rows(profile: Profile, gpu: Gpu) -> list[ModelRow]:
         order, warp = warp_order(profile, efficiency_rows(profile, group))
         chosen = profile.rays.rays[order]
         rows.append(model_row(work, gpu, simt(profile.rays.counts[order], warp, chosen["origin"], chosen["direction"])))
-    return rows
+    return Rows(rows, model_page)
 
 
-def summary(profile: Profile, rows: list[ModelRow], gpu: Gpu) -> str:
+def summary(profile: Profile, rows: Sequence[ModelRow], gpu: Gpu) -> str:
     rays = profile.rays
     traced = len(rays.trace_rows) / max(len(rays), 1)
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in profile.seconds.items())
@@ -102,7 +103,7 @@ def write_report(profile: Profile, text: str, folder: Path) -> list[Path]:
     for name in PICTURES:
         if profile.maps[name].any():
             paths.append(folder / f"{name}.png")
-            write_codes(paths[-1], heatmap(profile.maps[name], f"{TITLES[name]} a sample" if name != "stack" else TITLES[name]))
+            write_codes(paths[-1], np.asarray(profile.heatmap(name)))
     write_exr(folder / LAYERS, {name: profile.maps[name].astype(np.float32) for name in PICTURES},
               {"scene": profile.scene, "spp": profile.spp})
     kinds: dict[str, Any] = {TITLES[name]: {kind: ray_values(profile, name)[profile.rays.kind == i] for i, kind in enumerate(KINDS)

@@ -15,18 +15,19 @@ from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.bench.rtcore_report import COLUMNS, ModelRow, cells, model_row
 from wrt.bench.visibility_report import table
 from wrt.errors import InputError
-from wrt.mesh import load_mesh
+from wrt.mesh import Mesh, as_mesh
 from wrt.rtcore import Work, simt, trace_rays
 from wrt.rtcore_parameters import GPUS
 from wrt.simt import WARP, blocks
+from wrt.tables import Rows, html_table
 
 
 @dataclass(frozen=True)
 class Plan:
-    """meshes: files; structures: names (none: all BVHs of the registry); kinds: of ray; rays: of each kind; gpu: a name in GPUS;
-    inside: the camera is in a room. Raises InputError."""
+    """meshes: Meshes or files; structures: names (none: all BVHs of the registry); kinds: of ray; rays: of each kind; gpu: a name
+    in GPUS; inside: the camera is in a room. Raises InputError."""
 
-    meshes: Sequence[str | Path]
+    meshes: Sequence[Mesh | str | Path]
     structures: Sequence[str] = ()
     kinds: Sequence[str] = ("primary", "diffuse")
     rays: int = 2**16
@@ -85,20 +86,18 @@ def work_of(accel: Accelerator, rays: RaySet) -> Work:
     return trace_rays(accel, rays.kind, rays.origins, rays.directions, t_max=rays.t_max)
 
 
-def run(plan: Plan, tell: Callable[[Row], None] = lambda row: None) -> list[Row]:
+def run(plan: Plan, tell: Callable[[Row], None] = lambda row: None) -> Rows[Row]:
     """Every row in turn; `tell` gets each when it is there. Raises InputError for a mesh that cannot be read."""
     rows = []
-    for path in plan.meshes:
-        for row in _mesh_rows(plan, Path(path)):
+    for mesh in map(as_mesh, plan.meshes):
+        for row in _mesh_rows(plan, mesh):
             tell(row)
             rows.append(row)
-    return rows
+    return Rows(rows, page)
 
 
-def _mesh_rows(plan: Plan, path: Path) -> Iterator[Row]:
-    geometry = Geometry.of(load_mesh(path))
-    if not len(geometry):
-        raise InputError("has no triangles", path)
+def _mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
+    mesh_name, geometry = Path(mesh.name or "mesh").name, Geometry.of(mesh)
     sets = None
     for name in plan.names:
         accel = build(geometry, name)
@@ -107,19 +106,28 @@ def _mesh_rows(plan: Plan, path: Path) -> Iterator[Row]:
             rays = sets[kind]
             work = work_of(accel, rays)
             efficiencies = simt(work.counters.counts, work.warp, rays.origins, rays.directions)
-            yield Row(path.name, len(geometry), name, accel.stats.bytes, model_row(work, GPUS[plan.gpu], efficiencies))
+            yield Row(mesh_name, len(geometry), name, accel.stats.bytes, model_row(work, GPUS[plan.gpu], efficiencies))
+
+
+MESH_COLUMNS = ("structure", "kind", "B/triangle", *COLUMNS[1:], "SIMT", "sorted")
+
+
+def by_mesh(rows: Sequence[Row]) -> Iterator[tuple[str, list[tuple[str, ...]]]]:
+    """A title and the lines of a table for each mesh, with the structures' memory."""
+    for mesh in dict.fromkeys(row.mesh for row in rows):
+        group = [row for row in rows if row.mesh == mesh]
+        yield f"{mesh}, {group[0].triangles} triangles", [
+            (row.structure, row.row.name, f"{row.bytes / row.triangles:.0f}", *cells(row.row)[1:],
+             *(f"{row.row.simt[name]:.0%}" for name in ("as they come", "sorted"))) for row in group]
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """A table for each mesh, with the structures' memory."""
-    parts = []
-    for mesh in dict.fromkeys(row.mesh for row in rows):
-        group = [row for row in rows if row.mesh == mesh]
-        lines = [(row.structure, row.row.name, f"{row.bytes / row.triangles:.0f}", *cells(row.row)[1:],
-                  *(f"{row.row.simt[name]:.0%}" for name in ("as they come", "sorted"))) for row in group]
-        columns = ("structure", "kind", "B/triangle", *COLUMNS[1:], "SIMT", "sorted")
-        parts.append(f"## {mesh}, {group[0].triangles} triangles\n\n{table(columns, lines)}\n")
-    return "\n".join(parts)
+    return "\n".join(f"## {title}\n\n{table(MESH_COLUMNS, lines)}\n" for title, lines in by_mesh(rows))
+
+
+def page(rows: Sequence[Row]) -> str:
+    """The same as HTML."""
+    return "".join(html_table(title, MESH_COLUMNS, lines) for title, lines in by_mesh(rows))
 
 
 SOFTWARE_TITLE = """\

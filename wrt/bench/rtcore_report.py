@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from wrt.bench.visibility_report import table
 from wrt.rtcore import TERMS, Prediction, Work, predict, sensitivity, span, sweep
 from wrt.rtcore_parameters import PARAMETERS, SWEEPS, Gpu
+from wrt.tables import html_table
 
 RANGE = ("boxes", "triangles", "warps")  # what the reported range is swept over
 COLUMNS = ("rays", "nodes", "boxes", "triangles", "lines", *TERMS, "limit", "Grays/s", "range", "moved most by")
@@ -67,8 +68,19 @@ def model_table(rows: Sequence[ModelRow]) -> str:
     return table(COLUMNS, [cells(row) for row in rows])
 
 
+def simt_cells(row: ModelRow) -> tuple[str, ...]:
+    return (row.name, *(f"{row.simt[name]:.0%}" for name in SIMT_COLUMNS[1:]))
+
+
 def simt_table(rows: Sequence[ModelRow]) -> str:
-    return table(SIMT_COLUMNS, [(row.name, *(f"{row.simt[name]:.0%}" for name in SIMT_COLUMNS[1:])) for row in rows])
+    return table(SIMT_COLUMNS, [simt_cells(row) for row in rows])
+
+
+def model_page(rows: Sequence[ModelRow]) -> str:
+    """Both tables as HTML."""
+    gpu = rows[0].prediction.gpu.name if rows else "a GPU"
+    return html_table(f"Model of {gpu}", COLUMNS, map(cells, rows)) + html_table(
+        "SIMT efficiency", SIMT_COLUMNS, map(simt_cells, rows))
 
 
 def parameter_table() -> str:

@@ -20,10 +20,11 @@ from wrt.bench.visibility_report import table
 from wrt.bench.whatif_structures import base, resized, with_planes, with_traversal
 from wrt.errors import InputError
 from wrt.kernels.traverse_bvh2_study import STACK_SIZE, Study
-from wrt.mesh import load_mesh
+from wrt.mesh import Mesh, as_mesh
 from wrt.rtcore import TERMS, Prediction, Work, predict, simt
 from wrt.rtcore_parameters import BASE, GPUS, SWEEPS, Core, Gpu
 from wrt.simt import by_coherence, packed
+from wrt.tables import Rows, html_table
 
 MANY_WARPS = replace(BASE, warps=32, warm=True)  # beside BASE: where latency is hidden and the L2 full, units and lines decide
 ENTRIES = (STACK_SIZE, 8, 4, 2, 1, 0)
@@ -40,11 +41,11 @@ than the first variant's; must be 0."""
 
 @dataclass(frozen=True)
 class Plan:
-    """study: a name in STUDIES; mesh: a file; kinds of ray, rays of each, gpu: a name in GPUS; inside: the camera is in
+    """study: a name in STUDIES; mesh: a Mesh or a file; kinds of ray, rays of each, gpu: a name in GPUS; inside: the camera is in
     a room. Raises InputError."""
 
     study: str
-    mesh: str | Path
+    mesh: Mesh | str | Path
     kinds: Sequence[str] = ("primary", "diffuse")
     rays: int = 2**15
     gpu: str = "rtx2080ti"
@@ -158,7 +159,7 @@ STUDIES: dict[str, Callable[[Geometry, RaySet], Iterator[Variant]]] = {
     "width": width, "stack": stack, "planes": planes, "order": order, "sorting": sorting}
 
 
-def run(plan: Plan, tell: Callable[[Row], None] = lambda row: None) -> list[Row]:
+def run(plan: Plan, tell: Callable[[Row], None] = lambda row: None) -> Rows[Row]:
     """All rows of a study; `tell` gets each when it is there. Raises InputError for a mesh that cannot be read."""
     geometry, sets = rays_of(plan)
     rows = []
@@ -168,13 +169,11 @@ def run(plan: Plan, tell: Callable[[Row], None] = lambda row: None) -> list[Row]
             first = first or variant
             rows.append(row_of(variant, first, kind, GPUS[plan.gpu]))
             tell(rows[-1])
-    return rows
+    return Rows(rows, lambda rows: html_table(f"What if: {plan.study}", COLUMNS, map(cells, rows)))
 
 
 def rays_of(plan: Plan) -> tuple[Geometry, dict[str, RaySet]]:
-    geometry = Geometry.of(load_mesh(Path(plan.mesh)))
-    if not len(geometry):
-        raise InputError("has no triangles", plan.mesh)
+    geometry = Geometry.of(as_mesh(plan.mesh))
     tree = base(geometry)
     return geometry, in_warps(tree, ray_sets(tree, plan.rays, plan.seed, plan.inside))
 
@@ -217,7 +216,7 @@ class Rate:
     doubled: float
 
 
-def rates(plan: Plan, tell: Callable[[str], None] = lambda line: None) -> list[Rate]:
+def rates(plan: Plan, tell: Callable[[str], None] = lambda line: None) -> Rows[Rate]:
     """Every box rate against every triangle rate for every BVH of the registry, with MANY_WARPS: where latency is hidden, rates
     matter most."""
     geometry, sets = rays_of(plan)
@@ -232,13 +231,18 @@ def rates(plan: Plan, tell: Callable[[str], None] = lambda line: None) -> list[R
                     core: Core = replace(MANY_WARPS, boxes=boxes, triangles=triangles)
                     now, twice = (predict(work, GPUS[plan.gpu], replace(core, triangles=f * triangles)) for f in (1.0, 2.0))
                     out.append(Rate(name, kind, boxes, triangles, now, twice.rays_per_second / now.rays_per_second))
-    return out
+    return Rows(out, lambda rows: html_table("Box rate against triangle rate", RATE_COLUMNS, map(rate_cells, rows)))
+
+
+RATE_COLUMNS = ("structure", "rays", "boxes a clock", "triangles a clock", "Grays/s", "limit", *TERMS, "twice the triangles")
+
+
+def rate_cells(row: Rate) -> tuple[str, ...]:
+    return (row.structure, row.kind, f"{row.boxes:g}", f"{row.triangles:g}", f"{row.prediction.rays_per_second / 1e9:.2f}",
+            row.prediction.bottleneck, *(f"{row.prediction.terms[name]:.3g}" for name in TERMS), f"{row.doubled:.2f}x")
 
 
 def rates_markdown(rows: Sequence[Rate]) -> str:
-    columns = ("structure", "rays", "boxes a clock", "triangles a clock", "Grays/s", "limit", *TERMS, "twice the triangles")
-    lines = [(row.structure, row.kind, f"{row.boxes:g}", f"{row.triangles:g}", f"{row.prediction.rays_per_second / 1e9:.2f}",
-              row.prediction.bottleneck, *(f"{row.prediction.terms[name]:.3g}" for name in TERMS), f"{row.doubled:.2f}x")
-             for row in rows]
-    return (f"{table(columns, lines)}\n\n{', '.join(TERMS)}: clocks a ray and RT core, with {MANY_WARPS.warps} warps at a time and"
-            " an L2 that has seen the same rays before; twice the triangles: rays a second with twice that rate, over these.")
+    lines = [rate_cells(row) for row in rows]
+    return (f"{table(RATE_COLUMNS, lines)}\n\n{', '.join(TERMS)}: clocks a ray and RT core, with {MANY_WARPS.warps} warps at a time"
+            " and an L2 that has seen the same rays before; twice the triangles: rays a second with twice that rate, over these.")
