@@ -82,9 +82,9 @@ def load_kernel(kernel: Any, device: Any) -> None:
 def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:
     """A Warp array of `dtype` (a Warp type or struct) from rows of a NumPy array; on the CPU without a copy if it fits."""
     if hasattr(dtype, "numpy_dtype"):  # a struct
-        return wp.array(np.ascontiguousarray(array), dtype=dtype, device=device)
-    scalar = wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype))
-    array = np.ascontiguousarray(array, dtype=scalar)
+        array = np.ascontiguousarray(array)
+    else:
+        array = np.ascontiguousarray(array, dtype=wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype)))
     # A frozen NumPy array (a scene's) cannot be aliased: Warp wants to be able to write.
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
 

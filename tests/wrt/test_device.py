@@ -104,4 +104,5 @@ def test_records_go_up_and_come_back() -> None:
     assert rows.shape == (3,) and not rows["number"].any() and not rows["vector"].any()
     rows["number"], rows["vector"][1] = (7, 8, 9), (1, 2, 3)
     back = upload(rows, Pair, start("cpu")).numpy()
+    assert np.shares_memory(back, rows)
     assert back["number"].tolist() == [7, 8, 9] and back["vector"][1].tolist() == [1, 2, 3]

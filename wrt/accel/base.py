@@ -64,23 +64,29 @@ class Geometry:
             out.update(f"{array.shape}{array.dtype.str}".encode() + np.ascontiguousarray(array).tobytes())
         return out.hexdigest()
 
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of every primitive's padded box, two (N, 3) float32.
+    def bounds(self, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of every primitive's padded box, two (N, 3) float32."""
+        lo, hi = (np.empty((len(self), 3), np.float32) for _ in range(2))
+        self.write_bounds(lo, hi, threads)
+        return lo, hi
+
+    def write_bounds(self, lo: np.ndarray, hi: np.ndarray, threads: int = 1) -> None:
+        """The same into arrays that there are, (N, 3) float32.
 
         To the last bit what the units take (kernels.ray_triangle.within_bounds): a hit is never outside its box.
         """
-        lo = np.empty((len(self), 3), np.float32)
-        hi = np.empty((len(self), 3), np.float32)
-        n = len(self.faces)
-        corners = [self.vertices[self.faces[:, i]] for i in range(3)]
-        lo[:n] = np.minimum(np.minimum(corners[0], corners[1]), corners[2])
-        hi[:n] = np.maximum(np.maximum(corners[0], corners[1]), corners[2])
-        lo[n:] = self.spheres[:, :3] - self.spheres[:, 3:]
-        hi[n:] = self.spheres[:, :3] + self.spheres[:, 3:]
-        with np.errstate(over="ignore"):  # near the end of float32 the padded box is all of space
-            extent = hi - lo
-            pad = np.float32(PAD_EXTENT) * extent.max(axis=1, keepdims=True, initial=0.0)
-            return lo - (pad + np.float32(PAD_COORDINATE) * np.abs(lo)), hi + (pad + np.float32(PAD_COORDINATE) * np.abs(hi))
+        def fill(first: int) -> None:
+            some, n = slice(first, first + RECORDS_PER_JOB), len(self.faces)
+            corners = [self.vertices[self.faces[some, i]] for i in range(3)]
+            spheres = self.spheres[max(first - n, 0) : max(first + RECORDS_PER_JOB - n, 0)]
+            low, high = (np.concatenate([end(end(corners[0], corners[1]), corners[2]), spheres[:, :3] + sign * spheres[:, 3:]])
+                         for end, sign in ((np.minimum, np.float32(-1.0)), (np.maximum, np.float32(1.0))))
+            with np.errstate(over="ignore"):  # near the end of float32 the padded box is all of space
+                pad = np.float32(PAD_EXTENT) * (high - low).max(axis=1, keepdims=True, initial=0.0)
+                lo[some] = low - (pad + np.float32(PAD_COORDINATE) * np.abs(low))
+                hi[some] = high + (pad + np.float32(PAD_COORDINATE) * np.abs(high))
+
+        run_all([partial(fill, first) for first in range(0, len(self), RECORDS_PER_JOB)], threads)
 
     def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
         """What the triangle test of `units` reads, in the given order of prim_id, or in their own."""

@@ -17,19 +17,17 @@ from wrt.kernels.traverse_bvh2 import Bvh2Node
 
 def build_binned(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """Binned SAH (Wald 2007): fast, and within a few per cent of the full sweep."""
-    lo, hi = geometry.bounds()
-    return split_ranges("binned", in_order(lo, hi), options, threads)
+    return split_ranges("binned", build_records(geometry, threads), options, threads)
 
 
 def build_median(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """Object median along the longest axis: what there was before the surface area heuristic."""
-    lo, hi = geometry.bounds()
-    return split_ranges("median", in_order(lo, hi), options, threads)
+    return split_ranges("median", build_records(geometry, threads), options, threads)
 
 
 def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """Along a Morton curve (Lauterbach et al. 2009): the least work, and the worst tree but for the median's."""
-    lo, hi = geometry.bounds()
+    lo, hi = geometry.bounds(threads)
     codes = morton_codes(0.5 * lo + 0.5 * hi)
     order = np.argsort(codes, kind="stable")
     return split_ranges("lbvh", in_order(lo, hi, order), options, threads, codes=codes[order])
@@ -37,13 +35,21 @@ def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
 
 def build_sweep(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """Full-sweep SAH: every split of a range by centroid, along all three axes."""
-    lo, hi = geometry.bounds()
+    lo, hi = geometry.bounds(threads)
     center = 0.5 * lo + 0.5 * hi
     n = len(lo)
     build = in_order(lo, hi)
     order = np.concatenate([np.argsort(center[:, axis], kind="stable") for axis in range(3)]).astype(np.int32)
     return split_ranges("sweep", build, options, threads, boxes=build.copy(), order=order, area=np.empty(n, np.float32),
                         left=np.empty(n, np.uint8), scratch=np.empty(n, np.int32))
+
+
+def build_records(geometry: Geometry, threads: int) -> np.ndarray:
+    """BuildRecords of all primitives."""
+    build = records(build_bvh2.BuildRecord, len(geometry))
+    build["prim_id"] = np.arange(len(geometry))
+    geometry.write_bounds(build["lo"], build["hi"], threads)
+    return build
 
 
 def in_order(lo: np.ndarray, hi: np.ndarray, order: np.ndarray | None = None) -> np.ndarray:

@@ -25,7 +25,7 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
     if options.split_budget > MAX_BUDGET:
         raise InputError(f"split_budget must be at most {MAX_BUDGET:g}, got {options.split_budget}")
     cpu = start("cpu")
-    lo, hi = geometry.bounds()
+    lo, hi = geometry.bounds(threads)
     n = len(lo)
     if n <= 1:
         return small_tree(lo, hi)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from math import prod
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,17 +13,26 @@ from wrt.accel.base import Accelerator, Built
 from wrt.accel.bvh_build import BvhOptions, build_binary
 from wrt.accel.wide_compress import children_there, compress, decompress
 from wrt.accel.wide_tree import MAX_PLACES, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
+from wrt.device import run_all
 from wrt.errors import InputError
 from wrt.kernels.lanes import EMPTY
 from wrt.kernels.traverse_wide import LEAF_RANGE, WideTraversal
 from wrt.kernels.wide_nodes import first_reference, node_size
 
+ROWS_PER_JOB = 4096
+
+
+def empty_aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """An array in memory that begins where a cache line does."""
+    size = prod(shape) * np.dtype(dtype).itemsize
+    memory = np.empty(size + 64, np.uint8)
+    first = -memory.ctypes.data % 64
+    return memory[first : first + size].view(dtype).reshape(shape)
+
 
 def aligned(array: np.ndarray) -> np.ndarray:
-    """The same numbers in memory that begins where a cache line does."""
-    memory = np.empty(array.nbytes + 64, np.uint8)
-    first = -memory.ctypes.data % 64
-    out = memory[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
+    """The same numbers there."""
+    out = empty_aligned(array.shape, array.dtype)
     out[...] = array
     return out
 
@@ -45,7 +56,7 @@ class WideBvh(Accelerator):
         if self.compressed and len(binary.order) > MAX_PLACES:
             raise InputError(f"a {self.name} holds at most {MAX_PLACES} primitives, and there are {len(binary.order)}; take bvh8")
         built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
-        return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
+        return replace(built, sah_cost=(self._tree(built) if self.compressed else tree).sah_cost(tree.root_area))
 
     @property
     def _unit(self) -> int:
@@ -84,14 +95,22 @@ class WideBvh(Accelerator):
         return WideTree(lo, hi, children, lanes_of(children, built.order, self.width), built.leaves, built.depth, 0)
 
     def _primitives(self, built: Built) -> np.ndarray:
-        """What the triangle test reads, number by number in rows; lanes without a primitive hold the first one, untested."""
-        order = built.order if self.compressed else self._tree(built).order.reshape(-1)
-        order = np.append(order, np.zeros(-len(order) % self.width, np.int32))
-        if not order.size:
-            return np.zeros(0, np.float32)
-        records = self.geometry.primitives(self.structure.units, np.maximum(order, 0))
-        numbers = records.view(np.float32).reshape(-1, self.width, records.itemsize // 4)
-        return aligned(numbers.transpose(0, 2, 1).reshape(-1))
+        """What the triangle test reads, number by number in rows; lanes without a primitive hold the one before, untested."""
+        order = (built.order if self.compressed
+                 else lanes_of(self._references(built), built.order, self.width).reshape(-1))
+        units, width = self.structure.units, self.width
+        order = np.append(order, np.full(-len(order) % width, -1, np.int32))
+        numbers = units.triangle_test.record.numpy_dtype()["itemsize"] // 4
+        rows = empty_aligned((len(order) // width, numbers, width), np.float32)
+
+        def fill(first: int) -> None:
+            lanes = order[first * width : (first + ROWS_PER_JOB) * width]
+            records = self.geometry.primitives(units, lanes[lanes >= 0]).view(np.float32).reshape(-1, numbers)
+            index = np.cumsum(lanes >= 0) - 1
+            rows[first : first + ROWS_PER_JOB] = records[index].reshape(-1, width, numbers).transpose(0, 2, 1)
+
+        run_all([partial(fill, first) for first in range(0, len(rows), ROWS_PER_JOB)], self.threads)
+        return rows.reshape(-1)
 
     def _upload(self, built: Built) -> Any:
         return super()._upload(replace(built, arrays={name: aligned(array) for name, array in built.arrays.items()}))
