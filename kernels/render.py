@@ -50,7 +50,7 @@ def make_render_kernel(features, structure):
             accel.row = tid
         x = tile.x + tid % tile.width
         y = tile.y + tid / tile.width
-        pixel = y * film.width + x
+        pixel = (y - film.y) * film.columns + x - film.x
         key = hash_pair(hash_pair(limits.seed, wp.uint32(x)), wp.uint32(y))
         mean = film.mean[pixel]
         m2 = film.m2[pixel]
@@ -96,14 +96,14 @@ def make_aov_kernel(features, structure):
     surface_at, resolve, shading_normal = make_shade(features)
 
     @kernel
-    def aovs(accel: accel_struct, surfaces: Surfaces, camera: Camera, film: AovFilm, tile: Tile, width: int, height: int):
+    def aovs(accel: accel_struct, surfaces: Surfaces, camera: Camera, film: AovFilm, tile: Tile):
         tid = wp.tid()
         x = tile.x + tid % tile.width
         y = tile.y + tid / tile.width
-        pixel = y * width + x
+        pixel = (y - film.y) * film.columns + x - film.x
         ray = Ray()
         ray.origin = camera.origin
-        position = wp.vec2((float(x) + 0.5) / float(width), (float(y) + 0.5) / float(height))
+        position = wp.vec2((float(x) + 0.5) / float(film.width), (float(y) + 0.5) / float(film.height))
         ray.direction = wp.normalize(chief_ray(camera, position))
         ray.t_min = 0.0
         ray.t_max = float(wp.inf)

@@ -258,12 +258,16 @@ class Limits:
 class Film:
     """One entry a pixel, row by row: running mean and sum of squared deviations (Welford 1962), samples, and what it took.
 
+    width, height: of the whole picture; the arrays hold the rectangle of it that begins at x, y and has `columns` pixels a row.
     rays: closest-hit and any-hit rays; cut_depth, cut_throughput: rays that were not followed, and lost: the throughput
     (mean over the channels) that they would have carried. not_finite: samples that came out NaN or infinite and count as 0.
     """
 
     width: int
     height: int
+    x: int
+    y: int
+    columns: int
     mean: wp.array(dtype=wp.vec3)
     m2: wp.array(dtype=wp.vec3)
     samples: wp.array(dtype=wp.int32)
@@ -277,8 +281,13 @@ class Film:
 
 @wp.struct
 class AovFilm:
-    """What the ray through a pixel's centre sees first."""
+    """What the ray through a pixel's centre sees first. width .. columns: as of Film."""
 
+    width: int
+    height: int
+    x: int
+    y: int
+    columns: int
     depth: wp.array(dtype=wp.float32)
     normal: wp.array(dtype=wp.vec3)
     albedo: wp.array(dtype=wp.vec3)

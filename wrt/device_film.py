@@ -19,10 +19,11 @@ GROUPS = 4
 BYTES_OF_FILM, BYTES_OF_GROUP = 52, 20  # a pixel; of one film, and of each further group
 OF_A_GROUP = {"mean": wp.vec3, "samples": wp.int32, "lost": wp.float32}
 SHARED = {"m2": wp.vec3, "rays": wp.int64, "cut_depth": wp.int32, "cut_throughput": wp.int32, "not_finite": wp.int32}
+OF_AOVS = {"depth": wp.float32, "normal": wp.vec3, "albedo": wp.vec3, "prim_id": wp.int32, "material_id": wp.int32}
 
 
 class DeviceFilm:
-    """Arrays of one entry a pixel for the render kernel to fill: one struct for each group of samples, with its seed.
+    """Arrays of one entry a pixel of the crop for the render kernel to fill: one struct for each group of samples, with its seed.
 
     The samples of one group are one scrambled sequence. Its points avoid each other, so that their mean is better than
     their spread lets on, and by how much they do not tell. The means of several groups with scrambles of their own are
@@ -31,16 +32,19 @@ class DeviceFilm:
     """
 
     def __init__(self, settings: Settings, crop: tuple[int, int, int, int], device: Any, seed: int, groups: int = 1) -> None:
-        self.size, self.crop = settings.size, crop
+        self.crop = crop
         self.seeds = [seed] if groups == 1 else [int(s) for s in np.random.SeedSequence(seed).generate_state(groups)]
-        n = self.size[0] * self.size[1]
+        x0, y0, x1, y1 = crop
+        self.shape = y1 - y0, x1 - x0
+        n = self.shape[0] * self.shape[1]
         shared = {name: wp.zeros(n, dtype=dtype, device=device) for name, dtype in SHARED.items()}
         shared["filter_icdf"] = upload(filter_icdf(settings.filter), wp.float32, device)
         self.groups = []
         for _ in self.seeds:
             own = {name: wp.zeros(n, dtype=dtype, device=device) for name, dtype in OF_A_GROUP.items()}
             film = structs.Film()
-            film.width, film.height = self.size
+            film.width, film.height = settings.size
+            film.x, film.y, film.columns = x0, y0, x1 - x0
             for name, array in {**shared, **own}.items():
                 setattr(film, name, array)
             self.groups.append(film)
@@ -51,11 +55,8 @@ class DeviceFilm:
         return [(name, getattr(self.groups[0], name)) for name in SHARED] + own
 
     def put(self, array: Any, values: np.ndarray) -> None:
-        """Write values, (H, W) or (H, W, 3), into the crop of a device array that is 0 elsewhere."""
-        x0, y0, x1, y1 = self.crop
-        pixels = np.zeros((self.size[1], self.size[0], *values.shape[2:]), values.dtype)
-        pixels[y0:y1, x0:x1] = values
-        array.assign(pixels.reshape(array.shape[0], *values.shape[2:]))
+        """Write values, (H, W) or (H, W, 3), into a device array."""
+        array.assign(values.reshape(array.shape[0], *values.shape[2:]))
 
     @property
     def rays(self) -> int:
@@ -63,10 +64,9 @@ class DeviceFilm:
         return int(self.groups[0].rays.numpy().sum())
 
     def view(self, array: Any) -> np.ndarray:
-        """A device array of one entry a pixel as (H, W) or (H, W, 3), cropped; on the CPU without a copy."""
-        x0, y0, x1, y1 = self.crop
+        """A device array of one entry a pixel as (H, W) or (H, W, 3); on the CPU without a copy."""
         pixels = array.numpy()
-        return pixels.reshape(self.size[1], self.size[0], *pixels.shape[1:])[y0:y1, x0:x1]
+        return pixels.reshape(*self.shape, *pixels.shape[1:])
 
     def picture(self, array: Any) -> np.ndarray:
         """A copy of `view`."""
@@ -111,3 +111,21 @@ class DeviceFilm:
         mean = sum(self.picture(film.mean) / np.float64(n) for film in self.groups)
         variance = sum((self.picture(film.mean) - mean) ** 2 for film in self.groups) / (n * (n - 1.0))
         return np.asarray(mean), np.where(self.samples()[..., None] > 0, variance, np.inf)
+
+
+class AovFilm:
+    """Arrays for the AOV kernel to fill, of one entry a pixel of the crop."""
+
+    def __init__(self, settings: Settings, crop: tuple[int, int, int, int], device: Any) -> None:
+        x0, y0, x1, y1 = crop
+        self.shape = y1 - y0, x1 - x0
+        self.struct = structs.AovFilm()
+        self.struct.width, self.struct.height = settings.size
+        self.struct.x, self.struct.y, self.struct.columns = x0, y0, x1 - x0
+        for name, dtype in OF_AOVS.items():
+            setattr(self.struct, name, wp.zeros(self.shape[0] * self.shape[1], dtype=dtype, device=device))
+
+    def picture(self, name: str) -> np.ndarray:
+        """A copy of one AOV, (H, W) or (H, W, 3)."""
+        array = getattr(self.struct, name).numpy()
+        return array.reshape(*self.shape, *array.shape[1:]).copy()

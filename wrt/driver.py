@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -22,7 +22,7 @@ from wrt.accel import ACCELERATORS, Structure, build, tells_progress
 from wrt.arguments import unknown
 from wrt.checkpoint import Checkpoint
 from wrt.device import load_kernel, memory_size, start, thread_count
-from wrt.device_film import BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS, DeviceFilm
+from wrt.device_film import BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS, AovFilm, DeviceFilm
 from wrt.device_scene import camera_struct, upload_scene
 from wrt.errors import InputError
 from wrt.features import Features, features_of
@@ -37,7 +37,7 @@ from wrt.options import OPTIONS, Options, Progress
 from wrt.scene import SETTINGS, Camera, Scene
 from wrt.scene_digest import camera_digest, scene_digest
 from wrt.scene_file import as_scene
-from wrt.tiles import Rectangle, Work, tiles, work_left
+from wrt.tiles import Rectangle, Work, corners, tiles, work_left
 
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
 MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
@@ -96,7 +96,7 @@ class Renderer:
         self.threads = thread_count(options.threads)
         self.interrupts: list[int] = []
         self.fraction_built = 0.0
-        self.device = start(options.device)
+        self.device = self._film_device()
         self.camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
         self.features = features_of(scene, self.camera, options.instancing)
         self.groups = 1 if options.target_error is None else GROUPS
@@ -115,6 +115,13 @@ class Renderer:
         """What the kernels are made for; one that profiles puts a log before it."""
         return structure
 
+    def _film_device(self) -> Any:
+        return start(self.options.device)
+
+    def _kind(self) -> str:
+        """Of the device: pictures of two of the same kind have the same bits."""
+        return f"cuda, sm_{self.device.arch}" if self.device.is_cuda else "cpu"
+
     def _crop(self) -> tuple[int, int, int, int]:
         width, height = self.scene.settings.size
         x0, y0, x1, y1 = (0, 0, width, height) if self.options.crop is None else self.options.crop
@@ -124,23 +131,22 @@ class Renderer:
 
     def _check_memory(self) -> None:
         """Better told now than by the system after an hour, which ends whoever takes too much."""
-        width, height = self.scene.settings.size
         x0, y0, x1, y1 = self.crop
         film = BYTES_OF_FILM + BYTES_OF_GROUP * (self.groups - 1) + (BYTES_OF_AOVS if self.options.aov else 0)
-        needed, there = width * height * film + (x1 - x0) * (y1 - y0) * BYTES_OF_RESULT, memory_size(self.device)
+        needed, there = (x1 - x0) * (y1 - y0) * (film + BYTES_OF_RESULT), memory_size(self.device)
         if needed > there:
-            raise InputError(f"a picture of {width}x{height} takes {needed / 2**30:.1f} GiB of memory;"
+            raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {needed / 2**30:.1f} GiB of memory;"
                              f" {self.options.device} has {there / 2**30:.1f}")
 
     def _checkpoint(self) -> Checkpoint:
         """The file to save to, which says what must be the same to go on with it. Errors of it are told before the work."""
-        options, settings, device = self.options, self.scene.settings, self.device
+        options, settings = self.options, self.scene.settings
         identity = {name: getattr(settings, name) for name in SETTINGS if name not in NO_PIXEL}
         identity |= {name: getattr(options, name) for name in OPTIONS if name not in NO_PIXEL}
         identity |= {
             "crop": self.crop, "groups of samples": self.groups, "scene": scene_digest(self.scene),
-            "camera": camera_digest(self.camera), "device": f"cuda, sm_{device.arch}" if device.is_cuda else "cpu",
-            "version": wrt.__version__, "kernels": kernel_hash(self.kernels[0], device),
+            "camera": camera_digest(self.camera), "device": self._kind(),
+            "version": wrt.__version__, "kernels": self.kernels_hash(),
         }
         area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
         file = Checkpoint(Path(options.checkpoint or ""), options.checkpoint_every, identity, area=area, groups=self.groups,
@@ -149,6 +155,9 @@ class Renderer:
         if taken > max(1, settings.spp // self.groups):
             raise InputError(f"holds {taken * self.groups} samples a pixel already; spp is {settings.spp}", file.path)
         return file
+
+    def kernels_hash(self) -> str:
+        return kernel_hash(self.kernels[0], self.device)
 
     def _prepare(self) -> None:
         """Compile, which takes longest, and build the structure meanwhile. Neither Ctrl-C nor an error waits for the
@@ -271,28 +280,36 @@ class Renderer:
         x0, y0, x1, y1 = self.crop
         return tiles(self.crop, max(x1 - x0, y1 - y0) if self.device.is_cuda else self.options.tile_size)
 
-    def _launch(self, kernel: Any, arguments: list[Any], work: Work, rest: Sequence[Any] = ()) -> None:
+    def _launch(self, kernel: Any, arguments: list[Any], work: Work) -> None:
         tile = structs.Tile()
         tile.x, tile.y, tile.width, height = work.rectangle
         tile.first_sample, tile.n_samples = work.first, work.n
-        wp.launch(kernel, dim=tile.width * height, inputs=[*arguments, tile, *rest], device=self.device)
+        wp.launch(kernel, dim=tile.width * height, inputs=[*arguments, tile], device=self.device)
 
     def _run_pass(self, first: int, count: int) -> None:
         """Bring every pixel from `first` to `first + count` samples a group, where it is not there already."""
-        world = [self.accel.data, self.device_scene.surfaces, self.device_scene.lighting, self.device_camera]
-        groups = [[*world, self._limits(seed), film] for seed, film in zip(self.film.seeds, self.film.groups, strict=True)]
         area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
         work, before = [Work(tile, first, count) for tile in self._tiles()], first * area
         if first < self.most:  # of a resumed render
             samples = self.film.view(self.film.groups[0].samples)
             work, before = work_left(work, samples, self.crop), int(samples.sum(dtype=np.int64))
+        self._trace(work, lambda done: self._report(before + done, area))
+
+    def _trace(self, work: list[Work], report: Callable[[int], None]) -> None:
+        """Take those samples into the film."""
+        groups = self._arguments(self.film)
 
         def trace(job: Work) -> int:
             for arguments in groups:
                 self._launch(self.kernels[0], arguments, job)
             return job.total
 
-        self._each_tile(work, trace, lambda done: self._report(before + done, area))
+        self._each_tile(work, trace, report)
+
+    def _arguments(self, film: DeviceFilm) -> list[list[Any]]:
+        """Of the render kernel, for each group of the film."""
+        world = [self.accel.data, self.device_scene.surfaces, self.device_scene.lighting, self.device_camera]
+        return [[*world, self._limits(seed), group] for seed, group in zip(film.seeds, film.groups, strict=True)]
 
     def _limits(self, seed: int) -> Any:
         limits = structs.Limits()
@@ -356,19 +373,41 @@ class Renderer:
         return Film(*self.film.pixels_and_variance(), self.film.samples(), exposure=settings.exposure, tonemap=settings.tonemap)
 
     def _aovs(self) -> dict[str, np.ndarray]:
-        width, height = self.scene.settings.size
-        film = structs.AovFilm()
-        shapes = {"depth": wp.float32, "normal": wp.vec3, "albedo": wp.vec3, "prim_id": wp.int32, "material_id": wp.int32}
-        for name, dtype in shapes.items():
-            setattr(film, name, wp.zeros(width * height, dtype=dtype, device=self.device))
-        arguments = [self.accel.data, self.device_scene.surfaces, self.device_camera, film]
+        film = AovFilm(self.scene.settings, self.crop, self.device)
+        arguments = [self.accel.data, self.device_scene.surfaces, self.device_camera, film.struct]
 
         def trace(job: Work) -> int:
-            self._launch(self.kernels[1], arguments, job, [width, height])
+            self._launch(self.kernels[1], arguments, job)
             return job.total
 
         self._each_tile([Work(tile, 0, 1) for tile in self._tiles()], trace, lambda done: None)
-        return {name: self.film.picture(getattr(film, name)) for name in self.options.aov}
+        return {name: film.picture(name) for name in self.options.aov}
+
+    # --- for tiles that are traced elsewhere (wrt.spread) --------------------------------------------------------------
+
+    def facts(self) -> dict[str, Any]:
+        """What is told of the scene and its structure: counts, and seconds of making them ready."""
+        return {"triangles": self.accel.geometry.n_triangles, "stored_triangles": len(self.device_scene.world.faces),
+                "spheres": len(self.accel.geometry.spheres),
+                "accel": {"name": self.options.accel, **asdict(self.accel.stats)}}
+
+    def trace_tile(self, work: Work, seed: int, state: list[np.ndarray] | None) -> list[np.ndarray]:
+        """The arrays of a film of that rectangle (DeviceFilm.arrays) with those samples added to `state` (None: zeros).
+
+        It changes nothing here, so that it can be called in several threads, and again."""
+        film = DeviceFilm(self.scene.settings, corners(work.rectangle), self.device, seed, self.groups)
+        for (_, array), values in zip(film.arrays(), state or (), strict=False):
+            film.put(array, values)
+        for arguments in self._arguments(film):
+            self._launch(self.kernels[0], arguments, work)
+        return [film.picture(array) for _, array in film.arrays()]
+
+    def aov_tile(self, rectangle: Rectangle) -> list[np.ndarray]:
+        """The AOVs that were asked for, in their order, of a rectangle."""
+        film = AovFilm(self.scene.settings, corners(rectangle), self.device)
+        arguments = [self.accel.data, self.device_scene.surfaces, self.device_camera, film.struct]
+        self._launch(self.kernels[1], arguments, Work(rectangle, 0, 1))
+        return [film.picture(name) for name in self.options.aov]
 
     def _result(self, aov: dict[str, np.ndarray], interrupted: bool) -> Film:
         film, samples = self.film, self.film.samples()
@@ -381,9 +420,7 @@ class Renderer:
             "cut_by_depth": film.count("cut_depth"), "cut_by_throughput": film.count("cut_throughput"),
             "lost_throughput_per_sample": film.lost() / total,
             "not_finite": film.count("not_finite"), "samples": int(samples.sum()),
-            "triangles": self.accel.geometry.n_triangles, "stored_triangles": len(self.device_scene.world.faces),
-            "spheres": len(self.accel.geometry.spheres),
-            "accel": {"name": self.options.accel, **asdict(self.accel.stats)}, "interrupted": interrupted,
+            **self.facts(), "interrupted": interrupted,
             "signal": int(self.interrupts[0]) if self.interrupts else None, "timed_out": self.timed_out and not interrupted,
         }
         if self.options.target_error is not None:

@@ -31,6 +31,12 @@ def tiles(crop: tuple[int, int, int, int], step: int) -> Iterator[Rectangle]:
             yield x, y, min(step, x1 - x), min(step, y1 - y)
 
 
+def corners(rectangle: Rectangle) -> tuple[int, int, int, int]:
+    """x0, y0, x1, y1"""
+    x, y, width, height = rectangle
+    return x, y, x + width, y + height
+
+
 def work_left(work: list[Work], samples: np.ndarray, crop: tuple[int, int, int, int]) -> list[Work]:
     """What is left of the work where pixels have samples already: samples, (H, W) of the crop, `first` or more.
 
