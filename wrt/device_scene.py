@@ -216,9 +216,8 @@ def instance_records(placed: Placed) -> np.ndarray:
     return out
 
 
-def upload_scene(scene: Scene, device: Any, instancing: str = "auto") -> DeviceScene:
-    """Put a scene on a device (a Warp device); instancing: see wrt.instancing. Raises InputError where the scene cannot be
-    rendered."""
+def tell_left_out(scene: Scene) -> None:
+    """A SceneWarning for what a picture leaves out. Raises InputError where the scene cannot be rendered."""
     for sphere in scene.spheres:
         if sphere.material.alpha_mode == "mask" and sphere.material.albedo_texture is not None:
             raise InputError(f"sphere {sphere.name!r}: a cut-out texture needs a mesh; material {sphere.material.name!r}")
@@ -226,12 +225,18 @@ def upload_scene(scene: Scene, device: Any, instancing: str = "auto") -> DeviceS
             if thing.mesh.uvs is None and any(m.textures for m in thing.materials)]
     if bare:
         warnings.warn(f"no texture coordinates, so that a texture's first texel is everywhere: objects {', '.join(bare)}",
-                      SceneWarning, stacklevel=2)
+                      SceneWarning, stacklevel=3)
     unreached = [m.name or str(i) for i, m in enumerate(scene.materials)
                  if m.is_emissive and m.emits_light and not m.lights_others]
     if unreached:
         warnings.warn("emission that is seen but lights nothing, since a texture or alpha says where it is: materials"
-                      f" {', '.join(unreached)} (emits_light = false says that it is meant)", SceneWarning, stacklevel=2)
+                      f" {', '.join(unreached)} (emits_light = false says that it is meant)", SceneWarning, stacklevel=3)
+
+
+def upload_scene(scene: Scene, device: Any, instancing: str = "auto") -> DeviceScene:
+    """Put a scene on a device (a Warp device); instancing: see wrt.instancing. Raises InputError where the scene cannot be
+    rendered."""
+    tell_left_out(scene)
     world = world_of(scene, instancing)
     table = TextureTable()
     materials = material_records(scene.materials, table)

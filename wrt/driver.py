@@ -40,12 +40,13 @@ from wrt.scene_file import as_scene
 from wrt.tiles import Rectangle, Work, corners, tiles, work_left
 
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
+TILE_SIZE = 32
 MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
 PREPARING_TOLD = 1.0  # seconds of compiling and building before `progress` is told of it
 MAX_SPP = 1 << 16  # where a target error asks for more than anybody said
 # What may change between a checkpoint and going on with it; and the camera and the device, which are compared by what they are.
 NO_PIXEL = ("spp", "exposure", "tonemap", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size", "progress",
-            "checkpoint", "checkpoint_every", "resume", "camera", "device")
+            "checkpoint", "checkpoint_every", "resume", "camera", "device", "devices", "executor")
 
 
 def render(scene: Scene | Mesh | str | os.PathLike[str], *, spp: int | None = None,
@@ -69,7 +70,16 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], *, spp: int | None = No
         if name not in OPTIONS:
             raise InputError(unknown(name, "argument of render", (*SETTINGS, *OPTIONS)))
     rendering = Options(**options)
-    return Renderer(as_scene(scene).with_settings(**changes), rendering).run()
+    return renderer_of(as_scene(scene).with_settings(**changes), rendering).run()
+
+
+def renderer_of(scene: Scene, options: Options) -> Renderer:
+    """Of the kind that the options ask for."""
+    if options.executor is None and options.devices is None:
+        return Renderer(scene, options)
+    from wrt.spread import SpreadRenderer
+
+    return SpreadRenderer(scene, options)
 
 
 @cache
@@ -82,9 +92,9 @@ def aov_kernel(features: Features, structure: Structure) -> Any:
     return kernels.make_aov_kernel(features, structure)
 
 
-def kernel_hash(kernel: Any, device: Any) -> str:
+def kernel_hash(kernel: Any, device: str) -> str:
     """Of the kernel's whole code, the same in every process."""
-    return str(kernel.module.get_module_hash(1 if device.is_cpu else None).hex())
+    return str(kernel.module.get_module_hash(1 if device == "cpu" else None).hex())
 
 
 class Renderer:
@@ -136,7 +146,7 @@ class Renderer:
         needed, there = (x1 - x0) * (y1 - y0) * (film + BYTES_OF_RESULT), memory_size(self.device)
         if needed > there:
             raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {needed / 2**30:.1f} GiB of memory;"
-                             f" {self.options.device} has {there / 2**30:.1f}")
+                             f" {self.device} has {there / 2**30:.1f}")
 
     def _checkpoint(self) -> Checkpoint:
         """The file to save to, which says what must be the same to go on with it. Errors of it are told before the work."""
@@ -157,7 +167,7 @@ class Renderer:
         return file
 
     def kernels_hash(self) -> str:
-        return kernel_hash(self.kernels[0], self.device)
+        return kernel_hash(self.kernels[0], self.options.device)
 
     def _prepare(self) -> None:
         """Compile, which takes longest, and build the structure meanwhile. Neither Ctrl-C nor an error waits for the
@@ -278,7 +288,7 @@ class Renderer:
 
     def _tiles(self) -> Iterator[Rectangle]:
         x0, y0, x1, y1 = self.crop
-        return tiles(self.crop, max(x1 - x0, y1 - y0) if self.device.is_cuda else self.options.tile_size)
+        return tiles(self.crop, max(x1 - x0, y1 - y0) if self.device.is_cuda else self.options.tile_size or TILE_SIZE)
 
     def _launch(self, kernel: Any, arguments: list[Any], work: Work) -> None:
         tile = structs.Tile()
@@ -391,6 +401,10 @@ class Renderer:
                 "spheres": len(self.accel.geometry.spheres),
                 "accel": {"name": self.options.accel, **asdict(self.accel.stats)}}
 
+    def ready(self) -> dict[str, Any]:
+        """What a worker tells when it has made the scene ready."""
+        return {"kind": self._kind(), "facts": self.facts(), "seconds": self.seconds}
+
     def trace_tile(self, work: Work, seed: int, state: list[np.ndarray] | None) -> list[np.ndarray]:
         """The arrays of a film of that rectangle (DeviceFilm.arrays) with those samples added to `state` (None: zeros).
 
@@ -436,7 +450,7 @@ class Renderer:
             "scene": plain_text(self.scene.name), "camera": plain_text(self.camera.name), "spp": int(samples.max()),
             "seed": self.seed, "seconds": round(self.seconds["trace"], 3), "version": wrt.__version__,
             "max_depth": settings.max_depth, "filter": settings.filter, "accel": self.options.accel,
-            "device": self.options.device,
+            "device": ",".join(self.options.devices or [self.options.device]),
         }
         return Film(pixels=pixels, variance=variance, samples=samples, aov=aov, stats=stats,
                     metadata=metadata, exposure=settings.exposure, tonemap=settings.tonemap)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -155,6 +156,7 @@ def features_of(scene: Scene, camera: Camera, instancing: str = "auto") -> Featu
     )
 
 
+@cache
 def filter_icdf(name: str, size: int = 4097) -> np.ndarray:
     """The inverse distribution of a pixel filter along one axis, (size,) float32, in pixels from the centre.
 

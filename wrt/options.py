@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -20,7 +21,6 @@ from wrt.instancing import INSTANCING
 from wrt.scene import Camera
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
-TILE_SIZE = 32
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,13 @@ class Progress:
 
 @dataclass
 class Options:
-    """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once; never change a
-    pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always taken.
-    instancing: which meshes that several objects share are kept once (wrt.instancing).
+    """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once (None: chosen); never
+    change a pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always
+    taken. instancing: which meshes that several objects share are kept once (wrt.instancing).
+
+    devices: several of this machine, of one kind ("cuda:0", "cuda:1"), that share the tiles, in place of `device`. executor: a
+    concurrent.futures.Executor or a dask.distributed.Client whose workers trace the tiles on their `device` (docs/cluster.md);
+    neither changes a pixel.
 
     target_error: stop when the estimated error of the picture is no larger: the root mean square, over its pixels and
     channels, of the standard error in linear radiance. It is noise alone: what max_depth and min_throughput cut off is not
@@ -75,7 +79,7 @@ class Options:
     aov: Sequence[str] = ()
     time_limit: float | None = None
     target_error: float | None = None
-    tile_size: int = TILE_SIZE
+    tile_size: int | None = None
     pass_size: int | None = None
     progress: Callable[[Progress], None] | None = None
     triangle: str = "watertight"
@@ -85,6 +89,8 @@ class Options:
     checkpoint: str | os.PathLike[str] | None = None
     checkpoint_every: float = 60.0
     resume: bool = False
+    devices: Sequence[str] | None = None
+    executor: Any = None
 
     def __post_init__(self) -> None:
         for name in ("accel", "device", "triangle", "box", "instancing"):
@@ -109,7 +115,7 @@ class Options:
         self.checkpoint = None if self.checkpoint is None else as_path(self.checkpoint, "checkpoint")
         if as_one(self.resume, bool, "resume") and self.checkpoint is None:
             raise InputError("resume needs a checkpoint to go on with")
-        self.tile_size = as_integer(self.tile_size, "tile_size", 1, 1 << 15)
+        self.tile_size = None if self.tile_size is None else as_integer(self.tile_size, "tile_size", 1, 1 << 15)
         self.pass_size = None if self.pass_size is None else as_integer(self.pass_size, "pass_size", 1, 1 << 24)
         self.seed = as_integer(self.seed, "seed", 0, 2**32 - 1)
         if self.crop is not None and len(as_tuple(self.crop, (int, np.integer), "crop")) != 4:
@@ -120,7 +126,22 @@ class Options:
         as_one(self.accel_options, dict, "accel_options")
         as_one(self.threads, (int, np.integer, type(None)), "threads")
         thread_count(self.threads)
-        start(self.device)
+        if self.devices is not None:
+            self._check_devices()
+        elif self.executor is None:
+            start(self.device)
+        elif not (isinstance(self.executor, Executor) or hasattr(self.executor, "get_executor")):  # as Dask's Client has
+            raise InputError("executor must be a concurrent.futures.Executor or a dask.distributed.Client,"
+                             f" got {shown(self.executor)}")
+
+    def _check_devices(self) -> None:
+        self.devices = as_tuple(self.devices, str, "devices")
+        if self.executor is not None:
+            raise InputError("devices are of this machine; an executor's workers have one `device` each: give one or the other")
+        kinds = {str(device.arch) if device.is_cuda else "cpu" for device in map(start, self.devices)}
+        if len(kinds) != 1:
+            raise InputError(f"devices must be one or more of the same kind, whose pixels are the same, got {shown(self.devices)}")
+        self.device = self.devices[0]
 
 
 OPTIONS = tuple(each.name for each in fields(Options))

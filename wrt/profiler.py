@@ -30,7 +30,7 @@ KINDS = ("primary", "reflection", "refraction", "straight", "shadow")
 COUNTERS = tuple(Counts.vars)
 PICTURES = (*COUNTERS, "lines", *(f"probes_{kind}" for kind in KINDS))
 LEFT_OUT = ("aov", "time_limit", "target_error", "progress", "pass_size", "checkpoint", "checkpoint_every",
-            "resume")  # options of a render that a profile has no use for
+            "resume", "devices", "executor")  # options of a render that a profile has no use for
 TILE_SIZE = 64
 BYTES_OF_RAY = 200  # with what is made of it
 TRACE_LIMIT = 4_000_000  # fetches that are kept

@@ -1,0 +1,75 @@
+"""A scene as text and arrays: it comes back bit for bit, and what was shared is shared again."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.data import ROOT
+from wrt.errors import InputError
+from wrt.scene import Camera, EnvironmentBackground, Material, Object, Scene, Sphere, SpotLight, Texture
+from wrt.scene_arrays import KINDS, pack, unpack
+from wrt.scene_digest import camera_digest, scene_digest
+from wrt.scene_file import load_scene
+from wrt.shapes import box
+
+SHIPPED = sorted((ROOT / "scenes").glob("*.toml"))
+
+
+def sent(scene: Scene) -> Scene:
+    """As another process would have it."""
+    text, arrays = pack(scene)
+    return unpack(text, pickle.loads(pickle.dumps(arrays)))
+
+
+@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_scenes_come_back(path: Any) -> None:
+    scene = load_scene(path)
+    back = sent(scene)
+    assert scene_digest(back) == scene_digest(scene)
+    assert [camera_digest(camera) for camera in back.cameras] == [camera_digest(camera) for camera in scene.cameras]
+    assert back.settings == scene.settings and back.name == scene.name
+    assert [material.name for material in back.materials] == [material.name for material in scene.materials]
+
+
+def test_what_was_shared_is_shared_and_sent_once() -> None:
+    texture = Texture(np.arange(24, dtype=np.uint8).reshape(2, 3, 4))
+    one, two = Material(albedo_texture=texture), Material(albedo_texture=texture)
+    mesh = box()
+    scene = Scene(objects=(Object(mesh, (one, two)), Object(mesh, (one,))), spheres=(Sphere((0, 0, 0), 1.0, two),))
+    back = sent(scene)
+    a, b = back.objects
+    assert a.mesh is b.mesh and a.materials[0] is b.materials[0] and a.materials[0] is not a.materials[1]
+    assert a.materials[1] is back.spheres[0].material and len(back.materials) == 2
+    assert a.materials[0].albedo_texture is a.materials[1].albedo_texture
+    _, arrays = pack(scene)
+    assert sum(array is mesh.vertices for array in arrays) == 1
+
+
+def test_a_pose_that_another_rounding_would_change_stays_as_it_is() -> None:
+    generator = np.random.default_rng(0)
+    for _ in range(50):
+        camera = Camera.look_at(generator.normal(size=3), generator.normal(size=3))
+        back = sent(Scene(cameras=(camera,))).cameras[0]
+        assert back.camera_to_world.tobytes() == camera.camera_to_world.tobytes()
+
+
+def test_every_field_of_every_kind_travels() -> None:
+    scene = Scene(lights=(SpotLight((0, 1, 0), (0, -1, 0), (1.0, 0.1, 1 / 3)),),
+                  background=EnvironmentBackground(np.ones((2, 4, 3), np.float32), scale=0.1))
+    text, _ = pack(scene)
+    for name, content in json.loads(text):
+        assert list(content) == [each.name for each in fields(KINDS[name])]
+    assert sent(scene).lights[0] == scene.lights[0]
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '[["Scene", {}]]', '[["os", {}]]', '[["Mesh", 1]]', '[["Scene", [{"a": 9}]]]'])
+def test_another_text_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="no scene of this version"):
+        unpack(text, [])

@@ -1,0 +1,236 @@
+"""A render that others trace, threads, processes or several devices, is the one of this process, bit for bit."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.wrt.test_checkpoint import SCENE, same
+from wrt import crews, device_scene, profile, spread
+from wrt.driver import Options, Progress, Renderer, render
+from wrt.errors import InputError, SceneWarning
+from wrt.film import Film
+from wrt.scene import Material, Object
+from wrt.shapes import box
+
+# Fewer pixels than a tile that is worth sending has: a side is asked for.
+HOW: dict[str, Any] = {"tile_size": 16}
+
+
+@pytest.fixture(scope="module")
+def whole() -> Film:
+    return render(SCENE, aov=["depth", "normal", "material_id"])
+
+
+@pytest.fixture
+def threads() -> Iterator[Executor]:
+    with ThreadPoolExecutor(2) as pool:
+        yield pool
+
+
+@pytest.fixture(autouse=True)
+def nothing_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This process as a worker that has not seen a scene."""
+    monkeypatch.setattr(crews, "_ready", type(crews._ready)())
+
+
+class Deaf(Executor):
+    """One that tells nothing of itself, and runs a job when it is submitted."""
+
+    def __init__(self) -> None:
+        self.packages = 0
+
+    def submit(self, function: Any, /, *arguments: Any, **_: Any) -> Future[Any]:
+        self.packages += arguments[1] is not None
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(*arguments))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def test_several_devices(whole: Film) -> None:
+    film = render(SCENE, aov=["depth", "normal", "material_id"], devices=["cpu", "cpu"], **HOW)
+    assert same(film, whole)
+    assert set(film.stats["workers"]) == {"cpu (0)", "cpu (1)"} and film.metadata["device"] == "cpu,cpu"
+    assert film.stats["accel"]["nodes"] == whole.stats["accel"]["nodes"]
+    assert film.stats["seconds"].keys() == whole.stats["seconds"].keys()
+
+
+@pytest.mark.parametrize("options", [{}, {"tile_size": 7, "pass_size": 5}, {"crop": (5, 3, 40, 30)}, {"target_error": 0.02},
+                                     {"seed": 7, "crop": (60, 33, 61, 34)}])
+def test_threads(options: dict[str, Any], threads: Executor) -> None:
+    assert same(render(SCENE, executor=threads, aov="depth", **options), render(SCENE, aov="depth", **options))
+
+
+def test_processes(whole: Film) -> None:
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+        film = render(SCENE, aov=["depth", "normal", "material_id"], executor=pool, **HOW)
+        assert same(film, whole)
+        assert len(film.stats["workers"]) == 2 and f":{os.getpid()}" not in "".join(film.stats["workers"])
+        [process, *_] = pool._processes.values()
+        with pytest.raises(InputError, match=r"executor: .*terminated abruptly"):
+            render(SCENE, executor=pool, spp=1 << 16, size=(200, 200), progress=lambda _: os.kill(process.pid, signal.SIGKILL))
+
+
+def test_an_executor_that_tells_nothing_gets_the_scene_once(whole: Film) -> None:
+    executor = Deaf()
+    assert same(render(SCENE, executor=executor, aov=["depth", "normal", "material_id"], **HOW), whole)
+    first = executor.packages
+    assert 1 <= first <= crews.QUEUED * crews.SLOTS  # those that were asked before one had it
+    render(SCENE, executor=executor, aov=["depth", "normal", "material_id"], **HOW)
+    assert executor.packages == first
+
+
+def test_a_worker_that_forgot_asks_again(whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that was started anew would."""
+
+    def forgetful(*arguments: Any, **rest: Any) -> Any:
+        if forgetful.calls % 7 == 3:  # type: ignore[attr-defined]
+            crews._ready.clear()
+        forgetful.calls += 1  # type: ignore[attr-defined]
+        return call(*arguments, **rest)
+
+    call, forgetful.calls = crews.call, 0  # type: ignore[attr-defined]
+    monkeypatch.setattr(crews, "call", forgetful)
+    assert same(render(SCENE, executor=Deaf(), aov=["depth", "normal", "material_id"], **HOW), whole)
+    assert forgetful.calls > 50  # type: ignore[attr-defined]
+
+
+def test_few_scenes_are_kept(threads: Executor) -> None:
+    for color in (0.1, 0.2, 0.3):
+        material = Material(albedo=(color, 0.5, 0.5))
+        render(replace(SCENE, objects=(Object(box(), (material,)),)), executor=threads, spp=1)
+    assert len(crews._ready) == crews.KEPT
+
+
+# --- what belongs to a render ----------------------------------------------------------------------------------------
+
+
+def test_the_picture_grows(threads: Executor) -> None:
+    seen: list[tuple[int, float]] = []
+
+    def progress(progress: Progress) -> None:
+        if progress.picture is not None:
+            picture = progress.picture()
+            seen.append((progress.done, float((picture.samples > 0).mean())))
+            assert progress.done == picture.samples.sum()
+
+    film = render(SCENE, executor=threads, progress=progress, size=(160, 100), spp=64, **HOW)
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen) and seen[-1] == (film.samples.sum(), 1.0)
+
+
+@pytest.mark.parametrize("where", ["executor", "devices"])
+def test_an_interrupted_render_keeps_whole_tiles(where: str, threads: Executor) -> None:
+    def stop(progress: Progress) -> None:
+        if progress.done > 0:
+            raise KeyboardInterrupt
+
+    spread: dict[str, Any] = {"executor": threads} if where == "executor" else {"devices": ["cpu", "cpu"]}
+    film = render(SCENE, spp=1 << 16, size=(200, 150), progress=stop, pass_size=4, **spread, **HOW)
+    assert film.stats["interrupted"] and 0 < film.stats["samples"] < 200 * 150 << 16
+    spp = int(film.samples.max())
+    done = film.samples == spp
+    assert np.array_equal(film.pixels[done], render(SCENE, spp=spp, size=(200, 150)).pixels[done])
+
+
+def test_ctrl_c(threads: Executor) -> None:
+    film = render(SCENE, spp=1 << 16, size=(200, 150), executor=threads, progress=lambda _: os.kill(os.getpid(), signal.SIGINT))
+    assert film.stats["interrupted"] and film.stats["signal"] == signal.SIGINT
+
+
+def test_time_limit(threads: Executor) -> None:
+    film = render(SCENE, spp=1 << 16, executor=threads, time_limit=0.2)
+    assert film.stats["timed_out"] and film.samples.min() >= 1
+
+
+def test_a_checkpoint_from_threads_is_finished_by_others_and_back(tmp_path: Path, threads: Executor) -> None:
+    whole, path = render(SCENE, aov="depth"), tmp_path / "a.checkpoint"
+    for step, how in ((6, {}), (12, {"executor": threads}), (24, {"devices": ["cpu", "cpu"]})):
+        film = render(SCENE, spp=step, aov="depth", checkpoint=path, resume=True, checkpoint_every=1e-9, **how, **HOW)
+    assert same(film, whole) and film.stats["resumed"]["samples"] == 12
+
+
+# --- what goes wrong --------------------------------------------------------------------------------------------------
+
+
+def test_a_worker_s_error_is_told_and_the_work_is_saved(tmp_path: Path, threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
+    trace, path = Renderer.trace_tile, tmp_path / "a.checkpoint"
+
+    def fails(self: Renderer, work: Any, *rest: Any) -> Any:
+        if work.first >= 4:
+            raise ZeroDivisionError("as it happens")
+        return trace(self, work, *rest)
+
+    monkeypatch.setattr(Renderer, "trace_tile", fails)
+    with pytest.raises(ZeroDivisionError, match="as it happens"):
+        render(SCENE, executor=threads, checkpoint=path, **HOW)
+    monkeypatch.setattr(Renderer, "trace_tile", trace)
+    film = render(SCENE, executor=threads, checkpoint=path, resume=True, **HOW)
+    assert film.stats["resumed"]["samples"] == 4 and same(film, render(SCENE))
+
+
+@pytest.mark.parametrize(("change", "said"), [({"version": "0.0.9"}, r"has wrt .*; 0\.0\.9 is needed"),
+                                              ({"kernels": "0" * 64}, "has other kernels")])
+def test_a_worker_of_another_version_says_so(change: dict[str, str], said: str, threads: Executor,
+                                             monkeypatch: pytest.MonkeyPatch) -> None:
+    unpacked = crews._unpacked
+    monkeypatch.setattr(crews, "_unpacked", lambda package: unpacked({**package, **change}))
+    with pytest.raises(InputError, match=said):
+        render(SCENE, executor=threads)
+
+
+def test_workers_on_devices_of_several_kinds_are_refused(threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
+    ready, told = Renderer.ready, []
+
+    def other(self: Renderer) -> dict[str, Any]:
+        told.append(0)
+        return {**ready(self), "kind": f"cuda, sm_{80 + len(told)}"}
+
+    monkeypatch.setattr(Renderer, "ready", other)
+    with pytest.raises(InputError, match=r"several kinds.*sm_8"):
+        render(SCENE, executor=threads)
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    ({"devices": []}, "one or more of the same kind"), ({"devices": ["cpu", "gpu"]}, "no device 'gpu'"), ({"devices": "cpu"}, None),
+    ({"devices": [1]}, "devices"), ({"executor": "tcp://127.0.0.1:1"}, "executor must be"), ({"executor": 3}, "executor must be"),
+    ({"executor": Deaf(), "devices": ["cpu"]}, "give one or the other"),
+])
+def test_bad_options(options: dict[str, Any], said: str | None) -> None:
+    if said is None:
+        assert Options(**options).devices == ("cpu",)
+        return
+    with pytest.raises(InputError, match=said):
+        Options(**options)
+
+
+def test_a_profile_has_no_executor(threads: Executor) -> None:
+    with pytest.raises(InputError, match="no argument 'executor'"):
+        profile(SCENE, executor=threads)
+
+
+def test_a_closed_executor(threads: Executor) -> None:
+    threads.shutdown()
+    with pytest.raises(InputError, match="executor: cannot schedule"):
+        render(SCENE, executor=threads)
+
+
+def test_what_a_picture_leaves_out_is_told_once(threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (spread, device_scene):
+        monkeypatch.setattr(module, "tell_left_out", lambda scene: warnings.warn("left out", SceneWarning, stacklevel=1))
+    for how in ({"executor": threads}, {"devices": ["cpu", "cpu"]}):
+        with pytest.warns(SceneWarning, match="left out") as told:
+            render(SCENE, spp=1, **how)
+        assert len(told) == 1

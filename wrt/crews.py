@@ -1,0 +1,199 @@
+"""Who traces the tiles of a render that is spread: the devices of this machine, or the workers of an executor.
+
+A tile is a pure function of the scene, its samples and what it had before (Renderer.trace_tile), so that it can be computed
+anywhere, and again where somebody died over it. A worker process makes a scene ready once, and keeps it by its digest.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import warnings
+from collections import OrderedDict, deque
+from collections.abc import Generator, Iterable
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
+from dataclasses import replace
+from hashlib import sha256
+from queue import SimpleQueue
+from typing import Any
+
+import wrt
+from wrt.driver import Renderer
+from wrt.errors import InputError, SceneWarning
+from wrt.options import Options
+from wrt.scene import Scene
+from wrt.scene_arrays import pack, unpack
+from wrt.scene_digest import scene_digest
+
+QUEUED = 3  # calls that wait or run, for each that can run at once: nobody waits for us
+SLOTS = 32  # calls at once, of an executor that does not tell
+KEPT = 2  # scenes that a worker process keeps ready
+SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "instancing", "accel_options")  # options that workers need
+OURS: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, "resume": False, "progress": None}
+
+Job = tuple[Any, ...]  # the name of a method of Renderer, and its arguments
+Reply = tuple[str, Any]  # who answers, and what
+
+
+class Crew:
+    """Somebody who can do many jobs at once."""
+
+    def slots(self) -> int:
+        """How many."""
+        raise NotImplementedError
+
+    def submit(self, job: Job) -> Future[Any]:
+        raise NotImplementedError
+
+    def result(self, future: Future[Any]) -> Reply | None:
+        """What came of it; None: it must be submitted again. Raises what the worker raised."""
+        return future.result()
+
+    def ready(self) -> bool:
+        """Whether anybody is there to take jobs. Raises InputError where that will not change."""
+        return True
+
+    def run(self, jobs: Iterable[Job]) -> Generator[tuple[Job, Reply] | None, None, None]:
+        """Do the jobs, and give each with its reply as it is done, in any order; None every tenth of a second when none is. Jobs
+        are drawn from `jobs` shortly before they are needed. What has not begun when the caller stops is cancelled."""
+        coming, again = iter(jobs), deque[Job]()
+        pending: dict[Future[Any], Job] = {}
+        room, done = QUEUED * self.slots(), False
+        try:
+            while pending or again or not done:
+                while len(pending) < room and self.ready():
+                    job = again.popleft() if again else next(coming, None)
+                    if job is None:
+                        done = True
+                        break
+                    pending[self.submit(job)] = job
+                finished, _ = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    job, reply = pending.pop(future), self.result(future)
+                    if reply is None:
+                        again.append(job)
+                    else:
+                        yield job, reply
+                if not finished:
+                    yield None
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+class Devices(Crew):
+    """Several devices of this machine: a thread for each, which makes the scene ready on its device and keeps it."""
+
+    def __init__(self, scene: Scene, options: Options) -> None:
+        assert options.devices is not None
+        self.scene, self.options, self.names = scene, replace(options, **OURS), options.devices
+        self.pool = ThreadPoolExecutor(len(self.names))
+        self.free: SimpleQueue[tuple[int, Renderer | None]] = SimpleQueue()  # one is for every thread
+        for i in range(len(self.names)):
+            self.free.put((i, None))
+        self.lock = threading.Lock()
+
+    def slots(self) -> int:
+        return len(self.names)
+
+    def submit(self, job: Job) -> Future[Any]:
+        return self.pool.submit(self._call, *job)
+
+    def _call(self, method: str, *arguments: Any) -> Reply:
+        i, renderer = self.free.get()
+        try:
+            if renderer is None:
+                with self.lock:  # the second device of a kind finds the kernels compiled
+                    renderer = _made_ready(self.scene, replace(self.options, device=self.names[i]))
+            return f"{self.names[i]} ({i})", getattr(renderer, method)(*arguments)
+        finally:
+            self.free.put((i, renderer))
+
+
+class Workers(Crew):
+    """The workers of any concurrent.futures.Executor: threads, processes, or those of other machines that have wrt.
+
+    Jobs go with the scene's digest alone; a worker process that does not know it asks for the scene.
+    """
+
+    def __init__(self, executor: Executor, key: str, package: dict[str, Any]) -> None:
+        self.executor, self.key, self.package = executor, key, package
+        self.asked = 0  # for the scene
+
+    def slots(self) -> int:
+        return int(getattr(self.executor, "_max_workers", None) or SLOTS)
+
+    def _scene(self) -> Any:
+        if not self.asked:
+            return None
+        self.asked -= 1
+        return self.package
+
+    def submit(self, job: Job) -> Future[Any]:
+        try:
+            return self.executor.submit(call, self.key, self._scene(), *job)
+        except (BrokenExecutor, RuntimeError) as error:
+            raise InputError(f"executor: {error}") from error
+
+    def result(self, future: Future[Any]) -> Reply | None:
+        try:
+            reply = future.result()
+        except BrokenExecutor as error:
+            raise InputError(f"executor: {error}") from error
+        self.asked += reply is None
+        return reply
+
+
+# --- what is sent, and the worker's side ------------------------------------------------------------------------------
+
+
+def packaged(scene: Scene, options: Options, kernels: str) -> tuple[str, dict[str, Any]]:
+    """A scene and how to render it, in plain values and arrays, and its key: the same for all that have the same pixels.
+
+    kernels: their hash, which must be that of the workers' kernels.
+    """
+    text, arrays = pack(scene)
+    package = {"version": wrt.__version__, "kernels": kernels, "options": {name: getattr(options, name) for name in SENT},
+               "scene": text}
+    key = sha256(f"{package}{scene_digest(scene)}".encode()).hexdigest()
+    return key, {**package, "arrays": arrays}
+
+
+_ready: OrderedDict[str, Renderer] = OrderedDict()
+_lock = threading.Lock()
+
+
+def call(key: str, package: dict[str, Any] | None, method: str, *arguments: Any) -> Reply | None:
+    """On a worker: a method of the Renderer of that key, made ready from the package where it is not yet; None: it is not, and
+    there is no package. Raises InputError where this is another version of wrt."""
+    with _lock:
+        if key not in _ready:
+            if package is None:
+                return None
+            _ready[key] = _unpacked(package)
+        _ready.move_to_end(key)
+        while len(_ready) > KEPT:
+            _ready.popitem(last=False)
+        renderer = _ready[key]
+    return worker_name(), getattr(renderer, method)(*arguments)
+
+
+def _unpacked(package: dict[str, Any]) -> Renderer:
+    if package["version"] != wrt.__version__:
+        raise InputError(f"worker {worker_name()} has wrt {wrt.__version__}; {package['version']} is needed")
+    renderer = _made_ready(unpack(package["scene"], package["arrays"]), Options(**package["options"]))
+    if renderer.kernels_hash() != package["kernels"]:
+        raise InputError(f"worker {worker_name()} has other kernels, though its wrt says {wrt.__version__} too: install the same"
+                         " wrt and warp-lang everywhere")
+    return renderer
+
+
+def _made_ready(scene: Scene, options: Options) -> Renderer:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SceneWarning)  # told where the render was asked for
+        return Renderer(scene, options)
+
+
+def worker_name() -> str:
+    return f"{socket.gethostname()}:{os.getpid()}"

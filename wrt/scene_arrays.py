@@ -1,0 +1,83 @@
+"""A scene as JSON text and NumPy arrays, and back: what travels to other processes. Nothing in it is code."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from wrt import scene as scenes
+from wrt.errors import InputError
+from wrt.mesh import Mesh
+from wrt.scene import Object, Scene
+
+KINDS = {kind.__name__: kind for kind in (
+    Scene, scenes.Settings, scenes.Camera, Object, Mesh, scenes.Sphere, scenes.Material, scenes.Texture, scenes.Checkerboard,
+    scenes.PointLight, scenes.DirectionalLight, scenes.SpotLight, scenes.ConstantBackground, scenes.GradientBackground,
+    scenes.EnvironmentBackground)}
+LEFT_OUT: dict[type, tuple[str, ...]] = {Object: ("motion",)}  # a picture shows the object without
+
+
+def pack(scene: Scene) -> tuple[str, list[np.ndarray]]:
+    """The text, and the arrays that it counts on: each once, as each mesh, material and texture is that others share."""
+    packer = _Packer()
+    packer.plain(scene)
+    return json.dumps(packer.things), packer.arrays
+
+
+def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
+    """The scene, bit for bit, with what was shared shared again; its arrays are those given. Raises InputError where the text
+    is not of `pack`. Values are not checked again: a camera's pose would be rounded once more."""
+    things: list[Any] = []
+
+    def value(plain: Any) -> Any:
+        if not isinstance(plain, dict):
+            return plain
+        ((kind, content),) = plain.items()
+        if kind == "thing":
+            return things[content]
+        return arrays[content] if kind == "array" else tuple(value(each) for each in content)
+
+    try:
+        for name, content in json.loads(text):
+            thing = object.__new__(KINDS[name])
+            for each in fields(KINDS[name]):
+                object.__setattr__(thing, each.name, value(content[each.name]))
+            things.append(thing)
+        if not isinstance(things[-1], Scene):
+            raise KeyError("Scene")
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise InputError(f"is no scene of this version ({type(error).__name__}: {error})") from error
+    return things[-1]
+
+
+class _Packer:
+    """things: [kind, {field: value}], each after those that it holds."""
+
+    def __init__(self) -> None:
+        self.things: list[tuple[str, dict[str, Any]]] = []
+        self.arrays: list[np.ndarray] = []
+        self.known: dict[int, dict[str, int]] = {}
+
+    def plain(self, value: Any) -> Any:
+        """As JSON has it; what is met again by identity is told by number."""
+        if isinstance(value, tuple):
+            return {"tuple": [self.plain(each) for each in value]}
+        if isinstance(value, np.generic):
+            return value.item()
+        if not (is_dataclass(value) or isinstance(value, np.ndarray)):
+            return value
+        if id(value) not in self.known:
+            if isinstance(value, np.ndarray):
+                self.arrays.append(value)
+                place = {"array": len(self.arrays) - 1}
+            else:
+                left_out = LEFT_OUT.get(type(value), ())
+                content = {each.name: None if each.name in left_out else self.plain(getattr(value, each.name))
+                           for each in fields(value)}
+                self.things.append((type(value).__name__, content))
+                place = {"thing": len(self.things) - 1}
+            self.known[id(value)] = place
+        return self.known[id(value)]
