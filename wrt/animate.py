@@ -15,7 +15,7 @@ import numpy as np
 from wrt.accel import Accelerator, Geometry
 from wrt.accel import build as build_structure
 from wrt.arguments import as_integer
-from wrt.device_scene import camera_struct, upload_scene
+from wrt.device_scene import upload_scene
 from wrt.driver import Renderer
 from wrt.errors import InputError, SceneWarning
 from wrt.film import Film
@@ -66,8 +66,7 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
             told = follow(renderer, scene_at(scene, time), animation.rebuild_at)
         elif frame:
             told = {"structure": "kept", "seconds": 0.0, "growth": 1.0}
-        renderer.camera = orbited(start, middle, degrees * time)
-        renderer.device_camera = camera_struct(renderer.camera, scene.settings.size)
+        renderer.aim(orbited(start, middle, degrees * time))
         film = renderer.run()
         film.stats["frame"] = {"number": frame, "time": time, **told}
         yield film

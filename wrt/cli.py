@@ -26,6 +26,7 @@ from wrt.cli_build import build
 from wrt.cli_common import Crop, Duration, Names, Size, load, naming, say, say_json, warnings_told
 from wrt.cli_profile import profile, whatif
 from wrt.cli_save import check_room, checkpoint_options, save_film
+from wrt.cli_view import view
 from wrt.errors import InputError
 from wrt.interrupt import Interrupted, exit_code, raise_on_termination
 
@@ -42,6 +43,7 @@ cli.add_command(build)
 cli.add_command(profile)
 cli.add_command(animate)
 cli.add_command(whatif)
+cli.add_command(view)
 
 
 @cli.command()

@@ -44,6 +44,7 @@ TILE_SIZE = 32
 MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
 PREPARING_TOLD = 1.0  # seconds of compiling and building before `progress` is told of it
 MAX_SPP = 1 << 16  # where a target error asks for more than anybody said
+AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that no kernel is compiled from
 # What may change between a checkpoint and going on with it; and the camera and the device, which are compared by what they are.
 NO_PIXEL = ("spp", "exposure", "tonemap", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size", "progress",
             "checkpoint", "checkpoint_every", "resume", "camera", "device", "devices", "executor")
@@ -109,6 +110,7 @@ class Renderer:
         self.device = self._film_device()
         self.camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
         self.features = features_of(scene, self.camera, options.instancing)
+        self.deepest = scene.settings.max_depth
         self.groups = 1 if options.target_error is None else GROUPS
         self.crop = self._crop()
         self._check_memory()
@@ -205,6 +207,25 @@ class Renderer:
             options = {"progress": partial(setattr, self, "fraction_built"), **options}
         self.accel = build(self.device_scene.world.geometry, self.options.accel, self.options.device, self.threads, **options)
         self.seconds["build"] = self.accel.stats.build_seconds
+
+    def aim(self, camera: Camera, **settings: Any) -> None:
+        """Another camera and other settings (of AIMED) for the next `run`, with the same kernel and structure.
+
+        Raises InputError for what the kernel was not made for: an aperture where there was a pinhole, more bounces.
+        """
+        scene = self.scene.with_settings(**settings)
+        lacks = [name for name, needed, there in (
+            ("an aperture", camera.aperture_radius > 0.0, self.features.lens),
+            ("an aperture with blades", camera.aperture_radius > 0.0 and camera.blades > 0, self.features.blades),
+            ("so many bounces", scene.settings.max_depth > self.deepest, False),
+            ("other settings than " + ", ".join(AIMED), bool(settings.keys() - AIMED), False),
+            ("a checkpoint", self.checkpoint is not None, False)) if needed and not there]
+        if lacks:
+            raise InputError(f"this renderer was not made for {lacks[0]}")
+        self.scene, self.camera = scene, camera
+        self.crop = self._crop()
+        self._check_memory()
+        self.device_camera = camera_struct(camera, scene.settings.size)
 
     def run(self, *, seed: int | None = None, spp: int | None = None) -> Film:
         """Take all samples (or as many as time allows, or as the target error needs) and return the film.

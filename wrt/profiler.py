@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -209,14 +209,18 @@ class Profiler(Renderer):
     def _zeros(self, n: int, dtype: Any) -> Any:
         return wp.zeros(n, dtype=dtype, device=self.device)
 
-    def _count(self, rectangle: Rectangle) -> _Tile:
+    def _totals(self, rectangle: Rectangle) -> tuple[np.ndarray, np.ndarray]:
+        """Of each pixel of a tile, row by row: how many rays it takes, and their counters together."""
         n = rectangle[2] * rectangle[3]
         recorder, log = Recorder(), ray_log.RayLog()
         recorder.counts, log.used = self._zeros(n, Counts), self._zeros(n, wp.int32)
         self._run(rectangle, 0, recorder, log)
-        counts = recorder.counts.numpy()
+        return log.used.numpy(), recorder.counts.numpy()
+
+    def _count(self, rectangle: Rectangle) -> _Tile:
+        used, counts = self._totals(rectangle)
         fetches = int(counts["nodes"].sum(dtype=np.int64) + counts["primitives"].sum(dtype=np.int64))
-        return _Tile(rectangle, log.used.numpy().copy(), fetches)
+        return _Tile(rectangle, used.copy(), fetches)
 
     def _record(self, job: tuple[_Tile, bool]) -> None:
         tile, keep = job
@@ -265,3 +269,44 @@ class Profiler(Renderer):
         x, y, width, height = rectangle
         column, row = np.meshgrid(np.arange(x - x0, x - x0 + width), np.arange(y - y0, y - y0 + height))
         return (row * (x1 - x0) + column).ravel().astype(np.int64)
+
+
+class CostCounter(Profiler):
+    """What each pixel costs, and nothing of its rays one by one: one run a tile, over the structure of another renderer."""
+
+    def __init__(self, built: Renderer) -> None:
+        self.built = built
+        super().__init__(built.scene, replace(built.options, camera=built.camera))
+
+    def _build(self) -> None:
+        self.device_scene, self.accel = self.built.device_scene, self.built.accel
+
+    def costs(self, go_on: Callable[[int], bool] = lambda done: True) -> dict[str, np.ndarray] | None:
+        """COUNTERS, (H, W) int32 each, of the first sample of each pixel: summed over its rays (stack: the deepest).
+
+        go_on: asked after each tile, with the number of pixels that are done, and from several threads; where it says no, the
+        tiles that are left are not traced, and the result is None.
+        """
+        settings = self.scene.settings
+        self.limits = self._limits(self.options.seed)
+        self.films = [DeviceFilm(settings, self.crop, self.device, self.options.seed)]
+        x0, y0, x1, y1 = self.crop
+        out = {name: np.zeros((y1 - y0, x1 - x0), np.int32) for name in COUNTERS}
+        done: list[int] = []
+        stopped: list[bool] = []
+
+        def work(rectangle: Rectangle) -> None:
+            if stopped:
+                return
+            x, y, width, height = rectangle
+            _, counts = self._totals(rectangle)
+            for name, values in out.items():
+                values[y - y0 : y - y0 + height, x - x0 : x - x0 + width] = counts[name].reshape(height, width)
+            done.append(width * height)
+            if not go_on(sum(done)):
+                stopped.append(True)
+
+        begin = time.perf_counter()
+        self._over(work, list(self._tiles()))
+        self.seconds["trace"] = time.perf_counter() - begin
+        return None if stopped else out

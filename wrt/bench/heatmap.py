@@ -48,6 +48,11 @@ def step_of(top: float) -> float:
     return next(power * factor for factor in (5.0, 2.0, 1.0) if top / (power * factor) >= 4.0 - 1e-9)
 
 
+def colored(values: np.ndarray, top: float) -> np.ndarray:
+    """Values (h, w) of 0 or more as colours, (h, w, 3) uint8; `top` and what is beyond it get the last one."""
+    return colors()[np.rint(np.clip(np.nan_to_num(values / top, posinf=1.0), 0.0, 1.0) * 255.0).astype(np.uint8)]
+
+
 def heatmap(values: np.ndarray, title: str) -> np.ndarray:
     """The picture, (H, W, 3) uint8, of values (h, w) of 0 or more, row 0 on top; 0 is the first colour. What is beyond the scale
     gets the last one, and the title tells the largest value."""
@@ -56,10 +61,9 @@ def heatmap(values: np.ndarray, title: str) -> np.ndarray:
     scale = max(1, -(-LEAST // values.shape[1]))
     height, width = values.shape[0] * scale, values.shape[1] * scale
     top = top_of(values)
-    index = np.rint(np.clip(np.nan_to_num(values / top, posinf=1.0), 0.0, 1.0) * 255.0).astype(np.uint8)
     bar_height = max(height, 120)
     image = Image.new("RGB", (MARGIN * 3 + width + BAR + 64, TITLE + bar_height + MARGIN), "white")
-    image.paste(Image.fromarray(colors()[index].repeat(scale, axis=0).repeat(scale, axis=1)), (MARGIN, TITLE))
+    image.paste(Image.fromarray(colored(values, top).repeat(scale, axis=0).repeat(scale, axis=1)), (MARGIN, TITLE))
     left = 2 * MARGIN + width
     ramp = colors()[np.rint(np.linspace(255.0, 0.0, bar_height)).astype(np.uint8)]
     image.paste(Image.fromarray(np.repeat(ramp[:, None], BAR, axis=1)), (left, TITLE))

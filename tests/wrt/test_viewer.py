@@ -1,0 +1,270 @@
+"""The viewer without a browser: what it shows when, what it gives up, and what it does not do twice."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wrt
+from tests.wrt.test_checkpoint import SCENE as PINHOLE
+from wrt import viewer as module
+from wrt.driver import Renderer
+from wrt.errors import InputError
+from wrt.film import Film
+from wrt.options import Options
+from wrt.profiler import profile
+from wrt.scene import Camera, DirectionalLight, GradientBackground, Material, Object, Scene, Settings
+from wrt.shapes import box, quad
+from wrt.viewer import COARSE, DEEPEST, SCALES, Shown, Viewer
+
+# A box on a mirror, through an open lens: as the viewer compiles every scene. One kernel serves all tests here.
+CAMERA = Camera.look_at((2, 2, 4), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)
+SCENE = Scene(
+    objects=(Object(box(), (Material(albedo=(0.7, 0.6, 0.5)),)),
+             Object(quad((-4, -1, -4), (0, 0, 8), (8, 0, 0)), (Material("mirror", albedo=(0.5, 0.7, 0.9)),))),
+    lights=(DirectionalLight((-1, -2, -1.5), (1.5, 1.4, 1.3)),), cameras=(CAMERA,), background=GradientBackground(),
+    settings=Settings(size=(61, 34), max_depth=3),
+)
+
+
+class Eye:
+    """Sees what is shown and hears what is told; `react` may answer a picture."""
+
+    def __init__(self, scene: Scene = SCENE, spp: int = 4, **options: Any) -> None:
+        self.pictures: list[Shown] = []
+        self.words: list[str] = []
+        self.react: Callable[[Shown], Any] = lambda shown: None
+        self.viewer = Viewer(scene, Options(**options), self._show, self.words.append, spp)
+
+    def _show(self, shown: Shown) -> None:
+        self.pictures.append(shown)
+        self.react(shown)
+
+    def see(self, **changes: Any) -> Shown:
+        """The last picture after a change."""
+        self.viewer.change(**changes)
+        self.viewer.step()
+        return self.pictures[-1]
+
+
+def turned(degrees: float) -> Camera:
+    angle = np.radians(degrees)
+    return Camera.look_at((2 * np.cos(angle), 2, 4 + np.sin(angle)), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)
+
+
+def test_it_is_coarse_first_and_in_the_end_the_picture_itself() -> None:
+    eye = Eye()
+    last = eye.see(size=(61, 34))
+    scales = [shown.scale for shown in eye.pictures]
+    assert scales[0] == 8 and scales == sorted(scales, reverse=True) and set(scales) == {8, 4, 2, 1}
+    assert eye.pictures[0].codes.shape == (5, 8, 3) and not any(shown.done for shown in eye.pictures[:-1])
+    film = eye.viewer.picture()
+    assert isinstance(film, Film) and last.done and last.spp == 4
+    expected = wrt.render(SCENE, spp=4)
+    np.testing.assert_array_equal(film.pixels, expected.pixels)
+    np.testing.assert_array_equal(last.codes, expected.to_srgb8())
+    assert last.rays_per_sample == pytest.approx(expected.stats["rays_per_sample"]) and last.speed > 0.0
+
+
+def test_a_coarse_picture_covers_the_same_view() -> None:
+    """61 and 34 are no multiples of 8: the picture of 8x5 pixels has their angles all the same."""
+    eye = Eye(spp=64)
+    fine = eye.see(size=(61, 34))
+    coarse = next(shown for shown in eye.pictures if shown.scale == 8)
+    tangent = np.tan(0.5 * CAMERA.fov_y)
+    renderer = eye.viewer._renderers["bvh"]
+    assert renderer.device_camera.tan_x == pytest.approx(tangent * 61 / 34) and fine.scale == 1
+    x = np.linspace(0.0, 1.0, 8, endpoint=False) + 1 / 16
+    y = np.linspace(0.0, 1.0, 5, endpoint=False) + 1 / 10
+    sampled = fine.codes[(y * 34).astype(int)][:, (x * 61).astype(int)].astype(float)
+    assert np.corrcoef(sampled.ravel(), coarse.codes.astype(float).ravel())[0, 1] > 0.8
+
+
+def test_a_change_ends_the_refinement_and_the_next_view_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "EVERY", 0.0)
+    eye = Eye(spp=1 << 20)
+
+    def react(shown: Shown) -> None:
+        if shown.scale == 1 and shown.view.max_depth == 3:
+            eye.viewer.spp = 2
+            assert eye.viewer.change(max_depth=0)
+
+    eye.react = react
+    first = eye.see(size=(61, 34))
+    assert first.scale == 1 and not first.done and first.view.max_depth == 3
+    eye.viewer.step()
+    assert eye.pictures[-1].done and [shown.view.max_depth for shown in eye.pictures] == sorted(
+        (shown.view.max_depth for shown in eye.pictures), reverse=True)
+    assert sum(shown.scale == 1 and shown.view.max_depth == 3 for shown in eye.pictures) == 1
+
+
+def test_a_camera_that_never_rests_is_followed() -> None:
+    eye = Eye()
+    eye.react = lambda shown: eye.viewer.change(camera=turned(len(eye.pictures)))
+    for _ in range(6):
+        eye.see(size=(61, 34))
+    assert len(eye.pictures) == 6  # one of each view: what is asked for meanwhile ends it, and not before it was seen
+    assert len({shown.view for shown in eye.pictures}) == 6
+
+
+def test_what_takes_too_long_is_given_up_unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PATIENCE", -1.0)
+    eye = Eye()
+    eye.see(size=(61, 34))
+    renderer, pictures = eye.viewer._renderers["bvh"], len(eye.pictures)
+
+    def report(progress: Any) -> None:
+        eye.viewer.change(camera=turned(5.0))
+        eye.viewer._report(progress)
+
+    renderer.options.progress = report
+    eye.see(camera=turned(1.0))
+    assert len(eye.pictures) == pictures
+
+
+def test_the_first_picture_is_as_fine_as_there_is_time_for() -> None:
+    eye = Eye()
+    view = replace(eye.viewer.view, size=(1280, 720))
+    for scale in SCALES:
+        eye.viewer._pace["bvh", False] = 0.99 * COARSE * scale**2 / (1280 * 720)
+        assert eye.viewer._scales(view) == [each for each in SCALES[::-1] if each <= scale]
+    eye.viewer._pace["bvh", False] = 1.0
+    assert eye.viewer._scales(view) == list(SCALES[::-1])
+
+
+def test_a_structure_is_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    class Counted(Renderer):
+        def _build(self) -> None:
+            made.append(self.options.accel)
+            super()._build()
+
+    monkeypatch.setattr(module, "Renderer", Counted)
+    eye = Eye(spp=1)
+    pinhole = replace(CAMERA, aperture_radius=0.0)
+    for changes in ({"size": (61, 34)}, {"size": (30, 40)}, {"camera": turned(30.0)}, {"max_depth": DEEPEST}, {"camera": pinhole},
+                    {"cost": "nodes"}, {"cost": ""}):
+        assert eye.see(**changes).done
+    assert made == ["bvh"]
+    eye.see(accel="bvh8")  # the same structure by another name, with a renderer of its own
+    eye.see(accel="bvh")
+    assert made == ["bvh", "bvh8"] and eye.words[-1] == ""
+
+
+def test_nothing_is_rendered_twice() -> None:
+    eye = Eye()
+    eye.see(size=(61, 34))
+    pictures = len(eye.pictures)
+    same = Camera.look_at((2, 2, 4), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)
+    assert not eye.viewer.change(camera=same, size=(61, 34), cost="")
+    eye.viewer.step()
+    assert len(eye.pictures) == pictures
+    eye.viewer.pause()  # nobody looks; then the same view is asked for
+    eye.viewer.step()
+    assert len(eye.pictures) == pictures and eye.viewer.change(camera=same)
+
+
+def test_another_tone_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    eye = Eye()
+    eye.see(size=(61, 34))
+    film = eye.viewer.picture()
+    monkeypatch.setattr(Renderer, "run", lambda self: pytest.fail("rays were traced"))
+    eye.viewer.tone(-1.5, "aces")
+    eye.viewer.step()
+    assert isinstance(film, Film)
+    expected = replace(film, exposure=-1.5, tonemap="aces")
+    np.testing.assert_array_equal(eye.pictures[-1].codes, expected.to_srgb8())
+    saved = eye.viewer.picture()
+    assert isinstance(saved, Film) and (saved.exposure, saved.tonemap) == (-1.5, "aces")
+    with pytest.raises(InputError, match="tonemap must be one of"):
+        eye.viewer.tone(0.0, "sepia")
+
+
+def test_a_heat_map_is_the_profile_of_the_picture() -> None:
+    eye = Eye()
+    shown = eye.see(size=(61, 34), cost="nodes")
+    values = profile(SCENE, spp=1).maps["nodes"]
+    assert shown.done and shown.mean == pytest.approx(values.mean()) and shown.largest == values.max()
+    codes = eye.viewer.picture()
+    assert isinstance(codes, np.ndarray) and codes.shape == (34, 61, 3)
+    brightness = codes.astype(int).sum(axis=2)  # the colours of a heat map get lighter
+    below = values < shown.top
+    order = np.argsort(values[below], kind="stable")
+    assert (np.diff(brightness[below][order]) >= -2).all() and brightness[~below].min() >= brightness[below].max()
+    eye.react = lambda shown: eye.viewer.change(cost="")
+    eye.viewer._pace["bvh", True] = 1.0
+    assert eye.see(cost="primitives").scale == SCALES[-1]  # the rest was given up
+    eye.viewer.step()
+    assert isinstance(eye.viewer.picture(), Film)
+
+
+def test_what_a_click_focuses_on() -> None:
+    eye = Eye()
+    assert eye.viewer.focus_at(0.5, 0.5) is None  # nothing is built yet
+    eye.see(size=(61, 34))
+    corner = CAMERA.camera_to_world[:3, :3].T @ (SCENE.objects[0].mesh.vertices.max(axis=0) - CAMERA.camera_to_world[:3, 3])
+    tangent = np.tan(0.5 * CAMERA.fov_y)
+    x, y = 0.5 + 0.5 * corner[0] / -corner[2] / tangent * 34 / 61, 0.5 - 0.5 * corner[1] / -corner[2] / tangent
+    distance = eye.viewer.focus_at(x, y + 1e-4)  # just below the box's nearest corner
+    assert distance is not None and distance == pytest.approx(-corner[2], rel=1e-3)
+    assert eye.viewer.focus_at(0.5, 0.0) is None  # sky
+
+
+def test_what_there_is_not_is_refused_and_what_cannot_be_built_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    eye = Eye()
+    for changes, message in (({"accel": "bhv"}, "no structure 'bhv'"), ({"cost": "fees"}, "no counter 'fees'")):
+        with pytest.raises(InputError, match=message):
+            eye.viewer.change(**changes)
+    eye.see(size=(61, 34))
+    pictures = len(eye.pictures)
+
+    def refuse(*arguments: Any) -> None:
+        raise InputError("too many triangles")
+
+    monkeypatch.setattr(module, "Renderer", refuse)
+    eye.see(accel="kdtree")
+    assert eye.words[-1] == "error: too many triangles" and len(eye.pictures) == pictures
+    assert eye.see(accel="bvh", max_depth=1).done and eye.words[-1] == ""
+
+
+def test_a_thread_follows_until_it_is_stopped() -> None:
+    eye = Eye(spp=1 << 20)
+    fine = threading.Event()
+    eye.react = lambda shown: fine.set() if shown.spp > 1 else None
+    thread = threading.Thread(target=eye.viewer.run, daemon=True)
+    thread.start()
+    eye.viewer.change(size=(61, 34))
+    assert fine.wait(60.0)
+    eye.viewer.pause()
+    pictures = -1
+    for _ in range(60):  # then nothing comes any more
+        if pictures == (pictures := len(eye.pictures)):
+            break
+        time.sleep(3 * module.EVERY)
+    else:
+        pytest.fail("it goes on")
+    fine.clear()
+    eye.viewer.change(max_depth=1)
+    assert fine.wait(60.0)
+    eye.viewer.stop()
+    thread.join(30.0)
+    assert not thread.is_alive()
+
+
+def test_a_renderer_aims_elsewhere_with_what_it_has() -> None:
+    renderer = Renderer(PINHOLE, Options())
+    other = Camera.look_at((-3, 1, 4), (0, 0, 0))
+    renderer.aim(other, size=(20, 31), spp=2, max_depth=1)
+    expected = wrt.render(PINHOLE, camera=other, size=(20, 31), spp=2, max_depth=1)
+    np.testing.assert_array_equal(renderer.run().pixels, expected.pixels)
+    for camera, settings, message in ((replace(other, aperture_radius=0.1), {}, "an aperture"),
+                                      (other, {"max_depth": 9}, "so many bounces"), (other, {"filter": "box"}, "other settings")):
+        with pytest.raises(InputError, match=f"not made for {message}"):
+            renderer.aim(camera, **settings)

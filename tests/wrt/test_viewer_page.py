@@ -1,0 +1,255 @@
+"""The viewer in a real browser, and the command that starts it."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import socket
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.command_line import wrt as run
+from tests.data import ROOT
+from tests.wrt.test_viewer import CAMERA, SCENE
+from wrt.driver import render
+from wrt.options import Options
+
+WHITTED = ROOT / "scenes" / "whitted.toml"
+SIZE = {"width": 640, "height": 480}
+ROUGHLY = 0.5  # mean difference in codes of what is on the screen: it was drawn through a texture
+PATIENCE = 60.0  # seconds; a browser that draws in software on a busy machine is slow
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_without_viser_there_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    result = run("view", WHITTED)
+    assert result.code == 2 and result.out == "" and result.errors == [result.err.strip()]
+    assert 'pip install "wrt[viewer]"' in result.err
+
+
+@pytest.mark.parametrize(("host", "port", "part"), [
+    ("127.0.0.1", None, "Address already in use"), ("no.such.host.invalid", 0, "no.such.host.invalid")])
+def test_where_nobody_can_listen(host: str, port: int | None, part: str) -> None:
+    pytest.importorskip("viser")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1] if port is None else port
+        result = run("view", WHITTED, "--host", host, "--port", port, "--no-open")
+    assert result.code == 2 and result.out == "" and len(result.errors) == 1
+    assert part in result.err and f"port {port}" in result.err and "--port" in result.err
+
+
+def test_the_command_serves_until_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("viser")
+    from wrt.viewer_page import Page
+
+    seen: list[Page] = []
+
+    def wait(self: Page) -> None:
+        seen.append(self)
+        with socket.create_connection(("127.0.0.1", self.server.get_port()), timeout=10.0) as connection:
+            connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+            assert connection.recv(64).startswith(b"HTTP/1.1 200")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Page, "wait", wait)
+    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: True)  # this test compiles nothing
+    result = run("view", WHITTED, "--port", 0, "--no-open")
+    assert result.code == 0 and result.out == f"{seen[0].url}\n" and seen[0].url.startswith("http://localhost:")
+    seen[0].thread.join(10.0)
+    assert not seen[0].thread.is_alive()
+    assert "no camera 'nobody'" in run("view", WHITTED, "--camera", "nobody", "--port", 0).err
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Any]:
+    pytest.importorskip("viser")
+    from wrt.viewer_page import Page
+
+    page = Page(SCENE, Options(threads=1), port=0, spp=4)
+    yield page
+    page.close()
+
+
+@pytest.fixture(scope="module")
+def browser_page(page: Any) -> Iterator[Any]:
+    """The page in Chromium; its console's errors are the fixture's `mistakes`."""
+    api = pytest.importorskip("playwright.sync_api")
+    chromium = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
+    if chromium is None:
+        pytest.skip("needs a Chromium")
+    with api.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium, args=[
+            "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"])
+        view = browser.new_page(viewport=SIZE)
+        view.mistakes = []
+        view.on("console", lambda message: view.mistakes.append(message.text) if message.type == "error" else None)
+        view.on("pageerror", lambda error: view.mistakes.append(str(error)))
+        view.goto(f"{page.url}/?fixedDpr=1")  # else viser draws coarser where the machine is slow
+        yield view
+        browser.close()
+
+
+def until(condition: Callable[[], Any], browser_page: Any) -> Any:
+    """What the condition gives when it is true at last; the browser's events go on meanwhile."""
+    deadline = time.monotonic() + PATIENCE
+    while not (value := condition()):
+        assert time.monotonic() < deadline, "it never came about"
+        browser_page.wait_for_timeout(50)
+    return value
+
+
+def finished(page: Any, browser_page: Any, **view: Any) -> Any:
+    """The picture when it is as fine as it gets, and of the view that is wanted."""
+
+    def done() -> Any:
+        shown = page.viewer.shown
+        return shown if (shown is not None and shown.done and shown.view is page.viewer.view
+                         and all(getattr(shown.view, name) == value for name, value in view.items())) else None
+
+    return until(done, browser_page)
+
+
+def seen(browser_page: Any, shown: Any) -> np.ndarray:
+    """What the browser shows left of the panel, in pixels of the picture, when it has come to rest."""
+    last, same = None, 0
+    while same < 2:
+        data = browser_page.screenshot()
+        same, last = (same + 1, last) if data == last else (0, data)
+        browser_page.wait_for_timeout(100)
+    height, width = shown.codes.shape[:2]
+    with Image.open(io.BytesIO(data)) as image:
+        pixels = np.asarray(image.convert("RGB").resize((width, height), Image.Resampling.BILINEAR)).astype(float)
+    return pixels[height // 3 :, : width * 7 // 16]  # without viser's message about software rendering
+
+
+def expected(shown: Any, shift: tuple[int, int] = (0, 0)) -> np.ndarray:
+    height, width = shown.codes.shape[:2]
+    return np.roll(shown.codes, shift, axis=(0, 1)).astype(float)[height // 3 :, : width * 7 // 16]
+
+
+def difference(browser_page: Any, shown: Any) -> float:
+    return float(np.abs(seen(browser_page, shown) - expected(shown)).mean())
+
+
+def test_the_picture_is_there_and_lines_up(page: Any, browser_page: Any) -> None:
+    shown = finished(page, browser_page)
+    camera = shown.view.camera
+    np.testing.assert_allclose(camera.camera_to_world, CAMERA.camera_to_world, atol=1e-9)
+    assert camera.fov_y == pytest.approx(CAMERA.fov_y) and camera.aperture_radius == CAMERA.aperture_radius
+    width, height = shown.view.size
+    assert width / height == pytest.approx(SIZE["width"] / SIZE["height"], rel=0.01)
+    film = render(SCENE, size=shown.view.size, spp=4, camera=camera)
+    assert np.abs(film.to_srgb8().astype(int) - shown.codes).max() <= 1
+    until(lambda: "4 of 4 spp" in browser_page.inner_text("body"), browser_page)
+    there = seen(browser_page, shown)
+    off = {shift: np.abs(there - expected(shown, shift)).mean() for shift in np.ndindex(3, 3)}
+    off |= {(-y, -x): np.abs(there - expected(shown, (-y, -x))).mean() for y, x in np.ndindex(3, 3)}
+    assert off[0, 0] < ROUGHLY and min(off, key=lambda shift: off[shift]) == (0, 0), off
+    assert browser_page.mistakes == []
+
+
+def test_a_drag_orbits_and_stays_level(page: Any, browser_page: Any) -> None:
+    before = finished(page, browser_page)
+    browser_page.mouse.move(200, 300)
+    browser_page.mouse.down()
+    browser_page.mouse.move(250, 320, steps=5)
+    browser_page.mouse.up()
+    until(lambda: page.viewer.view.camera is not before.view.camera, browser_page)
+    browser_page.wait_for_timeout(800)  # until it has swung out
+    after = finished(page, browser_page)
+    pose, old = after.view.camera.camera_to_world, before.view.camera.camera_to_world
+    target = CAMERA.camera_to_world[:3] @ (0, 0, -CAMERA.focus_distance, 1)
+    assert np.linalg.norm(pose[:3, 3] - old[:3, 3]) > 0.2
+    assert np.linalg.norm(pose[:3, 3] - target) == pytest.approx(CAMERA.focus_distance, rel=1e-6)
+    assert abs(pose[1, 0]) < 1e-9 and pose[1, 1] > 0.0
+    assert difference(browser_page, after) < ROUGHLY
+
+
+def set_number(browser_page: Any, label: str, value: str) -> None:
+    """Write into the number beside a slider, or into a number field."""
+    row = browser_page.locator(f"xpath=//label[text()='{label}']/ancestor::*[.//input][1]")
+    field = row.locator("input[type=text], input[inputmode]").last
+    field.fill(value)
+    field.press("Enter")
+
+
+def choose(browser_page: Any, label: str, value: str) -> None:
+    row = browser_page.locator(f"xpath=//label[text()='{label}']/ancestor::*[.//input][1]")
+    row.locator("input").first.click()
+    browser_page.get_by_role("option", name=value, exact=True).click()
+
+
+def test_controls_change_the_picture(page: Any, browser_page: Any) -> None:
+    bright = finished(page, browser_page)
+    set_number(browser_page, "bounces", "0")
+    flat = finished(page, browser_page, max_depth=0)
+    assert flat.codes.mean() < bright.codes.mean() - 20.0 and difference(browser_page, flat) < ROUGHLY
+    choose(browser_page, "show", "nodes")
+    heat = finished(page, browser_page, cost="nodes")
+    until(lambda: "nodes a pixel" in browser_page.inner_text("body"), browser_page)
+    assert heat.mean > 1.0 and difference(browser_page, heat) < ROUGHLY
+    choose(browser_page, "show", "picture")
+    choose(browser_page, "structure", "bvh8")
+    finished(page, browser_page, cost="", accel="bvh8")
+    set_number(browser_page, "angle of view", "60")
+    until(lambda: abs(page.viewer.view.camera.fov_y - np.radians(60.0)) < 1e-6, browser_page)
+    wide = finished(page, browser_page)
+    film = render(SCENE, size=wide.view.size, spp=4, camera=wide.view.camera, max_depth=0)
+    assert np.abs(film.to_srgb8().astype(int) - wide.codes).max() <= 1
+    choose(browser_page, "tone mapping", "reinhard")
+    until(lambda: np.array_equal(page.viewer.shown.codes, replace(film, tonemap="reinhard").to_srgb8()), browser_page)
+    assert browser_page.mistakes == []
+
+
+def test_a_click_focuses(page: Any, browser_page: Any) -> None:
+    shown = finished(page, browser_page)
+    browser_page.mouse.click(150, 440)
+    browser_page.locator("xpath=//label[text()='click to focus']/ancestor::*[.//input][1]").locator("input").check()
+    until(lambda: page.by_click.value, browser_page)
+    assert page.viewer.view.camera.focus_distance == shown.view.camera.focus_distance  # the first click was none
+    browser_page.mouse.click(150, 440)
+    wanted = page.viewer.focus_at(150.5 / SIZE["width"], 440.5 / SIZE["height"])
+    until(lambda: page.viewer.view.camera.focus_distance == pytest.approx(wanted, rel=0.01), browser_page)
+    assert page.focus.value == page.viewer.view.camera.focus_distance != shown.view.camera.focus_distance
+
+
+def test_what_is_saved(page: Any, browser_page: Any, tmp_path: Path) -> None:
+    shown = finished(page, browser_page)
+    for name, suffix in (("picture as PNG", ".png"), ("picture as EXR", ".exr")):
+        with browser_page.expect_download() as download:
+            browser_page.get_by_role("button", name=name).click()
+        path = tmp_path / f"saved{suffix}"
+        download.value.save_as(path)
+        if suffix == ".png":
+            with Image.open(path) as image:
+                np.testing.assert_array_equal(np.asarray(image), page.viewer.shown.codes)
+        else:
+            from wrt.image import read_image
+
+            np.testing.assert_allclose(read_image(path), page.viewer.picture().pixels, rtol=1e-3, atol=1e-6)
+    browser_page.get_by_role("button", name="camera as TOML").click()
+    with browser_page.expect_download() as download:
+        browser_page.get_by_role("button", name="save as a file").click()
+    download.value.save_as(tmp_path / "camera.toml")
+    table = tomllib.loads((tmp_path / "camera.toml").read_text())["cameras"]["view"]
+    np.testing.assert_array_equal(table["position"], shown.view.camera.camera_to_world[:3, 3])
+    until(lambda: "[cameras.view]" in browser_page.inner_text("body"), browser_page)
+    browser_page.get_by_role("button", name="close").click()
+    assert browser_page.mistakes == []

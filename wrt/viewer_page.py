@@ -1,0 +1,271 @@
+"""The viewer in a browser: viser's orbit controls and panel before a wrt.viewer.Viewer, whose pictures fill the viewport.
+
+Several browsers share the panel; the picture follows the camera that moved last, in the browser where it moved.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import socket
+import tempfile
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrt.accel import ACCELERATORS
+from wrt.bench.heatmap import colors, short
+from wrt.errors import InputError
+from wrt.film import Film
+from wrt.image import encode_png
+from wrt.options import Options
+from wrt.scene import TONEMAPS, Camera, Scene
+from wrt.viewer import COSTS, Shown, Viewer
+from wrt.viewer_camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
+
+MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser one
+RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}
+PICTURE = "picture"
+QUALITY = {True: 92, False: 80}  # of JPEG: at full resolution, and coarse
+LEGEND_SIZE = (12, 256)
+
+
+def import_viser() -> Any:
+    """The module; raises InputError that says how to install it."""
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError(f'the viewer needs viser ({error}): pip install "wrt[viewer]"') from error
+    return viser
+
+
+def check_address(host: str, port: int) -> None:
+    """Raise InputError where nobody can listen there: viser itself would take another port without a word."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        raise InputError(f"cannot listen on port {port} of {host} ({error.strerror}); --port and --host choose another") from error
+
+
+def status(shown: Shown, viewer: Viewer) -> str:
+    """What the panel tells of a picture, as Markdown."""
+    height, width = shown.codes.shape[:2]
+    rays = f"{shown.speed / 1e6:.2f} Mray/s, {shown.rays_per_sample:.1f} rays a sample"
+    if shown.view.cost:
+        what = f"**{shown.view.cost}** a pixel: mean {short(shown.mean)}, largest {short(shown.largest)}"
+    else:
+        what = f"**{shown.spp} of {viewer.spp} spp**"
+    return f"{what}  \n{rays}  \n{width}x{height}{', coarse' if shown.scale > 1 else ''}; {viewer.structure(shown.view.accel)}"
+
+
+class Page:
+    """A server with the panel and one Viewer. host, port (0: any free one): where it listens. Raises InputError where it cannot.
+
+    `url` is where it is found; `close` ends it.
+    """
+
+    def __init__(self, scene: Scene, options: Options, host: str = "127.0.0.1", port: int = 8080, spp: int = 1024) -> None:
+        viser = import_viser()
+        check_address(host, port)
+        self.viewer = Viewer(scene, options, self._show, self._tell, spp)
+        start = self.viewer.view.camera
+        self.unit, self.watching, self.name = unit_of(scene, start), -1, scene.name or "picture"
+        with quiet():
+            self.server = viser.ViserServer(host, port, label="wrt", verbose=False)
+        if port and self.server.get_port() != port:  # somebody else was faster
+            self.close()
+            raise InputError(f"port {port} of {host} is in use; --port chooses another")
+        shown_host = "localhost" if host in ("127.0.0.1", "0.0.0.0", "::") else host
+        self.url = f"http://{shown_host}:{self.server.get_port()}"
+        self._place_camera(start, orbited_point(scene, start))
+        self.server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True)
+        self._panel(start)
+        self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(self._gone)
+        self.thread = threading.Thread(target=self._run, name="wrt viewer", daemon=True)
+        self.failure: BaseException | None = None
+        self.thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.viewer.run()
+        except BaseException as error:
+            self.failure = error
+
+    def wait(self) -> None:
+        """Until `close`, or an error of the renderer, which is raised."""
+        while self.thread.is_alive():
+            self.thread.join(0.5)
+        if self.failure is not None:
+            raise self.failure
+
+    def close(self) -> None:
+        self.viewer.stop()
+        with quiet():
+            self.server.stop()
+
+    # --- the viewport -------------------------------------------------------------------------------------------------
+
+    def _place_camera(self, camera: Camera, target: np.ndarray) -> None:
+        self.server.scene.set_up_direction(tuple(up_of(camera)))
+        start = self.server.initial_camera
+        start.position = tuple(camera.camera_to_world[:3, 3] / self.unit)
+        start.look_at = tuple(target / self.unit)
+        start.fov = camera.fov_y
+
+    async def _connected(self, client: Any) -> None:
+        client.camera.on_update(self._moved)
+
+    async def _gone(self, client: Any) -> None:
+        if client.client_id == self.watching:
+            self.viewer.pause()
+
+    async def _moved(self, viewport: Any) -> None:
+        """Not in a thread of its own: cameras must come in order."""
+        width, height = viewport.image_width, viewport.image_height
+        if width < 1 or height < 1:
+            return
+        self.watching = viewport.client.client_id
+        coarser = max(RESOLUTIONS[self.resolution.value], math.sqrt(width * height / MOST_PIXELS))
+        size = max(1, round(width / coarser)), max(1, round(height / coarser))
+        self.viewer.change(camera=lambda camera: from_viewport(camera, viewport, self.unit), size=size)
+
+    def _show(self, shown: Shown) -> None:
+        client = self.server.get_clients().get(self.watching)
+        if client is None:
+            return
+        form = {"format": "png"} if shown.done else {"format": "jpeg", "jpeg_quality": QUALITY[shown.scale == 1]}
+        client.scene.set_background_image(shown.codes, **form)
+        self.status.content = status(shown, self.viewer)
+        self.legend.visible = self.marks.visible = bool(shown.view.cost)
+        self.exr.disabled = bool(shown.view.cost)
+        if shown.view.cost:
+            self.marks.content = f"0 (dark) to {short(shown.top)} (light)"
+
+    def _tell(self, text: str) -> None:
+        self.doing.content, self.doing.visible = text, bool(text)
+
+    # --- the panel ----------------------------------------------------------------------------------------------------
+
+    def _panel(self, camera: Camera) -> None:
+        gui = self.server.gui
+        self.status = gui.add_markdown("waiting for the first picture")
+        self.doing = gui.add_markdown("", visible=False)
+        self._lens_folder(camera)
+        with gui.add_folder("Light"):
+            depth = gui.add_slider("bounces", 0, self.viewer.deepest, 1, self.viewer.view.max_depth, hint="After the first hit")
+            accel = gui.add_dropdown("structure", tuple(ACCELERATORS), initial_value=self.viewer.view.accel,
+                                     hint="Built once each; the picture is the same, its speed and cost are not")
+        depth.on_update(lambda event: self.viewer.change(max_depth=int(depth.value)))
+        accel.on_update(lambda event: self.viewer.change(accel=accel.value))
+        self._picture_folder()
+        with gui.add_folder("Save"):
+            png = gui.add_button("picture as PNG", hint="As it is shown")
+            self.exr = gui.add_button("picture as EXR", hint="Linear, with variance and samples")
+            toml = gui.add_button("camera as TOML", hint="A table for a scene file")
+        png.on_click(lambda event: self._save(event.client, ".png"))
+        self.exr.on_click(lambda event: self._save(event.client, ".exr"))
+        toml.on_click(lambda event: self._give_camera(event.client))
+
+    def _lens_folder(self, camera: Camera) -> None:
+        gui, unit = self.server.gui, self.unit
+        widest = nice(max(4.0 * camera.aperture_radius, 0.05 * unit))
+        with gui.add_folder("Lens"):
+            angle = gui.add_slider("angle of view", 5.0, 120.0, 0.5, min(max(math.degrees(camera.fov_y), 5.0), 120.0),
+                                   hint="Vertical, degrees")
+            aperture = gui.add_slider("aperture", 0.0, widest, widest / 200.0, camera.aperture_radius,
+                                      hint="Its radius in scene units; 0 is a pinhole")
+            self.focus = gui.add_number("focus", camera.focus_distance, min=1e-6 * unit, step=nice(0.01 * unit),
+                                        hint="Distance along the axis to what is sharp, in scene units")
+            self.by_click = gui.add_checkbox("click to focus", False, hint="A click into the picture focuses on what is there")
+        angle.on_update(lambda event: self._set_angle(math.radians(angle.value)))
+        aperture.on_update(lambda event: self._set_lens(aperture_radius=float(aperture.value)))
+        self.focus.on_update(lambda event: self._set_lens(focus_distance=float(self.focus.value)))
+
+        @self.server.scene.on_click()
+        def clicked(event: Any) -> None:
+            if self.by_click.value:
+                self._focus_at(*event.screen_pos)
+
+    def _picture_folder(self) -> None:
+        gui, viewer = self.server.gui, self.viewer
+        with gui.add_folder("Picture"):
+            cost = gui.add_dropdown("show", (PICTURE, *COSTS), initial_value=PICTURE,
+                                    hint="The picture, or a heat map of what each pixel costs: a counter summed over its rays")
+            self.legend = gui.add_image(np.repeat(colors()[None], LEGEND_SIZE[0], axis=0), visible=False)
+            self.marks = gui.add_markdown("", visible=False)
+            exposure = gui.add_slider("exposure", min(-8.0, viewer.exposure), max(8.0, viewer.exposure), 0.1, viewer.exposure,
+                                      hint="Stops")
+            tonemap = gui.add_dropdown("tone mapping", TONEMAPS, initial_value=viewer.tonemap)
+            self.resolution = gui.add_dropdown("resolution", tuple(RESOLUTIONS), initial_value="full",
+                                               hint="Of the viewport's pixels")
+        cost.on_update(lambda event: viewer.change(cost="" if cost.value == PICTURE else cost.value))
+        for control in (exposure, tonemap):
+            control.on_update(lambda event: viewer.tone(float(exposure.value), tonemap.value))
+
+        @self.resolution.on_update
+        async def resized(event: Any) -> None:
+            client = self.server.get_clients().get(self.watching)
+            if client is not None:
+                await self._moved(client.camera)
+
+    def _set_angle(self, fov_y: float) -> None:
+        for client in self.server.get_clients().values():
+            client.camera.fov = fov_y  # and the client tells that its camera changed
+
+    def _set_lens(self, **fields: float) -> None:
+        self.viewer.change(camera=lambda camera: replace(camera, **fields))
+
+    def _focus_at(self, x: float, y: float) -> None:
+        distance = self.viewer.focus_at(x, y)
+        if distance is not None:
+            self.focus.value = distance
+            self._set_lens(focus_distance=distance)
+
+    def _save(self, client: Any, suffix: str) -> None:
+        picture = self.viewer.picture()
+        if client is None or picture is None:
+            return
+        client.send_file_download(f"{self.name}{suffix}", encoded(picture, suffix), save_immediately=True)
+
+    def _give_camera(self, client: Any) -> None:
+        if client is None:
+            return
+        text = camera_toml(self.viewer.view.camera)
+        with client.gui.add_modal("Camera") as modal:
+            client.gui.add_markdown(f"```toml\n{text}```")
+            save = client.gui.add_button("save as a file")
+            close = client.gui.add_button("close")
+        save.on_click(lambda event: client.send_file_download("camera.toml", text.encode(), save_immediately=True))
+        close.on_click(lambda event: modal.close())
+
+
+def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
+    """A picture, or the codes (h, w, 3) of a heat map, as a file's content."""
+    if isinstance(picture, np.ndarray):
+        return encode_png(picture)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"picture{suffix}"
+        picture.save(path)
+        return path.read_bytes()
+
+
+def nice(value: float) -> float:
+    """The nearest power of ten times 1, 2 or 5 that is no smaller."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= value * (1.0 - 1e-9))
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """viser greets on stdout, which is for data."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
