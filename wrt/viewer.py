@@ -168,7 +168,7 @@ class Viewer:
         if accel not in self._renderers:
             return accel
         stats = self._renderers[accel].accel.stats
-        return f"{accel}: {stats.nodes:,} nodes, {stats.bytes / 2**20:.1f} MiB, built in {stats.build_seconds:.2f} s"
+        return f"{accel}: {stats.nodes:,} nodes, {stats.bytes / 2**20:.1f} MiB, {stats.build_seconds:.2f} s"
 
     def picture(self) -> Film | np.ndarray | None:
         """What was shown last, to be saved: a Film (with exposure and tone mapping), or the codes (h, w, 3) of a heat map."""

@@ -63,7 +63,8 @@ def status(shown: Shown, viewer: Viewer) -> str:
         what = f"**{shown.view.cost}** a pixel: mean {short(shown.mean)}, largest {short(shown.largest)}"
     else:
         what = f"**{shown.spp} of {viewer.spp} spp**"
-    return f"{what}  \n{rays}  \n{width}x{height}{', coarse' if shown.scale > 1 else ''}; {viewer.structure(shown.view.accel)}"
+    size = f"{width}x{height}{', coarse' if shown.scale > 1 else ''}"
+    return f"{what}, {size}  \n{rays}  \n{viewer.structure(shown.view.accel)}"
 
 
 class Page:
@@ -179,7 +180,7 @@ class Page:
         gui, unit = self.server.gui, self.unit
         widest = nice(max(4.0 * camera.aperture_radius, 0.05 * unit))
         with gui.add_folder("Lens"):
-            angle = gui.add_slider("angle of view", 5.0, 120.0, 0.5, min(max(math.degrees(camera.fov_y), 5.0), 120.0),
+            angle = gui.add_slider("angle of view", 5.0, 120.0, 0.5, min(max(round(math.degrees(camera.fov_y), 2), 5.0), 120.0),
                                    hint="Vertical, degrees")
             aperture = gui.add_slider("aperture", 0.0, widest, widest / 200.0, camera.aperture_radius,
                                       hint="Its radius in scene units; 0 is a pinhole")
