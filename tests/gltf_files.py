@@ -122,3 +122,27 @@ def load_warned(path: Path, **options: Any) -> tuple[Any, list[str]]:
         scene = load_gltf(path, **options)
     assert all(w.category is SceneWarning for w in caught)
     return scene, [str(w.message) for w in caught]
+
+
+def rich_file() -> GltfFile:
+    """A small file that uses nearly all that the reader reads."""
+    file = with_light({"type": "spot", "spot": {"innerConeAngle": 0.1}}, translation=[0, 1, 0], rotation=[0, 0, 0, 1])
+    rows, values = file.view(bytes([1])), file.view(np.ones(3, np.float32).tobytes())
+    texture = {"index": file.add("textures", {"source": file.image(np.zeros((2, 2, 4), np.uint8)), "sampler": 0})}
+    file.add("samplers", {"wrapS": 33071})
+    material = file.add("materials", {
+        "pbrMetallicRoughness": {"baseColorTexture": {
+            **texture, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}}},
+        "alphaMode": "MASK", "alphaCutoff": 0.4, "emissiveFactor": [1, 0, 0], "normalTexture": {**texture, "scale": 2},
+        "extensions": {"KHR_materials_transmission": {"transmissionFactor": 1}, "KHR_materials_ior": {"ior": 1.4},
+                       "KHR_materials_volume": {"thicknessFactor": 1, "attenuationDistance": 2}}})
+    primitive = file.primitive([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [0, 1, 2, 3], mode=5, material=material)
+    file.json["accessors"][primitive["attributes"]["POSITION"]]["sparse"] = {
+        "count": 1, "indices": {"bufferView": rows, "componentType": 5121}, "values": {"bufferView": values}}
+    primitive["attributes"]["TEXCOORD_0"] = file.accessor([[0, 0], [9, 0], [0, 9], [9, 9]], "uint8", normalized=True)
+    instances = {"TRANSLATION": file.accessor(TRIANGLE)}
+    leaf = file.node(mesh=file.mesh(primitive), extensions={"EXT_mesh_gpu_instancing": {"attributes": instances}})
+    file.node(children=[leaf], matrix=np.eye(4).ravel().tolist())
+    file.node(camera=file.add("cameras", {"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}))
+    file.json |= {"scenes": [{"nodes": [0, 1, 3, 4]}], "scene": 0, "extensionsUsed": ["KHR_materials_ior"]}
+    return file

@@ -83,12 +83,13 @@ def as_names(value: Any, what: str) -> tuple[str, ...]:
 
 
 def unknown(name: str, what: str, known: Iterable[str]) -> str:
-    """A sentence on a name that is not known, with the nearest one that is, and all of them."""
+    """A sentence on a name that is not known, with the nearest one that is, and all of them; long names and lists are cut."""
     names = [str(each) for each in known]
-    near = difflib.get_close_matches(name, names, n=1)
+    near = difflib.get_close_matches(name[:100], [each for each in names[:1000] if len(each) <= 100], n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""
-    return f"unknown {what} {name!r}; {hint}known are {', '.join(map(repr, names))}" if names else (
-        f"unknown {what} {name!r}; there are none")
+    more = f" and {len(names) - 100} more" if len(names) > 100 else ""
+    return f"unknown {what} {short(name)}; {hint}known are {', '.join(map(short, names[:100]))}{more}" if names else (
+        f"unknown {what} {short(name)}; there are none")
 
 
 def at_thing(kind: str, name: str) -> str:
@@ -99,11 +100,19 @@ def at_thing(kind: str, name: str) -> str:
 def shown(value: Any) -> str:
     """A value as a message shows it: with its type, where it does not tell that itself, and short."""
     if isinstance(value, str | int | float | tuple | list) or value is None:
-        text = repr(value)
-        return text if len(text) <= 60 else text[:57] + "..."
+        return short(value)
     if isinstance(value, np.ndarray):
         return f"an array {value.shape} of {value.dtype}"
     return _a(type(value).__name__)
+
+
+def short(value: Any, most: int = 60) -> str:
+    """repr(value), cut where it is longer; of what cannot be written, its type."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, tables nested thousands deep
+        return f"{_a(type(value).__name__)} too long to show"
+    return text if len(text) <= most else text[:most - 3] + "..."
 
 
 def _a(name: str) -> str:

@@ -12,6 +12,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from wrt.errors import InputError
+from wrt.memory import require
+from wrt.read_file import open_regular
 
 DIGEST_BYTES = 32
 MAX_HEADER = 1 << 16
@@ -33,16 +35,19 @@ def read_checked(path: str | os.PathLike[str], magic: bytes, what: str,
     """The header and the bytes of the arrays. Raises InputError, which calls it `what`, where it is missing, foreign, damaged,
     or has more than `largest` bytes, of which none is read then."""
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             if file.read(len(magic)) != magic:
-                raise InputError(f"is no {what} of this version", path)
+                raise InputError(f"is no {what} of this version")
             size = os.fstat(file.fileno()).st_size
             if largest is not None and size > largest:
-                raise InputError(f"is damaged: it has {size} bytes, and cannot have more than {largest}", path)
+                raise InputError(f"is damaged: it has {size} bytes, and cannot have more than {largest}")
+            require(2.0 * size, f"a file of {size} bytes")
             file.seek(0)
-            data = memoryview(file.read())
+            data = memoryview(file.read(size))
     except OSError as error:
         raise InputError(error.strerror or str(error), path) from error
+    except InputError as error:
+        raise InputError(str(error), path) from None
     end = bytes(data[: len(magic) + MAX_HEADER]).find(b"\n", len(magic))
     if end < 0 or sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
         raise InputError("is damaged: its checksum does not fit", path)

@@ -178,9 +178,11 @@ class Checkpoint:
         """Put what was read into an empty film."""
         assert self.saved is not None
         at = 0
-        for _, array in film.arrays():
+        for name, array in film.arrays():
             there = film.view(array)
             values = np.frombuffer(self.saved.body[at:at + there.nbytes], there.dtype).reshape(there.shape)
+            if name.startswith("mean") and not np.isfinite(values).all():  # the kernel counts such samples as black
+                raise InputError("is damaged: its film is not finite", self.path)
             film.put(array, values)
             at += there.nbytes
         samples = [film.view(group.samples) for group in film.groups]

@@ -95,7 +95,8 @@ class DeviceFilm:
             m2 = np.where(n < 2.0, np.float32(np.inf), self.picture(film.m2))
             return self.picture(film.mean), m2 / np.maximum(n * (n - 1.0), 1.0)
         mean, variance = self._over_groups()
-        return mean.astype(np.float32), variance.astype(np.float32)
+        with np.errstate(over="ignore"):
+            return mean.astype(np.float32), variance.astype(np.float32)
 
     def error(self) -> float:
         """Estimated root mean square error over pixels and channels, from the spread of the groups; needs two or more.
@@ -108,8 +109,9 @@ class DeviceFilm:
         """Mean of the groups' means and its estimated variance, (H, W, 3) float64, one group in memory at a time; the
         variance is inf where there are no samples."""
         n = len(self.groups)
-        mean = sum(self.picture(film.mean) / np.float64(n) for film in self.groups)
-        variance = sum((self.picture(film.mean) - mean) ** 2 for film in self.groups) / (n * (n - 1.0))
+        with np.errstate(over="ignore", invalid="ignore"):
+            mean = sum(self.picture(film.mean) / np.float64(n) for film in self.groups)
+            variance = sum((self.picture(film.mean) - mean) ** 2 for film in self.groups) / (n * (n - 1.0))
         return np.asarray(mean), np.where(self.samples()[..., None] > 0, variance, np.inf)
 
 

@@ -20,8 +20,10 @@ import numpy as np
 
 from wrt.errors import InputError
 from wrt.gltf_schema import at, read_as
+from wrt.read_file import read_file
 
 GLB_MAGIC = b"glTF"
+BYTES_OF_JSON = 1.0
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 
 SUPPORTED_EXTENSIONS = frozenset({
@@ -144,18 +146,14 @@ class Document:
                 return _decode_data_uri(uri)
         name = _local_name(uri, place)
         try:
-            return (self.path.parent / name).read_bytes()
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or str(error)
-            raise InputError(f"cannot read {name!r}: {reason}", None, place) from None
+            return read_file(self.path.parent / name)
+        except InputError as error:
+            raise InputError(f"cannot read {name!r}: {str(error).removeprefix('cannot be read: ')}", None, place) from None
 
 
 def _read_container(path: Path) -> tuple[Any, bytes | None]:
     """The parsed JSON and the binary chunk of a .gltf or .glb file; the first bytes tell which it is."""
-    try:
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read the file: {getattr(error, 'strerror', None) or error}") from None
+    data = read_file(path, BYTES_OF_JSON)
     if data[:4] == GLB_MAGIC:
         return _read_glb(data)
     if path.suffix.lower() == ".glb":

@@ -8,9 +8,7 @@ Source: Khronos, glTF 2.0 specification, sections 3.8 (texture data) and 3.9 (ma
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
 from typing import Any
 
 import numpy as np
@@ -28,11 +26,9 @@ from wrt.gltf_schema import (
     at,
     exactly,
 )
+from wrt.image_decode import decode_rgba8
 from wrt.scene import BLACK, Color, Material, Texture, as_number, as_vector
 
-MAX_SIDE = 16384
-# Only these formats are tried: pillow has others, such as EPS, that run programs or have no place in glTF.
-_FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF")
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
 _DARKEST = 1e-6  # of an attenuation colour: 0 would need infinite absorption
@@ -120,36 +116,8 @@ class Textures:
             else:
                 raise InputError("has neither a uri nor a bufferView", None, place)
             with at(place):
-                self._images[index] = decode_image(data)
+                self._images[index] = decode_rgba8(data)
         return self._images[index]
-
-
-def decode_image(data: bytes) -> np.ndarray:
-    """An encoded picture as (H, W, 4) uint8, row 0 on top; colour profiles are ignored, as glTF demands.
-
-    Raises InputError where it cannot be decoded, is truncated, has a side beyond MAX_SIDE, or is one of those that pillow
-    refuses as decompression bombs (above some 179 million pixels).
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    Image.init()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # at half of that number
-            with Image.open(io.BytesIO(data), formats=[name for name in _FORMATS if name in Image.OPEN]) as picture:
-                width, height = picture.size
-                if max(width, height) > MAX_SIDE:
-                    raise InputError(f"is {width}x{height}; at most {MAX_SIDE} a side are read")
-                if picture.mode.startswith("I"):  # 16-bit grey: pillow's own conversion clips at 255
-                    grey = (np.asarray(picture).astype(np.int64) // 257).clip(0, 255).astype(np.uint8)
-                    return np.dstack([grey, grey, grey, np.full_like(grey, 255)])
-                return np.array(picture.convert("RGBA"))
-    except InputError:
-        raise
-    except Exception as error:  # pillow's decoders raise many kinds, and a scene file is untrusted
-        unknown = isinstance(error, UnidentifiedImageError)
-        reason = f"it is none of {', '.join(_FORMATS)}" if unknown else str(error)
-        raise InputError(f"the image cannot be decoded: {reason}") from None
 
 
 def _uv_transform(transform: TextureTransform, place: str) -> np.ndarray:

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from wrt.arguments import short
 from wrt.errors import InputError
 
 
@@ -208,5 +209,4 @@ def _join(place: str, name: str) -> str:
 
 
 def _wrong(expected: str, raw: Any, place: str) -> InputError:
-    text = repr(raw)
-    return InputError(f"must be {expected}, got {text if len(text) <= 60 else text[:57] + '...'}", None, place or None)
+    return InputError(f"must be {expected}, got {short(raw)}", None, place or None)

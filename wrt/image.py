@@ -1,14 +1,13 @@
 """Image files: PNG (8 and 16 bit), OpenEXR and Radiance HDR, each written whole or not at all.
 
 Rows run from the top down. Colours in memory are linear Rec. 709; a PNG or JPEG file holds sRGB codes. OpenImageIO
-reads and writes EXR and HDR, Pillow reads the rest. PNG is encoded here: Pillow writes no 16-bit RGB, and OpenImageIO's
-PNG writer spoils text outside of ASCII and reports success on a full disk.
+reads and writes EXR and HDR, Pillow reads the rest (wrt.image_decode). PNG is encoded here: Pillow writes no 16-bit RGB, and
+OpenImageIO's PNG writer spoils text outside of ASCII and reports success on a full disk.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import struct
 import uuid
@@ -21,6 +20,9 @@ from typing import Any
 import numpy as np
 
 from wrt.errors import InputError, SceneWarning
+from wrt.image_decode import FORMATS as FORMATS_READ
+from wrt.image_decode import check_size, decode_png16, decode_rgba8, png_texts
+from wrt.read_file import read_file
 from wrt.tonemap import decode_srgb, to_codes
 
 PathLike = str | os.PathLike[str]
@@ -30,6 +32,9 @@ FORMATS: dict[str, tuple[int, ...]] = {".png": (8, 16), ".exr": (32, 16), ".hdr"
 DISPLAY_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga")  # read as sRGB codes
 LINEAR_SUFFIXES = (".exr", ".hdr")
 METADATA_PREFIX = "wrt:"  # what a file's text entries of ours begin with
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_MAGIC = {".exr": (b"\x76\x2f\x31\x01",), ".hdr": (b"#?RADIANCE", b"#?RGBE")}
+MAX_LINEAR_PIXELS = 1 << 28  # of an environment: 24576x10922, or 16384x16384
 HALF_MAX = 65504.0
 EXACT_IN_FLOAT = 1 << 24  # every integer up to here is a float32
 
@@ -233,7 +238,7 @@ def encode_png(codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> 
     header = struct.pack(">IIBBBBB", width, height, 8 * codes.dtype.itemsize, 2, 0, 0, 0)
     texts = [chunk(b"iTXt", (METADATA_PREFIX + key).encode("latin-1", "replace")[:79] + bytes(5) + _utf8(value))
              for key, value in (metadata or {}).items()]
-    return b"".join([b"\x89PNG\r\n\x1a\n", chunk(b"IHDR", header), chunk(b"sRGB", b"\0"), *texts,
+    return b"".join([PNG_MAGIC, chunk(b"IHDR", header), chunk(b"sRGB", b"\0"), *texts,
                      chunk(b"IDAT", zlib.compress(filtered.tobytes(), 6)), chunk(b"IEND", b"")])
 
 
@@ -244,18 +249,18 @@ def read_image(path: PathLike) -> np.ndarray:
     """The colours of an image file: (H, W, 3) float32, linear.
 
     EXR: R, G, B, or one channel taken three times; HDR as it is; PNG, JPEG and the like decoded from sRGB, 16-bit PNG
-    in full. Alpha is left out, not applied. Raises InputError where the file is missing, truncated, or no picture.
+    in full. Alpha is left out, not applied. Raises InputError where the file is missing, truncated, too large, or no picture.
     """
-    _check_readable(path)
     suffix = Path(path).suffix.lower()
     if suffix in LINEAR_SUFFIXES:
         return _pick_colors(read_channels(path), path)
     if suffix not in DISPLAY_SUFFIXES:
+        _read(path)
         raise InputError(f"not an image format that wrt reads ({', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)})", path)
-    # The whole file is decoded even where it has 16 bits: unlike OpenImageIO, Pillow refuses each truncated file.
-    codes = read_rgba8(path)[..., :3]
-    if _is_png16(path):
-        codes = np.rint(_pick_colors(read_channels(path), path) * 65535.0).astype(np.uint16)
+    data = _read(path)
+    with _told(path):
+        deep = data[:8] == PNG_MAGIC and data[24:25] == b"\x10"
+        codes = decode_png16(data) if deep else decode_rgba8(data, _formats(path))[..., :3]
     levels = np.iinfo(codes.dtype).max
     return decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)[codes]
 
@@ -264,67 +269,90 @@ def read_rgba8(source: PathLike | bytes, name: str = "") -> np.ndarray:
     """A PNG, JPEG, ... file, or its bytes, as (H, W, 4) uint8 codes; alpha is 255 where the file has none.
 
     16-bit channels keep their high byte. name: what an error calls the file (default: its path). Raises InputError
-    where the file is missing, truncated, or no picture.
+    where the file is missing, truncated, too large, or no picture.
     """
-    from PIL import Image
-
     name = name or ("image" if isinstance(source, bytes) else os.fspath(source))
-    if not isinstance(source, bytes):
-        _check_readable(source)
-    try:
-        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as image:
-            if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip to 255
-                return _grey_to_rgba(np.asarray(image).astype(np.uint32) >> 8)
-            return np.array(image.convert("RGBA"))
-    except Exception as error:  # decoders raise nearly anything on a broken file
-        raise InputError(f"cannot be read as an image: {error}", name) from error
+    data = source if isinstance(source, bytes) else _read(source)
+    with _told(name):
+        return decode_rgba8(data, FORMATS_READ if isinstance(source, bytes) else _formats(source))
 
 
 def read_channels(path: PathLike) -> dict[str, np.ndarray]:
-    """Every channel of the first part of an image file by name: (H, W) float32; integer codes are scaled to [0, 1].
+    """Every channel of the first part of an EXR or HDR file by name: (H, W) float32.
 
-    Raises InputError where the file is missing, truncated, or no picture.
+    Raises InputError where the file is missing, truncated, too large, or no such picture.
     """
-    import OpenImageIO as oiio
-
-    _check_readable(path)
-    hints = oiio.ImageSpec()
-    hints.attribute("oiio:UnassociatedAlpha", 1)  # colours as the file has them
-    source = oiio.ImageInput.open(os.fspath(path), hints)
-    if source is None:
-        raise InputError(f"cannot be read as an image: {' '.join(oiio.geterror().split())}", path)
-    try:
+    with _opened(path) as source:
+        spec = source.spec()
+        with _told(path):
+            check_size(spec.width, spec.height, 8.0 * spec.nchannels, MAX_LINEAR_PIXELS)
+        if spec.depth > 1 or spec.deep:
+            raise InputError("cannot be read as an image: it has no flat pixels", path)
         pixels = source.read_image("float")
         if pixels is None:
-            raise InputError(f"cannot be read as an image: {' '.join(source.geterror().split())}", path)
-        return {name: pixels[..., i] for i, name in enumerate(source.spec().channelnames)}
-    finally:
-        source.close()
+            raise InputError(f"cannot be read as an image: {_reason(source.geterror)}", path)
+        return {name: pixels[..., i] for i, name in enumerate(spec.channelnames)}
 
 
 def read_metadata(path: PathLike) -> dict[str, str]:
     """What wrt wrote about a picture into its PNG, EXR or HDR file, as text by key; empty where there is nothing."""
-    import OpenImageIO as oiio
-
-    _check_readable(path)
-    if Path(path).suffix.lower() == ".hdr":
-        head = Path(path).read_bytes().split(b"\n\n", 1)[0].decode(errors="replace")
-        pairs = [line[2:].split("=", 1) for line in head.splitlines() if line.startswith("# ") and "=" in line]
+    if Path(path).suffix.lower() not in LINEAR_SUFFIXES:
+        pairs = list(png_texts(_read(path)).items())
+    elif Path(path).suffix.lower() == ".hdr":
+        head = _read(path).split(b"\n\n", 1)[0].decode(errors="replace")
+        lines = [line[2:].partition("=") for line in head.splitlines() if line.startswith("# ")]
+        pairs = [(key, value) for key, equals, value in lines if equals]
     else:
-        source = oiio.ImageInput.open(os.fspath(path))
-        if source is None:
-            raise InputError(f"cannot be read as an image: {' '.join(oiio.geterror().split())}", path)
-        pairs = [[entry.name, str(entry.value)] for entry in source.spec().extra_attribs]
-        source.close()
+        with _opened(path) as source:
+            entries = source.spec().extra_attribs
+            pairs = [(entry.name, str(entry.value)) for entry in entries if entry.name.startswith(METADATA_PREFIX)]
     return {key.removeprefix(METADATA_PREFIX): value for key, value in pairs if key.startswith(METADATA_PREFIX)}
 
 
-def _check_readable(path: PathLike) -> None:
+def _read(path: PathLike) -> bytes:
     try:
-        with open(path, "rb"):
-            pass
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path) from error
+        return read_file(path)
+    except InputError as error:
+        raise InputError(str(error), path) from None
+
+
+def _formats(path: PathLike) -> tuple[str, ...]:
+    """What a file of that name may hold; TGA only where it says so, since nothing in it does."""
+    return ("TGA",) if Path(path).suffix.lower() == ".tga" else FORMATS_READ
+
+
+@contextlib.contextmanager
+def _told(name: PathLike) -> Iterator[None]:
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error), name) from error.__cause__
+
+
+@contextlib.contextmanager
+def _opened(path: PathLike) -> Iterator[Any]:
+    """An EXR or HDR file in OpenImageIO. Its first bytes are looked at first: it would try all the formats that it knows."""
+    data = _read(path)[:16]
+    if not data.startswith(_MAGIC[Path(path).suffix.lower()]):
+        raise InputError(f"cannot be read as an image: it is no {Path(path).suffix.lower()} file", path)
+    import OpenImageIO as oiio
+
+    oiio.attribute("try_all_readers", 0)
+    source = oiio.ImageInput.open(os.fspath(path))
+    if source is None:
+        raise InputError(f"cannot be read as an image: {_reason(oiio.geterror)}", path)
+    try:
+        yield source
+    finally:
+        source.close()
+
+
+def _reason(geterror: Callable[[], str]) -> str:
+    """What OpenImageIO tells, on one line."""
+    try:
+        return " ".join(geterror().split()) or "unknown error"
+    except UnicodeDecodeError:  # it quotes names from the file
+        return "its names are no text"
 
 
 def _pick_colors(channels: Mapping[str, np.ndarray], path: PathLike) -> np.ndarray:
@@ -335,14 +363,3 @@ def _pick_colors(channels: Mapping[str, np.ndarray], path: PathLike) -> np.ndarr
     if len(single) != 1:
         raise InputError(f"has no channels R, G, B; it has {', '.join(channels)}", path)
     return np.repeat(single[0][..., None], 3, axis=-1)
-
-
-def _is_png16(path: PathLike) -> bool:
-    with open(path, "rb") as file:
-        head = file.read(25)
-    return head[:8] == b"\x89PNG\r\n\x1a\n" and head[24] == 16
-
-
-def _grey_to_rgba(grey: np.ndarray) -> np.ndarray:
-    opaque = np.full(grey.shape, 255)
-    return np.stack([grey, grey, grey, opaque], axis=-1).astype(np.uint8)

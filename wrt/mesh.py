@@ -155,12 +155,12 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
     path = as_path(path, "path")
     if path.suffix.lower() not in READERS:
         raise InputError(f"is no mesh file: known are {', '.join(READERS)}", path)
-    if not path.is_file():
-        raise InputError("is a directory" if path.is_dir() else "no such file", path)
+    if not path.exists():
+        raise InputError("no such file", path)
     try:
         raw = _reader(path.suffix.lower())(path)
-    except (OSError, MemoryError) as error:
-        raise InputError(f"cannot be read: {error}", path) from error
+    except InputError as error:
+        raise error if error.path is not None else InputError(str(error), path) from None
     if len(raw.faces) == 0:
         raise InputError(f"holds no triangles ({raw.positions} positions, {raw.incomplete} faces of fewer than 3 "
                          "corners)", path)

@@ -15,13 +15,16 @@ from typing import NoReturn
 
 import numpy as np
 
+from wrt.arguments import short
 from wrt.errors import InputError
 from wrt.mesh import RawMesh
 from wrt.polygons import triangulate
+from wrt.read_file import read_file
 
 # What stands in a corner `v/vt/vn`, and how many numbers of a line of it are kept.
 _KEEP = {"v": 3, "vt": 2, "vn": 3}
-_CORNER = "face corner {!r} is not v, v/vt, v//vn or v/vt/vn"
+BYTES_OF_TEXT = 60.0  # of memory that a byte of the file takes at most, measured
+_CORNER = "face corner {} is not v, v/vt, v//vn or v/vt/vn"
 
 
 class _Text:
@@ -84,7 +87,7 @@ class _Text:
                 count = len(self.lines[key])
                 index = self.integer(part, corner, line)
                 if not -count <= index < 0:
-                    self.fail(line, f"face corner {corner!r}: {key} index {index}, but only {count} {key} stand before")
+                    self.fail(line, f"face corner {short(corner)}: {key} index {short(index)}, but only {count} {key} stand before")
                 parts[i] = str(count + 1 + index)
         return "/".join(parts)
 
@@ -92,7 +95,7 @@ class _Text:
         try:
             return int(part)
         except ValueError:
-            self.fail(line, _CORNER.format(corner))
+            self.fail(line, _CORNER.format(short(corner)))
 
     def array(self, key: str) -> np.ndarray:
         """(N, 2 or 3) float64 of all `key` lines."""
@@ -104,7 +107,7 @@ class _Text:
                 try:
                     float(number)
                 except ValueError:
-                    self.fail(self.lines[key][i // keep], f"{key} holds {number!r}, which is not a number")
+                    self.fail(self.lines[key][i // keep], f"{key} holds {short(number)}, which is not a number")
             raise
         return values.reshape(-1, _KEEP[key])
 
@@ -123,11 +126,12 @@ class _Text:
         for corner, i in place.items():
             for k, part in enumerate(corner.split("/")):
                 if k > 2 or (k == 0 and not part):
-                    self.fail(self._first_line(index, i), _CORNER.format(corner))
+                    self.fail(self._first_line(index, i), _CORNER.format(short(corner)))
                 if part:
-                    different[i, k] = int(part) if part.isdecimal() else 0
-                    if not 1 <= different[i, k] <= len(self.lines[keys[k]]):
-                        self.fail(self._first_line(index, i), f"face corner {corner!r}: {keys[k]} index {part} is not "
+                    number = int(part) if part.isdecimal() and len(part) < 19 else 0
+                    different[i, k] = number
+                    if not 1 <= number <= len(self.lines[keys[k]]):
+                        self.fail(self._first_line(index, i), f"face corner {short(corner)}: {keys[k]} index {part[:30]} is not "
                                                               f"in 1 to {len(self.lines[keys[k]])}")
         order = np.lexsort(different.T[::-1])
         rank = np.empty(len(order), dtype=np.int64)
@@ -162,7 +166,7 @@ def read_obj(path: str | os.PathLike[str]) -> RawMesh:
     number for numbers that are none, indices out of range and positions that are not finite.
     """
     text = _Text(Path(path))
-    text.read(Path(path).read_text(encoding="utf-8", errors="replace"))
+    text.read(read_file(path, BYTES_OF_TEXT).decode("utf-8", "replace").replace("\r\n", "\n").replace("\r", "\n"))
     positions = text.array("v")
     corner_triples, corners = text.triples()
     counts = np.array(text.counts, dtype=np.int64)

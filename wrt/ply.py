@@ -15,8 +15,10 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from wrt.errors import InputError
+from wrt.memory import require
 from wrt.mesh import RawMesh
 from wrt.polygons import triangulate
+from wrt.read_file import read_file
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -27,6 +29,8 @@ _SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # what a lis
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
+# Of memory, measured: what a byte of a text file takes at most, and what a value, or list, of rows that are read one by one does.
+BYTES_OF_TEXT, BYTES_OF_VALUE = 30.0, 200.0
 
 
 class _Property(NamedTuple):
@@ -130,12 +134,12 @@ class _Source:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.data = path.read_bytes()
+        self.data = read_file(path)
         form, self.elements, begin = self._header()
         binary = form != "ascii"
         self.stream: _Text | _Binary = _Binary(self.data, begin, _ORDERS[form]) if binary else _Text(self, begin)
         for element in self.elements:
-            if element.rows:
+            if element.rows and element.properties:
                 self._read(element)
 
     def fail(self, message: str, place: str | None = None) -> NoReturn:
@@ -157,7 +161,7 @@ class _Source:
                     pass
                 case ["format", name, *_] if name == "ascii" or name in _ORDERS:
                     form = name
-                case ["element", name, rows] if rows.isdecimal():
+                case ["element", name, rows] if rows.isdecimal() and len(rows) < 19:
                     elements.append(_Element(name, int(rows)))
                 case ["property", "list", count, kind, name] if elements and count in _SIZES and kind in _TYPES:
                     elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[count]))
@@ -174,6 +178,8 @@ class _Source:
     def _read(self, element: _Element) -> None:
         """Read all rows at once where their lists are as long as the first row's (nearly always), else row by row."""
         begin = self.stream.at
+        if element.rows > len(self.data):  # a row has at least one byte
+            self._truncated(element)
         sizes = [len(part) for part in self._row(element, 0)]
         self.stream.at = begin
         fields: list[tuple[str, int]] = []
@@ -184,6 +190,7 @@ class _Source:
             self._truncated(element)
         if table is None or not self._take_table(element, table, sizes):
             self.stream.at = begin
+            require(BYTES_OF_VALUE * element.rows * len(element.properties), f"element {element.name}")
             rows = [self._row(element, row) for row in range(element.rows)]
             for i, p in enumerate(element.properties):
                 element.values[p.name] = np.concatenate([row[i] for row in rows])
@@ -208,7 +215,7 @@ class _Source:
                 count = self.stream.take(p.count_type, 1)
                 if count is None:
                     self._truncated(element, row)
-                if not (count[0] >= 0 and count[0] == int(count[0])):
+                if not (0 <= count[0] < np.inf and count[0] == int(count[0])):
                     self.fail(f"a list of {count[0]:g} values", f"{element.name} {row}")
                 size = int(count[0])
             values = self.stream.take(p.type, size)
@@ -249,6 +256,7 @@ class _Text:
     """Values from words; None where the file ends before. All are float64, which holds every index exactly."""
 
     def __init__(self, source: _Source, begin: int) -> None:
+        require(BYTES_OF_TEXT * (len(source.data) - begin), "the mesh")
         words = source.data[begin:].split()
         self.at = 0
         try:

@@ -16,6 +16,7 @@ from wrt.arguments import unknown
 from wrt.errors import InputError
 from wrt.mesh import Mesh, load_mesh
 from wrt.motion import Motion
+from wrt.read_file import read_file
 from wrt.scene import (
     BLACK,
     CONDUCTORS,
@@ -204,15 +205,13 @@ class _Builder:
         return self._textures[key]
 
     def image(self, path: Path) -> np.ndarray:
-        from wrt.gltf_materials import decode_image
+        from wrt.image_decode import decode_rgba8
 
         if path not in self._images:
             try:
-                self._images[path] = decode_image(path.read_bytes())
-            except OSError as error:
-                raise InputError(f"cannot be read: {error.strerror}", path) from error
+                self._images[path] = decode_rgba8(read_file(path))
             except InputError as error:
-                raise InputError(str(error), path) from error
+                raise InputError(str(error), path) from None
         return self._images[path]
 
     def background(self, table: tables.SceneTable) -> Background:
@@ -286,7 +285,7 @@ class _Builder:
         else:
             parts = tuple((part.first, part.count) for part in table.parts or [])
             path = self.file(str(table.file))
-            key = (path.resolve(), parts)
+            key = (path, parts)
             if key not in self._meshes:
                 self._meshes[key] = load_mesh(path, parts)
         if table.smooth is not None:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wrt.arguments import unknown
+from wrt.arguments import short, unknown
 from wrt.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,12 +35,23 @@ def check(data: dict[str, Any], path: Path) -> SceneTable:
     try:
         return SceneTable.model_validate(data, context=known_keys)
     except ValidationError as error:
-        problems = [_line(each, data, known_keys) for each in error.errors(include_url=False)]
+        problems = _lines(error, data, known_keys)
     if not data.get("include"):
         materials = data.get("materials")
         problems += unknown_materials(data, materials if isinstance(materials, dict) else {})
     raise_all(problems, path)
     raise AssertionError("unreachable: there is at least one problem")
+
+
+def _lines(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> list[str]:
+    """A line for each problem; beyond MOST different ones the rest are only counted: each takes a look at all names."""
+    told: dict[str, None] = {}
+    errors = error.errors(include_url=False)
+    for i, each in enumerate(errors):
+        if len(told) > MOST:
+            return [*told, *(f"problem {j}" for j in range(i, len(errors)))]
+        told[_line(each, data, known_keys)] = None
+    return list(told)
 
 
 def raise_all(problems: Sequence[str], path: Path) -> None:
@@ -68,8 +79,10 @@ def unknown_materials(data: dict[str, Any], known: Iterable[str]) -> list[str]:
                 found += [(f"{at}.materials.{group}", name) for group, name in groups.items()]
             found += [(f"{at}.parts[{j}].material", part.get("material"))
                       for j, part in enumerate(_tables(table.get("parts")))]
-    return [f"{place}: {unknown(name, 'material', names)}" for place, name in found
-            if isinstance(name, str) and name not in names]
+    known_names = set(names)
+    wrong = [(place, name) for place, name in found if isinstance(name, str) and name not in known_names]
+    lines = [f"{place}: {unknown(name, 'material', names)}" for place, name in wrong[:MOST + 1]]
+    return lines + [f"{place}: unknown material" for place, _ in wrong[MOST + 1:]]  # raise_all counts them
 
 
 def _tables(value: Any) -> list[dict[str, Any]]:
@@ -90,17 +103,20 @@ def _line(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) ->
         if kind == "union_tag_not_found":
             return f"{place}.{tag}: is missing"
         choices = [name.strip("'") for name in context["expected_tags"].split(", ")]
-        return f"{place}.{tag}: {unknown(str(context['tag']), tag, choices)}"
+        return f"{place}.{tag}: {unknown(_text(context['tag']), tag, choices)}"
     if kind == "literal_error":
         choices = re.findall("'([^']*)'", context["expected"])
-        return f"{place}: {unknown(str(error['input']), 'value', choices)}"
+        return f"{place}: {unknown(_text(error['input']), 'value', choices)}"
     expected = _EXPECTED[kind].format(**context) if kind in _EXPECTED else error["msg"]
     return f"{place}: got {_shown(error['input'])}, expected {expected}"
 
 
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else short(value)
+
+
 def _shown(value: Any) -> str:
-    text = {True: "true", False: "false"}[value] if isinstance(value, bool) else repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return {True: "true", False: "false"}[value] if isinstance(value, bool) else short(value)
 
 
 def _place(location: Sequence[str | int], data: Any, missing: bool) -> tuple[str, Any]:

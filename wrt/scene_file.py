@@ -13,8 +13,11 @@ from typing import Any
 from wrt.arguments import as_path, shown
 from wrt.errors import InputError, SceneWarning
 from wrt.mesh import READERS, Mesh, load_mesh
+from wrt.read_file import read_file
 from wrt.scene import Material, Object, Scene
 from wrt.staging import stage
+
+BYTES_OF_TOML = 60.0  # of memory that a byte of the file takes at most, measured
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
@@ -91,9 +94,9 @@ LOADERS: dict[str, Callable[[Path], Scene]] = {
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path) from error
+        return tomllib.loads(read_file(path, BYTES_OF_TOML).decode("utf-8-sig"))
+    except InputError as error:
+        raise InputError(str(error), path) from None
     except UnicodeDecodeError as error:
         raise InputError(f"byte {error.start} is not UTF-8 text", path) from error
     except RecursionError:

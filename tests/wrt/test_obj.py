@@ -114,3 +114,10 @@ def test_same_triangles_as_trimesh(name: str) -> None:
         rows = rows[np.arange(len(rows))[:, None], (turn[:, None] + np.arange(3)) % 3].reshape(-1, 9)
         return rows[np.lexsort(rows.T)]
     np.testing.assert_array_equal(key(raw.vertices, raw.faces), key(other.vertices, other.faces))
+
+
+@pytest.mark.parametrize("index", ["99999999999999999999", "9" * 5000, "-" + "9" * 5000])
+def test_indices_of_any_length_are_told(index: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a\.obj: line 5: face corner '") as caught:
+        read_obj(write(tmp_path, f"{SQUARE}f 1 2 {index}\n"))
+    assert len(str(caught.value)) < 300 + len(str(tmp_path))

@@ -133,3 +133,23 @@ def test_same_arrays_as_trimesh(name: str) -> None:
     other = trimesh.load(path, process=False)
     np.testing.assert_array_equal(raw.faces, other.faces)
     np.testing.assert_array_equal(raw.vertices, np.asarray(other.vertices, dtype=np.float32))
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    (b"element vertex 3", b"element vertex 1000000000000", "element vertex: truncated: the header promises 1000000000000"),
+    (b"element vertex 3", b"element vertex " + b"9" * 5000, "line 4: cannot read 'element vertex 999"),
+    (b"element face 1", b"element face 1000000000000", "element face: truncated: the header promises 1000000000000"),
+    (b"element vertex", b"element nothing 1000000000000\nelement vertex", ""),
+    (b" 3 0 1 2", b" inf 0 1 2", "face 0: a list of inf values"),
+    (b" 3 0 1 2", b" nan 0 1 2", "face 0: a list of nan values"),
+    (b" 3 0 1 2", b" 1e300 0 1 2", "element face: truncated"),
+])
+def test_absurd_counts(old: bytes, new: bytes, message: str, tmp_path: Path) -> None:
+    data = ply("ascii", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+    assert old in data
+    path = write(tmp_path, data.replace(old, new))
+    if not message:  # rows that hold nothing need no room
+        assert len(read_ply(path).faces) == 1
+        return
+    with pytest.raises(InputError, match=message):
+        read_ply(path)

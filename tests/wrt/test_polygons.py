@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+import time
+
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wrt.polygons import triangulate
+from wrt.errors import InputError
+from wrt.polygons import MAX_CORNERS, triangulate
 
 
 def area_vectors(points: np.ndarray) -> np.ndarray:
@@ -67,3 +71,22 @@ def test_broken_polygons_end() -> None:
         triangles, _ = triangulate(np.array(corners), np.array([len(corners)]), points)
         assert triangles.shape == (len(corners) - 2, 3)
     assert triangulate(np.zeros(0, int), np.zeros(0, int), points)[0].shape == (0, 3)
+
+
+def test_a_polygon_of_many_corners() -> None:
+    """A convex one is a fan, whatever its size; a concave one takes time, and ends at a limit."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 1_000_000, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    assert len(triangulate(np.arange(len(circle)), np.array([len(circle)]), circle)[0]) == len(circle) - 2
+    n = MAX_CORNERS + 2
+    star = circle[:: len(circle) // n][:n] * np.where(np.arange(n) % 2, 1.0, 0.5)[:, None]
+    with pytest.raises(InputError, match=f"polygon 0: is concave and has {n} corners; at most {MAX_CORNERS} can be cut"):
+        triangulate(np.arange(n), np.array([n]), star)
+
+
+def test_tangled_polygons_end_soon() -> None:
+    points = np.random.default_rng(0).random((1000, 3))
+    begin = time.perf_counter()
+    triangles, _ = triangulate(np.arange(1000), np.array([1000]), points)
+    assert triangles.shape == (998, 3) and time.perf_counter() - begin < 10.0
+    assert (np.bincount(triangles.ravel(), minlength=1000) > 0).all()

@@ -1,0 +1,146 @@
+"""A long run of the fuzzer: `python -m tests.fuzz --inputs 1000000 --workers 2 --out FOLDER`.
+
+Each reader gets its share of the inputs. Workers are processes of their own, so that a crash or a hang costs one input, which is
+counted and saved. The same seed gives the same inputs: `--format ply --first 1234 --inputs 1` makes that one again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tests.fuzz.formats import FORMATS, make_case
+
+HANG = 10.0  # seconds
+POLL = 0.1
+START = 300.0  # seconds that a worker may take to compile before its first case
+AT_ONCE = 20_000  # inputs a process
+
+
+@dataclass
+class Tally:
+    """What came of one format's inputs."""
+
+    inputs: int = 0
+    read: int = 0
+    refused: int = 0
+    crashes: int = 0
+    hangs: int = 0
+    seconds: float = 0.0
+    slowest: tuple[float, int] = (0.0, -1)
+    defects: dict[str, list[int]] = field(default_factory=dict)  # by their first line
+
+
+class Run:
+    """Inputs first to first + count of one format."""
+
+    def __init__(self, name: str, seed: int, out: Path) -> None:
+        self.name, self.seed, self.out, self.tally = name, seed, out, Tally()
+
+    def work(self, first: int, count: int) -> None:
+        end = first + count
+        while first < end:
+            first = self._process(first, min(end, first + AT_ONCE))
+
+    def _process(self, first: int, end: int) -> int:
+        """One worker; returns the number of the first case that is still to do."""
+        with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as folder:
+            command = [sys.executable, "-m", "tests.fuzz.worker", self.name, str(self.seed), str(first), str(end - first), folder]
+            environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+            with open(Path(folder) / "told", "w+") as told, open(Path(folder) / "errors", "w+") as errors:
+                process = subprocess.Popen(command, stdout=told, stderr=errors, env=environment)
+                ended = self._watch(process, Path(folder) / "beat")
+                told.seek(0)
+                lines = [json.loads(line) for line in told if line.endswith("\n")]
+                errors.seek(0)
+                text = errors.read()
+            self._count(lines)
+            if lines and "done" in lines[-1]:
+                return end
+            last = int.from_bytes((Path(folder) / "beat").read_bytes(), "little") - 1 if (Path(folder) / "beat").exists() else -1
+            if last < 0:
+                raise SystemExit(f"{self.name}: the worker did not begin ({ended}): {text}")
+            setattr(self.tally, ended, getattr(self.tally, ended) + 1)
+            self.tally.inputs += last + 1 - first
+            self._defect(last, f"{ended}: exit code {process.returncode}\n{text}")
+            return last + 1
+
+    def _watch(self, process: subprocess.Popen[bytes], beat: Path) -> str:
+        """Wait for its end; kill it where a case takes longer than HANG. Counted in polls: whoever stops us both is no hang."""
+        number, polls = b"", 0
+        while process.poll() is None:
+            time.sleep(POLL)
+            now = beat.read_bytes() if beat.exists() else b""
+            number, polls = now, polls + 1 if now == number else 0
+            if polls * POLL > (HANG if any(number) else START):
+                process.kill()
+                process.wait()
+                return "hangs"
+        return "crashes"
+
+    def _count(self, lines: list[dict[str, Any]]) -> None:
+        for line in lines:
+            if "problem" in line:
+                self._defect(line["number"], line["problem"])
+            else:
+                self.tally.inputs += line["done"]
+                self.tally.read += line["read"]
+                self.tally.refused += line["refused"]
+                self.tally.seconds += line["seconds"]
+                self.tally.slowest = max(self.tally.slowest, tuple(line["slowest"]))
+
+    def _defect(self, number: int, problem: str) -> None:
+        numbers = self.tally.defects.setdefault(problem.split("\n")[0], [])
+        numbers.append(number)
+        if len(numbers) <= 3:  # the rest are alike
+            case = make_case(FORMATS[self.name], random.Random(f"{self.seed} {self.name} {number}"))
+            self.out.mkdir(parents=True, exist_ok=True)
+            (self.out / f"{self.name}-{number}{case.suffix}").write_bytes(case.data)
+            (self.out / f"{self.name}-{number}.txt").write_text(problem)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser.add_argument("--inputs", type=int, default=80_000, help="over all formats together")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--format", action="append", choices=list(FORMATS), help="only these")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="number of the first input of each format")
+    parser.add_argument("--out", type=Path, default=Path("fuzz-defects"), help="where inputs that show a defect are kept")
+    given = parser.parse_args()
+    names = given.format or list(FORMATS)
+    shutil.rmtree(given.out, ignore_errors=True)
+    runs = [Run(name, given.seed, given.out) for name in names]
+    begin = time.perf_counter()
+    with ThreadPoolExecutor(given.workers) as pool:
+        for run, future in [(run, pool.submit(run.work, given.first, -(-given.inputs // len(names)))) for run in runs]:
+            future.result()
+            tally = run.tally
+            slowest, which = tally.slowest
+            print(
+                f"{run.name}: {tally.inputs} inputs, {tally.read} read, {tally.refused} refused,"
+                f" {tally.crashes} crashes, {tally.hangs} hangs, {sum(map(len, tally.defects.values()))} defects;"
+                f" slowest {slowest:.2f} s (number {which}), {1e3 * tally.seconds / max(tally.inputs, 1):.2f} ms each",
+                flush=True,
+            )
+            for problem, numbers in sorted(tally.defects.items(), key=lambda item: -len(item[1])):
+                print(f"  {len(numbers)} x {problem} ({', '.join(map(str, numbers[:3]))})", flush=True)
+    total = sum(run.tally.inputs for run in runs)
+    defects = sum(len(numbers) for run in runs for numbers in run.tally.defects.values())
+    print(f"{total} inputs, {defects} defects, {time.perf_counter() - begin:.0f} s")
+    raise SystemExit(1 if defects else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,335 @@
+"""The readers under test: of each, sound files, ways to damage them, and what reads them."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import struct
+import tempfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+from tests.fuzz import seeds
+from tests.fuzz.mutate import BYTES, INTEGERS, TEXT, mutate, mutate_tree
+from tests.fuzz.seeds import Seed
+from tests.gltf_files import pack_glb
+
+
+@dataclass(frozen=True)
+class Format:
+    """seeds: sound files; damaged: a file made of one of them; read: whatever it raises but InputError is a defect."""
+
+    seeds: Callable[[], list[Seed]]
+    damaged: Callable[[Seed, Seed, Random], Seed]
+    read: Callable[[Path], object]
+
+
+def make_case(form: Format, rng: Random) -> Seed:
+    """A damaged file."""
+    sound = form.seeds()
+    return form.damaged(rng.choice(sound), rng.choice(sound), rng)
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+@cache
+def toml_words() -> list[str]:
+    """Every key and every choice of the schema."""
+    from wrt.scene_file import schema
+
+    found: set[str] = set()
+    stack: list[Any] = [schema()]
+    while stack:
+        value = stack.pop()
+        if isinstance(value, dict):
+            found |= set(value.get("properties", {})) | {each for each in value.get("enum", []) if isinstance(each, str)}
+            found |= {value["const"]} if isinstance(value.get("const"), str) else set()
+            stack += value.values()
+        elif isinstance(value, list):
+            stack += value
+    return sorted(found) + list(seeds.SIDE_FILES) + ["../a.png", "/dev/zero", "/dev/stdin", ".", "nowhere.obj", "pipe"]
+
+
+def toml_text(value: Any) -> str:
+    """A TOML value, inline; what TOML has no words for becomes text."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(key)} = {toml_text(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml_text, value)) + "]"
+    if isinstance(value, int | float):
+        return repr(value)
+    return json.dumps(value if isinstance(value, str) else str(value))
+
+
+def damaged_toml(seed: Seed, other: Seed, rng: Random) -> Seed:
+    import tomllib
+
+    if rng.random() < 0.4:
+        return Seed(".toml", mutate(seed.data, rng, TEXT + BYTES[:2], other.data))
+    tree = mutate_tree(tomllib.loads(seed.data.decode()), rng, toml_words())
+    if not isinstance(tree, dict):
+        return seed
+    return Seed(".toml", "\n".join(f"{json.dumps(key)} = {toml_text(value)}" for key, value in tree.items()).encode())
+
+
+GLTF_WORDS = (
+    "POSITION", "NORMAL", "TEXCOORD_0", "TANGENT", "TRANSLATION", "ROTATION", "SCALE", "byteOffset", "byteLength", "byteStride",
+    "count", "sparse", "normalized", "componentType", "type", "mode", "indices", "uri", "bufferView", "extensions", "matrix",
+    "children", "mesh", "camera", "weights", "translation", "rotation", "scale", "KHR_texture_transform",
+    "EXT_mesh_gpu_instancing", "KHR_materials_unlit", "KHR_lights_punctual", "VEC2", "VEC4", "MAT4", "point", "directional",
+    "a.png", "../a.png", "thing.glb", "/dev/zero", "pipe", "http://example.org/a.png",
+    "data:application/octet-stream;base64,AAAA", "data:image/png;base64,!", "%00", "%2e%2e/a.png", ".",
+)
+
+
+def damaged_gltf(seed: Seed, other: Seed, rng: Random) -> Seed:
+    """Its JSON, its buffer, or the bytes of the container; sizes fit after the first two."""
+    glb = seed.suffix == ".glb"
+    if rng.random() < 0.2:
+        return Seed(seed.suffix, mutate(seed.data, rng, BYTES if glb else TEXT + BYTES[:2], other.data))
+    length = struct.unpack_from("<I", seed.data, 12)[0]
+    tree = json.loads(seed.data[20 : 20 + length] if glb else seed.data)
+    binary = seed.data[28 + length :] if glb else base64.b64decode(tree["buffers"][0]["uri"].partition(",")[2])
+    if rng.random() < 0.8:
+        tree = mutate_tree(tree, rng, GLTF_WORDS)
+    else:
+        binary = mutate(binary, rng, BYTES)
+        if not glb:
+            tree["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(binary).decode()
+    text = json.dumps(tree).encode()
+    return Seed(".glb", pack_glb(text, binary)) if glb else Seed(".gltf", text)
+
+
+def read_scene(path: Path) -> object:
+    from wrt.scene_file import load_scene
+
+    return load_scene(path)
+
+
+# --- meshes -----------------------------------------------------------------------------------------------------------
+
+
+def damaged_mesh(seed: Seed, other: Seed, rng: Random) -> Seed:
+    text = b"\0" not in seed.data or rng.random() < 0.3
+    return Seed(seed.suffix, mutate(seed.data, rng, TEXT + BYTES[:2] if text else BYTES, other.data))
+
+
+def read_mesh(path: Path) -> object:
+    from wrt.mesh import load_mesh
+
+    return load_mesh(path)
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def damaged_image(seed: Seed, other: Seed, rng: Random) -> Seed:
+    if seed.data[:4] == b"\x89PNG" and rng.random() < 0.7:
+        return Seed(seed.suffix, damaged_png(seed.data, rng))
+    suffix = seed.suffix if rng.random() < 0.95 else other.suffix
+    steps = TEXT + BYTES if seed.suffix == ".hdr" else BYTES
+    return Seed(suffix, mutate(seed.data, rng, steps, other.data))
+
+
+def damaged_png(data: bytes, rng: Random) -> bytes:
+    """Chunks that are changed, moved, left out or doubled, with checksums that fit."""
+    chunks, begin = [], 8
+    while begin + 8 <= len(data):
+        length = struct.unpack_from(">I", data, begin)[0]
+        chunks.append((data[begin + 4 : begin + 8], data[begin + 8 : begin + 8 + length]))
+        begin += 12 + length
+    for _ in range(rng.randint(1, 3)):
+        i = rng.randrange(len(chunks))
+        kind, body = chunks[i]
+        what = rng.randrange(8)
+        if kind == b"IHDR" and what < 6:
+            fields = list(struct.unpack(">IIBBBBB", body.ljust(13, b"\0")[:13]))
+            j = rng.randrange(7)
+            fields[j] = rng.choice(INTEGERS) & (0xFFFFFFFF if j < 2 else 0xFF) if rng.random() < 0.5 else rng.randrange(20)
+            body = struct.pack(">IIBBBBB", *fields)
+        elif what < 3:
+            kind = rng.choice(
+                (
+                    b"IDAT",
+                    b"PLTE",
+                    b"tRNS",
+                    b"iCCP",
+                    b"zTXt",
+                    b"iTXt",
+                    b"tEXt",
+                    b"acTL",
+                    b"fcTL",
+                    b"fdAT",
+                    b"gAMA",
+                    b"eXIf",
+                    b"IEND",
+                )
+            )
+        elif what == 3 and kind == b"IDAT":
+            with contextlib.suppress(zlib.error):
+                body = zlib.compress(mutate(zlib.decompress(body), rng, BYTES))
+        elif what == 4:
+            chunks.insert(rng.randrange(len(chunks)), (kind, body))
+        elif what == 5 and len(chunks) > 1:
+            del chunks[i]
+            continue
+        else:
+            body = mutate(body, rng, BYTES)
+        chunks[i] = (kind, body)
+    return data[:8] + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
+    )
+
+
+def read_picture(path: Path) -> object:
+    """As an environment, as a texture, and what is written about it."""
+    from wrt.errors import InputError
+    from wrt.image import read_image, read_metadata
+    from wrt.image_decode import decode_rgba8
+
+    results: list[object] = []
+    for read in (read_image, lambda path: decode_rgba8(path.read_bytes()), read_metadata):
+        try:
+            results.append(read(path))
+        except InputError as error:
+            results.append(error)
+    refused = [result for result in results if isinstance(result, InputError)]
+    by_memory = [error for error in refused if isinstance(error.__cause__, MemoryError)]
+    if len(refused) == len(results) or by_memory:
+        raise (by_memory or refused)[0]
+    return results
+
+
+# --- checked files ----------------------------------------------------------------------------------------------------
+
+
+def damaged_checked(seed: Seed, other: Seed, rng: Random) -> Seed:
+    """Header or arrays changed, most often with a checksum that fits, as somebody with bad intentions would write it."""
+    if rng.random() < 0.05:
+        return Seed(seed.suffix, mutate(seed.data, rng, BYTES, other.data))
+    magic, header, body = seed.data.split(b"\n", 2)
+    body = body[:-32]
+    if rng.random() < 0.3:
+        tree = mutate_tree(
+            json.loads(header), rng, ("bvh2", "bvh4", "bvh8", "bvh8c", "grid", "kdtree", "octree", "brute_force", "fast", "order")
+        )
+        header = json.dumps(tree).encode() if rng.random() < 0.9 else mutate(header, rng, TEXT)
+    else:
+        body = damaged_numbers(body, rng) if rng.random() < 0.8 else mutate(body, rng, BYTES)
+    data = b"\n".join([magic, header, body])
+    return Seed(seed.suffix, data + sha256(data).digest())
+
+
+def damaged_numbers(body: bytes, rng: Random) -> bytes:
+    """Some 4-byte numbers replaced: by others from the same array, by neighbours, by extremes."""
+    numbers = np.frombuffer(body[: len(body) // 4 * 4], "<u4").copy()
+    for _ in range(rng.choice((1, 1, 1, 2, 5, 50)) if len(numbers) else 0):
+        i = rng.randrange(len(numbers))
+        special = (0, 1, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFF, 0x7F800000, 0xFF800000, 0x7FC00000, 0x00000001, rng.randrange(200))
+        numbers[i] = rng.choice(
+            (
+                numbers[rng.randrange(len(numbers))],
+                int(numbers[i]) + 1 & 0xFFFFFFFF,
+                int(numbers[i]) - 1 & 0xFFFFFFFF,
+                int(numbers[i]) ^ 1 << rng.randrange(32),
+                rng.choice(special),
+            )
+        )
+    return numbers.tobytes() + body[len(numbers) * 4 :]
+
+
+@cache
+def ball() -> Any:
+    from wrt.shapes import icosphere
+
+    return icosphere(1)
+
+
+@cache
+def rays() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return (2.0 * rng.normal(size=(24, 3))).astype(np.float32), rng.normal(size=(24, 3)).astype(np.float32)
+
+
+@cache
+def accel_seeds() -> list[Seed]:
+    from wrt.accel import ACCELERATORS, build
+
+    found = []
+    with tempfile.TemporaryDirectory() as name:
+        for accel in sorted({cls.name for cls in ACCELERATORS.values()}):
+            for triangle in ("watertight", "moeller_trumbore"):
+                path = Path(name) / "a.accel"
+                build(ball(), accel, threads=1, triangle=triangle).save(path)
+                found.append(Seed(".accel", path.read_bytes()))
+    return found
+
+
+def read_accel(path: Path) -> object:
+    """Read, and walked by rays: a link that leads nowhere shows only then."""
+    accel = load_accel_only(path)
+    return accel.closest_hit(*rays())
+
+
+def load_accel_only(path: Path) -> Any:
+    from wrt.accel.store import load_accel
+
+    return load_accel(path, ball(), threads=1)
+
+
+IDENTITY = {"seed": 0, "crop": [0, 0, 6, 4], "scene": "x", "kernels": "y"}
+
+
+def _checkpoint(path: Path, groups: int) -> tuple[Any, Any]:
+    from wrt.checkpoint import Checkpoint
+    from wrt.device import start
+    from wrt.device_film import DeviceFilm
+    from wrt.scene import Settings
+
+    film = DeviceFilm(Settings(size=(6, 4)), (0, 0, 6, 4), start("cpu"), 0, groups)
+    return film, Checkpoint(path, 60.0, {**IDENTITY, "groups": groups}, area=24, groups=groups, resume=True)
+
+
+@cache
+def checkpoint_seeds() -> list[Seed]:
+    found = []
+    for groups in (1, 4):
+        with tempfile.TemporaryDirectory() as name:
+            film, checkpoint = _checkpoint(Path(name) / "a.checkpoint", groups)
+            rng = np.random.default_rng(0)
+            for label, array in film.arrays():
+                film.put(array, np.full((4, 6), 3) if label.startswith("samples") else rng.random(film.view(array).shape) * 9)
+            checkpoint.save(film, 1.5)
+            found.append(Seed(f".checkpoint{groups}", checkpoint.path.read_bytes()))
+            checkpoint._release()
+    return found
+
+
+def read_checkpoint(path: Path) -> object:
+    film, checkpoint = _checkpoint(path, int(path.suffix[-1]))
+    checkpoint.restore(film)
+    return film.pixels_and_variance()
+
+
+FORMATS: dict[str, Format] = {
+    "toml": Format(seeds.scenes, damaged_toml, read_scene),
+    "gltf": Format(seeds.gltf, damaged_gltf, read_scene),
+    "obj": Format(seeds.obj, damaged_mesh, read_mesh),
+    "ply": Format(seeds.ply, damaged_mesh, read_mesh),
+    "stl": Format(seeds.stl, damaged_mesh, read_mesh),
+    "image": Format(seeds.images, damaged_image, read_picture),
+    "accel": Format(accel_seeds, damaged_checked, read_accel),
+    "checkpoint": Format(checkpoint_seeds, damaged_checked, read_checkpoint),
+}

@@ -1,0 +1,98 @@
+"""Pictures by strangers: their size is looked at first, few formats are tried, and 16 bits come whole."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from wrt import image
+from wrt.errors import InputError
+from wrt.image_decode import decode_png16, decode_rgba8, png_texts
+
+
+def png(codes: np.ndarray, color_type: int, interlaced: bool = False) -> bytes:
+    """A 16-bit PNG, each row with another filter (1 and 2 by hand, the rest none)."""
+    height, width = codes.shape[:2]
+    raw = b"".join(b"\0" + row.astype(">u2").tobytes() for row in codes)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, color_type, 0, 0, interlaced)) + chunk(
+        b"IDAT", zlib.compress(raw)) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(("channels", "color_type"), [(1, 0), (3, 2), (2, 4), (4, 6)])
+def test_sixteen_bits_come_whole(channels: int, color_type: int) -> None:
+    codes = np.random.default_rng(0).integers(0, 65536, (5, 7, channels)).astype(np.uint16)
+    expected = codes[..., :3] if channels > 2 else np.repeat(codes[..., :1], 3, axis=2)
+    data = png(codes, color_type)
+    assert np.array_equal(decode_png16(data), expected)
+    assert np.array_equal(decode_rgba8(data)[..., :3], expected >> 8)
+    with pytest.raises(InputError, match="cannot be read as an image"):
+        decode_png16(data[:-40])
+
+
+def exr_header(width: int, height: int) -> bytes:
+    """An OpenEXR file of that size, and nothing behind its header."""
+    def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:
+        return name + b"\0" + kind + b"\0" + struct.pack("<I", len(value)) + value
+
+    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    channels = b"".join(name + b"\0" + struct.pack("<iB3xii", 2, 0, 1, 1) for name in (b"B", b"G", b"R")) + b"\0"
+    return b"\x76\x2f\x31\x01\2\0\0\0" + b"".join([
+        attribute(b"channels", b"chlist", channels), attribute(b"compression", b"compression", b"\0"),
+        attribute(b"dataWindow", b"box2i", window), attribute(b"displayWindow", b"box2i", window),
+        attribute(b"lineOrder", b"lineOrder", b"\0"), attribute(b"pixelAspectRatio", b"float", struct.pack("<f", 1.0)),
+        attribute(b"screenWindowCenter", b"v2f", struct.pack("<2f", 0.0, 0.0)),
+        attribute(b"screenWindowWidth", b"float", struct.pack("<f", 1.0))]) + b"\0"
+
+
+@pytest.mark.parametrize("size", [(30000, 30000), (40000, 1), (1, 40000), (2**30, 2**30)])
+@pytest.mark.parametrize("suffix", [".png", ".exr", ".hdr", ".bmp"])
+def test_bombs_are_refused_by_their_headers(suffix: str, size: tuple[int, int], tmp_path: Path) -> None:
+    width, height = size
+    data = {".png": png(np.zeros((1, 1, 3)), 2), ".exr": exr_header(width, height),
+            ".hdr": f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode(),
+            ".bmp": b"BM" + struct.pack("<IIIIiiHHIIiiII", 70, 0, 54, 40, width, height, 1, 24, 0, 16, 0, 0, 0, 0)}[suffix]
+    if suffix == ".png":
+        data = data[:16] + struct.pack(">II", *size) + data[24:29] + struct.pack(">I", zlib.crc32(
+            b"IHDR" + struct.pack(">II", *size) + data[24:29])) + data[33:]
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=rf"a\{suffix}: cannot be read as an image: ") as caught:
+        image.read_image(path)
+    if max(size) < 2**20 and size[0] * size[1] < 2**27:  # beyond, some libraries have words of their own
+        assert f"it is {width}x{height}; at most 32768 a side and" in str(caught.value)
+
+
+def test_a_picture_larger_than_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WRT_MEMORY", "1G")
+    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8000 +X 16000\n")
+    with pytest.raises(InputError, match=r"a\.hdr: a picture of 16000x8000 takes 2\.9 GiB of memory; 1\.0 GiB are free"):
+        image.read_image(tmp_path / "a.hdr")
+
+
+@pytest.mark.parametrize("form", ["TIFF", "PPM", "ICO", "PCX", "EPS", "TGA"])
+def test_no_other_format_is_tried(form: str, tmp_path: Path) -> None:
+    """Whatever the file is called: Pillow and OpenImageIO know many more, and some run programs."""
+    buffer = io.BytesIO()
+    Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(buffer, form)
+    with pytest.raises(InputError, match="none of PNG, JPEG, WEBP, AVIF, BMP, GIF"):
+        decode_rgba8(buffer.getvalue())
+    for suffix in (".png", ".exr", ".hdr"):
+        (tmp_path / f"a{suffix}").write_bytes(buffer.getvalue())
+        with pytest.raises(InputError, match=rf"a\{suffix}: cannot be read as an image: it is no"):
+            image.read_image(tmp_path / f"a{suffix}")
+
+
+def test_texts_of_a_png() -> None:
+    data = image.encode_png(np.zeros((1, 1, 3), np.uint8), {"a": "ö", "b": "x\0y"})
+    assert png_texts(data) == {"wrt:a": "ö", "wrt:b": "x\0y"}
+    assert png_texts(data[:50]).keys() <= {"wrt:a"} and png_texts(b"") == {}

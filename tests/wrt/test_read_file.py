@@ -1,0 +1,77 @@
+"""Only regular files are read, and whatever is not one is told at once: pipes and devices may have no end."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz.seeds import scenes, side_files
+from tests.gltf_files import one_triangle
+from wrt.accel.store import load_accel
+from wrt.checkpoint import read
+from wrt.errors import InputError
+from wrt.image import read_image
+from wrt.read_file import read_file
+from wrt.scene_file import load_scene
+from wrt.shapes import icosphere
+
+
+@pytest.fixture
+def pipe(tmp_path: Path) -> Path:
+    os.mkfifo(tmp_path / "pipe")
+    return tmp_path / "pipe"
+
+
+def test_bytes_come_whole(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"\0\1\r\n" * 1000)
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    assert read_file(tmp_path / "a") == read_file(tmp_path / "link") == b"\0\1\r\n" * 1000
+
+
+@pytest.mark.parametrize(("path", "message"), [
+    ("/dev/zero", "no regular file"), ("/dev/null", "no regular file"), (".", "Is a directory"), ("a\0b", "null byte"),
+    ("nowhere", "No such file"), ("x" * 5000, "name too long"), ("/proc/self/mem/x", "Not a directory"),
+])
+def test_what_is_no_file(path: str, message: str) -> None:
+    with pytest.raises(InputError, match=f"cannot be read: .*{message}"):
+        read_file(path)
+
+
+def test_a_file_larger_than_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open(tmp_path / "a.obj", "wb") as file:
+        file.truncate(1 << 30)  # takes no room on the disk
+    monkeypatch.setenv("WRT_MEMORY", "0.5G")
+    with pytest.raises(InputError, match=r"a\.obj: a file of 1073741824 bytes takes .* of memory; 512 MiB|0\.5 GiB are free"):
+        load_scene(tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize("suffix", [".toml", ".gltf", ".glb", ".obj", ".ply", ".stl", ".exr", ".hdr", ".png", ".accel",
+                                    ".checkpoint"])
+def test_no_reader_waits_for_a_pipe(suffix: str, pipe: Path) -> None:
+    path = pipe.rename(pipe.with_suffix(suffix))
+    readers = {".accel": lambda path: load_accel(path, icosphere(0)), ".checkpoint": read}
+    readers |= dict.fromkeys((".exr", ".hdr", ".png"), read_image)
+    with pytest.raises(InputError, match=rf"pipe\{suffix}: .*no regular file"):
+        readers.get(suffix, load_scene)(path)
+
+
+@pytest.mark.parametrize("name", ["pipe", "/dev/zero", "a\\u0000b", "a.png/x"])
+@pytest.mark.parametrize("old", ['file = "sky.hdr"', 'file = "a.png"', 'file = "box.obj"'])
+def test_nor_does_a_scene_that_names_one(old: str, name: str, pipe: Path, tmp_path: Path) -> None:
+    side_files(tmp_path)
+    (tmp_path / "pipe.obj").symlink_to(pipe)
+    (tmp_path / "pipe.hdr").symlink_to(pipe)
+    new = f"{name}{old[-5:-1]}" if old[-4:-1] in ("obj", "hdr") and name[0] != "/" else name
+    (tmp_path / "a.toml").write_text(scenes()[0].data.decode().replace(old, f'file = "{new}"'))
+    with pytest.raises(InputError, match=r"a\.toml: "):
+        load_scene(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize("uri", ["pipe", "a%00b", "."])
+def test_nor_does_a_gltf_file(uri: str, pipe: Path, tmp_path: Path) -> None:
+    file = one_triangle()
+    file.json["buffers"] = [{"byteLength": len(file.binary), "uri": uri}]
+    with pytest.raises(InputError, match=r"buffers\[0\]\.uri: "):
+        load_scene(file.write(tmp_path, "a.gltf"))

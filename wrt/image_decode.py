@@ -1,0 +1,98 @@
+"""Pictures of display codes (PNG, JPEG and the like) from bytes, through Pillow. They may come from anybody: the size is looked at
+before anything is decoded, and only a few formats are tried."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from wrt.errors import InputError
+from wrt.memory import require
+
+# Pillow has others, such as EPS, that run programs or have no place here.
+FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF")
+MAX_SIDE = 32768  # pixels
+MAX_PIXELS = 1 << 27  # of codes: 16384x8192
+BYTES_OF_PIXEL = 12.0  # while it is decoded: Pillow's picture, its copy as RGBA, and the array
+
+
+def check_size(width: int, height: int, bytes_of_pixel: float, most: int = MAX_PIXELS) -> None:
+    """Raise InputError where a picture is too large to be read, with its size and the limit."""
+    if max(width, height) > MAX_SIDE or width * height > most:
+        limits = f"at most {MAX_SIDE} a side and {most} pixels are read"
+        raise InputError(f"cannot be read as an image: it is {width}x{height}; {limits}")
+    require(width * height * bytes_of_pixel, f"a picture of {width}x{height}")
+
+
+def decode_rgba8(data: bytes, formats: tuple[str, ...] = FORMATS) -> np.ndarray:
+    """An encoded picture as (H, W, 4) uint8 codes, row 0 on top; alpha is 255 where there is none.
+
+    16-bit channels keep their high byte; colour profiles are ignored. Raises InputError where it cannot be decoded, is truncated or
+    too large.
+    """
+    with _opened(data, formats) as picture:
+        if picture.mode.startswith("I"):  # 16-bit grey, which Pillow would clip to 255
+            grey = (np.asarray(picture).astype(np.uint32) >> 8).astype(np.uint8)
+            return np.dstack([grey, grey, grey, np.full_like(grey, 255)])
+        return np.array(picture.convert("RGBA"))
+
+
+def decode_png16(data: bytes) -> np.ndarray:
+    """A PNG of 16 bits a channel as (H, W, 3) uint16 codes, without its alpha. Raises InputError as decode_rgba8 does.
+
+    Pillow keeps only one byte of each channel of a colour picture: the high one, or the low one where it is told that the file has
+    the other order. Grey with alpha has four bytes a pixel: as RGBA, they come all.
+    """
+    with _opened(data, ("PNG",)) as picture:
+        order = picture.tile[0][3] if picture.tile else ""
+        if picture.mode.startswith("I"):
+            return np.repeat(np.asarray(picture).astype(np.uint16)[..., None], 3, axis=2)
+        if order == "LA;16B":
+            picture.tile = [(*tile[:3], "RGBA") for tile in picture.tile]
+            high, low = (np.repeat(np.asarray(picture)[..., i:i + 1], 3, axis=2) for i in (0, 1))
+        else:
+            high = np.asarray(picture)[..., :3]
+            with _opened(data, ("PNG",)) as other:
+                other.tile = [(*tile[:3], str(tile[3]).replace(";16B", ";16L")) for tile in other.tile]
+                low = np.asarray(other)[..., :3]
+        return high.astype(np.uint16) << 8 | low
+
+
+@contextmanager
+def _opened(data: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
+    """The picture, whose pixels are decoded when they are asked for."""
+    from PIL import Image, UnidentifiedImageError
+
+    Image.init()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of pictures above half of Pillow's own limit, of metadata that nobody asks for
+            with Image.open(io.BytesIO(data), formats=[name for name in formats if name in Image.OPEN]) as picture:
+                check_size(*picture.size, BYTES_OF_PIXEL)
+                yield picture
+    except InputError:
+        raise
+    except UnidentifiedImageError:
+        raise InputError(f"cannot be read as an image: it is none of {', '.join(formats)}") from None
+    except Exception as error:  # decoders raise nearly anything on a broken file
+        raise InputError(f"cannot be read as an image: {' '.join(str(error).split()) or type(error).__name__}") from error
+
+
+def png_texts(data: bytes) -> dict[str, str]:
+    """The uncompressed iTXt entries of a PNG file (as `encode_png` writes them) that stand before its pixels, by keyword."""
+    texts, begin = {}, 8
+    while begin + 8 <= len(data):
+        length, kind = int.from_bytes(data[begin:begin + 4], "big"), data[begin + 4:begin + 8]
+        if kind == b"IDAT":
+            break
+        if kind == b"iTXt":
+            keyword, _, rest = data[begin + 8:begin + 8 + length].partition(b"\0")
+            if rest[:1] == b"\0":  # not compressed; then a method, a language and a translation of the keyword
+                texts[keyword.decode("latin-1")] = rest[2:].split(b"\0", 2)[-1].decode("utf-8", "replace")
+        begin += 12 + length
+    return texts

@@ -1,0 +1,42 @@
+"""The way in for files that strangers have made or named."""
+
+from __future__ import annotations
+
+import os
+import stat
+from typing import BinaryIO
+
+from wrt.errors import InputError
+from wrt.memory import require
+
+
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+    """A regular file, open for reading.
+
+    Raises InputError, without the path, for a folder, and for a pipe or a device, whose end may never come. OSError comes through.
+    """
+    try:
+        # A pipe that nobody writes to would keep us waiting when it is opened.
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    except ValueError as error:  # a name with a zero byte in it
+        raise InputError(f"cannot be read: {error}") from None
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        raise InputError(f"cannot be read: {'Is a directory' if stat.S_ISDIR(mode) else 'no regular file'}")
+    return open(descriptor, "rb")
+
+
+def read_file(path: str | os.PathLike[str], factor: float = 1.0) -> bytes:
+    """All bytes of a regular file.
+
+    factor: how many times its size the memory of what becomes of it is. Raises InputError, without the path, where the file
+    cannot be read, is no regular one, or where the memory does not suffice.
+    """
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            require(size * factor, f"a file of {size} bytes")
+            return file.read(size)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}") from None
