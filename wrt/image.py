@@ -22,7 +22,7 @@ import numpy as np
 from wrt.errors import InputError, SceneWarning
 from wrt.image_decode import FORMATS as FORMATS_READ
 from wrt.image_decode import check_size, decode_png16, decode_rgba8, png_texts
-from wrt.read_file import read_file
+from wrt.read_file import open_regular, read_file
 from wrt.tonemap import decode_srgb, to_codes
 
 PathLike = str | os.PathLike[str]
@@ -332,8 +332,14 @@ def _told(name: PathLike) -> Iterator[None]:
 @contextlib.contextmanager
 def _opened(path: PathLike) -> Iterator[Any]:
     """An EXR or HDR file in OpenImageIO. Its first bytes are looked at first: it would try all the formats that it knows."""
-    data = _read(path)[:16]
-    if not data.startswith(_MAGIC[Path(path).suffix.lower()]):
+    try:
+        with open_regular(path) as file:
+            first = file.read(16)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", path) from error
+    except InputError as error:
+        raise InputError(str(error), path) from None
+    if not first.startswith(_MAGIC[Path(path).suffix.lower()]):
         raise InputError(f"cannot be read as an image: it is no {Path(path).suffix.lower()} file", path)
     import OpenImageIO as oiio
 
