@@ -178,8 +178,14 @@ def info(scene: Path, camera: str | None, as_json: bool) -> None:
 
 
 @cli.command()
-def schema() -> None:
+@click.option("--markdown", is_flag=True, help="As a page to read, docs/scene_format.md")
+def schema(markdown: bool) -> None:
     """Print the JSON Schema of scene files."""
+    if markdown:
+        from wrt.scene_reference import scene_format
+
+        click.echo(scene_format(), nl=False)
+        return
     from wrt.scene_file import schema as scene_schema
 
     click.echo(json.dumps(scene_schema(), indent=2))

@@ -25,11 +25,21 @@ def _or_one(values: dict[str, Any], count: int) -> WithJsonSchema:
     return WithJsonSchema({"anyOf": [values, array]})
 
 
+def unit(name: str) -> Any:
+    """Says in the schema what a number is measured in."""
+    return Field(json_schema_extra={"unit": name})
+
+
+LENGTH, DEGREES = unit("length"), unit("degrees")
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[float], Field(min_length=16, max_length=16)]
 Positive = Annotated[float, Field(gt=0.0)]
+Point = Annotated[list[float], Field(min_length=3, max_length=3), LENGTH]
+Length = Annotated[float, Field(gt=0.0), LENGTH]
+Angle = Annotated[float, DEGREES]
+Angles = Annotated[list[float], Field(min_length=3, max_length=3), DEGREES]
 Share = Annotated[  # a colour that reflects or transmits
     list[Unit], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
     _or_one({"type": "number", "minimum": 0, "maximum": 1}, 3)]
@@ -93,7 +103,7 @@ class _PlacedImage(Table):
     scale: Scale2 = Field([1.0, 1.0], description="how often the image repeats in one unit of u and of v")
     offset: Annotated[list[float], Field(min_length=2, max_length=2)] = Field(
         [0.0, 0.0], description="added to u and v")
-    rotation: float = Field(0.0, description="about uv (0, 0): turns the image clockwise (degrees)")
+    rotation: Angle = Field(0.0, description="about uv (0, 0): turns the image clockwise")
 
 
 class ImageTable(_PlacedImage):
@@ -147,15 +157,17 @@ class MaterialTable(Table):
         list(_MATERIAL.eta), description="real part of the index of refraction at red, green, blue (conductor)")
     k: Radiance = Field(list(_MATERIAL.k), description="imaginary part of the index of refraction (conductor)")
     ior: float = Field(_MATERIAL.ior, ge=1.0, le=10.0, description="index of refraction (glass, metallic_roughness)")
-    absorption: Radiance = Field(list(_MATERIAL.absorption), description="absorbed per unit length inside: what is "
-                                 "left after a length d is exp(-absorption d) (glass, metallic_roughness)")
+    absorption: Annotated[Radiance, unit("1 / length")] = Field(
+        list(_MATERIAL.absorption), description="per unit length inside: what is left after a length d is exp(-absorption d) "
+        "(glass, metallic_roughness)")
     thin: bool = Field(_MATERIAL.thin, description="an infinitely thin pane: nothing is bent (glass, "
                        "metallic_roughness)")
     metallic: Unit = Field(_MATERIAL.metallic, description="0 dielectric, 1 metal (metallic_roughness)")
     roughness: Unit = Field(_MATERIAL.roughness, description="perceptual roughness, the GGX alpha is its square; 0 "
                             "is a perfect mirror (conductor, glass, metallic_roughness)")
     transmission: Unit = Field(_MATERIAL.transmission, description="share that is transmitted (metallic_roughness)")
-    emission: Radiance = Field(list(_MATERIAL.emission), description="emitted radiance, of the front side")
+    emission: Annotated[Radiance, unit("radiance")] = Field(
+        list(_MATERIAL.emission), description="of the front side")
     two_sided: bool = Field(_MATERIAL.two_sided, description="both sides emit")
     emits_light: bool = Field(_MATERIAL.emits_light, description="the emission lights other surfaces (false: it is "
                               "only seen)")

@@ -12,9 +12,15 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from wrt import scene
 from wrt.material_schema import (
+    DEGREES,
+    LENGTH,
+    Angle,
+    Angles,
+    Length,
     MaterialTable,
     Matrix,
     NotNegative,
+    Point,
     Positive,
     Radiance,
     Scale3,
@@ -24,32 +30,35 @@ from wrt.material_schema import (
     Unit,
     Vector,
     require_one,
+    unit,
 )
 
 # --- cameras, background, settings ------------------------------------------------------------------------------------
 
 _CAMERA = scene.Camera()
 _SETTINGS = scene.Settings()
+RADIANCE = unit("radiance")
 
 
 class CameraTable(Table):
     """A pinhole, or a thin lens where it has an aperture. Give position and target, or matrix; fov_y, or
     focal_length."""
 
-    position: Vector | None = Field(None, description="where the camera stands")
-    target: Vector | None = Field(None, description="the point in the middle of the picture")
+    position: Point | None = Field(None, description="where the camera stands")
+    target: Point | None = Field(None, description="the point in the middle of the picture")
     up: Vector = Field([0.0, 1.0, 0.0], description="what is up in the picture")
     matrix: Matrix | None = Field(None, description="camera to world, row by row; the camera looks along -z, +y is up")
-    fov_y: float | None = Field(None, gt=0.0, lt=179.9, description="full vertical angle of view (degrees; default 45)")
-    focal_length: Positive | None = Field(None, description="of a real lens, in place of fov_y (scene units)")
-    sensor_height: Positive | None = Field(None, description="of a real lens (scene units)")
+    fov_y: Annotated[float, Field(gt=0.0, lt=179.9), DEGREES] | None = Field(
+        None, description="full vertical angle of view (default: 45)")
+    focal_length: Length | None = Field(None, description="of a real lens, in place of fov_y")
+    sensor_height: Length | None = Field(None, description="of a real lens")
     f_number: Positive | None = Field(
         None, description="of a real lens: the aperture's radius is focal_length / (2 f_number)")
-    aperture_radius: float | None = Field(None, ge=0.0, description="0 is a pinhole (scene units)")
-    focus_distance: Positive | None = Field(
-        None, description="along the axis to what is sharp (scene units; default: the distance to target, else 1)")
+    aperture_radius: Annotated[NotNegative, LENGTH] | None = Field(None, description="0 is a pinhole (default: 0)")
+    focus_distance: Length | None = Field(
+        None, description="along the axis to what is sharp (default: the distance to target, else 1)")
     blades: int = Field(_CAMERA.blades, ge=0, le=64, description="0: a round aperture; from 3 on its number of sides")
-    blade_rotation: float = Field(0.0, description="turns the aperture (degrees)")
+    blade_rotation: Angle = Field(0.0, description="turns the aperture")
 
     @model_validator(mode="after")
     def _check(self) -> CameraTable:
@@ -78,15 +87,15 @@ class ConstantTable(Table):
     """The same radiance from everywhere."""
 
     type: Literal["constant"]
-    color: Radiance = Field([0.0, 0.0, 0.0], description="radiance")
+    color: Annotated[Radiance, RADIANCE] = Field([0.0, 0.0, 0.0], description="from every direction")
 
 
 class GradientTable(Table):
     """Linear in the direction's y."""
 
     type: Literal["gradient"]
-    bottom: Radiance = Field(list(scene.GradientBackground().bottom), description="radiance from straight below (-y)")
-    top: Radiance = Field(list(scene.GradientBackground().top), description="radiance from straight above (+y)")
+    bottom: Annotated[Radiance, RADIANCE] = Field(list(scene.GradientBackground().bottom), description="from straight below (-y)")
+    top: Annotated[Radiance, RADIANCE] = Field(list(scene.GradientBackground().top), description="from straight above (+y)")
 
 
 class EnvironmentTable(Table):
@@ -95,14 +104,14 @@ class EnvironmentTable(Table):
     type: Literal["environment"]
     file: str = Field(description="image (.exr, .hdr, or sRGB), relative to the scene file")
     scale: NotNegative = Field(1.0, description="multiplies the image")
-    rotation: float = Field(0.0, description="about +y, counter-clockwise seen from above (degrees)")
+    rotation: Angle = Field(0.0, description="about +y, counter-clockwise seen from above")
 
 
 class SettingsTable(Table):
     """How the scene wants to be rendered; the command line can override all of it."""
 
     size: Annotated[list[Annotated[int, Field(ge=1, le=32768)]], Field(min_length=2, max_length=2)] = Field(
-        list(_SETTINGS.size), description="width and height (pixels)")
+        list(_SETTINGS.size), json_schema_extra={"unit": "pixels"}, description="width and height")
     spp: int = Field(_SETTINGS.spp, ge=1, le=1 << 24, description="samples per pixel")
     max_depth: int = Field(_SETTINGS.max_depth, ge=0, le=64, description="bounces after the first hit")
     min_throughput: Unit = Field(_SETTINGS.min_throughput, description="a ray that carries less is cut")
@@ -112,7 +121,8 @@ class SettingsTable(Table):
         "opaque", description="tinted: shadow rays go straight through solid glass")
     sampler: Literal["sobol", "independent"] = Field(
         "sobol", description="how a pixel's samples are spread: evenly, or by independent random numbers")
-    exposure: float = Field(_SETTINGS.exposure, ge=-100.0, le=100.0, description="stops")
+    exposure: float = Field(_SETTINGS.exposure, ge=-100.0, le=100.0, json_schema_extra={"unit": "stops"},
+                            description="doubles what is shown with each")
     tonemap: Literal["none", "reinhard", "aces", "agx"] = Field("none", description="curve from linear to display")
 
 
@@ -122,10 +132,10 @@ class SettingsTable(Table):
 class TransformTable(Table):
     """Scales first, then rotates, then translates; or a matrix."""
 
-    translate: Vector = Field([0.0, 0.0, 0.0], description="last")
-    rotate: Vector = Field([0.0, 0.0, 0.0], description="about x, then y, then z (degrees)")
+    translate: Point = Field([0.0, 0.0, 0.0], description="last")
+    rotate: Angles = Field([0.0, 0.0, 0.0], description="about x, then y, then z")
     axis: Vector | None = Field(None, description="axis of a rotation by `angle`, in place of rotate")
-    angle: float | None = Field(None, description="about axis, counter-clockwise for who looks against it (degrees)")
+    angle: Angle | None = Field(None, description="about axis, counter-clockwise for who looks against it")
     scale: Scale3 = Field([1.0, 1.0, 1.0], description="first; one number or one for each axis")
     matrix: Matrix | None = Field(None, description="object to world, row by row, in place of everything else")
 
@@ -155,8 +165,8 @@ class IncludeTable(Table):
 class SphereTable(Table):
     """An exact sphere."""
 
-    center: Vector = Field(description="its centre")
-    radius: Positive = Field(description="its radius")
+    center: Point = Field(description="its centre")
+    radius: Length = Field(description="its radius")
     material: str = Field(description="name of a material")
     name: str = Field("", description="for messages")
 
@@ -164,9 +174,9 @@ class SphereTable(Table):
 class QuadTable(Table):
     """A parallelogram; its front is towards cross(edge_u, edge_v), uvs run from 0 to 1."""
 
-    corner: Vector = Field(description="lower left for who sees the front upright")
-    edge_u: Vector = Field(description="from the corner to the right")
-    edge_v: Vector = Field(description="from the corner up")
+    corner: Point = Field(description="lower left for who sees the front upright")
+    edge_u: Point = Field(description="from the corner to the right")
+    edge_v: Point = Field(description="from the corner up")
     material: str = Field(description="name of a material")
     name: str = Field("", description="for messages")
 
@@ -174,8 +184,8 @@ class QuadTable(Table):
 class BoxTable(Table):
     """A closed box along the axes, before its transform."""
 
-    low: Vector = Field(description="lowest corner")
-    high: Vector = Field(description="highest corner")
+    low: Point = Field(description="lowest corner")
+    high: Point = Field(description="highest corner")
     material: str = Field(description="name of a material")
     transform: TransformTable | None = Field(None, description="object to world")
     name: str = Field("", description="for messages")
@@ -186,15 +196,15 @@ class IcosphereShape(Table):
 
     kind: Literal["icosphere"]
     subdivisions: Subdivisions = Field(3, description="each makes four triangles of one")
-    radius: Positive = Field(1.0, description="of the ball")
+    radius: Length = Field(1.0, description="of the ball")
 
 
 class TorusShape(Table):
     """A ring around the y axis."""
 
     kind: Literal["torus"]
-    radius: Positive = Field(1.0, description="from the axis to the middle of the tube")
-    tube_radius: Positive = Field(0.35, description="of the tube")
+    radius: Length = Field(1.0, description="from the axis to the middle of the tube")
+    tube_radius: Length = Field(0.35, description="of the tube")
     segments: Segments = Field(64, description="around the axis")
     tube_segments: Segments = Field(32, description="around the tube")
 
@@ -203,7 +213,7 @@ class LatheShape(Table):
     """A profile turned around the y axis."""
 
     kind: Literal["lathe"]
-    profile: Annotated[list[Annotated[list[float], Field(min_length=2, max_length=2)]], Field(min_length=2)] = Field(
+    profile: Annotated[list[Annotated[list[float], Field(min_length=2, max_length=2), LENGTH]], Field(min_length=2)] = Field(
         description="points (radius, height), from the bottom up; one given twice makes a sharp edge")
     segments: Segments = Field(64, description="around the axis")
 
@@ -213,16 +223,16 @@ class PrismShape(Table):
 
     kind: Literal["prism"]
     sides: Segments = Field(3, description="of the polygon")
-    radius: Positive = Field(1.0, description="of the circle through its corners")
-    length: Positive = Field(2.0, description="along z")
+    radius: Length = Field(1.0, description="of the circle through its corners")
+    length: Length = Field(2.0, description="along z")
 
 
 class TubeShape(Table):
     """A round tube along a line of points, with flat ends."""
 
     kind: Literal["tube"]
-    points: Annotated[list[Vector], Field(min_length=2)] = Field(description="the line")
-    radius: Positive | list[Positive] = Field(0.1, description="one, or one for each point")
+    points: Annotated[list[Point], Field(min_length=2)] = Field(description="the line")
+    radius: Length | list[Length] = Field(0.1, description="one, or one for each point")
     segments: Segments = Field(24, description="around the tube")
 
 
@@ -260,8 +270,8 @@ class MorphTable(Table):
 class KeyTable(Table):
     """Where a mesh is at a moment of an animation; between two moments, straight on. Scales, then rotates, then translates."""
 
-    translate: Vector = Field([0.0, 0.0, 0.0], description="last")
-    rotate: Vector = Field([0.0, 0.0, 0.0], description="about x, then y, then z (degrees); a full turn is from 0 to 360")
+    translate: Point = Field([0.0, 0.0, 0.0], description="last")
+    rotate: Angles = Field([0.0, 0.0, 0.0], description="about x, then y, then z; a full turn is from 0 to 360")
     scale: Scale3 = Field([1.0, 1.0, 1.0], description="first; one number or one for each axis")
 
 
@@ -301,8 +311,9 @@ class PointLightTable(Table):
     """A point that shines alike in all directions."""
 
     type: Literal["point"]
-    position: Vector = Field(description="where it is")
-    intensity: Radiance = Field(description="radiant intensity; irradiance falls with the square of the distance")
+    position: Point = Field(description="where it is")
+    intensity: Annotated[Radiance, unit("radiant intensity")] = Field(
+        description="the same in all directions; irradiance falls with the square of the distance")
     name: str = Field("", description="for messages")
 
 
@@ -311,7 +322,7 @@ class DirectionalLightTable(Table):
 
     type: Literal["directional"]
     direction: Vector = Field(description="the way the light travels (any length)")
-    irradiance: Radiance = Field(description="on a surface that faces it")
+    irradiance: Annotated[Radiance, unit("irradiance")] = Field(description="on a surface that faces it")
     name: str = Field("", description="for messages")
 
 
@@ -319,11 +330,11 @@ class SpotLightTable(Table):
     """A point light in a cone."""
 
     type: Literal["spot"]
-    position: Vector = Field(description="where it is")
+    position: Point = Field(description="where it is")
     direction: Vector = Field(description="axis of the cone (any length)")
-    intensity: Radiance = Field(description="radiant intensity on the axis")
-    inner: float = Field(0.0, ge=0.0, le=90.0, description="half angle of full light (degrees)")
-    outer: float = Field(45.0, gt=0.0, le=90.0, description="half angle without light beyond (degrees)")
+    intensity: Annotated[Radiance, unit("radiant intensity")] = Field(description="on the axis")
+    inner: Angle = Field(0.0, ge=0.0, le=90.0, description="half angle of full light")
+    outer: Angle = Field(45.0, gt=0.0, le=90.0, description="half angle without light beyond")
     name: str = Field("", description="for messages")
 
     @model_validator(mode="after")
@@ -337,10 +348,10 @@ class RectangleLightTable(Table):
     """A parallelogram that shines; its front is towards cross(edge_u, edge_v)."""
 
     type: Literal["rectangle"]
-    corner: Vector = Field(description="one corner")
-    edge_u: Vector = Field(description="from it along one side")
-    edge_v: Vector = Field(description="from it along the other")
-    radiance: Radiance = Field(description="emitted, the same in all directions")
+    corner: Point = Field(description="one corner")
+    edge_u: Point = Field(description="from it along one side")
+    edge_v: Point = Field(description="from it along the other")
+    radiance: Annotated[Radiance, RADIANCE] = Field(description="emitted, the same in all directions")
     two_sided: bool = Field(False, description="both sides shine")
     name: str = Field("", description="for messages")
 
@@ -365,7 +376,7 @@ class SceneTable(Table):
                                     description="how the scene wants to be rendered")
     cameras: dict[str, CameraTable] = Field({}, description="by name; the first is the default")
     background: BackgroundTable | None = Field(None, description="what rays that leave the scene see (default: black)")
-    ambient: Radiance = Field([0.0, 0.0, 0.0], description="radiance that every diffuse surface receives, unshadowed")
+    ambient: Annotated[Radiance, RADIANCE] = Field([0.0, 0.0, 0.0], description="what every diffuse surface receives, unshadowed")
     materials: dict[str, MaterialTable] = Field({}, description="by name")
     override: dict[str, MaterialTable] = Field({}, description="replaces the included material of that name")
     spheres: list[SphereTable] = Field([], description="exact spheres")

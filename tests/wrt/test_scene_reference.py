@@ -1,0 +1,95 @@
+"""The page on scene files says what the schema says, and its example is one."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.command_line import wrt as run
+from tests.data import ROOT
+from wrt.scene_check import check
+from wrt.scene_file import load_scene, schema
+from wrt.scene_reference import EXAMPLE, scene_format
+
+PAGE = ROOT / "docs" / "scene_format.md"
+# Numbers that are measured in nothing: shares, counts, factors, directions of any length, indices of refraction.
+NO_UNIT = {
+    "albedo", "alpha", "alpha_cutoff", "axis", "blades", "color_a", "color_b", "count", "direction", "eta", "exponent",
+    "f_number", "first", "ior", "k", "matrix", "max_depth", "metallic", "min_throughput", "normal_scale", "offset", "roughness",
+    "scale", "segments", "sides", "specular", "spp", "subdivisions", "transmission", "tube_segments", "up"}
+
+
+def tables() -> dict[str, Any]:
+    document = schema()
+    return {"SceneTable": document, **document["$defs"]}
+
+
+def test_the_committed_page_is_what_the_command_makes() -> None:
+    result = run("schema", "--markdown")
+    assert result.code == 0 and result.err == ""
+    assert PAGE.read_text(encoding="utf-8") == result.out == scene_format(), (
+        "run: python -m wrt schema --markdown > docs/scene_format.md")
+
+
+def test_every_key_of_every_table_has_a_row() -> None:
+    sections = re.split(r"^### .*\n", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+    found = {tuple(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)) for section in sections}
+    assert found == {tuple(table["properties"]) for table in tables().values()} and len(sections) == len(tables())
+
+
+def numeric(value: Any) -> bool:
+    if value.get("type") in ("number", "integer"):
+        return True
+    parts = [*value.get("anyOf", ()), *([value["items"]] if isinstance(value.get("items"), dict) else [])]
+    return any(numeric(part) for part in parts)
+
+
+def test_every_number_has_a_unit_or_is_known_to_have_none() -> None:
+    for name, table in tables().items():
+        for key, value in table["properties"].items():
+            if numeric(value):
+                assert ('"unit"' in json.dumps(value)) != (key in NO_UNIT), f"{name}.{key}"
+
+
+@pytest.mark.parametrize(("section", "row"), [
+    ("Settings", '| `size` | 2 whole numbers | pixels | `[640, 360]` | 1 to 32768 | width and height |'),
+    ("Camera", "| `fov_y` | number | degrees |  | > 0, < 179.9 | full vertical angle of view (default: 45) |"),
+    ("Sphere", "| `radius` | number | length | required | > 0 | its radius |"),
+    ("Tube", "| `radius` | number or list of numbers | length | `0.1` | > 0 | one, or one for each point |"),
+    ("Mesh", "| `instances` | list of [Transform](#transform) |  |  | 1 or more | the mesh once for each, placed so before"
+             " `transform` places all of them; kept once in memory |"),
+    ("Gradient", "| `top` | 1 or 3 numbers | radiance | `[0.5, 0.7, 1.0]` | >= 0 | from straight above (+y) |"),
+])
+def test_rows(section: str, row: str) -> None:
+    text = PAGE.read_text(encoding="utf-8").split(f"### {section}\n")[1].split("###")[0]
+    assert row in text.splitlines()
+
+
+def test_the_example_is_a_scene_and_shows_most_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "example.toml"
+    page = PAGE.read_text(encoding="utf-8")
+    assert re.findall(r"```toml\n(.*?)```", page, re.DOTALL) == [EXAMPLE]
+    path.write_text(EXAMPLE, encoding="utf-8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = load_scene(path)
+    assert len(scene.cameras) == 2 and {m.kind for m in scene.materials} == {"diffuse", "glass", "conductor"}
+    used: set[str] = set()
+
+    def visit(value: Any) -> None:
+        if hasattr(type(value), "model_fields"):
+            used.add(type(value).__name__)
+            for name in value.model_fields_set:
+                visit(getattr(value, name))
+        elif isinstance(value, list | dict):
+            for each in value.values() if isinstance(value, dict) else value:
+                visit(each)
+
+    visit(check(tomllib.loads(EXAMPLE), path))
+    assert len(used) >= 0.6 * len(tables()) and used >= {"SceneTable", "SettingsTable", "CameraTable", "MaterialTable", "MeshTable"}
