@@ -1,23 +1,24 @@
 """The inner loop of the builders from the top down, on the CPU backend: ranges of primitives are split in place.
 
 In the end the records stand in the order of the leaves. The host launches it once for the top of the tree and then once a
-subtree, on all cores. What differs between builders is how a range is split: CHOOSE is the table of the ways there are.
+subtree, on all cores. What differs between builders is how a range is split: SPLIT is the table of the ways there are.
 """
 
 from functools import cache
 
 import warp as wp
 
+from wrt.kernels.lanes import row_type
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
 
 BIN_COUNT = 32
 BINS = wp.constant(BIN_COUNT)
-# Up to here a range is swept, not binned: that is better, and no slower.
-SMALL_COUNT = 16
-SMALL = wp.constant(SMALL_COUNT)
 # From here on a range is halved by number, which takes ceil(log2(n)) more levels, whatever the SAH would like.
 MAX_DEPTH = wp.constant(STACK_SIZE - 2)
+
+# A box as one row, low corner and negated high one (two lanes are not used): the lower numbers of two rows are the box around both.
+Row = row_type(8)
 
 
 @wp.struct
@@ -30,10 +31,18 @@ class BuildRecord:
 
 
 @wp.struct
+class Measures:
+    """The box of some records, and that of their centroids."""
+
+    box: Row
+    centers: Row
+
+
+@wp.struct
 class BuildTask:
     """A range of records that becomes a child of `parent` (-1: the root): a leaf, or the inner node `slot`.
 
-    lo, hi: its box; center_lo, center_hi: the box of its centroids; limit: the end of the room that it has (spatial splits).
+    limit: the end of the room that it has (spatial splits).
     """
 
     begin: int
@@ -43,17 +52,16 @@ class BuildTask:
     parent: int
     side: int
     depth: int
-    lo: wp.vec3
-    hi: wp.vec3
-    center_lo: wp.vec3
-    center_hi: wp.vec3
+    measures: Measures
 
 
 @wp.struct
 class BuildOptions:
-    """Leaves hold at most max_leaf primitives; the costs are those of the surface area heuristic."""
+    """Leaves hold at most max_leaf primitives; the costs are those of the surface area heuristic: of a node, and of a row of
+    primitives, which are tested at once."""
 
     max_leaf: int
+    row: int
     cost_traversal: float
     cost_intersection: float
 
@@ -75,26 +83,88 @@ class BuildData:
 
 
 @wp.struct
+class Bins:
+    """Bins of centroids along each axis, 1 / scale long, from origin on. scale is 0 where the centroids cannot be told apart:
+    where they coincide, or are so close together (or so far apart) that it over- or underflows."""
+
+    count: int
+    origin: wp.vec3
+    scale: wp.vec3
+
+
+@wp.struct
 class Split:
-    """The chosen split: records whose bin along `axis` is below `bin` go left. axis < 0: none was found."""
+    """The chosen split: records whose bin along `axis` is below `bin` go left. axis < 0: none was found. Boxes of both sides."""
 
     axis: int
     bin: int
     cost: float
+    box_0: Row
+    box_1: Row
+
+
+@wp.struct
+class Halves:
+    """A split range whose records stand in their places: where the right side begins, and what both measure."""
+
+    middle: int
+    left: Measures
+    right: Measures
 
 
 @wp.func
-def area_scale(task: BuildTask) -> float:
+def rows_of(options: BuildOptions, n: int) -> float:
+    """How many rows n primitives fill."""
+    return float((n + options.row - 1) / options.row)
+
+
+@wp.func
+def row_of(lo: wp.vec3, hi: wp.vec3) -> Row:
+    return Row(lo[0], lo[1], lo[2], -hi[0], -hi[1], -hi[2], 0.0, 0.0)
+
+
+@wp.func
+def empty_row() -> Row:
+    return Row(wp.inf, wp.inf, wp.inf, wp.inf, wp.inf, wp.inf, 0.0, 0.0)
+
+
+@wp.func
+def low_of(row: Row) -> wp.vec3:
+    return wp.vec3(row[0], row[1], row[2])
+
+
+@wp.func
+def high_of(row: Row) -> wp.vec3:
+    return wp.vec3(-row[3], -row[4], -row[5])
+
+
+@wp.func
+def lower(a: Row, b: Row) -> Row:
+    """The lower number of each lane. (Warp's own minimum minds NaN, which takes three times as long.)"""
+    out = Row()
+    for k in range(8):
+        out[k] = wp.where(b[k] < a[k], b[k], a[k])
+    return out
+
+
+@wp.func
+def area_scale(box: Row) -> float:
     """The factor that makes a range's longest side 1, so that no area under- or overflows: what `half_area` wants."""
-    e = 0.5 * task.hi - 0.5 * task.lo
+    e = 0.5 * high_of(box) - 0.5 * low_of(box)
     return 1.0 / wp.max(wp.max(wp.max(e[0], e[1]), e[2]), 2.0**-126.0)
 
 
 @wp.func
-def half_area(lo: wp.vec3, hi: wp.vec3, scale: float) -> float:
+def half_area(box: Row, scale: float) -> float:
     """Half the surface of a box, in units of a range's own size; 0 for an empty one."""
-    e = wp.max((0.5 * hi - 0.5 * lo) * scale, wp.vec3(0.0, 0.0, 0.0))
-    return e[0] * e[1] + e[1] * e[2] + e[2] * e[0]
+    half = 0.5 * scale * box
+    x = -(half[0] + half[3])
+    y = -(half[1] + half[4])
+    z = -(half[2] + half[5])
+    x = wp.where(x > 0.0, x, 0.0)
+    y = wp.where(y > 0.0, y, 0.0)
+    z = wp.where(z > 0.0, z, 0.0)
+    return x * y + y * z + z * x
 
 
 @wp.func
@@ -103,9 +173,9 @@ def center_of(record: BuildRecord) -> wp.vec3:
 
 
 @wp.func
-def bin_of(center: wp.vec3, axis: int, origin: wp.vec3, scale: wp.vec3) -> int:
+def bin_of(center: wp.vec3, axis: int, bins: Bins) -> int:
     """Binning and partition call this one function, so that they agree to the last bit."""
-    return wp.clamp(int((center[axis] - origin[axis]) * scale[axis]), 0, BINS - 1)
+    return wp.clamp(int((center[axis] - bins.origin[axis]) * bins.scale[axis]), 0, bins.count - 1)
 
 
 @wp.func
@@ -118,151 +188,144 @@ def levels(n: int) -> int:
 
 
 @wp.func
-def bin_scale(task: BuildTask) -> wp.vec3:
-    """Bins a unit of length along each axis; 0 where the centroids cannot be told apart.
-
-    That is where they coincide, or are so close together (or so far apart) that the scale over- or underflows.
-    """
-    out = wp.vec3(0.0, 0.0, 0.0)
+def bins_of(task: BuildTask) -> Bins:
+    """The bins of a range, fewer of them for few records."""
+    out = Bins()
+    out.count = wp.min(4 + (task.end - task.begin) / 8, BINS)
+    low = low_of(task.measures.centers)
+    high = high_of(task.measures.centers)
+    out.origin = low
     for axis in range(3):
-        scale = float(BINS) * 0.999999 / (task.center_hi[axis] - task.center_lo[axis])
-        if task.center_hi[axis] > task.center_lo[axis] and wp.isfinite(scale):
-            out[axis] = scale
+        scale = float(out.count) * 0.999999 / (high[axis] - low[axis])
+        if high[axis] > low[axis] and wp.isfinite(scale):
+            out.scale[axis] = scale
     return out
 
 
 @wp.func
-def binned_split(data: BuildData, task: BuildTask, bins: wp.vec3) -> Split:
+def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
     """Wald 2007, "On fast Construction of SAH-based Bounding Volume Hierarchies": the cheapest split between two bins.
 
     Cost: the sum over both sides of half area x count, in units of area_scale.
     """
-    scale = area_scale(task)
+    scale = area_scale(task.measures.box)
     count = wp.zeros(shape=wp.static(3 * BIN_COUNT), dtype=wp.int32)
-    lo = wp.zeros(shape=wp.static(3 * BIN_COUNT), dtype=wp.vec3)
-    hi = wp.zeros(shape=wp.static(3 * BIN_COUNT), dtype=wp.vec3)
+    box = wp.zeros(shape=wp.static(3 * BIN_COUNT), dtype=Row)
     right_cost = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.float32)
-    for b in range(3 * BINS):
-        lo[b] = wp.vec3(wp.inf, wp.inf, wp.inf)
-        hi[b] = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    for axis in range(3):
+        for k in range(bins.count):
+            box[axis * BINS + k] = empty_row()
     for i in range(task.begin, task.end):
         record = data.records[i]
         center = center_of(record)
+        row = row_of(record.lo, record.hi)
         for axis in range(3):
-            b = axis * BINS + bin_of(center, axis, task.center_lo, bins)
+            b = axis * BINS + bin_of(center, axis, bins)
             count[b] = count[b] + 1
-            lo[b] = wp.min(lo[b], record.lo)
-            hi[b] = wp.max(hi[b], record.hi)
+            box[b] = lower(box[b], row)
 
     best = Split()
     best.axis = -1
     best.cost = float(wp.inf)
     for axis in range(3):
-        if bins[axis] > 0.0:
-            side_lo = wp.vec3(wp.inf, wp.inf, wp.inf)
-            side_hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+        if bins.scale[axis] > 0.0:
+            side = empty_row()
             n = int(0)
-            for k in range(BINS - 1):
-                b = axis * BINS + BINS - 1 - k
-                side_lo = wp.min(side_lo, lo[b])
-                side_hi = wp.max(side_hi, hi[b])
-                n = n + count[b]
-                cost = half_area(side_lo, side_hi, scale) * float(n)
-                right_cost[BINS - 1 - k] = wp.where(n == 0, float(wp.inf), cost)
-            side_lo = wp.vec3(wp.inf, wp.inf, wp.inf)
-            side_hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+            for j in range(bins.count - 1):
+                k = bins.count - 1 - j
+                side = lower(side, box[axis * BINS + k])
+                n = n + count[axis * BINS + k]
+                right_cost[k] = wp.where(n == 0, float(wp.inf), half_area(side, scale) * float(n))
+            side = empty_row()
             n = int(0)
-            for k in range(1, BINS):
-                b = axis * BINS + k - 1
-                side_lo = wp.min(side_lo, lo[b])
-                side_hi = wp.max(side_hi, hi[b])
-                n = n + count[b]
-                cost = half_area(side_lo, side_hi, scale) * float(n) + right_cost[k]
+            for k in range(1, bins.count):
+                side = lower(side, box[axis * BINS + k - 1])
+                n = n + count[axis * BINS + k - 1]
+                cost = half_area(side, scale) * float(n) + right_cost[k]
                 if n > 0 and cost < best.cost:
                     best.axis = axis
                     best.bin = k
                     best.cost = cost
+                    best.box_0 = side
+    if best.axis >= 0:
+        best.box_1 = empty_row()
+        for k in range(best.bin, bins.count):
+            best.box_1 = lower(best.box_1, box[best.axis * BINS + k])
     return best
 
 
 @wp.func
-def sort_by(records: wp.array(dtype=BuildRecord), begin: int, end: int, axis: int):
-    """Insertion sort of a small range by centroid."""
-    for i in range(begin + 1, end):
-        record = records[i]
-        key = center_of(record)[axis]
-        j = int(i)
-        while j > begin and center_of(records[j - 1])[axis] > key:
-            records[j] = records[j - 1]
-            j = j - 1
-        records[j] = record
-
-
-@wp.func
-def choose_small(data: BuildData, task: BuildTask) -> int:
-    """The cheapest of all splits of a range of up to SMALL records by their order along an axis."""
-    scale = area_scale(task)
-    right_cost = wp.zeros(shape=wp.static(SMALL_COUNT), dtype=wp.float32)
-    best_axis = int(0)
-    best_cost = float(wp.inf)
-    best = int(task.begin + (task.end - task.begin) / 2)
-    for axis in range(3):
-        if task.center_hi[axis] > task.center_lo[axis]:
-            sort_by(data.records, task.begin, task.end, axis)
-            lo = wp.vec3(wp.inf, wp.inf, wp.inf)
-            hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
-            for k in range(task.begin + 1, task.end):
-                i = task.begin + task.end - k
-                lo = wp.min(lo, data.records[i].lo)
-                hi = wp.max(hi, data.records[i].hi)
-                right_cost[i - task.begin] = half_area(lo, hi, scale) * float(task.end - i)
-            lo = wp.vec3(wp.inf, wp.inf, wp.inf)
-            hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
-            for i in range(task.begin + 1, task.end):
-                lo = wp.min(lo, data.records[i - 1].lo)
-                hi = wp.max(hi, data.records[i - 1].hi)
-                cost = half_area(lo, hi, scale) * float(i - task.begin) + right_cost[i - task.begin]
-                if cost < best_cost:
-                    best_cost = cost
-                    best_axis = axis
-                    best = i
-    if best_axis < 2:  # they stand in the order of the last axis that they were sorted by
-        sort_by(data.records, task.begin, task.end, best_axis)
-    return best
-
-
-@wp.func
-def choose_binned(data: BuildData, task: BuildTask) -> int:
-    """The first record of the right side, after the records of the left side have gone to the front. So each `choose`."""
-    half = task.begin + (task.end - task.begin) / 2
-    if task.depth + levels(task.end - task.begin) >= MAX_DEPTH:
-        return half
-    if task.end - task.begin <= SMALL:
-        return choose_small(data, task)
-    bins = bin_scale(task)
-    split = binned_split(data, task, bins)
-    if split.axis < 0:
-        return half
-    i = int(task.begin)
-    j = int(task.end)
-    while i < j:
+def measured(data: BuildData, begin: int, end: int) -> Measures:
+    out = Measures()
+    out.box = empty_row()
+    out.centers = empty_row()
+    for i in range(begin, end):
         record = data.records[i]
-        if bin_of(center_of(record), split.axis, task.center_lo, bins) < split.bin:
-            i = i + 1
-        else:
-            j = j - 1
-            data.records[i] = data.records[j]
-            data.records[j] = record
-    return i
+        center = center_of(record)
+        out.box = lower(out.box, row_of(record.lo, record.hi))
+        out.centers = lower(out.centers, row_of(center, center))
+    return out
+
+
+@wp.func
+def halves_at(data: BuildData, task: BuildTask, middle: int) -> Halves:
+    out = Halves()
+    out.middle = middle
+    out.left = measured(data, task.begin, middle)
+    out.right = measured(data, middle, task.end)
+    return out
+
+
+@wp.func
+def part_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> Halves:
+    """The records of the left side go to the front.
+
+    Lomuto's partition without a branch, which nothing could predict: what is exchanged for nothing stays on its side.
+    """
+    middle = int(task.begin)
+    empty = empty_row()
+    centers_0 = empty_row()
+    centers_1 = empty_row()
+    for i in range(task.begin, task.end):
+        record = data.records[i]
+        data.records[i] = data.records[middle]
+        data.records[middle] = record
+        center = center_of(record)
+        row = row_of(center, center)
+        left = bin_of(center, split.axis, bins) < split.bin
+        middle = middle + wp.where(left, 1, 0)
+        centers_0 = lower(centers_0, wp.where(left, row, empty))
+        centers_1 = lower(centers_1, wp.where(left, empty, row))
+    out = Halves()
+    out.middle = middle
+    out.left.box = split.box_0
+    out.left.centers = centers_0
+    out.right.box = split.box_1
+    out.right.centers = centers_1
+    return out
+
+
+@wp.func
+def split_binned(data: BuildData, task: BuildTask) -> Halves:
+    """The cheapest split between two bins; by number where no centroids can be told apart, or the tree gets too deep."""
+    n = task.end - task.begin
+    if n > 2 and task.depth + levels(n) < MAX_DEPTH:
+        bins = bins_of(task)
+        split = binned_split(data, task, bins)
+        if split.axis >= 0:
+            return part_by_bin(data, task, bins, split)
+    return halves_at(data, task, task.begin + n / 2)
 
 
 @wp.func
 def choose_median(data: BuildData, task: BuildTask) -> int:
-    """Half the records on each side of the median centroid along the axis where the centroids are farthest apart.
+    """The first record of the right side, after the records of the left side have gone to the front. So each `choose`.
+
+    Half the records on each side of the median centroid along the axis where the centroids are farthest apart:
 
     Hoare 1961, "Algorithm 65: Find", with the middle element as the pivot.
     """
-    e = 0.5 * task.center_hi - 0.5 * task.center_lo
+    e = 0.5 * high_of(task.measures.centers) - 0.5 * low_of(task.measures.centers)
     axis = wp.where(e[1] > e[0], 1, 0)
     axis = wp.where(e[2] > e[axis], 2, axis)
     half = task.begin + (task.end - task.begin) / 2
@@ -321,27 +384,23 @@ def choose_sweep(data: BuildData, task: BuildTask) -> int:
     MacDonald and Booth 1990, "Heuristics for ray tracing using space subdivision".
     """
     n = data.boxes.shape[0]
-    scale = area_scale(task)
+    scale = area_scale(task.measures.box)
     best_axis = int(0)
     best_cost = float(wp.inf)
     best = int(task.begin + (task.end - task.begin) / 2)
     if task.depth + levels(task.end - task.begin) < MAX_DEPTH:
         for axis in range(3):
-            lo = wp.vec3(wp.inf, wp.inf, wp.inf)
-            hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+            side = empty_row()
             for k in range(task.begin + 1, task.end):
                 i = task.begin + task.end - k
                 box = data.boxes[data.order[axis * n + i]]
-                lo = wp.min(lo, box.lo)
-                hi = wp.max(hi, box.hi)
-                data.area[i] = half_area(lo, hi, scale) * float(task.end - i)
-            lo = wp.vec3(wp.inf, wp.inf, wp.inf)
-            hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+                side = lower(side, row_of(box.lo, box.hi))
+                data.area[i] = half_area(side, scale) * float(task.end - i)
+            side = empty_row()
             for i in range(task.begin + 1, task.end):
                 box = data.boxes[data.order[axis * n + i - 1]]
-                lo = wp.min(lo, box.lo)
-                hi = wp.max(hi, box.hi)
-                cost = half_area(lo, hi, scale) * float(i - task.begin) + data.area[i]
+                side = lower(side, row_of(box.lo, box.hi))
+                cost = half_area(side, scale) * float(i - task.begin) + data.area[i]
                 if cost < best_cost:
                     best_cost = cost
                     best_axis = axis
@@ -367,41 +426,48 @@ def choose_sweep(data: BuildData, task: BuildTask) -> int:
     return best
 
 
-CHOOSE = {"binned": choose_binned, "sweep": choose_sweep, "median": choose_median, "lbvh": choose_morton}
+def split_at(choose):
+    @wp.func
+    def split(data: BuildData, task: BuildTask) -> Halves:
+        return halves_at(data, task, choose(data, task))
+
+    return split
+
+
+SPLIT = {
+    "binned": split_binned,
+    "sweep": split_at(choose_sweep),
+    "median": split_at(choose_median),
+    "lbvh": split_at(choose_morton),
+}
 
 
 @wp.func
-def measured(data: BuildData, task: BuildTask) -> BuildTask:
-    """The task with the boxes of its records and of their centroids."""
-    lo = wp.vec3(wp.inf, wp.inf, wp.inf)
-    hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
-    center_lo = wp.vec3(wp.inf, wp.inf, wp.inf)
-    center_hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
-    for i in range(task.begin, task.end):
-        record = data.records[i]
-        center = center_of(record)
-        lo = wp.min(lo, record.lo)
-        hi = wp.max(hi, record.hi)
-        center_lo = wp.min(center_lo, center)
-        center_hi = wp.max(center_hi, center)
-    task.lo = lo
-    task.hi = hi
-    task.center_lo = center_lo
-    task.center_hi = center_hi
-    return task
-
-
-@wp.func
-def child_of(data: BuildData, task: BuildTask, middle: int, side: int) -> BuildTask:
+def child_of(task: BuildTask, halves: Halves, side: int) -> BuildTask:
     """One side of a split range."""
     child = BuildTask()
-    child.begin = wp.where(side == 0, task.begin, middle)
-    child.end = wp.where(side == 0, middle, task.end)
-    child.slot = wp.where(side == 0, task.slot + 1, task.slot + middle - task.begin)
+    child.begin = wp.where(side == 0, task.begin, halves.middle)
+    child.end = wp.where(side == 0, halves.middle, task.end)
+    child.slot = wp.where(side == 0, task.slot + 1, task.slot + halves.middle - task.begin)
     child.parent = task.slot
     child.side = side
     child.depth = task.depth + 1
-    return measured(data, child)
+    if side == 0:
+        child.measures = halves.left
+    else:
+        child.measures = halves.right
+    return child
+
+
+@wp.func
+def worth_it(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
+    """Whether two leaves cost less than one."""
+    scale = area_scale(task.measures.box)
+    area = half_area(task.measures.box, scale)
+    parts = (half_area(halves.left.box, scale) * rows_of(options, halves.middle - task.begin)
+             + half_area(halves.right.box, scale) * rows_of(options, task.end - halves.middle))
+    split_cost = options.cost_traversal * area + options.cost_intersection * parts
+    return split_cost < options.cost_intersection * rows_of(options, task.end - task.begin) * area
 
 
 @wp.func
@@ -418,22 +484,22 @@ def tell_parent(nodes: wp.array(dtype=Bvh2Node), task: BuildTask, first: int, co
 
 @cache
 def make_build_ranges(builder: str):
-    """The kernel of the builder of that name in CHOOSE."""
-    choose = CHOOSE[builder]
+    """The kernel of the builder of that name in SPLIT."""
+    split = SPLIT[builder]
 
     @kernel
-    def build_ranges(data: BuildData, tasks: wp.array(dtype=BuildTask), first_task: int, options: BuildOptions, stop_size: int,
+    def build_ranges(data: BuildData, tasks: wp.array(dtype=BuildTask), options: BuildOptions, stop_size: int,
                      left_over: wp.array(dtype=BuildTask), n_left_over: wp.array(dtype=wp.int32),
                      max_depth: wp.array(dtype=wp.int32)):
         """Build the subtree of one task, down to ranges of at most stop_size records, which are listed in left_over.
 
-        Every task has two records or more. Inner nodes of a range of n records take the slots slot .. slot + n - 2; those
-        that stay free are squeezed out by the host.
+        Every task has two records or more. Inner nodes of a range of n records have the slots slot .. slot + n - 2 to
+        themselves; those that stay free are squeezed out by the host. A whole subtree (stop_size 0) takes the first of them.
         """
-        tid = first_task + wp.tid()
         stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=BuildTask)
-        stack[0] = tasks[tid]
+        stack[0] = tasks[0]
         size = int(1)
+        slot = int(stack[0].slot)
         while size > 0:
             size = size - 1
             task = stack[size]
@@ -442,40 +508,36 @@ def make_build_ranges(builder: str):
                 left_over[wp.atomic_add(n_left_over, 0, 1)] = task
                 continue
             if task.parent < 0:
-                task = measured(data, task)
+                task.measures = measured(data, task.begin, task.end)
 
-            middle = choose(data, task)
-            left = child_of(data, task, middle, 0)
-            right = child_of(data, task, middle, 1)
+            halves = split(data, task)
             if n <= options.max_leaf and task.parent >= 0:
-                scale = area_scale(task)
-                area = half_area(task.lo, task.hi, scale)
-                parts = (half_area(left.lo, left.hi, scale) * float(middle - task.begin)
-                         + half_area(right.lo, right.hi, scale) * float(task.end - middle))
-                split_cost = options.cost_traversal * area + options.cost_intersection * parts
-                if not split_cost < options.cost_intersection * float(n) * area:
+                if not worth_it(options, task, halves):
                     tell_parent(data.nodes, task, task.begin, n)
                     continue
 
-            max_depth[tid] = wp.max(max_depth[tid], task.depth)
+            if stop_size == 0:
+                task.slot = slot
+                slot = slot + 1
+            max_depth[0] = wp.max(max_depth[0], task.depth)
             tell_parent(data.nodes, task, task.slot, 0)
             data.used[task.slot] = wp.uint8(1)
             node = Bvh2Node()
-            node.lo_0 = left.lo
-            node.hi_0 = left.hi
-            node.lo_1 = right.lo
-            node.hi_1 = right.hi
-            node.first_0 = left.begin
-            node.count_0 = left.end - left.begin
-            node.first_1 = right.begin
-            node.count_1 = right.end - right.begin
+            node.lo_0 = low_of(halves.left.box)
+            node.hi_0 = high_of(halves.left.box)
+            node.lo_1 = low_of(halves.right.box)
+            node.hi_1 = high_of(halves.right.box)
+            node.first_0 = task.begin
+            node.count_0 = halves.middle - task.begin
+            node.first_1 = halves.middle
+            node.count_1 = task.end - halves.middle
             data.nodes[task.slot] = node
             # A single record is a leaf; others find out for themselves.
             if node.count_1 > 1:
-                stack[size] = right
+                stack[size] = child_of(task, halves, 1)
                 size = size + 1
             if node.count_0 > 1:
-                stack[size] = left
+                stack[size] = child_of(task, halves, 0)
                 size = size + 1
 
     return build_ranges

@@ -7,6 +7,7 @@ same tree, on all cores; then the moves are made one after the other, the best f
 
 import warp as wp
 
+from wrt.kernels.build_bvh2 import BuildOptions, rows_of
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse_bvh2 import Bvh2Node
 
@@ -206,7 +207,7 @@ def walk_down(links: wp.array(dtype=Link), walk: Walk):
 
 
 @kernel
-def weigh(links: wp.array(dtype=Link), walk: Walk, max_leaf: int, cost_traversal: float, cost_intersection: float, scale: float):
+def weigh(links: wp.array(dtype=Link), walk: Walk, options: BuildOptions, scale: float):
     """Leaves where they cost no more than the best that can be made of the subtree, from the bottom up: their left gets < -1."""
     n = walk.order.shape[0]
     for k in range(n):
@@ -215,13 +216,13 @@ def weigh(links: wp.array(dtype=Link), walk: Walk, max_leaf: int, cost_traversal
         area = area_of(link.lo, link.hi, scale)
         if link.left < 0:
             walk.count[i] = 1
-            walk.cost[i] = cost_intersection * area
+            walk.cost[i] = options.cost_intersection * area
         else:
             walk.count[i] = walk.count[link.left] + walk.count[link.right]
-            cost = cost_traversal * area + walk.cost[link.left] + walk.cost[link.right]
-            whole = cost_intersection * float(walk.count[i]) * area
+            cost = options.cost_traversal * area + walk.cost[link.left] + walk.cost[link.right]
+            whole = options.cost_intersection * rows_of(options, walk.count[i]) * area
             walk.cost[i] = cost
-            if walk.count[i] <= max_leaf and not cost < whole and i > 0:
+            if walk.count[i] <= options.max_leaf and not cost < whole and i > 0:
                 walk.cost[i] = whole
                 links[i].left = -2 - link.left
 

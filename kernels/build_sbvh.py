@@ -11,7 +11,6 @@ from wrt.kernels.build_bvh2 import (
     BIN_COUNT,
     BINS,
     MAX_DEPTH,
-    SMALL,
     BuildData,
     BuildOptions,
     BuildRecord,
@@ -19,13 +18,16 @@ from wrt.kernels.build_bvh2 import (
     Split,
     area_scale,
     bin_of,
-    bin_scale,
     binned_split,
+    bins_of,
     center_of,
-    choose_small,
     half_area,
+    high_of,
     levels,
+    low_of,
     measured,
+    row_of,
+    rows_of,
     tell_parent,
 )
 from wrt.kernels.ray_aabb import box_pad, padded_hi, padded_lo
@@ -41,10 +43,11 @@ class Box:
 
 @wp.struct
 class SpatialOptions:
-    """min_overlap: the least overlap of an object split's sides, in units of the root's half area, for a spatial split to be
-    tried; corners: of triangle i from 3 i on; what is no triangle (a sphere) is cut by its box."""
+    """min_overlap: the least overlap of an object split's sides for a spatial split to be tried, in units of the scene's own
+    size: scale is its area_scale; corners: of triangle i from 3 i on; what is no triangle (a sphere) is cut by its box."""
 
     build: BuildOptions
+    scale: float
     min_overlap: float
     corners: wp.array(dtype=wp.vec3)
 
@@ -63,6 +66,11 @@ def joined(a: Box, lo: wp.vec3, hi: wp.vec3) -> Box:
     out.lo = wp.min(a.lo, lo)
     out.hi = wp.max(a.hi, hi)
     return out
+
+
+@wp.func
+def box_area(box: Box, scale: float) -> float:
+    return half_area(row_of(box.lo, box.hi), scale)
 
 
 @wp.func
@@ -128,13 +136,14 @@ def is_empty(box: Box) -> bool:
 def plane_of(task: BuildTask, axis: int, k: int) -> float:
     """The plane between bins k - 1 and k of a range's box."""
     f = float(k) / float(BINS)
-    return task.lo[axis] * (1.0 - f) + task.hi[axis] * f
+    return task.measures.box[axis] * (1.0 - f) - task.measures.box[3 + axis] * f
 
 
 @wp.func
 def spatial_bin(task: BuildTask, axis: int, x: float) -> int:
     """The bin of a coordinate: the last one that begins at or before it, by the planes themselves."""
-    k = wp.clamp(int(float(BINS) * ((x - task.lo[axis]) / (task.hi[axis] - task.lo[axis]))), 0, BINS - 1)
+    low = task.measures.box[axis]
+    k = wp.clamp(int(float(BINS) * ((x - low) / (-task.measures.box[3 + axis] - low))), 0, BINS - 1)
     while k > 0 and x < plane_of(task, axis, k):
         k = k - 1
     while k < BINS - 1 and x >= plane_of(task, axis, k + 1):
@@ -148,10 +157,10 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
 
     Where a range is long, its references are clipped to every bin that they reach into.
     """
-    scale = area_scale(task)
+    scale = area_scale(task.measures.box)
     n = task.end - task.begin
     for axis in range(3):
-        extent = task.hi[axis] - task.lo[axis]
+        extent = -task.measures.box[3 + axis] - task.measures.box[axis]
         if extent > 0.0 and wp.isfinite(extent):
             enter = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.int32)
             leave = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.int32)
@@ -183,14 +192,14 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
                 b = BINS - 1 - k
                 side = joined(side, lo[b], hi[b])
                 count = count + leave[b]
-                right_cost[b] = half_area(side.lo, side.hi, scale) * float(count)
+                right_cost[b] = box_area(side, scale) * float(count)
                 right_count[b] = count
             side = empty_box()
             count = int(0)
             for b in range(1, BINS):
                 side = joined(side, lo[b - 1], hi[b - 1])
                 count = count + enter[b - 1]
-                cost = half_area(side.lo, side.hi, scale) * float(count) + right_cost[b]
+                cost = box_area(side, scale) * float(count) + right_cost[b]
                 fits = count > 0 and count < n and right_count[b] > 0 and right_count[b] < n
                 if fits and count + right_count[b] <= task.limit - task.begin and cost < best.cost:
                     best.axis = axis
@@ -206,7 +215,7 @@ def part_by_plane(data_records: wp.array(dtype=BuildRecord), room: wp.array(dtyp
 
     One on both sides is not split where leaving it whole on one side costs less ("reference unsplitting", section 4.4).
     """
-    scale = area_scale(task)
+    scale = area_scale(task.measures.box)
     plane = plane_of(task, split.axis, split.bin)
     left = empty_box()
     right = empty_box()
@@ -242,13 +251,13 @@ def part_by_plane(data_records: wp.array(dtype=BuildRecord), room: wp.array(dtyp
             to_left = is_empty(part_1)
             to_right = is_empty(part_0) and not to_left
             if not to_left and not to_right:
-                area_0 = half_area(left.lo, left.hi, scale)
-                area_1 = half_area(right.lo, right.hi, scale)
+                area_0 = box_area(left, scale)
+                area_1 = box_area(right, scale)
                 wide_0 = joined(left, record.lo, record.hi)
                 wide_1 = joined(right, record.lo, record.hi)
                 both = area_0 * float(n_left) + area_1 * float(n_right)
-                only_0 = half_area(wide_0.lo, wide_0.hi, scale) * float(n_left) + area_1 * float(n_right - 1)
-                only_1 = area_0 * float(n_left - 1) + half_area(wide_1.lo, wide_1.hi, scale) * float(n_right)
+                only_0 = box_area(wide_0, scale) * float(n_left) + area_1 * float(n_right - 1)
+                only_1 = area_0 * float(n_left - 1) + box_area(wide_1, scale) * float(n_right)
                 if only_0 < both and only_0 <= only_1:
                     to_left = bool(True)
                     left = wide_0
@@ -283,24 +292,21 @@ def object_split(data: BuildData, task: BuildTask) -> wp.vec2i:
     """Left references to room[begin ..], right ones to room[.. limit - 1] backwards, by centroid; how many each."""
     n = task.end - task.begin
     middle = task.begin + n / 2
-    if task.depth + levels(n) < MAX_DEPTH:
-        if n <= SMALL:
-            middle = choose_small(data, task)
-        else:
-            bins = bin_scale(task)
-            split = binned_split(data, task, bins)
-            if split.axis >= 0:
-                done_0 = int(0)
-                done_1 = int(0)
-                for i in range(task.begin, task.end):
-                    record = data.records[i]
-                    if bin_of(center_of(record), split.axis, task.center_lo, bins) < split.bin:
-                        data.boxes[task.begin + done_0] = record
-                        done_0 = done_0 + 1
-                    else:
-                        done_1 = done_1 + 1
-                        data.boxes[task.limit - done_1] = record
-                return wp.vec2i(done_0, done_1)
+    if n > 2 and task.depth + levels(n) < MAX_DEPTH:
+        bins = bins_of(task)
+        split = binned_split(data, task, bins)
+        if split.axis >= 0:
+            done_0 = int(0)
+            done_1 = int(0)
+            for i in range(task.begin, task.end):
+                record = data.records[i]
+                if bin_of(center_of(record), split.axis, bins) < split.bin:
+                    data.boxes[task.begin + done_0] = record
+                    done_0 = done_0 + 1
+                else:
+                    done_1 = done_1 + 1
+                    data.boxes[task.limit - done_1] = record
+            return wp.vec2i(done_0, done_1)
     for i in range(task.begin, middle):
         data.boxes[i] = data.records[i]
     for i in range(middle, task.end):
@@ -319,17 +325,17 @@ def box_of(records: wp.array(dtype=BuildRecord), begin: int, end: int) -> Box:
 @wp.func
 def split_references(data: BuildData, task: BuildTask, options: SpatialOptions) -> wp.vec2i:
     """Both sides of the cheaper of the best object split and, if the sides of that overlap, the best plane: as object_split."""
-    scale = area_scale(task)
+    scale = area_scale(task.measures.box)
     counts = object_split(data, task)
     left = box_of(data.boxes, task.begin, task.begin + counts[0])
     right = box_of(data.boxes, task.limit - counts[1], task.limit)
     n = task.end - task.begin
-    overlap = half_area(wp.max(left.lo, right.lo), wp.min(left.hi, right.hi), 1.0)
+    overlap = half_area(row_of(wp.max(left.lo, right.lo), wp.min(left.hi, right.hi)), options.scale)
     if task.depth + levels(n) >= MAX_DEPTH or not overlap > options.min_overlap:
         return counts
     best = Split()
     best.axis = -1
-    best.cost = (half_area(left.lo, left.hi, scale) * float(counts[0]) + half_area(right.lo, right.hi, scale) * float(counts[1]))
+    best.cost = (box_area(left, scale) * float(counts[0]) + box_area(right, scale) * float(counts[1]))
     best = spatial_split(data.records, task, options.corners, best)
     if best.axis < 0:
         return counts
@@ -362,7 +368,8 @@ def reference_child(data: BuildData, task: BuildTask, side: int, begin: int, cou
     child.parent = task.slot
     child.side = side
     child.depth = task.depth + 1
-    return measured(data, child)
+    child.measures = measured(data, child.begin, child.end)
+    return child
 
 
 @wp.func
@@ -373,16 +380,15 @@ def mark(left: wp.array(dtype=wp.uint8), begin: int, end: int):
 
 
 @kernel
-def build_references(data: BuildData, tasks: wp.array(dtype=BuildTask), first_task: int, options: SpatialOptions, stop_size: int,
+def build_references(data: BuildData, tasks: wp.array(dtype=BuildTask), options: SpatialOptions, stop_size: int,
                      left_over: wp.array(dtype=BuildTask), n_left_over: wp.array(dtype=wp.int32),
                      max_depth: wp.array(dtype=wp.int32)):
     """As kernels.build_bvh2's build_ranges, with references; data.boxes is room, data.left tells which records are in leaves.
 
     Inner nodes of a range with room for n references take the slots slot .. slot + n - 2.
     """
-    tid = first_task + wp.tid()
     stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=BuildTask)
-    stack[0] = tasks[tid]
+    stack[0] = tasks[0]
     size = int(1)
     while size > 0:
         size = size - 1
@@ -392,18 +398,18 @@ def build_references(data: BuildData, tasks: wp.array(dtype=BuildTask), first_ta
             left_over[wp.atomic_add(n_left_over, 0, 1)] = task
             continue
         if task.parent < 0:
-            task = measured(data, task)
+            task.measures = measured(data, task.begin, task.end)
 
         counts = split_references(data, task, options)
         if n <= options.build.max_leaf and task.parent >= 0:
-            scale = area_scale(task)
-            area = half_area(task.lo, task.hi, scale)
+            scale = area_scale(task.measures.box)
+            area = half_area(task.measures.box, scale)
             left_box = box_of(data.boxes, task.begin, task.begin + counts[0])
             right_box = box_of(data.boxes, task.limit - counts[1], task.limit)
-            parts = (half_area(left_box.lo, left_box.hi, scale) * float(counts[0])
-                     + half_area(right_box.lo, right_box.hi, scale) * float(counts[1]))
+            parts = (box_area(left_box, scale) * rows_of(options.build, counts[0])
+                     + box_area(right_box, scale) * rows_of(options.build, counts[1]))
             split_cost = options.build.cost_traversal * area + options.build.cost_intersection * parts
-            if not split_cost < options.build.cost_intersection * float(n) * area:
+            if not split_cost < options.build.cost_intersection * rows_of(options.build, n) * area:
                 tell_parent(data.nodes, task, task.begin, n)
                 mark(data.left, task.begin, task.end)
                 continue
@@ -411,14 +417,14 @@ def build_references(data: BuildData, tasks: wp.array(dtype=BuildTask), first_ta
         middle = take_room(data, task, counts)
         left = reference_child(data, task, 0, task.begin, counts[0], middle)
         right = reference_child(data, task, 1, middle, counts[1], task.limit)
-        max_depth[tid] = wp.max(max_depth[tid], task.depth)
+        max_depth[0] = wp.max(max_depth[0], task.depth)
         tell_parent(data.nodes, task, task.slot, 0)
         data.used[task.slot] = wp.uint8(1)
         node = Bvh2Node()
-        node.lo_0 = left.lo
-        node.hi_0 = left.hi
-        node.lo_1 = right.lo
-        node.hi_1 = right.hi
+        node.lo_0 = low_of(left.measures.box)
+        node.hi_0 = high_of(left.measures.box)
+        node.lo_1 = low_of(right.measures.box)
+        node.hi_1 = high_of(right.measures.box)
         node.first_0 = left.begin
         node.count_0 = counts[0]
         node.first_1 = right.begin

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -113,3 +114,19 @@ def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
     with ThreadPoolExecutor(threads) as pool:
         for future in [pool.submit(job) for job in jobs]:
             future.result()
+
+
+def run_growing(run: Callable[[Any], Iterable[Any]], tasks: Iterable[Any], threads: int) -> None:
+    """Run all tasks, and those that a run of one gives, on so many threads; the first error is raised after those that run have
+    ended."""
+    if threads == 1:
+        todo = deque(tasks)
+        while todo:
+            todo.extend(run(todo.popleft()))
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        running = {pool.submit(run, task) for task in tasks}
+        while running:
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                running |= {pool.submit(run, task) for task in future.result()}

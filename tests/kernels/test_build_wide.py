@@ -140,6 +140,20 @@ def test_a_deep_binary_tree_still_fits_on_the_stack():
             check_tree(tree, geometry, width, 1)
 
 
+@pytest.mark.parametrize("width", [4, 8])
+@pytest.mark.parametrize("builder", ["binned", "sweep", "reinsertion"])
+def test_a_binary_tree_down_to_single_primitives_is_not_cheaper(builder, width):
+    # The wide builder stops where two leaves of up to a row have no less area than one: the collapse would join them again.
+    rng = np.random.default_rng(7)
+    for kind in ("mixed", "soup"):
+        geometry = GEOMETRIES[kind](rng)
+        wide = build(geometry, f"bvh{width}", builder=builder)
+        trees = (collapse(build_binary(geometry, BvhOptions(builder, 1), 1), width, width, 1.0, 1.0), wide._tree(wide.built))
+        full, stopped = ((tree.areas * np.where(tree.children < 0, ((-1 - tree.children) % 64 + width) // width, 1)).sum()
+                         for tree in trees)
+        assert stopped <= 1.01 * full
+
+
 def test_children_are_where_any_hit_wants_them():
     tree = build(icosphere(3), "bvh8")._tree(build(icosphere(3), "bvh8").built)
     kind = np.where(tree.children == 0, 0, np.where(tree.children > 0, 1, 2))

@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 
-from wrt.device import _stderr_without, describe_devices, memory_size, records, run_all, start, thread_count, upload
+from wrt.device import _stderr_without, describe_devices, memory_size, records, run_all, run_growing, start, thread_count, upload
 
 import warp as wp  # isort: skip (after wrt.device, which silences Warp's banner)
 
@@ -91,6 +91,22 @@ def test_upload_never_lets_a_device_write_into_a_frozen_array() -> None:
         upload(array, wp.float32, start("cpu")).fill_(1.0)
     assert open_array.tolist() == [1.0] * 4  # no copy where none is needed
     assert frozen.tolist() == [0.0] * 4
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_run_growing_also_runs_what_tasks_give(threads: int) -> None:
+    done = []
+
+    def halves(n: int) -> list[int]:
+        done.append(n)  # atomic in CPython
+        if n == 3:
+            raise ValueError("three")
+        return [n // 2, n - n // 2] if n > 1 else []
+
+    run_growing(halves, [16, 4], threads)
+    assert sorted(done) == sorted([16] + 2 * [8] + 5 * [4] + 10 * [2] + 20 * [1])
+    with pytest.raises(ValueError, match="three"):
+        run_growing(halves, [5], threads)
 
 
 @wp.struct

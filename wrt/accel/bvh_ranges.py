@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import warp as wp
 
 from wrt.accel.base import Geometry
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions, small_tree, squeeze
-from wrt.device import load_kernel, records, run_all, start, upload
+from wrt.device import load_kernel, records, run_growing, start, upload
 from wrt.kernels import build_bvh2
 from wrt.kernels.traverse_bvh2 import Bvh2Node
 
@@ -86,39 +85,42 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
     arrays |= {"records": build, "nodes": records(Bvh2Node, n - 1), "used": np.zeros(n - 1, np.uint8)}
     for name, array in arrays.items():
         setattr(data, name, upload(array, data._cls.vars[name].type.dtype, cpu))
-    settings = build_bvh2.BuildOptions()
-    settings.max_leaf = options.max_leaf
-    settings.cost_traversal, settings.cost_intersection = options.cost_traversal, options.cost_intersection
-    depth = run_tasks(build_bvh2.make_build_ranges(builder), data, settings, n, threads)
+    depth = run_tasks(build_bvh2.make_build_ranges(builder), data, build_options(options), n, threads)
     return BinaryTree(squeeze(data.nodes.numpy(), data.used.numpy() != 0), data.records.numpy()["prim_id"].copy(), depth)
 
 
-def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int, room: int = 0) -> int:
-    """Build the top of the tree over records 0 .. n - 1, then its subtrees on all threads; the depth of the tree.
+def build_options(options: BvhOptions) -> Any:
+    """What kernels take of the options."""
+    out = build_bvh2.BuildOptions()
+    out.max_leaf, out.row = options.max_leaf, options.row
+    out.cost_traversal, out.cost_intersection = options.cost_traversal, options.cost_intersection
+    return out
 
-    room: how many records there is room for, where references may be duplicated.
+
+def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int, room: int = 0) -> int:
+    """Build the tree over records 0 .. n - 1 on all threads; its depth.
+
+    room: how many records there is room for, where references may be duplicated. A large range is split into halves or less,
+    which are tasks of their own: the tree is the same for any number of threads.
     """
     cpu = start("cpu")
     load_kernel(kernel, cpu)
+    least = max(n // 64, 4096)
+    depths = []
+
+    def split(task: np.ndarray) -> list[np.ndarray]:
+        size = int(task["end"][0] - task["begin"][0])
+        stop = max(size // 2, least) if threads > 1 and size > least else 0
+        # Ranges of two or more records that do not overlap: there can be no more of them than this.
+        most = (max(int(task["limit"][0]), int(task["end"][0])) - int(task["begin"][0])) // 2 if stop else 1
+        left_over = wp.empty(most, dtype=build_bvh2.BuildTask, device=cpu)
+        count, depth = (wp.zeros(1, dtype=wp.int32, device=cpu) for _ in range(2))
+        wp.launch(kernel, dim=1, device=cpu, inputs=[
+            data, upload(task, build_bvh2.BuildTask, cpu), settings, stop, left_over, count, depth])
+        depths.append(int(depth.numpy()[0]))
+        return [left_over.numpy()[i : i + 1] for i in range(int(count.numpy()[0]))]
+
     root = records(build_bvh2.BuildTask, 1)
     root["end"], root["parent"], root["limit"] = n, -1, room
-    stop_size = max(n // 32, 4096) if threads > 1 else 0
-    # Ranges of two or more records that do not overlap: there can be no more of them than this.
-    left_over = wp.empty(max(max(n, room) // 2, 1) if stop_size else 1, dtype=build_bvh2.BuildTask, device=cpu)
-    count = wp.zeros(1, dtype=wp.int32, device=cpu)
-
-    def launch(tasks: Any, depth: Any, task: int, stop: int) -> None:
-        wp.launch(kernel, dim=1, device=cpu, inputs=[data, tasks, task, settings, stop, left_over, count, depth])
-
-    depth = wp.zeros(1, dtype=wp.int32, device=cpu)
-    launch(upload(root, build_bvh2.BuildTask, cpu), depth, 0, stop_size)
-    max_depth = int(depth.numpy()[0])
-    tasks = left_over.numpy()[: int(count.numpy()[0])]
-    if len(tasks):
-        # Largest first, so that no thread is left with a big one at the end.
-        tasks = tasks[np.argsort(tasks["begin"] - tasks["end"], kind="stable")].copy()
-        depth = wp.zeros(len(tasks), dtype=wp.int32, device=cpu)
-        device_tasks = upload(tasks, build_bvh2.BuildTask, cpu)
-        run_all([partial(launch, device_tasks, depth, i, 0) for i in range(len(tasks))], threads)
-        max_depth = max(max_depth, int(depth.numpy().max()))
-    return max_depth + 1
+    run_growing(split, [root], threads)
+    return max(depths) + 1

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.accel.bvh_ranges import build_binned
+from wrt.accel.bvh_ranges import build_binned, build_options
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions
 from wrt.device import load_kernel, records, run_all, start, upload
 from wrt.kernels import build_reinsertion as kernels
@@ -114,8 +114,7 @@ def collapse(tree: BinaryTree, links: Any, options: BvhOptions, scale: np.float3
     cpu = start("cpu")
     n_inner = len(tree.nodes)
     walk = walk_down(links)
-    wp.launch(kernels.weigh, dim=1, device=cpu, inputs=[
-        links, walk, options.max_leaf, options.cost_traversal, options.cost_intersection, scale])
+    wp.launch(kernels.weigh, dim=1, device=cpu, inputs=[links, walk, build_options(options), scale])
     order = wp.empty(len(tree.order), dtype=wp.int32, device=cpu)
     nodes = wp.empty(n_inner, dtype=Bvh2Node, device=cpu)
     count = wp.zeros(1, dtype=wp.int32, device=cpu)

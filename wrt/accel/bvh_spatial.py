@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.accel.bvh_ranges import in_order, run_tasks
+from wrt.accel.bvh_ranges import build_options, in_order, run_tasks
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.device import records, start, upload
 from wrt.errors import InputError
@@ -39,13 +39,14 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
     data.used = wp.zeros(room - 1, dtype=wp.uint8, device=cpu)
     data.left = wp.zeros(room, dtype=wp.uint8, device=cpu)
     settings = kernels.SpatialOptions()
-    settings.build.max_leaf = options.max_leaf
-    settings.build.cost_traversal, settings.build.cost_intersection = options.cost_traversal, options.cost_intersection
+    settings.build = build_options(options)
     with np.errstate(over="ignore", invalid="ignore"):
-        x, y, z = hi.max(axis=0).astype(np.float64) - lo.min(axis=0)
-        area = min(options.split_alpha * (x * y + y * z + z * x), 3e38)
-    # Where areas underflow there is no overlap to tell of, and where they overflow no split that is worth it.
-    settings.min_overlap = area if np.isfinite(area) else 3e38
+        half = 0.5 * (hi.max(axis=0).astype(np.float64) - lo.min(axis=0))
+        settings.scale = 1.0 / max(half.max(), 2.0**-126)
+        x, y, z = half * settings.scale
+        area = options.split_alpha * (x * y + y * z + z * x)
+    # Where a scene has no end there is no split that is worth it.
+    settings.min_overlap = min(area, 3e38) if np.isfinite(area) else 3e38
     settings.corners = upload(geometry.vertices[geometry.faces].reshape(-1, 3), wp.vec3, cpu)
     depth = run_tasks(kernels.build_references, data, settings, n, threads, room)
     return compact(data, depth)

@@ -49,7 +49,8 @@ class WideBvh(Accelerator):
                cost_intersection: float = 1.0, split_alpha: float = 1e-5, split_budget: float = 0.5) -> Built:
         max_leaf = self.width if max_leaf is None else max_leaf
         BvhOptions(builder, max_leaf, cost_traversal, cost_intersection)  # refuses what is out of range
-        options = BvhOptions(builder, 1, split_alpha=split_alpha, split_budget=split_budget)
+        # Two leaves are worth it where they have less area than one: what their places in a node cost is not yet known.
+        options = BvhOptions(builder, min(max_leaf, self.width), 0.0, 1.0, split_alpha, split_budget, row=self.width)
         binary = build_binary(self.geometry, options, self.threads)
         tree = (collapse(binary, self.width, max_leaf, cost_traversal, cost_intersection) if len(binary.order) > 1
                 else small_tree(binary, self.width))
