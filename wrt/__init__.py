@@ -24,6 +24,7 @@ _PUBLIC = {
     "load_scene": "wrt.scene_file",
     "render": "wrt.driver",
     "LiveView": "wrt.notebook",
+    "side_by_side": "wrt.notebook",
     "Options": "wrt.options",
     "Progress": "wrt.options",
     "Film": "wrt.film",

@@ -1,13 +1,17 @@
-"""A running render in a notebook: the picture so far, in place."""
+"""Pictures in a notebook: a running render in place, and several side by side."""
 
 from __future__ import annotations
 
 import base64
 import html
 import time
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from wrt.errors import InputError
+from wrt.film import Film
 from wrt.options import Progress
 from wrt.progress import COMPILING, describe
 
@@ -54,3 +58,34 @@ class LiveView:
             self._handle = self._display(self._html(page), display_id=True)
         else:
             self._handle.update(self._html(page))
+
+
+TITLE, GAP = 22, 8  # pixels: above a picture, and between two
+
+
+def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, scale: int = 1) -> Any:
+    """Films or display codes, (H, W, 3) uint8, in rows under their names ("" is none): a PIL image, which a notebook shows.
+
+    No pixel is mixed with another: scale, a whole number, repeats each. Raises InputError for no pictures, or wrong arrays.
+    """
+    from PIL import Image, ImageDraw
+
+    from wrt.bench.heatmap import INK, font
+
+    if not pictures or columns < 1 or scale < 1:
+        raise InputError("side_by_side needs a picture or more, columns and scale of 1 or more")
+    codes = [each.to_srgb8() if isinstance(each, Film) else np.asarray(each) for each in pictures.values()]
+    for name, array in zip(pictures, codes, strict=True):
+        if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
+            raise InputError(f"{name}: a picture must be a Film or (H, W, 3) uint8, got {array.shape} {array.dtype}")
+    columns = min(columns, len(codes))
+    width, height = (scale * max(array.shape[axis] for array in codes) for axis in (1, 0))
+    rows = -(-len(codes) // columns)
+    title = TITLE if any(pictures) else 0
+    image = Image.new("RGB", (columns * (width + GAP) - GAP, rows * (title + height + GAP) - GAP), "white")
+    canvas = ImageDraw.Draw(image)
+    for i, (name, array) in enumerate(zip(pictures, codes, strict=True)):
+        x, y = i % columns * (width + GAP), i // columns * (title + height + GAP)
+        canvas.text((x, y + TITLE // 2), name, fill=INK, font=font(13), anchor="lm")
+        image.paste(Image.fromarray(array.repeat(scale, axis=0).repeat(scale, axis=1)), (x, y + title))
+    return image

@@ -212,7 +212,7 @@ def teapot(segments: int = 64) -> Mesh:
     dome = [(0.40 * math.cos(a), 0.735 + 0.13 * math.sin(a)) for a in np.linspace(0.0, 0.92 * math.pi / 2.0, rows // 2)]
     knob = [(0.03 + 0.06 * math.sin(a), 0.93 - 0.07 * math.cos(a)) for a in np.linspace(0.15, math.pi, rows // 2)]
     lid = [(0.0, 0.735), (0.40, 0.735), *dome, dome[-1], knob[0], *knob, (0.0, knob[-1][1])]
-    a = np.linspace(-1.92, 1.45, rows)
+    a = np.linspace(-1.92, 2.15, rows)  # both ends are inside the body
     handle = np.stack([-0.60 - 0.34 * np.cos(a), 0.42 + 0.25 * np.sin(a), 0.0 * a], axis=1)
     s = np.linspace(0.0, 1.0, rows)
     spout = np.stack([0.50 + 0.46 * s + 0.10 * s * (1.0 - s), 0.20 + 0.18 * s + 0.36 * s**2.5, 0.0 * s], axis=1)

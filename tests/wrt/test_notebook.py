@@ -123,6 +123,23 @@ def test_the_picture_in_progress_is_that_of_the_samples_so_far() -> None:
     assert taken and np.array_equal(taken[-1].pixels, wrt.render(SCENE, spp=int(taken[-1].samples.max())).pixels)
 
 
+def test_pictures_side_by_side_keep_their_pixels() -> None:
+    film = wrt.render(SCENE, spp=2)
+    codes = np.arange(4 * 5 * 3, dtype=np.uint8).reshape(4, 5, 3)
+    sheet = np.asarray(wrt.side_by_side({"film": film, "codes": codes, "": codes}, scale=2))
+    height, width = film.samples.shape
+    assert sheet.shape == (2 * (22 + 2 * height + 8) - 8, 2 * (2 * width + 8) - 8, 3)
+    np.testing.assert_array_equal(sheet[22:22 + 2 * height:2, 1:2 * width:2], film.to_srgb8())
+    x = 2 * width + 8
+    np.testing.assert_array_equal(sheet[23:30:2, x:x + 10:2], codes)
+    y = 22 + 2 * height + 8
+    assert (sheet[y:y + 22] == 255).all() and (sheet[:22] < 128).any()  # no name, and two names
+    np.testing.assert_array_equal(wrt.side_by_side({"": codes}), codes)
+    for wrong in ({}, {"x": codes[..., 0]}, {"x": film.pixels}):
+        with pytest.raises(InputError, match=r"side_by_side|x: a picture"):
+            wrt.side_by_side(wrong)
+
+
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 

@@ -78,6 +78,7 @@ def test_a_notebook_shows_heat_maps_and_the_model(measured: Profile) -> None:
 def test_the_scale_of_a_heat_map() -> None:
     assert [top_of(np.full(9, v)) for v in (0.0, 0.7, 1.0, 37.0, 1001.0)] == pytest.approx([1.0, 0.7, 1.0, 40.0, 1200.0])
     assert [step_of(top) for top in (0.7, 1.0, 40.0, 1200.0)] == pytest.approx([0.1, 0.2, 10.0, 200.0])
+    assert (heatmap(np.ones((2, 2)), "", top=2.0)[40, 100] == colors()[128]).all()
     outlier = np.ones(10_000)
     outlier[0] = 1e6
     assert top_of(outlier) == 1.0

@@ -6,6 +6,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
+import wrt
 from wrt import shapes
 from wrt.errors import InputError
 from wrt.mesh import Mesh
@@ -68,6 +69,14 @@ def test_teapot_parts_are_closed() -> None:
     assert open_edges(mesh) == 0
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     assert low[1] == 0.0 and 0.9 < high[1] < 1.1 and 1.8 < high[0] - low[0] < 2.2
+
+
+@pytest.mark.parametrize(("side", "height"), [(-1.0, 0.186), (-1.0, 0.629), (1.0, 0.2)])
+def test_handle_and_spout_end_in_the_body(side: float, height: float) -> None:
+    accel = wrt.build(shapes.teapot(32), "bvh2")
+    start = [[0.0, height, 0.0]] * 2
+    towards_the_end, wall = accel.closest_hit(start, [[side, 0.0, 0.0], [0.0, 0.0, 1.0]]).t
+    assert towards_the_end < wall - 0.02
 
 
 @pytest.mark.parametrize("mesh", [*(m for m, _, _ in CLOSED.values() if m.normals is not None), shapes.teapot()],

@@ -53,14 +53,15 @@ def colored(values: np.ndarray, top: float) -> np.ndarray:
     return colors()[np.rint(np.clip(np.nan_to_num(values / top, posinf=1.0), 0.0, 1.0) * 255.0).astype(np.uint8)]
 
 
-def heatmap(values: np.ndarray, title: str) -> np.ndarray:
+def heatmap(values: np.ndarray, title: str, top: float | None = None) -> np.ndarray:
     """The picture, (H, W, 3) uint8, of values (h, w) of 0 or more, row 0 on top; 0 is the first colour. What is beyond the scale
-    gets the last one, and the title tells the largest value."""
+    gets the last one, and the title tells the largest value. top: where the scale ends, so that several pictures can have one
+    (None: `top_of`)."""
     from PIL import Image, ImageDraw
 
     scale = max(1, -(-LEAST // values.shape[1]))
     height, width = values.shape[0] * scale, values.shape[1] * scale
-    top = top_of(values)
+    top = top_of(values) if top is None else top
     bar_height = max(height, 120)
     image = Image.new("RGB", (MARGIN * 3 + width + BAR + 64, TITLE + bar_height + MARGIN), "white")
     image.paste(Image.fromarray(colored(values, top).repeat(scale, axis=0).repeat(scale, axis=1)), (MARGIN, TITLE))

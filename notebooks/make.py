@@ -1,0 +1,69 @@
+"""Make the notebooks anew from their .py: `python notebooks/make.py [NAME ...]` runs each and writes its .ipynb, outputs included.
+
+The .py (jupytext, percent format) are what is edited; the .ipynb beside them hold the same cells and what they show. Nothing
+that depends on the run or the machine is kept, so that a diff shows what changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jupytext
+import nbformat
+from nbclient import NotebookClient
+
+FOLDER = Path(__file__).resolve().parent
+METADATA = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+            "language_info": {"name": "python"}}
+QUICK = "WRT_QUICK"  # in the environment: smaller pictures and fewer rays, the same steps
+TIMEOUT = 600  # seconds a cell
+
+
+def scripts() -> list[Path]:
+    """The sources of all notebooks."""
+    return sorted(path for path in FOLDER.glob("*.py") if path.name != Path(__file__).name)
+
+
+def read(script: Path) -> Any:
+    """The notebook that a .py is, without outputs."""
+    notebook = jupytext.read(script, fmt="py:percent")
+    notebook.metadata = nbformat.from_dict(METADATA)
+    for i, cell in enumerate(notebook.cells):
+        cell.id = f"{i:02}-{hashlib.sha256(cell.source.encode()).hexdigest()[:8]}"
+        cell.metadata = nbformat.from_dict({})
+    return notebook
+
+
+def execute(notebook: Any, quick: bool) -> Any:
+    """Run all cells in a fresh kernel; raises CellExecutionError where one fails."""
+    environment = {name: value for name, value in os.environ.items() if name != QUICK}
+    path = os.pathsep.join(filter(None, [str(FOLDER.parent), environment.get("PYTHONPATH")]))  # wrt of this checkout
+    environment |= {"PYTHONPATH": path, **({QUICK: "1"} if quick else {})}
+    client = NotebookClient(notebook, timeout=TIMEOUT, kernel_name="python3", record_timing=False,
+                            resources={"metadata": {"path": str(FOLDER)}})
+    client.execute(env=environment)
+    notebook.metadata = nbformat.from_dict(METADATA)  # without the version that ran it
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            if {"image/png", "image/jpeg"} <= output.get("data", {}).keys():
+                del output["data"]["image/jpeg"]  # the same picture once more
+    return notebook
+
+
+def main(names: list[str]) -> None:
+    for script in scripts():
+        if names and script.stem not in names:
+            continue
+        begin = time.perf_counter()
+        target = script.with_suffix(".ipynb")
+        nbformat.write(execute(read(script), quick=False), target)
+        print(f"{target.name}: {time.perf_counter() - begin:.0f} s, {target.stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,218 @@
+# %% [markdown]
+# # From a ray to a picture: pinhole, lens, depth of field
+# A picture is a question asked once for every pixel: what does the ray through it meet first? Here that question is asked by
+# hand, then by `wrt.render`; then the pinhole becomes a lens, and the blur that a lens makes is predicted and measured.
+#
+# Everything here is made by formulas or stands in `../scenes`. With `WRT_QUICK` in the environment, pictures are smaller and have
+# fewer samples; the outputs below are of the full setting.
+
+# %%
+import os
+from dataclasses import replace
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import wrt
+from wrt.bench.heatmap import heatmap
+from wrt.shapes import merged, quad, teapot
+
+QUICK = "WRT_QUICK" in os.environ
+SIZE, SPP = ((160, 90), 4) if QUICK else ((480, 270), 64)
+
+# %% [markdown]
+# ## One ray
+# A ray is an origin $o$ and a direction $d$; its points are $o + t\,d$ with $t \ge 0$. An acceleration structure over a mesh
+# answers which triangle a ray meets first: `prim_id`, the index of the triangle, $t$, and where in the triangle: $(1-u-v)\,v_0 +
+# u\,v_1 + v\,v_2$.
+
+# %%
+mesh = merged([quad((-3, 0, 3), (6, 0, 0), (0, 0, -6)), teapot(64)], "pot on a floor")
+accel = wrt.build(mesh)
+hits = accel.closest_hit([[0.0, 0.4, 3.0]], [[0.0, 0.0, -1.0]])
+t, prim_id, u, v = (array[0] for array in (hits.t, hits.prim_id, hits.u, hits.v))
+v0, v1, v2 = mesh.vertices[mesh.faces[prim_id]]
+print(f"triangle {prim_id} of {len(mesh.faces)} at t = {t:.4f}")
+print("by the ray:     ", np.round([0.0, 0.4, 3.0 - t], 4))
+print("by the triangle:", np.round((1 - u - v) * v0 + u * v1 + v * v2, 4))
+
+# %% [markdown]
+# ## One ray a pixel
+# A pinhole camera sends all its rays from one point. The ray of a pixel goes through the pixel's centre on a screen in front of
+# it, which is as high as the vertical angle of view tells: $2\tan(\mathrm{fov}_y/2)$ at distance 1. `camera_rays` gives one ray a
+# pixel.
+
+# %%
+camera = wrt.Camera.look_at((1.3, 1.5, 2.6), (0.05, 0.4, 0.0), fov_y=np.radians(32))
+origins, directions = wrt.camera_rays(camera, SIZE)
+hits = accel.closest_hit(origins, directions)
+hits
+
+# %%
+def picture(values):
+    return values.reshape(SIZE[1], SIZE[0], *values.shape[1:])
+
+
+hit = hits.prim_id >= 0
+depth = np.where(hit, hits.t, 0.0)
+wrt.side_by_side({"": heatmap(picture(depth), "distance to the hit (0: none)")})
+
+# %% [markdown]
+# The height of the view can be checked against the angle: the directions of the middle column's ends, moved half a pixel
+# outwards, enclose `fov_y`.
+
+# %%
+column = picture(directions)[:, SIZE[0] // 2].astype(np.float64)
+seen = np.degrees(np.arccos(column[0] @ column[-1]))
+step = np.degrees(np.arccos(column[0] @ column[1]))
+print(f"first to last pixel centre: {seen:.3f} degrees; and half a pixel at each end: {seen + step:.2f}")
+
+# %% [markdown]
+# ## Light by hand
+# A matte surface shows the cosine between its normal and the light, unless something stands between them: one more ray, the
+# shadow ray, from the hit to the light. It must not start on the surface itself, for the hit is rounded; here it is lifted by
+# $10^{-4}$, which is right for this scene and wrong for another size. (`wrt.render` leaves a surface by the bound of the rounding
+# errors instead.)
+
+# %%
+corners = mesh.vertices[mesh.faces]
+normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+normal = normals[hits.prim_id[hit]]
+facing = (normal * directions[hit]).sum(axis=1, keepdims=True) < 0.0
+normal = np.where(facing, normal, -normal)
+points = origins[hit] + hits.t[hit, None] * directions[hit] + 1e-4 * normal
+
+light = np.array([2.0, 4.0, 1.5])
+shadow_rays = light - points
+dark = accel.any_hit(points, shadow_rays, t_max=1.0)  # t = 1 is the light itself
+cosine = np.maximum((normal * shadow_rays).sum(axis=1) / np.linalg.norm(shadow_rays, axis=1), 0.0)
+
+color = np.full((len(hit), 3), (0.55, 0.68, 0.90))
+on_floor = hits.prim_id[hit] < 2
+paint = np.where(on_floor[:, None], (0.75, 0.72, 0.66), (0.80, 0.30, 0.20))
+color[hit] = paint * (0.12 + 0.88 * np.where(dark, 0.0, cosine))[:, None]
+by_hand = (255.0 * picture(color) ** (1 / 2.2)).astype(np.uint8)
+print(f"{hit.sum()} of {len(hit)} rays hit; {dark.sum()} of the hits lie in shadow")
+wrt.side_by_side({"by hand": by_hand})
+
+# %% [markdown]
+# That is a ray tracer. Two things are missing: the triangles show, since each has one normal; and edges have steps, since each
+# pixel has one ray.
+
+# %% [markdown]
+# ## Many rays a pixel
+# `wrt.render` takes the mean over `spp` rays a pixel, spread evenly over the pixel (and somewhat beyond it: a filter). It does
+# all else as well: normals that vary over a triangle, mirrors, glass, lights of every kind. The pot of `scenes/lens.toml`, each
+# pixel of the picture drawn as a square:
+
+# %%
+night = wrt.load_scene("../scenes/lens.toml")
+crop = tuple(round(x * SIZE[0] / 480) for x in (160, 158, 230, 208))
+wrt.side_by_side({f"{spp} ray{'s' * (spp > 1)} a pixel": wrt.render(night, camera="pinhole", size=SIZE, spp=spp, crop=crop)
+                  for spp in (1, 4, SPP)}, columns=3, scale=4)
+
+# %% [markdown]
+# ## From the pinhole to the lens
+# A real camera needs light, and so has a hole with a width, and a lens in it. A thin lens of focal length $f$ brings together
+# again what starts at distance $s$, at the distance $s'$ behind it with $1/s + 1/s' = 1/f$: there the sensor stands. So all rays
+# of a pixel cross in one point of the plane in focus, wherever on the lens they pass; what is nearer or farther is spread.
+# `Camera.lens` turns what a photographer sets into what a ray tracer needs.
+
+# %%
+pinhole = night.camera("pinhole")
+lens = night.camera("round")
+print({name: round(value, 4) for name, value in
+       wrt.Camera.lens(focal_length=0.9, focus_distance=6.0, sensor_height=0.40, f_number=2.25).items()})
+film = wrt.render(night, camera=lens, size=SIZE, spp=2 * SPP)
+wrt.side_by_side({"pinhole": wrt.render(night, camera=pinhole, size=SIZE, spp=SPP), "lens, f / 2.25, focused at 6": film})
+
+# %% [markdown]
+# ## How large is the blur?
+# A point at distance $z$ sends a cone of light to the lens of radius $r$. Seen in the plane in focus, at distance $s$, this cone
+# has the diameter $2 r\,|z - s| / z$ (similar triangles), and the picture shows $2 s \tan(\mathrm{fov}_y/2)$ of that plane over
+# its height:
+#
+# $$c = \frac{2 r\,|z-s|}{z}\cdot\frac{H}{2 s\tan(\mathrm{fov}_y/2)}\ \text{pixels}.$$
+#
+# Is it so? One small lamp alone is photographed at several distances. A disc of diameter $c$ has the variance $c^2/16$ along an
+# axis, and variances add: what the lamp's own size and the pixel filter contribute is the variance of its picture through a
+# pinhole. That is taken off.
+
+# %%
+side = SIZE[1]
+steel, lamp = night.spheres[:2]
+bright = replace(lamp.material, emission=(1000, 1000, 1000))
+away = np.eye(4)
+away[2, 3] = 100.0  # behind the camera
+pot = replace(night.objects[1], transform=away)
+position, axis = lens.camera_to_world[:3, 3], -lens.camera_to_world[:3, 2]
+
+
+def spread(camera, z, spp):
+    """The variance along an axis, in pixels^2, of the picture of a lamp on the axis at distance z."""
+    here = replace(lamp, center=position + z * axis, radius=0.004 * z, material=bright)
+    scene = replace(night, objects=(pot,), spheres=(replace(steel, center=away[:3, 3]), here))
+    light = wrt.render(scene, camera=camera, size=(side, side), spp=spp).pixels[..., 0].astype(np.float64)
+    light = np.where(light > 2.0, light, 0.0)  # nothing but the lamp is so bright
+    y, x = np.mgrid[:side, :side]
+    mean_x, mean_y = (light * x).sum() / light.sum(), (light * y).sum() / light.sum()
+    return 0.5 * (light * ((x - mean_x) ** 2 + (y - mean_y) ** 2)).sum() / light.sum()
+
+
+def blur(z):
+    r, s = lens.aperture_radius, lens.focus_distance
+    return 2.0 * r * np.abs(z - s) / z * side / (2.0 * s * np.tan(0.5 * lens.fov_y))
+
+
+sharp = replace(lens, aperture_radius=1e-6)
+distances = np.array([3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 24.0])
+measured = np.array([4.0 * np.sqrt(max(spread(lens, z, 2 * SPP) - spread(sharp, z, SPP), 0.0)) for z in distances])
+
+fig, ax = plt.subplots(figsize=(6.4, 3.4), dpi=80, layout="constrained")
+z = np.linspace(2.6, 26.0, 400)
+ax.plot(z, blur(z), color="0.4", label="predicted")
+ax.plot(distances, measured, "o", color="C3", label="measured in the picture")
+ax.set(xlabel="distance of the lamp along the axis", ylabel="diameter of the blur, pixels", xlim=(2, 26))
+ax.legend()
+plt.show()
+for z, m in zip(distances, measured, strict=True):
+    print(f"z = {z:4.0f}: predicted {blur(z):5.2f}, measured {m:5.2f} pixels")
+
+# %% [markdown]
+# ## What a photographer sets
+# The f-number is $N = f / (2r)$: a larger one is a smaller hole. Twice the number halves the blur, everywhere and in proportion.
+# Focusing moves the plane that is sharp. Note how little the blur of far things changes beyond some distance: $|z-s|/z$ goes to
+# 1.
+
+# %%
+def photo(f_number, focus_distance):
+    spp = 2 * SPP if f_number < 4.0 else SPP  # the wider the hole, the more there is to average
+    setting = wrt.Camera.lens(0.9, focus_distance, 0.40, f_number=f_number)
+    return wrt.render(night, camera=replace(lens, **setting), size=tuple(x * 2 // 3 for x in SIZE), spp=spp)
+
+
+wrt.side_by_side({f"f / {n:g}, focused at {s:g}": photo(n, s)
+                  for n, s in ((2.25, 4.8), (2.25, 6.0), (2.25, 10.4), (4.5, 6.0), (9.0, 6.0), (18.0, 6.0))}, columns=3)
+
+# %% [markdown]
+# The picture of a lamp out of focus is the shape of the hole. Six straight blades (`blades=6`) make hexagons; behind the plane in
+# focus a lamp's picture is as the hole stands, in front of it half a turn around, which three blades show (focused at 7).
+
+# %%
+def lamps(spp, **blades):
+    crop = tuple(round(x * SIZE[0] / 480) for x in (0, 0, 160, 110))
+    return wrt.render(night, camera=replace(lens, focus_distance=7.0, **blades), size=SIZE, spp=spp, crop=crop)
+
+
+wrt.side_by_side({"round": lamps(4 * SPP), "three blades": lamps(4 * SPP, blades=3), "six blades": lamps(4 * SPP, blades=6)},
+                 columns=3, scale=2)
+
+# %% [markdown]
+# ## Exercises
+# 1. In "light by hand", leave out the lift of $10^{-4}$. Which pixels change, and why not all of them?
+# 2. Let the shaded picture use normals that vary: `mesh.normals` is None for `pot on a floor`, but `teapot().normals` is not. The
+#    normal at a hit is the mean of the three corners' with the weights $1-u-v$, $u$ and $v$.
+# 3. At which f-number is the lamp at distance 24 blurred by one pixel? Predict it, then look.
+# 4. `Camera.lens` lets `fov_y` depend on `focus_distance` ("focus breathing"). By how much does it change from 4.8 to 10.4?
