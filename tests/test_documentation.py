@@ -1,0 +1,217 @@
+"""README and docs/: every command line in them is one, every piece of Python runs, and every link leads somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+
+from tests.command_line import BOX_OBJ
+from tests.command_line import wrt as run
+from tests.data import ROOT
+from tests.gltf_files import GltfFile
+from wrt.cli import cli
+from wrt.mesh import load_mesh
+
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+OTHERS = ("pip install ", "pytest", "sh ", "git clone ")  # commands that CI itself begins with (.ci/run), or that only it can run
+# What stands for something in a command line, and what it is here. The folder of each test has these files.
+STANDS_FOR = {"MESH...": "model.ply", "MESH": "model.ply", "SCENE": "scenes/whitted.toml", "FILE.gif": "file.gif", "STUDY": "order",
+              "bunny.ply": "model.ply", "FOLDER|FILE.gif|.png": "frames", "FOLDER": "folder"}
+# Cheap options, added behind a command's own, of the commands that are run; the others are only parsed: they take minutes, or
+# compile for minutes, and have tests of their own.
+CHEAP = {
+    "render": ("--size", "32x18", "--spp", "4"), "info": (), "compare": (), "validate": (), "schema": (), "devices": (),
+    "profile": ("--size", "24x14"), "animate": ("--frames", "2", "--size", "32x18", "--spp", "1"), "build": (),
+    "bench accel": ("--structures", "bvh", "--kinds", "primary", "--rays", "200", "--runs", "1", "--max-triangles", "2000"),
+    "whatif": ("--rays", "200", "--kinds", "primary"),
+}
+SLOW = {  # run by `pytest -m slow`
+    "stability": ("--rays", "200", "--sample", "50", "--runs", "1"), "bench peers": ("--rays", "500", "--runs", "1"),
+    "bench rtcore": ("--rays", "500",), "bench units": ("--rays", "500", "--runs", "1"),
+    "bench error": ("--size", "16x9", "--max-spp", "2", "--repeats", "1", "--reference-spp", "4", "--knobs", "max_depth"),
+    "bench bvh": ("--rays", "500", "--builds", "1", "--runs", "1", "--builders", "sweep"), "bench instructions": (),
+    "bench mitsuba": ("--size", "16x9", "--spp", "1", "--repeats", "1", "--starts", "0"),
+}
+
+
+def page_id(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+# --- command lines ----------------------------------------------------------------------------------------------------
+
+
+def command_lines(text: str) -> list[str]:
+    """What stands in shell blocks, and in the text between backquotes where it begins with the program's name."""
+    blocks = re.findall(r"^```(?:sh|bash|console)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    spans = [re.sub(r"\s+", " ", span) for span in re.findall(r"`([^`]+)`", prose)]
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    lines += [span for span in spans if re.match(r"(python -m )?wrt [a-z]", span)]
+    return [part.strip() for line in lines for part in re.split(r"&&|;", re.sub(r"(^|\s)#.*", "", line)) if part.strip()]
+
+
+def arguments(line: str) -> list[str] | None:
+    """Those of `python -m wrt`; None where the line is another command."""
+    words = shlex.split(re.sub(r"[\[\]]", "", line))
+    words = words[words.index("wrt") + 1 :] if "wrt" in words[:4] else []
+    if not words:
+        return None
+    out: list[str] = []
+    for word in words:
+        found = [STANDS_FOR.get(word, word)]
+        if "*" in word:
+            found = [str(path.relative_to(ROOT)) for path in sorted(ROOT.glob(word))][:3]
+        out += found
+    return out
+
+
+def command_of(words: list[str]) -> tuple[str, click.Command]:
+    name, command = words[0], cli.commands[words[0]]
+    if isinstance(command, click.Group):
+        name, command = f"{words[0]} {words[1]}", command.commands[words[1]]
+    return name, command
+
+
+LINES = sorted({(page_id(page), line) for page in PAGES for line in command_lines(page.read_text(encoding="utf-8"))})
+COMMANDS = [(page, line) for page, line in LINES if arguments(line) is not None]
+
+
+def test_there_are_command_lines() -> None:
+    assert len(COMMANDS) >= 25 and {page for page, _ in COMMANDS} >= {"README.md", "docs/viewer.md", "docs/rt_core.md"}
+    shown = {command_of(arguments(line) or [])[0] for _, line in COMMANDS}
+    assert shown - CHEAP.keys() - SLOW.keys() == {"view"}  # which waits for a browser: tests/wrt/test_viewer_page.py
+    known = {name for name, command in cli.commands.items() if not isinstance(command, click.Group)}
+    assert known <= shown  # no command is left out of the documentation
+
+
+@pytest.mark.parametrize(("page", "line"), [each for each in LINES if each not in COMMANDS])
+def test_other_commands_are_those_of_installing_and_testing(page: str, line: str) -> None:
+    assert line.startswith(OTHERS), f"{page}: {line}"
+
+
+@pytest.mark.parametrize(("page", "line"), COMMANDS)
+def test_a_command_line_is_one(page: str, line: str) -> None:
+    """Its command and its options exist, and their values have the right types."""
+    words = arguments(line) or []
+    name, command = command_of(words)
+    try:
+        command.make_context(name, words[len(name.split()) :], resilient_parsing=False)
+    except click.exceptions.MissingParameter:
+        assert re.fullmatch(r"(python -m )?wrt [a-z ]+", line), f"{page}: {line}"  # the text speaks of the command as such
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a reader may have beside him: the scenes, a mesh, a glTF file with three cameras, a scene, two pictures."""
+    folder = tmp_path_factory.mktemp("documentation")
+    shutil.copytree(ROOT / "scenes", folder / "scenes")
+    shutil.copy(ROOT / "scenes" / "whitted.toml", folder / "scene.toml")
+    (folder / "box.obj").write_text(BOX_OBJ, encoding="utf-8")
+    box = load_mesh(folder / "box.obj")
+    write_ply(folder / "model.ply", box.vertices, box.faces)
+    gltf = GltfFile()
+    camera = gltf.add("cameras", {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.1}})
+    for i in range(3):
+        gltf.node(camera=camera, translation=[0.2 * i, 0.1, 6.0])
+    gltf.node(mesh=gltf.mesh(gltf.primitive(box.vertices, box.faces.ravel())))
+    gltf.write(folder, "model.glb")
+    from wrt.image import write_image
+
+    for name in ("a.exr", "b.exr"):
+        write_image(folder / name, np.full((18, 32, 3), 0.25, np.float32))
+    return folder
+
+
+def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    head = (f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+            f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n")
+    rows = [" ".join(map(str, vertex)) for vertex in vertices] + [f"3 {' '.join(map(str, face))}" for face in faces]
+    path.write_text(head + "\n".join(rows) + "\n", encoding="ascii")
+
+
+def runs(commands: dict[str, tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """The distinct argument lists of lines that are complete, with the cheap options behind them."""
+    out = set()
+    for _, line in COMMANDS:
+        words = arguments(line) or []
+        name, command = command_of(words)
+        needs = any(isinstance(each, click.Argument) and each.required for each in command.params)
+        if name in commands and (len(words) > len(name.split()) or not needs):
+            out.add((*words, *commands[name]))
+    return sorted(out)
+
+
+@pytest.mark.parametrize("words", runs(CHEAP), ids=" ".join)
+def test_a_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(folder, tmp_path / "here")
+    monkeypatch.chdir(tmp_path / "here")
+    if "--accel" in words and "runs" in words:
+        pytest.skip("the structure that docs/extending.md makes: tests/wrt/test_extending.py runs it")
+    result = run(*words)
+    assert result.code == 0, result.err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", runs(SLOW), ids=" ".join)
+def test_a_slow_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    test_a_command_line_runs(words, folder, tmp_path, monkeypatch)
+
+
+# --- Python -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/long_renders.md"])
+def test_python_runs(page: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import wrt
+
+    shutil.copytree(folder, tmp_path / "here")
+    monkeypatch.chdir(tmp_path / "here")
+    scene = wrt.load_scene("scene.toml").with_settings(size=(24, 14))
+    rays = np.tile(np.array([0.1, 0.2, 5.0], np.float32), (3, 1)), np.tile(np.array([0.0, 0.0, -1.0], np.float32), (3, 1))
+    names: dict[str, Any] = {"wrt": wrt, "scene": scene, "origins": rays[0], "directions": rays[1], "camera": scene.camera()}
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    assert blocks
+    for block in blocks:
+        cheap = re.sub(r"spp=\d+", "spp=2", block).replace("640x360", "24x14").replace("(640, 360)", "(24, 14)")
+        cheap = cheap.replace('"bunny.ply"', '"model.ply"').replace(", progress=wrt.LiveView()", ", spp=1, size=(24, 14)")
+        exec(compile(cheap, page, "exec"), names)
+
+
+# --- links ------------------------------------------------------------------------------------------------------------
+
+
+def anchors(path: Path) -> set[str]:
+    """Of the headings, as GitHub makes them."""
+    text = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+://", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists() and file.is_relative_to(ROOT), f"{page.name}: {target}"
+        assert not anchor or anchor in anchors(file), f"{page.name}: {target}"
+
+
+def test_every_page_is_reached_from_the_readme() -> None:
+    reached, new = set(), [ROOT / "README.md"]
+    while new:
+        page = new.pop()
+        reached.add(page)
+        links = re.findall(r"\]\(([^)#\s]+\.md)[^)]*\)", page.read_text(encoding="utf-8"))
+        new += [file for link in links if (file := (page.parent / link).resolve()) not in reached and file.exists()]
+    assert {page for page in PAGES if page.name != "CHANGELOG.md"} <= reached
