@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from wrt.errors import InputError
+from wrt.memory import available
 
 wp.config.log_level = wp.LOG_WARNING if hasattr(wp, "LOG_WARNING") else 30
 
@@ -62,14 +63,9 @@ def describe_devices() -> list[str]:
     return lines
 
 
-def memory_size(device: Any) -> float:
-    """Bytes of memory of a device, free or not; infinite where the system does not tell."""
-    if device.is_cuda:
-        return float(device.total_memory)
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return float("inf")
+def free_memory(device: Any) -> float:
+    """Bytes of memory of a device that can still be had; infinite where the system does not tell."""
+    return float(device.free_memory) if device.is_cuda else available()
 
 
 def load_kernel(kernel: Any, device: Any) -> None:

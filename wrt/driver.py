@@ -21,7 +21,7 @@ import wrt
 from wrt.accel import ACCELERATORS, Structure, build, tells_progress
 from wrt.arguments import unknown
 from wrt.checkpoint import Checkpoint
-from wrt.device import load_kernel, memory_size, start, thread_count
+from wrt.device import free_memory, load_kernel, start, thread_count
 from wrt.device_film import BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS, AovFilm, DeviceFilm
 from wrt.device_scene import camera_struct, upload_scene
 from wrt.errors import InputError
@@ -31,6 +31,8 @@ from wrt.interrupt import held_interrupts
 from wrt.kernels import render as kernels
 from wrt.kernels import structs
 from wrt.kernels.traverse import Units
+from wrt.memory import SMALL, gib
+from wrt.memory_estimate import bytes_of_scene
 from wrt.mesh import Mesh
 from wrt.options import AOVS as AOVS
 from wrt.options import OPTIONS, Options, Progress
@@ -144,11 +146,13 @@ class Renderer:
     def _check_memory(self) -> None:
         """Better told now than by the system after an hour, which ends whoever takes too much."""
         x0, y0, x1, y1 = self.crop
-        film = BYTES_OF_FILM + BYTES_OF_GROUP * (self.groups - 1) + (BYTES_OF_AOVS if self.options.aov else 0)
-        needed, there = (x1 - x0) * (y1 - y0) * (film + BYTES_OF_RESULT), memory_size(self.device)
-        if needed > there:
-            raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {needed / 2**30:.1f} GiB of memory;"
-                             f" {self.device} has {there / 2**30:.1f}")
+        pixel = BYTES_OF_FILM + BYTES_OF_GROUP * (self.groups - 1) + (BYTES_OF_AOVS if self.options.aov else 0)
+        film = (x1 - x0) * (y1 - y0) * (pixel + BYTES_OF_RESULT)
+        scene = bytes_of_scene(self.scene, ACCELERATORS[self.options.accel], self.options.instancing)
+        there = free_memory(self.device)
+        if film + scene > max(there, SMALL):
+            raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {gib(film)} of memory, its scene {gib(scene)};"
+                             f" {self.device} has {gib(there)} free (WRT_MEMORY can say otherwise)")
 
     def _checkpoint(self) -> Checkpoint:
         """The file to save to, which says what must be the same to go on with it. Errors of it are told before the work."""

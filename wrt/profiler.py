@@ -14,7 +14,7 @@ import warp as wp
 
 from wrt.accel import Structure
 from wrt.cache_sim import distinct_lines
-from wrt.device import memory_size, run_all, upload
+from wrt.device import free_memory, run_all, upload
 from wrt.device_film import DeviceFilm
 from wrt.driver import OPTIONS, Options, Renderer
 from wrt.errors import InputError
@@ -180,7 +180,7 @@ class Profiler(Renderer):
         self._over(lambda rectangle: tiles.append(self._count(rectangle)), list(self._tiles()))
         tiles.sort(key=lambda tile: tile.rectangle[1::-1])
         total = sum(int(tile.used.sum(dtype=np.int64)) for tile in tiles)
-        if total * BYTES_OF_RAY > 0.5 * memory_size(self.device):
+        if total * BYTES_OF_RAY > 0.5 * free_memory(self.device):
             raise InputError(f"a profile of {total / 1e6:.0f} million rays takes {total * BYTES_OF_RAY / 2**30:.0f} GiB;"
                              " take a smaller size, fewer samples or a crop")
         step = max(1, -(-sum(tile.fetches for tile in tiles) // TRACE_LIMIT))

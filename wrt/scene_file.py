@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from wrt.arguments import as_path, shown
 from wrt.errors import InputError, SceneWarning
 from wrt.mesh import READERS, Mesh, load_mesh
@@ -35,7 +37,8 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         raise InputError(f"is a directory, not a scene file ({known})", path)
     if path.suffix.lower() not in LOADERS:
         raise InputError(f"is no scene file: known are {known}", path)
-    return LOADERS[path.suffix.lower()](path)
+    with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused by whoever is to hold it
+        return LOADERS[path.suffix.lower()](path)
 
 
 def as_scene(value: Scene | Mesh | str | os.PathLike[str]) -> Scene:

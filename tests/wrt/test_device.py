@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 
-from wrt.device import _stderr_without, describe_devices, memory_size, records, run_all, run_growing, start, thread_count, upload
+from wrt.device import _stderr_without, describe_devices, free_memory, records, run_all, run_growing, start, thread_count, upload
 
 import warp as wp  # isort: skip (after wrt.device, which silences Warp's banner)
 
@@ -26,7 +26,7 @@ def test_an_unknown_device_is_refused_with_those_there_are(name: str, capfd: pyt
 def test_the_cpu_is_there() -> None:
     assert start("cpu").is_cpu and start("cpu") is start("cpu")
     assert describe_devices()[0].startswith("cpu: ") and len(describe_devices()) == 1 + len(wp.get_cuda_devices())
-    assert memory_size(start("cpu")) > 2**28
+    assert free_memory(start("cpu")) > 2**28
 
 
 def test_stderr_loses_only_the_lines_that_are_not_wanted(capfd: pytest.CaptureFixture[str]) -> None:

@@ -499,9 +499,9 @@ def test_progress_is_told_of_a_structure_that_is_slow_to_build(monkeypatch: pyte
 
 
 def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driver, "memory_size", lambda device: 2.0**30)
+    monkeypatch.setattr(driver, "free_memory", lambda device: 2.0**30)
     monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("work was done"))
-    with pytest.raises(InputError, match=r"4096x4096 takes 2\.1 GiB of memory; cpu has 1\.0"):
+    with pytest.raises(InputError, match=r"4096x4096 takes 2\.1 GiB of memory, its scene 0 MiB; cpu has 1\.0 GiB free"):
         render(SCENE, size=(4096, 4096))
 
 

@@ -26,6 +26,7 @@ from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT, RAY_AABB
 from wrt.kernels.ray_triangle import RAY_TRIANGLE
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse import Units
+from wrt.memory import require
 from wrt.mesh import Mesh
 from wrt.tables import html_facts, html_table
 
@@ -263,6 +264,7 @@ class Accelerator(ABC):
 
     name: ClassVar[str]
     kernels: ClassVar[Any]
+    bytes_to_build: ClassVar[float] = 200.0  # of memory for each primitive, at the peak; measured, rounded up
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
                  box: str = "conservative", **options: Any) -> None:
@@ -274,6 +276,7 @@ class Accelerator(ABC):
             kind = OPTION_TYPES.get(known[option], object)
             if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
                 raise InputError(f"{option} must be {known[option]}, got {value!r}")
+        require(len(geometry) * self.bytes_to_build, f"a {self.name} over {len(geometry)} primitives")
         begin = time.perf_counter()
         self._take(self._build(**options), begin)
 

@@ -57,6 +57,7 @@ class Bvh2Kdop(Bvh2):
 
     name = "bvh2_kdop"
     kernels = traverse_bvh2_kdop
+    bytes_to_build = 300.0
     _children = Accelerator._children
 
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
