@@ -90,5 +90,6 @@ def test_public_names_exist() -> None:
 
     for name in wrt.__all__:
         assert getattr(wrt, name) is not None
+        assert not any((Path(folder) / f"{name}.py").exists() for folder in wrt.__path__)  # its import would hide the name
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = wrt.nothing

@@ -29,7 +29,7 @@ _PUBLIC = {
     "Progress": "wrt.options",
     "Film": "wrt.film",
     "profile": "wrt.profiler",
-    "camera_rays": "wrt.camera_rays",
+    "camera_rays": "wrt.pixel_rays",
     "Camera": "wrt.scene",
     "Checkerboard": "wrt.scene",
     "ConstantBackground": "wrt.scene",
