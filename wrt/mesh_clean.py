@@ -59,27 +59,41 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
 
 def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F,) bool: whether the corners of faces (F, 3) in vertices (V, 3) float32 are not on one line, exactly; True where one
-    is not finite.
+    is not finite."""
+    out = np.ones(len(faces), dtype=bool)
+    for first in range(0, len(faces), AT_ONCE):
+        part = faces[first:first + AT_ONCE]
+        out[first:first + AT_ONCE] = corners_have_area(*(vertices.take(part[:, i], axis=0) for i in range(3)))
+    return out
+
+
+def corners_have_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """As has_area, for corners (N, 3) float32 each; best where 24 N float64 fit in the cache.
 
     The cross product of two edges is taken in float64 and believed where a component exceeds its rounding error; the few
     others are taken again in whole numbers.
     """
-    out = np.ones(len(faces), dtype=bool)
-    for first in range(0, len(faces), AT_ONCE):
-        part = faces[first:first + AT_ONCE]
-        a, b, c = (vertices[part[:, i]].astype(np.float64).T for i in range(3))
-        e, f = b - a, c - a
-        unknown: np.ndarray | slice = slice(None)
-        with np.errstate(invalid="ignore"):
-            for i, j in ((1, 2), (2, 0), (0, 1)):
-                left, right = e[i, unknown] * f[j, unknown], e[j, unknown] * f[i, unknown]
-                # Two roundings in each product's factors and one in itself. NaN is not below anything: has area.
-                doubt = np.flatnonzero(np.abs(left - right) <= 2.0**-50 * (np.abs(left) + np.abs(right)))
-                unknown = doubt if isinstance(unknown, slice) else unknown[doubt]
-                if not len(unknown):
-                    break
-        assert isinstance(unknown, np.ndarray)
-        out[first + unknown] = _has_area_exactly(a[:, unknown], b[:, unknown], c[:, unknown])
+    a, b, c = (_columns(corner) for corner in (p, q, r))
+    e, f = b - a, c - a
+    out = np.ones(len(p), dtype=bool)
+    unknown: np.ndarray | slice = slice(None)
+    with np.errstate(invalid="ignore"):
+        for i, j in ((1, 2), (2, 0), (0, 1)):
+            left, right = e[i, unknown] * f[j, unknown], e[j, unknown] * f[i, unknown]
+            # Two roundings in each product's factors and one in itself. NaN is not below anything: has area.
+            doubt = np.flatnonzero(np.abs(left - right) <= 2.0**-50 * (np.abs(left) + np.abs(right)))
+            unknown = doubt if isinstance(unknown, slice) else unknown[doubt]
+            if not len(unknown):
+                return out
+    out[unknown] = _has_area_exactly(a[:, unknown], b[:, unknown], c[:, unknown])
+    return out
+
+
+def _columns(points: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 -> (3, N) float64, one coordinate after the other."""
+    out = np.empty((3, len(points)))
+    for axis in range(3):
+        out[axis] = points[:, axis]
     return out
 
 

@@ -78,12 +78,13 @@ class Geometry:
         """
         def fill(first: int) -> None:
             some, n = slice(first, first + RECORDS_PER_JOB), len(self.faces)
-            corners = [self.vertices[self.faces[some, i]] for i in range(3)]
+            corners = [self.vertices.take(self.faces[some, i], axis=0) for i in range(3)]
             spheres = self.spheres[max(first - n, 0) : max(first + RECORDS_PER_JOB - n, 0)]
             low, high = (np.concatenate([end(end(corners[0], corners[1]), corners[2]), spheres[:, :3] + sign * spheres[:, 3:]])
                          for end, sign in ((np.minimum, np.float32(-1.0)), (np.maximum, np.float32(1.0))))
             with np.errstate(over="ignore"):  # near the end of float32 the padded box is all of space
-                pad = np.float32(PAD_EXTENT) * (high - low).max(axis=1, keepdims=True, initial=0.0)
+                x, y, z = (high - low).T
+                pad = np.float32(PAD_EXTENT) * np.maximum(np.maximum(x, y), z)[:, None]
                 lo[some] = low - (pad + np.float32(PAD_COORDINATE) * np.abs(low))
                 hi[some] = high + (pad + np.float32(PAD_COORDINATE) * np.abs(high))
 
@@ -101,8 +102,10 @@ class Geometry:
             some = slice(first, first + RECORDS_PER_JOB)
             triangle = prim_id[some] < len(self.faces) if units.spheres else slice(None)
             part = out[some][triangle]
-            TRIANGLE_DATA[units.triangle](part, *(self.vertices[self.faces[part["prim_id"], i]] for i in range(3)))
-            out[some][triangle] = part
+            faces = self.faces.take(part["prim_id"], axis=0)
+            TRIANGLE_DATA[units.triangle](part, *(self.vertices.take(faces[:, i], axis=0) for i in range(3)))
+            if units.spheres:
+                out[some][triangle] = part
 
         run_all([partial(fill, first) for first in range(0, len(prim_id), RECORDS_PER_JOB)], threads)
         return out

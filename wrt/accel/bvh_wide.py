@@ -108,7 +108,7 @@ class WideBvh(Accelerator):
             lanes = order[first * width : (first + ROWS_PER_JOB) * width]
             records = self.geometry.primitives(units, lanes[lanes >= 0]).view(np.float32).reshape(-1, numbers)
             index = np.cumsum(lanes >= 0) - 1
-            rows[first : first + ROWS_PER_JOB] = records[index].reshape(-1, width, numbers).transpose(0, 2, 1)
+            rows[first : first + ROWS_PER_JOB] = records.take(index, axis=0).reshape(-1, width, numbers).transpose(0, 2, 1)
 
         run_all([partial(fill, first) for first in range(0, len(rows), ROWS_PER_JOB)], self.threads)
         return rows.reshape(-1)

@@ -6,15 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wrt.mesh_clean import has_area
+from wrt.mesh_clean import corners_have_area
 
 
 def corners(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> None:
     """The corners as they are. A triangle without area gets NaN for v0, which no ray hits: whether corners are on a line
     is more than float32 or float64 can tell, and is the same for every ray."""
     record["v0"], record["v1"], record["v2"] = v0, v1, v2
-    flat = ~has_area(np.concatenate([v0, v1, v2]), np.arange(3 * len(v0)).reshape(3, -1).T)
-    record["v0"][flat] = np.nan
+    record["v0"][~corners_have_area(v0, v1, v2)] = np.nan
 
 
 def edges(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> None:
