@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import re
 import shlex
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +23,7 @@ from wrt.cli import cli
 from wrt.mesh import load_mesh
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-OTHERS = ("pip install ", "pytest", "sh ", "git clone ")  # commands that CI itself begins with (.ci/run), or that only it can run
+OTHERS = ("pip install ", "pytest", "python -m pdoc ")  # which CI itself runs (.ci/run)
 # What stands for something in a command line, and what it is here. The folder of each test has these files.
 STANDS_FOR = {"MESH...": "model.ply", "MESH": "model.ply", "SCENE": "scenes/whitted.toml", "FILE.gif": "file.gif", "STUDY": "order",
               "bunny.ply": "model.ply", "FOLDER|FILE.gif|.png": "frames", "FOLDER": "folder"}
@@ -35,9 +38,9 @@ CHEAP = {
 SLOW = {  # run by `pytest -m slow`
     "stability": ("--rays", "200", "--sample", "50", "--runs", "1"), "bench peers": ("--rays", "500", "--runs", "1"),
     "bench rtcore": ("--rays", "500",), "bench units": ("--rays", "500", "--runs", "1"),
-    "bench error": ("--size", "16x9", "--max-spp", "2", "--repeats", "1", "--reference-spp", "4", "--knobs", "max_depth"),
+    "bench error": ("--size", "16x9", "--max-spp", "2", "--repeats", "3", "--reference-spp", "4", "--knobs", "max_depth"),
     "bench bvh": ("--rays", "500", "--builds", "1", "--runs", "1", "--builders", "sweep"), "bench instructions": (),
-    "bench mitsuba": ("--size", "16x9", "--spp", "1", "--repeats", "1", "--starts", "0"),
+    "bench mitsuba": ("--size", "16x9", "--spp", "1", "--repeats", "3", "--starts", "0"),
 }
 
 
@@ -60,12 +63,11 @@ def command_lines(text: str) -> list[str]:
 
 def arguments(line: str) -> list[str] | None:
     """Those of `python -m wrt`; None where the line is another command."""
-    words = shlex.split(re.sub(r"[\[\]]", "", line))
-    words = words[words.index("wrt") + 1 :] if "wrt" in words[:4] else []
-    if not words:
+    match = re.fullmatch(r"(?:python -m )?wrt ([a-z].*)", line)
+    if match is None:
         return None
     out: list[str] = []
-    for word in words:
+    for word in shlex.split(re.sub(r"[\[\]]", "", match[1])):
         found = [STANDS_FOR.get(word, word)]
         if "*" in word:
             found = [str(path.relative_to(ROOT)) for path in sorted(ROOT.glob(word))][:3]
@@ -143,7 +145,7 @@ def runs(commands: dict[str, tuple[str, ...]]) -> list[tuple[str, ...]]:
     for _, line in COMMANDS:
         words = arguments(line) or []
         name, command = command_of(words)
-        needs = any(isinstance(each, click.Argument) and each.required for each in command.params)
+        needs = any(isinstance(each, click.Argument) for each in command.params)
         if name in commands and (len(words) > len(name.split()) or not needs):
             out.add((*words, *commands[name]))
     return sorted(out)
@@ -183,6 +185,30 @@ def test_python_runs(page: str, folder: Path, tmp_path: Path, monkeypatch: pytes
         cheap = re.sub(r"spp=\d+", "spp=2", block).replace("640x360", "24x14").replace("(640, 360)", "(24, 14)")
         cheap = cheap.replace('"bunny.ply"', '"model.ply"').replace(", progress=wrt.LiveView()", ", spp=1, size=(24, 14)")
         exec(compile(cheap, page, "exec"), names)
+
+
+# --- the API reference ------------------------------------------------------------------------------------------------
+
+
+def functions_of(thing: Any) -> Iterator[tuple[str, Any]]:
+    """The public methods and properties that a class defines itself."""
+    for name, value in vars(thing).items():
+        function = value.fget if isinstance(value, property) else getattr(value, "__func__", value)
+        if not name.startswith("_") and inspect.isfunction(function):
+            yield name, function
+
+
+@pytest.mark.parametrize("module", ["wrt", "wrt.accel"])
+def test_everything_public_says_what_it_is(module: str) -> None:
+    silent = []
+    public = importlib.import_module(module)
+    for name in set(public.__all__) - {"__version__"}:
+        thing = getattr(public, name)
+        if not thing.__doc__ or thing.__doc__.startswith(f"{name}("):  # what a dataclass has by itself
+            silent.append(name)
+        if inspect.isclass(thing):
+            silent += [f"{name}.{each}" for each, function in functions_of(thing) if not function.__doc__]
+    assert silent == []
 
 
 # --- links ------------------------------------------------------------------------------------------------------------

@@ -43,10 +43,12 @@ class Progress:
 
     @property
     def rays_per_second(self) -> float:
+        """The mean so far; 0 before anything is traced."""
         return self.rays / self.seconds if self.seconds > 0.0 else 0.0
 
     @property
     def seconds_left(self) -> float:
+        """At the mean speed so far; inf before anything is done."""
         return self.seconds * (self.total - self.done) / self.done if self.done else float("inf")
 
 

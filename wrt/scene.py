@@ -208,6 +208,7 @@ class Material:
 
     @property
     def is_emissive(self) -> bool:
+        """Whether it emits anything, textures aside."""
         return max(self.emission) > 0.0
 
     @property
@@ -219,6 +220,7 @@ class Material:
 
     @property
     def textures(self) -> tuple[Texture | Checkerboard, ...]:
+        """Those that it has, in no order to rely on."""
         slots = (self.albedo_texture, self.metallic_roughness_texture, self.transmission_texture,
                  self.emission_texture, self.normal_texture)
         return tuple(texture for texture in slots if texture is not None)

@@ -49,6 +49,7 @@ class Geometry:
 
     @staticmethod
     def of(mesh: Mesh) -> Geometry:
+        """Of a mesh alone; prim_ids are indices into its faces."""
         return Geometry(mesh.vertices, mesh.faces, np.zeros((0, 4), np.float32))
 
     def __len__(self) -> int:
@@ -56,6 +57,7 @@ class Geometry:
 
     @property
     def n_triangles(self) -> int:
+        """How many of the primitives are triangles: they come before the spheres."""
         return len(self.faces)
 
     def digest(self) -> str:

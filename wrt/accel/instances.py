@@ -53,6 +53,7 @@ class InstancedGeometry:
 
     @property
     def spheres(self) -> np.ndarray:
+        """(S, 4) float32, as in Geometry; none of them is an instance."""
         return self.parts[0].spheres
 
     def __len__(self) -> int:
@@ -127,9 +128,11 @@ class Instances(Accelerator):
         raise InputError("instances are built by wrt.build")
 
     def refit(self, vertices: np.ndarray, rebuild_at: float = np.inf) -> Refit:
+        """Raises InputError: one array of vertices cannot say where instances go."""
         raise InputError("instances cannot follow vertices that move; refit their structures")
 
     def save(self, path: Any) -> None:
+        """Raises InputError: files hold one structure."""
         raise InputError("instances cannot be written to a file", path)
 
     def __repr__(self) -> str:
