@@ -23,7 +23,7 @@ import wrt
 from wrt.cli_animate import animate
 from wrt.cli_bench import bench, stability
 from wrt.cli_build import build
-from wrt.cli_common import Crop, Duration, Names, Size, load, naming, say, say_json, warnings_told
+from wrt.cli_common import CLUSTER, Crop, Duration, Names, Size, load, naming, say, say_json, spread_options, warnings_told
 from wrt.cli_profile import profile, whatif
 from wrt.cli_save import check_room, checkpoint_options, save_film
 from wrt.cli_view import view
@@ -53,7 +53,8 @@ cli.add_command(view)
 @click.option("--spp", type=int, help="Samples a pixel  [default: the scene's]")
 @click.option("--size", type=Size(), help="Pixels  [default: the scene's, 640x360]")
 @click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another noise")
-@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
+@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`); several share: cuda:0,cuda:1")
+@CLUSTER
 @click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
 @click.option("--crop", type=Crop(), help="Render only this rectangle, in pixels from the top left")
 @click.option("--camera", help="A camera's name or number  [default: the first]")
@@ -97,6 +98,7 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
         "spp", "size", "max_depth", "min_throughput", "fresnel", "sampler", "tonemap", "exposure")}
     options |= checkpoint_options(output, options.pop("every"), options.pop("checkpoint_file"), options.pop("resume"))
     Scene().with_settings(**settings)
+    options |= spread_options(options.pop("cluster"), options.pop("device"))
     Options(**options)
     layers = aov if output.suffix.lower() != ".exr" else None  # in an EXR file they are channels, all of them
     for name in layers or ():

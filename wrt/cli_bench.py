@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
-from wrt.cli_common import Duration, Names, Size, load, naming, now_and_then, say, say_json, warnings_told
+from wrt.cli_common import CLUSTER, Duration, Names, Size, client_of, load, naming, now_and_then, say, say_json, warnings_told
 from wrt.errors import InputError
 
 
@@ -20,12 +21,13 @@ from wrt.errors import InputError
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
 @click.option("--peers", is_flag=True, help="Also Embree (embreex), Warp's mesh_query_ray and Open3D, where installed")
 @click.option("--threads", type=int, help="Threads for the rays beyond the sample  [default: all cores]")
+@CLUSTER
 @click.option("--runs", type=click.IntRange(min=1), default=7, show_default=True, help="Runs of each for the speed, by turns")
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Write a report: Markdown with plots beside it (.md), or one page (.html)")
 @click.option("-q", "--quiet", is_flag=True, help="No progress")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def stability(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+def stability(output: Path | None, cluster: str | None, quiet: bool, as_json: bool, **options: Any) -> None:
     """The hard cases against the intersection tests: rays lost and errors, with the speed beside them.
 
     CASES: names such as E_grid, or the letters of groups; without any, all.
@@ -41,9 +43,10 @@ def stability(output: Path | None, quiet: bool, as_json: bool, **options: Any) -
     bench_stability.chosen(plan.cases)
     if output is not None:
         report.check_report(output)
+    client = client_of(cluster)
     if not as_json:
         click.echo("  ".join(report.COLUMNS))
-    result = bench_stability.run(plan, told, now_and_then(quiet))
+    result = bench_stability.run(plan, told, now_and_then(quiet), client)
     paths = [] if output is None else report.write_report(result, plan, output)
     if as_json:
         say_json({"machine": report.machine(plan), **result.as_dict(), "output": [str(path) for path in paths]})
@@ -51,6 +54,22 @@ def stability(output: Path | None, quiet: bool, as_json: bool, **options: Any) -
     click.echo(f"\n{report.summary(result)}")
     for path in paths:
         click.echo(path)
+
+
+def by_mesh(run: Callable[..., list[Any]], plan: Any, report: Callable[[Any], None], client: Any) -> list[Any]:
+    """As wrt.bench.sweep.by_mesh."""
+    from wrt.bench import sweep
+
+    return sweep.by_mesh(run, plan, report, client)
+
+
+def told_of(client: Any, here: str) -> str:
+    """What is measured on: this machine, or a cluster's, each mesh on one worker."""
+    if client is None:
+        return here
+    from wrt.cluster import machines
+
+    return f"a cluster, each mesh on one worker: {machines(client)}; started from {here}"
 
 
 @click.group()
@@ -67,10 +86,12 @@ def bench() -> None:
 @click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
 @click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
 @click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
+@CLUSTER
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for a report with plots")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def visibility(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+def visibility(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, quiet: bool, as_json: bool,
+               **options: Any) -> None:
     """Rasterising against ray casting, as triangles and pixels grow: the cost of both, and where they differ.
 
     MESHES: .obj, .ply or .stl files; without any, a sphere and a terrain.
@@ -81,14 +102,15 @@ def visibility(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_js
     plan = bench_visibility.Plan(meshes, **options)
     if output is not None:
         report.check_folder(output)
-    told = report.machine(plan)
+    client = client_of(cluster)
+    told = told_of(client, report.machine(plan))
 
     def progress(row: Any) -> None:
         if not quiet:
             say("  ".join(report.cells(row)[:8]))
 
     with warnings_told(quiet):
-        rows = bench_visibility.run(plan, progress)
+        rows = by_mesh(bench_visibility.run, plan, progress, client)
     paths = [] if output is None else report.write_report(rows, plan, output, told)
     if as_json:
         say_json({"machine": told, "rows": [row.as_dict() for row in rows], "exponents": bench_visibility.fits(rows),
@@ -140,10 +162,11 @@ def units(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> No
 @click.option("--rays", type=int, default=100_000, show_default=True, help="Rays of each kind")
 @click.option("--runs", type=int, default=7, show_default=True, help="Runs of each, by turns")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
+@CLUSTER
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the tables as Markdown (.md)")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def peers(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+def peers(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, quiet: bool, as_json: bool, **options: Any) -> None:
     """wrt beside Embree and Warp's mesh_query_ray: the same rays on one thread by turns, with ratios and answers that differ.
 
     MESHES: .obj, .ply or .stl files; without any, a sphere.
@@ -153,14 +176,15 @@ def peers(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: b
     plan = bench_peers.Plan(meshes, **options)
     if output is not None and (output.suffix.lower() != ".md" or not output.parent.is_dir()):
         raise InputError("the report is a .md file in a folder that is there", output)
-    told = bench_peers.machine(plan)
+    client = client_of(cluster)
+    told = told_of(client, bench_peers.machine(plan))
 
     def progress(row: Any) -> None:
         if not quiet:
             say(f"{row.mesh}: {'  '.join(bench_peers.cells(row, row))}")
 
     with warnings_told(quiet):
-        rows = bench_peers.run(plan, progress)
+        rows = by_mesh(bench_peers.run, plan, progress, client)
     text = bench_peers.text(rows, told)
     if output is not None:
         output.write_text(text, encoding="utf-8")
@@ -179,12 +203,13 @@ def peers(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: b
 @click.option("--builds", type=int, default=1, show_default=True, help="Builds of each structure")
 @click.option("--max-triangles", type=int, default=1_000_000, show_default=True, help="Without meshes, the terrain grows to this")
 @click.option("--threads", type=int, default=1, show_default=True, help="Threads to search with (builds use all cores)")
+@CLUSTER
 @click.option("--stadium", is_flag=True, help="Each mesh in a stadium a thousand times its size, with the rays it has alone")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for a report with plots")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def accel(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+def accel(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, quiet: bool, as_json: bool, **options: Any) -> None:
     """Structure against structure: time to build, memory, steps and time to search, and answers that differ (none may).
 
     MESHES: .obj, .ply or .stl files; without any, a terrain that grows from a thousand triangles on.
@@ -197,14 +222,15 @@ def accel(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: b
     plan = bench_accel.Plan(meshes, **options)
     if output is not None:
         report.check_folder(output)
-    told = report.machine(plan)
+    client = client_of(cluster)
+    told = told_of(client, report.machine(plan))
 
     def progress(row: Any) -> None:
         if not quiet:
             say(f"{row.mesh}: {'  '.join(report.cells(row, row)) if isinstance(row, bench_accel.Row) else row.reason}")
 
     with warnings_told(quiet):
-        rows = bench_accel.run(plan, progress)
+        rows = by_mesh(bench_accel.run, plan, progress, client)
     paths = [] if output is None else report.write_report(rows, plan, output, told)
     if as_json:
         say_json({"machine": told, "rows": [row.as_dict() for row in rows if isinstance(row, bench_accel.Row)],
@@ -223,24 +249,26 @@ def accel(meshes: tuple[Path, ...], output: Path | None, quiet: bool, as_json: b
 @click.option("--builds", type=int, default=3, show_default=True, help="Builds of each builder, after the first")
 @click.option("--runs", type=int, default=7, show_default=True, help="Runs of each volume, alternating")
 @click.option("--threads", type=int, help="Threads to build with  [default: all cores]")
+@CLUSTER
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def bvh(meshes: tuple[Path, ...], quiet: bool, as_json: bool, **options: Any) -> None:
+def bvh(meshes: tuple[Path, ...], cluster: str | None, quiet: bool, as_json: bool, **options: Any) -> None:
     """Builders of binary BVHs over MESHES: quality, time and memory; and boxes, spheres and 14-DOPs around the same tree."""
     from dataclasses import asdict
 
     from wrt.bench import bvh as bench_bvh
 
     plan = bench_bvh.Plan(meshes, **options)
-    told = bench_bvh.machine()
+    client = client_of(cluster)
+    told = told_of(client, bench_bvh.machine())
 
     def progress(row: Any) -> None:
         if not quiet:
             say(f"{row.mesh}: {'  '.join(row.cells())}")
 
     with warnings_told(quiet):
-        rows = bench_bvh.run(plan, progress)
+        rows = by_mesh(bench_bvh.run, plan, progress, client)
     if as_json:
         say_json({"machine": told, "builders": [asdict(row) for row in rows if isinstance(row, bench_bvh.BuilderRow)],
                   "volumes": [asdict(row) for row in rows if isinstance(row, bench_bvh.VolumeRow)]})

@@ -67,6 +67,29 @@ class Names(click.ParamType):
         return tuple(name.strip() for name in str(value).split(",") if name.strip())
 
 
+def spread_options(cluster: str | None, device: str) -> dict[str, Any]:
+    """The options of `wrt.render` for --cluster and --device; a cluster's connection is open until the command ends."""
+    names = [name.strip() for name in device.split(",")]
+    if cluster is None:
+        return {"device": device} if len(names) == 1 else {"devices": names}
+    if len(names) > 1:
+        raise InputError(f"--device {device}: with --cluster it is that of each worker, and one; start a worker for each device")
+    return {"device": device, "executor": client_of(cluster)}
+
+
+def client_of(cluster: str | None) -> Any:
+    """A dask.distributed.Client that is open until the command ends; None of None."""
+    if cluster is None:
+        return None
+    from wrt.cluster import connected
+
+    return click.get_current_context().with_resource(connected(cluster))
+
+
+CLUSTER = click.option("--cluster", metavar="ADDRESS",
+                       help="Spread over the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
+
+
 def load(path: Path, quiet: bool, clock: dict[str, float] | None = None) -> Any:
     """The scene, with the loader's warnings on stderr."""
     begin = time.perf_counter()

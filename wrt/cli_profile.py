@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from wrt.cli_bench import bench
-from wrt.cli_common import Crop, Names, Size, load, naming, say, say_json, warnings_told
+from wrt.cli_bench import bench, by_mesh
+from wrt.cli_common import CLUSTER, Crop, Names, Size, client_of, load, naming, say, say_json, warnings_told
 from wrt.errors import InputError
 
 
@@ -108,11 +108,13 @@ def check_report(output: Path | None) -> None:
 @click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
 @click.option("--inside", is_flag=True, help="The camera stands in the middle of the mesh's box, as in a room")
+@CLUSTER
 @click.option("--software", is_flag=True, help="Also what the same rays take in software on a GTX 1080 Ti (compiles for Turing)")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the tables as Markdown (.md)")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def rtcore(meshes: tuple[Path, ...], software: bool, output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+def rtcore(meshes: tuple[Path, ...], cluster: str | None, software: bool, output: Path | None, quiet: bool, as_json: bool,
+           **options: Any) -> None:
     """The model of the RT core on MESHES: what limits it, rays a second as ranges, and which assumption moves them most."""
     from wrt.bench import rtcore as bench_rtcore
     from wrt.bench.instructions import software_table
@@ -126,7 +128,7 @@ def rtcore(meshes: tuple[Path, ...], software: bool, output: Path | None, quiet:
             say("  ".join((row.mesh, row.structure, *cells(row.row))))
 
     with warnings_told(quiet):
-        rows = bench_rtcore.run(plan, told)
+        rows = by_mesh(bench_rtcore.run, plan, told, client_of(cluster))
     text = f"{bench_rtcore.markdown(rows)}\n{LEGEND}\n\n{parameter_table()}"
     in_software = bench_rtcore.in_software(rows) if software else []
     if software:

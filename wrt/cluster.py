@@ -6,22 +6,25 @@ all that held it. Nothing is imported from Dask before somebody asks for it.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import pkgutil
 import time
-from collections.abc import Iterator
-from concurrent.futures import CancelledError, Future
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import warp as wp
 
 import wrt
-from wrt.crews import Job, Reply, Workers, call
+from wrt.crews import Reply, Workers
+from wrt.device import describe_devices
 from wrt.errors import InputError
 
-CONNECT_SECONDS = 10.0  # to find the scheduler
+CONNECT_SECONDS = 5.0  # to find the scheduler
 WORKER_SECONDS = 10.0  # for a first worker to come
+RESULT_SECONDS = 30.0  # to fetch what a worker made
 PATIENCE = 60.0  # seconds without any worker, in a render
 # What must be the same everywhere, as pkgutil.resolve_name finds it: a worker without wrt can be asked too.
 VERSIONS = {"wrt:__version__": wrt.__version__, "warp:__version__": wp.__version__}
@@ -35,14 +38,28 @@ def connected(address: str) -> Iterator[Any]:
         from distributed import Client
     except ImportError:
         raise InputError("a cluster needs dask.distributed: pip install 'wrt[cluster]'") from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is told in our words
+    for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is told in our words
     try:
+        kind = asyncio.run(asyncio.wait_for(_identity(address), CONNECT_SECONDS))
+        if kind != "Scheduler":
+            raise ValueError(f"a {kind} answers")
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+    except TimeoutError as error:
+        raise InputError(f"no Dask scheduler at {address!r}: no answer in {CONNECT_SECONDS:g} s") from error
+    except Exception as error:  # of any kind, where something else answers
         raise InputError(f"no Dask scheduler at {address!r}: {error}") from error
     with client:
         check_workers(client)
         yield client
+
+
+async def _identity(address: str) -> str:
+    """Who answers there. A Client by itself waits for ever for one that takes the connection and says nothing."""
+    from distributed.core import rpc
+
+    async with rpc(address, timeout=CONNECT_SECONDS) as there:
+        return str((await there.identity())["type"])
 
 
 def check_workers(client: Any) -> None:
@@ -63,13 +80,38 @@ def check_workers(client: Any) -> None:
                 raise InputError(f"worker {worker} has {package} {found}; here it is {version}, and all must have the same")
 
 
+def machines(client: Any) -> str:
+    """What the workers run on, as far as it differs."""
+    told = [lines[0] for lines in client.run(describe_devices).values()]
+    return "; ".join(f"{told.count(line)} workers of {line}" for line in dict.fromkeys(told))
+
+
+class Submitter:
+    """A dask.distributed.Client with the little of an Executor that a sweep takes: its own futures tell of every end there is."""
+
+    def __init__(self, client: Any) -> None:
+        check_workers(client)
+        self.client, self.address = client, str(client.scheduler.address)
+
+    def submit(self, function: Any, *arguments: Any) -> Any:
+        return self.client.submit(function, *arguments, pure=False)
+
+    def cancel(self, futures: Iterable[Any]) -> None:
+        if self.client.status == "running":
+            with suppress(Exception):  # it may be lost meanwhile, and then there is nothing to cancel
+                self.client.cancel(list(futures))
+
+    def lost(self) -> InputError:
+        return InputError("the connection to the Dask scheduler is lost", self.address)
+
+
 class ClusterWorkers(Workers):
     """The workers of a dask.distributed.Client."""
 
     def __init__(self, client: Any, key: str, package: dict[str, Any]) -> None:
-        check_workers(client)
-        super().__init__(client.get_executor(pure=False), key, package)
-        self.client = client
+        self.submitter = Submitter(client)
+        super().__init__(self.submitter, key, package)
+        self.client, self.address = client, self.submitter.address
         self.scattered: Any = None
         self.alone_since: float | None = None
 
@@ -80,37 +122,51 @@ class ClusterWorkers(Workers):
         return self.scattered
 
     def ready(self) -> bool:
-        """Whether the scene is where the workers are, if one asked for it."""
-        if not self.asked or (self.scattered is not None and self.scattered.status in ("pending", "finished")):
-            return True
-        now = time.monotonic()
+        """Whether there are workers, and the scene is where they are, if one asked for it."""
+        if self.client.status not in ("running", "connecting"):
+            raise self.submitter.lost()
         try:
-            if self.client.nthreads():
-                # A list of one: a dict by itself would be a dict of futures.
-                self.scattered = self.client.scatter([self.package], broadcast=True, hash=False)[0]
+            if self.client.status == "running" and self._is_sent():
                 self.alone_since = None
                 return True
         except (OSError, CancelledError) as error:
-            raise self._lost() from error
-        self.alone_since = self.alone_since or now
-        if now - self.alone_since > PATIENCE:
-            raise InputError(f"no worker is left at {self.client.scheduler.address}")
+            raise self.submitter.lost() from error
+        self.alone_since = self.alone_since or time.monotonic()
+        if time.monotonic() - self.alone_since > PATIENCE:
+            raise InputError("no worker is left", self.address)
         return False
 
-    def submit(self, job: Job) -> Future[Any]:
-        return self.executor.submit(call, self.key, self._scene(), *job)
+    def _is_sent(self) -> bool:
+        if not self.asked or (self.scattered is not None and self.scattered.status in ("pending", "finished")):
+            return True
+        if not self.client.nthreads():
+            return False
+        # A list of one: a dict by itself would be a dict of futures.
+        self.scattered = self.client.scatter([self.package], broadcast=True, hash=False)[0]
+        return True
 
-    def result(self, future: Future[Any]) -> Reply | None:
+    def cancel(self, futures: Iterable[Any]) -> None:
+        self.submitter.cancel(futures)
+
+    def finished(self, pending: Iterable[Any]) -> Iterable[Any]:
+        from distributed import wait
+
+        waiting = list(pending)
+        self.ready()
+        if not waiting:
+            time.sleep(0.1)
+        with suppress(TimeoutError, CancelledError), self.client.as_current():
+            wait(waiting, timeout=0.1, return_when="FIRST_COMPLETED")
+        return [future for future in waiting if future.status != "pending"]
+
+    def result(self, future: Any) -> Reply | None:
         from distributed import KilledWorker
 
         try:
-            return super().result(future)
-        except CancelledError as error:  # what it needed died with its worker, or the scheduler did
-            if self.client.status != "running":
-                raise self._lost() from error
+            reply = future.result(timeout=RESULT_SECONDS)
+        except (CancelledError, TimeoutError):  # what it needed, or made, died with its worker
             return None
         except KilledWorker as error:
-            raise InputError(f"one tile after another worker died: {error}") from error
-
-    def _lost(self) -> InputError:
-        return InputError("the connection to the Dask scheduler is lost")
+            raise InputError(f"tiles kill their workers, one after another: {error}", self.address) from error
+        self.asked += reply is None
+        return reply

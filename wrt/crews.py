@@ -12,7 +12,7 @@ import threading
 import warnings
 from collections import OrderedDict, deque
 from collections.abc import Generator, Iterable
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from hashlib import sha256
 from queue import SimpleQueue
@@ -43,11 +43,16 @@ class Crew:
         """How many."""
         raise NotImplementedError
 
-    def submit(self, job: Job) -> Future[Any]:
+    def submit(self, job: Job) -> Any:
+        """A future of its reply."""
         raise NotImplementedError
 
-    def result(self, future: Future[Any]) -> Reply | None:
-        """What came of it; None: it must be submitted again. Raises what the worker raised."""
+    def finished(self, pending: Iterable[Any]) -> Iterable[Any]:
+        """Futures that are done, after a tenth of a second or earlier."""
+        return wait(pending, timeout=0.1, return_when=FIRST_COMPLETED).done
+
+    def result(self, future: Any) -> Reply | None:
+        """What came of one that is done; None: its job must be submitted again. Raises what the worker raised."""
         return future.result()
 
     def ready(self) -> bool:
@@ -58,7 +63,7 @@ class Crew:
         """Do the jobs, and give each with its reply as it is done, in any order; None every tenth of a second when none is. Jobs
         are drawn from `jobs` shortly before they are needed. What has not begun when the caller stops is cancelled."""
         coming, again = iter(jobs), deque[Job]()
-        pending: dict[Future[Any], Job] = {}
+        pending: dict[Any, Job] = {}
         room, done = QUEUED * self.slots(), False
         try:
             while pending or again or not done:
@@ -68,7 +73,7 @@ class Crew:
                         done = True
                         break
                     pending[self.submit(job)] = job
-                finished, _ = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
+                finished = self.finished(pending)
                 for future in finished:
                     job, reply = pending.pop(future), self.result(future)
                     if reply is None:
@@ -78,8 +83,12 @@ class Crew:
                 if not finished:
                     yield None
         finally:
-            for future in pending:
-                future.cancel()
+            self.cancel(pending)
+
+    def cancel(self, futures: Iterable[Any]) -> None:
+        """Those that have not begun will not."""
+        for future in futures:
+            future.cancel()
 
 
 class Devices(Crew):
@@ -117,7 +126,7 @@ class Workers(Crew):
     Jobs go with the scene's digest alone; a worker process that does not know it asks for the scene.
     """
 
-    def __init__(self, executor: Executor, key: str, package: dict[str, Any]) -> None:
+    def __init__(self, executor: Any, key: str, package: dict[str, Any]) -> None:
         self.executor, self.key, self.package = executor, key, package
         self.asked = 0  # for the scene
 

@@ -128,9 +128,11 @@ class SpreadRenderer(Renderer):
                 self._save_if_due()
                 if self.interrupts:
                     raise KeyboardInterrupt
-        except Exception:
+        except Exception as error:
             if self.checkpoint is not None:
                 self.checkpoint.save(self.film, self._seconds())
+                if isinstance(error, InputError) and not self.checkpoint.problem:
+                    raise InputError(f"{error}; {self.checkpoint.path} has what was done", error.path) from error
             raise
         finally:
             running.close()

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import socket
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from tests.command_line import BOX_OBJ
+from tests.command_line import wrt as run
 from tests.wrt.test_checkpoint import SCENE, same
-from wrt import cluster
-from wrt.driver import Progress, render
+from wrt import cluster, crews
+from wrt.driver import render
 from wrt.errors import InputError
 from wrt.film import Film
+from wrt.image import read_channels
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 
@@ -24,7 +31,7 @@ HOW: dict[str, Any] = {"tile_size": 16, "aov": "depth"}
 @pytest.fixture(scope="module")
 def local() -> Iterator[Any]:
     """Two workers, each a process with one thread."""
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as started:
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=50) as started:
         yield started
 
 
@@ -67,7 +74,7 @@ def test_the_picture_is_the_same(client: Any, whole: Film) -> None:
     assert same(again, render(SCENE, target_error=0.02, crop=(3, 4, 50, 30)))
 
 
-@pytest.mark.parametrize("killed", [1, 2])
+@pytest.mark.parametrize("killed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_killed_workers_cost_only_their_tiles(client: Any, whole: Film, tmp_path: Path, killed: int) -> None:
     """Of two: with both of them the scene is gone too, and is sent to those that come after."""
     flags = [str(tmp_path / str(i)) for i in range(killed)]
@@ -78,3 +85,141 @@ def test_killed_workers_cost_only_their_tiles(client: Any, whole: Film, tmp_path
     assert sorted(os.listdir(tmp_path)) == [str(i) for i in range(killed)]
     assert same(film, whole) and seen == sorted(seen)
     assert len(before - set(client.run(os.getpid).values())) == killed
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def threads() -> Iterator[Any]:
+    """A scheduler and a worker in this process: they are there at once."""
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, protocol="tcp://", silence_logs=50,
+                                  dashboard_address=":0") as started:
+        yield started
+
+
+def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
+    def fails() -> None:
+        from wrt.driver import Renderer
+
+        def trace_tile(self: Any, work: Any, *rest: Any) -> Any:
+            raise ZeroDivisionError("as it happens") if work.first else InputError("not this scene", "a.toml")
+
+        Renderer.kept, Renderer.trace_tile = Renderer.trace_tile, trace_tile  # type: ignore
+
+    def works() -> None:
+        from wrt.driver import Renderer
+
+        Renderer.trace_tile = Renderer.kept  # type: ignore
+
+    client.run(fails)
+    try:
+        with pytest.raises(InputError, match=r"^a\.toml: not this scene$"):
+            render(SCENE, executor=client)
+    finally:
+        client.run(works)
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda: sys.modules["wrt"].__dict__.update(__version__="0.0.9"), r"worker tcp://.* has wrt 0\.0\.9; here it is "),
+    (lambda: sys.modules.update(wrt=None), r"worker tcp://.* has no wrt \(.*\): wrt .* must be installed there"),  # type: ignore
+])
+def test_a_worker_that_cannot_serve(client: Any, change: Any, said: str) -> None:
+    import wrt
+
+    version, first = wrt.__version__, next(iter(client.scheduler_info()["workers"]))
+
+    def put_back() -> None:
+        if sys.modules["wrt"] is None:
+            sys.modules["wrt"] = sys.modules["wrt.driver"].wrt
+        sys.modules["wrt"].__version__ = version  # type: ignore[attr-defined]
+
+    render(SCENE, executor=client, spp=1)
+    client.run(change, workers=[first])
+    try:
+        with pytest.raises(InputError, match=said):
+            render(SCENE, executor=client)
+    finally:
+        client.run(put_back, workers=[first])
+
+
+def test_a_scene_that_is_lost_is_sent_again(threads: Any, whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As by the death of all workers that held it."""
+    monkeypatch.setattr(crews, "_ready", type(crews._ready)())
+    sent: list[Any] = []
+    with distributed.Client(threads, set_as_default=False) as one:
+        scatter = one.scatter
+        monkeypatch.setattr(one, "scatter", lambda *rest, **how: [sent.append(scatter(*rest, **how)[0]), sent[-1]][1:])
+
+        def progress(progress: Any) -> None:
+            if len(sent) == 1:
+                one.cancel(sent, force=True)
+
+        assert same(render(SCENE, executor=one, progress=progress, **HOW), whole)
+    assert len(sent) == 2
+
+
+def test_a_scheduler_that_goes_away_leaves_a_checkpoint(threads: Any, tmp_path: Path, whole: Film) -> None:
+    path = tmp_path / "a.checkpoint"
+
+    def progress(progress: Any) -> None:
+        if progress.done > 4 * 61 * 34:
+            threads.close()
+
+    with distributed.Client(threads, set_as_default=False, timeout=1) as one:
+        with pytest.raises(InputError, match=rf"(connection to the Dask scheduler is lost|no worker is left); {path} has what was"):
+            render(SCENE, executor=one, checkpoint=path, progress=progress, pass_size=1, **HOW)
+    film = render(SCENE, checkpoint=path, resume=True, aov="depth")
+    assert film.stats["resumed"]["samples"] >= 1 and same(film, whole)
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "box.obj"
+    path.write_text(BOX_OBJ)
+    return path
+
+
+def test_commands(threads: Any, mesh: Path) -> None:
+    address = threads.scheduler_address
+    for name, where in (("here", ()), ("there", ("--cluster", address)), ("devices", ("--device", "cpu,cpu"))):
+        done = run("render", mesh, "-o", f"{name}.exr", "--size", "64x36", "--spp", 4, "--json", "-q", *where)
+        assert done.code == 0 and json.loads(done.out)["samples"] == 64 * 36 * 4, done.err
+    here = read_channels("here.exr")
+    for name in ("there", "devices"):
+        other = read_channels(f"{name}.exr")
+        assert here.keys() == other.keys() and all(np.array_equal(here[layer], other[layer]) for layer in here)
+    few = ("--kinds", "primary", "--rays", 64, "--cluster", address)
+    done = run("bench", "rtcore", mesh, "--structures", "bvh2", "-q", "--json", *few)
+    assert done.code == 0 and [row["structure"] for row in json.loads(done.out)["rows"]] == ["bvh2"], done.err
+    done = run("bench", "peers", mesh, "--rivals", "warp", "--runs", 1, *few)
+    assert done.code == 0 and "each mesh on one worker: 1 workers of cpu: " in done.out, done.err
+    done = run("render", mesh, "--cluster", address, "--device", "cpu,cpu")
+    assert done.code == 2 and len(done.errors) == 1 and "a worker for each device" in done.err
+
+
+def test_wrong_addresses(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.3)
+    monkeypatch.setattr(cluster, "WORKER_SECONDS", 0.3)
+    with socket.socket() as closed, socket.socket() as deaf:
+        closed.bind(("127.0.0.1", 0))
+        deaf.bind(("127.0.0.1", 0))
+        deaf.listen()
+        addresses = [f"tcp://127.0.0.1:{one.getsockname()[1]}" for one in (closed, deaf)]
+        for address in (*addresses, "nonsense", "tcp://", "", "ftp://127.0.0.1:1", "tcp://127.0.0.1:99999999"):
+            done = run("render", mesh, "--cluster", address)
+            assert done.code == 2 and len(done.errors) == 1 and "no Dask scheduler at" in done.err, (address, done)
+    with distributed.LocalCluster(n_workers=0, protocol="tcp://", dashboard_address=":0", silence_logs=50) as empty:
+        done = run("render", mesh, "--cluster", empty.scheduler_address)
+        assert done.code == 2 and len(done.errors) == 1 and "no worker at tcp://" in done.err and "dask worker tcp://" in done.err
+    assert not list(mesh.parent.glob("*.png"))
+
+
+def test_without_distributed(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    done = run("render", mesh, "--cluster", "tcp://127.0.0.1:1")
+    assert done.code == 2 and len(done.errors) == 1 and "pip install 'wrt[cluster]'" in done.err

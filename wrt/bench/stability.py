@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache, partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from wrt.accel.base import Structure
 from wrt.bench.algorithms import PEERS, Algorithm, Own, own_algorithms
 from wrt.bench.hard_cases import ASK, HARD_CASES, HardCase, Verdict, check, chunks, generate, judge, judge_all_hits, judge_next
 from wrt.bench.price import Quartiles, alternate, quartiles
+from wrt.bench.sweep import cancel, one_at_a_time, result, submitter
+from wrt.crews import worker_name
 from wrt.device import load_kernel, thread_count, upload
 from wrt.errors import InputError
 from wrt.kernels.query import HitList, RayArrays, Respawn, make_all_hits_kernel, make_respawn_kernel
@@ -60,6 +63,10 @@ class Row:
     offset_self_hits: int = 0
     refused: bool | None = None
 
+    def add(self, verdict: Verdict, offset_self_hits: int) -> None:
+        """Of more rays."""
+        self.verdict, self.offset_self_hits = self.verdict + verdict, self.offset_self_hits + offset_self_hits
+
     def as_dict(self) -> dict[str, Any]:
         return {"case": self.case, "algorithm": self.algorithm, "judged": self.judged,
                 "offset_self_hits": self.offset_self_hits, "refused": self.refused, **self.verdict.as_dict()}
@@ -98,20 +105,35 @@ class Result:
 
 
 def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
-        progress: Callable[[str], None] = lambda line: None) -> Result:
+        progress: Callable[[str], None] = lambda line: None, executor: Any = None) -> Result:
     """Every case (names in HARD_CASES or letters of groups; none: all) with every algorithm, the same rays for all.
 
-    report: called with each row as it is done; progress: now and then with a line of text, from any thread. Raises
-    InputError for an unknown case.
+    report: called with each row as it is done; progress: now and then with a line of text, from any thread. executor: a
+    concurrent.futures.Executor or a dask.distributed.Client whose workers trace and judge the rays, for the same rows; the speed
+    is measured here all the same. Raises InputError for an unknown case.
     """
     begin = time.perf_counter()
     names = chosen(plan.cases)
-    algorithms: list[Algorithm] = list(own_algorithms())
-    peers = PEERS.values() if plan.peers else ()
-    algorithms += [peer() for peer in peers if peer.is_installed()]
-    result = Result(missing=tuple(peer.name for peer in peers if not peer.is_installed()))
+    algorithms, peers = all_algorithms(plan), PEERS.values() if plan.peers else ()
+    found = Result(missing=tuple(peer.name for peer in peers if not peer.is_installed()))
     progress("measuring the speed")
-    result.speeds = measure_speed(algorithms, plan.runs)
+    found.speeds = measure_speed(algorithms, plan.runs)
+    rows = _rows(names, algorithms, plan, progress) if executor is None else _spread_rows(
+        names, [algorithm.name for algorithm in algorithms], plan, progress, submitter(executor))
+    for row in rows:
+        found.rows.append(row)
+        report(row)
+    found.seconds = time.perf_counter() - begin
+    return found
+
+
+def all_algorithms(plan: Plan) -> list[Algorithm]:
+    """Our own, the default first, and the peers that are asked for and installed."""
+    peers = PEERS.values() if plan.peers else ()
+    return [*own_algorithms(), *(peer() for peer in peers if peer.is_installed())]
+
+
+def _rows(names: list[str], algorithms: list[Algorithm], plan: Plan, progress: Callable[[str], None]) -> Iterator[Row]:
     for i, name in enumerate(names):
         for algorithm in algorithms:
             progress(f"case {i + 1} of {len(names)}, {name}, {algorithm.name}")
@@ -119,12 +141,36 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
             if row is None:
                 continue
             if algorithm is algorithms[0] and row.refused is None:
-                more, offset = run_more(name, plan, progress)
-                row.verdict, row.offset_self_hits = row.verdict + more, row.offset_self_hits + offset
-            result.rows.append(row)
-            report(row)
-    result.seconds = time.perf_counter() - begin
-    return result
+                row.add(*run_more(name, plan, progress))
+            yield row
+
+
+def _spread_rows(names: list[str], algorithms: list[str], plan: Plan, progress: Callable[[str], None],
+                 pool: Any) -> Iterator[Row]:
+    """The same rows in the same order: each case with each algorithm is a task, and so is each chunk of the rays beyond."""
+    rows = [(name, algorithm, pool.submit(one_at_a_time, case_row, name, algorithm, plan))
+            for name in names for algorithm in algorithms]
+    more = {name: [pool.submit(one_at_a_time, more_part, name, plan, index) for index in range(parts(name, plan))]
+            for name in names}
+    try:
+        for i, (name, algorithm, future) in enumerate(rows):
+            progress(f"{i} of {len(rows)} are done; {name}, {algorithm}")
+            row = result(pool, future)
+            if row is None:
+                continue
+            if algorithm == algorithms[0] and row.refused is None:
+                row.add(*_sum(result(pool, part) for part in more[name]))
+            yield row
+    finally:
+        cancel(pool, chain((future for _, _, future in rows), *more.values()))
+
+
+def case_row(name: str, algorithm: str, plan: Plan) -> Row | None:
+    """On a worker: run_case of an algorithm by name. Raises InputError where it is not installed there."""
+    for each in all_algorithms(plan):
+        if each.name == algorithm:
+            return run_case(name, fewer(name, min(plan.sample, plan.rays)), each, plan.seed)
+    raise InputError(f"worker {worker_name()} has no {algorithm}, which is installed here")
 
 
 def chosen(cases: Sequence[str]) -> list[str]:
@@ -172,40 +218,56 @@ def run_more(name: str, plan: Plan, progress: Callable[[str], None]) -> tuple[Ve
     """The rays of a case beyond the sample through the default units, on all threads, held to what is known of them; and
     self-hits if only the offset kept rays off. Nothing where nothing is known of them: a case that only the oracle can judge.
     """
-    left = fewer(name, plan.rays) - fewer(name, plan.sample)
-    probe = generate(name, 64, plan.seed)
-    if left <= 0 or ((probe.expected == ASK).all() and probe.next_directions is None):
-        return Verdict(), 0
-    first = -(-fewer(name, plan.sample) // CHUNK)  # `chunks` has used the seeds below it
+    count, left = parts(name, plan), fewer(name, plan.rays) - fewer(name, plan.sample)
     own, lock = threading.local(), threading.Lock()
     done, begin = 0, time.perf_counter()
 
     def part(index: int) -> tuple[Verdict, int]:
         nonlocal done
-        case = generate(name, min(CHUNK, left - index * CHUNK), (plan.seed, first + index))
         if not hasattr(own, "default"):
             own.default = Own()
-        own.default.prepare(case.geometry)
-        verdict = check(case, own.default.closest(case.origins, case.directions, case.t_min, case.t_max))
-        offset = 0
-        if case.next_directions is not None:
-            verdict += judge_next(case, *respawn(own.default, case, exclude=True))
-            offset = judge_next(case, *respawn(own.default, case, exclude=False)).self_hits
-        else:
-            verdict.rays -= int((case.expected == ASK).sum())  # nothing was checked of them
+        found = more_part(name, plan, index, own.default)
         with lock:
-            done += len(case)
+            done += min(CHUNK, left - index * CHUNK)
             rate = done / (time.perf_counter() - begin) / 1e6
             progress(f"{name}, {done / 1e6:.1f} of {left / 1e6:.1f} M rays more, {rate:.2f} Mray/s")
-        return verdict, offset
+        return found
 
-    total, offsets = Verdict(), 0
     pool = ThreadPoolExecutor(thread_count(plan.threads))
     try:
-        for verdict, offset in pool.map(part, range(-(-left // CHUNK))):
-            total, offsets = total + verdict, offsets + offset
+        return _sum(pool.map(part, range(count)))
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def parts(name: str, plan: Plan) -> int:
+    """How many chunks of rays there are beyond the sample; none where nothing is known of them."""
+    left = fewer(name, plan.rays) - fewer(name, plan.sample)
+    if left <= 0:
+        return 0
+    probe = generate(name, 64, plan.seed)
+    return 0 if (probe.expected == ASK).all() and probe.next_directions is None else -(-left // CHUNK)
+
+
+def more_part(name: str, plan: Plan, index: int, own: Own | None = None) -> tuple[Verdict, int]:
+    """One chunk of the rays beyond the sample: verdict, and self-hits if only the offset kept rays off."""
+    own = own or Own()
+    left = fewer(name, plan.rays) - fewer(name, plan.sample)
+    first = -(-fewer(name, plan.sample) // CHUNK)  # `chunks` has used the seeds below it
+    case = generate(name, min(CHUNK, left - index * CHUNK), (plan.seed, first + index))
+    own.prepare(case.geometry)
+    verdict = check(case, own.closest(case.origins, case.directions, case.t_min, case.t_max))
+    if case.next_directions is None:
+        verdict.rays -= int((case.expected == ASK).sum())  # nothing was checked of them
+        return verdict, 0
+    verdict += judge_next(case, *respawn(own, case, exclude=True))
+    return verdict, judge_next(case, *respawn(own, case, exclude=False)).self_hits
+
+
+def _sum(found: Iterable[tuple[Verdict, int]]) -> tuple[Verdict, int]:
+    total, offsets = Verdict(), 0
+    for verdict, offset in found:
+        total, offsets = total + verdict, offsets + offset
     return total, offsets
 
 
