@@ -138,7 +138,8 @@ def say_json(value: Any) -> None:
 
 
 def say(text: str) -> None:
-    """On stderr; that its terminal is gone is no reason to fail."""
+    """On stderr; that its terminal is gone is no reason to fail. What a stranger's file quotes gives the terminal no orders."""
+    text = re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", lambda control: f"\\x{ord(control[0]):02x}", text)
     with contextlib.suppress(OSError):
         click.echo(text, err=True)
 

@@ -22,14 +22,28 @@ from wrt.gltf_accessors import Accessors
 from wrt.gltf_document import Document
 from wrt.gltf_materials import Materials
 from wrt.gltf_schema import Instancing, PunctualLightOfNode, PunctualLights, SpotCone, at, exactly
+from wrt.memory import Meter
 from wrt.mesh import Mesh
 from wrt.mesh_clean import clean
-from wrt.scene import MAX_REACH, Camera, DirectionalLight, Light, Object, PointLight, Scene, SpotLight, as_transform
+from wrt.scene import (
+    MAX_REACH,
+    Camera,
+    DirectionalLight,
+    Light,
+    Object,
+    PointLight,
+    Scene,
+    SpotLight,
+    as_transform,
+    require_count,
+)
 from wrt.staging import stage
 
 # Attributes that are read, or named by who wants them (skins, textures), or are the application's own (underscore).
 # TANGENT is named where a normal map would use it: tangents are made from the texture coordinates.
 _NAMED_ELSEWHERE = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_", "JOINTS_", "WEIGHTS_", "_")
+# Of memory, while a mesh is made; an index can be a triangle of its own.
+BYTES_OF_VERTEX, BYTES_OF_INDEX = 60.0, 150.0
 # What a node's instances may set, and what holds where they do not.
 _INSTANCE_ATTRIBUTES: dict[str, tuple[str, tuple[float, ...]]] = {
     "TRANSLATION": ("VEC3", (0.0, 0.0, 0.0)),
@@ -122,6 +136,8 @@ def _check_forest(document: Document) -> None:
 
 def local_matrix(node: Any, place: str) -> np.ndarray:
     """A node's own transform (4, 4) float64: its matrix, or translation * rotation * scale."""
+    if node.matrix is None and node.translation is None and node.scale is None and node.rotation is None:
+        return np.eye(4)
     if node.matrix is not None:
         with at(f"{place}.matrix"):
             return as_transform(np.array(exactly(node.matrix, 16, "")).reshape(4, 4).T, "it")
@@ -181,6 +197,7 @@ class _Meshes:
         self._document = document
         self._accessors = Accessors(document)
         self._meshes: dict[tuple[Any, ...], Mesh | None] = {}
+        self._meter = Meter()
 
     def mesh(self, primitive: Any, name: str, place: str) -> Mesh | None:
         """The mesh of a primitive, or None where it holds no triangle with an area."""
@@ -212,6 +229,8 @@ class _Meshes:
                 raise InputError(f"has {len(array)} elements, POSITION has {len(positions)}", None,
                                  f"{place}.attributes.{attribute}")
         indices = self._indices(primitive, len(positions), place)
+        with at(place):
+            self._meter.take(BYTES_OF_VERTEX * len(positions) + BYTES_OF_INDEX * len(indices), "the mesh")
         if primitive.mode == 4 and len(indices) % 3:
             self._document.left_out.add("incomplete last triangles", "mesh", name)
         with at(place):
@@ -254,6 +273,8 @@ class _Meshes:
         if "ROTATION" in found and not found["ROTATION"].any(axis=1).all():
             raise InputError("must hold unit quaternions, but one is zero", None, f"{place}.ROTATION")
         count = counts.pop()
+        with at(place):
+            require_count(count, "instances")
         return compose(*(found.get(name, np.broadcast_to(default, (count, len(default))))
                          for name, (_, default) in wanted.items()))
 
@@ -344,6 +365,7 @@ class _Reader:
                     left_out.add("TANGENT, in place of which tangents are made from TEXCOORD_0", "mesh", mesh_name)
                 with at(place):
                     _require_reach(mesh, transforms)
+                    require_count(len(self.objects) + len(transforms), "objects")
                     self.objects += [Object(mesh, (material,), transform, name=name) for transform in transforms]
 
     def _placements(self, node: Any, world: np.ndarray, name: str, place: str) -> np.ndarray:

@@ -16,7 +16,7 @@ from wrt.gltf_schema import at
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_COUNT = 2**31 - 1
-_MAX_IMPLICIT_COUNT = 2**26  # zeros that no buffer stands behind: a file of a few bytes must not ask for all memory
+_MAX_IMPLICIT_COUNT = 2**22  # zeros that no buffer stands behind: a file of a few bytes must not ask for all memory
 
 
 class Accessors:

@@ -20,10 +20,12 @@ import numpy as np
 
 from wrt.errors import InputError
 from wrt.gltf_schema import at, read_as
+from wrt.memory import require
 from wrt.read_file import read_file
 
 GLB_MAGIC = b"glTF"
-BYTES_OF_JSON = 1.0
+# Of memory: of a byte of the JSON, of an object in it, of a byte of a .glb file.
+BYTES_OF_JSON, BYTES_OF_OBJECT, BYTES_OF_GLB = 4.0, 1000.0, 3.0
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 
 SUPPORTED_EXTENSIONS = frozenset({
@@ -153,7 +155,7 @@ class Document:
 
 def _read_container(path: Path) -> tuple[Any, bytes | None]:
     """The parsed JSON and the binary chunk of a .gltf or .glb file; the first bytes tell which it is."""
-    data = read_file(path, BYTES_OF_JSON)
+    data = read_file(path, BYTES_OF_GLB)
     if data[:4] == GLB_MAGIC:
         return _read_glb(data)
     if path.suffix.lower() == ".glb":
@@ -186,6 +188,8 @@ def _read_glb(data: bytes) -> tuple[Any, bytes | None]:
 
 
 def _parse_json(data: bytes) -> Any:
+    require(BYTES_OF_JSON * len(data) + BYTES_OF_OBJECT * data.count(b"{"), "the JSON")
+
     def refuse(constant: str) -> None:
         raise InputError(f"is not valid JSON: it holds {constant}")
 

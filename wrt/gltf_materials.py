@@ -27,6 +27,7 @@ from wrt.gltf_schema import (
     exactly,
 )
 from wrt.image_decode import decode_rgba8
+from wrt.memory import Meter
 from wrt.scene import BLACK, Color, Material, Texture, as_number, as_vector
 
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -53,6 +54,7 @@ class Textures:
     def __init__(self, document: Document) -> None:
         self._document = document
         self._images: dict[int, np.ndarray] = {}
+        self._meter = Meter()
         self._textures: dict[tuple[Any, ...], Texture] = {}
 
     def texture(self, info: Any, srgb: bool, material: str, place: str) -> Texture | None:
@@ -117,6 +119,7 @@ class Textures:
                 raise InputError("has neither a uri nor a bufferView", None, place)
             with at(place):
                 self._images[index] = decode_rgba8(data)
+                self._meter.take(self._images[index].nbytes, "the images")
         return self._images[index]
 
 

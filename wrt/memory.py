@@ -37,6 +37,20 @@ def require(needed: float, what: str) -> None:
         raise InputError(f"{what} takes {gib(needed)} of memory; {gib(there)} are free (WRT_MEMORY can say otherwise)")
 
 
+class Meter:
+    """Asks for memory that is taken in many small pieces, whenever they come to a large one."""
+
+    def __init__(self) -> None:
+        self._taken = 0.0
+
+    def take(self, size: float, what: str) -> None:
+        """Raise InputError where what was taken since the last look, with these `size` bytes of `what`, is more than there is."""
+        self._taken += size
+        if self._taken > SMALL:
+            require(self._taken, what)
+            self._taken = 0.0
+
+
 def gib(size: float) -> str:
     return f"{size / 2**30:.1f} GiB" if size >= 2**30 / 10 else f"{size / 2**20:.0f} MiB"
 

@@ -25,6 +25,7 @@ Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 SMALLEST = 1e-30  # of a length that must not be 0
+MAX_OBJECTS = 1 << 20  # and spheres, and lights: a few bytes of a file must not make any number of them
 MAX_REACH = 1e18  # of a shape from the origin, in scene units: the square of a distance must be a float32
 
 
@@ -73,6 +74,12 @@ def as_transform(value: Any, what: str) -> np.ndarray:
 def _choice(value: str, choices: Sequence[str], what: str) -> None:
     if value not in choices:
         raise InputError(f"{what} must be one of {', '.join(choices)}; got {value!r}")
+
+
+def require_count(count: int, what: str) -> None:
+    """Raise InputError where a scene would hold too many of something."""
+    if count > MAX_OBJECTS:
+        raise InputError(f"{count} {what}; a scene holds at most {MAX_OBJECTS}")
 
 
 # --- textures ---------------------------------------------------------------------------------------------------------
@@ -541,6 +548,8 @@ class Scene:
                                  "lights": (PointLight, DirectionalLight, SpotLight)}
         for name, kind in kinds.items():
             object.__setattr__(self, name, as_tuple(getattr(self, name), kind, name))
+        for name in ("objects", "spheres", "lights"):
+            require_count(len(getattr(self, name)), name)
         as_one(self.background, (ConstantBackground, GradientBackground, EnvironmentBackground), "background")
         as_one(self.settings, Settings, "settings")
         object.__setattr__(self, "ambient", as_vector(self.ambient, "ambient", low=0.0))

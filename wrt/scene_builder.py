@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ import numpy as np
 from wrt import shapes
 from wrt.arguments import unknown
 from wrt.errors import InputError
+from wrt.memory import Meter
 from wrt.mesh import Mesh, load_mesh
 from wrt.motion import Motion
 from wrt.read_file import read_file
@@ -38,6 +39,7 @@ from wrt.scene import (
     SpotLight,
     Texture,
     as_vector,
+    require_count,
 )
 from wrt.scene_check import raise_all, unknown_materials
 from wrt.smooth import smooth
@@ -57,7 +59,10 @@ def build(table: tables.SceneTable, path: Path) -> Scene:
     every name that is not known, every file that cannot be used, and every value that the scene refuses.
     """
     builder = _Builder(path)
-    scene = builder.scene(table)
+    try:
+        scene = builder.scene(table)
+    except InputError as error:
+        raise InputError(str(error), path) from None
     raise_all(builder.problems, path)
     assert scene is not None
     return scene
@@ -71,6 +76,7 @@ class _Builder:
         self._images: dict[Path, np.ndarray] = {}
         self._textures: dict[tuple[Any, ...], Texture | Checkerboard] = {}
         self._meshes: dict[tuple[Any, ...], Mesh] = {}
+        self.meter = Meter()
 
     @contextlib.contextmanager
     def at(self, place: str) -> Iterator[None]:
@@ -88,7 +94,9 @@ class _Builder:
     def scene(self, table: tables.SceneTable) -> Scene | None:
         for name, material in table.materials.items():
             self.materials |= self.material(material, name, f"materials.{name}")
-        included = [scene for i, entry in enumerate(table.include) for scene in self.included(entry, f"include[{i}]")]
+        included: list[Scene] = []
+        for i, entry in enumerate(table.include):
+            included += self.included(entry, f"include[{i}]", sum(len(scene.objects) for scene in included))
         included = self.overridden(included, table)
         known = {m.name: m for scene in included for m in scene.materials} | self.materials
         # A material that is itself wrong is known all the same: one mistake gives one line.
@@ -146,14 +154,16 @@ class _Builder:
 
     # --- included files ---
 
-    def included(self, entry: str | tables.IncludeTable, place: str) -> list[Scene]:
+    def included(self, entry: str | tables.IncludeTable, place: str, before: int) -> list[Scene]:
         from wrt.gltf import load_gltf
 
         name, to_world = (entry, None) if isinstance(entry, str) else (entry.file, entry.transform)
         with self.at(place):
             if not name.lower().endswith((".gltf", ".glb")):
                 raise InputError(f"{name!r} is no .gltf or .glb file; a mesh file belongs into [[meshes]]")
-            return [moved(load_gltf(self.file(name), staged=False), transform(to_world))]
+            scene = load_gltf(self.file(name), staged=False)
+            require_count(before + len(scene.objects), "objects")
+            return [moved(scene, transform(to_world))]
         return []
 
     def overridden(self, included: list[Scene], table: tables.SceneTable) -> list[Scene]:
@@ -210,6 +220,7 @@ class _Builder:
         if path not in self._images:
             try:
                 self._images[path] = decode_rgba8(read_file(path))
+                self.meter.take(self._images[path].nbytes, "the images")
             except InputError as error:
                 raise InputError(str(error), path) from None
         return self._images[path]
@@ -279,19 +290,21 @@ class _Builder:
     def mesh(self, table: tables.MeshTable) -> Mesh:
         key: tuple[Any, ...]
         if table.shape is not None:
-            key = (table.shape.model_dump_json(),)
-            if key not in self._meshes:
-                self._meshes[key] = shapes.SHAPES[table.shape.kind](**table.shape.given("kind"))
+            shape, key = table.shape, (table.shape.model_dump_json(),)
+            plain = self._once(key, lambda: shapes.SHAPES[shape.kind](**shape.given("kind")))
         else:
             parts = tuple((part.first, part.count) for part in table.parts or [])
             path = self.file(str(table.file))
             key = (path, parts)
-            if key not in self._meshes:
-                self._meshes[key] = load_mesh(path, parts)
-        if table.smooth is not None:
-            plain, key = self._meshes[key], (*key, table.smooth)
-            if key not in self._meshes:
-                self._meshes[key] = smooth(plain) if table.smooth else replace(plain, normals=None)
+            plain = self._once(key, lambda: load_mesh(path, parts))
+        if table.smooth is None:
+            return plain
+        return self._once((*key, table.smooth), lambda: smooth(plain) if table.smooth else replace(plain, normals=None))
+
+    def _once(self, key: tuple[Any, ...], make: Callable[[], Mesh]) -> Mesh:
+        if key not in self._meshes:
+            mesh = self._meshes[key] = make()
+            self.meter.take(32.0 * len(mesh.vertices) + 12.0 * len(mesh.faces), "the meshes")
         return self._meshes[key]
 
 

@@ -97,7 +97,9 @@ LOADERS: dict[str, Callable[[Path], Scene]] = {
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(read_file(path, BYTES_OF_TOML).decode("utf-8-sig"))
+        data = tomllib.loads(read_file(path, BYTES_OF_TOML).decode("utf-8-sig"))
+        _require_int64(data)
+        return data
     except InputError as error:
         raise InputError(str(error), path) from None
     except UnicodeDecodeError as error:
@@ -111,6 +113,17 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError(message, path, place) from error
     except ValueError as error:  # Python's int refuses thousands of digits
         raise InputError("holds a number of thousands of digits", path) from error
+
+
+def _require_int64(data: dict[str, Any]) -> None:
+    """Raise InputError for an integer of more than 64 bits, as TOML demands: others cannot deal with thousands of digits."""
+    values: list[Any] = [data]
+    while values:
+        value = values.pop()
+        if isinstance(value, dict | list):
+            values += value.values() if isinstance(value, dict) else value
+        elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
+            raise InputError("holds an integer of more than 64 bits")
 
 
 def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = ()) -> Scene:

@@ -14,6 +14,7 @@ from wrt.mesh_clean import clean
 from wrt.scene import as_number, as_vector
 
 Point = Sequence[float] | np.ndarray
+MAX_FACES = 1 << 23  # of one shape: some words of a scene file must not ask for all memory, or for minutes
 
 
 def quad(corner: Point = (-0.5, -0.5, 0.0), edge_u: Point = (1.0, 0.0, 0.0), edge_v: Point = (0.0, 1.0, 0.0)) -> Mesh:
@@ -113,7 +114,7 @@ def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
     well_formed = line.ndim == 2 and line.shape[1:] == (2,) and len(line) >= 2
     if not well_formed or not np.isfinite(line).all() or (line[:, 0] < 0.0).any():
         raise InputError("lathe: profile must be two or more pairs (radius >= 0, height)")
-    _require_segments("lathe", segments)
+    _require_segments("lathe", segments, rows=len(line) - 1)
     step = np.diff(line, axis=0)
     length = np.linalg.norm(step, axis=1)
     if not length.any():
@@ -163,7 +164,7 @@ def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segm
     line = np.asarray(points, dtype=np.float64)
     if line.ndim != 2 or line.shape[1:] != (3,) or len(line) < 2 or not np.isfinite(line).all():
         raise InputError("tube: points must be two or more triples")
-    _require_segments("tube", segments)
+    _require_segments("tube", segments, rows=len(line) - 1)
     try:
         radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(line),))
     except ValueError:
@@ -245,10 +246,14 @@ def _grid(points: np.ndarray, normals: np.ndarray, name: str) -> Mesh:
     return Mesh(result.vertices, result.faces, normals=result.normals, uvs=result.uvs, name=name)
 
 
-def _require_segments(shape: str, *segments: int) -> None:
+def _require_segments(shape: str, *segments: int, rows: int = 1) -> None:
+    """Raise InputError unless each number of segments is in range, and all of them times `rows` of quads are not too many."""
     for count in segments:
         if not 3 <= count <= 4096:
             raise InputError(f"{shape}: segments must be 3 to 4096, got {count}")
+    faces = 2 * rows * math.prod(segments)
+    if faces > MAX_FACES:
+        raise InputError(f"{shape}: {faces} triangles; at most {MAX_FACES} are made")
 
 
 SHAPES: dict[str, Callable[..., Mesh]] = {

@@ -60,7 +60,8 @@ class Grid(Accelerator):
 
 def check_layout(lo: np.ndarray, hi: np.ndarray, size: np.ndarray, n: np.ndarray) -> None:
     """Raise InputError unless the planes of a layout from a file are in ascending order."""
-    last = lo + (n - 1).astype(np.float32) * size
+    with np.errstate(over="ignore", invalid="ignore"):
+        last = lo + (n - 1).astype(np.float32) * size
     empty = (lo == np.inf).all() and (hi == -np.inf).all()
     if not ((n >= 1) & (n <= MAX_AXIS) & (size >= 0.0) & ((last <= hi) | empty)).all():
         raise InputError("is damaged: its planes are not in order")

@@ -1,0 +1,179 @@
+"""Files of a few bytes that ask for everything: each is refused soon, with the number and the limit."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.command_line import wrt as command
+from tests.gltf_files import TRIANGLE, GltfFile, one_triangle
+from wrt.errors import InputError, SceneWarning
+from wrt.gltf import load_gltf
+from wrt.memory import Meter
+from wrt.scene import MAX_OBJECTS, Scene
+from wrt.scene_file import load_scene
+from wrt.shapes import MAX_FACES, icosphere, lathe, teapot, torus, tube
+
+SPHERE = "[[spheres]]\ncenter = [0, 0, 0]\nradius = 1\n"
+pytestmark = pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+
+
+@pytest.fixture(autouse=True)
+def soon_and_small() -> Iterator[None]:
+    """Ten seconds, and no gigabyte."""
+    begin, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield
+    assert time.perf_counter() - begin < 10.0
+    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 < 2**30
+
+
+def instanced(count: int, times: int = 1, nodes: int = 1) -> GltfFile:
+    """A triangle at `count` places of which no buffer says anything."""
+    file = GltfFile()
+    one = file.view(np.zeros(3, np.float32).tobytes())
+    index = {"bufferView": file.view(b"\0\0\0\0"), "componentType": 5125}
+    sparse = {"count": 1, "indices": index, "values": {"bufferView": one}}
+    places = file.add("accessors", {"componentType": 5126, "count": count, "type": "VEC3", "sparse": sparse})
+    mesh = file.mesh(*[file.primitive()] * times)
+    for _ in range(nodes):
+        file.node(mesh=mesh, extensions={"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": places}}})
+    return file
+
+
+@pytest.mark.parametrize(("count", "message"), [
+    (10**9, r"accessors\[0\]\.count: must be 1 to 4194304, got 1000000000"),
+    (MAX_OBJECTS + 1, rf"{MAX_OBJECTS + 1} instances; a scene holds at most {MAX_OBJECTS}"),
+])
+def test_instances_without_bytes_behind_them(count: int, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        load_gltf(instanced(count).write(tmp_path))
+
+
+def test_nodes_times_instances_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.scene.MAX_OBJECTS", 100)
+    assert len(load_gltf(instanced(50, 2).write(tmp_path)).objects) == 100
+    for file in (instanced(50, 3), instanced(40, 1, 3)):
+        with pytest.raises(InputError, match=r"nodes\[\d\]: 1\d\d objects; a scene holds at most 100"):
+            load_gltf(file.write(tmp_path))
+    one_triangle().write(tmp_path, "a.glb")
+    (tmp_path / "a.toml").write_text('include = ["a.glb"' + ', "a.glb"' * 100 + "]")
+    with pytest.raises(InputError, match=r"a\.toml: include\[100\]: 101 objects; a scene holds at most 100"):
+        load_scene(tmp_path / "a.toml")
+    with pytest.raises(InputError, match="101 lights; a scene holds at most 100"):
+        Scene(lights=tuple(load_gltf(one_triangle().write(tmp_path)).lights) * 101)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"count": 2**31}, "count: must be 1 to 2147483647, got 2147483648"), ({"count": 10**30}, "must be 1 to"),
+    ({"count": 2**31 - 1}, "2147483647 elements reach from byte 0 to"), ({"byteOffset": 2**40}, "reach from byte 1099511627776 to"),
+])
+def test_accessors_beyond_their_buffer(change: dict[str, int], message: str, tmp_path: Path) -> None:
+    file = one_triangle()
+    file.json["accessors"][0] |= change
+    with pytest.raises(InputError, match=message):
+        load_gltf(file.write(tmp_path))
+
+
+@pytest.mark.parametrize(("shape", "arguments"), [
+    (torus, {"segments": 4096, "tube_segments": 4096}), (teapot, {"segments": 4096}),
+    (lathe, {"profile": [(1.0, float(i)) for i in range(2000)], "segments": 4096}),
+    (tube, {"points": [(0.0, 0.0, float(i)) for i in range(2000)], "segments": 4096}),
+])
+def test_shapes_of_too_many_triangles(shape, arguments: dict) -> None:
+    with pytest.raises(InputError, match=rf": \d+ triangles; at most {MAX_FACES} are made"):
+        shape(**arguments)
+    assert 20 * 4**9 <= MAX_FACES and len(icosphere(0).faces) == 20  # its own limit is within
+
+
+def test_many_small_things_are_one_large_thing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("wrt.memory.SMALL", 1 << 20)
+    monkeypatch.setenv("WRT_MEMORY", "1M")
+    meter = Meter()
+    with pytest.raises(InputError, match=r"pieces takes .* of memory; 1 MiB are free"):
+        for _ in range(10):
+            meter.take(2.0**17, "pieces")
+    shape = "[[meshes]]\nmaterial = 'm'\nshape = {{kind = 'icosphere', subdivisions = 3, radius = {}}}\n"
+    balls = "".join(map(shape.format, range(1, 50)))
+    (tmp_path / "a.toml").write_text(f"materials.m = {{}}\n{balls}")
+    with pytest.raises(InputError, match=r"meshes\[\d+\]: the meshes takes .* of memory; 1 MiB are free"):
+        load_scene(tmp_path / "a.toml")
+    file = GltfFile()
+    many = np.tile(TRIANGLE, (300, 1))
+    position = file.accessor(many)
+    primitives = [{"attributes": {"POSITION": position, "NORMAL": file.accessor(many)}} for _ in range(9)]
+    file.node(mesh=file.mesh(*primitives))
+    with pytest.raises(InputError, match=r"primitives\[\d\]: the mesh takes .* of memory; 1 MiB are free"):
+        load_gltf(file.write(tmp_path))
+
+
+@pytest.mark.parametrize("text", [
+    "a" + ".a" * 5000 + " = 1", "a = " + "[" * 100_000, "a = " + "{a=" * 100_000, "[" + "a." * 20_000 + "a]",
+    "title = " + "0x" + "f" * 100_000, "title = 1" + "0" * 100_000, "settings.spp = 0x" + "f" * 10_000,
+    "background.type = 0x" + "f" * 10_000, "settings.filter = [" + "[" * 900 + "]" * 901,
+    "".join(f"key{i} = {i}\n" for i in range(20_000)), "[[spheres]]\n" * 20_000,
+    "".join(f"materials.m{i} = {{}}\n" for i in range(2000)) + f'{SPHERE}material = "m"\n' * 2000,
+    "materials." + "x" * 100_000 + f' = {{}}\n{SPHERE}material = "' + "y" * 100_000 + '"',
+], ids=["dots", "brackets", "braces", "header", "hexadecimal", "digits", "spp", "type", "filter",
+         "keys", "tables", "names", "long"])
+def test_toml_that_is_deep_or_long(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(InputError, match=r"a\.toml: ") as caught:
+        load_scene(tmp_path / "a.toml")
+    assert len(str(caught.value)) < 30_000
+
+
+@pytest.mark.parametrize("text", [
+    "[" * 200_000, '{"a":' * 200_000, '{"asset": {"version": "2.0"}, "nodes": [{"extras": ' + "[" * 900 + "]" * 900 + "}]}",
+    '{"asset": {"version": "2.0"}, "scene": ' + "9" * 4000 + "}", '{"asset": {"version": "' + "2" * 100_000 + '"}}',
+    '{"asset": {"version": "2.0"}, "nodes": [' + ",".join(f'{{"children": [{i + 1}]}}' for i in range(20_000)) + ", {}]}",
+    '{"asset": {"version": "2.0"}, "extensionsRequired": ["' + "x" * 100_000 + '"]}',
+], ids=["brackets", "braces", "extras", "digits", "version", "chain", "extension"])
+def test_json_that_is_deep_or_long(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.gltf").write_text(text)
+    with pytest.raises(InputError, match=r"a\.gltf: ") as caught:
+        load_scene(tmp_path / "a.gltf")
+    assert len(str(caught.value)) < 30_000
+
+
+@pytest.mark.parametrize("uri", ["../../etc/passwd", "/etc/passwd", "http://example.org/a.bin", "file:///etc/passwd", "%2e%2e/a",
+                                 "..\\a", "C:\\a", "a/../../b", "//host/a", "\\\\host\\a"])
+def test_nothing_outside_of_the_folder_is_read(uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read(path: Path, factor: float = 1.0) -> bytes:
+        assert path == file_path, f"{path} was read"
+        return path.read_bytes()
+
+    monkeypatch.setattr("wrt.gltf_document.read_file", read)
+    for array, item in (("buffers", {"byteLength": 36, "uri": uri}), ("images", {"uri": uri})):
+        file = one_triangle()
+        file.json[array] = [item]
+        if array == "images":
+            file.json["textures"] = [{"source": 0}]
+            file.json["materials"] = [{"emissiveTexture": {"index": 0}, "emissiveFactor": [1, 1, 1]}]
+            file.json["meshes"][0]["primitives"][0]["material"] = 0
+        file_path = file.write(tmp_path, "a.gltf")
+        with pytest.raises(InputError, match=rf"{array}\[0\]\.uri: .*(is an address|is an absolute path|leaves the folder)"):
+            load_gltf(file_path)
+
+
+def test_warnings_do_not_grow_with_the_file(tmp_path: Path) -> None:
+    file = one_triangle()
+    for i in range(2000):
+        file.node(name="n" * 1000 + str(i), mesh=0, skin=0)
+    file.json["skins"] = [{"joints": [0]}]
+    with pytest.warns(SceneWarning, match="skins") as caught:
+        load_gltf(file.write(tmp_path))
+    assert all(len(str(each.message)) < 10_000 for each in caught)
+
+
+def test_names_give_the_terminal_no_orders(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text('[[spheres]]\ncenter=[0,0,0]\nradius=1\nmaterial="\\u001b[2J"\n["\\u001b]0;x\\u0007"]\n')
+    result = command("validate", tmp_path / "a.toml")
+    assert result.code == 2 and "unknown material" in result.err and "\x1b" not in result.err and "\x07" not in result.err
+    file = one_triangle()
+    file.json["nodes"][0] |= {"skin": 0, "name": "\x1b[2J"}
+    assert "\x1b" not in command("validate", file.write(tmp_path, "\x1b[2J.gltf")).err
