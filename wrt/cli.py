@@ -281,6 +281,8 @@ def main() -> None:
         say("interrupted")
     except SystemExit as error:
         code = error.code
+        if code == 0:  # said outright: by `view`, whose end is somebody's Ctrl-C
+            _leave(0)
     if code:
         _leave(code if isinstance(code, int) else 1)
     sys.exit(code)

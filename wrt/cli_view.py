@@ -53,6 +53,7 @@ def view(scene: Path, port: int, host: str, open_browser: bool, spp: int, quiet:
         pass  # this is how it is meant to end
     finally:
         page.close()
+    raise SystemExit(0)  # at once, even if a kernel is being compiled
 
 
 def has_desktop() -> bool:

@@ -230,6 +230,19 @@ def test_a_click_focuses(page: Any, browser_page: Any) -> None:
     assert page.focus.value == page.viewer.view.camera.focus_distance != shown.view.camera.focus_distance
 
 
+def test_a_browser_that_comes_again_gets_the_picture(page: Any, browser_page: Any) -> None:
+    page.viewer.spp = 1 << 20  # it leaves in the middle of a refinement
+    set_number(browser_page, "bounces", "2")
+    until(lambda: page.viewer.shown.view.max_depth == 2, browser_page)
+    page.viewer.spp = 4
+    browser_page.reload()
+    until(lambda: page.viewer.shown.done, browser_page)
+    again = finished(page, browser_page, max_depth=2)
+    np.testing.assert_allclose(again.view.camera.camera_to_world, CAMERA.camera_to_world, atol=1e-9)
+    assert difference(browser_page, again) < ROUGHLY
+    assert page.thread.is_alive() and page.failure is None and browser_page.mistakes == []
+
+
 def test_what_is_saved(page: Any, browser_page: Any, tmp_path: Path) -> None:
     shown = finished(page, browser_page)
     for name, suffix in (("picture as PNG", ".png"), ("picture as EXR", ".exr")):
