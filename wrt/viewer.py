@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -77,7 +77,6 @@ class _Work:
     view: View
     number: int
     scale: int = 1
-    begin: float = field(default_factory=time.perf_counter)
     shown: float = -np.inf
 
 
@@ -100,7 +99,7 @@ class Viewer:
         self.shown: Shown | None = None  # last
         self._renderers: dict[str, Renderer] = {}
         self._counters: dict[str, CostCounter] = {}
-        self._pace: dict[tuple[str, bool], float] = {}  # seconds a pixel of a coarse picture
+        self._pace: dict[tuple[str, bool], float] = {}  # seconds a sample took last, of the picture and of heat maps
         self._condition = threading.Condition()
         self._number = self._done = 0  # of changes, so far and rendered
         self._looked_at = self._toned = self._stopped = False
