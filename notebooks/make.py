@@ -49,10 +49,23 @@ def execute(notebook: Any, quick: bool) -> Any:
     client.execute(env=environment)
     notebook.metadata = nbformat.from_dict(METADATA)  # without the version that ran it
     for cell in notebook.cells:
+        if "outputs" in cell:
+            cell.outputs = merged(cell.outputs)
         for output in cell.get("outputs", []):
             if {"image/png", "image/jpeg"} <= output.get("data", {}).keys():
                 del output["data"]["image/jpeg"]  # the same picture once more
     return notebook
+
+
+def merged(outputs: list[Any]) -> list[Any]:
+    """Text that came in several parts, as the clock had it, in one."""
+    out: list[Any] = []
+    for output in outputs:
+        if out and output.output_type == out[-1].output_type == "stream" and output.name == out[-1].name:
+            out[-1].text += output.text
+        else:
+            out.append(output)
+    return out
 
 
 def main(names: list[str]) -> None:

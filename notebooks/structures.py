@@ -1,0 +1,192 @@
+# %% [markdown]
+# # Acceleration structures: the teapot in a stadium
+# A ray could be tested against every triangle. A structure leaves nearly all of them out: but which structure, and at which
+# price? Here they are built over the same triangles, asked the same rays, counted step by step, and timed.
+#
+# With `WRT_QUICK` in the environment, pictures and meshes are smaller; the outputs below are of the full setting. Times are of
+# the machine that ran this; counts of steps are the same everywhere.
+
+# %%
+import os
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import wrt
+from wrt.bench import accel as bench
+from wrt.bench.heatmap import heatmap
+from wrt.bench.rays import ray_sets
+from wrt.bench.stadium import in_stadium
+from wrt.shapes import teapot
+
+QUICK = "WRT_QUICK" in os.environ
+SIZE, SPP, RAYS = ((160, 90), 1, 2_000) if QUICK else ((390, 220), 16, 20_000)
+STRUCTURES = ("bvh2", "kdtree", "octree", "grid")
+
+# %% [markdown]
+# Eric Haines (Ray Tracing News, 1988) asked what a structure of equal cells does with a teapot in a stadium: a few large
+# triangles say how large space is, and all the small ones are in one place.
+
+# %%
+scene = wrt.load_scene("../scenes/stadium.toml")
+views = {"a pot ...": "main", "... in a stadium": "stand"}
+wrt.side_by_side({title: wrt.render(scene, camera=camera, size=SIZE, spp=SPP) for title, camera in views.items()})
+
+# %%
+pot = teapot(24 if QUICK else 48)
+stadium = in_stadium(pot)  # a thousand times as large
+extents = {mesh.name: np.ptp(mesh.vertices, axis=0).max() for mesh in (pot, stadium)}
+print({name: f"{extent:.3g}" for name, extent in extents.items()}, f"triangles: {len(pot.faces)} and {len(stadium.faces)}")
+
+# %% [markdown]
+# ## What a step is, and where they are
+# `counters=True` counts for each ray: nodes fetched (of a grid: cells) and triangles tested. One ray a pixel, once at the pot
+# alone, once at the pot on the pitch. The scale is logarithmic: from dark to bright a factor of ten thousand.
+
+# %%
+camera = wrt.Camera.look_at((1.25, 1.0, 1.9), (0.03, 0.42, 0.0), fov_y=np.radians(36))
+half = tuple(x * 4 // 5 for x in SIZE)
+origins, directions = wrt.camera_rays(camera, half)
+
+
+def steps(accel):
+    """Nodes and triangles a ray, and what is hit."""
+    hits = accel.closest_hit(origins, directions, counters=True)
+    return hits.counters.nodes + hits.counters.primitives, hits
+
+
+fig, axes = plt.subplots(2, len(STRUCTURES), figsize=(12.4, 3.9), dpi=80, layout="constrained")
+mean = {}
+for row, (where, mesh) in enumerate({"alone": pot, "in the stadium": stadium}.items()):
+    found = {}
+    for ax, name in zip(axes[row], STRUCTURES, strict=True):
+        count, found[name] = steps(wrt.build(mesh, name))
+        mean[name, where] = count.mean()
+        shown = ax.imshow(np.maximum(count, 1).reshape(half[::-1]), norm="log", vmin=1, vmax=1e4, cmap="inferno")
+        ax.set(title=f"{name} {where}: {count.mean():,.0f}", xticks=[], yticks=[])
+    first = found[STRUCTURES[0]]
+    assert all((hits.prim_id == first.prim_id).all() and (hits.t == first.t).all() for hits in found.values())
+fig.colorbar(shown, ax=axes, label="steps of a ray", shrink=0.9)
+plt.show()
+
+# %% [markdown]
+# All of them find the same triangle at the same $t$, to the last bit (the cell checks it): a structure may only cost more or
+# less. The number above each map is its mean.
+
+# %%
+for name in STRUCTURES:
+    alone, there = mean[name, "alone"], mean[name, "in the stadium"]
+    print(f"{name:7} {alone:6.1f} steps a ray alone, {there:7.1f} in the stadium: {there / alone:6.1f} times")
+
+# %% [markdown]
+# Three of them adapt: they cut space where the triangles are, and pay a few steps more to come there. The grid's cells are all
+# alike, and as large as the stadium makes them: the whole view is in one or a few of them, and every ray tests all of the pot.
+
+# %%
+cells = np.array(wrt.build(stadium, "grid").built.arrays["n"])
+width = extents[stadium.name] / cells.max()
+print(f"{cells[0]} x {cells[1]} x {cells[2]} cells, each {width:.1f} wide; the pot: {extents[pot.name]:.1f}")
+
+# %% [markdown]
+# ## How fine should cells be?
+# Even without a stadium the right size of a grid's cells is a compromise: with few cells a ray tests many triangles, with many it
+# walks through many cells, and memory grows. The default is 2 cells a triangle.
+
+# %%
+densities = [0.03, 0.1, 0.5, 2.0, 8.0, 30.0, 100.0]
+rows = []
+for density in densities:
+    grid = wrt.build(pot, "grid", density=density)
+    c = grid.closest_hit(origins, directions, counters=True).counters
+    rows.append((c.nodes.mean(), c.primitives.mean(), grid.stats.bytes / len(pot.faces)))
+walked, tested, size = np.array(rows).T
+fig, axes = plt.subplots(1, 2, figsize=(8.0, 3.0), dpi=80, layout="constrained")
+axes[0].loglog(densities, walked, "s-", label="cells")
+axes[0].loglog(densities, tested, "o-", label="triangles")
+axes[0].loglog(densities, walked + tested, "k-", label="both")
+axes[0].set(xlabel="cells a triangle", ylabel="a ray")
+axes[0].legend()
+axes[1].loglog(densities, size, "o-", color="C2")
+axes[1].set(xlabel="cells a triangle", ylabel="bytes a triangle")
+plt.show()
+
+# %% [markdown]
+# ## Build against search
+# The report of `wrt.bench.accel` measures both, with memory, and checks every answer: `differ` and `wrong` must be 0. Here the
+# pot alone.
+
+# %%
+names = ("brute_force", *STRUCTURES, "bvh8")
+report = bench.run(bench.Plan((pot,), names, ("diffuse",), rays=RAYS // 4, runs=3))
+assert all(row.differ == row.wrong == 0 for row in report)
+report
+
+# %% [markdown]
+# A structure has paid for itself when the rays are many enough: seconds to build, and seconds for each ray. The line that is
+# lowest at a number of rays is the one to take for so many.
+
+# %%
+rays = np.geomspace(1, 1e8, 200)
+fig, ax = plt.subplots(figsize=(6.4, 3.6), dpi=80, layout="constrained")
+for row in report:
+    seconds = np.median(row.build) + rays * np.median(row.seconds) / row.rays
+    ax.loglog(rays, seconds, label=row.structure, linewidth=1.8)
+ax.axvline(640 * 360, color="0.7", linewidth=1)
+ax.text(640 * 360 * 1.2, ax.get_ylim()[0] * 1.5, "one ray a pixel\nof 640x360", color="0.4", fontsize=9)
+ax.set(xlabel="rays", ylabel="seconds, build and search")
+ax.legend()
+plt.show()
+
+brute = report[0]
+for row in report[1:]:
+    saved = np.median(brute.seconds) / brute.rays - np.median(row.seconds) / row.rays
+    print(f"{row.structure:7} has paid for itself after {max(np.median(row.build) - np.median(brute.build), 0) / saved:6.0f} rays")
+
+# %% [markdown]
+# ## Which tree?
+# A BVH can be built in many ways. The surface area heuristic (SAH) predicts what a random line through the root's box costs if
+# nothing stops it: each node is met with the probability (area of its box) / (area of the root's). Six builders over the stadium
+# with its pot, the prediction, and what such lines and the picture's rays really take:
+
+# %%
+BUILDERS = ("lbvh", "median", "binned", "sweep", "sbvh", "reinsertion")
+lines = ray_sets(wrt.build(stadium), RAYS)["random"]
+table = {}
+maps = {}
+for builder in BUILDERS:
+    tree = wrt.build(stadium, "bvh2", builder=builder)
+    picture, _ = steps(tree)
+    c = tree.closest_hit(lines.origins, lines.directions, counters=True).counters
+    table[builder] = np.array([tree.stats.sah_cost, (c.nodes + c.primitives).mean(), picture.mean()])
+    maps[builder] = picture.reshape(half[::-1])
+    print(f"{builder:12} built in {tree.stats.build_seconds:5.2f} s")
+
+fig, ax = plt.subplots(figsize=(7.2, 3.4), dpi=80, layout="constrained")
+labels = ("SAH: what a line should cost", "random lines, steps", "the picture's rays, steps")
+for i, label in enumerate(labels):
+    values = [table[builder][i] for builder in BUILDERS]
+    bars = ax.bar(np.arange(len(BUILDERS)) + 0.27 * (i - 1), np.array(values) / table["binned"][i], 0.27, label=label)
+    ax.bar_label(bars, [f"{value:.3g}" for value in values], fontsize=8, padding=1)
+ax.set_xticks(np.arange(len(BUILDERS)), BUILDERS)
+ax.set(ylabel="relative to binned")
+ax.margins(y=0.25)
+ax.legend(loc="upper right", fontsize=9)
+plt.show()
+
+# %% [markdown]
+# Lines stop at their first hit, so that they cost less than the prediction; but the builders keep its order. The picture's rays,
+# which go to the pot and not all over the stadium, keep it only roughly. The two builders that do not ask for areas (Morton
+# codes, medians) cost about twice the steps where it matters: they cut the pot where the count or a grid of powers of two says,
+# and boxes overlap. The maps show where.
+
+# %%
+wrt.side_by_side({builder: heatmap(maps[builder], "steps of a ray", top=80.0) for builder in ("lbvh", "binned")})
+
+# %% [markdown]
+# ## Exercises
+# 1. Put two pots into the stadium, far from each other. What does the grid do now? And what would a grid within a cell of the
+#    grid do?
+# 2. Which structures can follow moving vertices (`accel.refit`)? Twist the pot by a turn, refit, and compare the steps with a new
+#    tree's.
+# 3. `wrt.build(stadium, "bvh8c")`: half of the memory. What does it cost in steps, and in time?
+# 4. Find the number of rays from which a k-d tree's build has paid for itself against `bvh2`'s, if ever.
