@@ -3,6 +3,7 @@
 At each hit: emission, the ambient term and light straight from the lights, then at most three rays more: reflected, refracted,
 and onward through what is partly transparent. Those wait on a stack with what they will be worth (throughput); a ray is
 cut at max_depth bounces, after MAX_TRANSPARENT surfaces that it went straight through, or below min_throughput, and counted.
+So is what comes after MAX_RAYS: where nothing is cut by throughput, a tree of 64 levels has no end.
 """
 
 from functools import cache
@@ -24,6 +25,7 @@ from wrt.kernels.shadows import MAX_TRANSPARENT, OUTSIDE, Shadow, attenuation, m
 from wrt.kernels.structs import Lighting, Limits, Material, Ray, Surfaces
 from wrt.kernels.surface import Surface, spawn_point
 
+MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
 UNKNOWN = wp.constant(-2)  # where a camera ray begins: within glass, or not
 
 
@@ -150,12 +152,12 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
         return out
 
     @wp.func
-    def keep(next: Path, limits: Limits) -> int:
-        """0: carries nothing; 1: to be followed; 2: cut by depth; 3: cut by throughput."""
+    def keep(next: Path, limits: Limits, traced: int) -> int:
+        """0: carries nothing; 1: to be followed; 2: cut by depth, or by the number of rays so far; 3: cut by throughput."""
         largest = wp.max(next.throughput)
         if largest <= 0.0:
             return 0
-        if next.depth > limits.max_depth or next.passed > MAX_TRANSPARENT:
+        if next.depth > limits.max_depth or next.passed > MAX_TRANSPARENT or traced >= MAX_RAYS:
             return 2
         return wp.where(largest < limits.min_throughput, 3, 1)
 
@@ -213,6 +215,7 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
         path.key = key
         stack[0] = path
         size = int(1)
+        traced = int(0)
         while size > 0:
             size = size - 1
             path = stack[size]
@@ -225,6 +228,7 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
             if wp.static(counting):
                 ray.slot = label(path.branch, path.depth)
             out.rays += 1
+            traced += 1
             hit = closest_hit(accel, surfaces, ray)
             if hit.prim_id < 0:
                 out.radiance += wp.cw_mul(path.throughput, background_radiance(lighting.background, path.direction))
@@ -245,7 +249,7 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
                             onward.medium = OUTSIDE
                     if wp.static(features.absorption):
                         onward.throughput = absorbed(surfaces, onward.throughput, path.medium, hit.t)
-                    verdict = keep(onward, limits)
+                    verdict = keep(onward, limits, traced)
                     if verdict == 1:
                         stack[size] = onward
                         size = size + 1
@@ -279,7 +283,7 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
 
             if wp.static(features.reflection):
                 next = child(path, s, scatter.reflection, wp.cw_mul(path.throughput, scatter.reflected), 1)
-                verdict = keep(next, limits)
+                verdict = keep(next, limits, traced)
                 if verdict == 1:
                     stack[size] = next
                     size = size + 1
@@ -288,7 +292,7 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
                 next = child(path, s, scatter.refraction, wp.cw_mul(path.throughput, scatter.transmitted), 2)
                 if scatter.bends != 0:
                     next.medium = wp.where(s.front != 0, s.material, OUTSIDE)
-                verdict = keep(next, limits)
+                verdict = keep(next, limits, traced)
                 if verdict == 1:
                     stack[size] = next
                     size = size + 1

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.fuzz.formats import FORMATS, make_case
+from tests.fuzz.formats import FORMATS, SLOW_FORMATS, make_case
 
 HANG = 10.0  # seconds
 POLL = 0.1
@@ -104,7 +104,7 @@ class Run:
         numbers = self.tally.defects.setdefault(problem.split("\n")[0], [])
         numbers.append(number)
         if len(numbers) <= 3:  # the rest are alike
-            case = make_case(FORMATS[self.name], random.Random(f"{self.seed} {self.name} {number}"))
+            case = make_case({**FORMATS, **SLOW_FORMATS}[self.name], random.Random(f"{self.seed} {self.name} {number}"))
             self.out.mkdir(parents=True, exist_ok=True)
             (self.out / f"{self.name}-{number}{case.suffix}").write_bytes(case.data)
             (self.out / f"{self.name}-{number}.txt").write_text(problem)
@@ -114,7 +114,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=80_000, help="over all formats together")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--format", action="append", choices=list(FORMATS), help="only these")
+    parser.add_argument("--format", action="append", choices=[*FORMATS, *SLOW_FORMATS], help="only these")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of the first input of each format")
     parser.add_argument("--out", type=Path, default=Path("fuzz-defects"), help="where inputs that show a defect are kept")

@@ -9,7 +9,7 @@ import struct
 import tempfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -323,6 +323,57 @@ def read_checkpoint(path: Path) -> object:
     return film.pixels_and_variance()
 
 
+# --- pictures of damaged scenes ---------------------------------------------------------------------------------------
+
+
+def scene_seeds() -> list[Seed]:
+    return seeds.scenes() + seeds.gltf()
+
+
+def damaged_scene(seed: Seed, other: Seed, rng: Random) -> Seed:
+    """Of the same kind as the first."""
+    if other.suffix != seed.suffix:
+        other = seed
+    return damaged_toml(seed, other, rng) if seed.suffix == ".toml" else damaged_gltf(seed, other, rng)
+
+
+def render_scene(path: Path) -> object:
+    """A picture of 8x8 pixels of whatever can be loaded; pixels that are not finite are a defect.
+
+    One kernel with nearly all features for all scenes, one more for those with an environment: a kernel for each mixture would
+    take its time to compile. So each scene has smooth normals, be they zero.
+    """
+    from unittest import mock
+
+    from wrt import driver
+    from wrt.features import STACK_STEP, Features
+    from wrt.scene import EnvironmentBackground
+
+    scene = load_scene_with_normals(path)
+    environment = isinstance(scene.background, EnvironmentBackground)
+    switches = dict.fromkeys(Features().switches(), True)
+    switches |= {"environment": environment, "gradient": not environment}
+    switches |= dict.fromkeys(("instances", "independent", "schlick"), False)
+    features = Features(**switches, stack_size=9 * STACK_STEP)
+    with mock.patch.object(driver, "features_of", lambda *arguments: features):
+        film = driver.render(scene, size=(8, 8), spp=1, instancing="never", threads=1, aov=("depth", "normal"))
+    if not np.isfinite(film.pixels).all() or np.isnan(film.aov["depth"]).any() or not np.isfinite(film.aov["normal"]).all():
+        raise ArithmeticError("the picture is not finite")
+    return film
+
+
+def load_scene_with_normals(path: Path) -> Any:
+    from wrt.scene_file import load_scene
+
+    scene = load_scene(path)
+    if scene.objects and all(thing.mesh.normals is None for thing in scene.objects):
+        first = scene.objects[0]
+        mesh = replace(first.mesh, normals=np.zeros_like(first.mesh.vertices))
+        scene = replace(scene, objects=(replace(first, mesh=mesh, motion=None), *scene.objects[1:]))
+    return scene
+
+
+# What is read; and what is done with it, which takes longer and is run only when asked for.
 FORMATS: dict[str, Format] = {
     "toml": Format(seeds.scenes, damaged_toml, read_scene),
     "gltf": Format(seeds.gltf, damaged_gltf, read_scene),
@@ -333,3 +384,4 @@ FORMATS: dict[str, Format] = {
     "accel": Format(accel_seeds, damaged_checked, read_accel),
     "checkpoint": Format(checkpoint_seeds, damaged_checked, read_checkpoint),
 }
+SLOW_FORMATS = {"render": Format(scene_seeds, damaged_scene, render_scene)}

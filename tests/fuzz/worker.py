@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.fuzz import seeds
-from tests.fuzz.formats import FORMATS, Format, make_case
+from tests.fuzz.formats import FORMATS, SLOW_FORMATS, Format, make_case
 from wrt.errors import InputError, SceneWarning
 
 ROOM = 1 << 30  # bytes of address space beyond what a worker has when it begins
@@ -98,7 +98,7 @@ def _place(error: BaseException) -> str:
 
 
 def main(name: str, seed: str, first: str, count: str, folder: str) -> None:
-    judge = Judge(FORMATS[name], Path(folder))
+    judge = Judge({**FORMATS, **SLOW_FORMATS}[name], Path(folder))
     out = os.fdopen(os.dup(1), "w")
     beat_path = Path(folder) / "beat"
     beat_path.write_bytes(b"\0" * 8)

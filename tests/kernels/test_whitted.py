@@ -8,6 +8,7 @@ import pytest
 
 from wrt.driver import Options, Renderer, render
 from wrt.kernels.shadows import MAX_TRANSPARENT
+from wrt.kernels.whitted import MAX_RAYS
 from wrt.mesh import Mesh
 from wrt.scene import (
     Camera,
@@ -274,6 +275,18 @@ def test_what_is_not_there_hides_nothing_up_to_a_number_that_is_counted(count):
     there = count <= MAX_TRANSPARENT
     assert np.allclose(film.pixels, float(there)) and film.stats["lost_throughput_per_sample"] == float(not there)
     assert film.stats["cut_by_depth"] == (0 if there else film.stats["samples"])
+
+
+def test_a_tree_of_rays_without_end_is_cut_and_told():
+    pane = Material("glass", albedo=ONE, ior=1.5, thin=True)
+    panes = [Object(moved(quad((-50.0, -50.0, z), (100.0, 0.0, 0.0), (0.0, 100.0, 0.0))), (pane,)) for z in (0.0, -1.0, -2.0)]
+    scene = Scene(objects=tuple(panes), cameras=(toward(),), settings=SETTINGS, background=WHITE_SKY)
+    options = {"size": (2, 2), "spp": 1, "min_throughput": 0.0}
+    whole, endless = render(scene, max_depth=12, **options), render(scene, max_depth=64, **options)
+    assert whole.stats["rays"] < 4 * MAX_RAYS <= endless.stats["rays"] <= 4 * (MAX_RAYS + 200)  # those that wait are traced still
+    for film in (whole, endless):  # all that is not lost comes from the sky
+        assert 0.0 < film.stats["lost_throughput_per_sample"] < 0.2 and film.stats["cut_by_depth"] > 0
+        assert film.pixels.mean() + film.stats["lost_throughput_per_sample"] == pytest.approx(1.0, abs=1e-4)
 
 
 def blended_glass(alpha, **rest):
