@@ -43,12 +43,14 @@ class Subtrees:
 
 @wp.struct
 class WideTree:
-    """What comes out. children: `width` a node, references as in kernels.traverse_wide; boxes: whose box a child has, as
-    2 * (binary node) + side, or -1; order: the prim_id of each lane, rows filled up with -1; count: nodes, rows, leaves, depth,
-    and the most entries on a traversal's stack."""
+    """What comes out. children: `width` a node, references as in kernels.traverse_wide; lo, hi: their boxes, empty where there is
+    no child; order: the prim_id of each lane, rows filled up with -1; count: nodes, rows, leaves, depth, and the most entries on
+    a traversal's stack. source: room for the children of one node: whose boxes they have, as 2 * (binary node) + side."""
 
     children: wp.array(dtype=wp.int32)
-    boxes: wp.array(dtype=wp.int32)
+    lo: wp.array(dtype=wp.vec3)
+    hi: wp.array(dtype=wp.vec3)
+    source: wp.array(dtype=wp.int32)
     order: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
 
@@ -64,11 +66,19 @@ class WideTask:
 
 
 @wp.func
+def low_of(node: Bvh2Node, side: int) -> wp.vec3:
+    return wp.where(side == 0, node.lo_0, node.lo_1)
+
+
+@wp.func
+def high_of(node: Bvh2Node, side: int) -> wp.vec3:
+    return wp.where(side == 0, node.hi_0, node.hi_1)
+
+
+@wp.func
 def half_area(node: Bvh2Node, side: int) -> float:
     """Half the surface of a child's box, scaled so that only boxes near the end of float32 have one that overflows."""
-    lo = wp.where(side == 0, node.lo_0, node.lo_1)
-    hi = wp.where(side == 0, node.hi_0, node.hi_1)
-    e = wp.max(hi - lo, wp.vec3(0.0, 0.0, 0.0))
+    e = wp.max(high_of(node, side) - low_of(node, side), wp.vec3(0.0, 0.0, 0.0))
     return wp.min(e[0] * e[1] + e[1] * e[2] + e[2] * e[0], 1.0e30)
 
 
@@ -145,8 +155,8 @@ def subtree_costs(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, tre
 
 
 @wp.func
-def roots_of(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, out: WideTree, slot: int) -> int:
-    """Write the at most k roots that stand for the children of binary node i to boxes[slot ..]; how many they are.
+def roots_of(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, source: wp.array(dtype=wp.int32)) -> int:
+    """Write the at most k roots that stand for the children of binary node i to `source`; how many they are.
 
     Node i itself is opened, so that there are at least two.
     """
@@ -175,7 +185,7 @@ def roots_of(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, o
         while roots > 1 and trees.cost[c * MAX_WIDTH + roots - 2] <= trees.cost[c * MAX_WIDTH + roots - 1]:
             roots = roots - 1
         if roots == 1:
-            out.boxes[slot + n] = 2 * parent + side
+            source[n] = 2 * parent + side
             n = n + 1
             continue
         left = int(trees.choice[c * MAX_WIDTH + roots - 1])
@@ -211,6 +221,38 @@ def gather(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), par
             size = size + 2
 
 
+@wp.func
+def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, out: WideTree, base: int, n: int):
+    """The first n children of a row and the boxes of their sources, from the one to visit last to the one to visit first by a ray
+    that asks for any hit: those that do not exist, inner nodes, leaves; and large boxes after small ones."""
+    reference = wp.zeros(shape=wp.static(8), dtype=wp.int32)
+    source = wp.zeros(shape=wp.static(8), dtype=wp.int32)
+    area = wp.zeros(shape=wp.static(8), dtype=wp.float32)
+    for i in range(n):
+        code = out.source[i]
+        child = out.children[base + i]
+        child_area = half_area(nodes[code / 2], code % 2)
+        j = int(i)
+        while j > 0 and ((child > 0 and reference[j - 1] < 0)
+                         or ((child > 0) == (reference[j - 1] > 0) and area[j - 1] > child_area)):
+            reference[j] = reference[j - 1]
+            source[j] = source[j - 1]
+            area[j] = area[j - 1]
+            j = j - 1
+        reference[j] = child
+        source[j] = code
+        area[j] = child_area
+    first = base + options.width - n
+    for i in range(base, first):
+        out.children[i] = EMPTY
+        out.lo[i] = wp.vec3(wp.inf, wp.inf, wp.inf)
+        out.hi[i] = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    for i in range(n):
+        out.children[first + i] = reference[i]
+        out.lo[first + i] = low_of(nodes[source[i] / 2], source[i] % 2)
+        out.hi[first + i] = high_of(nodes[source[i] / 2], source[i] % 2)
+
+
 @kernel
 def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), options: CollapseOptions, trees: Subtrees,
              out: WideTree):
@@ -239,23 +281,20 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
         n = int(0)
         room = int(0)
         while True:
-            n = roots_of(nodes, trees, task.node, k, out, base)
+            n = roots_of(nodes, trees, task.node, k, out.source)
             room = task.room - (n - 1)
             tallest = int(0)
             for j in range(n):
-                code = out.boxes[base + j]
+                code = out.source[j]
                 if count_of(nodes[code / 2], code % 2) == 0:
                     tallest = wp.max(tallest, trees.height[first_of(nodes[code / 2], code % 2)])
             if k == 2 or room >= tallest:
                 break
             k = k - 1
         least_room = wp.min(least_room, room)
-        for j in range(n, options.width):
-            out.boxes[base + j] = -1
-            out.children[base + j] = EMPTY
         for j in range(n):
             # The last child is taken from the stack first: it gets the next slots.
-            code = out.boxes[base + j]
+            code = out.source[j]
             node = nodes[code / 2]
             side = code % 2
             c = first_of(node, side)
@@ -278,6 +317,7 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
                 stack[size] = child
                 size = size + 1
                 n_nodes = n_nodes + 1
+        write_in_order(nodes, options, out, base, n)
     out.count[0] = n_nodes
     out.count[1] = n_rows
     out.count[2] = n_leaves

@@ -76,8 +76,9 @@ class WideBvh(Accelerator):
         """The node rows of kernels.wide_nodes."""
         n, size, first = len(tree.children), node_size(self.width, self.compressed), first_reference(self.width, self.compressed)
         nodes = np.zeros((n, size), np.float32)
-        nodes[:, first : first + self.width] = packed(tree.children, self._unit).view(np.float32)
+        nodes[:, first : first + self.width] = tree.children.view(np.float32)
         if self.compressed:
+            nodes[:, first : first + self.width] = packed(tree.children, 1).view(np.float32)
             nodes[:, :first] = compress(tree.lo, tree.hi, tree.children != EMPTY)
         else:
             planes = nodes[:, :first].reshape(n, 6, self.width)

@@ -70,27 +70,18 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
     load_kernel(build_wide.collapse, cpu)
     wp.launch(build_wide.subtree_costs, dim=1, device=cpu, inputs=[nodes, options, trees])
     out = build_wide.WideTree()
-    out.children, out.boxes = (wp.empty(n * width, dtype=wp.int32, device=cpu) for _ in range(2))
+    out.children = wp.empty(n * width, dtype=wp.int32, device=cpu)
+    out.lo, out.hi = (wp.empty(n * width, dtype=wp.vec3, device=cpu) for _ in range(2))
+    out.source = wp.empty(width, dtype=wp.int32, device=cpu)
     out.order = wp.empty(len(tree.order) * width, dtype=wp.int32, device=cpu)
     out.count = wp.zeros(5, dtype=wp.int32, device=cpu)
     wp.launch(build_wide.collapse, dim=1, device=cpu, inputs=[nodes, order, options, trees, out])
     n_nodes, rows, leaves, depth, stack = out.count.numpy().tolist()
     if rows > MAX_PLACES:
         raise InputError(f"a wide BVH holds at most {MAX_PLACES} rows of primitives, and these need {rows}; take accel='bvh2'")
-    code = out.boxes.numpy()[: n_nodes * width].reshape(-1, width)
-    lo, hi = (np.stack([tree.nodes[f"{end}_0"], tree.nodes[f"{end}_1"]], axis=1).reshape(-1, 3)[code] for end in ("lo", "hi"))
-    lo[code < 0], hi[code < 0] = np.inf, -np.inf
-    return in_order(WideTree(lo, hi, out.children.numpy()[: n_nodes * width].reshape(-1, width).copy(),
-                             out.order.numpy()[: rows * width].reshape(-1, width).copy(), leaves, depth, stack))
-
-
-def in_order(tree: WideTree) -> WideTree:
-    """The children of each node from the one to visit last to the one to visit first by a ray that asks for any hit: those
-    that do not exist, inner nodes, leaves; and large boxes after small ones."""
-    kind = np.where(tree.children == EMPTY, 0, np.where(tree.children > 0, 1, 2))
-    by = np.lexsort((tree.areas, kind), axis=1)
-    lo, hi = (np.take_along_axis(array, by[..., None], axis=1) for array in (tree.lo, tree.hi))
-    return WideTree(lo, hi, np.take_along_axis(tree.children, by, axis=1), tree.order, tree.leaves, tree.depth, tree.stack)
+    children, lo, hi = (array.numpy()[: n_nodes * width].reshape(-1, width, *array.numpy().shape[1:]).copy()
+                        for array in (out.children, out.lo, out.hi))
+    return WideTree(lo, hi, children, out.order.numpy()[: rows * width].reshape(-1, width).copy(), leaves, depth, stack)
 
 
 def small_tree(tree: BinaryTree, width: int) -> WideTree:
@@ -134,12 +125,13 @@ def packed(children: np.ndarray, unit: int) -> np.ndarray:
 def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
     """Which primitive stands in each lane of the leaves' rows: (rows, width), -1 where there is none. children: references in
     units of `width`; order: (R,) the prim_id of every record, leaf after leaf as their rows are."""
-    leaf = np.sort(-1 - children[children < 0].astype(np.int64))
-    row, count = leaf // LEAF_RANGE, leaf % LEAF_RANGE + 1
-    rows = int(row[-1] + -(-count[-1] // width)) if len(leaf) else 0
+    row, count = np.divmod(-1 - children[children < 0], LEAF_RANGE)
+    rows = int((row + count // width).max(initial=-1)) + 1
+    at = np.zeros(rows, np.int64)
+    at[row] = count + 1
+    row, count = np.flatnonzero(at), at[at > 0]
     out = np.full(rows * width, -1, np.int32)
-    begin = np.cumsum(count) - count
-    out[np.repeat(row * width - begin, count) + np.arange(int(count.sum()))] = order
+    out[np.repeat(row * width - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))] = order
     return out.reshape(rows, width)
 
 
