@@ -191,7 +191,7 @@ def levels(n: int) -> int:
 def bins_of(task: BuildTask) -> Bins:
     """The bins of a range, fewer of them for few records."""
     out = Bins()
-    out.count = wp.min(4 + (task.end - task.begin) / 8, BINS)
+    out.count = wp.min(8 + (task.end - task.begin) / 8, BINS)
     low = low_of(task.measures.centers)
     high = high_of(task.measures.centers)
     out.origin = low

@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -86,9 +85,19 @@ def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
 
 
+@cache
+def record_dtype(struct: Any) -> np.dtype:
+    """The memory layout of a Warp struct.
+
+    NumPy parses it by way of `ast`, which two threads cannot do at the same time (CPython 3.11): what is asked for here before
+    threads start, they may ask for again. A Warp array of structs is not for threads to make, either.
+    """
+    return np.dtype(struct.numpy_dtype())
+
+
 def records(struct: Any, count: int) -> np.ndarray:
     """`count` zeroed records with the memory layout of a Warp struct, as a NumPy structured array."""
-    return np.zeros(count, dtype=struct.numpy_dtype())
+    return np.zeros(count, dtype=record_dtype(struct))
 
 
 def thread_count(threads: int | None) -> int:
@@ -112,17 +121,25 @@ def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
             future.result()
 
 
-def run_growing(run: Callable[[Any], Iterable[Any]], tasks: Iterable[Any], threads: int) -> None:
-    """Run all tasks, and those that a run of one gives, on so many threads; the first error is raised after those that run have
-    ended."""
-    if threads == 1:
-        todo = deque(tasks)
-        while todo:
-            todo.extend(run(todo.popleft()))
-        return
+def run_growing(begin: Callable[[Any], tuple[Callable[[], Any], Callable[[], Iterable[Any]]]], tasks: Iterable[Any],
+                threads: int) -> None:
+    """Run all tasks, and those that come of them, on so many threads.
+
+    begin(task) gives the job to run on a thread, and what to call afterwards, which gives more tasks. Both calls are made on this
+    thread. The first error is raised after the jobs that run have ended.
+    """
     with ThreadPoolExecutor(threads) as pool:
-        running = {pool.submit(run, task) for task in tasks}
+        running: dict[Future[Any], Callable[[], Iterable[Any]]] = {}
+
+        def submit(task: Any) -> None:
+            job, after = begin(task)
+            running[pool.submit(job)] = after
+
+        for task in tasks:
+            submit(task)
         while running:
-            done, running = wait(running, return_when=FIRST_COMPLETED)
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
-                running |= {pool.submit(run, task) for task in future.result()}
+                future.result()
+                for task in running.pop(future)():
+                    submit(task)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import threading
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -95,18 +97,21 @@ def test_upload_never_lets_a_device_write_into_a_frozen_array() -> None:
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_run_growing_also_runs_what_tasks_give(threads: int) -> None:
-    done = []
+    done: list[int] = []
 
-    def halves(n: int) -> list[int]:
+    def begin(n: int) -> tuple[Callable[[], None], Callable[[], list[int]]]:
+        assert threading.current_thread() is threading.main_thread()
+        return partial(job, n), lambda: [n // 2, n - n // 2] if n > 1 else []
+
+    def job(n: int) -> None:
         done.append(n)  # atomic in CPython
         if n == 3:
             raise ValueError("three")
-        return [n // 2, n - n // 2] if n > 1 else []
 
-    run_growing(halves, [16, 4], threads)
+    run_growing(begin, [16, 4], threads)
     assert sorted(done) == sorted([16] + 2 * [8] + 5 * [4] + 10 * [2] + 20 * [1])
     with pytest.raises(ValueError, match="three"):
-        run_growing(halves, [5], threads)
+        run_growing(begin, [5], threads)
 
 
 @wp.struct

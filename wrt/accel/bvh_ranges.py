@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -108,19 +109,22 @@ def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int, room:
     least = max(n // 64, 4096)
     depths = []
 
-    def split(task: np.ndarray) -> list[np.ndarray]:
+    def begin(task: np.ndarray) -> tuple[Any, Any]:
         size = int(task["end"][0] - task["begin"][0])
         stop = max(size // 2, least) if threads > 1 and size > least else 0
         # Ranges of two or more records that do not overlap: there can be no more of them than this.
         most = (max(int(task["limit"][0]), int(task["end"][0])) - int(task["begin"][0])) // 2 if stop else 1
         left_over = wp.empty(most, dtype=build_bvh2.BuildTask, device=cpu)
         count, depth = (wp.zeros(1, dtype=wp.int32, device=cpu) for _ in range(2))
-        wp.launch(kernel, dim=1, device=cpu, inputs=[
-            data, upload(task, build_bvh2.BuildTask, cpu), settings, stop, left_over, count, depth])
-        depths.append(int(depth.numpy()[0]))
-        return [left_over.numpy()[i : i + 1] for i in range(int(count.numpy()[0]))]
+        inputs = [data, upload(task, build_bvh2.BuildTask, cpu), settings, stop, left_over, count, depth]
+
+        def parts() -> list[np.ndarray]:
+            depths.append(int(depth.numpy()[0]))
+            return [left_over.numpy()[i : i + 1] for i in range(int(count.numpy()[0]))]
+
+        return partial(wp.launch, kernel, dim=1, device=cpu, inputs=inputs), parts
 
     root = records(build_bvh2.BuildTask, 1)
     root["end"], root["parent"], root["limit"] = n, -1, room
-    run_growing(split, [root], threads)
+    run_growing(begin, [root], threads)
     return max(depths) + 1

@@ -13,7 +13,7 @@ from wrt.accel.base import Accelerator, Built
 from wrt.accel.bvh_build import BvhOptions, build_binary
 from wrt.accel.wide_compress import children_there, compress, decompress
 from wrt.accel.wide_tree import MAX_PLACES, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
-from wrt.device import run_all
+from wrt.device import record_dtype, run_all
 from wrt.errors import InputError
 from wrt.kernels.lanes import EMPTY
 from wrt.kernels.traverse_wide import LEAF_RANGE, WideTraversal
@@ -102,7 +102,7 @@ class WideBvh(Accelerator):
                  else lanes_of(self._references(built), built.order, self.width).reshape(-1))
         units, width = self.structure.units, self.width
         order = np.append(order, np.full(-len(order) % width, -1, np.int32))
-        numbers = units.triangle_test.record.numpy_dtype()["itemsize"] // 4
+        numbers = record_dtype(units.triangle_test.record).itemsize // 4
         rows = empty_aligned((len(order) // width, numbers, width), np.float32)
 
         def fill(first: int) -> None:
