@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import sys
+import threading
+from collections.abc import Iterator
 from typing import NamedTuple
 from unittest import mock
 
@@ -55,6 +57,27 @@ def wrt(*arguments: object) -> Result:
         except SystemExit as error:
             code = error.code
     return Result(code if isinstance(code, int) else 0, out.getvalue(), without_compiling(err.getvalue()))
+
+
+@contextlib.contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """No file may become larger than this: what a full disk looks like from here (Python ignores the signal that goes with it).
+
+    An error does not wait for the compiler, and LLVM ends the process where it cannot write: those of earlier tests come first.
+    """
+    import resource
+
+    from wrt.driver import PREPARING
+
+    for thread in threading.enumerate():
+        if thread.name.startswith(PREPARING):
+            thread.join(300.0)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def without_compiling(err: str) -> str:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +20,8 @@ import warp as wp
 
 from wrt.errors import InputError
 from wrt.memory import available
+
+ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
 
 wp.config.log_level = wp.LOG_WARNING if hasattr(wp, "LOG_WARNING") else 30
 
@@ -70,9 +76,31 @@ def free_memory(device: Any) -> float:
 def load_kernel(kernel: Any, device: Any) -> None:
     """Compile a kernel, or take it from the cache, before threads launch it.
 
-    The CPU launches with blocks of one thread; the module's default block size would be compiled for nothing.
+    The CPU launches with blocks of one thread; the module's default block size would be compiled for nothing. Raises InputError
+    where the cache's folder has no room or cannot be written to.
     """
-    kernel.module.load(device, block_dim=1 if device.is_cpu else None)
+    block_dim = 1 if device.is_cpu else None
+    try:
+        if device.is_cpu:
+            _require_room_to_compile(Path(wp.config.kernel_cache_dir), kernel.module.get_module_identifier(block_dim))
+        kernel.module.load(device, block_dim=block_dim)
+    except OSError as error:
+        raise InputError(f"a kernel cannot be compiled: {error.strerror or error} (WARP_CACHE_PATH names another folder)",
+                         wp.config.kernel_cache_dir) from error
+
+
+def _require_room_to_compile(cache: Path, name: str) -> None:
+    """Raise OSError where a kernel is still to be compiled and there is no room for it: LLVM ends the process on a full disk."""
+    if any((cache / name).glob("*.o")):
+        return
+    room = float(shutil.disk_usage(cache).free)
+    with contextlib.suppress(ImportError):
+        import resource
+
+        most = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+        room = min(room, float("inf") if most == resource.RLIM_INFINITY else most)
+    if room < ROOM_TO_COMPILE:
+        raise OSError(errno.ENOSPC, f"room for {room / 2**20:.1f} MiB, and {ROOM_TO_COMPILE >> 20} are needed")
 
 
 def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:

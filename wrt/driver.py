@@ -44,6 +44,7 @@ from wrt.tiles import Rectangle, Work, corners, tiles, work_left
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
 TILE_SIZE = 32
 MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
+PREPARING = "wrt prepares"  # what the threads that compile and build are called
 PREPARING_TOLD = 1.0  # seconds of compiling and building before `progress` is told of it
 MAX_SPP = 1 << 16  # where a target error asks for more than anybody said
 AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that no kernel is compiled from
@@ -178,7 +179,7 @@ class Renderer:
     def _prepare(self) -> None:
         """Compile, which takes longest, and build the structure meanwhile. Neither Ctrl-C nor an error waits for the
         compiler, and no wait is long: Python may hear of Ctrl-C only between two of them."""
-        pool = ThreadPoolExecutor(2)
+        pool = ThreadPoolExecutor(2, thread_name_prefix=PREPARING)
         compiling = pool.submit(self._compile)
         jobs: set[Future[None]] = {compiling, pool.submit(self._build)}
         begin, tell, told = time.perf_counter(), self.options.progress, ("", 0.0)

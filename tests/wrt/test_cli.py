@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.command_line import BOX_OBJ, Result, without_compiling
+from tests.command_line import BOX_OBJ, Result, largest_file, without_compiling
 from tests.command_line import wrt as run
 from tests.data import ROOT
 from wrt import __version__, cli_common
@@ -298,17 +297,6 @@ def test_no_memory_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Renderer, "_prepare", fail)
     refused(run("render", "box.obj"), "not enough memory: Unable to allocate 9 GiB")
-
-
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """No file may become larger than this: what a full disk looks like from here."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.exr", "a.hdr"])

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.data import ROOT
 from wrt.device import _stderr_without, describe_devices, free_memory, records, run_all, run_growing, start, thread_count, upload
 
 import warp as wp  # isort: skip (after wrt.device, which silences Warp's banner)
@@ -127,3 +130,23 @@ def test_records_go_up_and_come_back() -> None:
     back = upload(rows, Pair, start("cpu")).numpy()
     assert np.shares_memory(back, rows)
     assert back["number"].tolist() == [7, 8, 9] and back["vector"][1].tolist() == [1, 2, 3]
+
+
+FULL_CACHE = """
+import resource, sys, numpy as np, wrt
+mesh = wrt.Mesh(np.eye(3), np.array([[0, 1, 2]]))
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
+try:
+    print(wrt.build(mesh, "brute_force").closest_hit(np.zeros((1, 3)), np.ones((1, 3))).t)
+except wrt.InputError as error:
+    print(error)
+"""
+
+
+def test_a_full_disk_under_the_kernel_cache_is_one_message(tmp_path: Path) -> None:
+    """LLVM would end the process. What is compiled already needs no room."""
+    for limit, told in (("1000000", "cannot be compiled: room for 1.0 MiB, and 16 are needed (WARP_CACHE_PATH"),
+                        ("1000000000", "[0.333"), ("1000000", "[0.333")):
+        done = subprocess.run([sys.executable, "-c", FULL_CACHE, limit], cwd=ROOT, capture_output=True, text=True, check=True,
+                              env=os.environ | {"WARP_CACHE_PATH": str(tmp_path)})
+        assert told in done.stdout, done

@@ -1,11 +1,10 @@
 from __future__ import annotations
 
-import contextlib
 import errno
 import io
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 
+from tests.command_line import largest_file
 from wrt.errors import InputError, SceneWarning
 from wrt.image import (
     EXACT_IN_FLOAT,
@@ -196,24 +196,12 @@ def test_metadata_cannot_break_the_hdr_header(pixels: np.ndarray, tmp_path: Path
 # --- whole or not at all ----------------------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def disk_full_after(size: int) -> Iterator[None]:
-    """Writes beyond `size` bytes of any file fail, as on a full disk (Python ignores the signal that goes with it)."""
-    resource = pytest.importorskip("resource")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 @EACH_SUFFIX
 def test_a_full_disk_leaves_the_old_file_and_nothing_else(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"old")
     noise = np.random.default_rng(0).random((H, 4 * W, 3)).astype(np.float32)
-    with disk_full_after(10_000), pytest.raises(InputError, match=rf"a{suffix}: cannot be written: ") as caught:
+    with largest_file(10_000), pytest.raises(InputError, match=rf"a{suffix}: cannot be written: ") as caught:
         write_image(path, noise)
     assert not re.search("[0-9a-f]{32}", str(caught.value))  # the temporary name is nobody's business
     assert path.read_bytes() == b"old"
