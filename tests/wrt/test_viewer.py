@@ -241,7 +241,7 @@ def test_a_thread_follows_until_it_is_stopped() -> None:
     thread = threading.Thread(target=eye.viewer.run, daemon=True)
     thread.start()
     eye.viewer.change(size=(61, 34))
-    assert fine.wait(60.0)
+    assert fine.wait(240.0)
     eye.viewer.pause()
     pictures = -1
     for _ in range(60):  # then nothing comes any more
@@ -252,9 +252,9 @@ def test_a_thread_follows_until_it_is_stopped() -> None:
         pytest.fail("it goes on")
     fine.clear()
     eye.viewer.change(max_depth=1)
-    assert fine.wait(60.0)
+    assert fine.wait(240.0)
     eye.viewer.stop()
-    thread.join(30.0)
+    thread.join(120.0)
     assert not thread.is_alive()
 
 

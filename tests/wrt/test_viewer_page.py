@@ -26,7 +26,7 @@ from wrt.options import Options
 WHITTED = ROOT / "scenes" / "whitted.toml"
 SIZE = {"width": 640, "height": 480}
 ROUGHLY = 0.5  # mean difference in codes of what is on the screen: it was drawn through a texture
-PATIENCE = 60.0  # seconds; a browser that draws in software on a busy machine is slow
+PATIENCE = 240.0  # seconds; a browser that draws in software on a busy machine is slow, and kernels may have to be compiled
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
