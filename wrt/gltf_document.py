@@ -18,6 +18,7 @@ from urllib.parse import unquote_to_bytes
 
 import numpy as np
 
+from wrt.arguments import short
 from wrt.errors import InputError
 from wrt.gltf_schema import at, read_as
 from wrt.memory import require
@@ -50,13 +51,11 @@ class LeftOut:
     """What a file holds and the picture does not show, each thing once with the places where it stands."""
 
     def __init__(self) -> None:
-        self._places: dict[str, dict[str, list[str]]] = {}
+        self._places: dict[str, dict[str, dict[str, None]]] = {}
 
     def add(self, feature: str, kind: str, name: str) -> None:
         """Note `feature` at the thing `name` of the kind `kind` ("material", "node", ...)."""
-        names = self._places.setdefault(feature, {}).setdefault(kind, [])
-        if name not in names:
-            names.append(name)
+        self._places.setdefault(feature, {}).setdefault(kind, {})[name] = None
 
     def add_extensions(self, extensions: dict[str, Any] | None, kind: str, name: str) -> None:
         """Note each extension that wrt does not read and that could change the picture."""
@@ -72,12 +71,12 @@ class LeftOut:
         return ", ".join(f"{feature} ({self._where(kinds)})" for feature, kinds in self._places.items())
 
     @staticmethod
-    def _where(kinds: dict[str, list[str]], most: int = 5) -> str:
+    def _where(kinds: dict[str, dict[str, None]], most: int = 5) -> str:
         parts = []
         for kind, names in kinds.items():
             more = f" and {len(names) - most} more" if len(names) > most else ""
             plural = {"mesh": "meshes"}.get(kind, kind + "s") if len(names) > 1 else kind
-            parts.append(f"{plural} {', '.join(map(repr, names[:most]))}{more}")
+            parts.append(f"{plural} {', '.join(map(short, list(names)[:most]))}{more}")
         return "; ".join(parts)
 
 

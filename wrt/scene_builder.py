@@ -243,8 +243,9 @@ class _Builder:
         mesh = self.mesh(table)
         parts = table.parts or []
         by_group: Mapping[str, str] = table.materials or {str(i): part.material for i, part in enumerate(parts)}
+        groups = set(mesh.groups)
         for group in by_group:
-            if group not in mesh.groups:
+            if group not in groups:
                 raise InputError(f"materials: {unknown(group, 'group of ' + mesh.name, mesh.groups)}")
         used = np.unique(mesh.face_group).tolist() if mesh.face_group is not None else []
         wanted = [by_group.get(mesh.groups[group], table.material) for group in used] if by_group else [table.material]
@@ -259,7 +260,8 @@ class _Builder:
         face_material = None
         if by_group and mesh.face_group is not None:
             of_group = np.zeros(len(mesh.groups), dtype=np.int32)
-            of_group[used] = [names.index(str(name)) for name in wanted]
+            number = {name: i for i, name in enumerate(names)}
+            of_group[used] = [number[str(name)] for name in wanted]
             face_material = of_group[mesh.face_group]
         whole, name = transform(table.transform), table.name or place
         each = [np.eye(4)] if table.instances is None else [self.placed(one, i) for i, one in enumerate(table.instances)]
