@@ -15,6 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import warp as wp
 
+from wrt.accel.streams import launch_stream, stream_kernel
 from wrt.accel.triangle_data import TRIANGLE_DATA
 from wrt.device import load_kernel, records, run_all, start, thread_count, upload
 from wrt.errors import InputError
@@ -264,7 +265,8 @@ class Structure(NamedTuple):
 class Accelerator(ABC):
     """A structure over a geometry, on a device. Subclasses set `name` and `kernels`, and implement `_build`.
 
-    kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts).
+    kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts); for the CPU it may have
+    make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.streams), with stream_block and stream_sizes.
     """
 
     name: ClassVar[str]
@@ -412,7 +414,7 @@ class Accelerator(ABC):
             setattr(hits, field, wp.empty(n, dtype=dtype, device=self.device))
         counted = self._counted(closest_hit_kernel, rays, hits, trace, threads) if counters or trace else None
         if counted is None:
-            self._launch(closest_hit_kernel(self.structure), rays, hits, n, threads)
+            self._trace(closest_hit_kernel, rays, hits, n, threads)
         t, u, v, prim_id = (array if as_warp else array.numpy() for array in (hits.t, hits.u, hits.v, hits.prim_id))
         return Hits(t, u, v, prim_id, counted)
 
@@ -422,7 +424,7 @@ class Accelerator(ABC):
         rays, as_warp = self._rays(origins, directions, t_min, t_max)
         n = len(rays.t_min)
         dark = wp.empty(n, dtype=wp.bool, device=self.device)
-        self._launch(any_hit_kernel(self.structure), rays, dark, n, threads)
+        self._trace(any_hit_kernel, rays, dark, n, threads)
         return dark if as_warp else dark.numpy()
 
     def _counted(self, make_kernel: Any, rays: RayArrays, out: Any, trace: bool, threads: int | None) -> Counters:
@@ -449,6 +451,14 @@ class Accelerator(ABC):
             self.data.recorder = Recorder()
         return Counters(counts, first, fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
 
+    def _trace(self, make_kernel: Any, rays: RayArrays, out: Any, n: int, threads: int | None) -> None:
+        """By the kernel for many rays at a time where there is one."""
+        stream = None if self.device.is_cuda else stream_kernel(self.structure, make_kernel is any_hit_kernel)
+        if stream is None:
+            self._launch(make_kernel(self.structure), rays, out, n, threads)
+        else:
+            launch_stream(self.structure, stream, [self.data, self._surfaces, rays, out], n, threads)
+
     def _launch(self, kernel: Any, rays: RayArrays, out: Any, n: int, threads: int | None) -> None:
         surfaces = self._surfaces
         if self.device.is_cuda:
@@ -470,7 +480,7 @@ class Accelerator(ABC):
             if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in (origins, directions)):
                 raise InputError("origins and directions must both be Warp arrays of vec3, or both NumPy arrays")
             n = len(origins)
-            rays.origin, rays.direction = origins, directions
+            rays.origin, rays.direction = (a if a.is_contiguous else a.contiguous() for a in (origins, directions))
         else:
             origins, directions = _vectors(origins, "origins"), _vectors(directions, "directions")
             n = len(origins)
@@ -488,7 +498,7 @@ class Accelerator(ABC):
         if isinstance(value, wp.array):
             if value.dtype != wp.float32 or value.shape != (n,):
                 raise InputError(f"{name} must be ({n},) float32, got {value.shape} {value.dtype.__name__}")
-            return value
+            return value if value.is_contiguous else value.contiguous()
         try:
             array = np.asarray(value, dtype=np.float32)
         except (TypeError, ValueError) as error:

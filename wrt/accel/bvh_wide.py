@@ -16,6 +16,7 @@ from wrt.accel.wide_tree import MAX_PLACES, WideTree, check_wide, collapse, lane
 from wrt.device import record_dtype, run_all
 from wrt.errors import InputError
 from wrt.kernels.lanes import EMPTY
+from wrt.kernels.traverse_packets import StreamTraversal
 from wrt.kernels.traverse_wide import LEAF_RANGE, WideTraversal
 from wrt.kernels.wide_nodes import first_reference, node_size
 
@@ -154,7 +155,7 @@ class Bvh8(WideBvh):
 
     name = "bvh8"
     width = 8
-    kernels = WideTraversal(8)
+    kernels = StreamTraversal()
 
 
 class Bvh8c(WideBvh):

@@ -1,0 +1,326 @@
+"""Packets: what sixteen lanes compute is, bit for bit, what the scalar units compute for each ray."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import floats, launch, vec3s, zeros  # isort: skip (starts Warp)
+import warp as wp
+
+from wrt.kernels import packets
+from wrt.kernels.lanes import LANE_PAD, make_twins, row_type
+from wrt.kernels.packets import ENTRY, LANES, MET, PACKET_SIZE, ROWS, STACK_SIZE
+from wrt.kernels.query import RayArrays, direction_scale, load_ray
+from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
+from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse_packets import COHERENT, PACKETS, SLOTS
+from wrt.kernels.traverse_wide import MAX_T, lane_ray
+from wrt.kernels.wide_nodes import make_twins as node_twins
+
+WIDTH = 8
+SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, -1e-40, 3e38, -3e38, np.inf, -np.inf, np.nan], np.float32)
+
+
+@wp.struct
+class Lanes:
+    """What the lanes say: per packet, then per ray."""
+
+    state: wp.array(dtype=wp.int32)
+    meets: wp.array(dtype=wp.int32)
+    children: wp.array(dtype=wp.int32)
+    reaching: wp.array(dtype=wp.int32)
+    size: wp.array(dtype=wp.int32)
+    candidates: wp.array(dtype=wp.int32)
+
+
+@kernel
+def by_packets(rays: RayArrays, count: int, nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32),
+               packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint64), out: Lanes):
+    """Packet i with node i and row i; rays beyond `count` of each packet are left out."""
+    i = wp.tid()
+    base = PACKET_SIZE * i
+    active = packets.set_up(rays, LANES * i, count, LANE_PAD, packet, base)
+    out.state[i] = active
+    mask = active & wp.static(COHERENT - 1)
+    out.meets[i] = packets.meets(nodes, 64 * i, mask, packet, base)
+    out.reaching[i] = packets.reaching(0.5, packet, base)
+    if active >= COHERENT:
+        out.children[i] = packets.children(nodes, 64 * i, mask, packet, base)
+    for j in range(LANES):
+        ray = LANES * i + j
+        bottom = ray * STACK_SIZE
+        packets.put_key(stacks, bottom, wp.uint64(7))
+        out.size[ray] = packets.step(nodes, 64 * i, packet, base + j, stacks, bottom + 1, bottom + STACK_SIZE - 1)
+        out.candidates[ray] = packets.sift(rows, 80 * i, 255, packet, base + j)
+
+
+@kernel
+def triangles_by_packets(rows: wp.array(dtype=wp.float32), state: wp.array(dtype=wp.int32), any_hit: bool,
+                         packet: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    mask = state[i] & wp.static(COHERENT - 1)
+    found[i] = packets.triangles(rows, 80 * i, WIDTH, mask, any_hit, packet, PACKET_SIZE * i)
+
+
+@cache
+def scalar_kernel():
+    row = row_type(WIDTH)
+    probe_of, intersect = make_probe(Units()), make_intersect(Units())
+    entries, entered = node_twins(WIDTH, False)
+    candidates = make_twins(WIDTH).candidates
+
+    @wp.struct
+    class Scalars:
+        rows: wp.array2d(dtype=wp.float32)
+        bits: wp.array2d(dtype=wp.int32)
+        entries: wp.array(dtype=row)
+        entered: wp.array(dtype=wp.int32)
+        candidates: wp.array(dtype=wp.int32)
+        hits: wp.array(dtype=Hit)
+
+    @wp.func
+    def put(rows: wp.array2d(dtype=wp.float32), i: int, first: int, v: wp.vec3):
+        for k in range(3):
+            rows[i, first + k] = v[k]
+
+    @kernel
+    def scalars(rays: RayArrays, nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32), surfaces: Surfaces,
+                out: Scalars):
+        i = wp.tid()
+        ray = load_ray(rays, i)
+        probe = probe_of(ray)
+        lanes = lane_ray(probe, LANE_PAD)
+        best = no_hit(ray)
+        best.t = wp.where(best.t < MAX_T, best.t, MAX_T)
+        put(out.rows, i, 0, ray.origin)
+        put(out.rows, i, 3, probe.box.inv_dir)
+        put(out.rows, i, 6, lanes.far_inv_dir)
+        out.rows[i, 9] = lanes.box.t_min
+        out.rows[i, 10] = best.t
+        put(out.rows, i, 11, ray.direction)
+        put(out.rows, i, 14, lanes.origin)
+        put(out.rows, i, 17, wp.vec3(probe.triangle.shear_x, probe.triangle.shear_y, probe.triangle.shear_z))
+        out.bits[i, 0] = probe.triangle.kx + 4 * probe.triangle.ky + 16 * probe.triangle.kz
+        out.bits[i, 1] = 8 * lanes.near_x
+        out.bits[i, 2] = 8 * lanes.near_y
+        out.bits[i, 3] = 8 * lanes.near_z
+        out.rows[i, 20] = direction_scale(rays.direction[i])
+        node = 64 * (i / LANES)
+        first = 80 * (i / LANES)
+        out.entries[i] = entries(nodes, node, lanes)
+        out.entered[i] = entered(nodes, node, lanes, best.t)
+        out.candidates[i] = candidates(rows, first, lanes)
+        for j in range(WIDTH):
+            k = first + j
+            triangle = Primitive()
+            triangle.v0 = wp.vec3(rows[k], rows[k + 8], rows[k + 16])
+            triangle.v1 = wp.vec3(rows[k + 24], rows[k + 32], rows[k + 40])
+            triangle.v2 = wp.vec3(rows[k + 48], rows[k + 56], rows[k + 64])
+            triangle.prim_id = wp.cast(rows[k + 72], wp.int32)
+            best = intersect(probe, surfaces, triangle, best)
+        out.hits[i] = best
+
+    return Scalars, scalars
+
+
+class Both:
+    """Rays, (16 n, 3) each, with a node and a row of triangles for each packet, through both."""
+
+    def __init__(self, rays, nodes, corners, count=LANES, any_hit=False):
+        self.rays = RayArrays()
+        self.rays.origin, self.rays.direction, self.rays.t_min, self.rays.t_max = (
+            vec3s(rays[0]), vec3s(rays[1]), floats(rays[2]), floats(rays[3]))
+        n = len(rays[0]) // LANES
+        self.n = n
+        rows = np.concatenate([corners.astype(np.float32).reshape(n, 72),
+                               np.tile(np.array([3, 1, 4, 0, 5, 9, 2, 6], np.int32).view(np.float32), (n, 1))], axis=1)
+        nodes, rows = floats(nodes.reshape(-1)), floats(rows.reshape(-1))
+        lanes = Lanes()
+        for name, length in (("state", n), ("meets", n), ("children", n), ("reaching", n), ("size", n * LANES),
+                             ("candidates", n * LANES)):
+            setattr(lanes, name, zeros(length, wp.int32))
+        packet, stacks = zeros(n * PACKET_SIZE), zeros(n * LANES * STACK_SIZE, wp.uint64)
+        launch(by_packets, n, self.rays, count, nodes, rows, packet, stacks, lanes)
+        self.state, self.meets, self.children, self.reaching = (
+            getattr(lanes, name).numpy() for name in ("state", "meets", "children", "reaching"))
+        self.size, self.candidates = (getattr(lanes, name).numpy().reshape(n, LANES) for name in ("size", "candidates"))
+        self.stacks = stacks.numpy().reshape(n, LANES, STACK_SIZE)
+        self.set_up = packet.numpy().reshape(n, PACKET_SIZE).copy()
+        found = zeros(n, wp.int32)
+        launch(triangles_by_packets, n, rows, lanes.state, any_hit, packet, found)
+        self.found, self.after = found.numpy(), packet.numpy().reshape(n, PACKET_SIZE)
+
+        out_type, scalars = scalar_kernel()
+        out = out_type()
+        m = n * LANES
+        out.rows, out.bits = zeros((m, 21)), zeros((m, 4), wp.int32)
+        out.entries, out.hits = zeros(m, row_type(WIDTH)), zeros(m, Hit)
+        out.entered, out.candidates = zeros(m, wp.int32), zeros(m, wp.int32)
+        launch(scalars, m, self.rays, nodes, rows, Surfaces(), out)
+        self.scalar = out
+
+    def lane_rows(self, of, names):
+        """(16 n, names) from the packets."""
+        table = of[:, : LANES * len(ROWS)].reshape(self.n, len(ROWS), LANES)
+        return np.stack([table[:, ROWS.index(name)].reshape(-1) for name in names], axis=1)
+
+    @property
+    def active(self):
+        """(n, 16) bool."""
+        return (self.state[:, None] >> np.arange(LANES) & 1).astype(bool)
+
+
+def same(a, b):
+    """Equal bits, or both NaN."""
+    np.testing.assert_array_equal(np.where(np.isnan(a), np.float32(np.nan), a).view(np.int32),
+                                  np.where(np.isnan(b), np.float32(np.nan), b).view(np.int32))
+
+
+def plain_nodes(lo, hi):
+    n = len(lo)
+    nodes = np.zeros((n, 8, WIDTH), np.float32)
+    nodes[:, 0:6:2], nodes[:, 1:6:2] = lo.transpose(0, 2, 1), hi.transpose(0, 2, 1)
+    nodes[:, 6] = (np.arange(1, 9) - 4).astype(np.int32).view(np.float32)
+    return nodes
+
+
+def random_case(rng, n, coherent):
+    """Rays around one per packet (or any), boxes and triangles about their way."""
+    spread = np.where(rng.random((n, 1, 1)) < 0.5, 0.02, 0.3) if coherent else 1.0
+    origin = rng.normal(size=(n, 1, 3)) + spread * rng.normal(size=(n, LANES, 3)) * (rng.random((n, 1, 1)) < 0.7)
+    towards = rng.normal(size=(n, 1, 3)) if coherent else 0.0
+    direction = towards + spread * rng.normal(size=(n, LANES, 3))
+    way = direction[:, :1] if coherent else 0.0
+    center = origin[:, :1] + way * rng.random((n, WIDTH, 1)) * 2.0 + 0.3 * rng.normal(size=(n, WIDTH, 3))
+    half = 0.3 * rng.random((n, WIDTH, 3))
+    corners = (center[..., None] + 0.4 * rng.normal(size=(n, WIDTH, 3, 3))).transpose(0, 3, 2, 1)
+    t_min = np.where(rng.random((n, LANES)) < 0.5, 0.0, 0.2 * rng.random((n, LANES)))
+    t_max = np.where(rng.random((n, LANES)) < 0.5, np.inf, t_min + rng.exponential(1.0, (n, LANES)))
+    rays = origin.reshape(-1, 3), direction.reshape(-1, 3), t_min.reshape(-1), t_max.reshape(-1)
+    return rays, plain_nodes((center - half).astype(np.float32), (center + half).astype(np.float32)), corners
+
+
+def special_case(rng, n):
+    """Zeros of both signs, denormals, overflow, infinities and NaN everywhere."""
+    direction = rng.choice(SPECIAL[:7], (n * LANES, 3))
+    direction[~direction.any(axis=1)] = 1.0
+    alike = rng.random(n * LANES) < 0.5  # else hardly a packet has a beam
+    direction[alike] = np.abs(direction[alike])
+    ends = np.array([0.0, -0.0, 0.5, 1.0, 1e30, 3.4e38, -np.inf, np.inf], np.float32)
+    rays = rng.choice(SPECIAL, (n * LANES, 3), p=[0.17, 0.1] + [0.08] * 9 + [0.01]), direction, rng.choice(ends[:4], n * LANES), \
+        rng.choice(ends, n * LANES)
+    return rays, plain_nodes(rng.choice(SPECIAL, (n, WIDTH, 3)), rng.choice(SPECIAL, (n, WIDTH, 3))), rng.choice(SPECIAL, (n, 72))
+
+
+CASES = {"coherent": lambda rng: random_case(rng, 2000, True), "incoherent": lambda rng: random_case(rng, 1000, False),
+         "special": lambda rng: special_case(rng, 3000)}
+
+
+@cache
+def case(name):
+    return Both(*CASES[name](np.random.default_rng(len(name))))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_set_up_is_that_of_the_scalar_units(name):
+    both = case(name)
+    names = [row for row in ROWS if row not in ("axes", "u", "v", "prim_id", "near_x", "near_y", "near_z")]
+    same(both.lane_rows(both.set_up, names), both.scalar.rows.numpy())
+    bits = both.lane_rows(both.set_up, ["axes", "near_x", "near_y", "near_z"]).view(np.int32)
+    np.testing.assert_array_equal(bits, both.scalar.bits.numpy())
+    t_min, t = both.lane_rows(both.set_up, ["t_min", "t"]).T
+    np.testing.assert_array_equal(both.active.reshape(-1), t >= t_min)
+    np.testing.assert_array_equal(both.reaching[:, None] >> np.arange(LANES) & 1, (t >= 0.5).reshape(-1, LANES))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_packets_with_a_beam_go_the_same_way(name):
+    both = case(name)
+    negative = (both.lane_rows(both.set_up, ["inverse_x", "inverse_y", "inverse_z"]) < 0.0).reshape(-1, LANES, 3)
+    some, all_of = ((negative | ~both.active[..., None]).all(axis=1), (negative & both.active[..., None]).any(axis=1))
+    expected = both.active.any(axis=1) & (some == all_of).all(axis=1)
+    np.testing.assert_array_equal(both.state >= COHERENT, expected)
+    assert expected.any() == (name != "incoherent")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_beam_enters_what_one_of_its_rays_enters(name):
+    # And the masks of the children are those of the box unit, ray by ray; so is what `meets` says of all children together.
+    both = case(name)
+    entered = both.scalar.entered.numpy().reshape(-1, LANES, 1) >> np.arange(WIDTH) & 1
+    entered = entered.astype(bool) & both.active[..., None]
+    np.testing.assert_array_equal(both.meets[:, None] >> np.arange(LANES) & 1, entered.any(axis=2))
+    coherent = both.state >= COHERENT
+    masks = both.set_up[:, MET : MET + WIDTH].view(np.int32)
+    told = (both.children[:, None] >> np.arange(WIDTH) & 1).astype(bool)
+    expected = (entered << np.arange(LANES)[:, None]).sum(axis=1)
+    np.testing.assert_array_equal(told[coherent], (expected > 0)[coherent])
+    np.testing.assert_array_equal(np.where(told, masks, 0)[coherent], expected[coherent])
+    first = np.where(entered, both.scalar.entries.numpy().reshape(-1, LANES, WIDTH), np.inf).min(axis=1)
+    assert (both.set_up[:, ENTRY : ENTRY + WIDTH] <= first)[coherent & told.any(axis=1)][told[coherent & told.any(axis=1)]].all()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_step_leaves_the_children_from_the_far_to_the_near(name):
+    both = case(name)
+    entered = (both.scalar.entered.numpy()[:, None] >> np.arange(WIDTH) & 1).astype(bool)
+    entries = both.scalar.entries.numpy()
+    count = entered.sum(axis=1)
+    np.testing.assert_array_equal(both.size.reshape(-1), count - 1)
+    keys = both.stacks.reshape(-1, STACK_SIZE)
+    node = np.repeat(np.arange(both.n), LANES)
+    pushed = np.arange(WIDTH) < count[:, None]
+    child = (keys[:, 1 : 1 + WIDTH] & 0xFFFFFFFF).astype(np.int64) - 64 * node[:, None] - 48
+    t = (keys[:, 1 : 1 + WIDTH] >> 32).astype(np.uint32).view(np.float32)
+    assert (np.diff(np.where(pushed, t, -1.0), axis=1) <= 0.0).all()
+    found = np.zeros((len(child), WIDTH), bool)
+    at = np.nonzero(pushed)
+    assert not found[at[0], child[at]].any()
+    found[at[0], child[at]] = True
+    np.testing.assert_array_equal(found, entered)
+    exact = entries[at[0], child[at]]
+    assert (t[at] <= exact).all() and (t[at].astype(np.float64) >= exact * (1.0 - 2.0**-19) - 2.0**-145).all()
+    last = np.where(count > 0, keys[np.arange(len(keys)), count], 7)
+    np.testing.assert_array_equal(keys[:, STACK_SIZE - 1], last)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_sifting_leaves_the_candidates_of_the_rows(name):
+    both = case(name)
+    np.testing.assert_array_equal(both.candidates.reshape(-1), both.scalar.candidates.numpy())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_triangles_are_hit_as_the_unit_hits_them(name):
+    both = case(name)
+    hits, active = both.scalar.hits.numpy(), both.active.reshape(-1)
+    lanes = both.lane_rows(both.after, ["t", "u", "v"])
+    found = hits["prim_id"] != NO_HIT
+    np.testing.assert_array_equal(both.lane_rows(both.after, ["prim_id"]).view(np.int32)[active, 0], hits["prim_id"][active])
+    same(lanes[active], np.stack([hits["t"], hits["u"], hits["v"]], axis=1)[active])
+    np.testing.assert_array_equal((both.found[:, None] >> np.arange(LANES) & 1).reshape(-1), found & active)
+    assert (name == "special") or 0.05 < (found & active).mean() < 0.95
+
+
+def test_any_hit_leaves_nothing_within_reach():
+    both = Both(*CASES["coherent"](np.random.default_rng(5)), any_hit=True)
+    found = (both.scalar.hits.numpy()["prim_id"] != NO_HIT) & both.active.reshape(-1)
+    t, before = both.lane_rows(both.after, ["t"])[:, 0], both.lane_rows(both.set_up, ["t"])[:, 0]
+    np.testing.assert_array_equal(t, np.where(found, -np.inf, before))
+    np.testing.assert_array_equal(both.lane_rows(both.after, ["prim_id"]).view(np.int32)[:, 0] != NO_HIT, found)
+
+
+@pytest.mark.parametrize("count", [1, 7, 15])
+def test_lanes_beyond_the_last_ray_are_not_active(count):
+    rays, nodes, corners = random_case(np.random.default_rng(6), 500, True)
+    part, whole = Both(rays, nodes, corners, count), Both(rays, nodes, corners)
+    assert not part.active[:, count:].any()
+    np.testing.assert_array_equal(part.active[:, :count], whole.active[:, :count])
+    names = [row for row in ROWS if row not in ("u", "v", "prim_id")]
+    there = np.arange(len(rays[0])) % LANES < count
+    same(part.lane_rows(part.set_up, names)[there], whole.lane_rows(whole.set_up, names)[there])
+
+
+def test_constants_fit_each_other():
+    assert SLOTS <= 31 and PACKETS * LANES == 64 and COHERENT == 1 << LANES  # masks of slots, of waiting rays and of lanes

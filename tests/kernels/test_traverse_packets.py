@@ -1,0 +1,166 @@
+"""Many rays at a time: the answers are those of the kernel for one ray, to the last bit, however rays are mixed."""
+
+import numpy as np
+import pytest
+
+from tests.data import data_path
+
+from tests.kernel_tools import CPU, vec3s, zeros  # isort: skip (starts Warp)
+import warp as wp
+
+from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.accel.base import Structure, any_hit_kernel, closest_hit_kernel
+from wrt.accel.streams import stream_kernel
+from wrt.bench.rays import ray_sets
+from wrt.kernels.query import HitArrays
+from wrt.kernels.traverse import Units
+from wrt.mesh import Mesh, load_mesh
+from wrt.shapes import icosphere
+
+
+def one_by_one(accel, o, d, t_min, t_max):
+    """Closest hits and any hits by the kernel for one ray."""
+    rays, _ = accel._rays(np.ascontiguousarray(o, np.float32), np.ascontiguousarray(d, np.float32), t_min, t_max)
+    n = len(o)
+    hits = HitArrays()
+    hits.t, hits.u, hits.v, hits.prim_id = zeros(n), zeros(n), zeros(n), zeros(n, wp.int32)
+    accel._launch(closest_hit_kernel(accel.structure), rays, hits, n, 1)
+    dark = zeros(n, wp.bool)
+    accel._launch(any_hit_kernel(accel.structure), rays, dark, n, 1)
+    return {name: getattr(hits, name).numpy() for name in ("t", "u", "v", "prim_id")}, dark.numpy()
+
+
+def assert_same(accel, o, d, t_min=0.0, t_max=np.inf, threads=1):
+    assert stream_kernel(accel.structure, False) is not None
+    expected, dark = one_by_one(accel, o, d, t_min, t_max)
+    found = accel.closest_hit(o, d, t_min, t_max, threads=threads)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(getattr(found, name).view(np.int32), values.view(np.int32), err_msg=name)
+    np.testing.assert_array_equal(accel.any_hit(o, d, t_min, t_max, threads=threads), dark)
+    return expected["prim_id"]
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return build(Geometry.of(icosphere(4)), "bvh8")
+
+
+def mixed_rays(n, seed=0):
+    """Runs of rays that go the same way, of all lengths, between rays that do not."""
+    rng = np.random.default_rng(seed)
+    run = np.repeat(np.arange(n), rng.integers(1, 40, n))[:n]
+    center, towards = 2.5 * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+    together = rng.random(n) < 0.6
+    o = np.where(together[run, None], center[run] + 0.05 * rng.normal(size=(n, 3)), 2.0 * rng.normal(size=(n, 3)))
+    aim = np.where(together[run, None], 0.6 * towards[run] + 0.05 * rng.normal(size=(n, 3)), rng.normal(size=(n, 3)))
+    return o.astype(np.float32), (aim - o).astype(np.float32), rng.random(n).astype(np.float32) * 0.5, rng.exponential(2.0, n)
+
+
+@pytest.mark.parametrize("n", [1, 2, 15, 16, 17, 63, 64, 65, 1000])
+def test_any_number_of_rays(sphere, n):
+    o, d, t_min, t_max = mixed_rays(n, n)
+    prim_id = assert_same(sphere, o, d)
+    assert_same(sphere, o, d, t_min, np.maximum(t_max, t_min))
+    assert n < 1000 or 0.2 < (prim_id >= 0).mean() < 0.9
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_more_rays_than_a_launch(sphere, threads):
+    o, d, _, _ = mixed_rays(150_001)
+    assert_same(sphere, o, d, threads=threads)
+
+
+def test_no_rays(sphere):
+    none = np.zeros((0, 3), np.float32)
+    assert len(sphere.closest_hit(none, none)) == 0 and len(sphere.any_hit(none, none)) == 0
+
+
+def test_strided_arrays_are_read_with_their_gaps(sphere):
+    o, d, _, t_max = mixed_rays(400)
+    t_max = t_max.astype(np.float32)
+    expected = sphere.closest_hit(o[::2], d[::2], 0.0, t_max[::2])
+    assert not vec3s(o)[::2].is_contiguous
+    found = sphere.closest_hit(vec3s(o)[::2], vec3s(d)[::2], 0.0, wp.array(t_max, dtype=wp.float32, device=CPU)[::2]).numpy()
+    np.testing.assert_array_equal(found.prim_id, expected.prim_id)
+    np.testing.assert_array_equal(found.t, expected.t)
+
+
+@pytest.mark.parametrize("kind", ["primary", "shadow", "diffuse", "random"])
+def test_the_rays_of_the_benchmarks(sphere, kind):
+    rays = ray_sets(sphere, 20_000)[kind]
+    assert_same(sphere, rays.origins, rays.directions, 0.0, rays.t_max)
+
+
+def crowd(seed=1):
+    """Many triangles in few places: leaves of several rows, ties in t between all of a leaf, thin ones and such without area."""
+    rng = np.random.default_rng(seed)
+    place = rng.normal(size=(6, 3, 3))
+    corners = np.concatenate([np.repeat(place, 60, axis=0), place[:, :1] + [[[0, 0, 0], [1, 0, 0], [2, 0, 0]]],
+                              rng.normal(size=(200, 1, 3)) + 1e-6 * rng.normal(size=(200, 3, 3)), rng.normal(size=(300, 3, 3))])
+    return Mesh(corners.reshape(-1, 3).astype(np.float32), np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("max_leaf", [8, 64])
+def test_leaves_of_several_rows_and_ties(max_leaf):
+    accel = build(Geometry.of(crowd()), "bvh8", max_leaf=max_leaf)
+    o, d, t_min, t_max = mixed_rays(20_000, 3)
+    prim_id = assert_same(accel, o, d)
+    assert_same(accel, o, d, t_min, np.maximum(t_max, t_min))
+    assert (np.unique(prim_id) >= 360).any() and (prim_id[prim_id >= 0] < 360).any()
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_trees_of_one_leaf(count):
+    mesh = crowd()
+    accel = build(Geometry.of(Mesh(mesh.vertices[-3 * count :], np.arange(3 * count, dtype=np.int32).reshape(-1, 3))), "bvh8")
+    o, d, _, _ = mixed_rays(3000, 4)
+    assert_same(accel, o, d)
+
+
+def test_rays_that_are_special(sphere):
+    # Along axes and through vertices, of very long and very short directions, and segments that are empty.
+    rng = np.random.default_rng(7)
+    vertices = sphere.geometry.vertices
+    n = 20_000
+    o = rng.choice(np.array([0.0, -0.0, 1.0, -1.0, 3.0, -2.5, 1e30]), (n, 3))
+    d = np.where(rng.random((n, 1)) < 0.5, vertices[rng.integers(len(vertices), size=n)] - o,
+                 rng.choice(np.array([0.0, -0.0, 1.0, -1.0, 1e-40]), (n, 3)))
+    d = np.where(d.any(axis=1, keepdims=True), d, 1.0) * rng.choice(np.array([1.0, 1e-25, 1e20]), (n, 1))
+    t_max = rng.choice(np.array([np.inf, 0.0, 1.0, -1.0, 1e30]), n)
+    with np.errstate(over="ignore"):
+        o, d = o.astype(np.float32), np.where(np.isfinite(d.astype(np.float32)), d, 1.0).astype(np.float32)
+    d[~d.any(axis=1)] = 1.0
+    assert_same(sphere, o, d)
+    assert_same(sphere, o, d, 0.0, t_max)
+
+
+def test_moved_vertices(sphere):
+    accel = build(Geometry.of(icosphere(3)), "bvh8")
+    accel.refit(accel.geometry.vertices * np.float32([1.0, 2.0, 0.5]))
+    o, d, _, _ = mixed_rays(5000)
+    assert_same(accel, o, d)
+
+
+def test_packets_are_given_up_where_they_fall_apart():
+    # Triangles far smaller than the distance of the rays: the answers are the same before and after.
+    accel = build(Geometry.of(icosphere(6)), "bvh8")
+    rays = ray_sets(accel, 6_000)["primary"]
+    assert_same(accel, rays.origins, rays.directions)
+
+
+def test_units_without_lanes_have_no_stream():
+    bvh8 = ACCELERATORS["bvh8"]
+    for units in (Units(triangle="moeller_trumbore"), Units(box="plain"), Units(spheres=True), Units(counters=True)):
+        assert stream_kernel(Structure(bvh8, units), False) is None
+    assert stream_kernel(Structure(ACCELERATORS["bvh2"]), False) is None
+    assert stream_kernel(Structure(bvh8, Units(box="minmax")), True) is not None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["medium/stanford_bunny.ply", "medium/sponza_dabrovic.obj", "large/conference_331k.ply",
+                                  "large/dragon_871k.ply"])
+def test_a_million_rays(name):
+    accel = build(Geometry.of(load_mesh(data_path(f"meshes/{name}"))), "bvh8")
+    for inside in (False, True):
+        for rays in ray_sets(accel, 125_000, inside=inside).values():
+            assert_same(accel, rays.origins, rays.directions, 0.0, rays.t_max)
