@@ -54,7 +54,8 @@ def test_nothing_imports_the_command_line(path: Path) -> None:
 def test_units_come_before_traversals_before_the_integrator() -> None:
     layers = [("structs",), ("ray_", "sampling", "camera"), ("counters", "lanes", "wide_nodes", "triangle_cell", "cell_ray"),
               ("textures", "surface", "materials", "traverse", "lights"),
-              ("shadows", "whitted", "query", "build_", "refit_", "cache_lru", "end_point_overlap", "peers"),
+              ("shadows", "whitted", "query", "packets", "trace_packets", "build_", "refit_", "cache_lru", "end_point_overlap",
+               "peers"),
               ("render", "rasterize", "primary_rays", "unit_probes")]
 
     def layer(name: str) -> int:

@@ -13,8 +13,8 @@ from wrt.kernels.lanes import LANE_PAD, make_twins, row_type
 from wrt.kernels.packets import ENTRY, LANES, MET, PACKET_SIZE, ROWS, STACK_SIZE
 from wrt.kernels.query import RayArrays, direction_scale, load_ray
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
+from wrt.kernels.trace_packets import COHERENT, PACKETS, SLOTS
 from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
-from wrt.kernels.traverse_packets import COHERENT, PACKETS, SLOTS
 from wrt.kernels.traverse_wide import MAX_T, lane_ray
 from wrt.kernels.wide_nodes import make_twins as node_twins
 

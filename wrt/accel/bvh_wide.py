@@ -16,7 +16,7 @@ from wrt.accel.wide_tree import MAX_PLACES, WideTree, check_wide, collapse, lane
 from wrt.device import record_dtype, run_all
 from wrt.errors import InputError
 from wrt.kernels.lanes import EMPTY
-from wrt.kernels.traverse_packets import StreamTraversal
+from wrt.kernels.trace_packets import StreamTraversal
 from wrt.kernels.traverse_wide import LEAF_RANGE, WideTraversal
 from wrt.kernels.wide_nodes import first_reference, node_size
 
