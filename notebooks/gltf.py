@@ -182,7 +182,7 @@ wrt.side_by_side({"": film})
 # %% [markdown]
 # ## From radiance to a picture
 # The film holds linear radiance; how it is shown is decided afterwards, and costs nothing. `none` clips what is brighter than 1;
-# the curves bend it down. Blender's default is AgX (with a look of its own on top).
+# the curves bend it down. Blender's default is AgX, too.
 
 # %%
 part = np.s_[SIZE[1] // 5:, SIZE[0] // 2:SIZE[0] * 17 // 20]
@@ -259,7 +259,7 @@ except wrt.InputError as error:
 # %% [markdown]
 # ## Exercises
 # 1. Load a file of your own. Which warnings does it give? Which of them can you see in the picture?
-# 2. glTF has no depth of field. Add an aperture to `cameras.close` in the TOML file (`focal_length`, `sensor_height`, `f_number`
-#    and `focus_distance`, as in `scenes/lens.toml`), and focus on the spout.
+# 2. glTF has no depth of field. Add an aperture to `cameras.close` in the TOML file (in place of `fov_y`: `focal_length`,
+#    `sensor_height`, `f_number` and `focus_distance`, as in `scenes/lens.toml`), and focus on the spout.
 # 3. Make the glass ball hollow: a second, smaller sphere in it with its faces turned round.
 # 4. Let a checkerboard be the wood's roughness (`metallicRoughnessTexture`: green is roughness, blue is metallic).
