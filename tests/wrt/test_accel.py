@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import threading
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -34,6 +38,23 @@ def test_the_registry_names_what_it_holds() -> None:
         assert ACCELERATORS[name].name == name
         assert type(build(BALL, name)) is ACCELERATORS[name]
     assert wrt.ACCELERATORS is ACCELERATORS
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "bsp"])  # which takes seconds
+def test_threads_of_a_build_parse_no_types(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # NumPy parses a struct's layout by way of `ast`; two threads at the same time can end in a SystemError (CPython 3.11).
+    parse = ast.parse
+    in_threads = []
+
+    def noted(*args: Any, **options: Any) -> Any:
+        in_threads.extend([args] if threading.current_thread() is not threading.main_thread() else [])
+        return parse(*args, **options)
+
+    ball = icosphere(5)
+    build(BALL, name, threads=3)  # compiles
+    monkeypatch.setattr(ast, "parse", noted)
+    build(ball, name, threads=3)
+    assert not in_threads
 
 
 def test_unknown_names_and_devices_are_refused() -> None:
