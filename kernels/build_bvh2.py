@@ -19,6 +19,10 @@ MAX_DEPTH = wp.constant(STACK_SIZE - 2)
 
 # A box as one row, low corner and negated high one (two lanes are not used): the lower numbers of two rows are the box around both.
 Row = row_type(8)
+# Of all bins of the three axes. (The stride of an array would be read from memory each time.)
+BinBoxes = wp.types.matrix((3 * BIN_COUNT, 8), wp.float32)
+BinCounts = wp.types.vector(3 * BIN_COUNT, wp.int32)
+BinCosts = wp.types.vector(BIN_COUNT, wp.float32)
 
 
 @wp.struct
@@ -209,9 +213,9 @@ def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
     Cost: the sum over both sides of half area x count, in units of area_scale.
     """
     scale = area_scale(task.measures.box)
-    count = wp.zeros(shape=wp.static(3 * BIN_COUNT), dtype=wp.int32)
-    box = wp.zeros(shape=wp.static(3 * BIN_COUNT), dtype=Row)
-    right_cost = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.float32)
+    count = BinCounts()
+    box = BinBoxes()
+    right_cost = BinCosts()
     for axis in range(3):
         for k in range(bins.count):
             box[axis * BINS + k] = empty_row()
