@@ -1,324 +1,36 @@
 """The inner loop of the builders from the top down, on the CPU backend: ranges of primitives are split in place.
 
-In the end the records stand in the order of the leaves. The host launches it once for the top of the tree and then once a
-subtree, on all cores. What differs between builders is how a range is split: SPLIT is the table of the ways there are.
+In the end the records stand in the order of the leaves. The host launches it for the root, and then for the parts that are left
+over, on all cores. What differs between builders is how a range is split: SPLIT is the table of the ways there are.
 """
 
 from functools import cache
 
 import warp as wp
 
-from wrt.kernels.lanes import row_type
+from wrt.kernels.build_binned import split_binned
+from wrt.kernels.build_records import (
+    MAX_DEPTH,
+    BuildData,
+    BuildOptions,
+    BuildTask,
+    Halves,
+    area_scale,
+    center_of,
+    empty_row,
+    half_area,
+    halves_at,
+    high_of,
+    levels,
+    low_of,
+    lower,
+    measured,
+    row_of,
+    rows_of,
+    tell_parent,
+)
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
-
-BIN_COUNT = 32
-BINS = wp.constant(BIN_COUNT)
-# From here on a range is halved by number, which takes ceil(log2(n)) more levels, whatever the SAH would like.
-MAX_DEPTH = wp.constant(STACK_SIZE - 2)
-
-# A box as one row, low corner and negated high one (two lanes are not used): the lower numbers of two rows are the box around both.
-Row = row_type(8)
-# Of all bins of the three axes. (The stride of an array would be read from memory each time.)
-BinBoxes = wp.types.matrix((3 * BIN_COUNT, 8), wp.float32)
-BinCounts = wp.types.vector(3 * BIN_COUNT, wp.int32)
-BinCosts = wp.types.vector(BIN_COUNT, wp.float32)
-
-
-@wp.struct
-class BuildRecord:
-    """A primitive's box and which one it is."""
-
-    lo: wp.vec3
-    hi: wp.vec3
-    prim_id: int
-
-
-@wp.struct
-class Measures:
-    """The box of some records, and that of their centroids."""
-
-    box: Row
-    centers: Row
-
-
-@wp.struct
-class BuildTask:
-    """A range of records that becomes a child of `parent` (-1: the root): a leaf, or the inner node `slot`.
-
-    limit: the end of the room that it has (spatial splits).
-    """
-
-    begin: int
-    end: int
-    limit: int
-    slot: int
-    parent: int
-    side: int
-    depth: int
-    measures: Measures
-
-
-@wp.struct
-class BuildOptions:
-    """Leaves hold at most max_leaf primitives; the costs are those of the surface area heuristic: of a node, and of a row of
-    primitives, which are tested at once."""
-
-    max_leaf: int
-    row: int
-    cost_traversal: float
-    cost_intersection: float
-
-
-@wp.struct
-class BuildData:
-    """records: rearranged; codes: Morton codes of the records, ascending (LBVH); of the sweep: boxes: the records as they were,
-    order: for each axis, one after another, the boxes by centroid; area, left, scratch: room, one entry a record."""
-
-    records: wp.array(dtype=BuildRecord)
-    nodes: wp.array(dtype=Bvh2Node)
-    used: wp.array(dtype=wp.uint8)
-    codes: wp.array(dtype=wp.uint64)
-    boxes: wp.array(dtype=BuildRecord)
-    order: wp.array(dtype=wp.int32)
-    area: wp.array(dtype=wp.float32)
-    left: wp.array(dtype=wp.uint8)
-    scratch: wp.array(dtype=wp.int32)
-
-
-@wp.struct
-class Bins:
-    """Bins of centroids along each axis, 1 / scale long, from origin on. scale is 0 where the centroids cannot be told apart:
-    where they coincide, or are so close together (or so far apart) that it over- or underflows."""
-
-    count: int
-    origin: wp.vec3
-    scale: wp.vec3
-
-
-@wp.struct
-class Split:
-    """The chosen split: records whose bin along `axis` is below `bin` go left. axis < 0: none was found. Boxes of both sides."""
-
-    axis: int
-    bin: int
-    cost: float
-    box_0: Row
-    box_1: Row
-
-
-@wp.struct
-class Halves:
-    """A split range whose records stand in their places: where the right side begins, and what both measure."""
-
-    middle: int
-    left: Measures
-    right: Measures
-
-
-@wp.func
-def rows_of(options: BuildOptions, n: int) -> float:
-    """How many rows n primitives fill."""
-    return float((n + options.row - 1) / options.row)
-
-
-@wp.func
-def row_of(lo: wp.vec3, hi: wp.vec3) -> Row:
-    return Row(lo[0], lo[1], lo[2], -hi[0], -hi[1], -hi[2], 0.0, 0.0)
-
-
-@wp.func
-def empty_row() -> Row:
-    return Row(wp.inf, wp.inf, wp.inf, wp.inf, wp.inf, wp.inf, 0.0, 0.0)
-
-
-@wp.func
-def low_of(row: Row) -> wp.vec3:
-    return wp.vec3(row[0], row[1], row[2])
-
-
-@wp.func
-def high_of(row: Row) -> wp.vec3:
-    return wp.vec3(-row[3], -row[4], -row[5])
-
-
-@wp.func
-def lower(a: Row, b: Row) -> Row:
-    """The lower number of each lane. (Warp's own minimum minds NaN, which takes three times as long.)"""
-    out = Row()
-    for k in range(8):
-        out[k] = wp.where(b[k] < a[k], b[k], a[k])
-    return out
-
-
-@wp.func
-def area_scale(box: Row) -> float:
-    """The factor that makes a range's longest side 1, so that no area under- or overflows: what `half_area` wants."""
-    e = 0.5 * high_of(box) - 0.5 * low_of(box)
-    return 1.0 / wp.max(wp.max(wp.max(e[0], e[1]), e[2]), 2.0**-126.0)
-
-
-@wp.func
-def half_area(box: Row, scale: float) -> float:
-    """Half the surface of a box, in units of a range's own size; 0 for an empty one."""
-    half = 0.5 * scale * box
-    x = -(half[0] + half[3])
-    y = -(half[1] + half[4])
-    z = -(half[2] + half[5])
-    x = wp.where(x > 0.0, x, 0.0)
-    y = wp.where(y > 0.0, y, 0.0)
-    z = wp.where(z > 0.0, z, 0.0)
-    return x * y + y * z + z * x
-
-
-@wp.func
-def center_of(record: BuildRecord) -> wp.vec3:
-    return 0.5 * record.lo + 0.5 * record.hi
-
-
-@wp.func
-def bin_of(center: wp.vec3, axis: int, bins: Bins) -> int:
-    """Binning and partition call this one function, so that they agree to the last bit."""
-    return wp.clamp(int((center[axis] - bins.origin[axis]) * bins.scale[axis]), 0, bins.count - 1)
-
-
-@wp.func
-def levels(n: int) -> int:
-    """ceil(log2(n)): the depth of a balanced tree over n primitives."""
-    result = int(0)
-    while result < 31 and (1 << result) < n:  # 1 << 31 is negative
-        result = result + 1
-    return result
-
-
-@wp.func
-def bins_of(task: BuildTask) -> Bins:
-    """The bins of a range, fewer of them for few records."""
-    out = Bins()
-    out.count = wp.min(8 + (task.end - task.begin) / 8, BINS)
-    low = low_of(task.measures.centers)
-    high = high_of(task.measures.centers)
-    out.origin = low
-    for axis in range(3):
-        scale = float(out.count) * 0.999999 / (high[axis] - low[axis])
-        if high[axis] > low[axis] and wp.isfinite(scale):
-            out.scale[axis] = scale
-    return out
-
-
-@wp.func
-def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
-    """Wald 2007, "On fast Construction of SAH-based Bounding Volume Hierarchies": the cheapest split between two bins.
-
-    Cost: the sum over both sides of half area x count, in units of area_scale.
-    """
-    scale = area_scale(task.measures.box)
-    count = BinCounts()
-    box = BinBoxes()
-    right_cost = BinCosts()
-    for axis in range(3):
-        for k in range(bins.count):
-            box[axis * BINS + k] = empty_row()
-    for i in range(task.begin, task.end):
-        record = data.records[i]
-        center = center_of(record)
-        row = row_of(record.lo, record.hi)
-        for axis in range(3):
-            b = axis * BINS + bin_of(center, axis, bins)
-            count[b] = count[b] + 1
-            box[b] = lower(box[b], row)
-
-    best = Split()
-    best.axis = -1
-    best.cost = float(wp.inf)
-    for axis in range(3):
-        if bins.scale[axis] > 0.0:
-            side = empty_row()
-            n = int(0)
-            for j in range(bins.count - 1):
-                k = bins.count - 1 - j
-                side = lower(side, box[axis * BINS + k])
-                n = n + count[axis * BINS + k]
-                right_cost[k] = wp.where(n == 0, float(wp.inf), half_area(side, scale) * float(n))
-            side = empty_row()
-            n = int(0)
-            for k in range(1, bins.count):
-                side = lower(side, box[axis * BINS + k - 1])
-                n = n + count[axis * BINS + k - 1]
-                cost = half_area(side, scale) * float(n) + right_cost[k]
-                if n > 0 and cost < best.cost:
-                    best.axis = axis
-                    best.bin = k
-                    best.cost = cost
-                    best.box_0 = side
-    if best.axis >= 0:
-        best.box_1 = empty_row()
-        for k in range(best.bin, bins.count):
-            best.box_1 = lower(best.box_1, box[best.axis * BINS + k])
-    return best
-
-
-@wp.func
-def measured(data: BuildData, begin: int, end: int) -> Measures:
-    out = Measures()
-    out.box = empty_row()
-    out.centers = empty_row()
-    for i in range(begin, end):
-        record = data.records[i]
-        center = center_of(record)
-        out.box = lower(out.box, row_of(record.lo, record.hi))
-        out.centers = lower(out.centers, row_of(center, center))
-    return out
-
-
-@wp.func
-def halves_at(data: BuildData, task: BuildTask, middle: int) -> Halves:
-    out = Halves()
-    out.middle = middle
-    out.left = measured(data, task.begin, middle)
-    out.right = measured(data, middle, task.end)
-    return out
-
-
-@wp.func
-def part_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> Halves:
-    """The records of the left side go to the front.
-
-    Lomuto's partition without a branch, which nothing could predict: what is exchanged for nothing stays on its side.
-    """
-    middle = int(task.begin)
-    empty = empty_row()
-    centers_0 = empty_row()
-    centers_1 = empty_row()
-    for i in range(task.begin, task.end):
-        record = data.records[i]
-        data.records[i] = data.records[middle]
-        data.records[middle] = record
-        center = center_of(record)
-        row = row_of(center, center)
-        left = bin_of(center, split.axis, bins) < split.bin
-        middle = middle + wp.where(left, 1, 0)
-        centers_0 = lower(centers_0, wp.where(left, row, empty))
-        centers_1 = lower(centers_1, wp.where(left, empty, row))
-    out = Halves()
-    out.middle = middle
-    out.left.box = split.box_0
-    out.left.centers = centers_0
-    out.right.box = split.box_1
-    out.right.centers = centers_1
-    return out
-
-
-@wp.func
-def split_binned(data: BuildData, task: BuildTask) -> Halves:
-    """The cheapest split between two bins; by number where no centroids can be told apart, or the tree gets too deep."""
-    n = task.end - task.begin
-    if n > 2 and task.depth + levels(n) < MAX_DEPTH:
-        bins = bins_of(task)
-        split = binned_split(data, task, bins)
-        if split.axis >= 0:
-            return part_by_bin(data, task, bins, split)
-    return halves_at(data, task, task.begin + n / 2)
 
 
 @wp.func
@@ -472,18 +184,6 @@ def worth_it(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
              + half_area(halves.right.box, scale) * rows_of(options, task.end - halves.middle))
     split_cost = options.cost_traversal * area + options.cost_intersection * parts
     return split_cost < options.cost_intersection * rows_of(options, task.end - task.begin) * area
-
-
-@wp.func
-def tell_parent(nodes: wp.array(dtype=Bvh2Node), task: BuildTask, first: int, count: int):
-    """What has become of a range: a leaf (count > 0), or the inner node `first`."""
-    if task.parent >= 0:
-        if task.side == 0:
-            nodes[task.parent].first_0 = first
-            nodes[task.parent].count_0 = count
-        else:
-            nodes[task.parent].first_1 = first
-            nodes[task.parent].count_1 = count
 
 
 @cache

@@ -7,7 +7,7 @@ same tree, on all cores; then the moves are made one after the other, the best f
 
 import warp as wp
 
-from wrt.kernels.build_bvh2 import BuildOptions, rows_of
+from wrt.kernels.build_records import BuildOptions, rows_of
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse_bvh2 import Bvh2Node
 

@@ -7,19 +7,14 @@ which is shared between its sides in proportion, so that subtrees can be built o
 
 import warp as wp
 
-from wrt.kernels.build_bvh2 import (
-    BIN_COUNT,
-    BINS,
+from wrt.kernels.build_binned import BIN_COUNT, BINS, Split, bin_of, binned_split, bins_of
+from wrt.kernels.build_records import (
     MAX_DEPTH,
     BuildData,
     BuildOptions,
     BuildRecord,
     BuildTask,
-    Split,
     area_scale,
-    bin_of,
-    binned_split,
-    bins_of,
     center_of,
     half_area,
     high_of,

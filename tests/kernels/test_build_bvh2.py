@@ -14,7 +14,7 @@ from wrt.accel import build
 from wrt.accel.base import Geometry
 from wrt.accel.bvh_build import BVH_BUILDERS, BvhOptions, build_binary, sah_cost
 from wrt.errors import InputError
-from wrt.kernels.build_bvh2 import levels
+from wrt.kernels.build_records import levels
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse_bvh2 import STACK_SIZE
 from wrt.mesh import Mesh

@@ -11,18 +11,18 @@ import warp as wp
 from wrt.accel.base import Geometry
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.device import load_kernel, records, run_growing, start, upload
-from wrt.kernels import build_bvh2
+from wrt.kernels import build_bvh2, build_records
 from wrt.kernels.traverse_bvh2 import Bvh2Node
 
 
 def build_binned(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """Binned SAH (Wald 2007): fast, and within a few per cent of the full sweep."""
-    return split_ranges("binned", build_records(geometry, threads), options, threads)
+    return split_ranges("binned", primitive_records(geometry, threads), options, threads)
 
 
 def build_median(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """Object median along the longest axis: what there was before the surface area heuristic."""
-    return split_ranges("median", build_records(geometry, threads), options, threads)
+    return split_ranges("median", primitive_records(geometry, threads), options, threads)
 
 
 def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
@@ -44,9 +44,9 @@ def build_sweep(geometry: Geometry, options: BvhOptions, threads: int) -> Binary
                         left=np.empty(n, np.uint8), scratch=np.empty(n, np.int32))
 
 
-def build_records(geometry: Geometry, threads: int) -> np.ndarray:
+def primitive_records(geometry: Geometry, threads: int) -> np.ndarray:
     """BuildRecords of all primitives."""
-    build = records(build_bvh2.BuildRecord, len(geometry))
+    build = records(build_records.BuildRecord, len(geometry))
     build["prim_id"] = np.arange(len(geometry))
     geometry.write_bounds(build["lo"], build["hi"], threads)
     return build
@@ -54,7 +54,7 @@ def build_records(geometry: Geometry, threads: int) -> np.ndarray:
 
 def in_order(lo: np.ndarray, hi: np.ndarray, order: np.ndarray | None = None) -> np.ndarray:
     """BuildRecords of the boxes lo, hi (N, 3) float32 in the given order of prim_id, or in their own."""
-    build = records(build_bvh2.BuildRecord, len(lo))
+    build = records(build_records.BuildRecord, len(lo))
     build["prim_id"] = np.arange(len(lo)) if order is None else order
     build["lo"], build["hi"] = (lo, hi) if order is None else (lo[order], hi[order])
     return build
@@ -82,7 +82,7 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
     n = len(build)
     if n <= 1:
         return small_tree(build["lo"], build["hi"])
-    data = build_bvh2.BuildData()
+    data = build_records.BuildData()
     arrays |= {"records": build, "nodes": records(Bvh2Node, n - 1), "used": np.zeros(n - 1, np.uint8)}
     for name, array in arrays.items():
         setattr(data, name, upload(array, data._cls.vars[name].type.dtype, cpu))
@@ -92,7 +92,7 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
 
 def build_options(options: BvhOptions) -> Any:
     """What kernels take of the options."""
-    out = build_bvh2.BuildOptions()
+    out = build_records.BuildOptions()
     out.max_leaf, out.row = options.max_leaf, options.row
     out.cost_traversal, out.cost_intersection = options.cost_traversal, options.cost_intersection
     return out
@@ -114,9 +114,9 @@ def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int, room:
         stop = max(size // 2, least) if threads > 1 and size > least else 0
         # Ranges of two or more records that do not overlap: there can be no more of them than this.
         most = (max(int(task["limit"][0]), int(task["end"][0])) - int(task["begin"][0])) // 2 if stop else 1
-        left_over = wp.empty(most, dtype=build_bvh2.BuildTask, device=cpu)
+        left_over = wp.empty(most, dtype=build_records.BuildTask, device=cpu)
         count, depth = (wp.zeros(1, dtype=wp.int32, device=cpu) for _ in range(2))
-        inputs = [data, upload(task, build_bvh2.BuildTask, cpu), settings, stop, left_over, count, depth]
+        inputs = [data, upload(task, build_records.BuildTask, cpu), settings, stop, left_over, count, depth]
 
         def parts() -> list[np.ndarray]:
             depths.append(int(depth.numpy()[0]))
@@ -124,7 +124,7 @@ def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int, room:
 
         return partial(wp.launch, kernel, dim=1, device=cpu, inputs=inputs), parts
 
-    root = records(build_bvh2.BuildTask, 1)
+    root = records(build_records.BuildTask, 1)
     root["end"], root["parent"], root["limit"] = n, -1, room
     run_growing(begin, [root], threads)
     return max(depths) + 1

@@ -10,7 +10,7 @@ from wrt.accel.bvh_ranges import build_options, in_order, run_tasks
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.device import records, start, upload
 from wrt.errors import InputError
-from wrt.kernels import build_bvh2
+from wrt.kernels import build_records
 from wrt.kernels import build_sbvh as kernels
 from wrt.kernels.traverse_bvh2 import Bvh2Node
 
@@ -30,11 +30,11 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
     if n <= 1:
         return small_tree(lo, hi)
     room = n + int(options.split_budget * n)
-    build = records(build_bvh2.BuildRecord, room)
+    build = records(build_records.BuildRecord, room)
     build[:n] = in_order(lo, hi)
-    data = build_bvh2.BuildData()
-    data.records = upload(build, build_bvh2.BuildRecord, cpu)
-    data.boxes = wp.empty(room, dtype=build_bvh2.BuildRecord, device=cpu)
+    data = build_records.BuildData()
+    data.records = upload(build, build_records.BuildRecord, cpu)
+    data.boxes = wp.empty(room, dtype=build_records.BuildRecord, device=cpu)
     data.nodes = upload(records(Bvh2Node, room - 1), Bvh2Node, cpu)
     data.used = wp.zeros(room - 1, dtype=wp.uint8, device=cpu)
     data.left = wp.zeros(room, dtype=wp.uint8, device=cpu)
@@ -52,7 +52,7 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
     return compact(data, depth)
 
 
-def compact(data: build_bvh2.BuildData, depth: int) -> BinaryTree:
+def compact(data: build_records.BuildData, depth: int) -> BinaryTree:
     """The tree without the room between its leaves."""
     used = data.left.numpy() != 0
     nodes = squeeze(data.nodes.numpy(), data.used.numpy() != 0)

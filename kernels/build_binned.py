@@ -1,0 +1,163 @@
+"""Binned splits of a range of records."""
+
+import warp as wp
+
+from wrt.kernels.build_records import (
+    MAX_DEPTH,
+    BuildData,
+    BuildTask,
+    Halves,
+    Row,
+    area_scale,
+    center_of,
+    empty_row,
+    half_area,
+    halves_at,
+    high_of,
+    levels,
+    low_of,
+    lower,
+    row_of,
+)
+
+BIN_COUNT = 32
+BINS = wp.constant(BIN_COUNT)
+# Of all bins of the three axes. (The stride of an array would be read from memory each time.)
+BinBoxes = wp.types.matrix((3 * BIN_COUNT, 8), wp.float32)
+BinCounts = wp.types.vector(3 * BIN_COUNT, wp.int32)
+BinCosts = wp.types.vector(BIN_COUNT, wp.float32)
+
+
+@wp.struct
+class Bins:
+    """Bins of centroids along each axis, 1 / scale long, from origin on. scale is 0 where the centroids cannot be told apart:
+    where they coincide, or are so close together (or so far apart) that it over- or underflows."""
+
+    count: int
+    origin: wp.vec3
+    scale: wp.vec3
+
+
+@wp.struct
+class Split:
+    """The chosen split: records whose bin along `axis` is below `bin` go left. axis < 0: none was found. Boxes of both sides."""
+
+    axis: int
+    bin: int
+    cost: float
+    box_0: Row
+    box_1: Row
+
+
+@wp.func
+def bin_of(center: wp.vec3, axis: int, bins: Bins) -> int:
+    """Binning and partition call this one function, so that they agree to the last bit."""
+    return wp.clamp(int((center[axis] - bins.origin[axis]) * bins.scale[axis]), 0, bins.count - 1)
+
+
+@wp.func
+def bins_of(task: BuildTask) -> Bins:
+    """The bins of a range, fewer of them for few records."""
+    out = Bins()
+    out.count = wp.min(8 + (task.end - task.begin) / 8, BINS)
+    low = low_of(task.measures.centers)
+    high = high_of(task.measures.centers)
+    out.origin = low
+    for axis in range(3):
+        scale = float(out.count) * 0.999999 / (high[axis] - low[axis])
+        if high[axis] > low[axis] and wp.isfinite(scale):
+            out.scale[axis] = scale
+    return out
+
+
+@wp.func
+def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
+    """Wald 2007, "On fast Construction of SAH-based Bounding Volume Hierarchies": the cheapest split between two bins.
+
+    Cost: the sum over both sides of half area x count, in units of area_scale.
+    """
+    scale = area_scale(task.measures.box)
+    count = BinCounts()
+    box = BinBoxes()
+    right_cost = BinCosts()
+    for axis in range(3):
+        for k in range(bins.count):
+            box[axis * BINS + k] = empty_row()
+    for i in range(task.begin, task.end):
+        record = data.records[i]
+        center = center_of(record)
+        row = row_of(record.lo, record.hi)
+        for axis in range(3):
+            b = axis * BINS + bin_of(center, axis, bins)
+            count[b] = count[b] + 1
+            box[b] = lower(box[b], row)
+
+    best = Split()
+    best.axis = -1
+    best.cost = float(wp.inf)
+    for axis in range(3):
+        if bins.scale[axis] > 0.0:
+            side = empty_row()
+            n = int(0)
+            for j in range(bins.count - 1):
+                k = bins.count - 1 - j
+                side = lower(side, box[axis * BINS + k])
+                n = n + count[axis * BINS + k]
+                right_cost[k] = wp.where(n == 0, float(wp.inf), half_area(side, scale) * float(n))
+            side = empty_row()
+            n = int(0)
+            for k in range(1, bins.count):
+                side = lower(side, box[axis * BINS + k - 1])
+                n = n + count[axis * BINS + k - 1]
+                cost = half_area(side, scale) * float(n) + right_cost[k]
+                if n > 0 and cost < best.cost:
+                    best.axis = axis
+                    best.bin = k
+                    best.cost = cost
+                    best.box_0 = side
+    if best.axis >= 0:
+        best.box_1 = empty_row()
+        for k in range(best.bin, bins.count):
+            best.box_1 = lower(best.box_1, box[best.axis * BINS + k])
+    return best
+
+
+@wp.func
+def part_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> Halves:
+    """The records of the left side go to the front.
+
+    Lomuto's partition without a branch, which nothing could predict: what is exchanged for nothing stays on its side.
+    """
+    middle = int(task.begin)
+    empty = empty_row()
+    centers_0 = empty_row()
+    centers_1 = empty_row()
+    for i in range(task.begin, task.end):
+        record = data.records[i]
+        data.records[i] = data.records[middle]
+        data.records[middle] = record
+        center = center_of(record)
+        row = row_of(center, center)
+        left = bin_of(center, split.axis, bins) < split.bin
+        middle = middle + wp.where(left, 1, 0)
+        centers_0 = lower(centers_0, wp.where(left, row, empty))
+        centers_1 = lower(centers_1, wp.where(left, empty, row))
+    out = Halves()
+    out.middle = middle
+    out.left.box = split.box_0
+    out.left.centers = centers_0
+    out.right.box = split.box_1
+    out.right.centers = centers_1
+    return out
+
+
+@wp.func
+def split_binned(data: BuildData, task: BuildTask) -> Halves:
+    """The cheapest split between two bins; by number where no centroids can be told apart, or the tree gets too deep."""
+    n = task.end - task.begin
+    if n > 2 and task.depth + levels(n) < MAX_DEPTH:
+        bins = bins_of(task)
+        split = binned_split(data, task, bins)
+        if split.axis >= 0:
+            return part_by_bin(data, task, bins, split)
+    return halves_at(data, task, task.begin + n / 2)
