@@ -307,8 +307,8 @@ def make_by_turns(units: Units, any_hit: bool):
 
 @cache
 def make_kernel(units: Units, any_hit: bool):
-    """Rays first .. end - 1, a block of PACKETS packets a thread, one thread after another in the same scratch, whose slots are
-    0 at the start. out: HitArrays, or for any hit an array of bool. Arrays must have no gaps."""
+    """Rays first .. end - 1, a block of PACKETS packets a thread, one thread after another in the same scratch. out:
+    HitArrays, or for any hit an array of bool. Arrays must have no gaps."""
     struct = make_struct(units.triangle_test.record)
     pad = make_box_test(units.box, WIDTH, False)[2]
     together = make_together(units, any_hit)
@@ -319,6 +319,8 @@ def make_kernel(units: Units, any_hit: bool):
     @kernel
     def trace(accel: struct, surfaces: Surfaces, rays: RayArrays, out: out_type, scratch: Scratch, first: int, end: int):
         begin = first + wp.static(PACKETS * LANES) * wp.tid()
+        if wp.tid() == 0:
+            put_slot(scratch.slots, GIVEN_UP, 0)
         alone = wp.uint64(0)
         for p in range(PACKETS):
             count = wp.min(end - begin - LANES * p, LANES)

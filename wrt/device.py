@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
@@ -73,12 +74,18 @@ def free_memory(device: Any) -> float:
     return float(device.free_memory) if device.is_cuda else available()
 
 
+_loaded: WeakKeyDictionary[Any, set[str]] = WeakKeyDictionary()  # names of devices; Warp would look at files again each time
+
+
 def load_kernel(kernel: Any, device: Any) -> None:
     """Compile a kernel, or take it from the cache, before threads launch it.
 
     The CPU launches with blocks of one thread; the module's default block size would be compiled for nothing. Raises InputError
     where the cache's folder has no room or cannot be written to.
     """
+    devices = _loaded.setdefault(kernel, set())
+    if device.alias in devices:
+        return
     block_dim = 1 if device.is_cpu else None
     try:
         if device.is_cpu:
@@ -87,6 +94,7 @@ def load_kernel(kernel: Any, device: Any) -> None:
     except OSError as error:
         raise InputError(f"a kernel cannot be compiled: {error.strerror or error} (WARP_CACHE_PATH names another folder)",
                          wp.config.kernel_cache_dir) from error
+    devices.add(device.alias)
 
 
 def _require_room_to_compile(cache: Path, name: str) -> None:

@@ -24,13 +24,18 @@ def stream_kernel(structure: Structure, any_hit: bool) -> Any:
     return make(structure.units, any_hit) if make else None
 
 
-def scratch(sizes: tuple[int, int, int]) -> Scratch:
-    """What one launch works in."""
-    out = Scratch()
-    out.packets = wp.empty(sizes[0], dtype=wp.float32, device="cpu")
-    out.stacks = wp.empty(sizes[1], dtype=wp.uint64, device="cpu")
-    out.slots = wp.zeros(sizes[2], dtype=wp.int32, device="cpu")
-    return out
+_free: list[Scratch] = []  # a new one costs as much as a thousand rays
+
+
+def borrow(sizes: tuple[int, int, int]) -> Scratch:
+    """What one launch works in; to be put back into _free. One size serves all: there is one kind of stream."""
+    try:
+        return _free.pop()
+    except IndexError:
+        out = Scratch()
+        out.packets, out.stacks, out.slots = (
+            wp.empty(size, dtype=dtype, device="cpu") for size, dtype in zip(sizes, (wp.float32, wp.uint64, wp.int32), strict=True))
+        return out
 
 
 def launch_stream(structure: Structure, kernel: Any, inputs: list[Any], n: int, threads: int | None) -> None:
@@ -41,9 +46,12 @@ def launch_stream(structure: Structure, kernel: Any, inputs: list[Any], n: int, 
     part = MOST if count == 1 else min(max(n // (4 * count), FEWEST), MOST)
     part -= part % module.stream_block
 
-    def job(first: int) -> Any:
+    jobs = []
+    used = []
+    for first in range(0, n, part):  # structs are made here: two threads must not make them at a time
         end = min(first + part, n)
-        arguments = [*inputs, scratch(module.stream_sizes), first, end]  # here: two threads must not make structs at a time
-        return partial(wp.launch, kernel, dim=-(-(end - first) // module.stream_block), inputs=arguments, device="cpu")
-
-    run_all([job(first) for first in range(0, n, part)], count)
+        used.append(borrow(module.stream_sizes))
+        jobs.append(partial(wp.launch, kernel, dim=-(-(end - first) // module.stream_block), inputs=[*inputs, used[-1], first, end],
+                            device="cpu"))
+    run_all(jobs, count)
+    _free.extend(used)
