@@ -24,7 +24,7 @@ from wrt.cli import cli
 from wrt.mesh import load_mesh
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-OTHERS = ("pip install ", "pytest", "python -m pdoc ")  # which CI itself runs (.ci/run)
+OTHERS = ("pip install ", "pytest", "python -m pdoc ", "dask ")  # which CI itself runs (.ci/run), or tests/wrt/test_cluster.py
 # What stands for something in a command line, and what it is here. The folder of each test has these files.
 STANDS_FOR = {"MESH...": "model.ply", "MESH": "model.ply", "SCENE": "scenes/whitted.toml", "FILE.gif": "file.gif", "STUDY": "order",
               "bunny.ply": "model.ply", "FOLDER|FILE.gif|.png": "frames", "FOLDER": "folder"}
@@ -160,6 +160,8 @@ def test_a_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path: Pat
         pytest.skip("the structure that docs/extending.md makes: tests/wrt/test_extending.py runs it")
     if words[0] == "profile":
         Path(words[1]).write_text(MIRRORS, encoding="utf-8")  # the kernel that counts its rays serves other tests too
+    if "--cluster" in words or any("cuda" in word for word in words):
+        pytest.skip("tests/wrt/test_cluster.py runs it where there is a scheduler; two GPUs are not needed for a test")
     result = run(*words)
     assert result.code == 0, result.err
 

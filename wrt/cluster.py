@@ -57,8 +57,10 @@ def connected(address: str) -> Iterator[Any]:
 async def _identity(address: str) -> str:
     """Who answers there. A Client by itself waits for ever for one that takes the connection and says nothing."""
     from distributed.core import rpc
+    from distributed.security import Security
 
-    async with rpc(address, timeout=CONNECT_SECONDS) as there:
+    how = Security().get_connection_args("client")  # as Dask's configuration has it, and a Client too
+    async with rpc(address, timeout=CONNECT_SECONDS, connection_args=how) as there:
         return str((await there.identity())["type"])
 
 
@@ -113,6 +115,7 @@ class ClusterWorkers(Workers):
         super().__init__(self.submitter, key, package)
         self.client, self.address = client, self.submitter.address
         self.scattered: Any = None
+        self.anybody, self.ask_again = True, 0.0
         self.alone_since: float | None = None
 
     def slots(self) -> int:
@@ -137,13 +140,16 @@ class ClusterWorkers(Workers):
         return False
 
     def _is_sent(self) -> bool:
-        if not self.asked or (self.scattered is not None and self.scattered.status in ("pending", "finished")):
+        sent = not self.asked or (self.scattered is not None and self.scattered.status in ("pending", "finished"))
+        if not sent or time.monotonic() >= self.ask_again:
+            self.anybody, self.ask_again = bool(self.client.nthreads()), time.monotonic() + 1.0
+        if sent or not self.anybody:
+            return self.anybody
+        with suppress(TimeoutError):  # the last worker went away meanwhile
+            # A list of one: a dict by itself would be a dict of futures.
+            self.scattered = self.client.scatter([self.package], broadcast=True, hash=False)[0]
             return True
-        if not self.client.nthreads():
-            return False
-        # A list of one: a dict by itself would be a dict of futures.
-        self.scattered = self.client.scatter([self.package], broadcast=True, hash=False)[0]
-        return True
+        return False
 
     def cancel(self, futures: Iterable[Any]) -> None:
         self.submitter.cancel(futures)

@@ -23,7 +23,7 @@ from wrt.options import Progress
 from wrt.tiles import Rectangle, Work, tiles
 
 TILES_EACH = 4  # of a pass, for each that traces: the last one to come must not be long
-SIDES = {"cpu": (64, 256), "cuda": (256, 1024)}  # pixels: smaller tiles are not worth sending, larger ones take long
+SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # pixels: smaller tiles are not worth sending, larger ones take long
 REPORT_EVERY = 0.1  # seconds
 
 

@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run
+from tests.data import ROOT
 from tests.wrt.test_checkpoint import SCENE, same
 from wrt import cluster, crews
 from wrt.driver import render
@@ -125,8 +127,6 @@ def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
     (lambda: sys.modules.update(wrt=None), r"worker tcp://.* has no wrt \(.*\): wrt .* must be installed there"),  # type: ignore
 ])
 def test_a_worker_that_cannot_serve(client: Any, change: Any, said: str) -> None:
-    import wrt
-
     version, first = wrt.__version__, next(iter(client.scheduler_info()["workers"]))
 
     def put_back() -> None:
@@ -157,6 +157,12 @@ def test_a_scene_that_is_lost_is_sent_again(threads: Any, whole: Film, monkeypat
 
         assert same(render(SCENE, executor=one, progress=progress, **HOW), whole)
     assert len(sent) == 2
+
+
+def test_without_any_worker_left_it_ends(threads: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "PATIENCE", 0.3)
+    with distributed.Client(threads, set_as_default=False) as one, pytest.raises(InputError, match=r"tcp://.*: no worker is left"):
+        render(SCENE, executor=one, spp=1 << 16, size=(200, 200), progress=lambda progress: threads.scale(0))
 
 
 def test_a_scheduler_that_goes_away_leaves_a_checkpoint(threads: Any, tmp_path: Path, whole: Film) -> None:
@@ -198,6 +204,12 @@ def test_commands(threads: Any, mesh: Path) -> None:
     assert done.code == 0 and [row["structure"] for row in json.loads(done.out)["rows"]] == ["bvh2"], done.err
     done = run("bench", "peers", mesh, "--rivals", "warp", "--runs", 1, *few)
     assert done.code == 0 and "each mesh on one worker: 1 workers of cpu: " in done.out, done.err
+    page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+    block = page.split("```python\n")[1].split("```")[0]
+    assert block.count("tcp://scheduler:8786") == 1
+    names: dict[str, Any] = {"wrt": wrt, "scene": SCENE}
+    exec(block.replace("tcp://scheduler:8786", address).replace("spp=4096", "spp=2"), names)
+    names["Client"].current().close()
     done = run("render", mesh, "--cluster", address, "--device", "cpu,cpu")
     assert done.code == 2 and len(done.errors) == 1 and "a worker for each device" in done.err
 
