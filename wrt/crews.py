@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import socket
 import threading
+import time
 import warnings
 from collections import OrderedDict, deque
 from collections.abc import Generator, Iterable
@@ -28,6 +29,7 @@ from wrt.scene_digest import scene_digest
 
 QUEUED = 3  # calls that wait or run, for each that can run at once: nobody waits for us
 SLOTS = 32  # calls at once, of an executor that does not tell
+DEAD_SECONDS = 5.0  # of a process of a pool that has not noticed
 KEPT = 2  # scenes that a worker process keeps ready
 SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "instancing", "accel_options")  # options that workers need
 OURS: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, "resume": False, "progress": None}
@@ -129,6 +131,7 @@ class Workers(Crew):
     def __init__(self, executor: Any, key: str, package: dict[str, Any]) -> None:
         self.executor, self.key, self.package = executor, key, package
         self.asked = 0  # for the scene
+        self.dead_since: float | None = None
 
     def slots(self) -> int:
         return int(getattr(self.executor, "_max_workers", None) or SLOTS)
@@ -144,6 +147,18 @@ class Workers(Crew):
             return self.executor.submit(call, self.key, self._scene(), *job)
         except (BrokenExecutor, RuntimeError) as error:
             raise InputError(f"executor: {error}") from error
+
+    def finished(self, pending: Iterable[Any]) -> Iterable[Any]:
+        done = super().finished(pending)
+        processes = dict(getattr(self.executor, "_processes", None) or {})
+        if done or all(process.is_alive() for process in processes.values()):
+            self.dead_since = None
+        elif self.dead_since is None:
+            self.dead_since = time.monotonic()
+        elif time.monotonic() - self.dead_since > DEAD_SECONDS:
+            # Killed in the middle of writing a reply: the pool waits for the rest of it, for ever.
+            raise InputError("executor: a process of the pool was killed")
+        return done
 
     def result(self, future: Future[Any]) -> Reply | None:
         try:

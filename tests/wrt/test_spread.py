@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -75,13 +76,38 @@ def test_threads(options: dict[str, Any], threads: Executor) -> None:
 
 
 def test_processes(whole: Film) -> None:
-    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), initializer=die_late) as pool:
         film = render(SCENE, aov=["depth", "normal", "material_id"], executor=pool, **HOW)
         assert same(film, whole)
         assert len(film.stats["workers"]) == 2 and f":{os.getpid()}" not in "".join(film.stats["workers"])
-        [process, *_] = pool._processes.values()
         with pytest.raises(InputError, match=r"executor: .*terminated abruptly"):
-            render(SCENE, executor=pool, spp=1 << 16, size=(200, 200), progress=lambda _: os.kill(process.pid, signal.SIGKILL))
+            render(SCENE, executor=pool, spp=1 << 16, **HOW)
+
+
+def die_late() -> None:
+    """In a worker process: killed at a tile's sample 64."""
+    trace = Renderer.trace_tile
+
+    def deadly(self: Renderer, work: Any, *rest: Any) -> Any:
+        if work.first >= 64:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return trace(self, work, *rest)
+
+    Renderer.trace_tile = deadly  # type: ignore[method-assign]
+
+
+def test_a_pool_that_waits_for_a_dead_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Python's does when it was killed while it wrote."""
+    monkeypatch.setattr(crews, "DEAD_SECONDS", 0.2)
+
+    class Waiting(Deaf):
+        _processes = {1: SimpleNamespace(is_alive=lambda: False)}
+
+        def submit(self, function: Any, /, *arguments: Any, **_: Any) -> Future[Any]:
+            return Future()
+
+    with pytest.raises(InputError, match="a process of the pool was killed"):
+        render(SCENE, executor=Waiting())
 
 
 def test_an_executor_that_tells_nothing_gets_the_scene_once(whole: Film) -> None:
