@@ -161,13 +161,15 @@ def units(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> No
 @click.option("--kinds", type=Names(), default=("primary", "shadow", "diffuse", "random"), help="Of rays  [default: all]")
 @click.option("--rays", type=int, default=100_000, show_default=True, help="Rays of each kind")
 @click.option("--runs", type=int, default=7, show_default=True, help="Runs of each, by turns")
+@click.option("--threads", default="both", show_default=True, help="one (by its CPU time), all (by the clock) or both")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
 @CLUSTER
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the tables as Markdown (.md)")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def peers(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, quiet: bool, as_json: bool, **options: Any) -> None:
-    """wrt beside Embree and Warp's mesh_query_ray: the same rays on one thread by turns, with ratios and answers that differ.
+    """wrt beside Embree and Warp's mesh_query_ray: the same rays by turns, on one thread and on all, with ratios and answers that
+    differ.
 
     MESHES: .obj, .ply or .stl files; without any, a sphere.
     """

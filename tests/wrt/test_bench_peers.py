@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,14 @@ import pytest
 
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
-from wrt.accel import Hits
+from wrt.accel import Geometry, Hits, build
 from wrt.bench import peers
 from wrt.bench.algorithms import PEERS
 from wrt.bench.peers import Plan, Row, differing, means, ratio, run
+from wrt.bench.rays import ray_sets
+from wrt.device import thread_count
 from wrt.errors import InputError
+from wrt.shapes import icosphere
 
 RIVALS = [name for name, peer in PEERS.items() if peer.is_installed()]
 
@@ -32,8 +36,9 @@ def box(tmp_path: Path) -> Path:
 def test_everybody_answers_alike_on_a_sphere() -> None:
     rows = run(Plan(structures=("bvh", "bvh2"), rays=2000, runs=2))
     names = ["wrt bvh8", "wrt bvh2", *(PEERS[name].name for name in RIVALS)]
-    assert [(row.kind, row.name) for row in rows] == [
-        (kind, name) for kind in ("primary", "shadow", "diffuse", "random") for name in names]
+    counts = [1, thread_count(None)] if thread_count(None) > 1 else [1]
+    assert [(row.kind, row.threads, row.name) for row in rows] == [
+        (kind, threads, name) for kind in ("primary", "shadow", "diffuse", "random") for threads in counts for name in names]
     for row in rows:
         assert row.triangles == 20480 and 0 < row.rays <= 2000 and len(row.seconds) == 2 and min(row.seconds) > 0.0
         # wrt's own structures never differ; a rival may lose a ray that grazes.
@@ -43,8 +48,21 @@ def test_everybody_answers_alike_on_a_sphere() -> None:
 
 def test_segments_end_where_they_end(box) -> None:
     # Shadow rays end at the light; a rival that looked beyond would find other walls.
-    for row in run(Plan((box,), kinds=("shadow",), rays=2000, runs=1)):
-        assert row.kind == "shadow" and row.differ <= 2
+    for row in run(Plan((box,), kinds=("shadow",), rays=2000, runs=1, threads="one")):
+        assert row.threads == 1 and row.kind == "shadow" and row.differ <= 2
+
+
+@pytest.mark.parametrize("rival", RIVALS)
+def test_parts_of_the_rays_are_put_together_again(rival: str) -> None:
+    geometry = Geometry.of(icosphere(3))
+    who = peers.Rival(PEERS[rival](), geometry)
+    rays = ray_sets(build(geometry, "bvh"), 997, 0)
+    for kind in ("primary", "shadow"):
+        one, some = (who.search(rays[kind], threads)() for threads in (1, 3))
+        assert rival == "open3d" or (len(one), len(some)) == (1, -(-len(rays[kind]) // -(-len(rays[kind]) // 12)))
+        assert differing(who.told(rays[kind], some), who.told(rays[kind], one)) == 0
+        dark = who.told(rays[kind], some)
+        assert not rays[kind].any_hit or (len(dark) == len(rays[kind]) and 0 < np.sum(dark) < len(dark))
 
 
 def test_differing_counts_misses_and_other_places_but_no_ties() -> None:
@@ -65,6 +83,8 @@ def test_ratios_are_medians_of_the_runs_and_means_are_geometric() -> None:
     rows = [first, other, made("wrt", (1.0,), "n"), made("it", (8.0,), "n"), made("wrt", (1.0,), "n", "random"),
             made("it", (0.5,), "n", "random")]
     assert means(rows) == {"it": {"primary": pytest.approx(4.0), "random": pytest.approx(0.5)}}
+    several = [replace(row, threads=2, seconds=tuple(0.5 * s for s in row.seconds)) for row in rows]
+    assert means([*rows, *several]) == means(rows) | {"it, 2 threads": means(rows)["it"]}
     text = peers.text(rows, "a machine")
     assert text.startswith("a machine") and "| primary |" in text and "4.00" in text and "Geometric means over 2 meshes" in text
 
@@ -72,6 +92,7 @@ def test_ratios_are_medians_of_the_runs_and_means_are_geometric() -> None:
 @pytest.mark.parametrize(("options", "message"), [
     ({"rays": 0}, "rays"), ({"runs": 0}, "runs"), ({"structures": ("x",)}, "no structure 'x'"), ({"structures": ()}, "structures"),
     ({"rivals": ("x",)}, "no rival 'x'"), ({"kinds": ("x",)}, "no kind of ray 'x'"),
+    ({"threads": "2"}, "threads must be one, all, both"),
 ])
 def test_wrong_plans_are_refused(options, message: str) -> None:
     with pytest.raises(InputError, match=message):
@@ -80,7 +101,7 @@ def test_wrong_plans_are_refused(options, message: str) -> None:
 
 def test_the_command_prints_and_writes(box, tmp_path) -> None:
     done = command("bench", "peers", box, "--rays", 300, "--runs", 2, "--rivals", "warp", "--kinds", "random", "--json", "-q",
-                   "-o", tmp_path / "out.md")
+                   "--threads", "one", "-o", tmp_path / "out.md")
     assert done.code == 0, done.err
     told = json.loads(done.out)
     assert [row["name"] for row in told["rows"]] == ["wrt bvh8", "Warp mesh_query_ray"]

@@ -1,4 +1,5 @@
-"""`python -m wrt bench peers`: wrt's structures beside Embree and Warp's mesh_query_ray; the same rays by turns on one thread."""
+"""`python -m wrt bench peers`: wrt's structures beside Embree and Warp's mesh_query_ray; the same rays by turns, on one
+thread and on all of them."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter, thread_time
 from typing import Any
@@ -17,24 +19,26 @@ from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
 from wrt.bench.algorithms import PEERS, Embree, Open3D, Peer, WarpMesh
 from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.bench.visibility_report import spread, table
-from wrt.device import describe_devices, load_kernel
+from wrt.device import describe_devices, load_kernel, run_all, thread_count
 from wrt.errors import InputError
 from wrt.mesh import Mesh, load_mesh
 from wrt.shapes import icosphere
 
 SAME_T = 1e-4  # two triangles may meet a ray at the same place: another prim_id there is a tie
-COLUMNS = ("rays", "hit", "who", "Mray/s", "wrt / it", "differ")
+THREADS = ("one", "all", "both")
+PARTS = 4  # a thread: into so many are rays cut for libraries that do not share them out themselves
+COLUMNS = ("rays", "threads", "hit", "who", "Mray/s", "wrt / it", "differ")
 LEGEND = """\
-Mray/s: rays over the thread's CPU seconds, median of the runs by turns, the middle half of them in brackets; rays and results are
-in each library's own arrays. wrt / it: how many times as fast the first structure of the table is, run by run. differ: rays of
-which one says hit and the other miss, or another primitive at another t (more than 1e-4 of it away); any-hit rays: another yes
-or no."""
+Mray/s: rays over the thread's CPU seconds (the clock's, where there are more threads), median of the runs by turns, the middle half
+of them in brackets; rays and results are in each library's own arrays, and each thread has parts of the rays where a library takes
+them on one. wrt / it: how many times as fast the first structure of the table is, run by run. differ: rays of which one says hit and
+the other miss, or another primitive at another t (more than 1e-4 of it away); any-hit rays: another yes or no."""
 
 
 @dataclass(frozen=True)
 class Plan:
     """What to measure: mesh files (none: a sphere); structures of wrt, the first of which ratios are of; rivals (none: those that
-    are installed); kinds of ray, rays of each kind, runs of each. Raises InputError."""
+    are installed); kinds of ray, rays of each kind, runs of each; on one thread, on all there are, or both. Raises InputError."""
 
     meshes: Sequence[str | Path] = ()
     structures: Sequence[str] = ("bvh",)
@@ -43,6 +47,7 @@ class Plan:
     rays: int = 100_000
     runs: int = 7
     seed: int = 0
+    threads: str = "both"
 
     def __post_init__(self) -> None:
         for name, low, high in (("rays", 1, 2**28), ("runs", 1, 1000)):
@@ -58,16 +63,24 @@ class Plan:
                 raise InputError(f'{name} is not installed: pip install "wrt[peers]"')
         if not self.structures:
             raise InputError("structures must name one or more")
+        if self.threads not in THREADS:
+            raise InputError(f"threads must be {', '.join(THREADS)}, got {self.threads!r}")
 
     @property
     def chosen(self) -> list[str]:
         return list(dict.fromkeys(self.rivals)) or [name for name, peer in PEERS.items() if peer.is_installed()]
 
+    @property
+    def counts(self) -> list[int]:
+        """Numbers of threads."""
+        return sorted({1, thread_count(None)} if self.threads == "both" else {1 if self.threads == "one" else thread_count(None)})
+
 
 @dataclass(frozen=True)
 class Row:
     """One contestant, mesh and kind of ray. hit: share of the rays that hit; build: seconds, by the clock; seconds: the thread's
-    CPU time of each run over `rays` rays; differ: rays with another answer than the first structure's."""
+    CPU time of each run over `rays` rays, or the clock's where there are more threads; differ: rays with another answer than the
+    first structure's."""
 
     mesh: str
     triangles: int
@@ -78,6 +91,7 @@ class Row:
     build: float
     seconds: tuple[float, ...]
     differ: int
+    threads: int = 1
 
     @property
     def mrays(self) -> np.ndarray:
@@ -95,7 +109,7 @@ class Contestant(ABC):
     build: float
 
     @abstractmethod
-    def search(self, rays: RaySet) -> Callable[[], Any]:
+    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
         """A function of no argument; whatever it takes to convert the rays is done before."""
 
     @abstractmethod
@@ -110,14 +124,14 @@ class Own(Contestant):
         self.accel: Accelerator = build(geometry, name, threads=1)
         self.build = perf_counter() - begin
 
-    def search(self, rays: RaySet) -> Callable[[], Any]:
+    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
         import warp as wp
 
         device = self.accel.device
         origins, directions = (wp.array(a, dtype=wp.vec3, device=device) for a in (rays.origins, rays.directions))
         t_max = wp.array(rays.t_max, dtype=wp.float32, device=device)
         ask = self.accel.any_hit if rays.any_hit else self.accel.closest_hit
-        return lambda: ask(origins, directions, 0.0, t_max, threads=1)
+        return lambda: ask(origins, directions, 0.0, t_max, threads=threads)
 
     def told(self, rays: RaySet, out: Any) -> Hits | np.ndarray:
         return np.asarray(out.numpy()) if rays.any_hit else Hits(*(getattr(out, f).numpy() for f in ("t", "u", "v", "prim_id")))
@@ -134,29 +148,46 @@ class Rival(Contestant):
             peer.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
         self.build = perf_counter() - begin
 
-    def search(self, rays: RaySet) -> Callable[[], Any]:
+    def search(self, rays: RaySet, threads: int) -> Callable[[], list[Any]]:
+        """Gives the results of the parts of the rays, one after another."""
+        if isinstance(self.peer, Open3D):
+            return self._search_part(rays, threads)
+        count = len(rays) if threads == 1 else max(-(-len(rays) // (PARTS * threads)), 1)
+        searches = [self._search_part(rays.part(slice(first, first + count)), 1) for first in range(0, len(rays), count)]
+        out: list[Any] = [None] * len(searches)
+
+        def search(i: int) -> None:
+            out[i] = searches[i]()[0]
+
+        def all_parts() -> list[Any]:
+            run_all([partial(search, i) for i in range(len(searches))], threads)
+            return out
+
+        return all_parts
+
+    def _search_part(self, rays: RaySet, threads: int) -> Callable[[], list[Any]]:
         peer, o, d = self.peer, np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)
         if isinstance(peer, Embree):
             if rays.any_hit:
-                return lambda: peer.scene.run(o, d, dists=rays.t_max, query="OCCLUDED")
-            return lambda: peer.scene.run(o, d, query="INTERSECT")
+                return lambda: [peer.scene.run(o, d, dists=rays.t_max, query="OCCLUDED")]
+            return lambda: [peer.scene.run(o, d, query="INTERSECT")]
         if isinstance(peer, WarpMesh):
             return _warp_search(peer, rays)
         assert isinstance(peer, Open3D)
         bundle = peer.tensor(np.concatenate([o, d], axis=1))
         if rays.any_hit:
-            return lambda: peer.scene.test_occlusions(bundle, tnear=0.0, tfar=1.0, nthreads=1)
-        return lambda: peer.scene.cast_rays(bundle, nthreads=1)
+            return lambda: [peer.scene.test_occlusions(bundle, tnear=0.0, tfar=1.0, nthreads=threads)]
+        return lambda: [peer.scene.cast_rays(bundle, nthreads=threads)]
 
-    def told(self, rays: RaySet, out: Any) -> Hits | np.ndarray:
+    def told(self, rays: RaySet, out: list[Any]) -> Hits | np.ndarray:
         if not rays.any_hit:
             return self.peer.closest(rays.origins, rays.directions, 0.0, rays.t_max)
         if isinstance(self.peer, Embree):
-            return np.asarray(out) >= 0
-        return np.asarray(out.numpy()).astype(bool)
+            return np.concatenate(out) >= 0
+        return np.concatenate([part.numpy() for part in out]).astype(bool)
 
 
-def _warp_search(peer: WarpMesh, rays: RaySet) -> Callable[[], Any]:
+def _warp_search(peer: WarpMesh, rays: RaySet) -> Callable[[], list[Any]]:
     """Warp wants unit directions, and its any-hit query a length beside them."""
     import warp as wp
 
@@ -168,16 +199,16 @@ def _warp_search(peer: WarpMesh, rays: RaySet) -> Callable[[], Any]:
     reach = wp.array(np.minimum(rays.t_max * length, 1e38).astype(np.float32), dtype=wp.float32, device=device)
     load_kernel(warp_mesh_any if rays.any_hit else warp_mesh_query, device)
 
-    def any_hit() -> Any:
+    def any_hit() -> list[Any]:
         dark = wp.empty(n, dtype=wp.bool, device=device)
         wp.launch(warp_mesh_any, dim=n, inputs=[peer.mesh.id, o, d, reach, dark], device=device)
-        return dark
+        return [dark]
 
-    def closest() -> Any:
+    def closest() -> list[Any]:
         t, u, v = (wp.empty(n, dtype=wp.float32, device=device) for _ in range(3))
         prim_id = wp.empty(n, dtype=wp.int32, device=device)
         wp.launch(warp_mesh_query, dim=n, inputs=[peer.mesh.id, o, d, t, u, v, prim_id], device=device)
-        return prim_id
+        return [prim_id]
 
     return any_hit if rays.any_hit else closest
 
@@ -212,36 +243,41 @@ def run(plan: Plan, report: Callable[[Row], None] | None = None) -> list[Row]:
         for kind, rays in ray_sets(own[0].accel, plan.rays, plan.seed).items():
             if kind not in plan.kinds:
                 continue
-            searches = [who.search(rays) for who in everybody]
-            told = [who.told(rays, search()) for who, search in zip(everybody, searches, strict=True)]  # this also warms up
-            hit = float((told[0].prim_id >= 0).mean() if isinstance(told[0], Hits) else np.mean(told[0]))
-            seconds = timed(searches, plan.runs)
-            for i, who in enumerate(everybody):
-                out.append(Row(name, len(mesh.faces), kind, len(rays), hit, who.name, who.build, tuple(seconds[i]),
-                               differing(told[i], told[0])))
-                if report is not None:
-                    report(out[-1])
+            for threads in plan.counts:
+                for row in _measured((name, len(mesh.faces)), everybody, rays, threads, plan.runs):
+                    out.append(row)
+                    if report is not None:
+                        report(row)
     return out
 
 
-def timed(searches: Sequence[Callable[[], Any]], runs: int) -> list[list[float]]:
-    """CPU seconds of this thread, run by run; the order turns, so that what else the machine does meets all alike."""
+def _measured(mesh: tuple[str, int], everybody: Sequence[Contestant], rays: RaySet, threads: int, runs: int) -> Iterator[Row]:
+    searches = [who.search(rays, threads) for who in everybody]
+    told = [who.told(rays, search()) for who, search in zip(everybody, searches, strict=True)]  # this also warms up
+    hit = float((told[0].prim_id >= 0).mean() if isinstance(told[0], Hits) else np.mean(told[0]))
+    seconds = timed(searches, runs, thread_time if threads == 1 else perf_counter)
+    for i, who in enumerate(everybody):
+        yield Row(*mesh, rays.kind, len(rays), hit, who.name, who.build, tuple(seconds[i]), differing(told[i], told[0]), threads)
+
+
+def timed(searches: Sequence[Callable[[], Any]], runs: int, clock: Callable[[], float]) -> list[list[float]]:
+    """Seconds of that clock, run by run; the order turns, so that what else the machine does meets all alike."""
     seconds: list[list[float]] = [[] for _ in searches]
     n = len(searches)
     for i in range(runs):
         for j in range(n):
             k = (i + j) % n
-            begin = thread_time()
+            begin = clock()
             searches[k]()
-            seconds[k].append(max(thread_time() - begin, 1e-9))
+            seconds[k].append(max(clock() - begin, 1e-9))
     return seconds
 
 
 def groups(rows: Sequence[Row]) -> list[list[Row]]:
-    """Rows of the same rays, in their order; the first is what ratios are of."""
-    found: dict[tuple[str, int, str], list[Row]] = {}
+    """Rows of the same rays on as many threads, in their order; the first is what ratios are of."""
+    found: dict[tuple[str, int, str, int], list[Row]] = {}
     for row in rows:
-        found.setdefault((row.mesh, row.triangles, row.kind), []).append(row)
+        found.setdefault((row.mesh, row.triangles, row.kind, row.threads), []).append(row)
     return list(found.values())
 
 
@@ -251,11 +287,13 @@ def ratio(first: Row, other: Row) -> float:
 
 
 def means(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Of each rival and kind of ray: the geometric mean over the meshes of how many times as fast the first structure is."""
+    """Of each rival (and its threads, where they are several) and kind of ray: the geometric mean over the meshes of how many
+    times as fast the first structure is."""
     logs: dict[str, dict[str, list[float]]] = {}
     for group in groups(rows):
         for row in group[1:]:
-            logs.setdefault(row.name, {}).setdefault(row.kind, []).append(np.log(ratio(group[0], row)))
+            name = row.name if row.threads == 1 else f"{row.name}, {row.threads} threads"
+            logs.setdefault(name, {}).setdefault(row.kind, []).append(np.log(ratio(group[0], row)))
     return {name: {kind: float(np.exp(np.mean(values))) for kind, values in kinds.items()} for name, kinds in logs.items()}
 
 
@@ -270,12 +308,14 @@ def machine(plan: Plan) -> str:
         except PackageNotFoundError:
             continue
     load = f"; load average {os.getloadavg()[0]:.1f} at the start" if hasattr(os, "getloadavg") else ""
-    return f"{describe_devices()[0]}, 1 used{load}; {', '.join(versions)}; {plan.runs} runs of {plan.rays} rays by turns"
+    used = " and ".join(map(str, plan.counts))
+    return f"{describe_devices()[0]}, {used} used{load}; {', '.join(versions)}; {plan.runs} runs of {plan.rays} rays by turns"
 
 
 def cells(row: Row, first: Row) -> tuple[str, ...]:
     """One line of the table, as COLUMNS names it."""
-    return row.kind, f"{row.hit:.0%}", row.name, spread(row.mrays, 1.0), f"{ratio(first, row):.2f}", f"{row.differ}"
+    speed = spread(row.mrays, 1.0), f"{ratio(first, row):.2f}"
+    return row.kind, f"{row.threads}", f"{row.hit:.0%}", row.name, *speed, f"{row.differ}"
 
 
 def text(rows: Sequence[Row], told: str) -> str:
