@@ -31,8 +31,8 @@ COLUMNS = ("rays", "threads", "hit", "who", "Mray/s", "wrt / it", "differ")
 LEGEND = """\
 Mray/s: rays over the thread's CPU seconds (the clock's, where there are more threads), median of the runs by turns, the middle half
 of them in brackets; rays and results are in each library's own arrays, and each thread has parts of the rays where a library takes
-them on one. wrt / it: how many times as fast the first structure of the table is, run by run. differ: rays of which one says hit and
-the other miss, or another primitive at another t (more than 1e-4 of it away); any-hit rays: another yes or no."""
+them on one. wrt / it: how many times as fast the first structure of the table is, run by run. differ: rays of which one says hit
+and the other miss, or another primitive at another t (more than 1e-4 of it away); any-hit rays: another yes or no."""
 
 
 @dataclass(frozen=True)
