@@ -19,8 +19,13 @@ ROW = {name: LANES * i for i, name in enumerate(ROWS)}  # where each row begins
 BEAM = LANES * len(ROWS)  # words of the beam: see SET_UP
 ENTRY = BEAM + 24  # what `children` leaves: 8 distances at which the beam enters the children
 MET = ENTRY + 8  # and 8 masks (int32) of the rays that meet each
-PACKET_SIZE = MET + 8
-STACK_SIZE = 80  # entries of a ray's stack: 64 (kernels.traverse_wide), one at the bottom, and 8 to write a whole row at a time
+FIRST = MET + 8  # what `meets` leaves: for each child a row of the distances at which the rays enter it, inf where they do not
+PACKET_SIZE = FIRST + 8 * LANES
+# A ray's stack, of words: for each node that it is in, the keys of the children that are still to come, from the near to the far,
+# an end, where their references begin, and where the level below goes on. 64 of them (kernels.traverse_wide), and the bottom.
+LEVEL = 16
+STACK_SIZE = LEVEL * 66
+TO_POP = 256  # in a slot's word 3
 
 # Rows by name, with the numbers of the table above.
 HEAD = f"""
@@ -29,7 +34,8 @@ HEAD = f"""
     typedef bool B __attribute__((ext_vector_type(16)));
     typedef float G __attribute__((ext_vector_type(8), aligned(4)));
     typedef bool C __attribute__((ext_vector_type(8)));
-    enum {{ {", ".join(f"{name.upper()} = {first}" for name, first in ROW.items())}, BEAM = {BEAM}, ENTRY = {ENTRY}, MET = {MET} }};
+    enum {{ {", ".join(f"{name.upper()} = {first}" for name, first in ROW.items())},
+           BEAM = {BEAM}, ENTRY = {ENTRY}, MET = {MET}, FIRST = {FIRST} }};
     #define LANE_MASK(x) (int)__builtin_bit_cast(unsigned short, __builtin_convertvector((x), B))
     #define CHILD_MASK(x) (int)__builtin_bit_cast(unsigned char, __builtin_convertvector((x), C))
     const I lane = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}};
@@ -192,9 +198,9 @@ CHILDREN = """
 MEETS = """
     const float* p = nodes.data + (long long)first;
     const F t_min = row(T_MIN), t_max = row(T), ox = row(ORIGIN_X), oy = row(ORIGIN_Y), oz = row(ORIGIN_Z), ix = row(INVERSE_X);
-    const F iy = row(INVERSE_Y), iz = row(INVERSE_Z), fx = row(FAR_X), fy = row(FAR_Y), fz = row(FAR_Z);
+    const F iy = row(INVERSE_Y), iz = row(INVERSE_Z), fx = row(FAR_X), fy = row(FAR_Y), fz = row(FAR_Z), never = __builtin_inff();
     int out = 0;
-    for (int c = 0; c < 8 && (mask & ~out); ++c) {
+    for (int c = 0; c < 8; ++c) {
         const F lo_x = p[c], hi_x = p[8 + c], lo_y = p[16 + c], hi_y = p[24 + c], lo_z = p[32 + c], hi_z = p[40 + c];
         F e = t_min, l = t_max, f;
         f = ((ix < 0.0f ? hi_x : lo_x) - ox) * ix; e = f > e ? f : e;
@@ -203,6 +209,7 @@ MEETS = """
         f = ((ix < 0.0f ? lo_x : hi_x) - ox) * fx; l = f < l ? f : l;
         f = ((iy < 0.0f ? lo_y : hi_y) - oy) * fy; l = f < l ? f : l;
         f = ((iz < 0.0f ? lo_z : hi_z) - oz) * fz; l = f < l ? f : l;
+        row(FIRST + 16 * c) = e <= l ? e : never;
         out |= LANE_MASK(e <= l);
     }
     return out & mask;
@@ -289,11 +296,43 @@ TRIANGLES = """
     return found;
 """.replace("FAR_PAD", f"{float(FAR_PAD)!r}f")
 
-# A sorting network for eight keys of 32 bits: the farthest first, and at the end 0 for what is not met. A key is the distance,
-# whose last four bits are not needed for an order, and the child's number + 8.
+# The children that a ray enters become a level of its stack, sorted by a network. A key is the distance, whose last four bits are
+# not needed for an order, and the child's number + 8; what is not entered has all bits, which is no distance.
+PUSH = """
+    typedef unsigned W __attribute__((ext_vector_type(8), aligned(4)));
+    const int n = __builtin_popcount(CHILD_MASK(met));
+    const W number = {8, 9, 10, 11, 12, 13, 14, 15};
+    W v = (__builtin_bit_cast(W, e) & ~15u) | number | ~__builtin_bit_cast(W, met);
+    #define LAYER(a, b, c, d, e, f, g, h, ...) { \
+        const W other = __builtin_shufflevector(v, v, a, b, c, d, e, f, g, h); \
+        const W low = other < v ? other : v, high = other < v ? v : other; \
+        v = __builtin_shufflevector(low, high, __VA_ARGS__); }
+    LAYER(1, 0, 3, 2, 5, 4, 7, 6, 0, 9, 2, 11, 4, 13, 6, 15)
+    LAYER(3, 2, 1, 0, 7, 6, 5, 4, 0, 1, 10, 11, 4, 5, 14, 15)
+    LAYER(1, 0, 3, 2, 5, 4, 7, 6, 0, 9, 2, 11, 4, 13, 6, 15)
+    LAYER(7, 6, 5, 4, 3, 2, 1, 0, 0, 1, 2, 3, 12, 13, 14, 15)
+    LAYER(2, 3, 0, 1, 6, 7, 4, 5, 0, 1, 10, 11, 4, 5, 14, 15)
+    LAYER(1, 0, 3, 2, 5, 4, 7, 6, 0, 9, 2, 11, 4, 13, 6, 15)
+    #undef LAYER
+    const int place = words[2];
+    unsigned* level = (unsigned*)stacks.data + (place & ~15) + 16;
+    *(W*)level = v;
+    level[8] = ~0u;
+    level[9] = first + 48;
+    level[10] = place;
+    // The nearest is next, and its reference is taken here: where the level is read soon, it is not there yet.
+    int next;
+    __builtin_memcpy(&next, nodes.data + (long long)first + 48 + (v[0] & 7u), 4);
+    const float* at = next < 0 ? rows.data + 80ll * ((-1 - next) >> 6) : nodes.data + 64ll * next;
+    for (int k = 0; k < 4; ++k) __builtin_prefetch(at + 16 * k);
+    words[1] = next;
+    words[2] = n > 1 ? (place & ~15) + 17 : place;
+    words[3] = n == 0 ? 256 : 0;
+"""
+
 STEP = """
-    typedef unsigned W __attribute__((ext_vector_type(8)));
-    typedef unsigned long long K __attribute__((ext_vector_type(8), aligned(8)));
+    int* const words = slots.data + (long long)slot;
+    const int first = words[1] * 64, ray = words[0];
     const float *p = nodes.data + (long long)first, *q = packet.data + (long long)ray;
     const int* near = (const int*)q;
     #define PLANES(k) (*(const G*)(p + (k)))
@@ -308,38 +347,19 @@ STEP = """
     f = (PLANES(z ^ 8) - oz) * q[FAR_Z]; l = f < l ? f : l;
     #undef PLANES
     const auto met = e <= l;
-    const int n = __builtin_popcount(CHILD_MASK(met));
-    const W number = {8, 9, 10, 11, 12, 13, 14, 15}, mask = __builtin_bit_cast(W, met);
-    const W key = (__builtin_bit_cast(W, e) & ~15u) | number;
-    W v = key & mask, least = key | ~mask;
-    #define LAYER(a, b, c, d, e, f, g, h, ...) { \
-        const W other = __builtin_shufflevector(v, v, a, b, c, d, e, f, g, h); \
-        const W up = other > v ? other : v, down = other > v ? v : other; \
-        v = __builtin_shufflevector(up, down, __VA_ARGS__); }
-    LAYER(1, 0, 3, 2, 5, 4, 7, 6, 0, 9, 2, 11, 4, 13, 6, 15)
-    LAYER(3, 2, 1, 0, 7, 6, 5, 4, 0, 1, 10, 11, 4, 5, 14, 15)
-    LAYER(1, 0, 3, 2, 5, 4, 7, 6, 0, 9, 2, 11, 4, 13, 6, 15)
-    LAYER(7, 6, 5, 4, 3, 2, 1, 0, 0, 1, 2, 3, 12, 13, 14, 15)
-    LAYER(2, 3, 0, 1, 6, 7, 4, 5, 0, 1, 10, 11, 4, 5, 14, 15)
-    LAYER(1, 0, 3, 2, 5, 4, 7, 6, 0, 9, 2, 11, 4, 13, 6, 15)
-    #undef LAYER
-    #define LEAST(...) { \\
-        const W other = __builtin_shufflevector(least, least, __VA_ARGS__); \\
-        least = other < least ? other : least; }
-    LEAST(4, 5, 6, 7, 0, 1, 2, 3)
-    LEAST(2, 3, 0, 1, 6, 7, 4, 5)
-    LEAST(1, 0, 3, 2, 5, 4, 7, 6)
-    #undef LEAST
-    unsigned long long* stack = stacks.data + (long long)top;
-    unsigned long long following = stack[-1];
-    *(K*)stack = __builtin_convertvector(v & ~15u, K) << 32 | __builtin_convertvector((v & 7u) + (unsigned)(first + 48), K);
-    // The nearest is not read from there: what was just written in one piece is not soon readable in another.
-    const unsigned nearest = least[0];
-    const unsigned long long nearest_key = (unsigned long long)(nearest & ~15u) << 32 | ((nearest & 7u) + (unsigned)(first + 48));
-    if (__builtin_unpredictable(n != 0)) following = nearest_key;
-    stacks.data[(long long)next] = following;
-    return n - 1;
-"""
+""" + PUSH
+
+BEGIN = """
+    const int first = 0;
+    int* const words = slots.data + (long long)slot;
+    const float* q = packet.data + (long long)ray + FIRST;
+    const G e = {q[0], q[16], q[32], q[48], q[64], q[80], q[96], q[112]};
+    const auto met = e < (G)(__builtin_inff());
+    words[0] = ray;
+    words[2] = bottom;
+    unsigned* under = (unsigned*)stacks.data + (long long)bottom;
+    *under = ~0u;
+""" + PUSH
 
 SIFT = """
     const float *p = rows.data + (long long)first, *q = packet.data + (long long)ray;
@@ -379,21 +399,40 @@ WRITE_DARK = """
     for (int j = 0; j < count; ++j) dark.data[first + j] = found >> j & 1;
 """
 
-PREFETCH = """
-    const float* at = reference < 0 ? rows.data + 80ll * ((-1 - reference) >> 6) : nodes.data + 64ll * reference;
-    const char* p = (const char*)at;
-    for (int k = 0; k < 5; ++k) __builtin_prefetch(p + 64 * k);
+# The next child that begins at or before t; whether there is one. Equal stays: a tie may have a lower prim_id there.
+POP = """
+    int* const words = slots.data + (long long)slot;
+    const unsigned* all = (const unsigned*)stacks.data;
+    int place = words[2];
+    unsigned key;
+    float entry;
+    for (;;) {
+        key = all[place];
+        const unsigned begins = key & ~15u;
+        __builtin_memcpy(&entry, &begins, 4);
+        if (entry <= t) break;
+        if (place == bottom) return false;
+        place = all[(place & ~15) + 10];
+    }
+    int next;
+    __builtin_memcpy(&next, nodes.data + (long long)all[(place & ~15) + 9] + (key & 7u), 4);
+    const float* at = next < 0 ? rows.data + 80ll * ((-1 - next) >> 6) : nodes.data + 64ll * next;
+    for (int k = 0; k < 4; ++k) __builtin_prefetch(at + 16 * k);
+    words[1] = next;
+    words[2] = place + 1;
+    words[3] = 0;
+    return true;
 """
 
 
 @wp.struct
 class Scratch:
-    """What one thread works in. packets: BLOCK / LANES packets; stacks: SLOTS stacks, then the next key of each slot; slots: what
-    is under way in each: the ray (where its column begins in `packets`), the size of its stack, and the triangles of a row that
-    are still to be tested, as a mask and where the row begins."""
+    """What one thread works in. packets; stacks: one a slot. slots, eight words each: 0 the ray that is under way (where its
+    column begins in `packets`), 1 the reference that is next, 2 where its stack goes on, 3 what comes before: a mask of triangles
+    to be tested, and whether to pop, 4 where their row begins."""
 
     packets: wp.array(dtype=wp.float32)
-    stacks: wp.array(dtype=wp.uint64)
+    stacks: wp.array(dtype=wp.uint32)
     slots: wp.array(dtype=wp.int32)
 
 
@@ -431,16 +470,22 @@ def write_dark(dark: wp.array(dtype=wp.bool), first: int, count: int, packet: wp
 
 
 @wp.func_native(HEAD + STEP + END)
-def step(nodes: wp.array(dtype=wp.float32), first: int, packet: wp.array(dtype=wp.float32), ray: int,
-         stacks: wp.array(dtype=wp.uint64), top: int, next: int) -> int: ...
+def step(nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32),
+         stacks: wp.array(dtype=wp.uint32), slots: wp.array(dtype=wp.int32), slot: int): ...
+
+
+@wp.func_native(HEAD + BEGIN + END)
+def begin(nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), ray: int,
+          stacks: wp.array(dtype=wp.uint32), bottom: int, slots: wp.array(dtype=wp.int32), slot: int): ...
+
+
+@wp.func_native(POP)
+def pop(nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32), t: float, stacks: wp.array(dtype=wp.uint32),
+        bottom: int, slots: wp.array(dtype=wp.int32), slot: int) -> bool: ...
 
 
 @wp.func_native(HEAD + SIFT + END)
 def sift(rows: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32), ray: int) -> int: ...
-
-
-@wp.func_native(PREFETCH)
-def prefetch(nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32), reference: int): ...
 
 
 @wp.func_native("return __builtin_ctz(mask);")
@@ -469,14 +514,6 @@ def put_number(packet: wp.array(dtype=wp.float32), i: int, value: float): ...
 
 @wp.func_native("__builtin_memcpy(packet.data + (long long)i, &value, 4);")
 def put_bits(packet: wp.array(dtype=wp.float32), i: int, value: int): ...
-
-
-@wp.func_native("return stacks.data[(long long)i];")
-def key_at(stacks: wp.array(dtype=wp.uint64), i: int) -> wp.uint64: ...
-
-
-@wp.func_native("stacks.data[(long long)i] = key;")
-def put_key(stacks: wp.array(dtype=wp.uint64), i: int, key: wp.uint64): ...
 
 
 @wp.func_native("return slots.data[(long long)i];")

@@ -17,18 +17,18 @@ from wrt.kernels.packets import (
     PACKET_SIZE,
     ROW,
     STACK_SIZE,
+    TO_POP,
     Scratch,
+    begin,
     bits,
     children,
     count_of,
-    key_at,
     lowest,
     lowest_of_all,
     meets,
     number,
-    prefetch,
+    pop,
     put_bits,
-    put_key,
     put_number,
     put_slot,
     reaching,
@@ -52,11 +52,10 @@ REFERENCES = first_reference(WIDTH, False)
 PACKETS = 4  # set up at a time
 SLOTS = 16  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
+WORDS = 8  # of a slot
 # Packets are given up for a while where one after another falls apart: so many in a row, for so many that follow.
 IN_A_ROW, BREAK = 4, 32
-GIVEN_UP = 4 * SLOTS  # where Scratch.slots counts: those in a row below 0, those that are left above
-NEXT = STACK_SIZE * SLOTS  # where the next keys begin in Scratch.stacks
-ROOT = -1  # instead of where the reference of a node stands: the root, which is nobody's child
+GIVEN_UP = WORDS * SLOTS  # where Scratch.slots counts: those in a row below 0, those that are left above
 COHERENT = 1 << LANES  # what `set_up` adds to the mask of rays that have a beam
 
 mask_stack = wp.types.vector(64, wp.int32)
@@ -132,13 +131,6 @@ def make_leaf_test(units: Units, any_hit: bool):
         return wp.static(any_hit) and best.prim_id != NO_HIT
 
     return test_row
-
-
-@wp.func
-def child_of(nodes: wp.array(dtype=wp.float32), key: wp.uint64) -> int:
-    """The reference that a key stands for: it tells where it is to be read."""
-    at = reference_of(key)
-    return wp.where(at < 0, 0, bits(nodes, wp.max(at, 0)))
 
 
 @wp.func
@@ -232,44 +224,42 @@ def make_by_turns(units: Units, any_hit: bool):
     test_row = make_leaf_test(units, any_hit)
 
     @wp.func
-    def begin(scratch: Scratch, slot: int, ray: int):
-        put_slot(scratch.slots, slot, ray / LANES * PACKET_SIZE + ray % LANES)
-        put_slot(scratch.slots, slot + SLOTS, 1)
-        put_slot(scratch.slots, slot + 2 * SLOTS, 0)
-        put_key(scratch.stacks, slot * STACK_SIZE, key_of(float(wp.inf), ROOT))  # the bottom, beyond every hit
-        put_key(scratch.stacks, NEXT + slot, key_of(0.0, ROOT))
+    def start(accel: struct, scratch: Scratch, slot: int, ray: int):
+        begin(accel.nodes, accel.primitives, scratch.packets, ray / LANES * PACKET_SIZE + ray % LANES, scratch.stacks,
+              slot * STACK_SIZE, scratch.slots, slot * WORDS)
 
     @wp.func
-    def visit(accel: struct, surfaces: Surfaces, scratch: Scratch, slot: int, ray: int) -> bool:
-        """One node, or one row of triangles; False where nothing is left."""
-        t = number(scratch.packets, ray + wp.static(ROW["t"]))
-        bottom = slot * STACK_SIZE
-        size = slot_at(scratch.slots, slot + SLOTS)
-        key = key_at(scratch.stacks, NEXT + slot)
-        # What begins beyond the closest hit is dropped. Equal stays: a tie may have a lower prim_id there.
-        while t_of(key) > t and size > 0:
-            size = size - 1
-            key = key_at(scratch.stacks, bottom + size)
-        if size == 0:
-            return False
-        reference = child_of(accel.nodes, key)
-        if reference >= 0:
-            size = size + step(accel.nodes, reference * NODE, scratch.packets, ray, scratch.stacks, bottom + size, NEXT + slot)
-        else:
-            n = size_of(reference)
-            first = row_of(reference) * wp.static(row_size)
-            while n > WIDTH:
-                pending = sift(accel.primitives, first, wp.static((1 << WIDTH) - 1), scratch.packets, ray)
-                if test_row(accel.primitives, first, pending, surfaces, scratch.packets, ray):
+    def visit_leaf(accel: struct, surfaces: Surfaces, scratch: Scratch, slot: int, ray: int, reference: int) -> bool:
+        """Sift the triangles of the last row; those of others are also tested. Whether the ray has found what it asks for."""
+        n = size_of(reference)
+        first = row_of(reference) * wp.static(row_size)
+        while n > WIDTH:
+            candidates = sift(accel.primitives, first, wp.static((1 << WIDTH) - 1), scratch.packets, ray)
+            if test_row(accel.primitives, first, candidates, surfaces, scratch.packets, ray):
+                return True
+            n = n - WIDTH
+            first = first + wp.static(row_size)
+        candidates = sift(accel.primitives, first, (2 << (n - 1)) - 1, scratch.packets, ray)
+        put_slot(scratch.slots, slot * WORDS + 3, candidates | TO_POP)
+        put_slot(scratch.slots, slot * WORDS + 4, first)
+        return False
+
+    @wp.func
+    def turn(accel: struct, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
+        """One node, one row of triangles, or what is left to do after them; False where the ray is done."""
+        ray = slot_at(scratch.slots, slot * WORDS)
+        before = slot_at(scratch.slots, slot * WORDS + 3)
+        if before != 0:
+            if before != TO_POP:
+                if test_row(accel.primitives, slot_at(scratch.slots, slot * WORDS + 4), before & (TO_POP - 1), surfaces,
+                            scratch.packets, ray):
                     return False
-                n = n - WIDTH
-                first = first + wp.static(row_size)
-            put_slot(scratch.slots, slot + 2 * SLOTS, sift(accel.primitives, first, (2 << (n - 1)) - 1, scratch.packets, ray))
-            put_slot(scratch.slots, slot + 3 * SLOTS, first)
-            size = size - 1
-            put_key(scratch.stacks, NEXT + slot, key_at(scratch.stacks, bottom + size))
-        put_slot(scratch.slots, slot + SLOTS, size)
-        prefetch(accel.nodes, accel.primitives, child_of(accel.nodes, key_at(scratch.stacks, NEXT + slot)))
+            return pop(accel.nodes, accel.primitives, number(scratch.packets, ray + wp.static(ROW["t"])), scratch.stacks,
+                       slot * STACK_SIZE, scratch.slots, slot * WORDS)
+        reference = slot_at(scratch.slots, slot * WORDS + 1)
+        if reference < 0:
+            return not visit_leaf(accel, surfaces, scratch, slot, ray, reference)
+        step(accel.nodes, accel.primitives, scratch.packets, scratch.stacks, scratch.slots, slot * WORDS)
         return True
 
     @wp.func
@@ -277,7 +267,7 @@ def make_by_turns(units: Units, any_hit: bool):
         live = int(0)
         slot = int(0)
         while slot < SLOTS and waiting != wp.uint64(0):
-            begin(scratch, slot, lowest_of_all(waiting))
+            start(accel, scratch, slot, lowest_of_all(waiting))
             waiting = waiting & (waiting - wp.uint64(1))
             live = live | (1 << slot)
             slot = slot + 1
@@ -286,18 +276,9 @@ def make_by_turns(units: Units, any_hit: bool):
             while todo != 0:
                 slot = lowest(todo)
                 todo = todo & (todo - 1)
-                ray = slot_at(scratch.slots, slot)
-                pending = slot_at(scratch.slots, slot + 2 * SLOTS)
-                goes_on = bool(True)
-                if pending != 0:
-                    put_slot(scratch.slots, slot + 2 * SLOTS, 0)
-                    goes_on = not test_row(accel.primitives, slot_at(scratch.slots, slot + 3 * SLOTS), pending, surfaces,
-                                           scratch.packets, ray)
-                else:
-                    goes_on = visit(accel, surfaces, scratch, slot, ray)
-                if not goes_on:
+                if not turn(accel, surfaces, scratch, slot):
                     if waiting != wp.uint64(0):
-                        begin(scratch, slot, lowest_of_all(waiting))
+                        start(accel, scratch, slot, lowest_of_all(waiting))
                         waiting = waiting & (waiting - wp.uint64(1))
                     else:
                         live = live & ~(1 << slot)
@@ -318,15 +299,15 @@ def make_kernel(units: Units, any_hit: bool):
 
     @kernel
     def trace(accel: struct, surfaces: Surfaces, rays: RayArrays, out: out_type, scratch: Scratch, first: int, end: int):
-        begin = first + wp.static(PACKETS * LANES) * wp.tid()
+        block = first + wp.static(PACKETS * LANES) * wp.tid()
         if wp.tid() == 0:
             put_slot(scratch.slots, GIVEN_UP, 0)
         alone = wp.uint64(0)
         for p in range(PACKETS):
-            count = wp.min(end - begin - LANES * p, LANES)
+            count = wp.min(end - block - LANES * p, LANES)
             if count > 0:
                 base = PACKET_SIZE * p
-                active = set_up(rays, begin + LANES * p, count, wp.static(float(pad)), scratch.packets, base)
+                active = set_up(rays, block + LANES * p, count, wp.static(float(pad)), scratch.packets, base)
                 given_up = slot_at(scratch.slots, GIVEN_UP)
                 if active >= COHERENT and given_up <= 0:
                     worth = together(accel, surfaces, scratch.packets, base, active - COHERENT)
@@ -340,9 +321,9 @@ def make_kernel(units: Units, any_hit: bool):
                     alone = alone | (wp.uint64(active) << wp.uint64(LANES * p))
         by_turns(accel, surfaces, scratch, alone)
         for p in range(PACKETS):
-            count = wp.min(end - begin - LANES * p, LANES)
+            count = wp.min(end - block - LANES * p, LANES)
             if count > 0:
-                write(out, begin + LANES * p, count, scratch.packets, PACKET_SIZE * p)
+                write(out, block + LANES * p, count, scratch.packets, PACKET_SIZE * p)
 
     return trace
 
@@ -351,7 +332,7 @@ class StreamTraversal(WideTraversal):
     """Plain nodes of 8, for which there is a kernel for many rays at a time."""
 
     stream_block = PACKETS * LANES
-    stream_sizes = PACKETS * PACKET_SIZE, NEXT + SLOTS, GIVEN_UP + 1  # lengths of a Scratch's arrays
+    stream_sizes = PACKETS * PACKET_SIZE, STACK_SIZE * SLOTS, GIVEN_UP + 1  # lengths of a Scratch's arrays
 
     def __init__(self) -> None:
         super().__init__(WIDTH)

@@ -10,15 +10,16 @@ import warp as wp
 
 from wrt.kernels import packets
 from wrt.kernels.lanes import LANE_PAD, make_twins, row_type
-from wrt.kernels.packets import ENTRY, LANES, MET, PACKET_SIZE, ROWS, STACK_SIZE
+from wrt.kernels.packets import ENTRY, LANES, MET, PACKET_SIZE, ROWS, STACK_SIZE, TO_POP
 from wrt.kernels.query import RayArrays, direction_scale, load_ray
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
-from wrt.kernels.trace_packets import COHERENT, PACKETS, SLOTS
+from wrt.kernels.trace_packets import COHERENT, PACKETS, SLOTS, WORDS
 from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse_wide import MAX_T, lane_ray
 from wrt.kernels.wide_nodes import make_twins as node_twins
 
 WIDTH = 8
+NOTHING = wp.constant(99)
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, -1e-40, 3e38, -3e38, np.inf, -np.inf, np.nan], np.float32)
 
 
@@ -30,14 +31,16 @@ class Lanes:
     meets: wp.array(dtype=wp.int32)
     children: wp.array(dtype=wp.int32)
     reaching: wp.array(dtype=wp.int32)
-    size: wp.array(dtype=wp.int32)
+    begun: wp.array(dtype=wp.int32)
+    walk: wp.array2d(dtype=wp.int32)
     candidates: wp.array(dtype=wp.int32)
 
 
 @kernel
-def by_packets(rays: RayArrays, count: int, nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32),
-               packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint64), out: Lanes):
-    """Packet i with node i and row i; rays beyond `count` of each packet are left out."""
+def by_packets(rays: RayArrays, count: int, reach: float, nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32),
+               packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint32), slots: wp.array(dtype=wp.int32), out: Lanes):
+    """Packet i with node i and row i, and a slot for each ray; rays beyond `count` of each packet are left out. walk: what is
+    next after a step, and after one pop after another, or NOTHING."""
     i = wp.tid()
     base = PACKET_SIZE * i
     active = packets.set_up(rays, LANES * i, count, LANE_PAD, packet, base)
@@ -49,9 +52,18 @@ def by_packets(rays: RayArrays, count: int, nodes: wp.array(dtype=wp.float32), r
         out.children[i] = packets.children(nodes, 64 * i, mask, packet, base)
     for j in range(LANES):
         ray = LANES * i + j
+        slot = ray * WORDS
         bottom = ray * STACK_SIZE
-        packets.put_key(stacks, bottom, wp.uint64(7))
-        out.size[ray] = packets.step(nodes, 64 * i, packet, base + j, stacks, bottom + 1, bottom + STACK_SIZE - 1)
+        packets.begin(nodes, rows, packet, base + j, stacks, bottom, slots, slot)
+        out.begun[ray] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
+        slots[slot + 1] = i
+        slots[slot + 2] = bottom
+        packets.step(nodes, rows, packet, stacks, slots, slot)
+        out.walk[ray, 0] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
+        goes_on = bool(True)
+        for k in range(WIDTH):
+            goes_on = goes_on and packets.pop(nodes, rows, reach, stacks, bottom, slots, slot)
+            out.walk[ray, k + 1] = wp.where(goes_on, slots[slot + 1], NOTHING)
         out.candidates[ray] = packets.sift(rows, 80 * i, 255, packet, base + j)
 
 
@@ -127,7 +139,7 @@ def scalar_kernel():
 class Both:
     """Rays, (16 n, 3) each, with a node and a row of triangles for each packet, through both."""
 
-    def __init__(self, rays, nodes, corners, count=LANES, any_hit=False):
+    def __init__(self, rays, nodes, corners, count=LANES, any_hit=False, reach=MAX_T):
         self.rays = RayArrays()
         self.rays.origin, self.rays.direction, self.rays.t_min, self.rays.t_max = (
             vec3s(rays[0]), vec3s(rays[1]), floats(rays[2]), floats(rays[3]))
@@ -137,15 +149,14 @@ class Both:
                                np.tile(np.array([3, 1, 4, 0, 5, 9, 2, 6], np.int32).view(np.float32), (n, 1))], axis=1)
         nodes, rows = floats(nodes.reshape(-1)), floats(rows.reshape(-1))
         lanes = Lanes()
-        for name, length in (("state", n), ("meets", n), ("children", n), ("reaching", n), ("size", n * LANES),
-                             ("candidates", n * LANES)):
+        for name, length in (("state", n), ("meets", n), ("children", n), ("reaching", n), ("begun", n * LANES),
+                             ("candidates", n * LANES), ("walk", (n * LANES, WIDTH + 1))):
             setattr(lanes, name, zeros(length, wp.int32))
-        packet, stacks = zeros(n * PACKET_SIZE), zeros(n * LANES * STACK_SIZE, wp.uint64)
-        launch(by_packets, n, self.rays, count, nodes, rows, packet, stacks, lanes)
+        packet, stacks = zeros(n * PACKET_SIZE), zeros(n * LANES * STACK_SIZE, wp.uint32)
+        launch(by_packets, n, self.rays, count, reach, nodes, rows, packet, stacks, zeros(n * LANES * WORDS, wp.int32), lanes)
         self.state, self.meets, self.children, self.reaching = (
             getattr(lanes, name).numpy() for name in ("state", "meets", "children", "reaching"))
-        self.size, self.candidates = (getattr(lanes, name).numpy().reshape(n, LANES) for name in ("size", "candidates"))
-        self.stacks = stacks.numpy().reshape(n, LANES, STACK_SIZE)
+        self.begun, self.walk, self.candidates = (getattr(lanes, name).numpy() for name in ("begun", "walk", "candidates"))
         self.set_up = packet.numpy().reshape(n, PACKET_SIZE).copy()
         found = zeros(n, wp.int32)
         launch(triangles_by_packets, n, rows, lanes.state, any_hit, packet, found)
@@ -261,34 +272,49 @@ def test_a_beam_enters_what_one_of_its_rays_enters(name):
     assert (both.set_up[:, ENTRY : ENTRY + WIDTH] <= first)[coherent & told.any(axis=1)][told[coherent & told.any(axis=1)]].all()
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_a_step_leaves_the_children_from_the_far_to_the_near(name):
-    both = case(name)
+def walked(both, reach=np.inf):
+    """(16 n, 9) children of each ray's node as a step and pops should tell them: at most `reach` away, the near first, where
+    entries differ by more than keys leave out; and the entries."""
     entered = (both.scalar.entered.numpy()[:, None] >> np.arange(WIDTH) & 1).astype(bool)
-    entries = both.scalar.entries.numpy()
-    count = entered.sum(axis=1)
-    np.testing.assert_array_equal(both.size.reshape(-1), count - 1)
-    keys = both.stacks.reshape(-1, STACK_SIZE)
-    node = np.repeat(np.arange(both.n), LANES)
-    pushed = np.arange(WIDTH) < count[:, None]
-    child = (keys[:, 1 : 1 + WIDTH] & 0xFFFFFFFF).astype(np.int64) - 64 * node[:, None] - 48
-    t = (keys[:, 1 : 1 + WIDTH] >> 32).astype(np.uint32).view(np.float32)
-    assert (np.diff(np.where(pushed, t, -1.0), axis=1) <= 0.0).all()
-    found = np.zeros((len(child), WIDTH), bool)
-    at = np.nonzero(pushed)
-    assert not found[at[0], child[at]].any()
-    found[at[0], child[at]] = True
-    np.testing.assert_array_equal(found, entered)
-    exact = entries[at[0], child[at]]
-    assert (t[at] <= exact).all() and (t[at].astype(np.float64) >= exact * (1.0 - 2.0**-19) - 2.0**-145).all()
-    last = np.where(count > 0, keys[np.arange(len(keys)), count], 7)
-    np.testing.assert_array_equal(keys[:, STACK_SIZE - 1], last)
+    entries = np.where(entered, both.scalar.entries.numpy(), np.inf)
+    keys = np.where(entered, (entries.view(np.int32) & ~15 | np.arange(WIDTH) + 8).astype(np.int64), 2**40)
+    order = np.argsort(keys, axis=1)
+    begins = (np.take_along_axis(keys, order, axis=1).clip(0, 2**31 - 1) & ~15).astype(np.int32).view(np.float32)
+    within = np.take_along_axis(entered, order, axis=1) & ((begins <= reach) | (np.arange(WIDTH) == 0))  # the first is not popped
+    return np.concatenate([np.where(within, order - 3, NOTHING), np.full((len(order), 1), NOTHING)], axis=1), entered
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_step_and_pops_lead_from_the_near_to_the_far(name):
+    both = case(name)
+    expected, entered = walked(both)
+    np.testing.assert_array_equal(np.where(entered.any(axis=1, keepdims=True), both.walk, NOTHING), expected)
+    assert (both.walk[~entered.any(axis=1), 0] == NOTHING).all()
+    # A key is never farther than the entry, and hardly nearer: no child is dropped that begins before the hit.
+    entries = both.scalar.entries.numpy()[entered]
+    begins = (entries.view(np.int32) & ~15).view(np.float32).astype(np.float64)
+    assert (begins <= entries).all() and (begins >= entries * (1.0 - 2.0**-19) - 2.0**-144).all()
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.5])
+def test_pops_drop_what_begins_beyond_the_hit(reach):
+    both = Both(*CASES["coherent"](np.random.default_rng(3)), reach=reach)
+    expected, entered = walked(both, reach)
+    np.testing.assert_array_equal(both.walk[entered.any(axis=1)], expected[entered.any(axis=1)])
+    assert (expected[:, 1] != NOTHING).any() and (expected[:, 1:-1] != NOTHING).sum() < (entered.sum(axis=1) - 1).clip(0).sum()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_rays_begin_with_the_nearest_child_of_the_root(name):
+    both = case(name)
+    expected, _ = walked(both)
+    np.testing.assert_array_equal(both.begun, expected[:, 0])
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_sifting_leaves_the_candidates_of_the_rows(name):
     both = case(name)
-    np.testing.assert_array_equal(both.candidates.reshape(-1), both.scalar.candidates.numpy())
+    np.testing.assert_array_equal(both.candidates, both.scalar.candidates.numpy())
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -34,7 +34,7 @@ def borrow(sizes: tuple[int, int, int]) -> Scratch:
     except IndexError:
         out = Scratch()
         out.packets, out.stacks, out.slots = (
-            wp.empty(size, dtype=dtype, device="cpu") for size, dtype in zip(sizes, (wp.float32, wp.uint64, wp.int32), strict=True))
+            wp.empty(size, dtype=dtype, device="cpu") for size, dtype in zip(sizes, (wp.float32, wp.uint32, wp.int32), strict=True))
         return out
 
 
