@@ -98,6 +98,7 @@ def browser_page(page: Any) -> Iterator[Any]:
         browser = play.chromium.launch(executable_path=chromium, args=[
             "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"])
         view = browser.new_page(viewport=SIZE)
+        view.set_default_timeout(1000.0 * PATIENCE)
         view.mistakes = []
         view.on("console", lambda message: view.mistakes.append(message.text) if message.type == "error" else None)
         view.on("pageerror", lambda error: view.mistakes.append(str(error)))
@@ -172,7 +173,11 @@ def test_a_drag_orbits_and_stays_level(page: Any, browser_page: Any) -> None:
     browser_page.mouse.move(250, 320, steps=5)
     browser_page.mouse.up()
     until(lambda: page.viewer.view.camera is not before.view.camera, browser_page)
-    browser_page.wait_for_timeout(800)  # until it has swung out
+    still = 0
+    while still < 10:  # it swings out
+        camera = page.viewer.view.camera
+        browser_page.wait_for_timeout(100)
+        still = still + 1 if page.viewer.view.camera is camera else 0
     after = finished(page, browser_page)
     pose, old = after.view.camera.camera_to_world, before.view.camera.camera_to_world
     target = CAMERA.camera_to_world[:3] @ (0, 0, -CAMERA.focus_distance, 1)
