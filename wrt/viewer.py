@@ -136,6 +136,12 @@ class Viewer:
             self._toned = True
             self._condition.notify_all()
 
+    def again(self) -> None:
+        """Show the last picture once more: somebody else looks."""
+        with self._condition:
+            self._toned = True
+            self._condition.notify_all()
+
     def pause(self) -> None:
         """Trace nothing more until the next change: nobody looks."""
         with self._condition:
@@ -201,8 +207,10 @@ class Viewer:
         if work is not None:
             self._refine(work)
             self._done = work.number
-        elif toned and self._film is not None and self.shown is not None:
-            self._put(replace(self.shown, codes=to_codes(self._film.pixels, self.exposure, self.tonemap)), self._film)
+        elif toned and self.shown is not None:
+            film = self._film
+            codes = self.shown.codes if film is None else to_codes(film.pixels, self.exposure, self.tonemap)
+            self._put(replace(self.shown, codes=codes), film)
 
     def _refine(self, work: _Work) -> None:
         if not self._prepare(work.view) or self._number != work.number:

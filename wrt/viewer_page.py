@@ -126,7 +126,12 @@ class Page:
         client.camera.on_update(self._moved)
 
     async def _gone(self, client: Any) -> None:
-        if client.client_id == self.watching:
+        if client.client_id != self.watching:
+            return
+        others = self.server.get_clients()
+        if others:
+            await self._moved(next(iter(others.values())).camera)
+        else:
             self.viewer.pause()
 
     async def _moved(self, viewport: Any) -> None:
@@ -134,10 +139,13 @@ class Page:
         width, height = viewport.image_width, viewport.image_height
         if width < 1 or height < 1:
             return
+        newcomer = self.watching != viewport.client.client_id
         self.watching = viewport.client.client_id
         coarser = max(RESOLUTIONS[self.resolution.value], math.sqrt(width * height / MOST_PIXELS))
         size = max(1, round(width / coarser)), max(1, round(height / coarser))
-        self.viewer.change(camera=lambda camera: from_viewport(camera, viewport, self.unit), size=size)
+        changed = self.viewer.change(camera=lambda camera: from_viewport(camera, viewport, self.unit), size=size)
+        if newcomer and not changed:
+            self.viewer.again()
 
     def _show(self, shown: Shown) -> None:
         client = self.server.get_clients().get(self.watching)

@@ -187,6 +187,17 @@ def test_another_tone_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
         eye.viewer.tone(0.0, "sepia")
 
 
+def test_who_comes_later_sees_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    eye = Eye()
+    for changes in ({"size": (61, 34)}, {"cost": "nodes"}):
+        last = eye.see(**changes)
+        pictures = len(eye.pictures)
+        eye.viewer.again()
+        eye.viewer.step()
+        assert len(eye.pictures) == pictures + 1
+        np.testing.assert_array_equal(eye.pictures[-1].codes, last.codes)
+
+
 def test_a_heat_map_is_the_profile_of_the_picture() -> None:
     eye = Eye()
     shown = eye.see(size=(61, 34), cost="nodes")

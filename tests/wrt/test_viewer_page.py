@@ -26,7 +26,7 @@ from wrt.options import Options
 WHITTED = ROOT / "scenes" / "whitted.toml"
 SIZE = {"width": 640, "height": 480}
 ROUGHLY = 0.5  # mean difference in codes of what is on the screen: it was drawn through a texture
-PATIENCE = 240.0  # seconds; a browser that draws in software on a busy machine is slow, and kernels may have to be compiled
+PATIENCE = 120.0  # seconds; a browser that draws in software on a busy machine is slow, and kernels may have to be compiled
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -129,8 +129,9 @@ def finished(page: Any, browser_page: Any, **view: Any) -> Any:
 
 def seen(browser_page: Any, shown: Any) -> np.ndarray:
     """What the browser shows left of the panel, in pixels of the picture, when it has come to rest."""
-    last, same = None, 0
+    last, same, deadline = None, 0, time.monotonic() + PATIENCE
     while same < 2:
+        assert time.monotonic() < deadline, "the screen never rests"
         data = browser_page.screenshot()
         same, last = (same + 1, last) if data == last else (0, data)
         browser_page.wait_for_timeout(100)
@@ -173,8 +174,9 @@ def test_a_drag_orbits_and_stays_level(page: Any, browser_page: Any) -> None:
     browser_page.mouse.move(250, 320, steps=5)
     browser_page.mouse.up()
     until(lambda: page.viewer.view.camera is not before.view.camera, browser_page)
-    still = 0
+    still, deadline = 0, time.monotonic() + PATIENCE
     while still < 10:  # it swings out
+        assert time.monotonic() < deadline, "the camera never rests"
         camera = page.viewer.view.camera
         browser_page.wait_for_timeout(100)
         still = still + 1 if page.viewer.view.camera is camera else 0
@@ -236,16 +238,32 @@ def test_a_click_focuses(page: Any, browser_page: Any) -> None:
 
 
 def test_a_browser_that_comes_again_gets_the_picture(page: Any, browser_page: Any) -> None:
+    finished(page, browser_page)
     page.viewer.spp = 1 << 20  # it leaves in the middle of a refinement
-    set_number(browser_page, "bounces", "2")
-    until(lambda: page.viewer.shown.view.max_depth == 2, browser_page)
-    page.viewer.spp = 4
+    try:
+        set_number(browser_page, "bounces", "2")
+        until(lambda: page.viewer.shown.view.max_depth == 2, browser_page)
+    finally:
+        page.viewer.spp = 4
     browser_page.reload()
     until(lambda: page.viewer.shown.done, browser_page)
     again = finished(page, browser_page, max_depth=2)
     np.testing.assert_allclose(again.view.camera.camera_to_world, CAMERA.camera_to_world, atol=1e-9)
     assert difference(browser_page, again) < ROUGHLY
     assert page.thread.is_alive() and page.failure is None and browser_page.mistakes == []
+
+
+def test_a_second_browser_gets_the_picture_and_leaves_it_to_the_first(page: Any, browser_page: Any) -> None:
+    shown = finished(page, browser_page)
+    first = page.watching
+    other = browser_page.context.browser.new_page(viewport=SIZE)
+    other.goto(browser_page.url)
+    until(lambda: page.watching != first, other)
+    assert difference(other, finished(page, other, size=shown.view.size)) < ROUGHLY
+    other.close()
+    until(lambda: page.watching == first, browser_page)
+    set_number(browser_page, "bounces", "1")
+    assert difference(browser_page, finished(page, browser_page, max_depth=1)) < ROUGHLY
 
 
 def test_what_is_saved(page: Any, browser_page: Any, tmp_path: Path) -> None:
