@@ -55,11 +55,11 @@ class Judge:
         """Write the file and read it: "" where that went well, else what is wrong, its first line without details."""
         path = self.folder / f"case{seed.suffix}"
         path.write_bytes(seed.data)
-        begin = time.perf_counter()
+        begin = time.process_time()  # who stops the process for a while makes no case slow
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             problem = self._attempt(path)
-        self.slowest = max(self.slowest, (time.perf_counter() - begin, number))
+        self.slowest = max(self.slowest, (time.process_time() - begin, number))
         problem = problem or next(
             (
                 f"{each.category.__name__} in {each.filename}:{each.lineno}\n{each.message}"

@@ -86,8 +86,9 @@ def load_accel(path: str | os.PathLike[str], mesh: Mesh | Geometry, device: str 
         if header["geometry"] != geometry.digest():
             raise InputError("was built over another mesh")
         built = read_arrays(cls, header, body)
-        return cls.restore(built, geometry, device, threads, triangle=header["triangle"], box=header["box"])
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        with np.errstate(over="ignore", invalid="ignore"):  # numbers at the end of their range are looked at like all others
+            return cls.restore(built, geometry, device, threads, triangle=header["triangle"], box=header["box"])
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise InputError(str(error), path) from error
         raise InputError(f"is no structure of this version ({type(error).__name__}: {error})", path) from error
