@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from hashlib import sha256
 from pathlib import Path
@@ -122,12 +123,27 @@ def set_child(i: int, first: int, count: int):
     lambda nodes, order, header: order.__setitem__(0, 10**6), lambda nodes, order, header: order.__setitem__(0, order[1]),
     lambda nodes, order, header: header.update(order=-1), lambda nodes, order, header: header["bytes"].update(nodes=-64),
     lambda nodes, order, header: header.update(accel="brute_force"), lambda nodes, order, header: header.update(triangle="x"),
-    lambda nodes, order, header: header.update(depth="deep"), lambda nodes, order, header: header.update(accel=["bvh2"]),
+    lambda nodes, order, header: header.update(depth="deep"),
+    lambda nodes, order, header: header.update(nodes=float("inf")), lambda nodes, order, header: header.update(accel=["bvh2"]),
 ])
 def test_indices_are_checked_before_a_ray_follows_them(saved: Path, change) -> None:
     edited(saved, change)
     with pytest.raises(InputError, match=r"ball\.accel"):
         load_accel(saved, BALL)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("name", ["octree", "grid"])
+def test_boxes_of_any_size_are_looked_at_without_a_word(name: str, tmp_path: Path) -> None:
+    build(BALL, name).save(tmp_path / "x.accel")
+    data = bytearray((tmp_path / "x.accel").read_bytes()[:-DIGEST_BYTES])
+    body = data.index(b"\n", len(MAGIC)) + 1
+    for at in range(body, body + 32, 4):
+        for number in (3.4e38, -3.4e38, np.inf, np.nan):
+            changed = data[:at] + np.float32(number).tobytes() + data[at + 4:]
+            (tmp_path / "x.accel").write_bytes(signed(bytes(changed)))
+            with contextlib.suppress(InputError):
+                load_accel(tmp_path / "x.accel", BALL)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
