@@ -132,7 +132,7 @@ class RawMesh:
 
 
 def _reader(suffix: str) -> Callable[[str | os.PathLike[str]], RawMesh]:
-    """The function that reads such files; modules are imported when they are needed, trimesh takes half a second."""
+    """The function that reads such files; modules are imported when they are needed."""
     module, function = READERS[suffix]
     return getattr(importlib.import_module(module), function)
 
