@@ -28,7 +28,8 @@ from wrt.shapes import box, icosphere, quad, teapot, torus
 
 QUICK = "WRT_QUICK" in os.environ
 SIZE, SPP = ((160, 90), 4) if QUICK else ((480, 270), 48)
-folder = Path(tempfile.mkdtemp())  # the place for files that this notebook makes
+workplace = tempfile.TemporaryDirectory()  # for the files that this notebook makes; gone when the kernel ends
+folder = Path(workplace.name)
 
 # %% [markdown]
 # ## A glTF file by hand
