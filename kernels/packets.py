@@ -19,8 +19,8 @@ ROW = {name: LANES * i for i, name in enumerate(ROWS)}  # where each row begins
 BEAM = LANES * len(ROWS)  # words of the beam: see SET_UP
 ENTRY = BEAM + 24  # what `children` leaves: 8 distances at which the beam enters the children
 MET = ENTRY + 8  # and 8 masks (int32) of the rays that meet each
-FIRST = MET + 8  # what `meets` leaves: for each child a row of the distances at which the rays enter it, inf where they do not
-PACKET_SIZE = FIRST + 8 * LANES
+FIRST = MET + 16  # what `meets` leaves: for each child a row of the distances at which the rays enter it, inf where they do not
+PACKET_SIZE = FIRST + 8 * LANES  # a multiple of 16: where the first row begins at a cache line, all rows do
 # A ray's stack, of words: for each node that it is in, the keys of the children that are still to come, from the near to the far,
 # an end, where their references begin, and where the level below goes on. 64 of them (kernels.traverse_wide), and the bottom.
 LEVEL = 16

@@ -10,7 +10,7 @@ import warp as wp
 
 from wrt.accel import ACCELERATORS, Geometry, build
 from wrt.accel.base import Structure, any_hit_kernel, closest_hit_kernel
-from wrt.accel.streams import stream_kernel
+from wrt.accel.streams import rays_per_launch, stream_kernel
 from wrt.bench.rays import ray_sets
 from wrt.kernels.query import HitArrays
 from wrt.kernels.traverse import Units
@@ -68,6 +68,13 @@ def test_any_number_of_rays(sphere, n):
 def test_more_rays_than_a_launch(sphere, threads):
     o, d, _, _ = mixed_rays(150_001)
     assert_same(sphere, o, d, threads=threads)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 16])
+def test_threads_have_as_many_launches(threads):
+    for n in (100_000, 150_001, 5_000_000):
+        part = rays_per_launch(n, threads, 64)
+        assert part % 64 == 0 and part <= 131_072 and -(-n // part) % threads == 0
 
 
 def test_no_rays(sphere):

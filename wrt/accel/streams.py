@@ -5,16 +5,18 @@ from __future__ import annotations
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import warp as wp
 
-from wrt.device import load_kernel, run_all, thread_count
+from wrt.device import load_kernel, run_all, thread_count, upload
 from wrt.kernels.packets import Scratch
 
 if TYPE_CHECKING:
     from wrt.accel.base import Structure
 
-# Work for a few milliseconds: a launch costs less than 1 % of it, and Ctrl-C is heard soon.
-FEWEST, MOST = 16384, 131072
+# Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Fewer than
+# FEWEST in all are not divided.
+FEWEST, SOME, MOST = 8192, 32768, 131072
 
 
 @cache
@@ -22,6 +24,13 @@ def stream_kernel(structure: Structure, any_hit: bool) -> Any:
     """The kernel for a structure, or None where it has no other than the one for one ray."""
     make = getattr(structure.accel.kernels, "make_stream", None)
     return make(structure.units, any_hit) if make else None
+
+
+def aligned_words(size: int, dtype: Any) -> Any:
+    """An array that begins where a cache line does: else each row of lanes would lie in two."""
+    memory = np.zeros(4 * size + 64, np.uint8)
+    first = -memory.ctypes.data % 64
+    return upload(memory[first : first + 4 * size].view(wp.dtype_to_numpy(dtype)), dtype, wp.get_device("cpu"))
 
 
 _free: list[Scratch] = []  # a new one costs as much as a thousand rays
@@ -33,9 +42,17 @@ def borrow(sizes: tuple[int, int, int]) -> Scratch:
         return _free.pop()
     except IndexError:
         out = Scratch()
-        out.packets, out.stacks, out.slots = (
-            wp.empty(size, dtype=dtype, device="cpu") for size, dtype in zip(sizes, (wp.float32, wp.uint32, wp.int32), strict=True))
+        out.packets, out.stacks, out.slots = (aligned_words(size, dtype) for size, dtype in
+                                              zip(sizes, (wp.float32, wp.uint32, wp.int32), strict=True))
         return out
+
+
+def rays_per_launch(n: int, threads: int, block: int) -> int:
+    """A multiple of `block`, so that all threads have as many launches."""
+    if threads == 1 or n <= FEWEST:
+        return MOST
+    launches = threads * max(round(n / (threads * SOME)), 1)
+    return -(-n // (launches * block)) * block
 
 
 def launch_stream(structure: Structure, kernel: Any, inputs: list[Any], n: int, threads: int | None) -> None:
@@ -43,8 +60,7 @@ def launch_stream(structure: Structure, kernel: Any, inputs: list[Any], n: int, 
     module = structure.accel.kernels
     load_kernel(kernel, wp.get_device("cpu"))
     count = thread_count(threads)
-    part = MOST if count == 1 else min(max(n // (4 * count), FEWEST), MOST)
-    part -= part % module.stream_block
+    part = rays_per_launch(n, count, module.stream_block)
 
     jobs = []
     used = []
