@@ -128,20 +128,19 @@ def is_empty(box: Box) -> bool:
 
 
 @wp.func
-def plane_of(task: BuildTask, axis: int, k: int) -> float:
+def plane_of(low: float, high: float, k: int) -> float:
     """The plane between bins k - 1 and k of a range's box."""
     f = float(k) / float(BINS)
-    return task.measures.box[axis] * (1.0 - f) - task.measures.box[3 + axis] * f
+    return low * (1.0 - f) + high * f
 
 
 @wp.func
-def spatial_bin(task: BuildTask, axis: int, x: float) -> int:
+def spatial_bin(low: float, high: float, x: float) -> int:
     """The bin of a coordinate: the last one that begins at or before it, by the planes themselves."""
-    low = task.measures.box[axis]
-    k = wp.clamp(int(float(BINS) * ((x - low) / (-task.measures.box[3 + axis] - low))), 0, BINS - 1)
-    while k > 0 and x < plane_of(task, axis, k):
+    k = wp.clamp(int(float(BINS) * ((x - low) / (high - low))), 0, BINS - 1)
+    while k > 0 and x < plane_of(low, high, k):
         k = k - 1
-    while k < BINS - 1 and x >= plane_of(task, axis, k + 1):
+    while k < BINS - 1 and x >= plane_of(low, high, k + 1):
         k = k + 1
     return k
 
@@ -155,7 +154,9 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
     scale = area_scale(task.measures.box)
     n = task.end - task.begin
     for axis in range(3):
-        extent = -task.measures.box[3 + axis] - task.measures.box[axis]
+        low = task.measures.box[axis]
+        high = -task.measures.box[3 + axis]
+        extent = high - low
         if extent > 0.0 and wp.isfinite(extent):
             enter = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.int32)
             leave = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.int32)
@@ -168,8 +169,8 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
                 hi[b] = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
             for i in range(task.begin, task.end):
                 record = records[i]
-                first = spatial_bin(task, axis, record.lo[axis])
-                last = spatial_bin(task, axis, record.hi[axis])
+                first = spatial_bin(low, high, record.lo[axis])
+                last = spatial_bin(low, high, record.hi[axis])
                 enter[first] = enter[first] + 1
                 leave[last] = leave[last] + 1
                 for b in range(first, last + 1):
@@ -177,7 +178,7 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
                     part.lo = record.lo
                     part.hi = record.hi
                     if first < last:
-                        part = cut(record, axis, plane_of(task, axis, b), plane_of(task, axis, b + 1), corners)
+                        part = cut(record, axis, plane_of(low, high, b), plane_of(low, high, b + 1), corners)
                     if not is_empty(part):
                         lo[b] = wp.min(lo[b], part.lo)
                         hi[b] = wp.max(hi[b], part.hi)
@@ -211,7 +212,7 @@ def part_by_plane(data_records: wp.array(dtype=BuildRecord), room: wp.array(dtyp
     One on both sides is not split where leaving it whole on one side costs less ("reference unsplitting", section 4.4).
     """
     scale = area_scale(task.measures.box)
-    plane = plane_of(task, split.axis, split.bin)
+    plane = plane_of(task.measures.box[split.axis], -task.measures.box[3 + split.axis], split.bin)
     left = empty_box()
     right = empty_box()
     n_left = int(0)

@@ -22,7 +22,7 @@ class Bvh2(Accelerator):
     kernels = kernels
 
     def _build(self, builder: str = "binned", max_leaf: int = 4, cost_traversal: float = 1.0,
-               cost_intersection: float = 1.0, split_alpha: float = 1e-5, split_budget: float = 0.5) -> Built:
+               cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
         options = BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget)
         tree = build_binary(self.geometry, options, self.threads)
         return self._around(tree.nodes, tree.order, tree.leaves, tree.depth)

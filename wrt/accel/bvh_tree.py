@@ -25,7 +25,7 @@ class BvhOptions:
     max_leaf: int = 4
     cost_traversal: float = 1.0
     cost_intersection: float = 1.0
-    split_alpha: float = 1e-5
+    split_alpha: float = 4e-5
     split_budget: float = 0.5
     row: int = 1
 
