@@ -10,6 +10,7 @@ import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.ray_aabb import FAR_PAD
+from wrt.kernels.traverse_wide import STACK_SIZE
 
 LANES = 16
 ROWS = ("origin_x", "origin_y", "origin_z", "inverse_x", "inverse_y", "inverse_z", "far_x", "far_y", "far_z", "t_min", "t",
@@ -22,9 +23,10 @@ MET = ENTRY + 8  # and 8 masks (int32) of the rays that meet each
 FIRST = MET + 16  # what `meets` leaves: for each child a row of the distances at which the rays enter it, inf where they do not
 PACKET_SIZE = FIRST + 8 * LANES  # a multiple of 16: where the first row begins at a cache line, all rows do
 # A ray's stack, of words: for each node that it is in, the keys of the children that are still to come, from the near to the far,
-# an end, where their references begin, and where the level below goes on. 64 of them (kernels.traverse_wide), and the bottom.
+# an end, where their references begin, and where the level below goes on. Every level but the top one keeps an entry of the walk
+# for one ray; under them is the bottom.
 LEVEL = 16
-STACK_SIZE = LEVEL * 66
+STACK_WORDS = LEVEL * (STACK_SIZE + 2)
 TO_POP = 256  # in a slot's word 3
 
 # Rows by name, with the numbers of the table above.

@@ -16,7 +16,7 @@ from wrt.kernels.packets import (
     MET,
     PACKET_SIZE,
     ROW,
-    STACK_SIZE,
+    STACK_WORDS,
     TO_POP,
     Scratch,
     begin,
@@ -43,7 +43,17 @@ from wrt.kernels.packets import (
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import NO_HIT, Hit, Surfaces, kernel
 from wrt.kernels.traverse import Probe, Units, make_intersect
-from wrt.kernels.traverse_wide import LEAF_RANGE, WideTraversal, empty_stack, key_of, make_gather, make_struct, reference_of, t_of
+from wrt.kernels.traverse_wide import (
+    EMPTY_STACK,
+    LEAF_RANGE,
+    STACK_SIZE,
+    WideTraversal,
+    key_of,
+    make_gather,
+    make_struct,
+    reference_of,
+    t_of,
+)
 from wrt.kernels.wide_nodes import first_reference, make_box_test, node_size
 
 WIDTH = 8
@@ -58,13 +68,16 @@ IN_A_ROW, BREAK = 4, 32
 GIVEN_UP = WORDS * SLOTS  # where Scratch.slots counts: those in a row below 0, those that are left above
 COHERENT = 1 << LANES  # what `set_up` adds to the mask of rays that have a beam
 
-mask_stack = wp.types.vector(64, wp.int32)
+# A packet leaves as many entries as a ray alone, but the nearest child is on the stack as well, before it is taken from there.
+ENTRIES = STACK_SIZE + 1
+key_stack, mask_stack = wp.types.vector(ENTRIES, wp.uint64), wp.types.vector(ENTRIES, wp.int32)
 
 
-@wp.func_native("""
-    alignas(wp::vec_t<64, wp::int32>) char memory[sizeof(wp::vec_t<64, wp::int32>)];
-    return *(wp::vec_t<64, wp::int32>*)memory;
-""")
+@wp.func_native(EMPTY_STACK.replace("TYPE", f"wp::vec_t<{ENTRIES}, wp::uint64>"))
+def empty_keys() -> key_stack: ...
+
+
+@wp.func_native(EMPTY_STACK.replace("TYPE", f"wp::vec_t<{ENTRIES}, wp::int32>"))
 def empty_masks() -> mask_stack: ...
 
 
@@ -178,7 +191,7 @@ def make_together(units: Units, any_hit: bool):
         """1 where it was worth it, -1 where two rays hardly ever met the same leaf, 0 without any leaf."""
         leaves = int(0)
         visits = int(0)
-        stack = empty_stack()
+        stack = empty_keys()
         masks = empty_masks()
         size = int(0)
         reference = int(0)
@@ -226,7 +239,7 @@ def make_by_turns(units: Units, any_hit: bool):
     @wp.func
     def start(accel: struct, scratch: Scratch, slot: int, ray: int):
         begin(accel.nodes, accel.primitives, scratch.packets, ray / LANES * PACKET_SIZE + ray % LANES, scratch.stacks,
-              slot * STACK_SIZE, scratch.slots, slot * WORDS)
+              slot * STACK_WORDS, scratch.slots, slot * WORDS)
 
     @wp.func
     def visit_leaf(accel: struct, surfaces: Surfaces, scratch: Scratch, slot: int, ray: int, reference: int) -> bool:
@@ -255,7 +268,7 @@ def make_by_turns(units: Units, any_hit: bool):
                             scratch.packets, ray):
                     return False
             return pop(accel.nodes, accel.primitives, number(scratch.packets, ray + wp.static(ROW["t"])), scratch.stacks,
-                       slot * STACK_SIZE, scratch.slots, slot * WORDS)
+                       slot * STACK_WORDS, scratch.slots, slot * WORDS)
         reference = slot_at(scratch.slots, slot * WORDS + 1)
         if reference < 0:
             return not visit_leaf(accel, surfaces, scratch, slot, ray, reference)
@@ -332,7 +345,7 @@ class StreamTraversal(WideTraversal):
     """Plain nodes of 8, for which there is a kernel for many rays at a time."""
 
     stream_block = PACKETS * LANES
-    stream_sizes = PACKETS * PACKET_SIZE, STACK_SIZE * SLOTS, GIVEN_UP + 1  # lengths of a Scratch's arrays
+    stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, GIVEN_UP + 1  # lengths of a Scratch's arrays
 
     def __init__(self) -> None:
         super().__init__(WIDTH)

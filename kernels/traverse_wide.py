@@ -45,12 +45,12 @@ stack_type = wp.types.vector(STACK_SIZE, wp.uint64)
 
 # Warp sets every new vector to 0: of these 512 bytes most rays use a few.
 EMPTY_STACK = """
-    alignas(wp::vec_t<64, wp::uint64>) char memory[sizeof(wp::vec_t<64, wp::uint64>)];
-    return *(wp::vec_t<64, wp::uint64>*)memory;
+    alignas(TYPE) char memory[sizeof(TYPE)];
+    return *(TYPE*)memory;
 """
 
 
-@wp.func_native(EMPTY_STACK)
+@wp.func_native(EMPTY_STACK.replace("TYPE", f"wp::vec_t<{STACK_SIZE}, wp::uint64>"))
 def empty_stack() -> stack_type: ...
 
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from wrt.kernels import packets
 from wrt.kernels.lanes import LANE_PAD, make_twins, row_type
-from wrt.kernels.packets import ENTRY, LANES, MET, PACKET_SIZE, ROWS, STACK_SIZE, TO_POP
+from wrt.kernels.packets import ENTRY, LANES, MET, PACKET_SIZE, ROWS, STACK_WORDS, TO_POP
 from wrt.kernels.query import RayArrays, direction_scale, load_ray
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
 from wrt.kernels.trace_packets import COHERENT, PACKETS, SLOTS, WORDS
@@ -53,7 +53,7 @@ def by_packets(rays: RayArrays, count: int, reach: float, nodes: wp.array(dtype=
     for j in range(LANES):
         ray = LANES * i + j
         slot = ray * WORDS
-        bottom = ray * STACK_SIZE
+        bottom = ray * STACK_WORDS
         packets.begin(nodes, rows, packet, base + j, stacks, bottom, slots, slot)
         out.begun[ray] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
         slots[slot + 1] = i
@@ -152,7 +152,7 @@ class Both:
         for name, length in (("state", n), ("meets", n), ("children", n), ("reaching", n), ("begun", n * LANES),
                              ("candidates", n * LANES), ("walk", (n * LANES, WIDTH + 1))):
             setattr(lanes, name, zeros(length, wp.int32))
-        packet, stacks = zeros(n * PACKET_SIZE), zeros(n * LANES * STACK_SIZE, wp.uint32)
+        packet, stacks = zeros(n * PACKET_SIZE), zeros(n * LANES * STACK_WORDS, wp.uint32)
         launch(by_packets, n, self.rays, count, reach, nodes, rows, packet, stacks, zeros(n * LANES * WORDS, wp.int32), lanes)
         self.state, self.meets, self.children, self.reaching = (
             getattr(lanes, name).numpy() for name in ("state", "meets", "children", "reaching"))

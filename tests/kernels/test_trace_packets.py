@@ -9,11 +9,14 @@ from tests.kernel_tools import CPU, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel import ACCELERATORS, Geometry, build
-from wrt.accel.base import Structure, any_hit_kernel, closest_hit_kernel
+from wrt.accel.base import Built, Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.streams import rays_per_launch, stream_kernel
+from wrt.accel.wide_tree import stack_need
 from wrt.bench.rays import ray_sets
+from wrt.kernels.lanes import EMPTY
 from wrt.kernels.query import HitArrays
 from wrt.kernels.traverse import Units
+from wrt.kernels.traverse_wide import LEAF_RANGE, STACK_SIZE
 from wrt.mesh import Mesh, load_mesh
 from wrt.shapes import icosphere
 
@@ -98,13 +101,18 @@ def test_the_rays_of_the_benchmarks(sphere, kind):
     assert_same(sphere, rays.origins, rays.directions, 0.0, rays.t_max)
 
 
+def soup(corners):
+    """Triangles without common vertices, corner after corner."""
+    return Mesh(corners.reshape(-1, 3).astype(np.float32), np.arange(corners.size // 3, dtype=np.int32).reshape(-1, 3))
+
+
 def crowd(seed=1):
     """Many triangles in few places: leaves of several rows, ties in t between all of a leaf, thin ones and such without area."""
     rng = np.random.default_rng(seed)
     place = rng.normal(size=(6, 3, 3))
     corners = np.concatenate([np.repeat(place, 60, axis=0), place[:, :1] + [[[0, 0, 0], [1, 0, 0], [2, 0, 0]]],
                               rng.normal(size=(200, 1, 3)) + 1e-6 * rng.normal(size=(200, 3, 3)), rng.normal(size=(300, 3, 3))])
-    return Mesh(corners.reshape(-1, 3).astype(np.float32), np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3))
+    return soup(corners)
 
 
 @pytest.mark.parametrize("max_leaf", [8, 64])
@@ -118,10 +126,39 @@ def test_leaves_of_several_rows_and_ties(max_leaf):
 
 @pytest.mark.parametrize("count", [1, 2, 9])
 def test_trees_of_one_leaf(count):
-    mesh = crowd()
-    accel = build(Geometry.of(Mesh(mesh.vertices[-3 * count :], np.arange(3 * count, dtype=np.int32).reshape(-1, 3))), "bvh8")
+    accel = build(Geometry.of(soup(crowd().vertices[-3 * count :])), "bvh8")
     o, d, _, _ = mixed_rays(3000, 4)
     assert_same(accel, o, d)
+
+
+def chain(k):
+    """A tree of nodes with k children, all but one of them leaves of one triangle, that needs a whole stack; every box is that of
+    the root."""
+    counts = [k] * (STACK_SIZE // (k - 1)) + [STACK_SIZE % (k - 1) + 1] * (STACK_SIZE % (k - 1) > 0)
+    children = np.zeros((len(counts), 8), np.int32)
+    for i, count in enumerate(counts):
+        children[i, 8 - count :] = -1
+        children[i, 7] = i + 1 if i + 1 < len(counts) else -1
+    n = int((children < 0).sum())
+    children[children < 0] = -1 - LEAF_RANGE * np.arange(n)
+    mesh = soup(np.random.default_rng(8).normal(size=(n, 3, 3)))
+    nodes = np.zeros((len(counts), 8, 8), np.float32)
+    nodes[:, 0:6:2] = np.where(children[:, None] != EMPTY, mesh.vertices.min() - 1.0, np.inf)
+    nodes[:, 1:6:2] = np.where(children[:, None] != EMPTY, mesh.vertices.max() + 1.0, -np.inf)
+    nodes[:, 6] = children.view(np.float32)
+    assert stack_need(children) == STACK_SIZE
+    built = Built({"nodes": nodes.reshape(-1)}, np.arange(n, dtype=np.int32), len(counts), n, len(counts))
+    return ACCELERATORS["bvh8"].restore(built, Geometry.of(mesh))
+
+
+@pytest.mark.parametrize("k", [2, 3, 8])
+def test_trees_that_need_a_whole_stack(k):
+    accel = chain(k)
+    for n in (1, 2000):
+        o, d, _, _ = mixed_rays(n, 9)
+        assert_same(accel, o, d)
+    rng = np.random.default_rng(10)
+    assert_same(accel, rng.normal(size=(64, 3)) * 0.1 - 5.0, 1.0 + 0.3 * rng.random((64, 3)))
 
 
 def test_rays_that_are_special(sphere):
