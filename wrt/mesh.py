@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from wrt.arguments import LARGEST, as_array, as_path, shown
 from wrt.errors import InputError, SceneWarning
 from wrt.mesh_clean import clean
 from wrt.tables import html_facts
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +81,32 @@ class Mesh:
         object.__setattr__(self, attribute, array)
         return array
 
+    @classmethod
+    def from_trimesh(cls, mesh: trimesh.Trimesh | trimesh.Scene, smooth: bool = False) -> Mesh:
+        """The triangles of a trimesh mesh, or of all of a trimesh scene in its world: every format that trimesh reads.
+
+        uvs are taken where there are some; smooth: also its vertex normals. Faces without area stay, and are never hit. Raises
+        InputError for anything else, and as Mesh does.
+        """
+        import trimesh
+
+        if isinstance(mesh, trimesh.Scene):
+            mesh = mesh.to_mesh()
+        if not isinstance(mesh, trimesh.Trimesh):
+            raise InputError(f"mesh must be a trimesh.Trimesh or a trimesh.Scene, got {shown(mesh)}")
+        uv = getattr(mesh.visual, "uv", None)
+        uvs = None if uv is None or len(uv) != len(mesh.vertices) else np.asarray(uv)[:, :2] * (1.0, -1.0) + (0.0, 1.0)
+        source = getattr(mesh, "source", None)
+        return cls(np.array(mesh.vertices), np.array(mesh.faces), np.array(mesh.vertex_normals) if smooth else None, uvs,
+                   name=str(getattr(source, "file_name", None) or ""))
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """The same as a trimesh mesh, to repair, simplify or write in its formats: vertices and faces in the same order,
+        normals and uvs where there are some."""
+        import trimesh
+
+        visual = None if self.uvs is None else trimesh.visual.TextureVisuals(uv=self.uvs * (1.0, -1.0) + (0.0, 1.0))
+        return trimesh.Trimesh(self.vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False)
 
     @cached_property
     def reach(self) -> float:

@@ -107,3 +107,38 @@ def test_odd_files_load_or_are_refused(path: Path) -> None:
     if mesh.normals is not None:
         length = np.linalg.norm(mesh.normals, axis=1)
         assert (np.isclose(length, 1.0, atol=1e-6) | (length == 0.0)).all()
+
+
+def test_meshes_come_from_trimesh_and_go_back() -> None:
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box((1.0, 2.0, 3.0))
+    mesh = Mesh.from_trimesh(box)
+    assert mesh.normals is None and mesh.uvs is None and len(mesh.faces) == 12
+    np.testing.assert_allclose(mesh.vertices, box.vertices)
+    smooth = Mesh.from_trimesh(box, smooth=True)
+    np.testing.assert_allclose(smooth.normals, box.vertex_normals, atol=1e-6)
+    back = smooth.to_trimesh()
+    assert back.is_watertight and back.volume == pytest.approx(6.0)
+    np.testing.assert_array_equal(back.faces, mesh.faces)
+    np.testing.assert_allclose(back.vertex_normals, smooth.normals, atol=1e-6)
+
+
+def test_a_trimesh_scene_is_taken_in_its_world() -> None:
+    trimesh = pytest.importorskip("trimesh")
+    scene = trimesh.Scene()
+    for x in (0.0, 5.0):
+        scene.add_geometry(trimesh.creation.icosphere(1), transform=trimesh.transformations.translation_matrix([x, 0.0, 0.0]))
+    mesh = Mesh.from_trimesh(scene)
+    assert len(mesh.faces) == 160
+    np.testing.assert_allclose([mesh.vertices.min(axis=0)[0], mesh.vertices.max(axis=0)[0]], [-1.0, 6.0], atol=0.1)
+
+
+def test_texture_coordinates_have_their_origin_where_pictures_have_it() -> None:
+    trimesh = pytest.importorskip("trimesh")
+    uvs = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], np.float32)
+    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]), uvs=uvs)
+    theirs = mesh.to_trimesh()
+    np.testing.assert_array_equal(theirs.visual.uv, [[0.0, 1.0], [1.0, 1.0], [0.0, 0.0]])
+    np.testing.assert_array_equal(Mesh.from_trimesh(theirs).uvs, uvs)
+    with pytest.raises(InputError, match=r"trimesh\.Trimesh"):
+        Mesh.from_trimesh(trimesh.creation)  # type: ignore[arg-type]
