@@ -55,8 +55,6 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
     degrees = animation.degrees if animation.degrees is not None else (0.0 if moves(scene) else 360.0)
     if animation.frames > 1 and degrees == 0.0 and not moves(scene):
         raise InputError("nothing moves: no object has a motion, and the camera goes round by 0 degrees")
-    if options.executor is not None or options.devices is not None:
-        raise InputError("an animation runs on one device: it has no executor and no devices")
     if moves(scene):
         options = replace(options, instancing="never")
     renderer = Renderer(scene_at(scene, 0.0), options)

@@ -35,7 +35,7 @@ SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "instancing
 OURS: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, "resume": False, "progress": None}
 
 Job = tuple[Any, ...]  # the name of a method of Renderer, and its arguments
-Reply = tuple[str, Any]  # who answers, and what
+Reply = tuple[str, str, Any]  # who answers, on what kind of device (Renderer.kind), and what
 
 
 class Crew:
@@ -117,7 +117,7 @@ class Devices(Crew):
             if renderer is None:
                 with self.lock:  # the second device of a kind finds the kernels compiled
                     renderer = _made_ready(self.scene, replace(self.options, device=self.names[i]))
-            return f"{self.names[i]} ({i})", getattr(renderer, method)(*arguments)
+            return f"{self.names[i]} ({i})", renderer.kind(), getattr(renderer, method)(*arguments)
         finally:
             self.free.put((i, renderer))
 
@@ -200,7 +200,7 @@ def call(key: str, package: dict[str, Any] | None, method: str, *arguments: Any)
         while len(_ready) > KEPT:
             _ready.popitem(last=False)
         renderer = _ready[key]
-    return worker_name(), getattr(renderer, method)(*arguments)
+    return worker_name(), renderer.kind(), getattr(renderer, method)(*arguments)
 
 
 def _unpacked(package: dict[str, Any]) -> Renderer:

@@ -131,9 +131,11 @@ class Renderer:
         return structure
 
     def _film_device(self) -> Any:
+        if self.options.executor is not None or self.options.devices is not None:  # wrt.spread's renderer takes them
+            raise InputError("an executor or several devices are for wrt.render; this runs on one device")
         return start(self.options.device)
 
-    def _kind(self) -> str:
+    def kind(self) -> str:
         """Of the device: pictures of two of the same kind have the same bits."""
         return f"cuda, sm_{self.device.arch}" if self.device.is_cuda else "cpu"
 
@@ -162,7 +164,7 @@ class Renderer:
         identity |= {name: getattr(options, name) for name in OPTIONS if name not in NO_PIXEL}
         identity |= {
             "crop": self.crop, "groups of samples": self.groups, "scene": scene_digest(self.scene),
-            "camera": camera_digest(self.camera), "device": self._kind(),
+            "camera": camera_digest(self.camera), "device": self.kind(),
             "version": wrt.__version__, "kernels": self.kernels_hash(),
         }
         area = (self.crop[2] - self.crop[0]) * (self.crop[3] - self.crop[1])
@@ -429,7 +431,7 @@ class Renderer:
 
     def ready(self) -> dict[str, Any]:
         """What a worker tells when it has made the scene ready."""
-        return {"kind": self._kind(), "facts": self.facts(), "seconds": self.seconds}
+        return {"facts": self.facts(), "seconds": self.seconds}
 
     def trace_tile(self, work: Work, seed: int, state: list[np.ndarray] | None) -> list[np.ndarray]:
         """The arrays of a film of that rectangle (DeviceFilm.arrays) with those samples added to `state` (None: zeros).

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.crews import Crew, Devices, Job, Workers, packaged
+from wrt.crews import Crew, Devices, Job, Reply, Workers, packaged
 from wrt.device import start
 from wrt.device_scene import tell_left_out
 from wrt.driver import PREPARING_TOLD, Renderer
@@ -33,15 +33,15 @@ class SpreadRenderer(Renderer):
     def _film_device(self) -> Any:
         return start("cpu")
 
-    def _kind(self) -> str:
-        return str(self.told["kind"])
+    def kind(self) -> str:
+        return self._told[0]
 
     @property
     def _on_cuda(self) -> bool:
         return self.options.device.startswith("cuda")
 
     def facts(self) -> dict[str, Any]:
-        return {**self.told["facts"], "workers": dict(self.tiles_by)}
+        return {**self._told[1]["facts"], "workers": dict(self.tiles_by)}
 
     @cached_property
     def crew(self) -> Crew:
@@ -57,8 +57,8 @@ class SpreadRenderer(Renderer):
         return Workers(options.executor, key, package)
 
     @cached_property
-    def told(self) -> dict[str, Any]:
-        """By the workers, when all of them have the scene ready."""
+    def _told(self) -> tuple[str, dict[str, Any]]:
+        """The kind of the workers' devices, and what one of them tells (Renderer.ready) when they have the scene ready."""
         tell_left_out(self.scene)
         begin, told, all_told = time.perf_counter(), False, []
         for done in self.crew.run([("ready",)] * self.crew.slots()):
@@ -68,14 +68,13 @@ class SpreadRenderer(Renderer):
                 told = True
             if done is not None:
                 all_told.append(done[1])
-        kinds = {reply["kind"]: name for name, reply in all_told}
-        if len(kinds) > 1:
-            differ = ", ".join(f"{name}: {kind}" for kind, name in kinds.items())
-            raise InputError(f"the workers' devices are of several kinds, which do not round alike ({differ})")
-        return all_told[0][1]
+        kind = all_told[0][1]
+        for reply in all_told:
+            _check_kind(reply, kind)
+        return kind, all_told[0][2]
 
     def _prepare(self) -> None:
-        self.seconds |= self.told["seconds"]
+        self.seconds |= self._told[1]["seconds"]
         self.tiles_by: Counter[str] = Counter()
 
     def run(self, *, seed: int | None = None, spp: int | None = None) -> Film:
@@ -122,9 +121,10 @@ class SpreadRenderer(Renderer):
                 if done is None:
                     yield None, None
                 else:
-                    job, (name, reply) = done
-                    self.tiles_by[name] += 1
-                    yield job, reply
+                    job, reply = done
+                    _check_kind(reply, self.kind())  # a worker may have come later
+                    self.tiles_by[reply[0]] += 1
+                    yield job, reply[2]
                 self._save_if_due()
                 if self.interrupts:
                     raise KeyboardInterrupt
@@ -141,3 +141,9 @@ class SpreadRenderer(Renderer):
         x, y, width, height = rectangle
         x, y = x - self.crop[0], y - self.crop[1]
         return slice(y, y + height), slice(x, x + width)
+
+
+def _check_kind(reply: Reply, kind: str) -> None:
+    if reply[1] != kind:
+        raise InputError(f"the workers' devices are of several kinds, which do not round alike: {kind},"
+                         f" and at {reply[0]} {reply[1]}")

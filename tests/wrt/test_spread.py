@@ -18,6 +18,7 @@ import pytest
 
 from tests.wrt.test_checkpoint import SCENE, same
 from wrt import crews, device_scene, profile, spread
+from wrt.animate import Animation, animate
 from wrt.driver import Options, Progress, Renderer, render
 from wrt.errors import InputError, SceneWarning
 from wrt.film import Film
@@ -217,16 +218,19 @@ def test_a_worker_of_another_version_says_so(change: dict[str, str], said: str, 
         render(SCENE, executor=threads)
 
 
-def test_workers_on_devices_of_several_kinds_are_refused(threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
-    ready, told = Renderer.ready, []
+@pytest.mark.parametrize("alike", [1, 5])
+def test_workers_on_devices_of_several_kinds_are_refused(alike: int, threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that are there first, and those that come later."""
+    told: list[str] = []
+    monkeypatch.setattr(Renderer, "kind", lambda self: told.append("") or f"cuda, sm_{80 + (len(told) > alike)}")
+    with pytest.raises(InputError, match=r"several kinds.*: cuda, sm_8., and at .* cuda, sm_8."):
+        render(SCENE, executor=threads, **HOW)
 
-    def other(self: Renderer) -> dict[str, Any]:
-        told.append(0)
-        return {**ready(self), "kind": f"cuda, sm_{80 + len(told)}"}
 
-    monkeypatch.setattr(Renderer, "ready", other)
-    with pytest.raises(InputError, match=r"several kinds.*sm_8"):
-        render(SCENE, executor=threads)
+def test_what_is_not_a_picture_takes_neither(threads: Executor) -> None:
+    for how in ({"executor": threads}, {"devices": ["cpu", "cpu"]}):
+        with pytest.raises(InputError, match="this runs on one device"):
+            next(animate(SCENE, Animation(frames=2), Options(**how)))
 
 
 @pytest.mark.parametrize(("options", "said"), [
