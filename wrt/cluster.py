@@ -96,12 +96,27 @@ class Submitter:
         self.client, self.address = client, str(client.scheduler.address)
 
     def submit(self, function: Any, *arguments: Any) -> Any:
-        return self.client.submit(function, *arguments, pure=False)
+        with self.telling():
+            return self.client.submit(function, *arguments, pure=False)
 
     def cancel(self, futures: Iterable[Any]) -> None:
         if self.client.status == "running":
             with suppress(Exception):  # it may be lost meanwhile, and then there is nothing to cancel
                 self.client.cancel(list(futures))
+
+    @contextmanager
+    def telling(self) -> Iterator[None]:
+        """A connection that breaks shows in errors of many kinds: all of them are `lost`."""
+        try:
+            yield
+        except Exception as error:
+            if self.is_broken(error):
+                raise self.lost() from error
+            raise
+
+    def is_broken(self, error: Exception) -> bool:
+        """Whether this error came of a broken connection."""
+        return isinstance(error, OSError | CancelledError) or self.client.status != "running"
 
     def lost(self) -> InputError:
         return InputError("the connection to the Dask scheduler is lost", self.address)
@@ -115,11 +130,13 @@ class ClusterWorkers(Workers):
         super().__init__(self.submitter, key, package)
         self.client, self.address = client, self.submitter.address
         self.scattered: Any = None
+        self.fetched: dict[str, Reply | None] = {}
         self.anybody, self.ask_again = True, 0.0
         self.alone_since: float | None = None
 
     def slots(self) -> int:
-        return max(1, sum(self.client.nthreads().values()))
+        with self.submitter.telling():
+            return max(1, sum(self.client.nthreads().values()))
 
     def _scene(self) -> Any:
         return self.scattered
@@ -132,8 +149,9 @@ class ClusterWorkers(Workers):
             if self.client.status == "running" and self._is_sent():
                 self.alone_since = None
                 return True
-        except (OSError, CancelledError) as error:
-            raise self.submitter.lost() from error
+        except Exception as error:
+            if not self.submitter.is_broken(error):
+                raise
         self.alone_since = self.alone_since or time.monotonic()
         if time.monotonic() - self.alone_since > PATIENCE:
             raise InputError("no worker is left", self.address)
@@ -161,18 +179,36 @@ class ClusterWorkers(Workers):
         self.ready()
         if not waiting:
             time.sleep(0.1)
-        with suppress(TimeoutError, CancelledError), self.client.as_current():
+        with self.submitter.telling(), suppress(TimeoutError, CancelledError), self.client.as_current():
             wait(waiting, timeout=0.1, return_when="FIRST_COMPLETED")
-        return [future for future in waiting if future.status != "pending"]
+        done = [future for future in waiting if future.status != "pending"]
+        self.fetched = self._fetched([future for future in done if future.status == "finished"])
+        return done
+
+    def _fetched(self, futures: list[Any]) -> dict[str, Reply | None]:
+        """Replies by key, all in one call; none where a worker died before it gave its own away."""
+
+        async def together() -> list[Any]:
+            return await self.client.gather(futures, errors="skip", asynchronous=True)
+
+        with self.submitter.telling(), suppress(TimeoutError, CancelledError):
+            replies = self.client.sync(together, callback_timeout=RESULT_SECONDS) if futures else []
+            if len(replies) == len(futures):
+                return {future.key: reply for future, reply in zip(futures, replies, strict=True)}
+        return {}
 
     def result(self, future: Any) -> Reply | None:
         from distributed import KilledWorker
 
+        if future.key in self.fetched:
+            reply = self.fetched.pop(future.key)
+            self.asked += reply is None
+            return reply
         try:
-            reply = future.result(timeout=RESULT_SECONDS)
-        except (CancelledError, TimeoutError):  # what it needed, or made, died with its worker
-            return None
+            if future.status == "error":
+                future.result(timeout=RESULT_SECONDS)
         except KilledWorker as error:
             raise InputError(f"tiles kill their workers, one after another: {error}", self.address) from error
-        self.asked += reply is None
-        return reply
+        except (CancelledError, TimeoutError):
+            pass
+        return None  # what it needed, or made, died with its worker

@@ -87,6 +87,19 @@ class SpreadRenderer(Renderer):
         side = math.ceil(math.sqrt((x1 - x0) * (y1 - y0) / (TILES_EACH * self.crew.slots())))
         return tiles(self.crop, self.options.tile_size or min(max(side, low), high))
 
+    def _run_pass(self, first: int, count: int) -> None:
+        """What ends a pass leaves a checkpoint."""
+        try:
+            super()._run_pass(first, count)
+        except Exception as error:
+            if self.checkpoint is not None:
+                self.checkpoint.save(self.film, self._seconds())
+                if isinstance(error, InputError) and not self.checkpoint.problem:
+                    told = InputError(f"{error}; {self.checkpoint.path} has what was done")
+                    told.path = error.path
+                    raise told from error
+            raise
+
     def _trace(self, work: list[Work], report: Callable[[int], None]) -> None:
         views = [self.film.view(array) for _, array in self.film.arrays()]
         jobs = (("trace_tile", job, self.seed, [view[self._place(job.rectangle)] for view in views] if job.first else None)
@@ -114,7 +127,7 @@ class SpreadRenderer(Renderer):
 
     def _replies(self, jobs: Iterator[Job]) -> Iterator[tuple[Any, Any]]:
         """Each job and what came of it; (None, None) where nothing came for a while. KeyboardInterrupt where Ctrl-C came: the
-        tiles that run are given up, and those that came are in the film. What ends the render otherwise leaves a checkpoint."""
+        tiles that run are given up, and those that came are in the film."""
         running = self.crew.run(jobs)
         try:
             for done in running:
@@ -128,12 +141,6 @@ class SpreadRenderer(Renderer):
                 self._save_if_due()
                 if self.interrupts:
                     raise KeyboardInterrupt
-        except Exception as error:
-            if self.checkpoint is not None:
-                self.checkpoint.save(self.film, self._seconds())
-                if isinstance(error, InputError) and not self.checkpoint.problem:
-                    raise InputError(f"{error}; {self.checkpoint.path} has what was done", error.path) from error
-            raise
         finally:
             running.close()
 
