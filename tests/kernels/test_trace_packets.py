@@ -8,7 +8,7 @@ from tests.data import data_path
 from tests.kernel_tools import CPU, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.accel import ACCELERATORS, Geometry, build, streams
 from wrt.accel.base import Built, Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.streams import rays_per_launch, stream_kernel
 from wrt.accel.wide_tree import stack_need
@@ -68,9 +68,11 @@ def test_any_number_of_rays(sphere, n):
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_more_rays_than_a_launch(sphere, threads):
-    o, d, _, _ = mixed_rays(150_001)
+def test_more_rays_than_a_launch(sphere, threads, monkeypatch):
+    monkeypatch.setattr(streams, "_free", [])
+    o, d, _, _ = mixed_rays(300_001)
     assert_same(sphere, o, d, threads=threads)
+    assert len(streams._free) == threads  # what the jobs work in is lent again
 
 
 @pytest.mark.parametrize("threads", [2, 3, 16])

@@ -164,6 +164,10 @@ def test_bad_warp_arrays_are_named() -> None:
         structure.closest_hit(good, vec3s(np.ones((2, 3))))
     with pytest.raises(InputError, match="t_max must be"):
         structure.closest_hit(good, good, t_max=wp.zeros(3, dtype=wp.float32, device=CPU))
+    for name, value, message in (("t_min", -0.5, "t_min must not be NaN or below 0"), ("t_min", np.nan, "t_min must not be NaN"),
+                                 ("t_max", np.nan, "t_max must not be NaN")):
+        with pytest.raises(InputError, match=message):
+            structure.closest_hit(good, good, **{name: wp.array([value], dtype=wp.float32, device=CPU)})
 
 
 def test_threads_must_be_positive() -> None:

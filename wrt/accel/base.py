@@ -404,8 +404,8 @@ class Accelerator(ABC):
         Closed means that a surface through the origin is hit at t_min = 0; a t_min above 0 leaves it out. origins,
         directions: (N, 3) float32, finite, directions not zero and of any length (where t would be beyond float32, the hit
         is a miss); coordinates up to 1e37, so that differences are finite; t_min (>= 0), t_max: scalars or
-        (N,). counters: count what each ray costs (hits.counters); trace: also record what it fetches, which takes a second
-        run. Raises InputError that names the argument, its shape and what was expected.
+        (N,) (values on a GPU are not looked at). counters: count what each ray costs (hits.counters); trace: also record what
+        it fetches, which takes a second run. Raises InputError that names the argument, its shape and what was expected.
         """
         rays, as_warp = self._rays(origins, directions, t_min, t_max)
         n = len(rays.t_min)
@@ -498,6 +498,8 @@ class Accelerator(ABC):
         if isinstance(value, wp.array):
             if value.dtype != wp.float32 or value.shape != (n,):
                 raise InputError(f"{name} must be ({n},) float32, got {value.shape} {value.dtype.__name__}")
+            if value.device.is_cpu:
+                _check_ends(value.numpy(), name, low)
             return value if value.is_contiguous else value.contiguous()
         try:
             array = np.asarray(value, dtype=np.float32)
@@ -505,9 +507,13 @@ class Accelerator(ABC):
             raise InputError(f"{name} must be a number or ({n},), got {value!r}") from error
         if array.ndim > 1 or (array.ndim == 1 and len(array) != n):
             raise InputError(f"{name} must be a number or ({n},), got {array.shape}")
-        if np.isnan(array).any() or (array < low).any():
-            raise InputError(f"{name} must not be NaN" + (f" or below {low:g}" if low > -np.inf else ""))
+        _check_ends(array, name, low)
         return upload(np.broadcast_to(array, (n,)).copy(), wp.float32, self.device)
+
+
+def _check_ends(array: np.ndarray, name: str, low: float) -> None:
+    if not (array >= low).all():
+        raise InputError(f"{name} must not be NaN" + (f" or below {low:g}" if low > -np.inf else ""))
 
 
 def array_bytes(data: Any) -> int:

@@ -61,13 +61,15 @@ def launch_stream(structure: Structure, kernel: Any, inputs: list[Any], n: int, 
     load_kernel(kernel, wp.get_device("cpu"))
     count = thread_count(threads)
     part = rays_per_launch(n, count, module.stream_block)
+    firsts = range(0, n, part)
+    # One for each job that runs at a time. They are made here: two threads must not make structs at a time.
+    mine = [borrow(module.stream_sizes) for _ in range(min(count, len(firsts)))]
 
-    jobs = []
-    used = []
-    for first in range(0, n, part):  # structs are made here: two threads must not make them at a time
+    def job(first: int) -> None:
         end = min(first + part, n)
-        used.append(borrow(module.stream_sizes))
-        jobs.append(partial(wp.launch, kernel, dim=-(-(end - first) // module.stream_block), inputs=[*inputs, used[-1], first, end],
-                            device="cpu"))
-    run_all(jobs, count)
-    _free.extend(used)
+        scratch = mine.pop()
+        wp.launch(kernel, dim=-(-(end - first) // module.stream_block), inputs=[*inputs, scratch, first, end], device="cpu")
+        mine.append(scratch)
+
+    run_all([partial(job, first) for first in firsts], count)
+    _free.extend(mine)  # not after an error: a thread may still be at work in one
