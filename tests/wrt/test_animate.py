@@ -35,7 +35,10 @@ def tumbling() -> Scene:
     keys[:, 2] = 1.0
     keys[1, 0], keys[:, 1, 1] = (0.0, 1.5, -1.0), (0.0, 180.0, 360.0)
     ball = icosphere(2)
-    bent = replace(ball, vertices=(ball.vertices * np.array([0.4, 1.8, 0.7])).astype(np.float32))
+    x, y, z = ball.vertices.T.astype(np.float64)
+    turned = np.stack([x * np.cos(3.0 * y) - z * np.sin(3.0 * y), y, x * np.sin(3.0 * y) + z * np.cos(3.0 * y)], axis=1)
+    # Twisted too: a tree that is only stretched may well become a better one.
+    bent = replace(ball, vertices=(turned * np.array([0.4, 1.8, 0.7])).astype(np.float32))
     return scene_of(Motion(keys), Motion(target=bent))
 
 
