@@ -101,6 +101,15 @@ def test_options_out_of_range_are_refused(options, message: str) -> None:
 
 
 @pytest.mark.parametrize("name", WIDE)
+def test_any_number_of_threads_makes_the_same_nodes_and_rows(name: str) -> None:
+    ball = icosphere(6)  # more triangles than one thread takes at a time
+    one, *others = (build(ball, name, threads=threads).data for threads in (1, 2, 3))
+    for other in others:
+        assert one.nodes.numpy().tobytes() == other.nodes.numpy().tobytes()
+        assert one.primitives.numpy().tobytes() == other.primitives.numpy().tobytes()
+
+
+@pytest.mark.parametrize("name", WIDE)
 def test_nodes_and_rows_begin_where_cache_lines_do(name: str) -> None:
     data = build(BALL, name).data
     assert data.nodes.ptr % 64 == 0 and data.primitives.ptr % 64 == 0
