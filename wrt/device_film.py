@@ -93,7 +93,8 @@ class DeviceFilm:
             film = self.groups[0]
             n = self.picture(film.samples)[..., None].astype(np.float32)
             m2 = np.where(n < 2.0, np.float32(np.inf), self.picture(film.m2))
-            return self.picture(film.mean), m2 / np.maximum(n * (n - 1.0), 1.0)
+            with np.errstate(invalid="ignore"):  # of a checkpoint by a stranger, m2 can be anything
+                return self.picture(film.mean), m2 / np.maximum(n * (n - 1.0), 1.0)
         mean, variance = self._over_groups()
         with np.errstate(over="ignore"):
             return mean.astype(np.float32), variance.astype(np.float32)

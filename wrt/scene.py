@@ -109,8 +109,8 @@ class Texture:
         for wrap in self.wrap:
             _choice(wrap, WRAPS, at_thing("texture", self.name) + "wrap")
         transform = as_array(self.uv_transform, np.float64, at_thing("texture", self.name) + "uv_transform")
-        if transform.shape != (2, 3) or not np.isfinite(transform).all():
-            raise InputError(at_thing("texture", self.name) + "uv_transform must be a finite 2x3 matrix")
+        if transform.shape != (2, 3) or not (np.abs(transform) <= LARGEST).all():
+            raise InputError(at_thing("texture", self.name) + f"uv_transform must be a 2x3 matrix of numbers up to {LARGEST:g}")
         object.__setattr__(self, "image", image)
         object.__setattr__(self, "uv_transform", transform)
 

@@ -22,7 +22,8 @@ from typing import Any
 
 from tests.fuzz.formats import FORMATS, SLOW_FORMATS, make_case
 
-HANG = 10.0  # seconds
+HANG = 10.0  # seconds of work on a case
+STUCK = 60.0  # seconds without any
 POLL = 0.1
 START = 300.0  # seconds that a worker may take to compile before its first case
 AT_ONCE = 20_000  # inputs a process
@@ -77,13 +78,18 @@ class Run:
             return last + 1
 
     def _watch(self, process: subprocess.Popen[bytes], beat: Path) -> str:
-        """Wait for its end; kill it where a case takes longer than HANG. Counted in polls: whoever stops us both is no hang."""
-        number, polls = b"", 0
+        """Wait for its end; kill it where a case takes longer than HANG of its own time, or waits for something.
+
+        Waiting is counted in polls: whoever stops us both is no hang, and a machine with other work is not either.
+        """
+        number, polls, begin = b"", 0, 0.0
         while process.poll() is None:
             time.sleep(POLL)
             now = beat.read_bytes() if beat.exists() else b""
-            number, polls = now, polls + 1 if now == number else 0
-            if polls * POLL > (HANG if any(number) else START):
+            if now != number:
+                number, polls, begin = now, 0, _worked(process.pid)
+            polls += 1
+            if (any(number) and _worked(process.pid) - begin > HANG) or polls * POLL > (STUCK if any(number) else START):
                 process.kill()
                 process.wait()
                 return "hangs"
@@ -108,6 +114,15 @@ class Run:
             self.out.mkdir(parents=True, exist_ok=True)
             (self.out / f"{self.name}-{number}{case.suffix}").write_bytes(case.data)
             (self.out / f"{self.name}-{number}.txt").write_text(problem)
+
+
+def _worked(pid: int) -> float:
+    """Seconds that a process has computed so far; 0 where the system does not tell, or it has ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError):
+        return 0.0
 
 
 def main() -> None:

@@ -292,7 +292,7 @@ def load_accel_only(path: Path) -> Any:
 IDENTITY = {"seed": 0, "crop": [0, 0, 6, 4], "scene": "x", "kernels": "y"}
 
 
-def _checkpoint(path: Path, groups: int) -> tuple[Any, Any]:
+def checkpoint_of(path: Path, groups: int) -> tuple[Any, Any]:
     from wrt.checkpoint import Checkpoint
     from wrt.device import start
     from wrt.device_film import DeviceFilm
@@ -307,7 +307,7 @@ def checkpoint_seeds() -> list[Seed]:
     found = []
     for groups in (1, 4):
         with tempfile.TemporaryDirectory() as name:
-            film, checkpoint = _checkpoint(Path(name) / "a.checkpoint", groups)
+            film, checkpoint = checkpoint_of(Path(name) / "a.checkpoint", groups)
             rng = np.random.default_rng(0)
             for label, array in film.arrays():
                 film.put(array, np.full((4, 6), 3) if label.startswith("samples") else rng.random(film.view(array).shape) * 9)
@@ -318,7 +318,7 @@ def checkpoint_seeds() -> list[Seed]:
 
 
 def read_checkpoint(path: Path) -> object:
-    film, checkpoint = _checkpoint(path, int(path.suffix[-1]))
+    film, checkpoint = checkpoint_of(path, int(path.suffix[-1]))
     checkpoint.restore(film)
     return film.pixels_and_variance()
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import wrt
+from tests.fuzz.formats import checkpoint_of
 from wrt import checkpoint as module
 from wrt.checked_file import read_checked, write_checked
 from wrt.checkpoint import MAGIC, Checkpoint, read
@@ -378,3 +379,29 @@ def test_when_the_next_is_due(path: Path, monkeypatch: pytest.MonkeyPatch) -> No
             assert not file.due()
             now += 0.02
             assert file.due()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("name", "bits", "groups", "sound"), [
+    ("m2", 0x7FA00000, 1, True), ("m2", 0x7F800000, 1, True), ("mean", 0x7F7FFFFF, 4, True), ("mean", 0x7FA00000, 1, False),
+    ("mean", 0xFF800000, 4, False),
+], ids=["m2 no number", "m2 infinite", "mean huge", "mean no number", "mean infinite"])
+def test_a_film_by_a_stranger_is_read_without_a_word_or_refused(name: str, bits: int, groups: int, sound: bool, path: Path) -> None:
+    """With a checksum that fits; the bits of one number in it are anybody's choice."""
+    film, file = checkpoint_of(path, groups)
+    rng = np.random.default_rng(0)
+    for label, array in film.arrays():
+        values = np.ascontiguousarray(np.full((4, 6), 3) if label.startswith("samples") else rng.random(film.view(array).shape),
+                                      film.view(array).dtype)
+        if label.startswith(name):
+            values.reshape(-1).view(np.uint32)[5] = bits
+        film.put(array, values)
+    file.save(film, 1.5)
+    file._release()
+    again, file = checkpoint_of(path, groups)
+    if sound:
+        file.restore(again)
+        assert again.pixels_and_variance()[0].shape == (4, 6, 3)
+    else:
+        with pytest.raises(InputError, match="is damaged"):
+            file.restore(again)

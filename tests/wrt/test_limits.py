@@ -15,7 +15,7 @@ from tests.gltf_files import TRIANGLE, GltfFile, one_triangle
 from wrt.errors import InputError, SceneWarning
 from wrt.gltf import load_gltf
 from wrt.memory import Meter
-from wrt.scene import MAX_OBJECTS, Scene
+from wrt.scene import MAX_OBJECTS, Scene, Texture
 from wrt.scene_file import load_scene
 from wrt.shapes import MAX_FACES, icosphere, lathe, teapot, torus, tube
 
@@ -177,3 +177,11 @@ def test_names_give_the_terminal_no_orders(tmp_path: Path) -> None:
     file = one_triangle()
     file.json["nodes"][0] |= {"skin": 0, "name": "\x1b[2J"}
     assert "\x1b" not in command("validate", file.write(tmp_path, "\x1b[2J.gltf")).err
+
+
+@pytest.mark.parametrize("number", [1e31, 1e300, float("inf"), float("nan")])
+def test_transforms_of_textures_end_where_the_device_does(number: float) -> None:
+    image = np.zeros((1, 1, 4), np.uint8)
+    with pytest.raises(InputError, match=r"uv_transform must be a 2x3 matrix of numbers up to 1e\+30"):
+        Texture(image, uv_transform=np.array([[1.0, 0.0, 0.0], [0.0, number, 0.0]]))
+    assert Texture(image, uv_transform=np.full((2, 3), 1e30)).uv_transform[0, 0] == 1e30
