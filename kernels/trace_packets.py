@@ -204,14 +204,14 @@ def make_together(units: Units, any_hit: bool):
             else:
                 first = reference * NODE
                 met = children(accel.nodes, first, mask, packet, base)
-                begin = size
+                under = size
                 while met != 0:
                     lane = lowest(met)
                     met = met & (met - 1)
                     key = key_of(number(packet, base + ENTRY + lane), bits(accel.nodes, first + REFERENCES + lane))
                     at = size
                     if wp.static(not any_hit):  # sorted, the farthest deepest
-                        while at > begin and stack[at - 1] < key:
+                        while at > under and stack[at - 1] < key:
                             stack[at] = stack[at - 1]
                             masks[at] = masks[at - 1]
                             at = at - 1

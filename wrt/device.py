@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
+from math import prod
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -119,6 +120,14 @@ def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:
         array = np.ascontiguousarray(array, dtype=wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype)))
     # A frozen NumPy array (a scene's) cannot be aliased: Warp wants to be able to write.
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
+
+
+def empty_aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """An array in memory that begins where a cache line does."""
+    size = prod(shape) * np.dtype(dtype).itemsize
+    memory = np.empty(size + 64, np.uint8)
+    first = -memory.ctypes.data % 64
+    return memory[first : first + size].view(dtype).reshape(shape)
 
 
 @cache

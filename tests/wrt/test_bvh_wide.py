@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -63,6 +65,23 @@ def test_arrays_of_a_file_are_checked(name: str) -> None:
             check_wide(spoiled, len(BALL.faces), width)
     with pytest.raises(InputError, match="leads out"):
         check_wide(np.zeros((0, width), np.int32), 0, width)
+
+
+@pytest.mark.parametrize("name", ["bvh4", "bvh8"])
+def test_a_child_that_does_not_exist_has_no_box(name: str) -> None:
+    # A ray that entered it would begin again at the root.
+    accel = build(BALL, name)
+    none = accel._references(accel.built) == 0
+    assert none.any()
+    for k, plane in enumerate((np.inf, -np.inf) * 3):
+        nodes = accel.built.arrays["nodes"].reshape(-1, 8, WIDE[name]).copy()
+        assert (nodes[:, k][none] == plane).all()
+        nodes[:, k][none] = 0.0
+        with pytest.raises(InputError, match="damaged: a child that does not exist"):
+            accel._check(replace(accel.built, arrays={"nodes": nodes.reshape(-1)}))
+    nodes = accel.built.arrays["nodes"].reshape(-1, 8, WIDE[name]).copy()
+    nodes[:, 7] = np.nan  # not used
+    accel._check(replace(accel.built, arrays={"nodes": nodes.reshape(-1)}))
 
 
 def test_a_tree_too_deep_for_the_stack_is_refused() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from math import prod
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,7 +12,7 @@ from wrt.accel.base import Accelerator, Built
 from wrt.accel.bvh_build import BvhOptions, build_binary
 from wrt.accel.wide_compress import children_there, compress, decompress
 from wrt.accel.wide_tree import MAX_PLACES, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
-from wrt.device import record_dtype, run_all
+from wrt.device import empty_aligned, record_dtype, run_all
 from wrt.errors import InputError
 from wrt.kernels.lanes import EMPTY
 from wrt.kernels.trace_packets import StreamTraversal
@@ -21,14 +20,6 @@ from wrt.kernels.traverse_wide import LEAF_RANGE, WideTraversal
 from wrt.kernels.wide_nodes import first_reference, node_size
 
 ROWS_PER_JOB = 4096
-
-
-def empty_aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An array in memory that begins where a cache line does."""
-    size = prod(shape) * np.dtype(dtype).itemsize
-    memory = np.empty(size + 64, np.uint8)
-    first = -memory.ctypes.data % 64
-    return memory[first : first + size].view(dtype).reshape(shape)
 
 
 def aligned(array: np.ndarray) -> np.ndarray:
@@ -125,6 +116,11 @@ class WideBvh(Accelerator):
         check_wide(references, len(built.order), self._unit)
         if self.compressed and (children_there(self._nodes(built), self.width) != (references != EMPTY)).any():
             raise InputError("is damaged: a node tells of children that it does not have")
+        if not self.compressed:
+            planes = self._nodes(built)[:, : first_reference(self.width, False)].reshape(-1, 3, 2, self.width)
+            empty = ((planes[:, :, 0] == np.inf) & (planes[:, :, 1] == -np.inf)).all(axis=1)
+            if not empty[references == EMPTY].all():
+                raise InputError("is damaged: a child that does not exist has a box")
 
     def _refit(self, built: Built) -> Built:
         tree = refit(self._tree(built), self.geometry)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import warp as wp
 
-from wrt.device import load_kernel, run_all, thread_count, upload
+from wrt.device import empty_aligned, load_kernel, run_all, thread_count, upload
 from wrt.kernels.packets import Scratch
 
 if TYPE_CHECKING:
@@ -26,13 +25,6 @@ def stream_kernel(structure: Structure, any_hit: bool) -> Any:
     return make(structure.units, any_hit) if make else None
 
 
-def aligned_words(size: int, dtype: Any) -> Any:
-    """An array that begins where a cache line does: else each row of lanes would lie in two."""
-    memory = np.zeros(4 * size + 64, np.uint8)
-    first = -memory.ctypes.data % 64
-    return upload(memory[first : first + 4 * size].view(wp.dtype_to_numpy(dtype)), dtype, wp.get_device("cpu"))
-
-
 _free: list[Scratch] = []  # a new one costs as much as a thousand rays
 
 
@@ -42,8 +34,9 @@ def borrow(sizes: tuple[int, int, int]) -> Scratch:
         return _free.pop()
     except IndexError:
         out = Scratch()
-        out.packets, out.stacks, out.slots = (aligned_words(size, dtype) for size, dtype in
-                                              zip(sizes, (wp.float32, wp.uint32, wp.int32), strict=True))
+        # Rows of lanes would else lie in two cache lines each.
+        out.packets, out.stacks, out.slots = (upload(empty_aligned((size,), wp.dtype_to_numpy(dtype)), dtype, wp.get_device("cpu"))
+                                              for size, dtype in zip(sizes, (wp.float32, wp.uint32, wp.int32), strict=True))
         return out
 
 
