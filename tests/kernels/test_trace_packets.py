@@ -70,7 +70,7 @@ def test_any_number_of_rays(sphere, n):
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_more_rays_than_a_launch(sphere, threads, monkeypatch):
     monkeypatch.setattr(streams, "_free", [])
-    o, d, _, _ = mixed_rays(300_001)
+    o, d, _, _ = mixed_rays(150_001)
     assert_same(sphere, o, d, threads=threads)
     assert len(streams._free) == threads  # what the jobs work in is lent again
     assert all(array.ptr % 64 == 0 for lent in streams._free for array in (lent.packets, lent.stacks))
