@@ -91,6 +91,21 @@ def test_a_structure_that_refuses_is_named_and_the_others_go_on(box, monkeypatch
     assert "<td style=\"text-align:left\">more than 11 triangles</td>" in rows._repr_html_()
 
 
+def test_the_build_that_is_timed_is_not_the_first(box, monkeypatch) -> None:
+    sizes = []
+
+    class Slow(ACCELERATORS["bvh2"]):  # type: ignore[misc, name-defined]
+        name = "slow"
+
+        def _build(self):
+            sizes.append(len(self.geometry))
+            return super()._build()
+
+    monkeypatch.setitem(bench.ACCELERATORS, "slow", Slow)
+    run(plan(box, structures=("slow",), kinds=("random",), builds=2))
+    assert len(sizes) == 3 and sizes[0] != sizes[1] == sizes[2]
+
+
 def test_meshes_need_no_file_and_a_notebook_shows_tables(tmp_path) -> None:
     rows = run(Plan((icosphere(1), icosphere(2)), ("bvh2",), ("primary",), rays=100, runs=1))
     page = rows._repr_html_()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -19,6 +20,7 @@ from wrt.bench.visibility import TERRAINS, fit, terrain
 from wrt.device import thread_count
 from wrt.errors import InputError
 from wrt.mesh import Mesh, as_mesh
+from wrt.shapes import icosphere
 from wrt.tables import Rows
 
 YARDSTICK = "bvh2"  # every ray is compared with it, and as many as YARDSTICK_TESTS allow with brute force
@@ -140,6 +142,7 @@ class _Bench:
         built: dict[str, tuple[Accelerator, tuple[float, ...]]] = {}
         peaks: dict[str, float] = {}
         for name in self.plan.names:
+            warm_up(name)
             try:
                 first, peaks[name] = peak_bytes(partial(build, self.geometry, name))
                 accels = [first, *(build(self.geometry, name) for _ in range(self.plan.builds - 1))]
@@ -178,6 +181,13 @@ class _Bench:
         s, n = accel.stats, len(self.geometry)
         return Row(self.name, n, name, rays.kind, len(rays), build_seconds, s.bytes / n, s.sah_cost, s.depth, s.references,
                    float(c.nodes.mean()), float(c.boxes.mean()), float(c.primitives.mean()), tuple(seconds), differ, checked, wrong)
+
+
+@cache
+def warm_up(structure: str) -> None:
+    """Build it over a small ball, so that the kernels of its builder are compiled before a build is timed."""
+    with suppress(InputError):  # where it refuses, the mesh that is asked about says why
+        build(Geometry.of(icosphere(3)), structure)
 
 
 def answer(accel: Accelerator, rays: RaySet, threads: int | None) -> Hits | np.ndarray:

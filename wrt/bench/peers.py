@@ -16,6 +16,7 @@ import numpy as np
 
 import wrt
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
+from wrt.bench.accel import warm_up
 from wrt.bench.algorithms import PEERS, Embree, Open3D, Peer, WarpMesh
 from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.bench.visibility_report import spread, table
@@ -120,6 +121,7 @@ class Contestant(ABC):
 class Own(Contestant):
     def __init__(self, name: str, geometry: Geometry) -> None:
         self.name = f"wrt {ACCELERATORS[name].name}"
+        warm_up(name)
         begin = perf_counter()
         self.accel: Accelerator = build(geometry, name, threads=1)
         self.build = perf_counter() - begin
