@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import click
@@ -229,7 +230,10 @@ def accel(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, qu
 
     def progress(row: Any) -> None:
         if not quiet:
-            say(f"{row.mesh}: {'  '.join(report.cells(row, row)) if isinstance(row, bench_accel.Row) else row.reason}")
+            if isinstance(row, bench_accel.Refused):
+                say(f"{row.mesh}: {row.structure}: {row.reason}")
+            else:
+                say(f"{row.mesh}: {row.structure}, {row.kind} rays: {median(row.mrays):.3g} Mray/s, {row.differ} differ")
 
     with warnings_told(quiet):
         rows = by_mesh(bench_accel.run, plan, progress, client)
