@@ -490,24 +490,12 @@ def pop(nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32), t: 
 def sift(rows: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32), ray: int) -> int: ...
 
 
-@wp.func_native("return __builtin_ctz(mask);")
-def lowest(mask: int) -> int: ...
-
-
 @wp.func_native("return __builtin_ctzll(mask);")
 def lowest_of_all(mask: wp.uint64) -> int: ...
 
 
 @wp.func_native("return __builtin_popcount(mask);")
 def count_of(mask: int) -> int: ...
-
-
-@wp.func_native("return packet.data[(long long)i];")
-def number(packet: wp.array(dtype=wp.float32), i: int) -> float: ...
-
-
-@wp.func_native("int value; __builtin_memcpy(&value, packet.data + (long long)i, 4); return value;")
-def bits(packet: wp.array(dtype=wp.float32), i: int) -> int: ...
 
 
 @wp.func_native("packet.data[(long long)i] = value;")

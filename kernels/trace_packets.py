@@ -10,6 +10,7 @@ from functools import cache
 
 import warp as wp
 
+from wrt.kernels.lanes import make_lanes
 from wrt.kernels.packets import (
     ENTRY,
     LANES,
@@ -20,13 +21,10 @@ from wrt.kernels.packets import (
     TO_POP,
     Scratch,
     begin,
-    bits,
     children,
     count_of,
-    lowest,
     lowest_of_all,
     meets,
-    number,
     pop,
     put_bits,
     put_number,
@@ -57,6 +55,7 @@ from wrt.kernels.traverse_wide import (
 from wrt.kernels.wide_nodes import first_reference, make_box_test, node_size
 
 WIDTH = 8
+lowest, number, bits = make_lanes(WIDTH).lowest, make_lanes(WIDTH).value, make_lanes(WIDTH).bits
 NODE = node_size(WIDTH, False)
 REFERENCES = first_reference(WIDTH, False)
 PACKETS = 4  # set up at a time

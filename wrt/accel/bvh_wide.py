@@ -23,7 +23,7 @@ ROWS_PER_JOB = 4096
 
 
 def aligned(array: np.ndarray) -> np.ndarray:
-    """The same numbers there."""
+    """The same numbers in memory that begins where a cache line does."""
     out = empty_aligned(array.shape, array.dtype)
     out[...] = array
     return out
