@@ -1,0 +1,83 @@
+"""The bits of shipped scenes' pixels and of hits: `python -m tests.bits` prints what tests/bits.txt holds.
+
+Pixels go through the C library's sin, cos, pow, exp, log, acos and atan2, whose last bits differ between libraries. So the
+first line is a digest of these functions: where it differs, the pixels below it may.
+"""
+
+from __future__ import annotations
+
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+import wrt
+from tests.data import ROOT
+from tests.kernel_tools import floats, launch, zeros  # before warp: it silences Warp's banner
+from wrt import shapes
+
+import warp as wp  # isort: skip
+
+STORED = Path(__file__).with_suffix(".txt")
+SCENES = sorted((ROOT / "scenes").glob("*.toml"))
+RAYS = 20_000
+
+
+@wp.kernel(enable_backward=False)
+def call_library(x: wp.array(dtype=float), out: wp.array(dtype=float)):
+    i = wp.tid()
+    a = x[i]
+    unit = a / (1.0 + wp.abs(a))
+    out[7 * i] = wp.sin(a)
+    out[7 * i + 1] = wp.cos(a)
+    out[7 * i + 2] = wp.exp(a)
+    out[7 * i + 3] = wp.log(wp.abs(a))
+    out[7 * i + 4] = wp.pow(wp.abs(a), 1.0 + unit)
+    out[7 * i + 5] = wp.acos(unit)
+    out[7 * i + 6] = wp.atan2(a, unit + 2.0)
+
+
+def digest(*arrays: np.ndarray) -> str:
+    return sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:32]
+
+
+def library() -> str:
+    """Digest of the C library's functions, over 50,000 arguments."""
+    x = np.random.default_rng(0).normal(size=50_000).astype(np.float32) * np.float32(10.0)
+    out = zeros(7 * len(x))
+    launch(call_library, len(x), floats(x), out)
+    return digest(out.numpy())
+
+
+def pixels(scene: Path) -> str:
+    return digest(wrt.render(scene, size="64x36", spp=4, seed=3).pixels)
+
+
+def hits(accel: str) -> str:
+    """Of primary rays and of random ones, at a torus with a bump beside it: no face is a mirror image of another."""
+    mesh = shapes.torus(1.0, 0.4, 64, 32)
+    rng = np.random.default_rng(1)
+    origins = rng.normal(size=(RAYS, 3)) * 2.0
+    directions = rng.normal(size=(RAYS, 3)) * 0.4 - origins
+    structure = wrt.build(mesh, accel)
+    hit = structure.closest_hit(origins, directions)
+    assert (hit.prim_id >= 0).mean() > 0.3
+    camera = wrt.Camera.look_at((0.0, 2.0, 4.0), (0.0, 0.0, 0.0), fov_y=0.6)
+    seen = structure.closest_hit(*wrt.camera_rays(camera, "160x90"))
+    occluded = structure.any_hit(origins, directions, t_max=0.9)
+    return digest(hit.t, hit.u, hit.v, hit.prim_id, seen.t, seen.u, seen.v, seen.prim_id, occluded)
+
+
+def stored() -> dict[str, str]:
+    return dict(line.split() for line in STORED.read_text().splitlines())
+
+
+def main() -> None:
+    print("library", library())
+    print("hits", hits("bvh"))
+    for scene in SCENES:
+        print(scene.stem, pixels(scene), flush=True)
+
+
+if __name__ == "__main__":
+    main()
