@@ -20,7 +20,7 @@ from wrt.errors import InputError
 @click.option("--sample", type=click.IntRange(min=1), default=10_000, show_default=True,
               help="How many of them the oracle judges, and the other tests and peers get")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
-@click.option("--peers", is_flag=True, help="Also Embree (embreex), Warp's mesh_query_ray and Open3D, where installed")
+@click.option("--peers", is_flag=True, help="Also Embree (robust and fast), Warp's mesh_query_ray and Open3D, where installed")
 @click.option("--threads", type=int, help="Threads for the rays beyond the sample  [default: all cores]")
 @CLUSTER
 @click.option("--runs", type=click.IntRange(min=1), default=7, show_default=True, help="Runs of each for the speed, by turns")
@@ -158,7 +158,7 @@ def units(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> No
 @bench.command()
 @click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--structures", type=Names(), default=("bvh",), help="Of wrt, by name; ratios are of the first  [default: bvh]")
-@click.option("--rivals", type=Names(), default=(), help="embree, warp, open3d  [default: those that are installed]")
+@click.option("--rivals", type=Names(), default=(), help="embree, embree_fast, warp, open3d  [default: those that are installed]")
 @click.option("--kinds", type=Names(), default=("primary", "shadow", "diffuse", "random"), help="Of rays  [default: all]")
 @click.option("--rays", type=int, default=100_000, show_default=True, help="Rays of each kind")
 @click.option("--runs", type=int, default=7, show_default=True, help="Runs of each, by turns")
@@ -169,8 +169,8 @@ def units(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> No
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def peers(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, quiet: bool, as_json: bool, **options: Any) -> None:
-    """wrt beside Embree and Warp's mesh_query_ray: the same rays by turns, on one thread and on all, with ratios and answers that
-    differ.
+    """wrt beside Embree (robust and fast) and Warp's mesh_query_ray: the same rays by turns, on one thread and on all, with ratios
+    and answers that differ.
 
     MESHES: .obj, .ply or .stl files; without any, a sphere.
     """

@@ -11,7 +11,7 @@ import pytest
 from wrt.accel import Geometry
 from wrt.bench import stability
 from wrt.bench import stability_report as report
-from wrt.bench.algorithms import Embree, Open3D, Own, WarpMesh, own_algorithms
+from wrt.bench.algorithms import PEERS, Embree, EmbreeFast, Open3D, Own, WarpMesh, own_algorithms
 from wrt.bench.hard_cases import generate
 from wrt.errors import InputError
 from wrt.kernels.ray_aabb import RAY_AABB
@@ -46,9 +46,9 @@ def test_every_unit_is_put_to_the_cases() -> None:
     assert {triangle for triangle, _ in names} == set(RAY_TRIANGLE) and {box for _, box in names} == set(RAY_AABB)
 
 
-@pytest.mark.parametrize("peer", [WarpMesh, Embree])
+@pytest.mark.parametrize("peer", [WarpMesh, Embree, EmbreeFast])
 def test_peers_answer_as_wrt_does_where_it_is_easy(peer) -> None:
-    if peer is Embree:
+    if issubclass(peer, Embree):
         pytest.importorskip("embreex", reason='needs embreex: pip install "wrt[peers]"')
     case = generate("H_scale_1_uniform", 500)
     rival, own = peer(), Own()
@@ -58,6 +58,37 @@ def test_peers_answer_as_wrt_does_where_it_is_easy(peer) -> None:
     np.testing.assert_allclose(theirs.t, ours.t, rtol=1e-4)
     np.testing.assert_allclose(np.stack([theirs.u, theirs.v]), np.stack([ours.u, ours.v]), atol=1e-3)
     assert not rival.prepare(generate("C_spheres", 10).geometry)  # triangles only
+
+
+def test_embree_is_asked_in_both_modes() -> None:
+    pytest.importorskip("embreex", reason='needs embreex: pip install "wrt[peers]"')
+    assert {"embree", "embree_fast"} <= PEERS.keys() and (Embree.name, EmbreeFast.name) == ("Embree robust", "Embree fast")
+    case = generate("A_origin_vertices", 2000)
+    both = []
+    for peer in (Embree(), EmbreeFast()):
+        peer.prepare(case.geometry)
+        both.append(peer.closest(case.origins, case.directions, case.t_min, case.t_max))
+    robust, fast = both
+    assert (robust.t != fast.t).mean() > 0.1  # the last bits of most distances
+    missed_robust, missed_fast = ((hits.prim_id < 0).sum() for hits in both)
+    assert missed_fast > 5 * missed_robust  # of rays at the vertices of a closed sphere: none should be
+
+
+@pytest.mark.parametrize("peer", [Embree, EmbreeFast])
+def test_embree_s_mode_is_asked_for_and_not_left_to_embreex(peer, monkeypatch) -> None:
+    scenes = pytest.importorskip("embreex.rtcore_scene", reason='needs embreex: pip install "wrt[peers]"')
+    real, asked = scenes.EmbreeScene, []
+
+    def spy(**options):
+        asked.append(options)
+        return real(**options)
+
+    monkeypatch.setattr(scenes, "EmbreeScene", spy)
+    assert peer().prepare(generate("E_grid", 10).geometry)
+    assert asked == [{"robust": peer is Embree}]
+    monkeypatch.setattr(scenes, "EmbreeScene", lambda: real())  # as before embreex 4.4
+    with pytest.raises(InputError, match=r"embreex .*4\.4"):
+        peer().prepare(generate("E_grid", 10).geometry)
 
 
 def test_peers_need_not_keep_to_the_rule_for_ties() -> None:

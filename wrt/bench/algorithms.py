@@ -71,10 +71,11 @@ class Peer(Algorithm):
 
 
 class Embree(Peer):
-    """Embree 4 through embreex, with its robust flag off, as embreex sets it."""
+    """Embree 4 through embreex, in its robust mode (RTC_SCENE_FLAG_ROBUST), which is also what embreex takes unasked from 4.4 on."""
 
-    name = "Embree (embreex)"
+    name = "Embree robust"
     package = "embreex"
+    robust: ClassVar[bool] = True
 
     def load(self, geometry: Geometry) -> None:
         try:
@@ -82,13 +83,23 @@ class Embree(Peer):
             from embreex.rtcore_scene import EmbreeScene
         except ImportError as error:
             raise InputError(f'embreex is not usable ({error}); pip install "wrt[peers]" installs it') from error
-        self.scene = EmbreeScene()
+        try:
+            self.scene = EmbreeScene(robust=self.robust)
+        except TypeError as error:
+            raise InputError('embreex is too old to be asked for a mode; pip install "embreex>=4.4"') from error
         self.mesh = TriangleMesh(self.scene, geometry.vertices, geometry.faces)
 
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
         out = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
         prim_id = out["primID"].astype(np.int32)
         return _cut(out["tfar"], prim_id, out["u"], out["v"], t_min, t_max)
+
+
+class EmbreeFast(Embree):
+    """Embree 4 through embreex without its robust flag: what Embree itself does unasked, and faster. It loses rays at edges."""
+
+    name = "Embree fast"
+    robust = False
 
 
 class WarpMesh(Peer):
@@ -124,7 +135,7 @@ class WarpMesh(Peer):
 
 
 class Open3D(Peer):
-    """Open3D's RaycastingScene, which is Embree with its robust flag on."""
+    """Open3D's RaycastingScene, which is Embree in its robust mode."""
 
     name = "Open3D RaycastingScene"
     package = "open3d"
@@ -159,4 +170,4 @@ def own_algorithms() -> list[Own]:
     return [Own(triangle) for triangle in RAY_TRIANGLE] + [Own(box=box) for box in RAY_AABB if box != "conservative"]
 
 
-PEERS: dict[str, type[Peer]] = {"embree": Embree, "warp": WarpMesh, "open3d": Open3D}
+PEERS: dict[str, type[Peer]] = {"embree": Embree, "embree_fast": EmbreeFast, "warp": WarpMesh, "open3d": Open3D}

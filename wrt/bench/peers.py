@@ -1,5 +1,5 @@
-"""`python -m wrt bench peers`: wrt's structures beside Embree and Warp's mesh_query_ray; the same rays by turns, on one
-thread and on all of them."""
+"""`python -m wrt bench peers`: wrt's structures beside Embree (robust and fast) and Warp's mesh_query_ray; the same rays by
+turns, on one thread and on all of them."""
 
 from __future__ import annotations
 
