@@ -330,7 +330,10 @@ def error(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tu
 @click.option("--reference-spp", type=int, help="Samples of each of the reference's 8 seeds  [default: 8 times --spp]")
 @click.option("--rival-limit", "rival_seconds", type=Duration(), default="60s", show_default=True,
               help="No picture of Mitsuba's takes longer")
-@click.option("--integrator", default="auto", show_default=True, help="Mitsuba's: path, volpath, direct or whitted (in Python)")
+@click.option("--integrator", default="auto", show_default=True,
+              help="Mitsuba's: path, volpath, direct or whitted (in Python, scalar_rgb only)")
+@click.option("--variants", type=Names(), default=("scalar_rgb", "llvm_ad_rgb"),
+              help="Mitsuba's; llvm_ad_rgb needs an LLVM library  [default: scalar_rgb,llvm_ad_rgb]")
 @click.option("--matte", is_flag=True, help="Make every surface diffuse, for the integrator direct, which draws the same light")
 @click.option("--starts", type=int, default=3, show_default=True, help="How often to time whole processes; 0: not at all")
 @click.option("--camera", help="A camera's name or number  [default: the first]")
@@ -340,7 +343,11 @@ def error(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tu
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def mitsuba(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tuple[int, int], matte: bool,
             camera: str | None, **options: Any) -> None:
-    """SCENE by wrt and by Mitsuba 3 (scalar_rgb), on all threads: time to equal error, process start included and excluded."""
+    """SCENE by wrt and by Mitsuba 3 (scalar_rgb and llvm_ad_rgb), on all threads: time to equal error, process start included and
+    excluded.
+
+    llvm_ad_rgb gets the LLVM library that DRJIT_LIBLLVM_PATH names, else the newest in the usual places that passes a trial.
+    """
     from wrt.bench import equal_error
     from wrt.driver import Options
 

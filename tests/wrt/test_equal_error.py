@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import shutil
+import signal
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +17,8 @@ from tests import command_line
 from tests.data import ROOT
 from wrt.bench import equal_error
 from wrt.bench.equal_error import Plan, Result, matte
+from wrt.bench.mitsuba_llvm import PATH_VARIABLE, NotAvailable
+from wrt.bench.mitsuba_process import VARIANTS, MitsubaProcess
 from wrt.driver import Options
 from wrt.errors import InputError
 from wrt.scene import Camera, Material, Object, PointLight, Scene, Settings, Sphere
@@ -29,27 +35,78 @@ ROOM = Scene(
 PLAN = Plan(spp=8, repeats=3, reference_spp=64, rival_seconds=1.0, starts=0)
 
 
-def measured(integrator: str) -> Result:
-    return equal_error.run(ROOM, replace(PLAN, integrator=integrator), Options())
+def measured(integrator: str, variant: str) -> Result:
+    try:
+        return equal_error.run(ROOM, replace(PLAN, integrator=integrator, variants=(variant,)), Options())
+    except NotAvailable as error:
+        if variant == "scalar_rgb":
+            raise
+        pytest.skip(str(error))
 
 
-def test_direct_light_is_the_same_and_the_ratio_is_its_own_definition() -> None:
-    result = measured("direct")
-    assert result.same_light
-    assert result.wrt.spp == 8 and len(result.wrt.seconds) == len(result.mitsuba.seconds) == 3
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_direct_light_is_the_same_and_the_ratio_is_its_own_definition(variant: str) -> None:
+    result = measured("direct", variant)
+    (name, rival), = result.mitsuba.items()
+    assert name == variant and rival.same_light and not result.not_available
+    assert result.wrt.spp == 8 and len(result.wrt.seconds) == len(rival.side.seconds) == 3
     assert result.reference.max_depth == ROOM.settings.max_depth
-    expected = np.median(result.mitsuba.seconds / result.wrt.seconds) * (result.mitsuba.rmse / result.wrt.rmse) ** 2
-    assert result.ratio[1] == pytest.approx(expected)
+    expected = np.median(rival.side.seconds / result.wrt.seconds) * (rival.side.rmse / result.wrt.rmse) ** 2
+    assert rival.ratio[1] == pytest.approx(expected)
     # Mitsuba was given about as many samples as it needs: the two errors are near each other.
-    assert 0.4 < result.mitsuba.rmse / result.wrt.rmse < 2.5
-    assert math.isnan(result.process_ratio)
-    assert "times as long" in equal_error.text(result) and "not of the same light" not in equal_error.text(result)
+    assert 0.4 < rival.side.rmse / result.wrt.rmse < 2.5
+    assert math.isnan(rival.process_ratio)
+    assert f"Mitsuba {variant}, direct" in equal_error.text(result) and "not of the same light" not in equal_error.text(result)
 
 
-def test_interreflection_is_another_light() -> None:
-    result = measured("path")
-    assert not result.same_light
-    assert "not of the same light" in equal_error.text(result)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_interreflection_is_another_light(variant: str) -> None:
+    result = measured("path", variant)
+    assert not result.mitsuba[variant].same_light
+    assert f"The picture of {variant} is not of the same light" in equal_error.text(result)
+
+
+def test_a_variant_without_its_library_is_left_out_and_named(monkeypatch) -> None:
+    monkeypatch.setenv(PATH_VARIABLE, "/nowhere/libLLVM.so")
+    result = equal_error.run(ROOM, replace(PLAN, integrator="direct"), Options())
+    assert set(result.mitsuba) == {"scalar_rgb"} and "/nowhere/libLLVM.so" in result.not_available["llvm_ad_rgb"]
+    assert "Mitsuba llvm_ad_rgb is not available: " in equal_error.text(result)
+    with pytest.raises(InputError, match=r"Mitsuba llvm_ad_rgb: .*/nowhere/libLLVM\.so"):
+        equal_error.run(ROOM, replace(PLAN, integrator="direct", variants=("llvm_ad_rgb",)), Options())
+
+
+def test_a_variant_that_ends_on_its_way_is_left_out(monkeypatch) -> None:
+    class Mortal(MitsubaProcess):
+        """Its third picture is its last."""
+
+        pictures = 0
+
+        def render(self, spp, seed):
+            self.pictures += 1
+            if self.pictures > 3 and self.variant == "llvm_ad_rgb":
+                os.kill(self._process.pid, signal.SIGABRT)
+            return super().render(spp, seed)
+
+        def __init__(self, job):
+            self.variant = job.variant
+            super().__init__(job._replace(variant="scalar_rgb"))  # which needs no library
+
+    monkeypatch.setattr(equal_error, "MitsubaProcess", Mortal)
+    result = equal_error.run(ROOM, replace(PLAN, integrator="direct"), Options())
+    assert len(result.mitsuba["scalar_rgb"].side.seconds) == PLAN.repeats
+    assert set(result.not_available) == {"llvm_ad_rgb"} and "its process ended by SIGABRT" in result.not_available["llvm_ad_rgb"]
+
+
+def test_starts_have_all_that_a_process_takes(tmp_path) -> None:
+    scene = tmp_path / "room.toml"
+    shutil.copy(ROOT / "scenes" / "independent.toml", scene)
+    command = ["render", str(scene), "--spp", "1", "--size", "8x8", "-q", "-o", str(tmp_path / "start.png")]
+    plan = replace(PLAN, integrator="direct", starts=1, variants=("scalar_rgb",))
+    result = equal_error.run(ROOM, plan, Options(), command)
+    rival = result.mitsuba["scalar_rgb"]
+    assert result.wrt.process_seconds > np.median(result.wrt.seconds)
+    assert rival.side.process_seconds > rival.side.prepare_seconds
+    assert rival.process_ratio == pytest.approx(rival.side.process_seconds / result.wrt.process_seconds)
 
 
 def test_matte_leaves_the_albedo_and_what_lights_others() -> None:
@@ -62,8 +119,8 @@ def test_matte_leaves_the_albedo_and_what_lights_others() -> None:
     assert first.emission == lamp.emission and second.emission == (0.0, 0.0, 0.0) and third.albedo == GREEN.albedo
 
 
-@pytest.mark.parametrize("wrong", [{"spp": 0}, {"repeats": 2}])
-def test_plans_that_cannot_be_measured(wrong: dict[str, int]) -> None:
+@pytest.mark.parametrize("wrong", [{"spp": 0}, {"repeats": 2}, {"integrator": "x"}, {"variants": ()}, {"variants": ("cuda_rgb",)}])
+def test_plans_that_cannot_be_measured(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=next(iter(wrong))):
         Plan(**wrong)
 
@@ -73,5 +130,8 @@ def test_the_command(tmp_path) -> None:
     scene = ROOT / "scenes" / "independent.toml"
     done = command_line.wrt("bench", "mitsuba", scene, "--matte", "--size", "16x9", "--spp", "4",
                             "--repeats", "3", "--starts", "0", "--rival-limit", "1s", "--json", "-q", "-o", output)
-    assert json.loads(done.out)["mitsuba"]["spp"] >= 1
+    assert done.code == 0, done.err
+    told = json.loads(done.out)
+    assert told["mitsuba"]["scalar_rgb"]["spp"] >= 1
+    assert set(told["mitsuba"]) | set(told["not_available"]) == set(VARIANTS)
     assert "Mitsuba scalar_rgb, direct" in output.read_text()

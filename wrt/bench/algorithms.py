@@ -71,7 +71,7 @@ class Peer(Algorithm):
 
 
 class Embree(Peer):
-    """Embree 4 through embreex, in its robust mode (RTC_SCENE_FLAG_ROBUST), which is also what embreex takes unasked from 4.4 on."""
+    """Embree 4 through embreex in its robust mode (RTC_SCENE_FLAG_ROBUST), which embreex also takes unasked from 4.4 on."""
 
     name = "Embree robust"
     package = "embreex"

@@ -1,8 +1,9 @@
-"""`python -m wrt bench mitsuba`: the same picture by wrt and by Mitsuba 3 (scalar_rgb), to the same error.
+"""`python -m wrt bench mitsuba`: the same picture by wrt and by Mitsuba 3, to the same error; Mitsuba with both of its variants
+that run on a CPU, each in a process of its own.
 
-Both are held against one reference. wrt renders with a given number of samples; Mitsuba gets as many as it likely needs for the
+All are held against one reference. wrt renders with a given number of samples; Mitsuba gets as many as it likely needs for the
 same error, and what it really needs is taken from the error that it reaches: its samples are independent, so that its mean
-squared error falls as 1 / time. Runs alternate; each has a seed of its own.
+squared error falls as 1 / time. Runs alternate; each has a seed of its own. All have the same number of threads.
 """
 
 from __future__ import annotations
@@ -10,16 +11,22 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from wrt.bench import error_statistics as statistics
 from wrt.bench.error import REFERENCE_SEEDS, Reference, finished, make_reference
-from wrt.bench.mitsuba import mitsuba, to_mitsuba
+from wrt.bench.mitsuba import INTEGRATORS
+from wrt.bench.mitsuba_llvm import NotAvailable
+from wrt.bench.mitsuba_process import VARIANTS, Job, MitsubaProcess, environment_of
 from wrt.bench.price import Quartiles, quartiles, shown
+from wrt.bench.visibility_report import table
+from wrt.device import thread_count
 from wrt.driver import Options, Renderer
 from wrt.errors import InputError
 from wrt.scene import Material, Scene
@@ -31,20 +38,25 @@ SAME = 0.25  # of the squared error compared at: a squared bias beyond it means 
 @dataclass(frozen=True)
 class Plan:
     """spp: wrt's samples. repeats: pictures of each. reference_spp: of each of its seeds (None: 8 spp). rival_seconds: no
-    picture of Mitsuba's takes longer. integrator: Mitsuba's, see wrt.bench.mitsuba. starts: how often a whole process is
-    timed (0: not at all)."""
+    picture of Mitsuba's takes longer. integrator: Mitsuba's, see wrt.bench.mitsuba. variants: Mitsuba's. starts: how often a
+    whole process is timed (0: not at all). Raises InputError."""
 
     spp: int = 64
     repeats: int = 7
     reference_spp: int | None = None
     rival_seconds: float = 60.0
     integrator: str = "auto"
+    variants: tuple[str, ...] = VARIANTS
     starts: int = 3
     seed: int = 0
 
     def __post_init__(self) -> None:
         if not 1 <= self.spp <= 1 << 16 or not 3 <= self.repeats <= 1000:
             raise InputError(f"spp must be 1 to 65536 and repeats 3 to 1000, got {self.spp} and {self.repeats}")
+        if self.integrator not in INTEGRATORS:
+            raise InputError(f"integrator must be one of {', '.join(INTEGRATORS)}; got {self.integrator!r}")
+        if not self.variants or not set(self.variants) <= set(VARIANTS):
+            raise InputError(f"variants must be of {', '.join(VARIANTS)}; got {', '.join(self.variants) or 'none'}")
 
 
 @dataclass(frozen=True)
@@ -67,27 +79,37 @@ class Side:
 
 
 @dataclass(frozen=True)
+class Rival:
+    """A variant of Mitsuba. ratio: its seconds over those of wrt at wrt's error, tracing alone; process_ratio: of whole
+    processes. same_light: whether its picture has wrt's expectation, as far as its noise at equal error can tell."""
+
+    side: Side
+    ratio: Quartiles
+    process_ratio: float
+    same_light: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        return {**self.side.as_dict(), "ratio": list(self.ratio), "process_ratio": self.process_ratio,
+                "same_light": self.same_light}
+
+
+@dataclass(frozen=True)
 class Result:
-    """ratio: seconds of Mitsuba over those of wrt at wrt's error, tracing alone; process_ratio: of whole processes."""
+    """mitsuba: by variant. not_available: variants that could not be used, and why."""
 
     scene: str
     size: tuple[int, int]
     integrator: str
+    threads: int
     wrt: Side
-    mitsuba: Side
-    ratio: Quartiles
-    process_ratio: float
+    mitsuba: dict[str, Rival]
+    not_available: dict[str, str]
     reference: Reference
 
-    @property
-    def same_light(self) -> bool:
-        """Whether Mitsuba's picture has wrt's expectation, as far as its noise at equal error can tell."""
-        return not self.mitsuba.bias**2 > SAME * self.wrt.rmse**2
-
     def as_dict(self) -> dict[str, Any]:
-        return {"scene": self.scene, "size": list(self.size), "integrator": self.integrator, "wrt": self.wrt.as_dict(),
-                "mitsuba": self.mitsuba.as_dict(), "ratio": list(self.ratio), "process_ratio": self.process_ratio,
-                "same_light": self.same_light, "reference": self.reference.as_dict()}
+        return {"scene": self.scene, "size": list(self.size), "integrator": self.integrator, "threads": self.threads,
+                "wrt": self.wrt.as_dict(), "mitsuba": {name: rival.as_dict() for name, rival in self.mitsuba.items()},
+                "not_available": self.not_available, "reference": self.reference.as_dict()}
 
 
 def matte(scene: Scene) -> Scene:
@@ -101,94 +123,184 @@ def matte(scene: Scene) -> Scene:
     return replace(scene, objects=objects, spheres=spheres, cameras=cameras, ambient=(0.0, 0.0, 0.0))
 
 
+class _Runs:
+    """Pictures of one renderer at its number of samples, and their seconds."""
+
+    def __init__(self, spp: int) -> None:
+        self.spp = spp
+        self.seconds: list[float] = []
+        self.films: list[np.ndarray] = []
+
+    def add(self, seconds: float, film: np.ndarray) -> None:
+        self.seconds.append(seconds)
+        self.films.append(film)
+
+    def side(self, truth: Reference, prepare: float, start: float) -> Side:
+        """start: seconds of a process but for tracing."""
+        products = statistics.gram(self.films, truth.pixels)
+        bias, below = statistics.bias_with_bound(products, truth.variance)
+        return Side(self.spp, np.array(self.seconds), max(statistics.mse_of(products, truth.variance), 0.0) ** 0.5, bias, below,
+                    prepare, start + float(np.median(self.seconds)))
+
+
+class _Measured:
+    """A variant of Mitsuba that is being measured."""
+
+    def __init__(self, job: Job, process: MitsubaProcess) -> None:
+        self.job, self.process = job, process
+        self.runs = _Runs(PILOT_SPP)
+        self.start = float("nan")
+
+    def choose_spp(self, seed: int, truth: Reference, target: float, longest: float) -> None:
+        """As many samples as likely give the squared error `target`, in pictures that take no longer than `longest`. Kernels are
+        compiled as a picture is rendered, and others for another number of samples: the first of each is not counted."""
+        self.process.render(PILOT_SPP, seed)
+        seconds, film = self.process.render(PILOT_SPP, seed)
+        needed = PILOT_SPP * statistics.mse_of(statistics.gram([film], truth.pixels), truth.variance) / max(target, 1e-30)
+        self.runs.spp = int(np.clip(round(needed), 1, max(1.0, PILOT_SPP * longest / seconds)))
+        self.process.render(self.runs.spp, seed)
+
+    def picture(self, seed: int) -> None:
+        self.runs.add(*self.process.render(self.runs.spp, seed))
+
+    def time_starts(self, times: int) -> None:
+        """All that a process takes but for tracing, with its first picture at 1 spp, as wrt's process is timed. (It is handed
+        the scene as arrays: reading files is not counted.)"""
+        program = f"import mitsuba as mi; mi.set_variant({self.job.variant!r})"
+        imports = process_seconds(["-c", program], times, environment_of(self.job.variant))
+        rest = [self._load_and_first_picture() for _ in range(times + 1 if times else 0)]
+        self.start = imports + float(np.median(rest[1:])) if times else imports
+
+    def _load_and_first_picture(self) -> float:
+        with MitsubaProcess(self.job) as process:
+            return process.load_seconds + process.render(1, 0)[0]
+
+    def result(self, ours: Side, truth: Reference) -> Rival:
+        side = self.runs.side(truth, self.process.load_seconds, self.start)
+        factor = (side.rmse / ours.rmse) ** 2
+        process_seconds = self.start + factor * float(np.median(side.seconds))
+        return Rival(replace(side, process_seconds=process_seconds), quartiles(factor * side.seconds / ours.seconds),
+                     process_seconds / ours.process_seconds, not side.bias**2 > SAME * ours.rmse**2)
+
+
+class _Rivals:
+    """The variants that can be used, and why the others cannot. Raises NotAvailable where none can."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.stack = stack
+        self.measured: dict[str, _Measured] = {}
+        self.not_available: dict[str, str] = {}
+
+    def start(self, jobs: list[Job]) -> None:
+        for job in jobs:
+            try:
+                self.measured[job.variant] = _Measured(job, self.stack.enter_context(MitsubaProcess(job)))
+            except NotAvailable as error:
+                self._leave_out(job.variant, error)
+
+    def each(self, do: Callable[[_Measured], None]) -> None:
+        for variant, measured in list(self.measured.items()):
+            try:
+                do(measured)
+            except NotAvailable as error:
+                self._leave_out(variant, error)
+
+    def _leave_out(self, variant: str, error: NotAvailable) -> None:
+        self.measured.pop(variant, None)
+        self.not_available[variant] = str(error)
+
+    def check(self) -> None:
+        if not self.measured:
+            raise NotAvailable("; ".join(f"Mitsuba {variant}: {why}" for variant, why in self.not_available.items()))
+
+
 def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = None,
         report: Callable[[str], None] = lambda line: None) -> Result:
     """Measure. command: arguments of `python -m wrt` that render this scene at 1 spp: what a process takes but for tracing
-    (None: not timed).
+    (None: not timed). A variant of Mitsuba that cannot be used is left out, and named in the result.
 
-    Raises InputError where Mitsuba is missing, or cannot draw the scene exactly.
+    Raises InputError where no variant can be used, Mitsuba is missing, or cannot draw the scene exactly.
     """
     scene = scene.with_settings(filter="box")  # the only one whose pixels Mitsuba takes by themselves
     seeds = [int(word) for word in np.random.SeedSequence(plan.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
-    pictures = seeds[REFERENCE_SEEDS:]
-    with mitsuba() as mi:
-        begin = time.perf_counter()
-        translated = to_mitsuba(scene, options.camera, integrator=plan.integrator)
-        load_seconds = time.perf_counter() - begin
-        spp = PILOT_SPP
+    pictures, starts = seeds[REFERENCE_SEEDS:], plan.starts if command else 0
+    threads, ours = thread_count(options.threads), _Runs(plan.spp)
+    with ExitStack() as stack:
+        rivals = _Rivals(stack)
+        report("starting Mitsuba")
+        rivals.start([Job(variant, scene, options.camera, plan.integrator, threads) for variant in dict.fromkeys(plan.variants)])
+        rivals.check()
         report(f"reference: {REFERENCE_SEEDS} seeds")
         truth = make_reference(scene, options, plan.reference_spp or 8 * plan.spp, seeds[:REFERENCE_SEEDS],
                                scene.settings.max_depth)
         renderer = Renderer(scene, options)
 
-        def ours(seed: int) -> np.ndarray:
-            return finished(renderer.run(seed=seed, spp=plan.spp)).pixels
-
-        def theirs(seed: int) -> np.ndarray:
-            return np.array(mi.render(translated, spp=spp, seed=seed % 2**31), dtype=np.float32)
+        def our_picture(seed: int) -> tuple[float, np.ndarray]:
+            begin = time.perf_counter()
+            film = finished(renderer.run(seed=seed, spp=plan.spp)).pixels
+            return time.perf_counter() - begin, film
 
         report("pilot")
-        target = statistics.mse_of(statistics.gram([ours(pictures[0])], truth.pixels), truth.variance)
-        seconds, pilot = timed(theirs, pictures[0])
-        needed = spp * statistics.mse_of(statistics.gram([pilot], truth.pixels), truth.variance) / max(target, 1e-30)
-        spp = int(np.clip(round(needed), 1, max(1.0, PILOT_SPP * plan.rival_seconds / seconds)))
-        times: dict[str, list[float]] = {"wrt": [], "mitsuba": []}
-        films: dict[str, list[np.ndarray]] = {"wrt": [], "mitsuba": []}
+        target = statistics.mse_of(statistics.gram([our_picture(pictures[0])[1]], truth.pixels), truth.variance)
+        rivals.each(lambda rival: rival.choose_spp(pictures[0], truth, target, plan.rival_seconds))
         for turn, seed in enumerate(pictures):
-            for name, job in list({"wrt": ours, "mitsuba": theirs}.items())[:: 1 if turn % 2 == 0 else -1]:
-                report(f"picture {turn + 1} of {plan.repeats}, {name}")
-                seconds, film = timed(job, seed)
-                times[name].append(seconds)
-                films[name].append(film)
-
-    def side(name: str, samples: int, prepare: float, process: float) -> Side:
-        products = statistics.gram(films[name], truth.pixels)
-        bias, below = statistics.bias_with_bound(products, truth.variance)
-        return Side(samples, np.array(times[name]), max(statistics.mse_of(products, truth.variance), 0.0) ** 0.5, bias, below,
-                    prepare, process)
-
-    report("whole processes")
+            report(f"picture {turn + 1} of {plan.repeats}")
+            if turn % 2 == 0:
+                ours.add(*our_picture(seed))
+            rivals.each(partial(_Measured.picture, seed=seed))
+            if turn % 2 == 1:
+                ours.add(*our_picture(seed))
+        report("whole processes")
+        rivals.each(lambda rival: rival.time_starts(starts))
+        rivals.check()
     prepare = sum(renderer.seconds.get(part, 0.0) for part in ("compile", "upload", "build"))
-    starts = plan.starts if command else 0
-    a = side("wrt", plan.spp, prepare, process_seconds(["-m", "wrt", *(command or [])], starts) + float(np.median(times["wrt"])))
-    b = side("mitsuba", spp, load_seconds, float("nan"))
-    factor = (b.rmse / a.rmse) ** 2
-    start = process_seconds(["-c", "import mitsuba as mi; mi.set_variant('scalar_rgb')"], starts) + load_seconds
-    b = replace(b, process_seconds=start + factor * float(np.median(b.seconds)))
-    return Result(scene.name, scene.settings.size, plan.integrator, a, b, quartiles(factor * b.seconds / a.seconds),
-                  b.process_seconds / a.process_seconds, truth)
+    side = ours.side(truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
+    found = {variant: measured.result(side, truth) for variant, measured in rivals.measured.items()}
+    return Result(scene.name, scene.settings.size, plan.integrator, threads, side, found, rivals.not_available, truth)
 
 
-def timed(job: Callable[[int], np.ndarray], seed: int) -> tuple[float, np.ndarray]:
-    begin = time.perf_counter()
-    out = job(seed)
-    return time.perf_counter() - begin, out
-
-
-def process_seconds(arguments: list[str], times: int) -> float:
+def process_seconds(arguments: list[str], times: int, environment: Mapping[str, str] | None = None) -> float:
     """The median wall clock of a Python process; one more run, before, is not counted (kernel caches, files). NaN: no times."""
     seconds = []
     for _ in range(times + 1 if times else 0):
         begin = time.perf_counter()
-        done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
+        done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=environment)
         if done.returncode != 0:
             raise InputError(f"python {' '.join(arguments)} ended with {done.returncode}: {done.stderr.strip()[-300:]}")
         seconds.append(time.perf_counter() - begin)
     return float(np.median(seconds[1:])) if times else float("nan")
 
 
+COLUMNS = ("", "spp", "seconds, tracing", "RMSE", "bias against the reference", "scene and structure, s",
+           "process to wrt's error, s", "times wrt's, tracing", "times wrt's, process")
+
+
 def text(result: Result) -> str:
     """For the terminal and for a report, as Markdown."""
-    rows = ["| | spp | seconds, tracing | RMSE | bias against the reference | scene and structure, s | process to wrt's error, s |",
-            "| --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
-    for name, side in (("wrt", result.wrt), (f"Mitsuba scalar_rgb, {result.integrator}", result.mitsuba)):
-        bias = f"below {side.bias_below:.2g}" if np.isnan(side.bias) else f"{side.bias:.2g}"
-        rows.append(f"| {name} | {side.spp} | {shown(quartiles(side.seconds))} | {side.rmse:.4g} | {bias} | "
-                    f"{side.prepare_seconds:.2f} | {side.process_seconds:.2f} |")
-    told = [f"{result.scene}, {result.size[0]}x{result.size[1]}; the reference's own RMSE is {result.reference.rmse:.2g}.", "",
-            *rows, "", f"To equal error Mitsuba takes {shown(result.ratio)} times as long, tracing alone."]
-    if not np.isnan(result.process_ratio):
-        told.append(f"With start, imports and scene (kernels compiled before): {result.process_ratio:.3g} times.")
-    if not result.same_light:
-        told.append("The pictures are not of the same light: the ratio says nothing. Try --matte, or another --integrator.")
+    lines = [("wrt", *_cells(result.wrt), "1", "1")]
+    for variant, rival in result.mitsuba.items():
+        lines.append((f"Mitsuba {variant}, {result.integrator}", *_cells(rival.side), shown(rival.ratio),
+                      _known(rival.process_ratio, "{:.3g}")))
+    width, height = result.size
+    told = [f"{result.scene}, {width}x{height}, {result.threads} threads; the reference's own RMSE is {result.reference.rmse:.2g}.",
+            "", table(COLUMNS, lines), "", LEGEND]
+    told += [f"Mitsuba {variant} is not available: {why}." for variant, why in result.not_available.items()]
+    told += [f"The picture of {variant} is not of the same light: its ratio says nothing. Try --matte, or another --integrator."
+             for variant, rival in result.mitsuba.items() if not rival.same_light]
     return "\n".join(told)
+
+
+LEGEND = """\
+times wrt's: how many times as long Mitsuba takes to wrt's error, tracing alone (median and quartiles) and as a whole process, with
+start, imports, scene, structure and compiler; what both programs' compilers keep on disk was there before. Mitsuba traces with
+Embree in its robust mode."""
+
+
+def _cells(side: Side) -> tuple[str, ...]:
+    bias = f"below {side.bias_below:.2g}" if np.isnan(side.bias) else f"{side.bias:.2g}"
+    return (str(side.spp), shown(quartiles(side.seconds)), f"{side.rmse:.4g}", bias, f"{side.prepare_seconds:.2f}",
+            _known(side.process_seconds, "{:.2f}"))
+
+
+def _known(value: float, form: str) -> str:
+    return "not timed" if np.isnan(value) else form.format(value)

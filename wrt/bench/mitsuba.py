@@ -1,7 +1,8 @@
 """Mitsuba 3 as an independent oracle and a rival: the same scene, rays and camera, answered by someone else's code.
 
-The variant is always scalar_rgb, which traces with Embree, in its robust mode. `llvm_ad_rgb` would be faster, but with
-an LLVM library that is too old it ends the whole process instead of raising.
+As an oracle the variant is scalar_rgb, in this process; as a rival also llvm_ad_rgb, which is faster, but ends the whole process
+where the LLVM library does not suit it (mitsuba_llvm.py chooses one, mitsuba_process.py is the process). Both trace with Embree,
+which is asked for its robust mode; Mitsuba unasked takes the fast one.
 
 What can be compared exactly (Mitsuba's estimate has the same expectation as wrt's picture):
 - integrator "whitted" (mitsuba_whitted.py): any scene of diffuse, mirror, conductor and glass surfaces;
@@ -37,14 +38,14 @@ FILTERS = ("box", "gaussian", "tent", "mitchell")
 
 
 @contextmanager
-def mitsuba() -> Iterator[Any]:
-    """The module `mitsuba`, its variant set to scalar_rgb while the block runs; InputError where it is missing."""
+def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
+    """The module `mitsuba`, its variant set while the block runs; InputError where it is missing."""
     try:
         mi = importlib.import_module("mitsuba")
     except ImportError as error:
         raise InputError(f'Mitsuba 3 is not usable ({error}); pip install "wrt[peers]" installs it') from error
     before = mi.variant()
-    mi.set_variant(VARIANT)
+    mi.set_variant(variant)
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)  # it warns of every integrator written in Python
     try:
@@ -105,7 +106,7 @@ class Approximations:
 
 
 class Translation(NamedTuple):
-    """scene: the `mitsuba.Scene` (scalar_rgb); parts: shape id -> which object and faces the shape holds."""
+    """scene: the `mitsuba.Scene`; parts: shape id -> which object and faces the shape holds."""
 
     scene: Any
     parts: dict[str, Part]
@@ -120,14 +121,15 @@ def to_mitsuba(scene: Scene, camera: Camera | str | int | None = None, **options
     options: the fields of `Options`. Raises InputError for what cannot be translated, and where Mitsuba is missing.
     """
     with mitsuba() as mi:
-        return _translate(mi, scene, _camera(scene, camera), Options(**options)).scene
+        return translate(mi, scene, camera, Options(**options)).scene
 
 
 def _camera(scene: Scene, camera: Camera | str | int | None) -> Camera:
     return camera if isinstance(camera, Camera) else scene.camera(camera)
 
 
-def _translate(mi: Any, scene: Scene, camera: Camera, options: Options) -> Translation:
+def translate(mi: Any, scene: Scene, camera: Camera | str | int | None, options: Options) -> Translation:
+    """As `to_mitsuba`, for the module `mitsuba` with the variant that it has set."""
     notes = Approximations(options.approximate)
     contents: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True}
     parts: dict[str, Part] = {}
@@ -151,7 +153,7 @@ def _translate(mi: Any, scene: Scene, camera: Camera, options: Options) -> Trans
     _check_light_transport(scene, integrator, notes)
 
     contents["integrator"] = _integrator(mi, integrator, scene, options, lit, parts)
-    contents["sensor"] = _sensor(mi, scene, camera, options, notes)
+    contents["sensor"] = _sensor(mi, scene, _camera(scene, camera), options, notes)
     notes.warn()
     try:
         return Translation(mi.load_dict(contents), parts)
@@ -272,7 +274,7 @@ def render_mitsuba(scene: Scene, camera: Camera | str | int | None = None, **opt
     per_pass = max(1, spp // 32) if choice.filter == "box" else spp
     passes = math.ceil(spp / per_pass)
     with mitsuba() as mi:
-        translated = _translate(mi, scene, _camera(scene, camera), choice).scene
+        translated = translate(mi, scene, camera, choice).scene
         mean: Any = 0.0
         squares: Any = 0.0
         for index in range(passes):  # Welford's update: the sum of squares does not cancel
@@ -369,7 +371,7 @@ def aov_mitsuba(scene: Scene, camera: Camera | str | int | None = None, size: tu
     sizes = [len(thing.mesh.faces) for thing in shapes_only.objects] + [1] * len(shapes_only.spheres)
     first_prim = np.concatenate([[0], np.cumsum(sizes)])
     with mitsuba() as mi:
-        translated = _translate(mi, shapes_only, shapes_only.cameras[0], Options(integrator="path"))
+        translated = translate(mi, shapes_only, shapes_only.cameras[0], Options(integrator="path"))
         start = origin.tolist()
         for index, direction in enumerate(directions.reshape(-1, 3).tolist()):
             hit = translated.scene.ray_intersect(mi.Ray3f(start, direction))
