@@ -197,6 +197,7 @@ class _Rivals:
                 self.measured[job.variant] = _Measured(job, self.stack.enter_context(MitsubaProcess(job)))
             except NotAvailable as error:
                 self._leave_out(job.variant, error)
+        self._check()
 
     def each(self, do: Callable[[_Measured], None]) -> None:
         for variant, measured in list(self.measured.items()):
@@ -204,12 +205,13 @@ class _Rivals:
                 do(measured)
             except NotAvailable as error:
                 self._leave_out(variant, error)
+        self._check()
 
     def _leave_out(self, variant: str, error: NotAvailable) -> None:
         self.measured.pop(variant, None)
         self.not_available[variant] = str(error)
 
-    def check(self) -> None:
+    def _check(self) -> None:
         if not self.measured:
             raise NotAvailable("; ".join(f"Mitsuba {variant}: {why}" for variant, why in self.not_available.items()))
 
@@ -229,7 +231,6 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
         rivals = _Rivals(stack)
         report("starting Mitsuba")
         rivals.start([Job(variant, scene, options.camera, plan.integrator, threads) for variant in dict.fromkeys(plan.variants)])
-        rivals.check()
         report(f"reference: {REFERENCE_SEEDS} seeds")
         truth = make_reference(scene, options, plan.reference_spp or 8 * plan.spp, seeds[:REFERENCE_SEEDS],
                                scene.settings.max_depth)
@@ -252,7 +253,6 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
                 ours.add(*our_picture(seed))
         report("whole processes")
         rivals.each(lambda rival: rival.time_starts(starts))
-        rivals.check()
     prepare = sum(renderer.seconds.get(part, 0.0) for part in ("compile", "upload", "build"))
     side = ours.side(truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
     found = {variant: measured.result(side, truth) for variant, measured in rivals.measured.items()}
