@@ -3,7 +3,7 @@
 import warp as wp
 
 from wrt.kernels.sampling import disk, polygon
-from wrt.kernels.structs import Camera, Ray
+from wrt.kernels.structs import Camera, Ray, make_ray
 
 
 @wp.func
@@ -29,12 +29,7 @@ def make_camera_ray(lens: bool, blades: bool):
         the chief ray at distance s = focus_distance along the axis. The ray then goes from the lens sample L to S.
         """
         chief = chief_ray(camera, film)
-        ray = Ray()
-        ray.t_min = 0.0
-        ray.t_max = float(wp.inf)
-        ray.exclude = -1
-        ray.origin = camera.origin
-        ray.direction = wp.normalize(chief)
+        ray = make_ray(camera.origin, wp.normalize(chief))
         if wp.static(lens):
             sample = disk(xi)
             if wp.static(blades):

@@ -4,7 +4,7 @@ import warp as wp
 
 from wrt.kernels.materials import DIFFUSE, Scatter, blinn_phong
 from wrt.kernels.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, hash_pair, make_sample_2d, search_cdf, triangle
-from wrt.kernels.structs import Background, Light, Lighting, Material, Ray, Surfaces, gamma
+from wrt.kernels.structs import Background, Light, Lighting, Material, Ray, Surfaces, gamma, make_ray
 from wrt.kernels.surface import (
     Surface,
     make_place_of,
@@ -282,14 +282,9 @@ def shadow_ray(s: Surface, sample: LightSample) -> Ray:
     A light with an area ends it a little earlier: the rounding of the segment's direction and of t, some 16 steps, grows with
     the distance, and not with the light's own error bound.
     """
-    ray = Ray()
-    ray.origin = spawn_point(s.point, s.error, s.geometric, sample.wi)
-    ray.t_min = 0.0
-    ray.exclude = s.exclude
-    if sample.distant != 0:
-        ray.direction = sample.wi
-        ray.t_max = float(wp.inf)
-    else:
+    ray = make_ray(spawn_point(s.point, s.error, s.geometric, sample.wi), sample.wi)
+    ray.exclude_plus_one = s.exclude_plus_one
+    if sample.distant == 0:
         ray.direction = sample.end - ray.origin
         ray.t_max = wp.where(sample.area != 0, 1.0 - gamma(32.0), 1.0)
     return ray

@@ -88,7 +88,7 @@ SET_UP = """
     const F inverse = longest > 0x1p64f ? up : (longest < 0x1p-64f ? down : one);
     dx = by * dx; dy = by * dy; dz = by * dz;
     t_min = t_min * inverse + 0.0f;
-    t_max = t_max * inverse;
+    t_max = (t_max > largest ? largest : t_max) * inverse;
     // kernels.traverse.no_hit
     const F zero_x = 0.0f * ox + 0.0f * dx, zero_y = 0.0f * oy + 0.0f * dy, zero_z = 0.0f * oz + 0.0f * dz;
     t_max = zero_x + zero_y + zero_z == 0.0f ? t_max : nothing;
@@ -381,7 +381,7 @@ WRITE_HITS = """
     const F far = __builtin_inff();
     const I id = *(const I*)(q + PRIM_ID), none = -1;
     const F scaled = row(T) * row(SCALE), at = id == 0x7FFFFFFF ? far : scaled;
-    const I told = at < far ? id : none;
+    const I told = id == 0x7FFFFFFF ? none : id;
     if (count == 16) {
         *(F*)(hits.t.data + first) = at;
         *(F*)(hits.u.data + first) = row(U);

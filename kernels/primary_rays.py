@@ -3,7 +3,7 @@
 import warp as wp
 
 from wrt.kernels.camera import chief_ray
-from wrt.kernels.structs import Camera, Ray, Surfaces, Tile, kernel
+from wrt.kernels.structs import Camera, Surfaces, Tile, kernel, make_ray
 
 
 def make_primary_rays_kernel(accel_struct, closest_hit):
@@ -23,13 +23,8 @@ def make_primary_rays_kernel(accel_struct, closest_hit):
         tid = wp.tid()
         x = tile.x + tid % tile.width
         y = tile.y + tid / tile.width
-        ray = Ray()
-        ray.origin = camera.origin
         position = wp.vec2((float(x) + 0.5) / float(width), (float(y) + 0.5) / float(height))
-        ray.direction = wp.normalize(chief_ray(camera, position))
-        ray.t_min = 0.0
-        ray.t_max = float(wp.inf)
-        ray.exclude = -1
+        ray = make_ray(camera.origin, wp.normalize(chief_ray(camera, position)))
         hit = closest_hit(accel, surfaces, ray)
         depth[y * width + x] = hit.t
         prim_id[y * width + x] = hit.prim_id

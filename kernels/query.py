@@ -2,9 +2,11 @@
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Ray, Surfaces, kernel
+from wrt.kernels.structs import NO_HIT, Ray, Surfaces, kernel, make_ray
 from wrt.kernels.surface import spawn_point
 from wrt.kernels.traverse import make_intersect, make_probe, no_hit
+
+LARGEST = wp.constant(3.4028234663852886e38)  # of float32
 
 
 @wp.struct
@@ -42,15 +44,17 @@ def direction_scale(direction: wp.vec3) -> float:
 
 @wp.func
 def load_ray(rays: RayArrays, i: int) -> Ray:
-    """Ray i in units of its scaled direction: t times `direction_scale` is in the caller's."""
+    """Ray i in units of its scaled direction: t times `direction_scale` is in the caller's.
+
+    The segment ends where t in the caller's units would be beyond float32, so that no traversal finds what cannot be told.
+    """
     scale = direction_scale(rays.direction[i])
     inverse = wp.where(scale > 1.0, wp.static(2.0**-96), wp.where(scale < 1.0, wp.static(2.0**96), 1.0))
     ray = Ray()
     ray.origin = rays.origin[i]
     ray.direction = scale * rays.direction[i]
     ray.t_min = rays.t_min[i] * inverse
-    ray.t_max = rays.t_max[i] * inverse
-    ray.exclude = -1
+    ray.t_max = wp.where(rays.t_max[i] > LARGEST, LARGEST, rays.t_max[i]) * inverse
     ray.slot = i
     return ray
 
@@ -63,17 +67,16 @@ def make_closest_hit_kernel(accel_struct, traverse):
         i = first + wp.tid()
         scale = direction_scale(rays.direction[i])
         hit = traverse(accel, surfaces, load_ray(rays, i))
-        t = hit.t * scale
-        hits.t[i] = t
+        hits.t[i] = hit.t * scale
         hits.u[i] = hit.u
         hits.v[i] = hit.v
-        hits.prim_id[i] = wp.where(t < wp.inf, hit.prim_id, -1)
+        hits.prim_id[i] = hit.prim_id
 
     return closest_hit
 
 
 def make_any_hit_kernel(accel_struct, traverse):
-    """As closest_hit, but only whether there is one (also beyond float32)."""
+    """As closest_hit, but only whether there is one."""
 
     @kernel
     def any_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, dark: wp.array(dtype=wp.bool), first: int):
@@ -113,12 +116,8 @@ def make_respawn_kernel(accel_struct, traverse, surface_at):
             d = out.direction[i]
             if hit.prim_id >= surfaces.n_triangles and wp.dot(d, outward) < 0.0:
                 d = -d
-            next = Ray()
-            next.origin = spawn_point(s.point, s.error, s.geometric, d)
-            next.direction = d
-            next.t_min = 0.0
-            next.t_max = float(wp.inf)
-            next.exclude = wp.where(out.exclude != 0, s.exclude, -1)
+            next = make_ray(spawn_point(s.point, s.error, s.geometric, d), d)
+            next.exclude_plus_one = wp.where(out.exclude != 0, s.exclude_plus_one, 0)
             out.next_prim_id[i] = traverse(accel, surfaces, next).prim_id
 
     return respawn

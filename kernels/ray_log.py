@@ -27,7 +27,7 @@ class LoggedRay:
     direction: wp.vec3
     t_min: float
     t_max: float
-    exclude: int
+    exclude_plus_one: int
     label: int
     any_hit: int
     hit: int
@@ -75,7 +75,7 @@ def make_traversal(accel_struct, traverse, any_hit):
         entry.direction = ray.direction
         entry.t_min = ray.t_min
         entry.t_max = ray.t_max
-        entry.exclude = ray.exclude
+        entry.exclude_plus_one = ray.exclude_plus_one
         entry.label = ray.slot
         entry.any_hit = wp.static(1 if any_hit else 0)
         hit = traverse(accel.accel, surfaces, numbered)

@@ -5,7 +5,7 @@ import warp as wp
 from wrt.kernels.camera import chief_ray, make_camera_ray
 from wrt.kernels.materials import make_cutout, make_shade
 from wrt.kernels.sampling import hash_pair, make_sample_2d
-from wrt.kernels.structs import AovFilm, Camera, Film, Lighting, Limits, Ray, Surfaces, Tile, kernel
+from wrt.kernels.structs import AovFilm, Camera, Film, Lighting, Limits, Surfaces, Tile, kernel, make_ray
 from wrt.kernels.whitted import make_radiance
 
 
@@ -101,13 +101,8 @@ def make_aov_kernel(features, structure):
         x = tile.x + tid % tile.width
         y = tile.y + tid / tile.width
         pixel = (y - film.y) * film.columns + x - film.x
-        ray = Ray()
-        ray.origin = camera.origin
         position = wp.vec2((float(x) + 0.5) / float(film.width), (float(y) + 0.5) / float(film.height))
-        ray.direction = wp.normalize(chief_ray(camera, position))
-        ray.t_min = 0.0
-        ray.t_max = float(wp.inf)
-        ray.exclude = -1
+        ray = make_ray(camera.origin, wp.normalize(chief_ray(camera, position)))
         hit = closest_hit(accel, surfaces, ray)
         film.depth[pixel] = hit.t
         film.prim_id[pixel] = hit.prim_id

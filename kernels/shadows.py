@@ -150,7 +150,7 @@ def make_transmittance(features, accel_struct, closest_hit, any_hit):
             if wp.max(now.transmittance) <= 0.0:
                 return out
             ray.origin = spawn_point(s.point, s.error, s.geometric, d)
-            ray.exclude = s.exclude
+            ray.exclude_plus_one = s.exclude_plus_one
             if ray.t_max <= 1.0:
                 ray.direction = end - ray.origin
                 if wp.dot(ray.direction, d) <= 0.0:  # the light is within the surface's rounding error

@@ -33,18 +33,32 @@ def gamma(n: float) -> float:
 class Ray:
     """The points origin + t * direction for t_min <= t <= t_max; direction need not be of unit length.
 
-    exclude: a triangle that is not hit, because the ray starts on it (a plane is crossed once), or -1. slot: the row of the
-    counters that this ray adds to, where they are compiled in. first_prim: what an instance adds to its primitives' numbers,
-    where there are instances.
+    `make_ray` makes one that meets all that is before its origin. Ray() is all zeros: its segment ends where it begins, and
+    t_max has to be set. exclude_plus_one: 1 + the prim_id of a triangle that is not hit, because the ray starts on it (a plane is
+    crossed once); 0: none is left out. slot: the row of the counters that this ray adds to, where they are compiled in.
+    first_prim: what an instance adds to its primitives' numbers, where there are instances.
     """
 
     origin: wp.vec3
     direction: wp.vec3
     t_min: float
     t_max: float
-    exclude: int
+    exclude_plus_one: int
     slot: int
     first_prim: int
+
+
+@wp.func
+def make_ray(origin: wp.vec3, direction: wp.vec3) -> Ray:
+    """The ray from origin to infinity (t_min = 0, t_max = inf), which leaves nothing out. World space; direction of any length
+    between 2^-64 and 2^64 (kernels.query.direction_scale brings others there)."""
+    ray = Ray()
+    ray.origin = origin
+    ray.direction = direction
+    ray.t_min = 0.0
+    ray.t_max = float(wp.inf)
+    ray.exclude_plus_one = 0
+    return ray
 
 
 @wp.struct

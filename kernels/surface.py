@@ -12,7 +12,7 @@ class Surface:
 
     error: bound on the point's rounding error, per axis; geometric: unit normal of the flat triangle (or the sphere), on the
     ray's side; shading: the interpolated one, on that side too; front: the ray comes from outside (counter-clockwise);
-    exclude: the triangle that rays from here need not be tested against, -1 on a sphere.
+    exclude_plus_one: 1 + the triangle that rays from here need not be tested against, 0 on a sphere.
     tangent: unit vector along growing u, not necessarily at right angles to the normal; bitangent_sign: -1 where the texture
     is mirrored, else 1.
     """
@@ -26,7 +26,7 @@ class Surface:
     uv: wp.vec2
     material: int
     front: int
-    exclude: int
+    exclude_plus_one: int
 
 
 @wp.func
@@ -252,7 +252,7 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
         if not wp.dot(s.shading, s.shading) > 0.0:
             s.shading = s.geometric
         s.material = place.material
-        s.exclude = wp.where(hit.prim_id < surfaces.n_triangles, hit.prim_id, -1)
+        s.exclude_plus_one = wp.where(hit.prim_id < surfaces.n_triangles, hit.prim_id + 1, 0)
         s.front = 1
         # A smooth normal belongs to the outside, which the winding defines: both are turned together, and a normal that
         # disagrees with the winding by more than a right angle is brought to the winding's side.

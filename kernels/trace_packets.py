@@ -93,7 +93,6 @@ def probe_at(packet: wp.array(dtype=wp.float32), ray: int) -> Probe:
     probe.ray.origin = vector(packet, ray + wp.static(ROW["origin_x"]))
     probe.ray.direction = vector(packet, ray + wp.static(ROW["direction_x"]))
     probe.ray.t_min = number(packet, ray + wp.static(ROW["t_min"]))
-    probe.ray.exclude = -1
     probe.box.origin = probe.ray.origin
     probe.box.inv_dir = vector(packet, ray + wp.static(ROW["inverse_x"]))
     probe.box.t_min = probe.ray.t_min

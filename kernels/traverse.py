@@ -94,7 +94,7 @@ def make_intersect(units: Units, accepts=None):
             return best
         if hit.t == best.t and prim_id > best.prim_id:
             return best
-        if prim_id == probe.ray.exclude:
+        if prim_id + 1 == probe.ray.exclude_plus_one:
             return best
         if wp.static(accepts is not None):
             if not accepts(surfaces, prim_id, hit.u, hit.v):

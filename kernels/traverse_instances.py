@@ -104,7 +104,7 @@ def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
     )
     out.t_min = float(wp.float64(ray.t_min) / scale)
     out.t_max = float(wp.float64(ray.t_max) / scale)
-    out.exclude = ray.exclude
+    out.exclude_plus_one = ray.exclude_plus_one
     out.slot = ray.slot
     out.first_prim = place.first_prim
     return out

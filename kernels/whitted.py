@@ -22,7 +22,7 @@ from wrt.kernels.materials import BLEND, Scatter, make_is_solid, make_scatter, m
 from wrt.kernels.ray_log import label
 from wrt.kernels.sampling import hash_pair, make_sample_2d
 from wrt.kernels.shadows import MAX_TRANSPARENT, OUTSIDE, Shadow, attenuation, make_transmittance
-from wrt.kernels.structs import Lighting, Limits, Material, Ray, Surfaces
+from wrt.kernels.structs import Lighting, Limits, Material, Ray, Surfaces, make_ray
 from wrt.kernels.surface import Surface, spawn_point
 
 MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
@@ -36,8 +36,8 @@ def make_path(counting):
     @wp.struct
     class Path:
         """How much its light counts, how many bounces it has behind it and how many surfaces in a row it went straight
-        through, which solid glass it is in (a material, OUTSIDE or UNKNOWN), its samples' key, the triangle that it starts on,
-        and where rays are counted the branch that made it (0: the camera)."""
+        through, which solid glass it is in (a material, OUTSIDE or UNKNOWN), its samples' key, 1 + the triangle that it starts
+        on (0: none), and where rays are counted the branch that made it (0: the camera)."""
 
         origin: wp.vec3
         direction: wp.vec3
@@ -45,7 +45,7 @@ def make_path(counting):
         depth: int
         passed: int
         medium: int
-        exclude: int
+        exclude_plus_one: int
         key: wp.uint32
         if counting:
             branch: int
@@ -145,7 +145,7 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
         out.throughput = throughput
         out.depth = path.depth + 1
         out.medium = path.medium
-        out.exclude = s.exclude
+        out.exclude_plus_one = s.exclude_plus_one
         out.key = hash_pair(path.key, wp.uint32(branch))
         if wp.static(counting):
             out.branch = branch
@@ -211,7 +211,6 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
         path.direction = camera_ray.direction
         path.throughput = wp.vec3(1.0, 1.0, 1.0)
         path.medium = UNKNOWN
-        path.exclude = -1
         path.key = key
         stack[0] = path
         size = int(1)
@@ -219,12 +218,8 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
         while size > 0:
             size = size - 1
             path = stack[size]
-            ray = Ray()
-            ray.origin = path.origin
-            ray.direction = path.direction
-            ray.t_min = 0.0
-            ray.t_max = float(wp.inf)
-            ray.exclude = path.exclude
+            ray = make_ray(path.origin, path.direction)
+            ray.exclude_plus_one = path.exclude_plus_one
             if wp.static(counting):
                 ray.slot = label(path.branch, path.depth)
             out.rays += 1

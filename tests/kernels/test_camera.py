@@ -35,7 +35,7 @@ def rays(camera, size, film, xi=None):
     out = zeros(len(film), Ray)
     launch(camera_kernel(lens, blades), len(film), camera_struct(camera, size), vec2s(film), vec2s(xi), out)
     out = out.numpy()
-    assert (out["t_min"] == 0.0).all() and np.isinf(out["t_max"]).all() and (out["exclude"] == -1).all()
+    assert (out["t_min"] == 0.0).all() and np.isinf(out["t_max"]).all() and (out["exclude_plus_one"] == 0).all()
     origin, direction = out["origin"].astype(np.float64), out["direction"].astype(np.float64)
     assert np.abs(np.linalg.norm(direction, axis=1) - 1.0).max() < 1e-6
     return origin, direction

@@ -55,7 +55,6 @@ def light_kernel(features):
         s.point = point[i]
         s.geometric = n[i]
         s.shading = n[i]
-        s.exclude = -1
         if light < lighting.count:
             out[i] = light_sample(lighting, surfaces, lighting.lights[light], s, xi[i])
         else:

@@ -11,7 +11,7 @@ import warp as wp
 from wrt.accel import ACCELERATORS, Structure, build
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
 from wrt.kernels.ray_triangle import RAY_TRIANGLE
-from wrt.kernels.structs import Surfaces
+from wrt.kernels.structs import Ray, Surfaces, kernel, make_ray
 from wrt.mesh import Mesh
 
 TRIANGLE = Mesh([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], [[0, 1, 2]])
@@ -80,9 +80,81 @@ def test_t_scales_with_the_direction_and_nothing_else_does(power, triangle):
     np.testing.assert_array_equal(hits.u, reference.u)
 
 
-def test_a_hit_whose_t_is_beyond_float32_is_a_miss_but_dark():
-    accel = build(TRIANGLE, "bvh")
-    origin, direction = [[0.0, 0.0, -2.0], [0.0, 0.0, -2.0**-40]], [[0.0, 0.0, 2.0**-140]] * 2
-    hits = accel.closest_hit(origin, direction)
-    assert hits.prim_id.tolist() == [-1, 0] and hits.t.tolist() == [np.inf, 2.0**100]
-    assert accel.any_hit(origin, direction).tolist() == [True, True]
+LARGEST = np.finfo(np.float32).max
+
+
+@pytest.mark.parametrize("name", [name for name, _ in STRUCTURES])
+@pytest.mark.parametrize("t_max", [np.inf, LARGEST, 2.0**127])
+def test_a_hit_whose_t_is_beyond_float32_is_none(name, t_max):
+    # t = 2^128, beyond by half a step; the last number there is; one step less; 2^127; far within; beyond by a lot.
+    distance = np.array([1.0, 1.0 - 2.0**-24, 1.0 - 2.0**-23, 0.5, 2.0**-40, 2.0**12]) * 2.0**-12
+    expected = distance.astype(np.float64) * 2.0**140
+    origin = np.stack([0.0 * distance, 0.0 * distance, -distance], axis=1)
+    direction = np.tile([0.0, 0.0, 2.0**-140], (6, 1))
+    for copies in (1, 16):  # a packet takes sixteen rays alike
+        accel = build(TRIANGLE, name)
+        o, d = np.repeat(origin, copies, axis=0), np.repeat(direction, copies, axis=0)
+        found = np.repeat(expected <= min(t_max, LARGEST), copies)
+        hits = accel.closest_hit(o, d, t_max=t_max)
+        assert np.array_equal(hits.prim_id >= 0, found) and found.any() and not found.all()
+        assert np.array_equal(hits.t, np.where(found, np.repeat(expected, copies), np.inf).astype(np.float32))
+        assert np.array_equal(accel.any_hit(o, d, t_max=t_max), found)
+        assert not hits.u[~found].any() and not hits.v[~found].any()
+
+
+@pytest.mark.parametrize("name", [name for name, _ in STRUCTURES])
+def test_any_hit_and_closest_hit_agree_on_rays_of_any_length(name):
+    # Two triangles, so that what is found first may be beyond float32 and the other not.
+    rng = np.random.default_rng(4)
+    near = np.concatenate([TRIANGLE.vertices, TRIANGLE.vertices + [0.0, 0.0, 3.0]])
+    n = 4000
+    origin = np.stack([*rng.uniform(-0.6, 0.6, (2, n)), -(10.0 ** rng.uniform(-4, 2, n))], axis=1)
+    direction = np.stack([0.1 * rng.normal(size=n), 0.1 * rng.normal(size=n), rng.choice([-1.0, 1.0], n)], axis=1)
+    direction = (direction * 2.0 ** rng.uniform(-140, -120, (n, 1))).astype(np.float32)
+    direction[~direction.any(axis=1), 2] = 1e-45
+    accel = build(Mesh(near, [[0, 1, 2], [3, 4, 5]]), name)
+    for t_min, t_max in ((0.0, np.inf), (1e37, np.inf), (0.0, 3e38)):
+        hits = accel.closest_hit(origin, direction, t_min, t_max)
+        assert np.array_equal(accel.any_hit(origin, direction, t_min, t_max), hits.prim_id >= 0)
+        assert np.array_equal(np.isfinite(hits.t), hits.prim_id >= 0)
+        assert 500 < (hits.prim_id >= 0).sum() < 3500
+
+
+@kernel
+def ray_defaults(origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.vec3), out: wp.array(dtype=Ray)):
+    i = wp.tid()
+    out[i] = wp.where(i == 0, Ray(), make_ray(origin[i], direction[i]))
+
+
+def test_make_ray_goes_to_infinity_and_leaves_nothing_out():
+    out = zeros(2, Ray)
+    wp.launch(ray_defaults, dim=2, inputs=[vec3s(np.ones((2, 3))), vec3s(np.full((2, 3), 2.0)), out], device=CPU)
+    zero, ray = out.numpy()
+    assert (ray["origin"] == 1.0).all() and (ray["direction"] == 2.0).all()
+    assert ray["t_min"] == 0.0 and ray["t_max"] == np.inf and ray["exclude_plus_one"] == ray["slot"] == ray["first_prim"] == 0
+    assert zero["t_max"] == 0.0 and zero["exclude_plus_one"] == 0
+
+
+@pytest.mark.parametrize(("name", "cls"), STRUCTURES)
+def test_a_ray_with_nothing_said_of_it_leaves_no_triangle_out(name, cls):
+    # As somebody writes a kernel of his own: triangle 0 is hit, unless it is left out by its number + 1.
+    structure = Structure(cls)
+    struct, traverse = structure.struct, structure.traversal(any_hit=False)
+
+    @kernel
+    def own(accel: struct, known: Surfaces, origin: wp.array(dtype=wp.vec3), prim_id: wp.array(dtype=wp.int32)):
+        i = wp.tid()
+        direction = wp.vec3(0.0, 0.0, 1.0)
+        ray = Ray()
+        ray.origin = origin[0]
+        ray.direction = direction
+        ray.t_max = float(wp.inf)
+        if i == 1:
+            ray = make_ray(origin[0], direction)
+        if i > 1:
+            ray.exclude_plus_one = i - 1
+        prim_id[i] = traverse(accel, known, ray).prim_id
+
+    found = zeros(4, wp.int32)
+    wp.launch(own, dim=4, inputs=[build(TRIANGLE, name).data, surfaces(), vec3s([[0.0, 0.0, -2.0]]), found], device=CPU)
+    assert found.numpy().tolist() == [0, 0, -1, 0]

@@ -111,7 +111,7 @@ def test_flat_normals_and_points_at_any_scale(scale):
     assert np.abs(found["geometric"] - facing)[sound].max() < 1e-4
     assert np.array_equal(found["geometric"], found["shading"])
     assert ((found["geometric"] * direction).sum(axis=1) <= 0.0).all()
-    assert np.array_equal(found["exclude"], hits.prim_id)
+    assert np.array_equal(found["exclude_plus_one"], hits.prim_id + 1)
     w = np.stack([1.0 - hits.u.astype(np.float64) - hits.v, hits.u, hits.v], axis=1)
     point = np.einsum("ni,nij->nj", w, corner)
     assert (np.abs(found["point"].astype(np.float64) / scale - point) <= found["error"].astype(np.float64) / scale).all()
@@ -221,7 +221,7 @@ def test_spheres(ball):
     outward = np.where(found["front"][:, None] != 0, found["geometric"], -found["geometric"])
     assert np.abs(outward - unit(from_center)).max() < max(reach, 1e-6)
     assert ((found["geometric"] * direction).sum(axis=1) <= 1e-6 * np.linalg.norm(direction, axis=1)).all()
-    assert (found["exclude"] == -1).all()
+    assert (found["exclude_plus_one"] == 0).all()
 
 
 def test_sphere_coordinates():

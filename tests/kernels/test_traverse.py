@@ -311,7 +311,7 @@ def refusing_kernels(name):
     def excluding(accel: struct, surfaces: Surfaces, rays: RayArrays, exclude: wp.array(dtype=wp.int32), hits: HitArrays):
         i = wp.tid()
         ray = load_ray(rays, i)
-        ray.exclude = exclude[i]
+        ray.exclude_plus_one = exclude[i] + 1
         hit = closest(accel, surfaces, ray)
         hits.t[i] = hit.t
         hits.prim_id[i] = hit.prim_id

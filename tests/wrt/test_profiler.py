@@ -106,7 +106,7 @@ def test_costs_are_those_of_a_walk_in_python(measured: Profile) -> None:
     assert set(table.kind[chosen]) == {KINDS.index("primary"), KINDS.index("reflection")}
     entries = table.rays[chosen]
     for row, entry, ray in zip(chosen, entries, rays(accel.geometry, entries["origin"], entries["direction"]), strict=True):
-        ray.hits.pop(int(entry["exclude"]), None)
+        ray.hits.pop(int(entry["exclude_plus_one"]) - 1, None)
         walk = walk_of(accel, ray)
         names = [name for name in COUNTERS if hasattr(walk, name)]
         assert {name: int(table.counts[name][row]) for name in names} == {name: getattr(walk, name) for name in names}
