@@ -27,6 +27,15 @@ def test_entries_become_what_they_name() -> None:
         table.check("float")
 
 
+def test_names_are_shown_whatever_was_imported() -> None:
+    table: Registry[type] = Registry("number", {"fraction": "fractions:Fraction", "decimal": "decimal:Decimal"})
+    before = repr(table)
+    assert before == str(table) == "Registry(number: fraction, decimal)"
+    assert table["decimal"] and repr(table) == before
+    table["own"] = int
+    assert repr(table) == "Registry(number: fraction, decimal, own)"
+
+
 def test_a_render_imports_only_its_own_structure() -> None:
     code = ("import sys, wrt; from wrt.shapes import icosphere; wrt.build(icosphere(1)); "
             "print(*(name for name in sys.modules if name.startswith('wrt.')))")

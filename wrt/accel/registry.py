@@ -27,6 +27,9 @@ class Registry(dict[str, T]):
             self[name] = thing
         return thing
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.kind}: {', '.join(self)})"
+
     def check(self, name: str) -> None:
         """Raise InputError where there is nothing of that name."""
         if name not in self:
