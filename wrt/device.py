@@ -4,28 +4,56 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import operator
 import os
 import shutil
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, wraps
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
 
+from wrt.arguments import shown
 from wrt.errors import InputError
 from wrt.memory import available
 
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
 
 wp.config.log_level = wp.LOG_WARNING if hasattr(wp, "LOG_WARNING") else 30
+
+
+T = TypeVar("T")
+_making = threading.RLock()
+
+
+def made_once(make: Callable[..., T]) -> Callable[..., T]:
+    """functools.cache for what several threads may ask for first: one of them makes it, and the others wait for that one.
+
+    Two kernels of the same code would be compiled twice, and two structs of the same fields are different types to Warp.
+    """
+    known: dict[tuple[Any, ...], T] = {}
+
+    @wraps(make)
+    def asked(*key: Any) -> T:
+        try:
+            return known[key]
+        except KeyError:
+            pass
+        with _making:
+            if key not in known:
+                known[key] = make(*key)
+            return known[key]
+
+    return asked
 
 
 @contextmanager
@@ -48,7 +76,7 @@ def _stderr_without(text: bytes) -> Iterator[None]:
             os.write(2, b"".join(line for line in held.read().splitlines(keepends=True) if text not in line))
 
 
-@cache
+@made_once
 def start(device: str) -> Any:
     """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are."""
     with _stderr_without(b"NVIDIA CUDA driver"):  # where there is no GPU, it says so each time
@@ -75,18 +103,32 @@ def free_memory(device: Any) -> float:
     return float(device.free_memory) if device.is_cuda else available()
 
 
-_loaded: WeakKeyDictionary[Any, set[str]] = WeakKeyDictionary()  # names of devices; Warp would look at files again each time
+class _Loaded:
+    """On which devices (their names) a kernel is loaded; Warp would look at files again each time."""
+
+    def __init__(self) -> None:
+        self.devices: set[str] = set()
+        self.lock = threading.Lock()
+
+
+_loaded: WeakKeyDictionary[Any, _Loaded] = WeakKeyDictionary()
 
 
 def load_kernel(kernel: Any, device: Any) -> None:
-    """Compile a kernel, or take it from the cache, before threads launch it.
+    """Compile a kernel, or take it from the cache, before threads launch it. One thread compiles it; others that ask wait.
 
     The CPU launches with blocks of one thread; the module's default block size would be compiled for nothing. Raises InputError
     where the cache's folder has no room or cannot be written to.
     """
-    devices = _loaded.setdefault(kernel, set())
-    if device.alias in devices:
-        return
+    loaded = _loaded.get(kernel) or _loaded.setdefault(kernel, _Loaded())
+    if device.alias not in loaded.devices:
+        with loaded.lock:
+            if device.alias not in loaded.devices:
+                _load(kernel, device)
+                loaded.devices.add(device.alias)
+
+
+def _load(kernel: Any, device: Any) -> None:
     block_dim = 1 if device.is_cpu else None
     try:
         if device.is_cpu:
@@ -95,7 +137,6 @@ def load_kernel(kernel: Any, device: Any) -> None:
     except OSError as error:
         raise InputError(f"a kernel cannot be compiled: {error.strerror or error} (WARP_CACHE_PATH names another folder)",
                          wp.config.kernel_cache_dir) from error
-    devices.add(device.alias)
 
 
 def _require_room_to_compile(cache: Path, name: str) -> None:
@@ -146,11 +187,14 @@ def records(struct: Any, count: int) -> np.ndarray:
 
 
 def thread_count(threads: int | None) -> int:
-    """The number of threads to use: as given, or one a core that this process may run on."""
+    """The number of threads to use: as given, or one a core that this process may run on. Raises InputError for what is no
+    number of threads."""
     if threads is not None:
+        if isinstance(threads, bool) or not hasattr(threads, "__index__"):
+            raise InputError(f"threads must be a whole number, got {shown(threads)}")
         if threads < 1:
             raise InputError(f"threads must be 1 or more, got {threads}")
-        return threads
+        return operator.index(threads)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 

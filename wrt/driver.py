@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import nullcontext
 from dataclasses import asdict
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ import wrt
 from wrt.accel import ACCELERATORS, Structure, build, tells_progress
 from wrt.arguments import unknown
 from wrt.checkpoint import Checkpoint
-from wrt.device import free_memory, load_kernel, start, thread_count
+from wrt.device import free_memory, load_kernel, made_once, start, thread_count
 from wrt.device_film import BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS, AovFilm, DeviceFilm
 from wrt.device_scene import camera_struct, upload_scene
 from wrt.errors import InputError
@@ -86,12 +86,12 @@ def renderer_of(scene: Scene, options: Options) -> Renderer:
     return SpreadRenderer(scene, options)
 
 
-@cache
+@made_once
 def render_kernel(features: Features, structure: Structure) -> Any:
     return kernels.make_render_kernel(features, structure)
 
 
-@cache
+@made_once
 def aov_kernel(features: Features, structure: Structure) -> Any:
     return kernels.make_aov_kernel(features, structure)
 

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from warp._src import context  # there is no public way to ask whether a tape records
 
 from wrt.arguments import shown
 from wrt.errors import InputError
 
 DLPACK_CPU = 1
+REAL = "iufO"  # NumPy's kinds of real numbers, and objects such as fractions: no bool, complex, text or date
 
 
 def to_numpy(array: Any) -> np.ndarray:
@@ -27,6 +29,29 @@ def to_warp(array: Any, dtype: Any = None) -> Any:
         return array
     array = np.ascontiguousarray(array)
     return wp.array(array, dtype=dtype or wp.dtype_from_numpy(array.dtype), device="cpu", copy=not array.flags.writeable)
+
+
+def real_numbers(value: Any, name: str, shape: str) -> np.ndarray:
+    """A contiguous float32 array of what somebody gives as real numbers: arrays of integers or floats of any size, lists, scalars;
+    what is beyond float32 becomes infinite. Raises InputError that calls it `name`, and says that `shape` was expected."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise InputError(f"{name} must not be a masked array: its mask would be ignored; leave masked rows out, or fill them")
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind in REAL:
+            with np.errstate(over="ignore"):
+                return np.asarray(array, dtype=np.float32, order="C")
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise InputError(f"{name} must be {shape} of real numbers, got {shown(value)}")
+
+
+def check_no_gradients(**arrays: Any) -> None:
+    """Raise InputError that names the Warp array of which a tape would wait for gradients: there are none."""
+    for name, array in arrays.items():
+        if isinstance(array, wp.array) and array.requires_grad and context.runtime.tape is not None:
+            raise InputError(f"{name} requires gradients and a wp.Tape is recording, but wrt has no gradients: ask outside of the"
+                             f" tape, or give wp.clone({name}, requires_grad=False)")
 
 
 def taken(value: Any, name: str) -> Any:

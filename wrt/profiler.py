@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel import Structure
+from wrt.accel.base import copied
 from wrt.cache_sim import distinct_lines
 from wrt.device import free_memory, run_all, upload
 from wrt.device_film import DeviceFilm
@@ -197,9 +198,7 @@ class Profiler(Renderer):
         run_all([task(item) for item in items], 1 if self.device.is_cuda else self.threads)
 
     def _run(self, tile: Rectangle, film: int, recorder: Any, log: Any) -> None:
-        data = self.logged.inner.struct()  # a copy, since every tile has a recorder of its own
-        for name in data._cls.vars:
-            setattr(data, name, getattr(self.accel.data, name))
+        data = copied(self.accel.data)  # since every tile has a recorder of its own
         data.recorder = recorder
         accel = self.logged.struct()
         accel.accel, accel.log = data, log

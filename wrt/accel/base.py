@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from copy import copy
 from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from functools import partial
 from hashlib import sha256
 from inspect import signature
 from typing import Any, ClassVar, NamedTuple
@@ -17,11 +19,11 @@ import warp as wp
 
 from wrt.accel.streams import launch_stream, stream_kernel
 from wrt.accel.triangle_data import TRIANGLE_DATA
-from wrt.device import load_kernel, records, run_all, start, thread_count, upload
+from wrt.device import load_kernel, made_once, records, run_all, start, thread_count, upload
 from wrt.errors import InputError
-from wrt.exchange import taken, to_numpy, to_warp
+from wrt.exchange import check_no_gradients, real_numbers, taken, to_numpy, to_warp
 from wrt.kernels import traverse_instances
-from wrt.kernels.counters import SIZE_RANGE, Counts, Recorder
+from wrt.kernels.counters import SIZE_RANGE, Counts
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
 from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT, RAY_AABB
 from wrt.kernels.ray_triangle import RAY_TRIANGLE
@@ -33,6 +35,7 @@ from wrt.tables import html_facts, html_table
 
 RAYS_PER_LAUNCH = 16384
 RECORDS_PER_JOB = 32768
+FARTHEST = 1e37  # of an origin's coordinates: differences of such are finite
 # By the annotations of _build.
 OPTION_TYPES: dict[str, Any] = {"int": int, "int | None": int | None, "float": int | float, "bool": bool, "str": str}
 
@@ -151,6 +154,19 @@ class Built:
         return len(self.arrays.get("references", self.order))
 
 
+@dataclass(frozen=True, eq=False)
+class State:
+    """All that a refit changes. It is replaced as a whole, and nothing in it is written to: whoever takes it once has parts that
+    belong together, whatever other threads do. data: the Warp struct that kernels get; built_cost: the SAH cost that growth is
+    measured against. Until the structure is built, there is a geometry and nothing else."""
+
+    geometry: Geometry
+    built: Any = None
+    data: Any = None
+    stats: Any = None
+    built_cost: float = float("nan")
+
+
 @dataclass(frozen=True)
 class Refit:
     """What Accelerator.refit did: seconds; growth: SAH cost of the refitted tree over that of the tree when it was built; rebuilt:
@@ -245,14 +261,12 @@ class Structure(NamedTuple):
     @property
     def struct(self) -> Any:
         """The Warp struct of the structure's arrays."""
-        if self.units.instances:
-            return traverse_instances.make_struct(self.bottom)
-        return self.bottom
+        return struct_of(self)
 
     @property
     def bottom(self) -> Any:
         """The struct of one structure, also where there are instances of several."""
-        return self.accel.kernels.make_struct(self.units.triangle_test.record)
+        return struct_of(self._replace(units=self.units._replace(instances=False)))
 
     def traversal(self, *, any_hit: bool, accepts: Any = None) -> Any:
         """The traversal unit as a Warp function (accel, surfaces, ray) -> Hit."""
@@ -262,8 +276,17 @@ class Structure(NamedTuple):
         return traverse
 
 
+@made_once
+def struct_of(structure: Structure) -> Any:
+    if structure.units.instances:
+        return traverse_instances.make_struct(structure.bottom)
+    return structure.accel.kernels.make_struct(structure.units.triangle_test.record)
+
+
 class Accelerator(ABC):
     """A structure over a geometry, on a device. Subclasses set `name` and `kernels`, and implement `_build`.
+
+    Several threads may ask one structure at a time, and one of them may refit it: docs/acceleration.md, "Several threads".
 
     kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts); for the CPU it may have
     make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.streams), with stream_block and stream_sizes.
@@ -285,7 +308,8 @@ class Accelerator(ABC):
                 raise InputError(f"{option} must be {known[option]}, got {value!r}")
         require(len(geometry) * self.bytes_to_build, f"a {self.name} over {len(geometry)} primitives")
         begin = time.perf_counter()
-        self._take(self._build(**options), begin)
+        built = self._build(**options)
+        self._take(built, begin, built.sah_cost)
 
     @classmethod
     def restore(cls, built: Built, geometry: Geometry, device: str = "cpu", threads: int | None = None, *,
@@ -297,24 +321,45 @@ class Accelerator(ABC):
         if not np.array_equal(np.unique(built.order), np.arange(len(geometry))):
             raise InputError(f"is no {cls.name} over this geometry: its primitives are not in it, or not all of them")
         self._check(built)
-        self._take(built, begin)
+        self._take(built, begin, built.sah_cost)
         return self
 
     def _begin(self, geometry: Geometry, device: str, threads: int | None, triangle: str, box: str) -> None:
         check_units(triangle, box)
         self.device = start(device)
-        self.geometry = geometry
+        self._state = State(geometry)
+        self._refitting = threading.Lock()
         self.threads = thread_count(threads)
         self.structure = Structure(type(self), Units(triangle, box, len(geometry.spheres) > 0))
         self._surfaces = Surfaces()
         self._surfaces.n_triangles = len(geometry.faces)
         self._surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # the caller may change his
 
-    def _take(self, built: Built, begin: float) -> None:
-        self.built = built
-        self.data = self._upload(built)
-        self.stats = AccelStats(time.perf_counter() - begin, built.nodes, built.leaves, built.depth, built.references,
-                                array_bytes(self.data), built.sah_cost)
+    @property
+    def geometry(self) -> Geometry:
+        """What the structure is over, as it is now."""
+        return self._state.geometry
+
+    @property
+    def built(self) -> Built:
+        """What the builder gave, or the last refit."""
+        return self._state.built
+
+    @property
+    def data(self) -> Any:
+        """The Warp struct that kernels get. It is never written to: a refit makes another."""
+        return self._state.data
+
+    @property
+    def stats(self) -> AccelStats:
+        return self._state.stats
+
+    def _take(self, built: Built, begin: float, built_cost: float) -> None:
+        """built_cost: as in State."""
+        data = self._upload(built)
+        stats = AccelStats(time.perf_counter() - begin, built.nodes, built.leaves, built.depth, built.references,
+                           array_bytes(data), built.sah_cost)
+        self._state = State(self.geometry, built, data, stats, built_cost)
 
     @abstractmethod
     def _build(self, *args: Any, **options: Any) -> Built:
@@ -332,26 +377,25 @@ class Accelerator(ABC):
         """Follow vertices that have moved, (V, 3) float32, as many as before: boxes are fitted anew, the tree stays as it is.
 
         It answers as exactly as a new one, but slower and slower as the motion mixes what was near. rebuild_at: build it anew
-        (with default options) where the SAH cost passes this multiple of what it was when built. Raises InputError for another
-        shape or values that are not finite, and from structures that cannot be refitted.
+        (with default options) where the SAH cost passes this multiple of what it was when built. Other threads may go on asking:
+        every query that begins before the refit ends answers of the old shape, all others of the new one. Raises InputError for
+        another shape or values that are not finite, and from structures that cannot be refitted.
         """
         moved = _vectors(vertices, "vertices").copy()
         if moved.shape != self.geometry.vertices.shape:
             raise InputError(f"vertices must be {self.geometry.vertices.shape}, got {moved.shape}")
-        begin = time.perf_counter()
-        before, self._built_cost = self.geometry, getattr(self, "_built_cost", self.stats.sah_cost)
-        self.geometry = replace(before, vertices=moved)
-        try:
-            built = self._refit(self.built)
-        except InputError:
-            self.geometry = before
-            raise
-        growth = float(built.sah_cost) / float(self._built_cost) if self._built_cost > 0.0 else 1.0
-        if rebuilt := growth > rebuild_at:
-            built = self._build()
-            self._built_cost = built.sah_cost
-        self._take(built, begin)
-        return Refit(self.stats.build_seconds, growth, rebuilt)
+        with self._refitting:
+            begin, before = time.perf_counter(), self._state
+            beside = copy(self)  # has the new shape while others still ask for the old one
+            beside._state = State(replace(before.geometry, vertices=moved))
+            built, built_cost = beside._refit(before.built), before.built_cost
+            growth = float(built.sah_cost) / float(built_cost) if built_cost > 0.0 else 1.0
+            if rebuilt := growth > rebuild_at:
+                built = beside._build()
+                built_cost = built.sah_cost
+            beside._take(built, begin, built_cost)
+            self._state = beside._state
+            return Refit(beside.stats.build_seconds, growth, rebuilt)
 
     def _children(self, built: Built) -> Any:
         """A hierarchy of boxes as kernels.end_point_overlap.Children."""
@@ -365,7 +409,8 @@ class Accelerator(ABC):
         """
         from wrt.accel.epo import end_point_overlap
 
-        return end_point_overlap(self._children(self.built), self.geometry, self.threads)
+        state = self._state
+        return end_point_overlap(self._children(state.built), state.geometry, self.threads)
 
     def _upload(self, built: Built) -> Any:
         data = self.structure.struct()
@@ -402,77 +447,81 @@ class Accelerator(ABC):
         """The closest hit of each ray in the closed segment [t_min, t_max]; at equal t the lowest prim_id.
 
         Closed means that a surface through the origin is hit at t_min = 0; a t_min above 0 leaves it out. origins,
-        directions: (N, 3) float32, finite, directions not zero and of any length (where t would be beyond float32, the hit
-        is a miss); coordinates up to 1e37, so that differences are finite; t_min (>= 0), t_max: scalars or
-        (N,) (values on a GPU are not looked at). counters: count what each ray costs (hits.counters); trace: also record what
-        it fetches, which takes a second run. Raises InputError that names the argument, its shape and what was expected.
+        directions: (N, 3) real numbers, taken as float32; origins up to 1e37, so that differences are finite; directions finite,
+        not zero and of any length (where t would be beyond float32, there is no hit); t_min (>= 0), t_max: scalars or (N,).
+        Warp arrays are (N,) vec3, and of their values only t_min and t_max are looked at, on the CPU. threads: 1 or more, or one
+        a core. counters: count what each ray costs (hits.counters); trace: also record what it fetches, which takes a second run.
+
+        Several threads may ask at a time, with or without counters, while another refits. There are no gradients: Warp arrays
+        that require them are refused while a wp.Tape records. Raises InputError that names the argument and what was expected.
         """
+        data, threads = self.data, thread_count(threads)  # data once: a refit may replace it meanwhile
         rays, as_warp = self._rays(origins, directions, t_min, t_max)
         n = len(rays.t_min)
         hits = HitArrays()
         for field, dtype in (("t", wp.float32), ("u", wp.float32), ("v", wp.float32), ("prim_id", wp.int32)):
             setattr(hits, field, wp.empty(n, dtype=dtype, device=self.device))
-        counted = self._counted(closest_hit_kernel, rays, hits, trace, threads) if counters or trace else None
+        counted = self._counted(data, rays, hits, trace, threads) if counters or trace else None
         if counted is None:
-            self._trace(closest_hit_kernel, rays, hits, n, threads)
+            self._trace(closest_hit_kernel, data, rays, hits, threads)
         t, u, v, prim_id = (array if as_warp else array.numpy() for array in (hits.t, hits.u, hits.v, hits.prim_id))
         return Hits(t, u, v, prim_id, counted)
 
     def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                 threads: int | None = None) -> Any:
-        """Whether each ray hits anything in its segment: (N,) bool. Arguments as in closest_hit."""
+        """Whether each ray hits anything in its segment: (N,) bool, True where closest_hit finds a hit and nowhere else. Arguments
+        as in closest_hit."""
+        data, threads = self.data, thread_count(threads)
         rays, as_warp = self._rays(origins, directions, t_min, t_max)
-        n = len(rays.t_min)
-        dark = wp.empty(n, dtype=wp.bool, device=self.device)
-        self._trace(any_hit_kernel, rays, dark, n, threads)
+        dark = wp.empty(len(rays.t_min), dtype=wp.bool, device=self.device)
+        self._trace(any_hit_kernel, data, rays, dark, threads)
         return dark if as_warp else dark.numpy()
 
-    def _counted(self, make_kernel: Any, rays: RayArrays, out: Any, trace: bool, threads: int | None) -> Counters:
+    def _counted(self, data: Any, rays: RayArrays, hits: HitArrays, trace: bool, threads: int) -> Counters:
         """Launch with counters; with a trace once more, when it is known how long the trace of each ray is."""
         n = len(rays.t_min)
-        structure = self.structure._replace(units=self.structure.units._replace(counters=True))
-        kernel = make_kernel(structure)
+        kernel = closest_hit_kernel(self.structure._replace(units=self.structure.units._replace(counters=True)))
 
         def run(first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            # The struct of the counting kernel is the same: only the recorder is set.
-            self.data.recorder.counts = wp.zeros(n, dtype=Counts, device=self.device)
-            self.data.recorder.first = upload(first, wp.int64, self.device)
-            self.data.recorder.fetches = wp.zeros(int(first[-1]) if len(first) else 0, dtype=wp.int64, device=self.device)
-            self._launch(kernel, rays, out, n, threads)
-            return self.data.recorder.counts.numpy().copy(), self.data.recorder.fetches.numpy().copy()
+            # The struct of the counting kernel is the same, but what it records is this call's alone.
+            own = copied(data)
+            own.recorder.counts = wp.zeros(n, dtype=Counts, device=self.device)
+            own.recorder.first = upload(first, wp.int64, self.device)
+            own.recorder.fetches = wp.zeros(int(first[-1]) if len(first) else 0, dtype=wp.int64, device=self.device)
+            self._launch(kernel, [own, self._surfaces, rays, hits], n, threads)
+            return own.recorder.counts.numpy(), own.recorder.fetches.numpy()
 
-        try:
-            counts, fetches = run(np.zeros(0, np.int64))
-            first = np.zeros(n + 1, np.int64)
-            if trace:
-                np.cumsum(counts["nodes"].astype(np.int64) + counts["primitives"], out=first[1:])
-                counts, fetches = run(first)
-        finally:
-            self.data.recorder = Recorder()
+        counts, fetches = run(np.zeros(0, np.int64))
+        first = np.zeros(n + 1, np.int64)
+        if trace:
+            np.cumsum(counts["nodes"].astype(np.int64) + counts["primitives"], out=first[1:])
+            counts, fetches = run(first)
         return Counters(counts, first, fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
 
-    def _trace(self, make_kernel: Any, rays: RayArrays, out: Any, n: int, threads: int | None) -> None:
+    def _trace(self, make_kernel: Any, data: Any, rays: RayArrays, out: Any, threads: int) -> None:
         """By the kernel for many rays at a time where there is one."""
+        n, inputs = len(rays.t_min), [data, self._surfaces, rays, out]
         stream = None if self.device.is_cuda else stream_kernel(self.structure, make_kernel is any_hit_kernel)
         if stream is None:
-            self._launch(make_kernel(self.structure), rays, out, n, threads)
+            self._launch(make_kernel(self.structure), inputs, n, threads)
         else:
-            launch_stream(self.structure, stream, [self.data, self._surfaces, rays, out], n, threads)
+            launch_stream(self.structure, stream, inputs, n, threads)
 
-    def _launch(self, kernel: Any, rays: RayArrays, out: Any, n: int, threads: int | None) -> None:
-        surfaces = self._surfaces
+    def _launch(self, kernel: Any, inputs: list[Any], n: int, threads: int) -> None:
+        """inputs: the kernel's first ones, up to where the hits go."""
         if self.device.is_cuda:
-            wp.launch(kernel, dim=n, inputs=[self.data, surfaces, rays, out, 0], device=self.device)
+            wp.launch(kernel, dim=n, inputs=[*inputs, 0], device=self.device, record_tape=False)
             return
         load_kernel(kernel, self.device)
 
         def job(first: int) -> Any:
             count = min(RAYS_PER_LAUNCH, n - first)
-            return lambda: wp.launch(kernel, dim=count, inputs=[self.data, surfaces, rays, out, first], device=self.device)
+            return lambda: wp.launch(kernel, dim=count, inputs=[*inputs, first], device=self.device, record_tape=False)
 
-        run_all([job(first) for first in range(0, n, RAYS_PER_LAUNCH)], thread_count(threads))
+        run_all([job(first) for first in range(0, n, RAYS_PER_LAUNCH)], threads)
 
     def _rays(self, origins: Any, directions: Any, t_min: Any, t_max: Any) -> tuple[RayArrays, bool]:
+        check_no_gradients(origins=origins, directions=directions, t_min=t_min, t_max=t_max)
         origins, directions = taken(origins, "origins"), taken(directions, "directions")
         as_warp = isinstance(origins, wp.array) or isinstance(directions, wp.array)
         rays = RayArrays()
@@ -482,10 +531,9 @@ class Accelerator(ABC):
             n = len(origins)
             rays.origin, rays.direction = (a if a.is_contiguous else a.contiguous() for a in (origins, directions))
         else:
-            origins, directions = _vectors(origins, "origins"), _vectors(directions, "directions")
+            origins, directions = _vectors(origins, "origins", FARTHEST), _vectors(directions, "directions")
             n = len(origins)
-            if not directions.any(axis=1).all():
-                raise InputError(f"directions must not be zero; row {int(np.argmin(directions.any(axis=1)))} is")
+            _check_not_zero(directions)
             rays.origin = upload(origins, wp.vec3, self.device)
             rays.direction = upload(directions, wp.vec3, self.device)
         if len(directions) != n:
@@ -501,10 +549,7 @@ class Accelerator(ABC):
             if value.device.is_cpu:
                 _check_ends(value.numpy(), name, low)
             return value if value.is_contiguous else value.contiguous()
-        try:
-            array = np.asarray(value, dtype=np.float32)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{name} must be a number or ({n},), got {value!r}") from error
+        array = real_numbers(value, name, f"a number or ({n},)")
         if array.ndim > 1 or (array.ndim == 1 and len(array) != n):
             raise InputError(f"{name} must be a number or ({n},), got {array.shape}")
         _check_ends(array, name, low)
@@ -512,8 +557,15 @@ class Accelerator(ABC):
 
 
 def _check_ends(array: np.ndarray, name: str, low: float) -> None:
-    if not (array >= low).all():
+    if not array.min(initial=np.inf) >= low:  # the least of what has a NaN is NaN
         raise InputError(f"{name} must not be NaN" + (f" or below {low:g}" if low > -np.inf else ""))
+
+
+def copied(data: Any) -> Any:
+    """A Warp struct with the same arrays and numbers, of which fields may be set."""
+    out = data._cls()
+    out.assign(data)
+    return out
 
 
 def array_bytes(data: Any) -> int:
@@ -522,24 +574,34 @@ def array_bytes(data: Any) -> int:
     return sum(array.capacity for array in arrays if isinstance(array, wp.array))
 
 
-def _vectors(value: Any, name: str) -> np.ndarray:
-    try:
-        array = np.ascontiguousarray(value, dtype=np.float32)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be (N, 3) float32, got {type(value).__name__}") from error
+def _vectors(value: Any, name: str, most: float = float(np.finfo(np.float32).max)) -> np.ndarray:
+    """(N, 3) float32, no component beyond `most`."""
+    array = real_numbers(value, name, "(N, 3)")
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"{name} must be (N, 3), got {array.shape}")
-    finite = np.isfinite(array).all(axis=1)
-    if not finite.all():
-        raise InputError(f"{name} must be finite; row {int(np.argmin(finite))} is {array[np.argmin(finite)].tolist()}")
+    numbers = array.reshape(-1)
+    if not (numbers.min(initial=0.0) >= -most and numbers.max(initial=0.0) <= most):  # False for NaN
+        for good, what in ((np.isfinite(array), "finite"), (np.abs(array) <= most, f"within {most:g}")):
+            if not good.all():
+                row = int(np.argmin(good.all(axis=1)))
+                raise InputError(f"{name} must be {what}; row {row} is {array[row].tolist()}")
     return array
 
 
-@cache
+def _check_not_zero(directions: np.ndarray) -> None:
+    zero = directions[:, 0] == 0.0
+    if zero.any():
+        zero &= directions[:, 1] == 0.0
+        zero &= directions[:, 2] == 0.0
+        if zero.any():
+            raise InputError(f"directions must not be zero; row {int(np.argmax(zero))} is")
+
+
+@made_once
 def closest_hit_kernel(structure: Structure) -> Any:
     return make_closest_hit_kernel(structure.struct, structure.traversal(any_hit=False))
 
 
-@cache
+@made_once
 def any_hit_kernel(structure: Structure) -> Any:
     return make_any_hit_kernel(structure.struct, structure.traversal(any_hit=True))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator, AccelStats, Built, Geometry, Refit, Structure, array_bytes, check_units
+from wrt.accel.base import Accelerator, AccelStats, Built, Geometry, Refit, State, Structure, array_bytes, check_units
 from wrt.accel.bvh_ranges import in_order, split_ranges
 from wrt.accel.bvh_tree import BinaryTree, BvhOptions
 from wrt.device import records, start, thread_count, upload
@@ -90,7 +90,7 @@ class Instances(Accelerator):
         check_units(triangle, box)
         begin = time.perf_counter()
         self.device = start(device)
-        self.geometry = geometry  # type: ignore[assignment]  # it has what a Geometry is asked for here
+        self._state = State(geometry)  # type: ignore[arg-type]  # it has what a Geometry is asked for here
         self.threads = thread_count(threads)
         self.structure = Structure(kind, Units(triangle, box, len(geometry.spheres) > 0, instances=True))
         self._surfaces = Surfaces()
@@ -101,13 +101,16 @@ class Instances(Accelerator):
 
     def _place(self, begin: float) -> None:
         """The upper level around the structures as they are."""
+        # As they are now: a Warp array of structs holds addresses, and does not keep what a refit would replace.
+        self._placed = [bottom._state for bottom in self.bottoms]
         tree = top_tree(self.geometry, self.bottoms, self.threads)  # type: ignore[arg-type]
-        self.data = self._upload_top(tree)
-        stats = [bottom.stats for bottom in self.bottoms]
-        self.stats = AccelStats(
+        data = self._upload_top(tree)
+        stats = [state.stats for state in self._placed]
+        told = AccelStats(
             time.perf_counter() - begin, len(tree.nodes) + sum(s.nodes for s in stats), tree.leaves + sum(s.leaves for s in stats),
             tree.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
-            array_bytes(self.data) + sum(s.bytes for s in stats), float("nan"))
+            array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
+        self._state = State(self.geometry, None, data, told)
 
     def _upload_top(self, tree: BinaryTree) -> Any:
         geometry: Any = self.geometry
@@ -116,10 +119,10 @@ class Instances(Accelerator):
         rows["bottom"], rows["first_prim"] = geometry.part[tree.order], geometry.first_prim[tree.order]
         to_local = geometry.to_local[tree.order]
         rows["local_x"], rows["local_y"], rows["local_z"] = to_local[:, 0], to_local[:, 1], to_local[:, 2]
-        sizes = np.array([tree.nodes.nbytes, *(bottom.stats.bytes for bottom in self.bottoms)], np.int64)
+        sizes = np.array([tree.nodes.nbytes, *(state.stats.bytes for state in self._placed)], np.int64)
         data.nodes = upload(tree.nodes, data._cls.vars["nodes"].type.dtype, self.device)
         data.placements = upload(rows, Placement, self.device)
-        data.bottoms = wp.array([bottom.data for bottom in self.bottoms], dtype=self.structure.bottom, device=self.device)
+        data.bottoms = wp.array([state.data for state in self._placed], dtype=self.structure.bottom, device=self.device)
         data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)
         data.slack = slack(geometry)
         return data
@@ -129,7 +132,7 @@ class Instances(Accelerator):
 
     def refit(self, vertices: np.ndarray, rebuild_at: float = np.inf) -> Refit:
         """Raises InputError: one array of vertices cannot say where instances go."""
-        raise InputError("instances cannot follow vertices that move; refit their structures")
+        raise InputError("instances cannot follow vertices that move; build them again")
 
     def save(self, path: Any) -> None:
         """Raises InputError: files hold one structure."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from wrt.device import empty_aligned, load_kernel, run_all, thread_count, upload
+from wrt.device import empty_aligned, load_kernel, made_once, run_all, upload
 from wrt.kernels.packets import Scratch
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 FEWEST, SOME, MOST = 8192, 32768, 131072
 
 
-@cache
+@made_once
 def stream_kernel(structure: Structure, any_hit: bool) -> Any:
     """The kernel for a structure, or None where it has no other than the one for one ray."""
     make = getattr(structure.accel.kernels, "make_stream", None)
@@ -48,21 +48,21 @@ def rays_per_launch(n: int, threads: int, block: int) -> int:
     return -(-n // (launches * block)) * block
 
 
-def launch_stream(structure: Structure, kernel: Any, inputs: list[Any], n: int, threads: int | None) -> None:
+def launch_stream(structure: Structure, kernel: Any, inputs: list[Any], n: int, threads: int) -> None:
     """Trace rays 0 .. n - 1 with a kernel of stream_kernel. inputs: its first ones, up to `out`."""
     module = structure.accel.kernels
     load_kernel(kernel, wp.get_device("cpu"))
-    count = thread_count(threads)
-    part = rays_per_launch(n, count, module.stream_block)
+    part = rays_per_launch(n, threads, module.stream_block)
     firsts = range(0, n, part)
-    # One for each job that runs at a time. They are made here: two threads must not make structs at a time.
-    mine = [borrow(module.stream_sizes) for _ in range(min(count, len(firsts)))]
+    # One for each job that runs at a time; other calls, on other threads, borrow others.
+    mine = [borrow(module.stream_sizes) for _ in range(min(threads, len(firsts)))]
 
     def job(first: int) -> None:
         end = min(first + part, n)
         scratch = mine.pop()
-        wp.launch(kernel, dim=-(-(end - first) // module.stream_block), inputs=[*inputs, scratch, first, end], device="cpu")
+        wp.launch(kernel, dim=-(-(end - first) // module.stream_block), inputs=[*inputs, scratch, first, end], device="cpu",
+                  record_tape=False)
         mine.append(scratch)
 
-    run_all([partial(job, first) for first in firsts], count)
+    run_all([partial(job, first) for first in firsts], threads)
     _free.extend(mine)  # not after an error: a thread may still be at work in one
