@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import threading
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -143,12 +144,88 @@ def test_warp_arrays_come_back_as_warp_arrays(name: str) -> None:
     (([[0, 0, 0]], [[1, 0, 0]], [0.0, 0.0]), r"t_min must be a number or \(1,\), got \(2,\)"),
     (([[0, 0, 0]], [[1, 0, 0]], 0.0, [[1.0]]), r"t_max must be a number or \(1,\)"),
     (([[0, 0, 0]], [[1, 0, 0]], "near"), "t_min must be"),
+    (([[0, 0, 0], [1e38, 0, 0]], [[1, 0, 0]] * 2), r"origins must be within 1e\+37; row 1 is \[1e\+38"),
+    (([[0, 0, -1.1e37]], [[1, 0, 0]]), r"origins must be within 1e\+37; row 0"),
+    (([[0, 0, 1e300]], [[1, 0, 0]]), "origins must be finite; row 0 is"),
+    (([[0, 0, 10**400]], [[1, 0, 0]]), r"origins must be \(N, 3\) of real numbers"),
+    ((np.zeros((1, 3), complex), [[1, 0, 0]]), r"origins must be \(N, 3\) of real numbers, got an array \(1, 3\) of complex128"),
+    (([[0, 0, 0]], [[1j, 0, 0]]), r"directions must be \(N, 3\) of real numbers, got \[\[1j, 0, 0\]\]"),
+    ((np.zeros((1, 3), bool), [[1, 0, 0]]), r"origins must be \(N, 3\) of real numbers, got an array \(1, 3\) of bool"),
+    (([[0, 0, 0]], [["1", "0", "0"]]), r"directions must be \(N, 3\) of real numbers"),
+    ((np.zeros((1, 3), "datetime64[s]"), [[1, 0, 0]]), r"origins must be \(N, 3\) of real numbers"),
+    ((np.ma.zeros((1, 3)), [[1, 0, 0]]), "origins must not be a masked array"),
+    (([[0, 0, 0]], np.ma.masked_less([[1.0, 0, 0]], 0.5)), "directions must not be a masked array"),
+    (([[0, 0, 0]], [[1, 0, 0]], 1j), r"t_min must be a number or \(1,\) of real numbers, got a complex"),
+    (([[0, 0, 0]], [[1, 0, 0]], True), r"t_min must be a number or \(1,\) of real numbers, got True"),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, np.ma.ones(1)), "t_max must not be a masked array"),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, "5"), "t_max must be a number"),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, None), "t_max must"),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, 1.5), "threads must be a whole number, got 1.5"),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, "2"), "threads must be a whole number, got '2'"),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, True), "threads must be a whole number, got True"),
+    ((np.zeros((0, 3)), np.zeros((0, 3)), 0.0, 1.0, 1.5), "threads must be a whole number, got 1.5"),
 ])
+@pytest.mark.filterwarnings("error")  # one message, and no other
 def test_bad_arguments_are_named(arguments: tuple, message: str) -> None:
     structure = build(BALL, "brute_force")
     for query in (structure.closest_hit, structure.any_hit):
         with pytest.raises(InputError, match=message):
             query(*arguments)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("convert", [
+    lambda a: a.astype(np.float64), lambda a: a.astype(np.float16), lambda a: a.astype(np.int64), lambda a: a.astype(">f4"),
+    lambda a: a.astype(">i2"), lambda a: a.astype(np.longdouble), lambda a: a.astype(np.uint8), lambda a: a.astype(object),
+    lambda a: a.tolist(), lambda a: tuple(map(tuple, a)), np.asfortranarray, lambda a: np.repeat(a, 2, axis=0)[::2],
+    lambda a: [[Fraction(int(x)) for x in row] for row in a],
+], ids=range(13))
+def test_real_numbers_of_any_kind_are_taken(convert: Any) -> None:
+    structure = build(BALL, "brute_force")
+    origins, directions = np.float32([[3, 2, 1], [0, 0, 0], [3, 0, 5]]), np.float32([[3, 2, 1], [1, 0, 0], [0, 1, 0]])
+    expected = structure.closest_hit(origins, directions, 0, 2)
+    found = structure.closest_hit(convert(origins), convert(directions), np.int8(0), Fraction(2), np.int64(1))
+    for field in ("t", "u", "v", "prim_id"):
+        assert np.array_equal(getattr(found, field), getattr(expected, field))
+    assert expected.prim_id.tolist()[0] == expected.prim_id.tolist()[2] == -1 < expected.prim_id[1]
+
+
+def test_origins_may_be_as_far_as_1e37_and_directions_of_any_length() -> None:
+    structure = build(BALL, "brute_force")
+    hits = structure.closest_hit([[1e37, 0, 0], [-1e37, 1e37, 0], [0, 0, 0]], [[-1e37, 0, 0], [1, 0, 0], [0, 3.4e38, 0]])
+    assert hits.t[0] == 1.0 and hits.prim_id[1] == -1 and 0.0 < hits.t[2] < 1e-38
+
+
+def test_a_zero_among_directions_along_the_axes_is_found() -> None:
+    structure = build(BALL, "brute_force")
+    directions = np.tile(np.float32([[0, 1, 0], [0, 0, -1e-45], [1, 0, 0], [0, -1, 2]]), (50, 1))
+    origins = np.zeros_like(directions)
+    assert len(structure.closest_hit(origins, directions)) == 200
+    for row in (0, 1, 137, 199):
+        wrong = directions.copy()
+        wrong[row] = 0.0, -0.0, 0.0
+        with pytest.raises(InputError, match=f"directions must not be zero; row {row} is"):
+            structure.closest_hit(origins, wrong)
+
+
+def test_gradients_are_refused_and_not_lost_in_silence() -> None:
+    structure = build(BALL, "bvh2")
+    plain, down = vec3s([[0.0, 0.0, 3.0], [0.0, 0.0, 4.0]]), vec3s([[0.0, 0.0, -1.0]] * 2)
+    needed = wp.clone(plain, requires_grad=True)
+    end = wp.array(np.float32([9, 9]), dtype=wp.float32, device=CPU, requires_grad=True)
+    expected = structure.closest_hit(needed, down, t_max=end).t.numpy()  # without a tape nobody waits for them
+    for query in (structure.closest_hit, structure.any_hit):
+        for arguments, name in (((needed, down), "origins"), ((down, needed), "directions"), ((plain, down, 0.0, end), "t_max")):
+            message = f"^{name} requires gradients and a wp.Tape is recording.*wp.clone\\({name}"
+            with pytest.raises(InputError, match=message), wp.Tape():
+                query(*arguments)
+    with wp.Tape() as tape:
+        for rays in ((plain, down), (wp.clone(needed, requires_grad=False), down), (plain.numpy(), down.numpy())):
+            assert np.array_equal(structure.closest_hit(*rays).numpy().t, expected)
+        structure.closest_hit(plain, down, counters=True)
+        build(BALL, "bvh").any_hit(plain, down)
+    kernels = [launch[0].key for launch in tape.launches if isinstance(launch, list)]
+    assert not [key for key in kernels if "hit" in key or "trace" in key]  # backward() would warn of them
 
 
 def test_bad_warp_arrays_are_named() -> None:

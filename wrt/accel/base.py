@@ -584,7 +584,7 @@ def _vectors(value: Any, name: str, most: float = float(np.finfo(np.float32).max
         for good, what in ((np.isfinite(array), "finite"), (np.abs(array) <= most, f"within {most:g}")):
             if not good.all():
                 row = int(np.argmin(good.all(axis=1)))
-                raise InputError(f"{name} must be {what}; row {row} is {array[row].tolist()}")
+                raise InputError(f"{name} must be {what}; row {row} is [{', '.join(map(str, array[row]))}]")
     return array
 
 
