@@ -15,19 +15,16 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from typing import Any
 
-import warp as wp
-
 import wrt
 from wrt.crews import Reply, Workers
 from wrt.device import describe_devices
 from wrt.errors import InputError
+from wrt.installed import INSTALLED, difference
 
 CONNECT_SECONDS = 5.0  # to find the scheduler
 WORKER_SECONDS = 10.0  # for a first worker to come
 RESULT_SECONDS = 30.0  # to fetch what a worker made
 PATIENCE = 60.0  # seconds without any worker, in a render
-# What must be the same everywhere, as pkgutil.resolve_name finds it: a worker without wrt can be asked too.
-VERSIONS = {"wrt:__version__": wrt.__version__, "warp:__version__": wp.__version__}
 
 
 @contextmanager
@@ -65,7 +62,7 @@ async def _identity(address: str) -> str:
 
 
 def check_workers(client: Any) -> None:
-    """Raises InputError where there are no workers, or one of them has no wrt, or another version of it."""
+    """Raises InputError where there are no workers, or one of them has no wrt, or not the same as here."""
     if client.asynchronous:
         raise InputError("the Client is asynchronous: make one without asynchronous=True")
     where = client.scheduler.address
@@ -73,13 +70,15 @@ def check_workers(client: Any) -> None:
         client.wait_for_workers(1, timeout=WORKER_SECONDS)
     except TimeoutError as error:
         raise InputError(f"no worker at {where}: start some with `dask worker {where}`") from error
-    for name, version in VERSIONS.items():
-        package = name.partition(":")[0]
+    # A function that workers without wrt have too, and before what is compared, what every version of wrt has.
+    for name in ("wrt:__version__", "wrt.installed:INSTALLED"):
         for worker, found in client.run(pkgutil.resolve_name, name, on_error="return").items():
             if isinstance(found, BaseException):
-                raise InputError(f"worker {worker} has no {package} ({found}): wrt {wrt.__version__} must be installed there")
-            if found != version:
-                raise InputError(f"worker {worker} has {package} {found}; here it is {version}, and all must have the same")
+                raise InputError(f"worker {worker} has no such wrt ({found}): wrt {wrt.__version__} must be installed there")
+            if isinstance(found, str) and found != wrt.__version__:
+                raise InputError(f"worker {worker} has wrt {found} (here {wrt.__version__}): all must have the same")
+            if isinstance(found, dict) and (told := difference(INSTALLED, found)):
+                raise InputError(f"worker {worker} has {told}: all must have the same")
 
 
 def machines(client: Any) -> str:

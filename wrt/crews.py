@@ -19,9 +19,9 @@ from hashlib import sha256
 from queue import SimpleQueue
 from typing import Any
 
-import wrt
 from wrt.driver import Renderer
 from wrt.errors import InputError, SceneWarning
+from wrt.installed import INSTALLED, Installed, difference
 from wrt.options import Options
 from wrt.scene import Scene
 from wrt.scene_arrays import pack, unpack
@@ -178,7 +178,7 @@ def packaged(scene: Scene, options: Options, kernels: str) -> tuple[str, dict[st
     kernels: their hash, which must be that of the workers' kernels.
     """
     text, arrays = pack(scene)
-    package = {"version": wrt.__version__, "kernels": kernels, "options": {name: getattr(options, name) for name in SENT},
+    package = {"installed": INSTALLED, "kernels": kernels, "options": {name: getattr(options, name) for name in SENT},
                "scene": text}
     key = sha256(f"{package}{scene_digest(scene)}".encode()).hexdigest()
     return key, {**package, "arrays": arrays}
@@ -190,7 +190,7 @@ _lock = threading.Lock()
 
 def call(key: str, package: dict[str, Any] | None, method: str, *arguments: Any) -> Reply | None:
     """On a worker: a method of the Renderer of that key, made ready from the package where it is not yet; None: it is not, and
-    there is no package. Raises InputError where this is another version of wrt."""
+    there is no package. Raises InputError where what is installed here is not what asks."""
     with _lock:
         if key not in _ready:
             if package is None:
@@ -204,13 +204,17 @@ def call(key: str, package: dict[str, Any] | None, method: str, *arguments: Any)
 
 
 def _unpacked(package: dict[str, Any]) -> Renderer:
-    if package["version"] != wrt.__version__:
-        raise InputError(f"worker {worker_name()} has wrt {wrt.__version__}; {package['version']} is needed")
+    check_installed(package["installed"])
     renderer = _made_ready(unpack(package["scene"], package["arrays"]), Options(**package["options"]))
     if renderer.kernels_hash() != package["kernels"]:
-        raise InputError(f"worker {worker_name()} has other kernels, though its wrt says {wrt.__version__} too: install the same"
-                         " wrt and warp-lang everywhere")
+        raise InputError(f"worker {worker_name()} makes other kernels of the same code: install the same warp-lang everywhere")
     return renderer
+
+
+def check_installed(there: Installed) -> None:
+    """On a worker: raise InputError where what is installed here is not what is there, with those who ask."""
+    if told := difference(there, INSTALLED):
+        raise InputError(f"worker {worker_name()} has {told}: all must have the same")
 
 
 def _made_ready(scene: Scene, options: Options) -> Renderer:

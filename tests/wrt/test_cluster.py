@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import signal
 import socket
+import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,8 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run
 from tests.data import ROOT
 from tests.wrt.test_checkpoint import SCENE, same
-from wrt import cluster, crews
+from wrt import cluster, crews, installed
+from wrt.bench import sweep
 from wrt.driver import render
 from wrt.errors import InputError
 from wrt.film import Film
@@ -123,8 +128,9 @@ def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
 
 
 @pytest.mark.parametrize(("change", "said"), [
-    (lambda: sys.modules["wrt"].__dict__.update(__version__="0.0.9"), r"worker tcp://.* has wrt 0\.0\.9; here it is "),
-    (lambda: sys.modules.update(wrt=None), r"worker tcp://.* has no wrt \(.*\): wrt .* must be installed there"),  # type: ignore
+    (lambda: sys.modules["wrt"].__dict__.update(__version__="0.0.9"), r"worker tcp://.* has wrt 0\.0\.9 \(here "),
+    (lambda: sys.modules.update(wrt=None), r"worker tcp://.* has no such wrt \(.*\): wrt .* must be installed there"),  # type: ignore
+    (lambda: sys.modules.update({"wrt.installed": None}), r"worker tcp://.* has no such wrt \(.*wrt\.installed.*\)"),
 ])
 def test_a_worker_that_cannot_serve(client: Any, change: Any, said: str) -> None:
     version, first = wrt.__version__, next(iter(client.scheduler_info()["workers"]))
@@ -133,6 +139,8 @@ def test_a_worker_that_cannot_serve(client: Any, change: Any, said: str) -> None
         if sys.modules["wrt"] is None:
             sys.modules["wrt"] = sys.modules["wrt.driver"].wrt
         sys.modules["wrt"].__version__ = version  # type: ignore[attr-defined]
+        if sys.modules.get("wrt.installed", 0) is None:
+            sys.modules["wrt.installed"] = sys.modules["wrt"].installed  # type: ignore[attr-defined]
 
     render(SCENE, executor=client, spp=1)
     client.run(change, workers=[first])
@@ -141,6 +149,49 @@ def test_a_worker_that_cannot_serve(client: Any, change: Any, said: str) -> None
             render(SCENE, executor=client)
     finally:
         client.run(put_back, workers=[first])
+
+
+@contextmanager
+def workers_of_other_code(address: str, folder: Path, **env: str) -> Iterator[str]:
+    """A `dask worker` process whose wrt has one more line in driver.py; yields the name of its folder."""
+    for name in ("wrt", "kernels"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    with open(folder / "wrt" / "driver.py", "a", encoding="utf-8") as file:
+        file.write("TILE_SIZE = 31\n")
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny",
+               "--name", "other", "--local-directory", str(folder)]
+    with subprocess.Popen(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(folder), **env},
+                          stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as worker:
+        try:
+            yield str(folder)
+        finally:
+            worker.terminate()
+
+
+def test_a_worker_whose_code_differs_in_a_line_is_refused_by_name(threads: Any, mesh: Path) -> None:
+    with distributed.Client(threads, set_as_default=False) as one, workers_of_other_code(threads.scheduler_address,
+                                                                                        mesh.parent / "other"):
+        one.wait_for_workers(2, timeout=60)
+        (address,) = [where for where, worker in one.scheduler_info(n_workers=-1)["workers"].items() if worker["id"] == "other"]
+        said = f"worker {address} has other code of wrt {wrt.__version__} (driver.py): all must have the same"
+        with pytest.raises(InputError, match=f"^{re.escape(said)}$"):
+            render(SCENE, executor=one)
+        done = run("render", mesh, "-o", "a.png", "--cluster", threads.scheduler_address)
+        assert (done.code, done.errors, Path("a.png").exists()) == (2, [f"error: {said}"], False)
+
+
+def test_a_worker_that_comes_later_is_compared_too(threads: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a render: when it is asked to make the scene ready. With a sweep: at each task."""
+    with distributed.Client(threads, set_as_default=False) as one, workers_of_other_code(threads.scheduler_address,
+                                                                                        tmp_path / "other"):
+        one.wait_for_workers(2, timeout=60)
+        monkeypatch.setattr(cluster, "check_workers", lambda client: None)  # it was not there when they were looked at
+        with pytest.raises(InputError, match=r"^worker \S+ has other code of wrt \S+ \(driver\.py\): all must have the same$"):
+            render(SCENE, executor=one, spp=256, tile_size=16, pass_size=4)
+        (other,) = [where for where, worker in one.scheduler_info(n_workers=-1)["workers"].items() if worker["id"] == "other"]
+        task = one.submit(sweep.one_at_a_time, installed.DIGEST, os.getpid, workers=[other], pure=False)
+        with pytest.raises(InputError, match="has other code of wrt, another Python, NumPy or Warp"):
+            task.result(timeout=60)
 
 
 def test_a_scene_that_is_lost_is_sent_again(threads: Any, whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:

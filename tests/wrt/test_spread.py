@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
+import shutil
 import signal
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -16,12 +20,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+import wrt
+from tests.data import ROOT
 from tests.wrt.test_checkpoint import SCENE, same
 from wrt import crews, device_scene, profile, spread
 from wrt.animate import Animation, animate
 from wrt.driver import Options, Progress, Renderer, render
 from wrt.errors import InputError, SceneWarning
 from wrt.film import Film
+from wrt.installed import INSTALLED, difference
 from wrt.scene import Material, Object
 from wrt.shapes import box
 
@@ -208,14 +215,39 @@ def test_a_worker_s_error_is_told_and_the_work_is_saved(tmp_path: Path, threads:
     assert film.stats["resumed"]["samples"] == 4 and same(film, render(SCENE))
 
 
-@pytest.mark.parametrize(("change", "said"), [({"version": "0.0.9"}, r"has wrt .*; 0\.0\.9 is needed"),
-                                              ({"kernels": "0" * 64}, "has other kernels")])
-def test_a_worker_of_another_version_says_so(change: dict[str, str], said: str, threads: Executor,
+def other(part: str, **changes: str) -> dict[str, Any]:
+    """A package from somebody who has something else installed."""
+    return {"installed": {**INSTALLED, part: INSTALLED[part] | changes}}
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    (other("versions", wrt="0.0.9"), rf"has wrt {wrt.__version__} \(here 0\.0\.9\): all must"),
+    (other("versions", NumPy="1.0"), rf"has NumPy {np.__version__} \(here 1\.0\): all must"),
+    (other("versions", Python="3.4"), r"has Python 3\.\d+ \(here 3\.4\): all must"),
+    (other("files", **{"driver.py": "0"}), rf"has other code of wrt {wrt.__version__} \(driver\.py\): all must"),
+    (other("files", **{"kernels/new.py": "0"}), r"has other code of wrt .* \(kernels/new\.py\): all must"),
+    (other("files", **{name: "0" for name in ("a.py", "b.py", "c.py", "d.py")}), r"\(a\.py, b\.py, c\.py and 1 more\)"),
+    ({"kernels": "0" * 64}, "makes other kernels of the same code"),
+], ids=range(7))
+def test_a_worker_that_has_something_else_says_so(change: dict[str, str], said: str, threads: Executor,
                                              monkeypatch: pytest.MonkeyPatch) -> None:
     unpacked = crews._unpacked
     monkeypatch.setattr(crews, "_unpacked", lambda package: unpacked({**package, **change}))
     with pytest.raises(InputError, match=said):
         render(SCENE, executor=threads)
+
+
+def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
+    """A checkout has them beside the package, a wheel in it: the same names and digests, so that both can work together."""
+    shutil.copytree(ROOT / "wrt", tmp_path / "wrt", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "kernels", tmp_path / "wrt" / "kernels", ignore=shutil.ignore_patterns("__pycache__"))
+    done = subprocess.run([sys.executable, "-c", "import json, wrt.installed; print(json.dumps(wrt.installed.INSTALLED))"],
+                          cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=True)
+    wheel = json.loads(done.stdout)
+    assert difference(INSTALLED, wheel) == "" and list(wheel["files"]) == list(INSTALLED["files"])
+    assert {"driver.py", "accel/store.py", "bench/memory.py", "kernels/render.py"} <= INSTALLED["files"].keys()
+    assert len(INSTALLED["files"]) == sum(path.suffix in (".py", ".h") for folder in ("wrt", "kernels")
+                                          for path in (ROOT / folder).rglob("*"))
 
 
 @pytest.mark.parametrize("alike", [1, 5])

@@ -22,6 +22,7 @@ from wrt.bench.sweep import cancel, one_at_a_time, result, submitter
 from wrt.crews import worker_name
 from wrt.device import load_kernel, thread_count, upload
 from wrt.errors import InputError
+from wrt.installed import DIGEST
 from wrt.kernels.query import HitList, RayArrays, Respawn, make_all_hits_kernel, make_respawn_kernel
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.surface import make_surface_at
@@ -148,9 +149,9 @@ def _rows(names: list[str], algorithms: list[Algorithm], plan: Plan, progress: C
 def _spread_rows(names: list[str], algorithms: list[str], plan: Plan, progress: Callable[[str], None],
                  pool: Any) -> Iterator[Row]:
     """The same rows in the same order: each case with each algorithm is a task, and so is each chunk of the rays beyond."""
-    rows = [(name, algorithm, pool.submit(one_at_a_time, case_row, name, algorithm, plan))
+    rows = [(name, algorithm, pool.submit(one_at_a_time, DIGEST, case_row, name, algorithm, plan))
             for name in names for algorithm in algorithms]
-    more = {name: [pool.submit(one_at_a_time, more_part, name, plan, index) for index in range(parts(name, plan))]
+    more = {name: [pool.submit(one_at_a_time, DIGEST, more_part, name, plan, index) for index in range(parts(name, plan))]
             for name in names}
     try:
         for i, (name, algorithm, future) in enumerate(rows):

@@ -11,7 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from wrt.crews import worker_name
 from wrt.errors import InputError
+from wrt.installed import DIGEST
 from wrt.mesh import Mesh
 
 _alone = threading.Lock()
@@ -56,7 +58,7 @@ def by_mesh(run: Callable[..., list[Any]], plan: Any, report: Callable[[Any], No
     if not plan.meshes:
         raise InputError("a cluster measures meshes, each on one worker: name some")
     pool, rows = submitter(executor), []
-    futures = [pool.submit(one_at_a_time, run, replace(plan, meshes=(where,))) for where in map(_found, plan.meshes)]
+    futures = [pool.submit(one_at_a_time, DIGEST, run, replace(plan, meshes=(where,))) for where in map(_found, plan.meshes)]
     try:
         for future in futures:
             part = result(pool, future)
@@ -72,8 +74,10 @@ def _found(mesh: Mesh | str | Path) -> Mesh | str:
     return mesh if isinstance(mesh, Mesh) else os.path.abspath(mesh)
 
 
-def one_at_a_time(function: Callable[..., Any], *arguments: Any) -> Any:
+def one_at_a_time(digest: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """On a worker: two that are timed at once in a process would each slow the other down, and kernels are not made for two
-    threads at once."""
+    threads at once. Raises InputError where the DIGEST of who asks is another."""
+    if digest != DIGEST:
+        raise InputError(f"worker {worker_name()} has other code of wrt, another Python, NumPy or Warp: all must have the same")
     with _alone:
         return function(*arguments)
