@@ -19,10 +19,10 @@ from wrt.device_scene import upload_scene
 from wrt.driver import Renderer
 from wrt.errors import InputError, SceneWarning
 from wrt.film import Film
-from wrt.image import replacing
 from wrt.motion import moves, scene_at
 from wrt.options import Options
 from wrt.scene import Camera, Scene, as_number
+from wrt.write_file import check_writable, replacing
 
 REBUILD_AT = 1.5  # growth of the SAH cost by refits (docs/acceleration.md, "Moving meshes")
 MOVIES = {".gif": "GIF", ".png": "PNG", ".apng": "PNG"}
@@ -116,9 +116,7 @@ def check_output(path: str | os.PathLike[str]) -> Path:
     """The path, if frames can be written there: a file of MOVIES, or a folder, which is made. Raises InputError if not."""
     path = Path(path)
     if path.suffix.lower() in MOVIES:
-        with replacing(path) as temporary:
-            temporary.touch()
-            temporary.unlink()
+        check_writable(path)
         return path
     if path.suffix and not path.is_dir():
         raise InputError(f"frames go into a folder, or into a {', '.join(MOVIES)} file", path)
@@ -126,6 +124,7 @@ def check_output(path: str | os.PathLike[str]) -> Path:
         path.mkdir(exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be made: {error.strerror}", path) from error
+    check_writable(frame_path(path, 0, 1))
     return path
 
 

@@ -2,12 +2,14 @@
 
 A checkpoint is a checked file (wrt.checked_file): who made it (IDENTITY: everything that can change a pixel), how far it is, and
 the film's arrays. How many samples each pixel has is one of them: rendering goes on from any state in which each pixel is done
-whole. Beside the file lies `.NAME.part`, which is locked while a render runs, and holds the room that the next one needs.
+whole. Beside the file lies `.NAME.part`, which is locked while a render runs, and holds the room that the next one needs. The
+header's first entry tells on which system it is written: so a part that a killed render left is known (wrt.write_file).
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -16,20 +18,17 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from wrt.checked_file import DIGEST_BYTES, MAX_HEADER, read_checked, write_checked
 from wrt.device_film import OF_A_GROUP, SHARED, DeviceFilm
 from wrt.errors import InputError
-
-try:
-    import fcntl
-except ImportError:  # no POSIX: nothing keeps two renders from one file
-    fcntl = None  # type: ignore[assignment]
+from wrt.write_file import WINDOWS, is_file_of, remove_leftovers, sync_folder, this_system, try_lock
 
 MAGIC = b"wrt checkpoint 1\n"
+LOCK_SECONDS = 0.3  # for a lock that is only held for a moment
 # What is told of a value that differs: the rest are told with both values.
 OTHER = {"scene": "the scene is another", "camera": "the camera is another", "kernels": "the kernels are another version"}
 
@@ -100,6 +99,7 @@ class Checkpoint:
     def held(self) -> Iterator[Checkpoint]:
         """Keep the part file, its lock and its room during the block. Raises InputError where the system refuses."""
         try:
+            remove_leftovers(self.path.parent)
             self._reserve(2 * self.bytes)
             if self.saved is None and os.path.lexists(self.path):  # another render was faster
                 self._release()
@@ -115,33 +115,39 @@ class Checkpoint:
 
     def _reserve(self, room: int) -> None:
         """Open and lock the part file, and take the room on the disk; at least so many bytes must be there."""
-        while True:
-            self._file = open(os.open(self.part, os.O_RDWR | os.O_CREAT, 0o666), "wb")
-            if fcntl is not None:
-                try:
-                    fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    self._file.close()
-                    self._file = None
-                    raise InputError("another render is writing it", self.path) from None
-                except OSError:
-                    pass  # a file system without locks
-            if os.path.exists(self.part) and os.path.samestat(os.fstat(self._file.fileno()), os.stat(self.part)):
-                break  # else another render has just renamed it
-            self._file.close()
+        self._file = self._opened()
         if hasattr(os, "posix_fallocate"):
             os.posix_fallocate(self._file.fileno(), 0, room)
         elif shutil.disk_usage(self.part.parent).free < room:
-            raise OSError(f"no room for {room / 2**20:.0f} MiB")
+            raise OSError(errno.ENOSPC, f"no room for {room / 2**20:.0f} MiB")
         os.ftruncate(self._file.fileno(), min(room, self.bytes))
+        self._file.write(MAGIC + json.dumps(_maker()).encode() + b"\n")
+        self._file.flush()
+
+    def _opened(self) -> BinaryIO:
+        """The part file, locked where there are locks."""
+        patience = time.monotonic() + LOCK_SECONDS
+        while True:
+            file = open(os.open(self.part, os.O_RDWR | os.O_CREAT, 0o666), "wb")
+            if not try_lock(file.fileno()):
+                file.close()
+                if time.monotonic() > patience:
+                    raise InputError("another render is writing it", self.path)
+                time.sleep(0.01)  # it may be somebody who looks for leftovers
+                continue
+            if is_file_of(self.part, file.fileno()):
+                return file
+            file.close()  # another render has just renamed it
 
     def _release(self) -> None:
-        if self._file is not None:
-            with contextlib.suppress(OSError):  # a folder that is gone, a disk that has become read-only
-                self.part.unlink()
-            with contextlib.suppress(OSError):  # what a full disk did not take of a file that is gone
-                self._file.close()
-            self._file = None
+        file, self._file = self._file, None
+        if file is None:
+            return
+        # Removed under its lock, or it could be another render's by now; Windows has no such lock, and removes no open file.
+        steps = (self.part.unlink, file.close)
+        for step in reversed(steps) if WINDOWS else steps:
+            with contextlib.suppress(OSError):  # a folder that is gone, a disk that is full or has become read-only
+                step()
 
     def due(self) -> bool:
         """Whether it is time: a new file is to be there `every` seconds after the state that the last one holds."""
@@ -151,7 +157,7 @@ class Checkpoint:
         """Write the film. Where the system refuses, the old file stays, `problem` says why, and the render goes on in memory."""
         begin = time.monotonic()
         samples = film.view(film.groups[0].samples)
-        header = {"samples": [int(samples.min()), int(samples.max())], "seconds": seconds, "identity": self.identity}
+        header = _maker() | {"samples": [int(samples.min()), int(samples.max())], "seconds": seconds, "identity": self.identity}
         try:
             if self._file is None:
                 self._reserve(self.bytes)
@@ -160,13 +166,15 @@ class Checkpoint:
             self._file.truncate()
             self._file.flush()
             os.fsync(self._file.fileno())
+            if WINDOWS:
+                self._file.close()  # it renames no open file
             os.replace(self.part, self.path)
-            self.problem = ""
             written, self._file = self._file, None
-            _sync_folder(self.path.parent)
-            with contextlib.suppress(OSError, InputError):  # then the next one says so
-                self._reserve(self.bytes)
-            written.close()
+            with contextlib.closing(written):  # its lock ends when that of the next is there
+                sync_folder(self.path.parent)
+                self.problem = ""
+                with contextlib.suppress(OSError, InputError):  # then the next one says so
+                    self._reserve(self.bytes)
         except (OSError, InputError, MemoryError) as error:
             self.problem = f"{self.path}: the checkpoint cannot be written: {_reason(error)}"
             self._release()
@@ -201,11 +209,5 @@ def _reason(error: Exception) -> str:
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
-def _sync_folder(folder: Path) -> None:
-    """A rename is on the disk only when its folder is."""
-    with contextlib.suppress(OSError):  # not every system opens folders
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+def _maker() -> dict[str, Any]:
+    return {"maker": this_system()}

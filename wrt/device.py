@@ -25,6 +25,7 @@ import warp as wp
 from wrt.arguments import shown
 from wrt.errors import InputError
 from wrt.memory import available
+from wrt.write_file import compiling
 
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
 
@@ -80,7 +81,8 @@ def _stderr_without(text: bytes) -> Iterator[None]:
 def start(device: str) -> Any:
     """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are."""
     with _stderr_without(b"NVIDIA CUDA driver"):  # where there is no GPU, it says so each time
-        wp.init()
+        with _cache_told():
+            wp.init()
     try:
         with _stderr_without(b"Warp CUDA error"):  # told by the InputError below
             return wp.get_device(device)
@@ -130,19 +132,29 @@ def load_kernel(kernel: Any, device: Any) -> None:
 
 def _load(kernel: Any, device: Any) -> None:
     block_dim = 1 if device.is_cpu else None
+    with _cache_told():
+        cache, name = Path(wp.config.kernel_cache_dir), kernel.module.get_module_identifier(block_dim)
+        compiled = ("*.o",) if device.is_cpu else ("*.cubin", "*.ptx")
+        if any(any((cache / name).glob(pattern)) for pattern in compiled):
+            kernel.module.load(device, block_dim=block_dim)
+        else:
+            _require_room_to_compile(cache)
+            with compiling(cache, f"{name}_p{os.getpid()}_t{threading.get_ident()}"):  # as Warp calls the folder
+                kernel.module.load(device, block_dim=block_dim)
+
+
+@contextmanager
+def _cache_told() -> Iterator[None]:
+    """What the system refuses Warp's cache is told with the way out."""
     try:
-        if device.is_cpu:
-            _require_room_to_compile(Path(wp.config.kernel_cache_dir), kernel.module.get_module_identifier(block_dim))
-        kernel.module.load(device, block_dim=block_dim)
+        yield
     except OSError as error:
-        raise InputError(f"a kernel cannot be compiled: {error.strerror or error} (WARP_CACHE_PATH names another folder)",
-                         wp.config.kernel_cache_dir) from error
+        raise InputError(f"kernels cannot be compiled: {error.strerror or error} (WARP_CACHE_PATH names another folder)",
+                         wp.config.kernel_cache_dir or error.filename) from error
 
 
-def _require_room_to_compile(cache: Path, name: str) -> None:
-    """Raise OSError where a kernel is still to be compiled and there is no room for it: LLVM ends the process on a full disk."""
-    if any((cache / name).glob("*.o")):
-        return
+def _require_room_to_compile(cache: Path) -> None:
+    """Raise OSError where there is no room for a kernel: LLVM ends the process on a full disk."""
     room = float(shutil.disk_usage(cache).free)
     with contextlib.suppress(ImportError):
         import resource

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import struct
-import uuid
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -19,11 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from wrt import write_file
 from wrt.errors import InputError, SceneWarning
 from wrt.image_decode import FORMATS as FORMATS_READ
 from wrt.image_decode import check_size, decode_png16, decode_rgba8, png_texts
 from wrt.read_file import open_regular, read_file
 from wrt.tonemap import decode_srgb, to_codes
+from wrt.write_file import replacing
 
 PathLike = str | os.PathLike[str]
 
@@ -55,37 +56,7 @@ def output_format(path: PathLike, bits: int | None = None) -> tuple[str, int]:
 def check_writable(path: PathLike, bits: int | None = None) -> None:
     """Raise the InputError that writing an image to `path` would end in, before any work is done for it."""
     output_format(path, bits)
-    with replacing(path) as temporary:
-        temporary.touch()
-        temporary.unlink()
-
-
-@contextlib.contextmanager
-def replacing(path: PathLike) -> Iterator[Path]:
-    """A new name in the folder of `path`, to write to; on success that file takes the place of `path`.
-
-    On any failure the new file is removed and an existing `path` stays as it was. A link is followed, not replaced.
-    Raises InputError where the system refuses.
-    """
-    target = Path(os.path.realpath(path))
-    if not target.parent.is_dir():
-        raise InputError("its folder does not exist", path)
-    if target.is_dir():
-        raise InputError("is a folder", path)
-    if target.exists() and not target.is_file():
-        raise InputError("is no regular file", path)  # a device: replacing it would destroy its node
-    if target.exists() and not os.access(target, os.W_OK):
-        raise InputError("is write-protected", path)
-    # The suffix stays, since OpenImageIO takes the format from it.
-    temporary = target.parent / f".{uuid.uuid4().hex}{target.suffix}"
-    try:
-        yield temporary
-        if temporary.exists():
-            os.replace(temporary, target)
-    except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror or error}", path) from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_file.check_writable(path)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------

@@ -282,7 +282,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path: Path, monkeypat
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(Path, "touch", refuse)  # permissions do not bind the superuser, as which tests may run
+    monkeypatch.setattr(os, "open", refuse)  # permissions do not bind the superuser, as which tests may run
     with pytest.raises(InputError, match=r"a\.png: cannot be written: Permission denied"):
         check_writable(tmp_path / "a.png")
 

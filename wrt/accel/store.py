@@ -6,6 +6,7 @@ structure's class, and indices are checked before a ray follows them.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from hashlib import sha256
@@ -19,8 +20,8 @@ import wrt
 from wrt.accel.base import Accelerator, Built, Geometry
 from wrt.checked_file import read_checked, write_checked
 from wrt.errors import InputError
-from wrt.image import replacing
 from wrt.mesh import Mesh
+from wrt.write_file import check_writable, replacing
 
 MAGIC = b"wrt acceleration structure 1\n"
 STATS = ("nodes", "leaves", "depth", "sah_cost")
@@ -52,9 +53,7 @@ def check_target(path: str | os.PathLike[str]) -> None:
     """Raise the InputError that saving to `path` would end in, before any work is done for it."""
     if Path(path).suffix.lower() != ".accel":
         raise InputError("a structure is written to a .accel file", path)
-    with replacing(path) as temporary:
-        temporary.touch()
-        temporary.unlink()
+    check_writable(path)
 
 
 def save(accel: Accelerator, path: str | os.PathLike[str]) -> None:
@@ -121,12 +120,14 @@ def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: s
     key = json.dumps([geometry.digest(), accel, chosen, wrt.__version__], sort_keys=True)
     path = Path(folder) / f"{sha256(key.encode()).hexdigest()[:32]}.accel"
     if path.is_file():
-        try:
+        with contextlib.suppress(InputError):  # a damaged one is replaced below
             return load_accel(path, geometry, device, threads)
-        except InputError:
-            path.unlink(missing_ok=True)
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made: {error.strerror}", folder) from error
+    check_target(path)
     structure = build(geometry, accel, device, threads, **options)
-    Path(folder).mkdir(parents=True, exist_ok=True)
     structure.save(path)
     return structure
 

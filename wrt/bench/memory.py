@@ -17,7 +17,7 @@ def peak_bytes(work: Callable[[], T]) -> tuple[T, float]:
     What the process had freed and kept would be used without growing: it is given back first, as far as the system can.
     """
     gc.collect()
-    with suppress(AttributeError, OSError):
+    with suppress(AttributeError, OSError, TypeError):  # no such library, or (Windows) none without a name
         ctypes.CDLL(None).malloc_trim(0)
     before = status("VmRSS") if reset_peak() else float("nan")
     result = work()

@@ -20,6 +20,7 @@ from wrt.bench.visibility_report import table
 from wrt.device import describe_devices, thread_count
 from wrt.errors import InputError
 from wrt.image import check_writable, write_codes
+from wrt.write_file import replacing
 
 COLUMNS = ("case", "algorithm", "rays", "judged", "misses", "false hits", "wrong prim", "self-hits", "duplicates", "ties",
            "near ties", "borderline", "t ulp max", "t ulp 99.9 %", "t / bound")
@@ -200,13 +201,8 @@ def paths(path: Path) -> list[Path]:
 def write_report(result: Result, plan: Plan, path: Path) -> list[Path]:
     """The files; the report is written whole or not at all. Raises InputError where the system refuses."""
     text = page(result, plan) if path.suffix.lower() == ".html" else markdown(result, plan, path.stem)
-    temporary = path.with_name(path.name + ".part")
-    try:
+    with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"cannot be written: {error.strerror}", path) from error
     for target in paths(path)[1:]:
         write_codes(target, plot(result, target.stem.rsplit("-", 1)[1]).draw())
     return paths(path)
