@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ from wrt.scene import (
     Object,
     PointLight,
     Scene,
+    Settings,
     SpotLight,
     as_transform,
     require_count,
@@ -58,6 +59,7 @@ def load_gltf(path: str | os.PathLike[str], *, staged: bool = True) -> Scene:
     Meshes, materials and textures that the file shares are shared objects in the scene. staged: a file without a camera
     or light gets one (see `wrt.staging`), and one without triangles is refused; False: the scene is as in the file, as
     another file includes it. Everything that is left out or added is named in one SceneWarning.
+    The scene's settings are the defaults, but for glass_shadows = "tinted" where the file has solid glass (KHR_materials_volume).
     Raises InputError that names the file and the place in its JSON.
     """
     try:
@@ -316,6 +318,12 @@ LIGHTS: dict[str, Callable[..., Light]] = {"point": _point, "directional": _dire
 # --- the scene --------------------------------------------------------------------------------------------------------
 
 
+def _settings(scene: Scene) -> Settings:
+    """A glTF file has no settings. Other viewers light what stands in its glass, and so do shadow rays that go through glass."""
+    solid_glass = any(material.transmission > 0.0 and not material.thin for material in scene.materials)
+    return Settings(glass_shadows="tinted" if solid_glass else "opaque")
+
+
 @dataclass
 class _Reader:
     document: Document
@@ -344,7 +352,8 @@ class _Reader:
         for extension, raw in (document.gltf.extensions or {}).items():
             if extension not in left_out:
                 left_out.add_extensions({extension: raw}, "file", document.path.name)
-        return Scene(tuple(self.objects), (), tuple(self.lights), tuple(self.cameras), name=document.path.stem)
+        scene = Scene(tuple(self.objects), (), tuple(self.lights), tuple(self.cameras), name=document.path.stem)
+        return replace(scene, settings=_settings(scene))
 
     def _add_mesh(self, node: Any, world: np.ndarray, name: str, place: str) -> None:
         source = self.document.item("meshes", node.mesh, f"{place}.mesh")

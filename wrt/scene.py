@@ -496,7 +496,7 @@ class Settings:
     max_depth: bounces after the first hit (0: only direct light). min_throughput: a ray that would carry less than this
     share (largest channel) is cut. fresnel: "exact", or "schlick" (cheaper, approximate). glass_shadows: solid glass
     "opaque" to shadow rays (right but for caustics, which a Whitted tracer does not see), or "tinted": shadow rays go
-    straight through it. sampler: "sobol" (Owen-scrambled, evenly spread), or "independent" random numbers, whose noise falls
+    straight through it, as they do in scenes from glTF files that have solid glass. sampler: "sobol" (Owen-scrambled, evenly spread), or "independent" random numbers, whose noise falls
     more slowly. exposure in stops.
     """
 

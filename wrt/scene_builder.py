@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -144,7 +144,7 @@ class _Builder:
             cameras=(*cameras, *(camera for scene in included for camera in scene.cameras)),
             background=background,
             ambient=as_vector(table.ambient, "ambient"),
-            settings=Settings(**{**table.settings.given(), "size": tuple(table.settings.size)}),
+            settings=settings(table.settings, included),
             name=table.title or self.path.stem,
         )
 
@@ -308,6 +308,13 @@ class _Builder:
             mesh = self._meshes[key] = make()
             self.meter.take(32.0 * len(mesh.vertices) + 12.0 * len(mesh.faces), "the meshes")
         return self._meshes[key]
+
+
+def settings(table: tables.SettingsTable, included: Sequence[Scene]) -> Settings:
+    """What the file says; where it does not say how glass casts shadows, the included files decide: tinted if one needs that."""
+    tinted = any(scene.settings.glass_shadows == "tinted" for scene in included)
+    needed = {"glass_shadows": "tinted"} if tinted else {}
+    return Settings(**{**needed, **table.given(), "size": tuple(table.size)})
 
 
 def moved(scene: Scene, matrix: np.ndarray) -> Scene:

@@ -118,7 +118,8 @@ class SettingsTable(Table):
     filter: Literal["box", "gaussian", "blackman-harris"] = Field("blackman-harris", description="pixel filter")
     fresnel: Literal["exact", "schlick"] = Field("exact", description="of dielectrics")
     glass_shadows: Literal["opaque", "tinted"] = Field(
-        "opaque", description="tinted: shadow rays go straight through solid glass")
+        "opaque", description="tinted: shadow rays go straight through solid glass (default: tinted where an included glTF file has"
+                              " solid glass, else opaque)")
     sampler: Literal["sobol", "independent"] = Field(
         "sobol", description="how a pixel's samples are spread: evenly, or by independent random numbers")
     exposure: float = Field(_SETTINGS.exposure, ge=-100.0, le=100.0, json_schema_extra={"unit": "stops"},
