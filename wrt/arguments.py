@@ -6,7 +6,8 @@ import difflib
 import operator
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -82,14 +83,34 @@ def as_names(value: Any, what: str) -> tuple[str, ...]:
     return as_tuple(value, str, what)
 
 
+def as_choice(value: str, choices: Collection[str], what: str) -> str:
+    """The value, if it is one of the choices."""
+    if value not in choices:
+        hint = did_you_mean(value, choices)
+        raise InputError(f"{what} must be one of {', '.join(choices)}; got {shown(value)}{'; ' if hint else ''}{hint}".rstrip())
+    return value
+
+
+def require_known(name: str, known: Collection[str], what: str) -> None:
+    """Raise InputError where there is no such thing of that name."""
+    if name not in known:
+        raise InputError(f"no {what} {shown(name)}; {did_you_mean(name, known)}there is {', '.join(known)}")
+
+
 def unknown(name: str, what: str, known: Iterable[str]) -> str:
     """A sentence on a name that is not known, with the nearest one that is, and all of them; long names and lists are cut."""
     names = [str(each) for each in known]
-    near = difflib.get_close_matches(name[:100], [each for each in names[:1000] if len(each) <= 100], n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    hint = did_you_mean(name, names)
     more = f" and {len(names) - 100} more" if len(names) > 100 else ""
     return f"unknown {what} {short(name)}; {hint}known are {', '.join(map(short, names[:100]))}{more}" if names else (
         f"unknown {what} {short(name)}; there are none")
+
+
+def did_you_mean(name: Any, known: Iterable[str]) -> str:
+    """A question with the known name that is nearest, for the middle of a message; "" where none is near."""
+    names = [each for each in islice(known, 1000) if len(each) <= 100]
+    near = difflib.get_close_matches(name[:100], names, n=1) if isinstance(name, str) else []
+    return f"did you mean {near[0]!r}? " if near else ""
 
 
 def at_thing(kind: str, name: str) -> str:

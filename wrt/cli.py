@@ -23,7 +23,25 @@ import wrt
 from wrt.cli_animate import animate
 from wrt.cli_bench import bench, stability
 from wrt.cli_build import build
-from wrt.cli_common import CLUSTER, Crop, Duration, Names, Size, load, naming, say, say_json, spread_options, warnings_told
+from wrt.cli_common import (
+    ACCEL,
+    CLUSTER,
+    SET,
+    Commands,
+    Crop,
+    Duration,
+    Names,
+    OneOf,
+    Size,
+    depth_hint,
+    load,
+    naming,
+    say,
+    say_json,
+    settings_of,
+    spread_options,
+    warnings_told,
+)
 from wrt.cli_profile import profile, whatif
 from wrt.cli_save import check_room, checkpoint_options, save_film
 from wrt.cli_view import view
@@ -31,7 +49,7 @@ from wrt.errors import InputError
 from wrt.interrupt import Interrupted, exit_code, raise_on_termination
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(wrt.__version__, message="wrt %(version)s")
 def cli() -> None:
     """A Whitted ray tracer on NVIDIA Warp."""
@@ -60,14 +78,16 @@ cli.add_command(view)
 @click.option("--camera", help="A camera's name or number  [default: the first]")
 @click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's, 8]")
 @click.option("--min-throughput", type=float, help="Cut rays that carry less than this share  [default: 0.001]")
-@click.option("--filter", "filter_name", help="Pixel filter: box, gaussian or blackman-harris")
-@click.option("--fresnel", help="exact, or schlick (cheaper, approximate)")
-@click.option("--sampler", help="sobol (evenly spread), or independent (random)")
-@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
-@click.option("--instancing", default="auto", show_default=True, help="Keep shared meshes once: auto (large ones), always or never")
+@click.option("--filter", "filter_name", type=OneOf("wrt.scene:FILTERS"), help="Pixel filter")
+@click.option("--fresnel", type=OneOf("wrt.scene:FRESNELS"), help="exact, or schlick (cheaper, approximate)")
+@click.option("--sampler", type=OneOf("wrt.scene:SAMPLERS"), help="sobol (evenly spread), or independent (random)")
+@SET
+@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
+@click.option("--instancing", type=OneOf("wrt.instancing:INSTANCING"), default="auto", show_default=True,
+              help="Keep shared meshes once: auto (large ones), always or never")
 @click.option("--aov", type=Names(), default=(), help="Also depth, normal, albedo, prim_id, material_id")
 @click.option("--bits", type=int, help="PNG: 8 or 16; EXR: 16 or 32")
-@click.option("--tonemap", help="none, reinhard, aces or agx  [default: the scene's]")
+@click.option("--tonemap", type=OneOf("wrt.scene:TONEMAPS"), help="Curve from linear to display  [default: the scene's]")
 @click.option("--exposure", type=float, help="Stops  [default: the scene's, 0]")
 @click.option("--time-limit", type=Duration(), help="Stop after 30s, 5m, 1h of tracing, with what there is")
 @click.option("--target-error", type=float,
@@ -78,7 +98,8 @@ cli.add_command(view)
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint; without one, from the beginning")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print the statistics as JSON")
-def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
+def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool,
+           **options: Any) -> None:
     """Render SCENE (.toml, .gltf, .glb, or a mesh: .obj, .ply, .stl) to a picture."""
     begin = time.perf_counter()
     from wrt.image import check_writable
@@ -93,9 +114,10 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
     from wrt.scene import Scene
 
     # Whatever can be wrong with an option is told before a scene is read and a kernel compiled.
-    settings = {"filter": options.pop("filter_name")}
-    settings |= {name: options.pop(name) for name in (
+    flags = {"filter": options.pop("filter_name")}
+    flags |= {name: options.pop(name) for name in (
         "spp", "size", "max_depth", "min_throughput", "fresnel", "sampler", "tonemap", "exposure")}
+    settings = settings_of(given, flags)
     options |= checkpoint_options(output, options.pop("every"), options.pop("checkpoint_file"), options.pop("resume"))
     Scene().with_settings(**settings)
     options |= spread_options(options.pop("cluster"), options.pop("device"))
@@ -112,7 +134,7 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
 
     with warnings_told(quiet):
         with progress_reporter(quiet) as progress, naming(scene):
-            film = render_scene(loaded, spp=settings["spp"], progress=progress, **options)
+            film = render_scene(loaded, spp=settings.get("spp"), progress=progress, **options)
         if not film.stats["samples"]:
             raise Interrupted(film.stats["signal"] or signal.SIGINT)  # there is nothing to keep
         begin = time.perf_counter()
@@ -139,7 +161,6 @@ def render(scene: Path, output: Path | None, quiet: bool, as_json: bool, **optio
 
 def _summary(film: Any) -> str:
     s = film.stats
-    seconds = ", ".join(f"{name} {value:.2f}" for name, value in s["seconds"].items())
     cut = f"cut: {s['cut_by_depth']} rays by depth, {s['cut_by_throughput']} by throughput"
     note = " (interrupted)" if s["interrupted"] else " (time limit)" if s["timed_out"] else ""
     if s.get("resumed"):
@@ -150,20 +171,36 @@ def _summary(film: Any) -> str:
     if s.get("target_error") is not None:
         note += f", estimated error {s['estimated_error']:.3g}"
         note += "" if s["target_reached"] else f" (above the target of {s['target_error']:g})"
+    hint = depth_hint(s["visibly_cut"], film.metadata["max_depth"])
+    hint = f"\n{hint}" if hint else ""
     kept = f"\n{s['checkpoint']}: go on from it with --resume" if s.get("checkpoint") else ""
     return (f"{film.metadata['spp']} spp{note}, {s['rays'] / 1e6:.2f} M rays, {s['rays_per_second'] / 1e6:.2f} Mray/s; "
-            f"{cut}, lost throughput {s['lost_throughput_per_sample']:.2g} a sample{lost}\nseconds: {seconds}{kept}")
+            f"{cut}, lost throughput {s['lost_throughput_per_sample']:.2g} a sample{lost}\n{_seconds(s)}{kept}{hint}")
+
+
+def _seconds(stats: dict[str, Any]) -> str:
+    """Each second once: what is built while kernels compile stands in brackets."""
+    seconds = stats["seconds"]
+    notes = dict.fromkeys(seconds, "")
+    meanwhile = min(stats["accel"]["build_seconds"] - seconds["build"], seconds["compile"])
+    if meanwhile >= 0.005:
+        notes["build"] = f" (and {meanwhile:.2f} while kernels compiled)"
+    if stats.get("resumed"):
+        notes["trace"] = f" ({stats['resumed']['seconds']:.2f} of them before it was resumed)"
+    return "seconds: " + ", ".join(f"{name} {value:.2f}{notes[name]}" for name, value in seconds.items())
 
 
 @cli.command()
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--camera", help="A camera's name or number  [default: the first]")
+@SET
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def info(scene: Path, camera: str | None, as_json: bool) -> None:
+def info(scene: Path, camera: str | None, given: tuple[tuple[str, Any], ...], as_json: bool) -> None:
     """Tell what SCENE holds, and which features its kernel is compiled with."""
     from wrt.features import describe
 
-    loaded = load(scene, quiet=False)
+    settings = settings_of(given)
+    loaded = load(scene, quiet=False).with_settings(**settings)
     with naming(scene):
         facts = describe(loaded, camera)
     if as_json:
@@ -217,7 +254,8 @@ def validate(scenes: tuple[Path, ...]) -> None:
 @click.option("--max-relmse", type=float, help="Fail above this relative mean squared error")
 @click.option("--min-psnr", type=float, help="Fail below this many dB")
 @click.option("--max-flip", type=float, help="Fail above this mean FLIP error")
-@click.option("--tonemap", default="none", show_default=True, help="For PSNR and FLIP, which see what a display shows")
+@click.option("--tonemap", type=OneOf("wrt.scene:TONEMAPS"), default="none", show_default=True,
+              help="For PSNR and FLIP, which see what a display shows")
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, likewise")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float, as_json: bool, **limits: Any) -> None:

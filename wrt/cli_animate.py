@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import Size, load, naming, say, say_json, warnings_told
+from wrt.cli_common import ACCEL, SET, Size, depth_hint, load, naming, say, say_json, settings_of, warnings_told
 from wrt.errors import InputError
 from wrt.interrupt import exit_code
 
@@ -24,15 +24,16 @@ from wrt.interrupt import exit_code
               help="Growth of the structure's SAH cost from which it is built anew, not refitted")
 @click.option("--spp", type=int, help="Samples a pixel  [default: the scene's]")
 @click.option("--size", type=Size(), help="Pixels  [default: the scene's, 640x360]")
+@SET
 @click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another noise, the same in all frames")
 @click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
 @click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
 @click.option("--camera", help="A camera's name or number  [default: the first]")
-@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
+@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print what each frame took as JSON")
-def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: float, rebuild_at: float, quiet: bool,
-            as_json: bool, **options: Any) -> None:
+def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: float, rebuild_at: float,
+            given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool, **options: Any) -> None:
     """A turntable of SCENE, or its motion (`motion` and `morph` of TOML scenes), frame by frame."""
     from wrt import animate as animation
     from wrt.options import Options
@@ -40,11 +41,11 @@ def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: 
     if not 0.1 <= fps <= 100.0:
         raise InputError(f"fps must be 0.1 to 100, got {fps:g}")
     plan = animation.Animation(frames, degrees, rebuild_at)
-    settings = {name: options.pop(name) for name in ("spp", "size")}
+    settings = settings_of(given, {name: options.pop(name) for name in ("spp", "size")})
     rendering = Options(**options)
     target = animation.check_output(output)
     loaded = load(scene, quiet).with_settings(**settings)
-    pictures, rows, signal = [], [], None
+    pictures, rows, signal, visibly_cut = [], [], None, 0.0
     begin = time.perf_counter()
     with warnings_told(quiet), naming(scene):
         for film in animation.animate(loaded, plan, rendering):
@@ -53,6 +54,7 @@ def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: 
                 break
             row = film.stats["frame"] | {"trace": film.stats["seconds"]["trace"]}
             rows.append(row)
+            visibly_cut = max(visibly_cut, film.stats["visibly_cut"])
             if target.is_dir():
                 film.save(animation.frame_path(target, row["number"], frames))
             else:
@@ -66,6 +68,9 @@ def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: 
         say_json({"output": str(target), "frames": rows, "seconds": time.perf_counter() - begin})
     elif rows:
         click.echo(target)
+    hint = depth_hint(visibly_cut, loaded.settings.max_depth)
+    if hint and not quiet:
+        say(hint)
     if len(rows) < frames:
         say(f"interrupted after {len(rows)} of {frames} frames")
         raise SystemExit(exit_code(signal))

@@ -10,7 +10,23 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import CLUSTER, Duration, Names, Size, client_of, load, naming, now_and_then, say, say_json, warnings_told
+from wrt.cli_common import (
+    ACCEL,
+    CLUSTER,
+    SET,
+    Commands,
+    Duration,
+    Names,
+    Size,
+    client_of,
+    load,
+    naming,
+    now_and_then,
+    say,
+    say_json,
+    settings_of,
+    warnings_told,
+)
 from wrt.errors import InputError
 
 
@@ -73,7 +89,7 @@ def told_of(client: Any, here: str) -> str:
     return f"a cluster, each mesh on one worker: {machines(client)}; started from {here}"
 
 
-@click.group()
+@click.group(cls=Commands)
 def bench() -> None:
     """Measure: speed against error, and one method against another."""
 
@@ -84,7 +100,7 @@ def bench() -> None:
 @click.option("--max-size", type=int, default=1024, show_default=True, help="Pixels a side at the end of the sweep from 64 on")
 @click.option("--max-triangles", type=int, default=1_500_000, show_default=True, help="Meshes are cut finer up to this many")
 @click.option("--runs", type=int, default=7, show_default=True, help="Runs of each kind, alternating")
-@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
+@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
 @click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
 @click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
 @CLUSTER
@@ -126,7 +142,7 @@ def visibility(meshes: tuple[Path, ...], output: Path | None, cluster: str | Non
 @click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--rays", type=int, default=2**17, show_default=True, help="Rays of each kind")
 @click.option("--runs", type=int, default=9, show_default=True, help="Runs of each unit, by turns")
-@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
+@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the table as Markdown (.md)")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
@@ -293,13 +309,15 @@ def bvh(meshes: tuple[Path, ...], cluster: str | None, quiet: bool, as_json: boo
 @click.option("--row-limit", type=Duration(), default="120s", show_default=True,
               help="Leave out what would take longer than this, with all its seeds")
 @click.option("--camera", help="A camera's name or number  [default: the first]")
+@SET
 @click.option("--seed", type=int, default=0, show_default=True, help="Decides on all seeds")
 @click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
 @click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for a report: Markdown, plot and data")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def error(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tuple[int, int], **options: Any) -> None:
+def error(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool, size: tuple[int, int],
+          **options: Any) -> None:
     """Speed against error of SCENE over the knobs that a render has: each picture against a converged reference."""
     from wrt.bench import error as bench_error
     from wrt.bench import error_report as report
@@ -308,8 +326,9 @@ def error(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tu
     plan = bench_error.Plan(**{name: options.pop(name) for name in (
         "knobs", "max_spp", "repeats", "reference_spp")}, row_seconds=options.pop("row_limit"))
     rendering = Options(**options)
+    settings = settings_of(given, size="--size", spp="--max-spp")
     paths = {} if output is None else report.report_paths(output, scene.stem)
-    loaded = load(scene, quiet).with_settings(size=size)
+    loaded = load(scene, quiet).with_settings(size=size, **settings)
     with warnings_told(quiet), naming(scene):
         result = bench_error.sweep(loaded, plan, rendering, lambda step: None if quiet else say(step))
     if paths:
@@ -337,12 +356,13 @@ def error(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tu
 @click.option("--matte", is_flag=True, help="Make every surface diffuse, for the integrator direct, which draws the same light")
 @click.option("--starts", type=int, default=3, show_default=True, help="How often to time whole processes; 0: not at all")
 @click.option("--camera", help="A camera's name or number  [default: the first]")
+@SET
 @click.option("--seed", type=int, default=0, show_default=True, help="Decides on all seeds")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the table as Markdown (.md)")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def mitsuba(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: tuple[int, int], matte: bool,
-            camera: str | None, **options: Any) -> None:
+def mitsuba(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool,
+            size: tuple[int, int], matte: bool, camera: str | None, **options: Any) -> None:
     """SCENE by wrt and by Mitsuba 3 (scalar_rgb and llvm_ad_rgb), on all threads: time to equal error, process start included and
     excluded.
 
@@ -356,9 +376,11 @@ def mitsuba(scene: Path, output: Path | None, quiet: bool, as_json: bool, size: 
     plan = equal_error.Plan(**options)
     if output is not None and (output.suffix.lower() != ".md" or not output.parent.is_dir()):
         raise InputError("the report is a .md file in a folder that is there", output)
-    loaded = load(scene, quiet).with_settings(size=size)
+    settings = settings_of(given, size="--size", spp="--spp")
+    loaded = load(scene, quiet).with_settings(size=size, **settings)
     with tempfile.TemporaryDirectory() as folder, warnings_told(quiet), naming(scene):
         command = ["render", str(scene), "--spp", "1", "--size", f"{size[0]}x{size[1]}", "-q", "-o", f"{folder}/start.png"]
+        command += [f"--set={name}={value}" for name, value in settings.items()]
         result = equal_error.run(equal_error.matte(loaded) if matte else loaded, plan, Options(camera=camera), command,
                                  now_and_then(quiet))
     told = equal_error.text(result)

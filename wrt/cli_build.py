@@ -2,36 +2,19 @@
 
 from __future__ import annotations
 
-import ast
 from pathlib import Path
 from typing import Any
 
 import click
 
-from wrt.cli_common import now_and_then, say, say_json, warnings_told
+from wrt.cli_common import ACCEL, Setting, now_and_then, say, say_json, warnings_told
 from wrt.errors import InputError
-
-
-class Setting(click.ParamType):
-    """NAME=VALUE; the value is a number, True, False or a word."""
-
-    name = "NAME=VALUE"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, Any]:
-        name, sign, text = str(value).partition("=")
-        if not sign or not name:
-            self.fail(f"{value!r} is not NAME=VALUE", param, ctx)
-        try:
-            parsed = ast.literal_eval(text)
-        except (ValueError, SyntaxError, MemoryError, RecursionError):
-            parsed = text
-        return name, parsed if isinstance(parsed, bool | int | float | str) else text
 
 
 @click.command()
 @click.argument("mesh", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write: .accel")
-@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
+@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
 @click.option("--set", "settings", type=Setting(), multiple=True, help="An option of the structure, such as max_leaf=8; repeatable")
 @click.option("--threads", type=int, help="Threads to build with  [default: all cores]")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")

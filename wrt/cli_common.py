@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import importlib
 import json
 import math
 import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ import click
 from wrt.errors import InputError, SceneWarning
 
 DIGITS = "[0-9]{1,9}"  # more are no pixel, and Python refuses to read thousands
+SEEN = 1e-3  # of the pixels: a patch of 15x15 in a picture of 640x360
 
 
 class Size(click.ParamType):
@@ -65,6 +68,126 @@ class Names(click.ParamType):
         if isinstance(value, tuple):  # the default
             return value
         return tuple(name.strip() for name in str(value).split(",") if name.strip())
+
+
+class Commands(click.Group):
+    """Commands; a name that is none is answered with those that there are."""
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            if self.get_command(ctx, args[0]) is None and "No such command" in error.format_message():
+                from wrt.arguments import did_you_mean
+
+                known = self.list_commands(ctx)
+                ctx.fail(f"No such command {args[0]!r}; {did_you_mean(args[0], known)}there is {', '.join(known)}")
+            raise
+
+
+class OneOf(click.ParamType):
+    """One name of a table, given as "module:TABLE". It is only shown, by --help and by completion in a shell: whoever takes the
+    option checks it against the table, and tells the nearest name."""
+
+    name = "NAME"
+
+    def __init__(self, place: str) -> None:
+        self.place = place
+
+    def names(self) -> list[str]:
+        """The table's, whose module is imported now."""
+        module, table = self.place.split(":")
+        return list(getattr(importlib.import_module(module), table))
+
+    def get_metavar(self, param: Any, ctx: Any = None) -> str:
+        return f"[{'|'.join(self.names())}]"
+
+    def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[Any]:
+        return _completions(self.names(), incomplete)
+
+
+def _completions(words: Iterable[str], incomplete: str) -> list[Any]:
+    from click.shell_completion import CompletionItem
+
+    return [CompletionItem(word) for word in words if word.startswith(incomplete)]
+
+
+ACCEL = OneOf("wrt.structures:STRUCTURES")
+
+
+class Setting(click.ParamType):
+    """NAME=VALUE; the value is a number, True, False or a word."""
+
+    name = "NAME=VALUE"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, Any]:
+        name, sign, text = str(value).partition("=")
+        if not sign or not name:
+            self.fail(f"{value!r} is not NAME=VALUE", param, ctx)
+        try:
+            parsed = ast.literal_eval(text)
+        except (ValueError, SyntaxError, MemoryError, RecursionError):
+            parsed = text
+        return name, parsed if isinstance(parsed, bool | int | float | str) else text
+
+
+class SceneSetting(Setting):
+    """A setting of a scene; completion in a shell knows them."""
+
+    def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[Any]:
+        from wrt.scene import SETTINGS
+        from wrt.scene_check import setting_choices
+
+        name, sign, _ = incomplete.partition("=")
+        words = [f"{name}={value}" for value in setting_choices(name)] if sign else [f"{each}=" for each in SETTINGS]
+        return _completions(words, incomplete)
+
+
+SET = click.option(
+    "--set", "given", type=SceneSetting(), multiple=True,
+    help="A setting of the scene, such as glass_shadows=tinted; repeatable. There is size, spp, max_depth, min_throughput, filter,"
+         " fresnel, glass_shadows, sampler, exposure and tonemap (docs/scene_format.md)")
+
+
+def settings_of(given: tuple[tuple[str, Any], ...], flags: dict[str, Any] | None = None, **taken: str) -> dict[str, Any]:
+    """The settings that --set gives, and those of `flags`, which are flags of their own (None: not given).
+
+    taken: settings that this command does not take from --set, each with who decides on it. Values are checked as those of a
+    scene file are. Raises InputError for them, and where a setting is given twice and not the same.
+    """
+    from wrt.arguments import as_size
+    from wrt.scene_check import check_settings
+
+    if not given:
+        return dict(flags or {})
+    values: dict[str, Any] = {}
+    for name, value in given:
+        if name in taken:
+            raise InputError(f"--set {name}: {taken[name]} decides on that here")
+        if name in values and values[name] != value:
+            raise InputError(f"--set {name}: given twice, {values[name]!r} and {value!r}")
+        values[name] = value
+    if "size" in values:
+        values["size"] = list(as_size(values["size"], "--set size"))
+    settings = check_settings(values, "--set")
+    for name, value in (flags or {}).items():
+        if value is not None and name in settings and _plain(settings[name]) != _plain(value):
+            raise InputError(f"--set {name}: --{name.replace('_', '-')} is given too, and says otherwise: leave one of them out")
+    return {**{name: value for name, value in (flags or {}).items() if value is not None}, **settings}
+
+
+def _plain(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list | tuple) else value
+
+
+def depth_hint(visibly_cut: float, max_depth: int) -> str | None:
+    """A line for who may want more bounces: where so many pixels lack light visibly (Film.stats) that somebody would see them."""
+    from wrt.scene import MAX_DEPTH
+
+    if visibly_cut < SEEN:
+        return None
+    advice = "raise --max-depth" if max_depth < MAX_DEPTH else f"{MAX_DEPTH} is the most there is"
+    return f"max_depth {max_depth} leaves {100.0 * visibly_cut:.2g}% of the pixels visibly too dark: {advice}"
 
 
 def spread_options(cluster: str | None, device: str) -> dict[str, Any]:

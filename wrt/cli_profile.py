@@ -8,7 +8,21 @@ from typing import Any
 import click
 
 from wrt.cli_bench import bench, by_mesh
-from wrt.cli_common import CLUSTER, Crop, Names, Size, client_of, load, naming, say, say_json, warnings_told
+from wrt.cli_common import (
+    ACCEL,
+    CLUSTER,
+    SET,
+    Crop,
+    Names,
+    Size,
+    client_of,
+    load,
+    naming,
+    say,
+    say_json,
+    settings_of,
+    warnings_told,
+)
 from wrt.errors import InputError
 
 
@@ -18,25 +32,28 @@ from wrt.errors import InputError
 @click.option("--size", type=Size(), help="Pixels  [default: the scene's]")
 @click.option("--spp", type=int, default=1, show_default=True, help="Samples a pixel")
 @click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's]")
+@SET
 @click.option("--crop", type=Crop(), help="Only this rectangle, in pixels from the top left")
 @click.option("--camera", help="A camera's name or number  [default: the first]")
-@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure")
+@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
 @click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other samples")
 @click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
 @click.option("-q", "--quiet", is_flag=True, help="No warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def profile(scene: Path, output: Path | None, gpu: str, quiet: bool, as_json: bool, **options: Any) -> None:
+def profile(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], gpu: str, quiet: bool, as_json: bool,
+            **options: Any) -> None:
     """What every ray of SCENE costs: counters by pixel, kind and depth, and a model of the RT core."""
+    from wrt.arguments import require_known
     from wrt.bench import profile_report as report
     from wrt.profiler import profile as measure
     from wrt.rtcore_parameters import GPUS
 
-    if gpu not in GPUS:
-        raise InputError(f"no GPU {gpu!r}; there is {', '.join(GPUS)}")
+    require_known(gpu, GPUS, "GPU")
     if output is not None:
         report.check_folder(output)
-    loaded = load(scene, quiet)
+    settings = settings_of(given, {name: options.pop(name) for name in ("size", "max_depth")}, spp="--spp")
+    loaded = load(scene, quiet).with_settings(**settings)
     with warnings_told(quiet), naming(scene):
         found = measure(loaded, **options)
     rows = report.model_rows(found, GPUS[gpu])

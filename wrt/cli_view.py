@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import load, naming, say
+from wrt.cli_common import ACCEL, SET, load, naming, say, settings_of
 
 
 @click.command()
@@ -22,9 +22,11 @@ from wrt.cli_common import load, naming, say
 @click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
 @click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
 @click.option("--camera", help="A camera's name or number to begin with  [default: the first]")
-@click.option("--accel", default="bvh", show_default=True, help="Acceleration structure to begin with")
+@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure to begin with")
+@SET
 @click.option("-q", "--quiet", is_flag=True, help="No warnings")
-def view(scene: Path, port: int, host: str, open_browser: bool, spp: int, quiet: bool, **options: Any) -> None:
+def view(scene: Path, port: int, host: str, open_browser: bool, spp: int,
+         given: tuple[tuple[str, Any], ...], quiet: bool, **options: Any) -> None:
     """Look around in SCENE: an orbit camera in the browser, whose picture gets finer while it stands still.
 
     Needs the extra `viewer`. Ctrl-C ends it.
@@ -36,7 +38,8 @@ def view(scene: Path, port: int, host: str, open_browser: bool, spp: int, quiet:
     from wrt.options import Options
 
     rendering = Options(**options)
-    loaded = load(scene, quiet)
+    settings = settings_of(given, size="the browser's window", spp="--spp")
+    loaded = load(scene, quiet).with_settings(**settings)
     with naming(scene):
         loaded.camera(rendering.camera)  # told with the file's name
     page = Page(loaded, rendering, host, port, spp)

@@ -25,6 +25,7 @@ import warp as wp
 from wrt.arguments import shown
 from wrt.errors import InputError
 from wrt.memory import available
+from wrt.seconds import loading
 from wrt.write_file import compiling
 
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
@@ -132,7 +133,7 @@ def load_kernel(kernel: Any, device: Any) -> None:
 
 def _load(kernel: Any, device: Any) -> None:
     block_dim = 1 if device.is_cpu else None
-    with _cache_told():
+    with loading(), _cache_told():
         cache, name = Path(wp.config.kernel_cache_dir), kernel.module.get_module_identifier(block_dim)
         compiled = ("*.o",) if device.is_cpu else ("*.cubin", "*.ptx")
         if any(any((cache / name).glob(pattern)) for pattern in compiled):

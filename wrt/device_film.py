@@ -18,6 +18,8 @@ from wrt.scene import Settings
 GROUPS = 4
 BYTES_OF_FILM, BYTES_OF_GROUP = 52, 20  # a pixel; of one film, and of each further group
 OF_A_GROUP = {"mean": wp.vec3, "samples": wp.int32, "lost": wp.float32}
+# Of the brightness around: a difference that people see in a detail of some pixels (in a large patch, less than half of it).
+VISIBLE = 0.05
 SHARED = {"m2": wp.vec3, "rays": wp.int64, "cut_depth": wp.int32, "cut_throughput": wp.int32, "not_finite": wp.int32}
 OF_AOVS = {"depth": wp.float32, "normal": wp.vec3, "albedo": wp.vec3, "prim_id": wp.int32, "material_id": wp.int32}
 
@@ -79,6 +81,18 @@ class DeviceFilm:
     def lost(self) -> float:
         """Throughput that was cut, summed over all samples."""
         return sum(float(self.picture(film.lost).sum(dtype=np.float64)) for film in self.groups)
+
+    def visibly_cut(self, most_by_throughput: float) -> float:
+        """The share of the pixels that are visibly darker for rays that were cut by depth: those rays would have added VISIBLE or
+        more to the pixel in a room of radiance 1.
+
+        The room stands for what the picture shows on average, which the eye adapts to. most_by_throughput: what one ray that was
+        cut by its throughput is worth at most; `lost` holds both, so that what is left of it is a lower bound.
+        """
+        film = self.groups[0]
+        lost = sum((self.view(group.lost) for group in self.groups[1:]), self.view(film.lost))
+        by_depth = np.where(self.view(film.cut_depth) > 0, lost - most_by_throughput * self.view(film.cut_throughput), 0.0)
+        return float((by_depth > VISIBLE * self.samples()).mean())
 
     def samples(self) -> np.ndarray:
         """(H, W) int32, over all groups; a pixel's groups have equally many."""

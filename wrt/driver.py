@@ -39,6 +39,7 @@ from wrt.options import OPTIONS, Options, Progress
 from wrt.scene import SETTINGS, Camera, Scene
 from wrt.scene_digest import camera_digest, scene_digest
 from wrt.scene_file import as_scene
+from wrt.seconds import Span, counted_once, loads_since
 from wrt.tiles import Rectangle, Work, corners, tiles, work_left
 
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
@@ -107,6 +108,7 @@ class Renderer:
     def __init__(self, scene: Scene, options: Options) -> None:
         self.scene, self.options = scene, options
         self.seconds: dict[str, float] = {}
+        self.spans: dict[str, list[Span]] = {}  # when things were done that others may have been done beside
         self.threads = thread_count(options.threads)
         self.interrupts: list[int] = []
         self.fraction_built = 0.0
@@ -181,10 +183,10 @@ class Renderer:
     def _prepare(self) -> None:
         """Compile, which takes longest, and build the structure meanwhile. Neither Ctrl-C nor an error waits for the
         compiler, and no wait is long: Python may hear of Ctrl-C only between two of them."""
+        begin, tell, told = time.perf_counter(), self.options.progress, ("", 0.0)
         pool = ThreadPoolExecutor(2, thread_name_prefix=PREPARING)
         compiling = pool.submit(self._compile)
         jobs: set[Future[None]] = {compiling, pool.submit(self._build)}
-        begin, tell, told = time.perf_counter(), self.options.progress, ("", 0.0)
         try:
             while jobs:
                 finished, jobs = wait(jobs, timeout=0.1, return_when=FIRST_EXCEPTION)
@@ -198,22 +200,21 @@ class Renderer:
                     job.result()
         finally:
             pool.shutdown(wait=False)
+        self.seconds |= counted_once({"compile": loads_since(begin), **self.spans})
 
     def _compile(self) -> None:
-        begin = time.perf_counter()
         for kernel in self.kernels:
             load_kernel(kernel, self.device)
-        self.seconds["compile"] = time.perf_counter() - begin
 
     def _build(self) -> None:
         begin = time.perf_counter()
         self.device_scene = upload_scene(self.scene, self.device, self.options.instancing)
-        self.seconds["upload"] = time.perf_counter() - begin
+        uploaded = time.perf_counter()
         options = {"triangle": self.options.triangle, "box": self.options.box, **self.options.accel_options}
         if tells_progress(self.options.accel):
             options = {"progress": partial(setattr, self, "fraction_built"), **options}
         self.accel = build(self.device_scene.world.geometry, self.options.accel, self.options.device, self.threads, **options)
-        self.seconds["build"] = self.accel.stats.build_seconds
+        self.spans = {"upload": [(begin, uploaded)], "build": [(uploaded, time.perf_counter())]}
 
     def aim(self, camera: Camera, **settings: Any) -> None:
         """Another camera and other settings (of AIMED) for the next `run`, with the same kernel and structure.
@@ -397,6 +398,11 @@ class Renderer:
         """Of tracing, those before the last resume too."""
         return self.seconds_before + time.perf_counter() - self.begin
 
+    def _most_cut_by_throughput(self) -> float:
+        """What a ray that is cut by its throughput is worth at most: in glass, light is denser."""
+        glass = [m.ior for m in self.scene.materials if m.kind == "glass" or m.transmission > 0.0]
+        return self.scene.settings.min_throughput * max(glass, default=1.0) ** 2
+
     def _report(self, done: int, area: int) -> None:
         if self.options.progress is None:
             return
@@ -430,8 +436,9 @@ class Renderer:
                 "accel": {"name": self.options.accel, **asdict(self.accel.stats)}}
 
     def ready(self) -> dict[str, Any]:
-        """What a worker tells when it has made the scene ready."""
-        return {"facts": self.facts(), "seconds": self.seconds}
+        """What a worker tells when it has made the scene ready. Who asks first is told the seconds; for others it was ready."""
+        seconds, self.seconds = self.seconds, dict.fromkeys(self.seconds, 0.0)
+        return {"facts": self.facts(), "seconds": seconds}
 
     def trace_tile(self, work: Work, seed: int, state: list[np.ndarray] | None) -> list[np.ndarray]:
         """The arrays of a film of that rectangle (DeviceFilm.arrays) with those samples added to `state` (None: zeros).
@@ -461,6 +468,7 @@ class Renderer:
             "rays_per_second": rays / self.seconds["trace"] if self.seconds["trace"] > 0.0 else 0.0,
             "cut_by_depth": film.count("cut_depth"), "cut_by_throughput": film.count("cut_throughput"),
             "lost_throughput_per_sample": film.lost() / total,
+            "visibly_cut": film.visibly_cut(self._most_cut_by_throughput()) if self.features.reflection else 0.0,
             "not_finite": film.count("not_finite"), "samples": int(samples.sum()),
             **self.facts(), "interrupted": interrupted,
             "signal": int(self.interrupts[0]) if self.interrupts else None, "timed_out": self.timed_out and not interrupted,

@@ -6,7 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from wrt.errors import InputError
+from wrt.arguments import as_choice
 from wrt.scene import Object, Scene
 
 INSTANCING = ("auto", "always", "never")
@@ -23,8 +23,7 @@ def instanced_meshes(scene: Scene, instancing: str = "auto") -> frozenset[int]:
     Objects whose transform flattens or shears too much (MAX_SPREAD) are always copied: see `is_instance`.
     Raises InputError for an unknown choice.
     """
-    if instancing not in INSTANCING:
-        raise InputError(f"instancing must be one of {', '.join(INSTANCING)}, got {instancing!r}")
+    as_choice(instancing, INSTANCING, "instancing")
     if instancing == "never":
         return frozenset()
     users: dict[int, list[Object]] = defaultdict(list)

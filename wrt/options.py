@@ -13,7 +13,7 @@ import numpy as np
 
 from wrt.accel import ACCELERATORS
 from wrt.accel.base import check_units
-from wrt.arguments import as_integer, as_names, as_one, as_path, as_tuple, shown
+from wrt.arguments import as_choice, as_integer, as_names, as_one, as_path, as_tuple, did_you_mean, shown
 from wrt.device import start, thread_count
 from wrt.errors import InputError
 from wrt.film import Film
@@ -99,12 +99,11 @@ class Options:
             as_one(getattr(self, name), str, name)
         ACCELERATORS.check(self.accel)
         check_units(self.triangle, self.box)
-        if self.instancing not in INSTANCING:
-            raise InputError(f"instancing must be one of {', '.join(INSTANCING)}, got {self.instancing!r}")
+        as_choice(self.instancing, INSTANCING, "instancing")
         self.aov = as_names(self.aov, "aov")
         no_aov = sorted(set(self.aov) - set(AOVS))
         if no_aov:
-            raise InputError(f"no AOV {', '.join(no_aov)}; there is {', '.join(AOVS)}")
+            raise InputError(f"no AOV {', '.join(no_aov)}; {did_you_mean(no_aov[0], AOVS)}there is {', '.join(AOVS)}")
         for name in ("time_limit", "target_error"):
             as_one(getattr(self, name), (int, float, np.number, type(None)), name)
         if self.time_limit is not None and not self.time_limit > 0.0:

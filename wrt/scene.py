@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
-from wrt.arguments import LARGEST, as_array, as_integer, as_one, as_size, as_tuple, at_thing, unknown
+from wrt.arguments import LARGEST, as_array, as_choice, as_integer, as_one, as_size, as_tuple, at_thing, unknown
 from wrt.errors import InputError
 from wrt.mesh import Mesh
 from wrt.motion import Motion
@@ -71,11 +70,6 @@ def as_transform(value: Any, what: str) -> np.ndarray:
     return matrix
 
 
-def _choice(value: str, choices: Sequence[str], what: str) -> None:
-    if value not in choices:
-        raise InputError(f"{what} must be one of {', '.join(choices)}; got {value!r}")
-
-
 def require_count(count: int, what: str) -> None:
     """Raise InputError where a scene would hold too many of something."""
     if count > MAX_OBJECTS:
@@ -107,7 +101,7 @@ class Texture:
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 4 or image.size == 0:
             raise InputError(at_thing("texture", self.name) + f"image must be (H, W, 4) uint8, got {image.shape} {image.dtype}")
         for wrap in self.wrap:
-            _choice(wrap, WRAPS, at_thing("texture", self.name) + "wrap")
+            as_choice(wrap, WRAPS, at_thing("texture", self.name) + "wrap")
         transform = as_array(self.uv_transform, np.float64, at_thing("texture", self.name) + "uv_transform")
         if transform.shape != (2, 3) or not (np.abs(transform) <= LARGEST).all():
             raise InputError(at_thing("texture", self.name) + f"uv_transform must be a 2x3 matrix of numbers up to {LARGEST:g}")
@@ -193,8 +187,8 @@ class Material:
 
     def __post_init__(self) -> None:
         at = at_thing("material", self.name)
-        _choice(self.kind, MATERIAL_KINDS, at + "kind")
-        _choice(self.alpha_mode, ALPHA_MODES, at + "alpha_mode")
+        as_choice(self.kind, MATERIAL_KINDS, at + "kind")
+        as_choice(self.alpha_mode, ALPHA_MODES, at + "alpha_mode")
         bounds: dict[str, tuple[float, float]] = {
             "albedo": (0.0, 1.0), "specular": (0.0, 1.0), "eta": (0.0, 1e3), "k": (0.0, 1e3),
             "absorption": (0.0, math.inf), "emission": (0.0, math.inf),
@@ -487,6 +481,9 @@ class Camera:
 FILTERS = ("box", "gaussian", "blackman-harris")
 SAMPLERS = ("sobol", "independent")
 TONEMAPS = ("none", "reinhard", "aces", "agx")
+MAX_DEPTH = 64  # bounces
+FRESNELS = ("exact", "schlick")
+GLASS_SHADOWS = ("opaque", "tinted")
 
 
 @dataclass(frozen=True)
@@ -496,8 +493,8 @@ class Settings:
     max_depth: bounces after the first hit (0: only direct light). min_throughput: a ray that would carry less than this
     share (largest channel) is cut. fresnel: "exact", or "schlick" (cheaper, approximate). glass_shadows: solid glass
     "opaque" to shadow rays (right but for caustics, which a Whitted tracer does not see), or "tinted": shadow rays go
-    straight through it, as they do in scenes from glTF files that have solid glass. sampler: "sobol" (Owen-scrambled, evenly spread), or "independent" random numbers, whose noise falls
-    more slowly. exposure in stops.
+    straight through it, as they do in scenes from glTF files that have solid glass. sampler: "sobol" (Owen-scrambled, evenly
+    spread), or "independent" random numbers, whose noise falls more slowly. exposure in stops.
     """
 
     size: tuple[int, int] = (640, 360)
@@ -514,14 +511,14 @@ class Settings:
     def __post_init__(self) -> None:
         object.__setattr__(self, "size", as_size(self.size))
         object.__setattr__(self, "spp", as_integer(self.spp, "spp", 1, 1 << 24))
-        object.__setattr__(self, "max_depth", as_integer(self.max_depth, "max_depth", 0, 64))
+        object.__setattr__(self, "max_depth", as_integer(self.max_depth, "max_depth", 0, MAX_DEPTH))
         as_number(self.min_throughput, "min_throughput", low=0.0, high=1.0)
         as_number(self.exposure, "exposure", low=-100.0, high=100.0)
-        _choice(self.filter, FILTERS, "filter")
-        _choice(self.fresnel, ("exact", "schlick"), "fresnel")
-        _choice(self.glass_shadows, ("opaque", "tinted"), "glass_shadows")
-        _choice(self.sampler, SAMPLERS, "sampler")
-        _choice(self.tonemap, TONEMAPS, "tonemap")
+        as_choice(self.filter, FILTERS, "filter")
+        as_choice(self.fresnel, FRESNELS, "fresnel")
+        as_choice(self.glass_shadows, GLASS_SHADOWS, "glass_shadows")
+        as_choice(self.sampler, SAMPLERS, "sampler")
+        as_choice(self.tonemap, TONEMAPS, "tonemap")
 
 
 SETTINGS = tuple(each.name for each in fields(Settings))

@@ -43,6 +43,27 @@ def check(data: dict[str, Any], path: Path) -> SceneTable:
     raise AssertionError("unreachable: there is at least one problem")
 
 
+def check_settings(values: dict[str, Any], origin: str) -> dict[str, Any]:
+    """Settings by name, checked as [settings] of a file is. Raises one InputError that lists everything that is wrong."""
+    from pydantic import ValidationError
+
+    from wrt.scene_schema import SettingsTable
+
+    known_keys: dict[int, list[str]] = {}
+    try:
+        return SettingsTable.model_validate(values, context=known_keys).given()
+    except ValidationError as error:
+        raise_all(_lines(error, values, known_keys), Path(origin))
+    raise AssertionError("unreachable: there is at least one problem")
+
+
+def setting_choices(name: str) -> tuple[str, ...]:
+    """The words that a setting may be; none where it is no choice between words."""
+    from wrt.scene_schema import SettingsTable
+
+    return tuple(SettingsTable.model_json_schema()["properties"].get(name, {}).get("enum", ()))
+
+
 def _lines(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> list[str]:
     """A line for each problem; beyond MOST different ones the rest are only counted: each takes a look at all names."""
     told: dict[str, None] = {}

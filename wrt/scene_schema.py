@@ -113,7 +113,7 @@ class SettingsTable(Table):
     size: Annotated[list[Annotated[int, Field(ge=1, le=32768)]], Field(min_length=2, max_length=2)] = Field(
         list(_SETTINGS.size), json_schema_extra={"unit": "pixels"}, description="width and height")
     spp: int = Field(_SETTINGS.spp, ge=1, le=1 << 24, description="samples per pixel")
-    max_depth: int = Field(_SETTINGS.max_depth, ge=0, le=64, description="bounces after the first hit")
+    max_depth: int = Field(_SETTINGS.max_depth, ge=0, le=scene.MAX_DEPTH, description="bounces after the first hit")
     min_throughput: Unit = Field(_SETTINGS.min_throughput, description="a ray that carries less is cut")
     filter: Literal["box", "gaussian", "blackman-harris"] = Field("blackman-harris", description="pixel filter")
     fresnel: Literal["exact", "schlick"] = Field("exact", description="of dielectrics")

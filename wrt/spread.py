@@ -71,7 +71,7 @@ class SpreadRenderer(Renderer):
         kind = all_told[0][1]
         for reply in all_told:
             _check_kind(reply, kind)
-        return kind, all_told[0][2]
+        return kind, max((reply[2] for reply in all_told), key=lambda ready: sum(ready["seconds"].values()))
 
     def _prepare(self) -> None:
         self.seconds |= self._told[1]["seconds"]

@@ -87,7 +87,8 @@ def block_with_a_leaf(folder: Path, thickness: float = 1.0) -> Path:
     glass = file.add("materials", {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.0}, "extensions": {
         "KHR_materials_transmission": {"transmissionFactor": 1.0}, "KHR_materials_ior": {"ior": 1.0},
         "KHR_materials_volume": {"thicknessFactor": thickness}}})
-    white = file.add("materials", {"pbrMetallicRoughness": {"metallicFactor": 0.0}, "extensions": {"KHR_materials_ior": {"ior": 1.0}}})
+    white = file.add("materials", {"pbrMetallicRoughness": {"metallicFactor": 0.0},
+                                   "extensions": {"KHR_materials_ior": {"ior": 1.0}}})
     block = box((-1, -1, -1), (1, 1, 1))
     leaf = [[-0.9, -0.9, 0.0], [0.9, -0.9, 0.0], [0.0, 0.9, 0.0]]
     file.node(mesh=file.mesh(file.primitive(block.vertices, block.faces.ravel(), material=glass),

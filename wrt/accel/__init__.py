@@ -10,24 +10,12 @@ from wrt.accel.instances import InstancedGeometry, Instances
 from wrt.accel.registry import Registry
 from wrt.accel.store import build_cached, load_accel
 from wrt.mesh import Mesh
+from wrt.structures import STRUCTURES
 
 __all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "InstancedGeometry", "Instances", "Structure", "build",
            "build_cached", "load_accel", "tells_progress"]
 
-ACCELERATORS: Registry[type[Accelerator]] = Registry("structure", {
-    "bvh": "wrt.accel.bvh_wide:Bvh8",  # the default: the best one there is
-    "bvh2": "wrt.accel.bvh2:Bvh2",
-    "bvh4": "wrt.accel.bvh_wide:Bvh4",
-    "bvh8": "wrt.accel.bvh_wide:Bvh8",
-    "bvh2_sphere": "wrt.accel.bvh2_volumes:Bvh2Sphere",
-    "bvh2_kdop": "wrt.accel.bvh2_volumes:Bvh2Kdop",
-    "bvh8c": "wrt.accel.bvh_wide:Bvh8c",
-    "kdtree": "wrt.accel.kdtree:KdTree",
-    "bsp": "wrt.accel.bsp:Bsp",
-    "brute_force": "wrt.accel.brute_force:BruteForce",
-    "grid": "wrt.accel.grid:Grid",
-    "octree": "wrt.accel.octree:Octree",
-})
+ACCELERATORS: Registry[type[Accelerator]] = Registry("structure", STRUCTURES)
 
 
 def tells_progress(accel: str) -> bool:

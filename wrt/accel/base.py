@@ -31,6 +31,7 @@ from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse import Units
 from wrt.memory import require
 from wrt.mesh import Mesh
+from wrt.seconds import seconds_without_loads
 from wrt.tables import html_facts, html_table
 
 RAYS_PER_LAUNCH = 16384
@@ -119,9 +120,10 @@ class Geometry:
 
 @dataclass(frozen=True)
 class AccelStats:
-    """build_seconds: wall clock; nodes, leaves, depth: 0 where there is no tree; references: primitives in all leaves together,
-    more than there are where a structure splits space; bytes: on the device, triangles included; sah_cost: expected cost of a
-    random line through the root box, one node visited and one primitive tested costing 1 each (NaN where nobody knows)."""
+    """build_seconds: wall clock, without those in which the builder's kernels were compiled; nodes, leaves, depth: 0 where there is
+    no tree; references: primitives in all leaves together, more than there are where a structure splits space; bytes: on the
+    device, triangles included; sah_cost: expected cost of a random line through the root box, one node visited and one
+    primitive tested costing 1 each (NaN where nobody knows)."""
 
     build_seconds: float
     nodes: int
@@ -357,7 +359,7 @@ class Accelerator(ABC):
     def _take(self, built: Built, begin: float, built_cost: float) -> None:
         """built_cost: as in State."""
         data = self._upload(built)
-        stats = AccelStats(time.perf_counter() - begin, built.nodes, built.leaves, built.depth, built.references,
+        stats = AccelStats(seconds_without_loads(begin), built.nodes, built.leaves, built.depth, built.references,
                            array_bytes(data), built.sah_cost)
         self._state = State(self.geometry, built, data, stats, built_cost)
 

@@ -18,6 +18,7 @@ from wrt.kernels.ray_aabb import PAD_COORDINATE
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse import Units
 from wrt.kernels.traverse_instances import Placement
+from wrt.seconds import seconds_without_loads
 
 ROUNDOFF = 2.0**-24
 SLACK = 32.0 * ROUNDOFF  # see kernels.traverse_instances.enter
@@ -107,7 +108,7 @@ class Instances(Accelerator):
         data = self._upload_top(tree)
         stats = [state.stats for state in self._placed]
         told = AccelStats(
-            time.perf_counter() - begin, len(tree.nodes) + sum(s.nodes for s in stats), tree.leaves + sum(s.leaves for s in stats),
+            seconds_without_loads(begin), len(tree.nodes) + sum(s.nodes for s in stats), tree.leaves + sum(s.leaves for s in stats),
             tree.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
             array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
         self._state = State(self.geometry, None, data, told)

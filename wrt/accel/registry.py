@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any, TypeVar
 
-from wrt.errors import InputError
+from wrt.arguments import require_known
 
 T = TypeVar("T")
 
@@ -32,8 +32,7 @@ class Registry(dict[str, T]):
 
     def check(self, name: str) -> None:
         """Raise InputError where there is nothing of that name."""
-        if name not in self:
-            raise InputError(f"no {self.kind} {name!r}; there is {', '.join(self)}")
+        require_known(name, self, self.kind)
 
     def get(self, name: str, default: Any = None) -> Any:
         return self[name] if name in self else default

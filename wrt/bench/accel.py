@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
+from wrt.arguments import require_known
 from wrt.bench.memory import peak_bytes
 from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.bench.stadium import in_stadium
@@ -51,8 +52,7 @@ class Plan:
                 raise InputError(f"{name} must be {low} to {high}, got {getattr(self, name)}")
         for what, names, table in (("structure", self.structures, ACCELERATORS), ("kind of ray", self.kinds, RAY_KINDS)):
             for name in names:
-                if name not in table:
-                    raise InputError(f"no {what} {name!r}; there is {', '.join(table)}")
+                require_known(name, table, what)
         thread_count(self.threads)
 
     @property

@@ -18,6 +18,7 @@ import numpy as np
 import wrt
 from wrt import metrics
 from wrt.accel import ACCELERATORS
+from wrt.arguments import did_you_mean
 from wrt.bench import error_statistics as statistics
 from wrt.bench.error_statistics import UNKNOWN, Estimate
 from wrt.driver import Options, Renderer
@@ -235,7 +236,7 @@ def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int]
         relmse=statistics.mean_estimate([result["relmse"] for result in compared]),
         flip=statistics.mean_estimate([result["flip"] for result in compared]),
         bias=bias, bias_below=bias_below, noise=max(statistics.noise_of(products), 0.0) ** 0.5,
-        build_seconds=films[0].stats["seconds"]["build"],
+        build_seconds=films[0].stats["accel"]["build_seconds"],
         rays_per_sample=float(np.mean([film.stats["rays_per_sample"] for film in films])),
         digest=hashlib.sha256(b"".join(film.pixels.tobytes() for film in films)).hexdigest())
 
@@ -330,7 +331,7 @@ class Plan:
     def __post_init__(self) -> None:
         unknown = sorted(set(self.knobs) - set(KNOBS))
         if unknown:
-            raise InputError(f"no knob {', '.join(unknown)}; there is {', '.join(KNOBS)}")
+            raise InputError(f"no knob {', '.join(unknown)}; {did_you_mean(unknown[0], KNOBS)}there is {', '.join(KNOBS)}")
         if not 1 <= self.max_spp <= 1 << 16:
             raise InputError(f"max_spp must be 1 to 65536, got {self.max_spp}")
         if not 3 <= self.repeats <= 1000:

@@ -16,6 +16,7 @@ import numpy as np
 
 import wrt
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
+from wrt.arguments import require_known
 from wrt.bench.accel import warm_up
 from wrt.bench.algorithms import PEERS, Embree, Open3D, Peer, WarpMesh
 from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
@@ -57,8 +58,7 @@ class Plan:
         for what, names, known in (("structure", self.structures, ACCELERATORS), ("rival", self.rivals, PEERS),
                                    ("kind of ray", self.kinds, RAY_KINDS)):
             for name in names:
-                if name not in known:
-                    raise InputError(f"no {what} {name!r}; there is {', '.join(known)}")
+                require_known(name, known, what)
         for name in self.rivals:
             if not PEERS[name].is_installed():
                 raise InputError(f'{name} is not installed: pip install "wrt[peers]"')

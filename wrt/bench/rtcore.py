@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, build
+from wrt.arguments import require_known
 from wrt.bench.instructions import Software, box_unit, software, triangle_unit
 from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.bench.rtcore_report import COLUMNS, ModelRow, cells, model_row
@@ -42,8 +43,7 @@ class Plan:
             ("structure", self.structures, ACCELERATORS), ("kind of ray", self.kinds, RAY_KINDS), ("GPU", [self.gpu], GPUS))
         for what, names, known in tables:
             for name in names:
-                if name not in known:
-                    raise InputError(f"no {what} {name!r}; there is {', '.join(known)}")
+                require_known(name, known, what)
 
     @property
     def names(self) -> list[str]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from wrt.accel import Accelerator, Geometry, build
 from wrt.accel.base import Counters
+from wrt.arguments import require_known
 from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.bench.rtcore import bvhs, in_warps
 from wrt.bench.visibility_report import table
@@ -58,8 +59,7 @@ class Plan:
         for what, names, known in (("study", [self.study], STUDIES), ("kind of ray", self.kinds, RAY_KINDS),
                                    ("GPU", [self.gpu], GPUS)):
             for name in names:
-                if name not in known:
-                    raise InputError(f"no {what} {name!r}; there is {', '.join(known)}")
+                require_known(name, known, what)
 
 
 @dataclass(frozen=True)
