@@ -134,6 +134,10 @@ class Setting(click.ParamType):
 class SceneSetting(Setting):
     """A setting of a scene; completion in a shell knows them."""
 
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, Any]:
+        name, parsed = super().convert(value, param, ctx)
+        return name, str(value).partition("=")[2] if name == "size" else parsed  # 0x360 is no number
+
     def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[Any]:
         from wrt.scene import SETTINGS
         from wrt.scene_check import setting_choices

@@ -1,0 +1,281 @@
+"""Settings on the command line: --set, names that --help and completion know, and the hint that max_depth cuts what is seen."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+from click.shell_completion import ShellComplete
+
+import wrt
+from tests.command_line import BOX_OBJ, Result
+from tests.command_line import wrt as run
+from tests.data import ROOT
+from wrt import cli_common
+from wrt.cli import cli
+from wrt.cli_common import ACCEL, SceneSetting, depth_hint
+from wrt.device_film import GROUPS, VISIBLE
+from wrt.image import read_image
+from wrt.scene import (
+    FILTERS,
+    FRESNELS,
+    GLASS_SHADOWS,
+    MAX_DEPTH,
+    SETTINGS,
+    Camera,
+    ConstantBackground,
+    Material,
+    Object,
+    Scene,
+    Settings,
+)
+from wrt.scene_check import setting_choices
+from wrt.shapes import quad
+
+SMALL = ("--size", "32x18", "--spp", 2)
+SCENE = """\
+[materials.glass]
+kind = "glass"
+[materials.floor]
+[[spheres]]
+center = [0, 1, 0]
+radius = 1
+material = "glass"
+[[quads]]
+corner = [-3, 0, 3]
+edge_u = [6, 0, 0]
+edge_v = [0, 0, -6]
+material = "floor"
+[cameras.main]
+position = [0, 2, 6]
+target = [0, 0.5, 0]
+[[lights]]
+type = "directional"
+direction = [-1, -2, -1]
+irradiance = 2
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("box.obj").write_text(BOX_OBJ)
+    return tmp_path
+
+
+def with_settings(text: str) -> None:
+    Path("scene.toml").write_text(f"[settings]\n{text}\n{SCENE}")
+
+
+# --- --set ------------------------------------------------------------------------------------------------------------
+
+
+def test_set_is_the_setting_of_a_file() -> None:
+    values = {"size": [20, 12], "spp": 3, "max_depth": 3, "min_throughput": 0.01, "filter": "gaussian", "fresnel": "schlick",
+              "glass_shadows": "tinted", "sampler": "independent", "exposure": -1, "tonemap": "reinhard"}
+    assert tuple(values) == SETTINGS
+    with_settings("\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items()))
+    assert run("render", "scene.toml", "-o", "expected.png").code == 0
+    Path("scene.toml").write_text(SCENE)
+    words = {**values, "size": "20x12"}
+    assert run("render", "scene.toml", "-o", "set.png", *(f"--set={name}={value}" for name, value in words.items())).code == 0
+    assert np.array_equal(read_image("set.png"), read_image("expected.png"))
+    plain = ("render", "scene.toml", "-o", "plain.png", "--size", "20x12")
+    assert run(*plain).code == 0 and not np.array_equal(read_image("plain.png"), read_image("set.png"))
+
+
+def test_set_wins_over_the_file_and_stands_beside_flags() -> None:
+    with_settings('spp = 7\nglass_shadows = "opaque"')
+    result = run("render", "scene.toml", "--size", "8x6", "--set", "spp=3", "--set", "glass_shadows=tinted", "--json")
+    assert json.loads(result.out)["spp"] == 3
+    described = json.loads(run("info", "scene.toml", "--json", "--set", "glass_shadows=tinted").out)
+    assert described["features"]["tinted_shadows"] is True
+    assert json.loads(run("info", "scene.toml", "--json").out)["features"]["tinted_shadows"] is False
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["--set", "fitler=box"], "--set: fitler: unknown key 'fitler'; did you mean 'filter'?"),
+    (["--set", "filter=gausian"], "--set: filter: unknown value 'gausian'; did you mean 'gaussian'?"),
+    (["--set", "glass_shadows=tint"], "did you mean 'tinted'? known are 'opaque', 'tinted'"),
+    (["--set", "spp=1.5"], "--set: spp: got 1.5, expected a whole number"), (["--set", "spp=0"], "spp: got 0, expected"),
+    (["--set", "spp=" + "9" * 5000], "--set: spp: got "), (["--set", "exposure=nan"], "exposure: got 'nan', expected a number"),
+    (["--set", "max_depth=65"], "max_depth: got 65, expected a number <= 64"), (["--set", "spp="], "spp: got ''"),
+    (["--set", "exposure=True"], "exposure: got true, expected a number"),
+    (["--set", "size=640"], "--set size must be two whole numbers"), (["--set", "size=0x3"], "--set size must be 1x1 to"),
+    (["--set", "filter"], "'filter' is not NAME=VALUE"), (["--set", "=box"], "'=box' is not NAME=VALUE"),
+    (["--set", "spp=4", "--set", "spp=5"], "--set spp: given twice, 4 and 5"),
+    (["--set", "spp=4", "--spp", "5"], "--set spp: --spp is given too, and says otherwise"),
+    (["--set", "size=3x4", "--size", "4x3"], "--set size: --size is given too"),
+    (["--set", "max_depth=4", "--max-depth", "0"], "--set max_depth: --max-depth is given too"),
+], ids=lambda value: str(value)[:40])
+def test_a_wrong_setting_is_told_before_the_scene_is_read(arguments: list[str], message: str,
+                                                          monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    result = run("render", "box.obj", *arguments)
+    assert result.code == 2 and result.out == "" and len(result.errors) == 1 and message in result.errors[0], result
+    assert not Path("box.png").exists()
+
+
+def test_all_that_is_wrong_is_told_at_once() -> None:
+    result = run("render", "box.obj", "--set", "fitler=box", "--set", "spp=0")
+    assert result.code == 2 and result.err.startswith("error: --set: 2 errors\n  ")
+    assert "  spp: got 0" in result.err and "  fitler: unknown key" in result.err
+
+
+def test_the_same_said_twice_is_no_contradiction() -> None:
+    result = run("render", "box.obj", *SMALL, "--set", "spp=2", "--set", "size=32x18", "--set", "spp=2", "--json")
+    assert result.code == 0 and json.loads(result.out)["spp"] == 2
+
+
+@pytest.mark.parametrize(("command", "setting", "who"), [
+    (("view", "box.obj"), "size=9x9", "the browser's window"), (("view", "box.obj"), "spp=9", "--spp"),
+    (("profile", "box.obj"), "spp=9", "--spp"), (("bench", "error", "box.obj"), "size=9x9", "--size"),
+    (("bench", "error", "box.obj"), "spp=9", "--max-spp"), (("bench", "mitsuba", "box.obj"), "spp=9", "--spp"),
+])
+def test_what_a_command_decides_on_itself_is_not_set(command: tuple[str, ...], setting: str, who: str) -> None:
+    pytest.importorskip("viser")
+    result = run(*command, "--set", setting)
+    assert result.code == 2 and f"--set {setting.split('=')[0]}: {who} decides on that here" in result.err, result
+
+
+def test_the_other_commands_that_render_take_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Settings] = []
+
+    def stop(scene: Scene, *arguments: Any, **options: Any) -> None:
+        seen.append(scene.settings)
+        raise wrt.InputError("seen")
+
+    for place in ("wrt.animate.animate", "wrt.profiler.profile", "wrt.bench.error.sweep", "wrt.bench.equal_error.run",
+                  "wrt.viewer_page.Page"):
+        module, name = place.rsplit(".", 1)
+        monkeypatch.setattr(importlib.import_module(module), name, stop)
+    commands = [("animate", "box.obj", "-o", "a.gif"), ("profile", "box.obj"), ("bench", "error", "box.obj"),
+                ("bench", "mitsuba", "box.obj")]
+    if importlib.util.find_spec("viser"):
+        commands.append(("view", "box.obj", "--port", "0"))
+    for command in commands:
+        assert "seen" in run(*command, "--set", "filter=box", "--set", "max_depth=3").err
+    assert len(seen) == len(commands) and {(each.filter, each.max_depth) for each in seen} == {("box", 3)}
+
+
+# --- what --help and completion know ----------------------------------------------------------------------------------
+
+
+def options_of(command: click.Command) -> list[click.Parameter]:
+    below = command.commands.values() if isinstance(command, click.Group) else ()
+    return [*command.params, *(each for inner in below for each in options_of(inner))]
+
+
+def test_the_help_of_set_names_every_setting() -> None:
+    texts = {each.help for each in options_of(cli) if isinstance(each, click.Option) and isinstance(each.type, SceneSetting)}
+    listed, = {text.split("There is ")[1].split(" (")[0] for text in texts if text}
+    assert tuple(re.split(r", | and ", listed)) == SETTINGS
+
+
+def test_help_shows_the_names_of_each_table() -> None:
+    text = re.sub(r"\s+", " ", run("render", "--help").out)
+    for option, names in (("accel", wrt.ACCELERATORS), ("filter", FILTERS), ("fresnel", FRESNELS)):
+        assert f"--{option} [{'|'.join(names)}]" in text
+    accels = [each for each in options_of(cli) if each.name == "accel"]
+    assert len(accels) > 5 and all(each.type is ACCEL for each in accels)
+
+
+@pytest.mark.parametrize("arguments", ["--help", "render --help", "bench --help", "bench units --help", "rendr"])
+def test_help_does_not_wait_for_warp(arguments: str) -> None:
+    code = ("import sys\nfrom wrt.cli import cli\ntry:\n    cli()\nfinally:\n"
+            "    print({name.split('.')[0] for name in sys.modules} & {'warp', 'scipy', 'trimesh', 'pydantic', 'rich'})")
+    done = subprocess.run([sys.executable, "-c", code, *arguments.split()], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.endswith("set()\n"), done
+
+
+@pytest.mark.parametrize(("arguments", "incomplete", "expected"), [
+    (["render", "--accel"], "bvh2", ["bvh2", "bvh2_sphere", "bvh2_kdop"]),
+    (["render", "--tonemap"], "", ["none", "reinhard", "aces", "agx"]),
+    (["render", "--set"], "f", ["filter=", "fresnel="]),
+    (["animate", "--set"], "glass_shadows=", ["glass_shadows=opaque", "glass_shadows=tinted"]),
+    (["render", "--set"], "spp=", []), (["render", "--set"], "nothing=", []),
+])
+def test_completion(arguments: list[str], incomplete: str, expected: list[str]) -> None:
+    words = ShellComplete(cli, {}, "wrt", "_WRT_COMPLETE").get_completions(arguments, incomplete)
+    assert [word.value for word in words] == expected
+
+
+def test_choices_come_from_the_schema() -> None:
+    assert setting_choices("glass_shadows") == GLASS_SHADOWS and setting_choices("fresnel") == FRESNELS
+    assert setting_choices("spp") == setting_choices("nothing") == ()
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["render", "box.obj", "--accel", "bhv"], "no structure 'bhv'; did you mean 'bvh'? there is bvh, "),
+    (["render", "box.obj", "--filter", "gausian"], "got 'gausian'; did you mean 'gaussian'?"),
+    (["render", "box.obj", "--instancing", "alwys"], "got 'alwys'; did you mean 'always'?"),
+    (["render", "box.obj", "--aov", "dept"], "no AOV dept; did you mean 'depth'? there is depth"),
+    (["bench", "accel", "box.obj", "--structures", "gird"], "no structure 'gird'; did you mean 'grid'?"),
+    (["profile", "box.obj", "--gpu", "rtx2080"], "no GPU 'rtx2080'; did you mean 'rtx2080ti'?"),
+    (["rendr"], "No such command 'rendr'; did you mean 'render'? there is animate, bench, "),
+    (["bench", "foo"], "No such command 'foo'; there is accel, bvh, error, "),
+])
+def test_a_wrong_name_is_answered_with_the_nearest_and_all(arguments: list[str], message: str) -> None:
+    result = run(*arguments)
+    assert result.code == 2 and len(result.errors) == 1 and message in result.errors[0], result
+
+
+# --- what max_depth cuts ----------------------------------------------------------------------------------------------
+
+
+def mirrors(albedo: float, **settings: Any) -> Scene:
+    """A mirror over the left half of the picture, in front of a white sky."""
+    mirror = Material("mirror", albedo=(albedo,) * 3)
+    half = Object(quad((-100, -100, 0), (100, 0, 0), (0, 200, 0)), (mirror,))
+    return Scene(objects=(half,), background=ConstantBackground((1, 1, 1)), cameras=(Camera.look_at((0, 0, 5), (0, 0, 0)),),
+                 settings=Settings(size=(8, 6), spp=4, filter="box", **settings))
+
+
+@pytest.mark.parametrize(("albedo", "settings", "expected"), [
+    (0.5, {"max_depth": 0}, 0.5), (0.5, {"max_depth": 1}, 0.0), (1.2 * VISIBLE, {"max_depth": 0}, 0.5),
+    (0.8 * VISIBLE, {"max_depth": 0}, 0.0), (0.5, {"min_throughput": 0.9}, 0.0),
+    (0.5, {"max_depth": 0, "min_throughput": 0.9}, 0.5),
+])
+@pytest.mark.parametrize("options", [{}, {"target_error": 1e-9, "spp": 4 * GROUPS}], ids=["one sequence", "groups"])
+def test_pixels_that_are_visibly_darker_are_counted(albedo: float, settings: dict[str, Any], expected: float,
+                                                    options: dict[str, Any]) -> None:
+    film = wrt.render(mirrors(albedo, **settings), **options)
+    assert film.stats["visibly_cut"] == expected
+
+
+def test_more_bounces_do_not_help_where_a_ray_goes_through_too_many_surfaces() -> None:
+    pane = Material(albedo=(0, 0, 0), alpha=0.001, alpha_mode="blend")
+    panes = tuple(Object(quad((-100, -100, -0.01 * i), (200, 0, 0), (0, 200, 0)), (pane,)) for i in range(300))
+    film = wrt.render(Scene(panes, background=ConstantBackground((1, 1, 1)), cameras=(Camera.look_at((0, 0, 5), (0, 0, 0)),)),
+                      size=(4, 3), spp=1)
+    assert film.stats["cut_by_depth"] > 0 and film.stats["visibly_cut"] == 0.0
+
+
+def test_the_hint_names_the_value_and_what_to_do() -> None:
+    assert depth_hint(0.0, 8) is None and depth_hint(0.9 * cli_common.SEEN, 8) is None
+    assert depth_hint(0.032, 8) == "max_depth 8 leaves 3.2% of the pixels visibly too dark: raise --max-depth"
+    assert depth_hint(0.25, MAX_DEPTH) == "max_depth 64 leaves 25% of the pixels visibly too dark: 64 is the most there is"
+
+
+def hints(result: Result) -> list[str]:
+    assert result.code == 0, result
+    return [line for line in result.err.splitlines() if "visibly too dark" in line]
+
+
+def test_the_command_line_tells_what_was_cut() -> None:
+    with_settings("max_depth = 1")
+    small = ("--size", "32x18", "--spp", "4")
+    told, = hints(run("render", "scene.toml", *small))
+    assert re.fullmatch(r"max_depth 1 leaves [0-9.]+% of the pixels visibly too dark: raise --max-depth", told)
+    assert not hints(run("render", "scene.toml", *small, "-q"))
+    assert not hints(run("render", "scene.toml", *small, "--max-depth", 20))
+    assert 0.0 < json.loads(run("render", "scene.toml", *small, "--json").out)["visibly_cut"] < 0.5
+    assert len(hints(run("animate", "scene.toml", *small, "--frames", 2, "-o", "a.gif"))) == 1  # once, not each frame
