@@ -10,6 +10,7 @@ import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.ray_aabb import FAR_PAD
+from wrt.kernels.ray_triangle import HELD_ROUNDING
 from wrt.kernels.traverse_wide import STACK_SIZE
 
 LANES = 16
@@ -80,12 +81,13 @@ SET_UP = """
         t_min = *(F*)copy[6]; t_max = *(F*)copy[7];
     }
     // kernels.query.load_ray
-    const F one = 1.0f, up = 0x1p96f, down = 0x1p-96f, nothing = -__builtin_inff(), largest = 3.4028234663852886e38f;
+    const F one = 1.0f, nothing = -__builtin_inff(), largest = 3.4028234663852886e38f;
     F ax = __builtin_elementwise_abs(dx), ay = __builtin_elementwise_abs(dy), az = __builtin_elementwise_abs(dz);
     F longest = ay > ax ? ay : ax;
     longest = az > longest ? az : longest;
+    const F up = 0x1p96f, up_inverse = 0x1p-96f, down = 0x1p-64f, down_inverse = 0x1p64f;
     const F by = longest > 0x1p64f ? down : (longest < 0x1p-64f ? up : one);
-    const F inverse = longest > 0x1p64f ? up : (longest < 0x1p-64f ? down : one);
+    const F inverse = longest > 0x1p64f ? down_inverse : (longest < 0x1p-64f ? up_inverse : one);
     dx = by * dx; dy = by * dy; dz = by * dz;
     t_min = t_min * inverse + 0.0f;
     t_max = (t_max > largest ? largest : t_max) * inverse;
@@ -261,23 +263,48 @@ TRIANGLES = """
                 leave = l < leave ? l : leave;
             }
         };
-        interval();
-        if (LANE_MASK(~(enter <= leave)) & m) {
+        bool padded = false;
+        auto padded_interval = [&]() {
             const float e_x = hi[0] - lo[0], e_y = hi[1] - lo[1], e_z = hi[2] - lo[2];
             float pad = e_x > e_y ? e_x : e_y;
-            pad = 0x1p-21f * (e_z > pad ? e_z : pad);
-            for (int k = 0; k < 3; ++k) {
+            pad = 0x1p-21f * (e_z > pad ? e_z : pad) + 0x1p-148f;
+            for (int k = 0; k < 3 && !padded; ++k) {
                 lo[k] = lo[k] - (pad + 0x1p-22f * __builtin_fabsf(lo[k]));
                 hi[k] = hi[k] + (pad + 0x1p-22f * __builtin_fabsf(hi[k]));
             }
-            const F own_enter = enter, own_leave = leave;
+            padded = true;
             interval();
+        };
+        auto held = [&]() { const F before = at > leave ? leave : at; return before < enter ? enter : before; };
+        auto underflowed = [&](F moved) {
+            const F size = __builtin_elementwise_abs(at), end = __builtin_elementwise_abs(moved);
+            const int far = LANE_MASK(__builtin_elementwise_abs(moved - at) > HELD_ROUNDING * size + 0x1p-149f);
+            if ((far & m) == 0) return 0;
+            F steep = inf, grazing = 0.0f, way = end > size ? end : size;
+            for (int k = 0; k < 3; ++k) {
+                const F inverse = __builtin_elementwise_abs(row(INVERSE_X + 16 * k));
+                steep = inverse < steep ? inverse : steep;
+                grazing = ((inverse > grazing) & (inverse < inf)) ? inverse : grazing;
+            }
+            way = steep < way ? steep : way;
+            return far & LANE_MASK(way < 0x1p-120f * grazing);
+        };
+        interval();
+        if (LANE_MASK(~(enter <= leave)) & m) {
+            const F own_enter = enter, own_leave = leave;
+            padded_interval();
             m &= LANE_MASK((own_enter <= own_leave) | (enter <= leave * FAR_PAD));
             enter = own_enter <= own_leave ? own_enter : enter;
             leave = own_enter <= own_leave ? own_leave : leave;
         }
-        at = at > leave ? leave : at;
-        at = at < enter ? enter : at;
+        F moved = held();
+        const int again = underflowed(moved) & m;
+        if (again) {
+            padded_interval();
+            const I other = ((again >> lane) & 1) != 0;
+            moved = other ? held() : moved;
+        }
+        at = moved;
         const F best = row(T);
         const I id = __builtin_bit_cast(int, p[72 + j]), best_id = *(const I*)(q + PRIM_ID);
         m &= LANE_MASK((__builtin_elementwise_abs(at) < inf) & (at >= row(T_MIN)) & (at <= best));
@@ -296,7 +323,7 @@ TRIANGLES = """
     #undef NARROW
     #undef COMPONENT
     return found;
-""".replace("FAR_PAD", f"{float(FAR_PAD)!r}f")
+""".replace("FAR_PAD", f"{float(FAR_PAD)!r}f").replace("HELD_ROUNDING", f"{float(HELD_ROUNDING)!r}f")
 
 # The children that a ray enters become a level of its stack, sorted by a network. A key is the distance, whose last four bits are
 # not needed for an order, and the child's number + 8; what is not entered has all bits, which is no distance.

@@ -33,13 +33,14 @@ class HitArrays:
 def direction_scale(direction: wp.vec3) -> float:
     """A power of two that brings a very short or very long direction to where 1 / d is no denormal and no infinity, else 1.
 
-    Scaling by it is exact. What is left is between 2^-64 and 2^64, also of a direction that is denormal.
+    Scaling by it is exact, but for components that become denormal: they are off by 2^-150, where the longest is 1 or more.
+    What is left is between 2^-64 and 2^64, also of a direction that is denormal.
     """
     longest = wp.abs(direction[0])
     longest = wp.where(wp.abs(direction[1]) > longest, wp.abs(direction[1]), longest)
     longest = wp.where(wp.abs(direction[2]) > longest, wp.abs(direction[2]), longest)
     short = wp.where(longest < wp.static(2.0**-64), wp.static(2.0**96), 1.0)
-    return wp.where(longest > wp.static(2.0**64), wp.static(2.0**-96), short)
+    return wp.where(longest > wp.static(2.0**64), wp.static(2.0**-64), short)
 
 
 @wp.func
@@ -49,7 +50,7 @@ def load_ray(rays: RayArrays, i: int) -> Ray:
     The segment ends where t in the caller's units would be beyond float32, so that no traversal finds what cannot be told.
     """
     scale = direction_scale(rays.direction[i])
-    inverse = wp.where(scale > 1.0, wp.static(2.0**-96), wp.where(scale < 1.0, wp.static(2.0**96), 1.0))
+    inverse = wp.where(scale > 1.0, wp.static(2.0**-96), wp.where(scale < 1.0, wp.static(2.0**64), 1.0))
     ray = Ray()
     ray.origin = rays.origin[i]
     ray.direction = scale * rays.direction[i]

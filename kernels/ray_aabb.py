@@ -19,6 +19,7 @@ FAR_PAD = wp.constant(1.0 + 2.0 * (7.0 * 2.0**-24) / (1.0 - 7.0 * 2.0**-24))
 # Powers of two, so that the host computes the same box to the last bit (wrt.accel.base.Geometry.bounds).
 PAD_EXTENT = 2.0**-21
 PAD_COORDINATE = 2.0**-22
+PAD_SMALLEST = 2.0**-148
 
 
 @wp.struct
@@ -47,10 +48,11 @@ def box_pad(lo: wp.vec3, hi: wp.vec3) -> float:
     The triangle unit's signed areas are those of a triangle whose vertices, seen along the ray, are off by up to 3 u of the
     hit's distance (FAR_PAD covers it) and 5 u of the triangle's own extent, which may be far longer than the ray: a ray that
     starts just above a floor 1000 wide. Without it, a ray through the edge of two triangles is given to the one whose box it
-    misses, and is lost. 8 u here, and 4 u of the coordinates in `padded` for the rounding of lo and hi themselves.
+    misses, and is lost. 8 u here, and 4 u of the coordinates in `padded` for the rounding of lo and hi themselves. PAD_SMALLEST
+    is for what underflows in the shear, and changes no pad but those of triangles below 2^-103.
     """
     e = hi - lo
-    return wp.static(PAD_EXTENT) * wp.max(wp.max(e[0], e[1]), e[2])
+    return wp.static(PAD_EXTENT) * wp.max(wp.max(e[0], e[1]), e[2]) + wp.static(PAD_SMALLEST)
 
 
 @wp.func

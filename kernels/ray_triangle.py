@@ -13,6 +13,10 @@ import warp as wp
 from wrt.kernels.ray_aabb import FAR_PAD, BoxRay, box_pad, padded_hi, padded_lo, slab_interval
 from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray
 
+# How far holding t to its box may move it through rounding: seven of them (wrt.reference_bounds), and one step of a denormal t.
+HELD_ROUNDING = wp.constant(7.0 * 2.0**-24)
+HELD_STEP = wp.constant(2.0**-149)
+
 
 @wp.struct
 class TriangleRay:
@@ -132,19 +136,46 @@ def held(t: float, interval: wp.vec2) -> float:
 
 
 @wp.func
+def underflowed(ray: BoxRay, t: float, moved: float) -> bool:
+    """Whether holding t to a box moved it farther than rounding explains, on a ray whose shear may have underflowed.
+
+    Such a ray crosses some axis by less than 2^-120 on its way to t, or by less than 2^-120 of its length. What underflows puts the
+    sheared corners off by 2^-150 (1 + the distance): of any other ray's way that is 2^-29 at most, but divided by such a component
+    of the direction, as in the distance to a slab, it is any length.
+    """
+    if not wp.abs(moved - t) > HELD_ROUNDING * wp.abs(t) + HELD_STEP:
+        return False
+    steep = float(wp.inf)
+    grazing = float(0.0)
+    for axis in range(3):
+        inverse = wp.abs(ray.inv_dir[axis])
+        steep = wp.where(inverse < steep, inverse, steep)
+        grazing = wp.where(inverse > grazing and inverse < wp.inf, inverse, grazing)
+    way = wp.where(wp.abs(moved) > wp.abs(t), wp.abs(moved), wp.abs(t))
+    way = wp.where(steep < way, steep, way)
+    return way < wp.static(2.0**-120) * grazing
+
+
+@wp.func
 def within_bounds(ray: BoxRay, t: float, lo: wp.vec3, hi: wp.vec3) -> float:
     """t moved into the interval of the primitive's own box, or inf where the ray passes by even the padded box.
 
     Rounding can put t before the place where the ray enters the box around the triangle. A traversal that visits boxes front
     to back would then drop some nodes or not, depending on the order. With t inside the box's own interval, and boxes
     monotone (a node's contains its triangles' padded ones), every structure finds the same hits to the last bit.
+
+    Where the shear underflowed, the slabs tell where the exact ray enters and leaves, but t belongs to a ray beside it, which may
+    never be in the box. It is in the padded box: t is then only moved into the interval of that.
     """
     interval = slab_interval(ray, lo, hi)
     if not interval[0] <= interval[1]:
         interval = padded_interval(ray, lo, hi)
         if not interval[0] <= interval[1] * FAR_PAD:
             return float(wp.inf)
-    return held(t, interval)
+    moved = held(t, interval)
+    if underflowed(ray, t, moved):
+        moved = held(t, padded_interval(ray, lo, hi))
+    return moved
 
 
 @wp.func

@@ -16,8 +16,9 @@ point P = sum l_i v_i *of the triangle* passes the ray at (x, y) with |x| <= del
 - t: P lies at t_P = sum l_i Z_i / d_z, and the plane's slope makes |t_P - exact| <= (|N_x| delta_x + |N_y| delta_y) / |d.N|.
   The sum itself carries three errors (Z, 1 / d_z, the result), and holding t to the triangle's box, whose slabs carry three
   and whose planes P can only leave by errors of its own, moves it by at most 7 more: gamma(10) T, where T = |t_P| if
-  all Z have one sign and max |Z| / |d_z| if not. Very short and very long directions are scaled by 2^96 before and t after:
-  that is exact, but for what underflows.
+  all Z have one sign and max |Z| / |d_z| if not. Of those errors eta is divided by d_x, which may be tiny: where |d_x t| and S
+  are above 2^-120 it moves t by less than 2^-28 T, and elsewhere the unit lets no eta move t (kernels.ray_triangle.underflowed).
+  Very short and very long directions are scaled by powers of two before and t after: that is exact, but for what underflows.
 
 *The sphere test* is taken in float64 and rounded once; the box it is held to contains the sphere, so that only the slabs' own
 rounding counts: gamma(5) |t|. Seen at a grazing angle, float64's own error grows: see `sphere_bounds`.
@@ -86,7 +87,7 @@ def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarra
         lean *= SLACK / np.abs(crossings.slope)
         one_sided = (z >= 0.0).all(axis=0) | (z <= 0.0).all(axis=0)
         reach = np.where(one_sided, np.abs(crossings.t) + lean, np.abs(z).max(axis=0) / np.abs(d_z))
-        t = SLACK * (lean + gamma(10) * reach) + 2.0 * TINY_32 * np.where(np.abs(d_z) < 2.0**-64, 2.0**96, 1.0)
+        t = SLACK * (lean + (gamma(10) + 2.0**-28) * reach) + 2.0 * TINY_32 * np.where(np.abs(d_z) < 2.0**-64, 2.0**96, 1.0)
     # A difference overflows: nothing is promised.
     lost = np.abs(np.stack(local)).max(axis=(0, 1)) > LARGEST_32
     unknown = lost | ~(np.abs(crossings.slope) > 0.0)

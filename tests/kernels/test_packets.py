@@ -224,8 +224,21 @@ def special_case(rng, n):
     return rays, plain_nodes(rng.choice(SPECIAL, (n, WIDTH, 3)), rng.choice(SPECIAL, (n, WIDTH, 3))), rng.choice(SPECIAL, (n, 72))
 
 
+def underflow_case(rng, n):
+    """Rays that start in faces of the triangles' boxes, and leave them so slowly that the shear underflows."""
+    size = 10.0 ** rng.uniform(-20.0, 0.0, (n, 1, 1))
+    origin = rng.integers(-2, 3, (n, LANES, 3)) * size
+    slow = 10.0 ** rng.uniform(-45.0, -15.0, (n, LANES, 2)) * rng.choice([-1.0, 1.0], (n, 1, 2))
+    direction = np.concatenate([slow, rng.choice([-1.0, 1.0], (n, 1, 1)) * np.ones((n, LANES, 1))], axis=2)
+    direction *= 10.0 ** rng.uniform(-20.0, 20.0, (n, 1, 1))
+    low = -rng.integers(0, 3, (n, WIDTH, 3)) * size
+    corners = rng.integers(-3, 4, (n, 3, 3, WIDTH)) * size[..., None]
+    rays = origin.reshape(-1, 3), direction.reshape(-1, 3), np.zeros(n * LANES), np.full(n * LANES, np.inf)
+    return rays, plain_nodes(low.astype(np.float32), (low + size).astype(np.float32)), corners
+
+
 CASES = {"coherent": lambda rng: random_case(rng, 2000, True), "incoherent": lambda rng: random_case(rng, 1000, False),
-         "special": lambda rng: special_case(rng, 3000)}
+         "special": lambda rng: special_case(rng, 3000), "underflow": lambda rng: underflow_case(rng, 3000)}
 
 
 @cache

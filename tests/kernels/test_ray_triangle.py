@@ -326,6 +326,25 @@ def test_triangles_without_area_are_missed():
         assert not is_hit(run(target - direction, direction, line)).any()
 
 
+@pytest.mark.parametrize(("origin", "direction", "triangle", "t"), [
+    # Across x the ray goes by less than float32 has numbers for, from a face of the triangle's box: the sheared corners do not
+    # see it, while the slab of x ends where the ray starts.
+    ((0.0, 3.6090652682815795e-20, 3.338891601232995e-20), (-2.652004651570872e-37, 0.0, 0.29204800724983215),
+     ((-2e-20, 1e-20, -3e-20), (0.0, 4e-20, -3e-20), (0.0, 3e-20, 4e-20)), -1.23e-19),
+    ((0.0, 3.6090652682815795e-20, -2.5e-20), (2.652004651570872e-37, 0.0, 0.29204800724983215),
+     ((-2e-20, 1e-20, -3e-20), (0.0, 4e-20, -3e-20), (0.0, 3e-20, 4e-20)), 7.66e-20),
+    ((0.0, 0.0, 0.0), (4e-39, 0.0, 1.0), ((-1.0, -1.0, 1e-7), (0.0, -1.0, 1.2e-7), (0.0, 1.0, -1e-7)), 1e-8),
+    ((0.0, 0.0, 0.0), (4e-39, 0.0, 1.0), ((-1.0, -1.0, 1e-7), (0.0, -1.0, 1e-7), (0.0, 1.0, 1e-7)), 1e-7),
+    # The shear itself underflows.
+    ((0.0, 0.0, 1.5), (1e-38, 0.0, 1e18), ((-1.0, -1.0, 2.0), (0.0, -1.0, 4.0), (0.0, 1.0, 1.0)), 1e-18),
+    ((0.0, 0.0, 3.5), (-1e-38, 0.0, 1e18), ((-1.0, -1.0, 2.0), (0.0, -1.0, 4.0), (0.0, 1.0, 1.0)), -1e-18),
+])
+def test_t_where_the_shear_underflows(origin, direction, triangle, t):
+    for axes in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):  # the same along every axis
+        hit = run(np.array(origin)[axes], np.array(direction)[axes], np.array(triangle)[:, axes])
+        assert is_hit(hit).all() and np.allclose(hit["t"], t, rtol=5e-3, atol=0.0)
+
+
 def test_published_collinear_triangle_is_missed():
     assert not is_hit(run(BAD_ORIGIN, BAD_DIRECTION, BAD_TRIANGLE)).any()
 

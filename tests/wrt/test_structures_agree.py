@@ -18,7 +18,8 @@ SMALL = ["meshes/small/suzanne.obj", "meshes/small/cow.obj", "meshes/small/teapo
 LARGE = ["meshes/medium/rocker-arm.obj", "meshes/medium/stanford_bunny.ply", "meshes/medium/sponza_dabrovic.obj"]
 LARGEST = ["meshes/large/conference_331k.ply", "meshes/large/dragon_871k.ply"]
 STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()} - {"brute_force"})
-HARD = ["D_without_area_wide", "D_huge", "D_tiny", "E_grid", "F_slivers", "F_edge_on", "H_exact_ends", "I_underflow", "I_denormal"]
+HARD = ["D_without_area_wide", "D_huge", "D_tiny", "E_grid", "F_slivers", "F_edge_on", "H_exact_ends", "I_underflow", "I_denormal",
+        "I_tiny_components"]
 TESTS = 60_000_000  # ray-triangle tests that brute force may take in the quick run
 
 

@@ -25,7 +25,7 @@ from wrt.exchange import check_no_gradients, real_numbers, taken, to_numpy, to_w
 from wrt.kernels import traverse_instances
 from wrt.kernels.counters import SIZE_RANGE, Counts
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
-from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT, RAY_AABB
+from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST, RAY_AABB
 from wrt.kernels.ray_triangle import RAY_TRIANGLE
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse import Units
@@ -91,7 +91,7 @@ class Geometry:
                          for end, sign in ((np.minimum, np.float32(-1.0)), (np.maximum, np.float32(1.0))))
             with np.errstate(over="ignore"):  # near the end of float32 the padded box is all of space
                 x, y, z = (high - low).T
-                pad = np.float32(PAD_EXTENT) * np.maximum(np.maximum(x, y), z)[:, None]
+                pad = np.float32(PAD_EXTENT) * np.maximum(np.maximum(x, y), z)[:, None] + np.float32(PAD_SMALLEST)
                 lo[some] = low - (pad + np.float32(PAD_COORDINATE) * np.abs(low))
                 hi[some] = high + (pad + np.float32(PAD_COORDINATE) * np.abs(high))
 

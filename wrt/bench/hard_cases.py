@@ -57,6 +57,7 @@ HARD_CASES: dict[str, Callable[[Seed, int], HardCase]] = {
     "I_lengths": inside.lengths,
     "I_underflow": inside.underflowing,
     "I_denormal": inside.denormal,
+    "I_tiny_components": outside.tiny_components,
     "I_rays_not_finite": outside.rays_not_finite,
     "I_mesh_not_finite": outside.mesh_not_finite,
 }

@@ -144,6 +144,30 @@ def tiny(seed: Seed, n: int) -> HardCase:
     return hard_case(geometry, origins, directions / np.where(length > 0.0, length, 1.0), ASK)
 
 
+def tiny_components(seed: Seed, n: int) -> HardCase:
+    """I: triangles of size 1e-20 to 1 with corners on a lattice, and rays of which one or two components of the direction are
+    2^-20 to 2^-149 of the longest. In those axes they start exactly at their target's coordinate, which mostly is a face of the
+    triangle's box; half of them leave their target behind. Directions are 1e-15 to 1e15 long."""
+    rng = np.random.default_rng(seed)
+    corners = rng.integers(-4, 5, (32, 3, 3)) * 10.0 ** rng.uniform(-20.0, 0.0, (32, 1, 1))
+    geometry = soup(corners)
+    chosen, weights = rng.integers(32, size=n), rng.dirichlet([0.3] * 3, n)
+    weights[rng.random(n) < 0.6] = (0.0, 0.0, 1.0)  # a corner
+    weights = np.where((rng.random(n) < 0.4)[:, None], weights.round(), weights)
+    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1.0)
+    corners = geometry.vertices.reshape(32, 3, 3)[chosen].astype(np.float64)
+    target = np.einsum("ni,nij->nj", weights, corners).astype(np.float32).astype(np.float64)
+    way = rng.normal(size=(n, 3)) * np.abs(corners).max(axis=(1, 2))[:, None] * 10.0 ** rng.uniform(-2.0, 2.0, (n, 1))
+    tiny = rng.random((n, 3)) < 0.6
+    tiny[np.arange(n), rng.integers(3, size=n)] = False
+    origins = np.where(tiny, target, target - way).astype(np.float32)
+    directions = (target - origins) * rng.choice([-1.0, 1.0], (n, 1))
+    longest = np.abs(directions).max(axis=1, keepdims=True)
+    directions = np.where(tiny, longest * _signed_powers(rng, (n, 3), -45.0, -6.0), directions)
+    length = 10.0 ** rng.uniform(-15.0, 15.0, (n, 1))
+    return hard_case(geometry, origins, directions / np.where(longest > 0.0, longest, 1.0) * length, ASK)
+
+
 def slivers(seed: Seed, n: int) -> HardCase:
     """F: single triangles of aspect 1e3 to 1e8, some along the axes, where float32 resolves their width, and some turned."""
     rng = np.random.default_rng(seed)
