@@ -4,6 +4,7 @@ import warp as wp
 
 from wrt.kernels.sampling import disk, polygon
 from wrt.kernels.structs import Camera, Ray, make_ray
+from wrt.kernels.surface import lift
 
 
 @wp.func
@@ -36,7 +37,8 @@ def make_camera_ray(lens: bool, blades: bool):
                 sample = polygon(xi, camera.blades, camera.blade_rotation)
             offset = camera.aperture_radius * (sample[0] * camera.right + sample[1] * camera.up)
             ray.origin = camera.origin + offset
-            ray.direction = wp.normalize(camera.focus_distance * chief - offset)
+            way = camera.focus_distance * chief - offset
+            ray.direction = wp.normalize(lift(way) * way)
         return ray
 
     return camera_ray

@@ -168,7 +168,7 @@ def make_mesh_light_sample(features):
         sample = LightSample()
         way = point - s.point
         distance2 = wp.dot(way, way)
-        sample.wi = way / wp.sqrt(wp.max(distance2, 1.0e-36))
+        sample.wi = way / wp.sqrt(wp.max(distance2, wp.static(2.0**-126)))
         cos_light = -wp.dot(sample.wi, n)
         if material.two_sided != 0:
             cos_light = wp.abs(cos_light)

@@ -133,6 +133,12 @@ def largest(v: wp.vec3) -> float:
 
 
 @wp.func
+def lift(v: wp.vec3) -> float:
+    """A power of two that brings a very short vector to where its square is no denormal, else 1: scaling by it is exact."""
+    return wp.where(largest(v) < wp.static(2.0**-40), wp.static(2.0**80), 1.0)
+
+
+@wp.func
 def triangle_point_error(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec3:
     """How far a ray that starts at triangle_point must stand off to be clear of the triangle's plane, per axis.
 
@@ -192,6 +198,9 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
         if wp.static(tangents):
             e1 = surfaces.vertices[face[1]] - surfaces.vertices[face[0]]
             e2 = surfaces.vertices[face[2]] - surfaces.vertices[face[0]]
+            longer = wp.min(lift(e1), lift(e2))
+            e1 = longer * e1
+            e2 = longer * e2
             t1 = surfaces.uvs[face[1]] - surfaces.uvs[face[0]]
             t2 = surfaces.uvs[face[2]] - surfaces.uvs[face[0]]
             # dp/du up to a positive factor. v runs down: a picture that is not mirrored has a negative determinant.
@@ -210,7 +219,8 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
         s.geometric = world_normal(instance, local.geometric)
         if wp.static(tangents):
             s.bitangent_sign = local.bitangent_sign * instance.handedness
-            s.tangent = wp.normalize(world_direction(instance, local.tangent))
+            tangent = world_direction(instance, local.tangent)
+            s.tangent = wp.normalize(lift(tangent) * tangent)
         return s
 
     @wp.func
@@ -219,7 +229,8 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
         sphere = surfaces.spheres[hit.prim_id - surfaces.n_triangles]
         center = wp.vec3(sphere[0], sphere[1], sphere[2])
         # The point is moved back onto the sphere, so that its error no longer grows with the ray's length.
-        s.geometric = wp.normalize(ray.origin + hit.t * ray.direction - center)
+        way = ray.origin + hit.t * ray.direction - center
+        s.geometric = wp.normalize(lift(way) * way)
         s.shading = s.geometric
         s.point = center + sphere[3] * s.geometric
         s.error = gamma(6.0) * (wp.vec3(sphere[3], sphere[3], sphere[3]) + wp.abs(center))

@@ -27,6 +27,7 @@ from wrt.scene import (
     SpotLight,
     Texture,
 )
+from wrt.scene_size import require_size
 from wrt.world import Placed, World, world_of
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -164,7 +165,9 @@ def _emitters(scene: Scene, world: World, prim_id: np.ndarray) -> tuple[np.ndarr
     share = np.diff(cdf.astype(np.float64), prepend=0.0)
     out = records(structs.Emitter, len(prim_id))
     out["prim_id"] = prim_id
-    out["pdf_area"] = np.divide(share, area, out=np.zeros_like(area), where=area > 0.0)
+    # A light of less than 2^-128 square units lights nothing: a density of inf. At SMALLEST_LIT that is 3e-9 of its radiance.
+    with np.errstate(over="ignore"):
+        out["pdf_area"] = np.divide(share, area, out=np.zeros_like(area), where=area > 0.0)
     return out, cdf
 
 
@@ -218,6 +221,7 @@ def instance_records(placed: Placed) -> np.ndarray:
 
 def tell_left_out(scene: Scene) -> None:
     """A SceneWarning for what a picture leaves out. Raises InputError where the scene cannot be rendered."""
+    require_size(scene)
     for sphere in scene.spheres:
         if sphere.material.alpha_mode == "mask" and sphere.material.albedo_texture is not None:
             raise InputError(f"sphere {sphere.name!r}: a cut-out texture needs a mesh; material {sphere.material.name!r}")

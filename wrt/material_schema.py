@@ -147,8 +147,8 @@ class MaterialTable(Table):
         "diffuse", description="diffuse: Lambert, with an optional Blinn-Phong highlight; mirror: reflects albedo at "
         "every angle; conductor: Fresnel reflection of a metal; glass: reflection and refraction; metallic_roughness: "
         "glTF's")
-    albedo: Share = Field(list(_MATERIAL.albedo), description="share of the light that is scattered, mirrored or "
-                          "(glass) transmitted")
+    albedo: Share = Field(list(_MATERIAL.albedo), description="share of the light that is scattered or mirrored, or (glass) "
+                          "let through by each surface: clear glass has 1, and by default each takes a fifth")
     specular: Share = Field(list(_MATERIAL.specular), description="colour of the highlight (diffuse)")
     exponent: float = Field(_MATERIAL.exponent, ge=0.0, le=1e6, description="Blinn-Phong exponent (diffuse)")
     metal: Literal["gold", "silver", "copper", "aluminium"] | None = Field(

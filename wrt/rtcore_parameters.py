@@ -35,8 +35,8 @@ PARAMETERS = (
     Parameter("RTX 2080 Ti: clocks a ray and RT core", "10.5", DERIVED, "68 x 1.545 GHz / 10 Grays/s"),
     Parameter("GTX 1080 Ti: rays in software", "1.1 Grays/s claimed", PUBLISHED, TURING),
     Parameter("GTX 1080 Ti: FP32 lanes, clock", "28 SMs x 128, 1.582 GHz (boost)", PUBLISHED, PASCAL),
-    Parameter("GTX 1080 Ti: instructions of a lane a ray", "5155", DERIVED, "28 x 128 x 1.582 GHz / 1.1 Grays/s"),
-    Parameter("RTX 2060: SMs, clock", "30, 1.365 GHz", PUBLISHED, VULKAN_SIM),
+    Parameter("GTX 1080 Ti: instructions of a lane a ray", "5154", DERIVED, "28 x 128 x 1.582 GHz / 1.1 Grays/s"),
+    Parameter("RTX 2060: SMs, clock", "30, 1.365 GHz (base)", PUBLISHED, VULKAN_SIM),
     Parameter("RTX 2060: DRAM, L2", "336 GB/s, 3 MB", PUBLISHED, "NVIDIA GeForce RTX 2060, product data (2019)"),
     Parameter("cache line", "128 bytes", PUBLISHED, VULKAN_SIM),
     Parameter("L2: ways", "16", ASSUMED, VULKAN_SIM),
@@ -58,7 +58,8 @@ PARAMETERS = (
 
 @dataclass(frozen=True)
 class Gpu:
-    """clock in Hz; dram in bytes a second; claimed: rays a second that its maker says it traces (0: none said)."""
+    """clock in Hz, as its source has it: the RTX 2080 Ti's boost clock, the RTX 2060's base clock; dram in bytes a second;
+    claimed: rays a second that its maker says it traces (0: none said)."""
 
     name: str
     sms: int

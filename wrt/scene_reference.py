@@ -19,11 +19,12 @@ by `python -m wrt schema --markdown` from the schema that every file is checked 
 Schema, for editors, and `python -m wrt validate scene.toml` tells all that is wrong with a file at once, each with its place. An
 unknown key, a wrong type, NaN and infinity are mistakes.
 
-World space is right-handed, +y is up. *length*: in the scene's own unit, whatever that is. Angles are in degrees here (in Python,
-in radians). Colours are linear Rec. 709, red, green and blue; where one is asked for, a single number is a grey. *radiance*,
-*irradiance* and *radiant intensity* belong to each other, and have no unit of their own: a white diffuse surface that receives the
-irradiance pi has the radiance 1, which is shown as white. Matrices are 16 numbers, row by row, and act on column vectors. Names of
-files are relative to the scene file. What a scene lacks to be seen (a camera, any light) is added and told.
+World space is right-handed, +y is up. *length*: in the scene's own unit, whatever that is, as long as the scene is at least 1e-15
+units across and no shape reaches farther than 1e18 from the origin (see [accuracy](accuracy.md#known-limits)). Angles are in
+degrees here (in Python, in radians). Colours are linear Rec. 709, red, green and blue; where one is asked for, a single number is a
+grey. *radiance*, *irradiance* and *radiant intensity* belong to each other, and have no unit of their own: a white diffuse surface
+that receives the irradiance pi has the radiance 1, which is shown as white. Matrices are 16 numbers, row by row, and act on column
+vectors. Names of files are relative to the scene file. What a scene lacks to be seen (a camera, any light) is added and told.
 
 ## An example
 """

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from wrt.scene import BLACK, SMALLEST, Camera, ConstantBackground, DirectionalLight, GradientBackground, Scene
+from wrt.scene_size import require_size
 
 FOV_Y = math.radians(40.0)
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # from the scene to the camera: glTF's front is +z, its up +y
@@ -58,8 +59,10 @@ def stage(scene: Scene) -> tuple[Scene, list[str]]:
     """The scene with what it lacks to be seen, and a sentence on each thing that was added.
 
     No camera: one that frames the scene. No light: a directional key light from above the first camera's right
-    shoulder, and a pale sky as the background. Raises InputError where a camera is missing and the scene has no shapes.
+    shoulder, and a pale sky as the background. Raises InputError where a camera is missing and the scene has no shapes, and
+    for a scene that is too small to be rendered.
     """
+    require_size(scene)
     added = []
     if not scene.cameras:
         scene = replace(scene, cameras=(frame_camera(scene),))

@@ -92,13 +92,13 @@ def test_a_structure_on_a_gpu() -> None:
 
 
 def test_published_numbers() -> None:
-    """The claim of 10 Grays/s is 10.5 clocks a ray and core; 1.1 Grays/s in software are 5155 instructions of a lane."""
+    """The claim of 10 Grays/s is 10.5 clocks a ray and core; 1.1 Grays/s in software are 5154 instructions of a lane."""
     gpu = GPUS["rtx2080ti"]
     assert gpu.sms * gpu.clock / gpu.claimed == pytest.approx(10.5, abs=0.01)
     assert gpu.l2.size == 5632 * 1024 and gpu.l1.size == 96 * 1024
     values = {parameter.name: parameter.value for parameter in PARAMETERS}
     assert float(values["RTX 2080 Ti: clocks a ray and RT core"]) == pytest.approx(68 * 1.545 / 10, abs=0.01)
-    assert float(values["GTX 1080 Ti: instructions of a lane a ray"]) == pytest.approx(28 * 128 * 1.582 / 1.1, abs=1.0)
+    assert float(values["GTX 1080 Ti: instructions of a lane a ray"]) == pytest.approx(28 * 128 * 1.582 / 1.1, abs=0.5)
     assert {parameter.status for parameter in PARAMETERS} == {PUBLISHED, DERIVED, ASSUMED}
     assert all(parameter.source for parameter in PARAMETERS)
     base = vars(Core())

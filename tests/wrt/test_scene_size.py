@@ -1,0 +1,215 @@
+"""Pictures do not depend on the unit of length, down to where a scene is refused as too small."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import wrt
+from tests.command_line import wrt as command
+from tests.gltf_files import TRIANGLE, GltfFile
+from wrt.errors import InputError
+from wrt.scene import (
+    BLACK,
+    SMALLEST,
+    WHITE,
+    Camera,
+    ConstantBackground,
+    DirectionalLight,
+    Material,
+    Object,
+    PointLight,
+    Scene,
+    Settings,
+    Sphere,
+    SpotLight,
+    Texture,
+)
+from wrt.scene_size import SMALLEST_LIT
+from wrt.shapes import box, icosphere, quad
+
+pytestmark = pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning", "error::RuntimeWarning")
+LAMP, CHALK = Material(albedo=BLACK, emission=WHITE, name="lamp"), Material(albedo=WHITE)
+SKY = ConstantBackground(WHITE)
+BUMPS = Texture(np.random.default_rng(1).integers(90, 166, (8, 8, 4), dtype=np.uint8) | np.uint8(1), srgb=False)
+
+
+def moved(y: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[1, 3] = y
+    return matrix
+
+
+# What stands above a floor of 2 x 2 or around it, at the scale s: parts of the scene. The floor alone makes it 2 s across.
+LIT = {
+    "rectangle": lambda s: {"objects": (Object(quad((-s, s, -s), (2 * s, 0, 0), (0, 0, 2 * s)), (LAMP,), name="lamp"),)},
+    "mesh": lambda s: {"objects": (Object(icosphere(3, 0.4 * s), (LAMP,), moved(s), name="lamp"),)},
+    "sphere": lambda s: {"spheres": (Sphere((0, s, 0), 0.4 * s, LAMP, "lamp"),)},
+    "point": lambda s: {"lights": (PointLight((0, s, 0), (s * s,) * 3, "lamp"),)},
+    "spot": lambda s: {"lights": (SpotLight((0, s, 0), (0, -1, 0), (s * s,) * 3, 0.2, 0.4, "lamp"),)},
+}
+UNLIT = {
+    "directional": lambda s: {"lights": (DirectionalLight((0.3, -1, 0.2), WHITE),)},
+    "background": lambda s: {"background": SKY},
+    "lens": lambda s: {"lights": (DirectionalLight((0.3, -1, 0.2), WHITE),), "cameras": (Camera.look_at(
+        (0.5 * s, 1.5 * s, 2 * s), (0, 0, 0), fov_y=0.9, aperture_radius=0.1 * s, focus_distance=2 * s),)},
+    "glass sphere": lambda s: {"background": SKY, "spheres": (Sphere(
+        (0, 0.5 * s, 0), 0.5 * s, Material("glass", albedo=WHITE, absorption=(0.5 / s, 0, 0))),)},
+    "glass mesh": lambda s: {"background": SKY, "objects": (Object(
+        box((-0.5 * s, 0.1 * s, -0.5 * s), (0.5 * s, s, 0.5 * s)), (Material("glass", albedo=WHITE),)),)},
+    "normal map": lambda s: {"lights": (DirectionalLight((1, -1, 0), WHITE),), "objects": (Object(
+        quad((-s, 0.1 * s, s), (1.6 * s, 0, -0.8 * s), (-0.8 * s, 0, -1.6 * s)), (Material(albedo=WHITE, normal_texture=BUMPS),)),)},
+    "instances": lambda s: {"background": SKY, "lights": (DirectionalLight((1, -1, 0), WHITE),), "objects": tuple(Object(
+        PLATE, (Material(albedo=WHITE, normal_texture=BUMPS),), np.diag([s, s, s, 1.0]) @ moved(0.2 + 0.2 * i)) for i in range(3))},
+}
+PLATE = quad((-0.3, 0, 0.3), (0.5, 0, -0.3), (-0.3, 0, -0.5))
+
+
+def scene_of(parts: dict, s: float) -> Scene:
+    floor = Object(quad((-s, 0, s), (2 * s, 0, 0), (0, 0, -2 * s)), (CHALK,), name="floor")
+    camera = Camera.look_at((0.5 * s, 1.5 * s, 2 * s), (0, 0, 0), fov_y=0.9)
+    parts = {"cameras": (camera,), **parts, "objects": (floor, *parts.get("objects", ()))}
+    return Scene(**parts, settings=Settings(filter="box", max_depth=4))
+
+
+def picture(scene: Scene) -> np.ndarray:
+    film = wrt.render(scene, size=(16, 12), spp=16, instancing="always")
+    assert film.stats["not_finite"] == 0
+    return film.pixels.astype(np.float64)
+
+
+@cache
+def expected(name: str) -> np.ndarray:
+    return picture(scene_of({**LIT, **UNLIT}[name](1.0), 1.0))
+
+
+def assert_same(name: str, found: np.ndarray) -> None:
+    # Scales are no powers of two: roundings differ, and a ray in a thousand goes the other way at an edge.
+    difference = np.abs(found - expected(name)).max(axis=2)
+    assert expected(name).max() > 0.02 and np.median(difference) < 1e-5
+    assert (difference > 1e-4).mean() < 0.03 and difference.mean() < 1e-3
+
+
+@pytest.mark.parametrize("name", LIT)
+@pytest.mark.parametrize("scale", [0.5001 * SMALLEST_LIT, 3e-12, 1e12])
+def test_light_with_a_place_is_right_down_to_the_smallest_scene(name: str, scale: float) -> None:
+    assert_same(name, picture(scene_of(LIT[name](scale), scale)))
+
+
+@pytest.mark.parametrize("name", LIT)
+@pytest.mark.parametrize("scale", [0.4999 * SMALLEST_LIT, 1e-19, 1e-24])
+def test_smaller_scenes_with_such_a_light_are_refused(name: str, scale: float) -> None:
+    scene = scene_of(LIT[name](scale), scale)
+    what = {"point": "light", "spot": "light", "sphere": "sphere"}.get(name, "object")
+    with pytest.raises(InputError, match=rf"units across; at least 1e-15 .* has a place in it \({what} 'lamp'\): make it larger"):
+        wrt.render(scene, size=(4, 4), spp=1)
+
+
+@pytest.mark.parametrize("name", UNLIT)
+@pytest.mark.parametrize("scale", [2.0 * SMALLEST, 1e-24, 1e-20, 1e-16])
+def test_other_scenes_are_right_down_to_1e_30(name: str, scale: float) -> None:
+    assert_same(name, picture(scene_of(UNLIT[name](scale), scale)))
+
+
+def test_scenes_below_1e_30_are_refused() -> None:
+    with pytest.raises(InputError, match=r"the scene is 8e-31 units across; at least 1e-30 can be rendered: make it larger"):
+        wrt.render(scene_of({"background": SKY}, 4e-31), size=(4, 4), spp=1)
+
+
+def test_a_square_light_has_its_closed_form_at_the_smallest_scene() -> None:
+    for scale in (1.0, 0.5001 * SMALLEST_LIT):
+        scene = scene_of(LIT["rectangle"](scale), scale)
+        down = Camera.look_at((0.5 * scale,) * 3, (0, 0, 0), fov_y=0.02)
+        pixels = wrt.render(scene, camera=down, size=(4, 4), spp=256, max_depth=0).pixels
+        side = 1.0 / math.sqrt(2.0)  # four times a quarter with the point below its corner
+        assert pixels.mean(dtype=np.float64) == pytest.approx(4.0 * side * math.atan(side) / math.pi, rel=3e-3)
+
+
+@pytest.mark.parametrize("scale", [2.0 * SMALLEST, 1e-20, 1.0])
+def test_a_furnace_of_glass_is_white_at_any_size(scale: float) -> None:
+    glass = Sphere((0, 0, 0), scale, Material("glass", albedo=WHITE))
+    camera = Camera.look_at((2 * scale, 1.5 * scale, 3 * scale), (0, 0, 0), fov_y=0.6)
+    scene = Scene(spheres=(glass,), background=SKY, cameras=(camera,), settings=Settings(filter="box", min_throughput=0.0))
+    film = wrt.render(scene, size=(24, 24), spp=4, max_depth=20)
+    assert film.pixels.max() <= 1.0 + 1e-5
+    assert 1.0 - film.pixels.mean(dtype=np.float64) == pytest.approx(film.stats["lost_throughput_per_sample"], abs=2e-6)
+
+
+# --- what is small in a scene that is not -----------------------------------------------------------------------------
+
+
+def test_a_tiny_light_in_a_room_gives_nothing_and_is_not_refused() -> None:
+    parts = LIT["rectangle"](1.0)
+    tiny = (Object(quad((0, 0.2, 0), (1e-20, 0, 0), (0, 0, 1e-20)), (LAMP,)), Object(icosphere(1, 1e-25), (LAMP,), moved(0.3)))
+    with_tiny = scene_of({**parts, "objects": (*parts["objects"], *tiny), "spheres": (Sphere((0, 0.1, 0), 1e-28, LAMP),)}, 1.0)
+    # More lights draw other numbers: the mean is within its noise, and any one of them would add as much as there is.
+    assert picture(with_tiny).mean() == pytest.approx(expected("rectangle").mean(), rel=0.02)
+
+
+def test_tiny_shapes_far_from_their_light_are_lit() -> None:
+    # Its distance counts, not their size.
+    def lit(scale: float) -> np.ndarray:
+        return picture(scene_of({"lights": (PointLight((0, 1e3, 0), (1e6,) * 3),)}, scale))
+
+    assert np.allclose(lit(1e-20), lit(1.0), atol=1e-5) and lit(1.0).max() > 0.3
+
+
+def test_a_single_point_is_rendered_as_nothing() -> None:
+    point = Object(wrt.Mesh(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32)), (CHALK,))
+    scene = Scene(objects=(point,), background=SKY, cameras=(Camera.look_at((0, 0, 1), (0, 0, 0)),))
+    assert (wrt.render(scene, size=(4, 4), spp=1).pixels == 1.0).all()
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1e-35])
+def test_queries_take_any_size(scale: float) -> None:
+    mesh = wrt.Mesh((scale * TRIANGLE).astype(np.float32), np.array([[0, 1, 2]], np.int32))
+    origin = np.array([[0.25, 0.25, 1.0], [0.75, 0.75, 1.0]]) * scale
+    for name in ("bvh", "brute_force", "kdtree"):
+        hits = wrt.build(mesh, name).closest_hit(origin.astype(np.float32), np.array([[0, 0, -1.0]] * 2, np.float32))
+        assert hits.prim_id.tolist() == [0, -1] and hits.t[0] == pytest.approx(scale, rel=1e-6)
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def toml(scale: float) -> str:
+    return f"""
+materials.m = {{}}
+cameras.c = {{ position = [0, 0, 3], target = [0, 0, 0] }}
+meshes = [{{ shape = {{ kind = "icosphere" }}, material = "m", transform = {{ scale = {scale} }} }}]
+lights = [{{ type = "point", position = [0, {2 * scale}, 0], intensity = 1, name = "bulb" }}]
+"""
+
+
+def gltf(scale: float) -> GltfFile:
+    file = GltfFile()
+    glow = file.add("materials", {"emissiveFactor": [1, 1, 1], "name": "glow"})
+    child = file.node(mesh=file.mesh({**file.primitive(), "material": glow}), name="leaf", scale=[math.sqrt(scale)] * 3)
+    file.node(children=[child], scale=[math.sqrt(scale)] * 3)
+    return file
+
+
+def test_transforms_of_files_count(tmp_path: Path) -> None:
+    for scale, small in ((1e-14, False), (1e-16, True)):
+        (tmp_path / "a.toml").write_text(toml(scale))
+        gltf(scale).write(tmp_path, "a.gltf")
+        result = command("validate", tmp_path / "a.toml", tmp_path / "a.gltf")
+        assert result.code == 2 * small, result.err
+        for name, light in (("a.toml", "light 'bulb'"), ("a.gltf", "object 'leaf'")):
+            line = next((line for line in result.err.splitlines() if line.startswith(f"error: {tmp_path / name}")), "")
+            assert small == (f"at least 1e-15 can be rendered with a light that has a place in it ({light})" in line), result.err
+    result = command("render", tmp_path / "a.toml", "-o", tmp_path / "a.png")
+    assert result.code == 2 and "at least 1e-15" in result.err and "Traceback" not in result.err
+
+
+def test_a_tiny_file_may_be_included_and_made_larger(tmp_path: Path) -> None:
+    gltf(1e-24).write(tmp_path, "a.gltf")
+    (tmp_path / "a.toml").write_text('include = [{ file = "a.gltf", transform = { scale = 1e20 } }]')
+    assert wrt.load_scene(tmp_path / "a.toml").bounds()[1].max() == pytest.approx(1e-4)
+    (tmp_path / "a.toml").write_text('include = ["a.gltf"]')
+    with pytest.raises(InputError, match=r"a\.toml: the scene is 1e-24 units across"):
+        wrt.load_scene(tmp_path / "a.toml")

@@ -1,0 +1,66 @@
+"""Scenes that are too small: what single precision cannot tell apart, or not square."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from wrt.arguments import at_thing
+from wrt.errors import InputError
+from wrt.scene import SMALLEST, DirectionalLight, Scene
+
+# Where a light has a place in the scene, the square of its distance counts, which is a float32 with all its digits from 2^-63
+# (1.1e-19) on. So in the smallest scene all is lit rightly that is farther from the light than its ten-thousandth part.
+SMALLEST_LIT = 1e-15
+VERTICES_AT_ONCE = 1 << 16
+
+
+def require_size(scene: Scene) -> None:
+    """Raise InputError where a scene is too small to be rendered."""
+    light = _light_with_a_place(scene)
+    needed = SMALLEST_LIT if light else SMALLEST
+    size = _size(scene, needed)
+    if 0.0 < size < needed:  # a single point cannot be hit
+        within = f" with a light that has a place in it ({light})" if light else ""
+        raise InputError(f"the scene is {size:.3g} units across; at least {needed:g} can be rendered{within}: make it larger")
+
+
+def _light_with_a_place(scene: Scene) -> str:
+    """What the first light is called whose distance counts: a point or spot light, or a shape that lights others. "" for none."""
+    for light in scene.lights:
+        if not isinstance(light, DirectionalLight):
+            return at_thing("light", light.name)[:-2]
+    for thing in scene.objects:
+        if any(material.lights_others for material in thing.materials):
+            return at_thing("object", thing.name)[:-2]
+    for sphere in scene.spheres:
+        if sphere.material.lights_others:
+            return at_thing("sphere", sphere.name)[:-2]
+    return ""
+
+
+def _size(scene: Scene, enough: float) -> float:
+    """The longest side of the box around all shapes and the lights that have a place, or what is known to be enough of it."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    size = 0.0
+    for points in _points(scene):
+        low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+        size = float((high - low).max())
+        if size >= enough:
+            break
+    return size
+
+
+def _points(scene: Scene) -> Iterator[np.ndarray]:
+    """(N, 3) float64 in world space, a part at a time."""
+    for light in scene.lights:
+        if not isinstance(light, DirectionalLight):
+            yield np.array([light.position])
+    for sphere in scene.spheres:
+        yield np.array(sphere.center) + sphere.radius * np.array([[-1.0], [1.0]])
+    for thing in scene.objects:
+        if len(thing.mesh.faces):
+            for i in range(0, len(thing.mesh.vertices), VERTICES_AT_ONCE):
+                part = thing.mesh.vertices[i:i + VERTICES_AT_ONCE].astype(np.float64)
+                yield part @ thing.transform[:3, :3].T + thing.transform[:3, 3]
