@@ -38,6 +38,8 @@ def real_numbers(value: Any, name: str, shape: str) -> np.ndarray:
         raise InputError(f"{name} must not be a masked array: its mask would be ignored; leave masked rows out, or fill them")
     try:
         array = np.asarray(value)
+        if array.dtype == np.float32:
+            return np.asarray(array, order="C")
         if array.dtype.kind in REAL:
             with np.errstate(over="ignore"):
                 return np.asarray(array, dtype=np.float32, order="C")

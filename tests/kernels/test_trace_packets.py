@@ -27,9 +27,9 @@ def one_by_one(accel, o, d, t_min, t_max):
     n = len(o)
     hits = HitArrays()
     hits.t, hits.u, hits.v, hits.prim_id = zeros(n), zeros(n), zeros(n), zeros(n, wp.int32)
-    accel._launch(closest_hit_kernel(accel.structure), rays, hits, n, 1)
+    accel._launch(closest_hit_kernel(accel.structure), [accel.data, accel._surfaces, rays, hits], n, 1)
     dark = zeros(n, wp.bool)
-    accel._launch(any_hit_kernel(accel.structure), rays, dark, n, 1)
+    accel._launch(any_hit_kernel(accel.structure), [accel.data, accel._surfaces, rays, dark], n, 1)
     return {name: getattr(hits, name).numpy() for name in ("t", "u", "v", "prim_id")}, dark.numpy()
 
 

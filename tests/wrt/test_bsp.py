@@ -243,7 +243,7 @@ def test_random_lines_cost_what_the_heuristic_says(kind: str, options: dict[str,
     hits = HitArrays()
     hits.t, hits.u, hits.v = (wp.zeros(len(rays.t_min), dtype=wp.float32, device="cpu") for _ in range(3))
     hits.prim_id = wp.zeros(len(rays.t_min), dtype=wp.int32, device="cpu")
-    counts = tree._counted(lambda structure: refusing_kernel(), rays, hits, False, None).counts
+    counts = tree._counted(lambda structure: refusing_kernel(), tree.data, rays, hits, False, 1).counts
     steps = counts["nodes"] + counts["primitives"]
     assert abs(steps.mean() - tree.stats.sah_cost) < 3.0 * steps.std() / np.sqrt(len(steps))
 

@@ -5,17 +5,22 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
+import wrt
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, build, load_accel
 from wrt.accel.base import RAYS_PER_LAUNCH, Hits
 from wrt.accel.instances import Instances, place
+from wrt.accel.store import array_types
 from wrt.device import load_kernel, made_once, start
+from wrt.errors import InputError
 from wrt.kernels.structs import kernel
+from wrt.scene import Camera, Material, Object, PointLight, Scene
 from wrt.shapes import icosphere
 
 BALL = icosphere(3)
@@ -162,8 +167,12 @@ def test_a_refit_between_two_launches_of_a_query_waits_for_the_next(name: str, a
 
 
 def test_refits_come_one_after_another_and_what_is_saved_is_whole(tmp_path: Any, often: None) -> None:
-    accel = build(BALL, "bvh2")
-    costs = [accel.refit(vertices).growth for vertices in SHAPES]
+    accel, rays = build(BALL, "bvh2"), some_rays(500)
+    geometries = [Geometry(vertices, BALL.faces, np.zeros((0, 4), np.float32)) for vertices in SHAPES]
+    costs, answers = [], []
+    for vertices in SHAPES:
+        costs.append(accel.refit(vertices).growth)
+        answers.append((accel.built.arrays["nodes"].tobytes(), bits(accel.closest_hit(*rays))))
     path, growths = tmp_path / "ball.accel", []
 
     def flip(which: int) -> None:
@@ -172,19 +181,34 @@ def test_refits_come_one_after_another_and_what_is_saved_is_whole(tmp_path: Any,
     def save() -> None:
         for _ in range(10):
             accel.save(path)
-            loaded = 0
-            for vertices in SHAPES:  # whose digest is in the file
+            found = []
+            for geometry, answer in zip(geometries, answers, strict=True):
                 try:
-                    load_accel(path, Geometry(vertices, BALL.faces, np.zeros((0, 4), np.float32)))
-                    loaded += 1
-                except ValueError as error:
+                    loaded = load_accel(path, geometry)
+                except InputError as error:
                     assert "another mesh" in str(error)
-            assert loaded == 1
+                else:
+                    found.append((loaded.built.arrays["nodes"].tobytes(), bits(loaded.closest_hit(*rays))) == answer)
+            assert found == [True]
 
     at_a_time(lambda: flip(0), lambda: flip(1), save)
     assert len(growths) == 60 and all(growth == costs[which] for which, growth in growths)
     state = accel._state
     assert state.stats.sah_cost == state.built.sah_cost and state.geometry is accel.geometry
+
+
+def test_a_file_that_a_refit_comes_into_holds_one_shape(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    accel, path = build(BALL, "bvh2"), tmp_path / "ball.accel"
+    nodes = accel.built.arrays["nodes"].tobytes()
+
+    def types_and_refit(*arguments: Any) -> Any:
+        accel.refit(SHAPES[1])
+        return array_types(*arguments)
+
+    monkeypatch.setattr("wrt.accel.store.array_types", types_and_refit)
+    accel.save(path)
+    monkeypatch.undo()
+    assert load_accel(path, BALL).built.arrays["nodes"].tobytes() == nodes != accel.built.arrays["nodes"].tobytes()
 
 
 def test_instances_stay_where_they_were_when_their_structure_is_refitted() -> None:
@@ -238,6 +262,20 @@ def test_a_kernel_is_compiled_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(nothing.module, "load", lambda *arguments, **options: (loads.append(1), load(*arguments, **options)))
     at_a_time(*[lambda: load_kernel(nothing, device)] * 8)
     assert len(loads) == 1
+
+
+def test_scenes_are_rendered_on_several_threads() -> None:
+    camera, other = (Camera.look_at(position, (0, 0, 0)) for position in ((0, 1, 4), (3, 0, 2)))
+    scene = Scene(Object(BALL, Material()), lights=PointLight((2, 5, 3), 50), cameras=camera)
+    scenes = [scene, scene.with_settings(max_depth=2), replace(scene, cameras=other)]
+    alone = [wrt.render(each, size=(24, 16), spp=2).pixels.tobytes() for each in scenes]
+    assert len(set(alone)) > 1
+
+    def draw(i: int) -> None:
+        for k in range(i, i + 3):
+            assert wrt.render(scenes[k % 3], size=(24, 16), spp=2, threads=2).pixels.tobytes() == alone[k % 3]
+
+    at_a_time(*(lambda i=i: draw(i) for i in range(4)))  # type: ignore[misc]
 
 
 def test_structures_are_built_and_asked_on_several_threads() -> None:

@@ -463,7 +463,7 @@ class Accelerator(ABC):
         hits = HitArrays()
         for field, dtype in (("t", wp.float32), ("u", wp.float32), ("v", wp.float32), ("prim_id", wp.int32)):
             setattr(hits, field, wp.empty(n, dtype=dtype, device=self.device))
-        counted = self._counted(data, rays, hits, trace, threads) if counters or trace else None
+        counted = self._counted(closest_hit_kernel, data, rays, hits, trace, threads) if counters or trace else None
         if counted is None:
             self._trace(closest_hit_kernel, data, rays, hits, threads)
         t, u, v, prim_id = (array if as_warp else array.numpy() for array in (hits.t, hits.u, hits.v, hits.prim_id))
@@ -479,10 +479,10 @@ class Accelerator(ABC):
         self._trace(any_hit_kernel, data, rays, dark, threads)
         return dark if as_warp else dark.numpy()
 
-    def _counted(self, data: Any, rays: RayArrays, hits: HitArrays, trace: bool, threads: int) -> Counters:
+    def _counted(self, make_kernel: Any, data: Any, rays: RayArrays, out: Any, trace: bool, threads: int) -> Counters:
         """Launch with counters; with a trace once more, when it is known how long the trace of each ray is."""
         n = len(rays.t_min)
-        kernel = closest_hit_kernel(self.structure._replace(units=self.structure.units._replace(counters=True)))
+        kernel = make_kernel(self.structure._replace(units=self.structure.units._replace(counters=True)))
 
         def run(first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             # The struct of the counting kernel is the same, but what it records is this call's alone.
@@ -490,7 +490,7 @@ class Accelerator(ABC):
             own.recorder.counts = wp.zeros(n, dtype=Counts, device=self.device)
             own.recorder.first = upload(first, wp.int64, self.device)
             own.recorder.fetches = wp.zeros(int(first[-1]) if len(first) else 0, dtype=wp.int64, device=self.device)
-            self._launch(kernel, [own, self._surfaces, rays, hits], n, threads)
+            self._launch(kernel, [own, self._surfaces, rays, out], n, threads)
             return own.recorder.counts.numpy(), own.recorder.fetches.numpy()
 
         counts, fetches = run(np.zeros(0, np.int64))

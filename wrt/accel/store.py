@@ -59,13 +59,14 @@ def check_target(path: str | os.PathLike[str]) -> None:
 def save(accel: Accelerator, path: str | os.PathLike[str]) -> None:
     """Write it whole or not at all. Raises InputError where the system refuses."""
     check_target(path)
-    units, built = accel.structure.units, accel.built
+    units, state = accel.structure.units, accel._state
+    built = state.built
     rows = {name: np.ascontiguousarray(np.atleast_1d(array)) for name, array in built.arrays.items()}
     types = array_types(type(accel), units.triangle)
     body = [rows[name].astype(types[name].base, copy=False).tobytes() for name in types]
     body.append(built.order.astype("<i4").tobytes())
     header = {"accel": accel.name, "triangle": units.triangle, "box": units.box, "wrt": wrt.__version__,
-              "geometry": accel.geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
+              "geometry": state.geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
               "order": len(built.order)} | {name: getattr(built, name) for name in STATS}
     with replacing(path) as temporary, open(temporary, "wb") as file:
         write_checked(file, MAGIC, header, body)
