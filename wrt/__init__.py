@@ -51,6 +51,8 @@ __all__ = ["__version__", *_PUBLIC]
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
+        if _PUBLIC[name] != "wrt.errors":
+            importlib.import_module("wrt.address_space").require_modules()
         value = getattr(importlib.import_module(_PUBLIC[name]), name)
         globals()[name] = value
         return value

@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 import click
 
 import wrt
+from wrt.address_space import is_out_of_memory, require_modules, told_limit
 from wrt.cli_animate import animate
 from wrt.cli_bench import bench, stability
 from wrt.cli_build import build
@@ -53,6 +54,7 @@ from wrt.interrupt import Interrupted, exit_code, raise_on_termination
 @click.version_option(wrt.__version__, message="wrt %(version)s")
 def cli() -> None:
     """A Whitted ray tracer on NVIDIA Warp."""
+    require_modules()  # before a command imports them
 
 
 cli.add_command(stability)
@@ -310,8 +312,10 @@ def main() -> None:
     except OSError as error:  # from outside of wrt: a path too long for the system, stdout on a full disk
         say(f"error: {error}")
         code = 2
-    except MemoryError as error:
-        say(f"error: not enough memory: {error}")
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        say(f"error: not enough memory: {error}{told_limit()}")
         code = 2
     except (click.Abort, KeyboardInterrupt) as error:  # click makes the first of the second
         cause = error.__cause__ if isinstance(error, click.Abort) else error

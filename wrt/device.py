@@ -22,6 +22,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import warp as wp
 
+from wrt.address_space import require_compiler, require_warp
 from wrt.arguments import shown
 from wrt.errors import InputError
 from wrt.memory import available
@@ -81,6 +82,7 @@ def _stderr_without(text: bytes) -> Iterator[None]:
 @made_once
 def start(device: str) -> Any:
     """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are."""
+    require_warp(thread_count(None) + 2)  # two that prepare
     with _stderr_without(b"NVIDIA CUDA driver"):  # where there is no GPU, it says so each time
         with _cache_told():
             wp.init()
@@ -140,6 +142,7 @@ def _load(kernel: Any, device: Any) -> None:
             kernel.module.load(device, block_dim=block_dim)
         else:
             _require_room_to_compile(cache)
+            require_compiler()
             with compiling(cache, f"{name}_p{os.getpid()}_t{threading.get_ident()}"):  # as Warp calls the folder
                 kernel.module.load(device, block_dim=block_dim)
 

@@ -28,7 +28,7 @@ def available() -> float:
         if match is None:
             raise InputError(f"must be a number of bytes such as 24G, got {text!r}", None, "WRT_MEMORY")
         return float(match[1]) * UNITS[match[2].upper()]
-    return min(_of_system(), _of_groups(), _of_address_space())
+    return min(_of_system(), _of_groups(), address_space())
 
 
 def require(needed: float, what: str) -> None:
@@ -90,7 +90,8 @@ def _of_group(folder: Path, limit: str, use: str, cache: str) -> float:
     return float("inf") if most == "max" else max(0.0, float(most) - used + (int(match[1]) if match else 0))
 
 
-def _of_address_space() -> float:
+def address_space() -> float:
+    """Bytes of address space that this process can still take; infinite where it is not limited."""
     try:
         import resource
 

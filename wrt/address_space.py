@@ -1,0 +1,80 @@
+"""Little address space (ulimit -v): told before it is felt. OpenBLAS and LLVM end the process where they get none, and Warp's
+libraries and threads need more of it than of memory. Imports nothing that needs any."""
+
+from __future__ import annotations
+
+import os
+import sys
+from contextlib import suppress
+
+from wrt.errors import InputError
+from wrt.memory import address_space
+
+# Bytes, measured with Python 3.11, NumPy 2.4, Warp 1.19 on Linux, and some to spare.
+MODULES = 130 << 20  # NumPy, Pydantic and the like, without
+BLAS_THREAD = 40 << 20  # which OpenBLAS starts for each core when NumPy is imported
+BLAS_THREADS = 64  # at most, in NumPy's wheels
+WARP = 400 << 20  # warp.so and warp-clang.so, and a small scene
+STACK = 8 << 20  # of a thread, where its limit (ulimit -s) is none
+LLVM = 128 << 20  # while it compiles the largest kernel
+ARENAS = -8  # M_ARENA_MAX of <malloc.h>
+
+
+def require_modules() -> None:
+    """Raise InputError where the address space does not suffice for what wrt imports; where it is limited, see that threads take
+    little of it."""
+    if address_space() == float("inf"):
+        return
+    threads = 0 if "numpy" in sys.modules else min(_blas_threads(), BLAS_THREADS)
+    require(MODULES + threads * BLAS_THREAD, "NumPy and what else is imported",
+            "; OPENBLAS_NUM_THREADS=1 makes NumPy take less" if threads > 1 else "")
+    import ctypes
+
+    with suppress(AttributeError, OSError, TypeError):  # another C library, which reserves nothing
+        ctypes.CDLL(None).mallopt(ARENAS, 1)  # glibc would reserve 64 MiB for each thread
+
+
+def require_warp(threads: int) -> None:
+    """Raise InputError where it does not suffice for Warp and so many threads."""
+    require(WARP + threads * _stack(), "Warp")
+
+
+def require_compiler() -> None:
+    """Raise InputError where it does not suffice for a compilation."""
+    require(LLVM, "compiling a kernel")
+
+
+def require(needed: float, what: str, way_out: str = "") -> None:
+    """Raise InputError, which tells both numbers, where `what` takes more bytes of address space than are left."""
+    if needed > (left := address_space()):
+        raise InputError(f"{what} takes {needed / 2**20:.0f} MiB of address space, and {left / 2**20:.0f} are left: raise its limit"
+                         f" (ulimit -v){way_out}")
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether it is Python's, or what Python and Warp raise where the system gives them no thread or no array."""
+    return isinstance(error, MemoryError) or str(error).startswith(("can't start new thread", "Failed to allocate"))
+
+
+def told_limit() -> str:
+    """What to add to such an error: nothing where the address space is not limited."""
+    left = address_space()
+    return "" if left == float("inf") else f" ({left / 2**20:.0f} MiB of address space are left: raise its limit, ulimit -v)"
+
+
+def _blas_threads() -> int:
+    """How many OpenBLAS will start."""
+    for name in ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS"):
+        if os.environ.get(name, "").isdecimal() and int(os.environ[name]) > 0:
+            return min(int(os.environ[name]), os.cpu_count() or 1)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def _stack() -> int:
+    try:
+        import resource
+
+        soft = resource.getrlimit(resource.RLIMIT_STACK)[0]
+    except ImportError:
+        return STACK
+    return STACK if soft == resource.RLIM_INFINITY else soft
