@@ -28,6 +28,7 @@ from wrt.cli_common import (
     warnings_told,
 )
 from wrt.errors import InputError
+from wrt.interrupt import exit_code
 
 
 @click.command()
@@ -67,10 +68,18 @@ def stability(output: Path | None, cluster: str | None, quiet: bool, as_json: bo
     paths = [] if output is None else report.write_report(result, plan, output)
     if as_json:
         say_json({"machine": report.machine(plan), **result.as_dict(), "output": [str(path) for path in paths]})
-        return
-    click.echo(f"\n{report.summary(result)}")
-    for path in paths:
-        click.echo(path)
+    else:
+        click.echo(f"\n{report.summary(result)}")
+        for path in paths:
+            click.echo(path)
+    _end(result.interrupted)
+
+
+def _end(interrupted: int | None) -> None:
+    """With a signal's exit code, where one ended the work early and what was done is told."""
+    if interrupted is not None:
+        say("interrupted: what was done is kept")
+        raise SystemExit(exit_code(interrupted))
 
 
 def by_mesh(run: Callable[..., list[Any]], plan: Any, report: Callable[[Any], None], client: Any) -> list[Any]:
@@ -335,10 +344,11 @@ def error(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], 
         report.write_report(result, paths, f"python -m wrt {click.get_current_context().command_path}")
     if as_json:
         say_json({**result.as_dict(), "output": [str(path) for path in paths.values()]})
-        return
-    click.echo(report.text(result))
-    for path in paths.values():
-        click.echo(path)
+    else:
+        click.echo(report.text(result))
+        for path in paths.values():
+            click.echo(path)
+    _end(result.interrupted)
 
 
 @bench.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -18,10 +19,27 @@ LINE_EVERY = 10.0  # seconds between lines where stderr is no terminal
 
 def describe(progress: Progress) -> str:
     """Rays a second, the time left, and what goes wrong."""
-    left = progress.seconds_left
-    time_left = f"{int(left // 60)}:{int(left % 60):02d} left" if left < 1e6 else "?"
     note = f"; {progress.note}" if progress.note else ""
-    return f"{progress.rays_per_second / 1e6:.1f} Mray/s, {time_left}{note}"
+    return f"{progress.rays_per_second / 1e6:.1f} Mray/s, {time_left(progress.seconds_left)}{note}"
+
+
+def time_left(seconds: float) -> str:
+    """Minutes and seconds; "?" where they cannot be told."""
+    return f"{int(seconds // 60)}:{int(seconds % 60):02d} left" if seconds < 1e6 else "?"
+
+
+class TimeLeft:
+    """How long work of known size will take, at the mean speed so far."""
+
+    def __init__(self, total: float) -> None:
+        self.total, self.done, self.begin = total, 0.0, time.perf_counter()
+
+    def __str__(self) -> str:
+        """", about 1:30 left", to put behind a line; nothing before anything is done."""
+        if self.done <= 0.0:
+            return ""
+        seconds = (time.perf_counter() - self.begin) * max(self.total - self.done, 0.0) / self.done
+        return f", about {time_left(seconds)}"
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run_command
 from wrt.accel import ACCELERATORS
 from wrt.bench import error as bench
@@ -23,6 +25,7 @@ from wrt.driver import Options
 from wrt.errors import InputError
 from wrt.features import features_of
 from wrt.image import read_image
+from wrt.interrupt import Interrupted
 from wrt.scene import Camera, ConstantBackground, GradientBackground, Material, Object, Scene, Settings, Sphere
 from wrt.shapes import box, quad
 
@@ -301,6 +304,44 @@ def test_the_command(tmp_path: Path) -> None:
     wrong = run_command(*common, "--knobs", "flux")
     assert wrong.code == 2 and "there is sampler" in wrong.errors[0]
     assert run_command(*common[:2], tmp_path / "none.toml").code == 2
+
+
+@pytest.mark.parametrize(("rows", "number"), [(1, signal.SIGINT), (4, signal.SIGTERM)])
+def test_an_interrupted_sweep_keeps_the_rows_that_are_done(rows: int, number: int, tmp_path: Path,
+                                                           monkeypatch: pytest.MonkeyPatch) -> None:
+    measure, done = bench.measure, 0
+
+    def interrupting(*arguments: Any) -> bench.Row:
+        nonlocal done
+        if done == rows:
+            raise Interrupted(number)
+        done += 1
+        return measure(*arguments)
+
+    monkeypatch.setattr(bench, "measure", interrupting)
+    Path(tmp_path / "box.obj").write_text(BOX_OBJ)
+    common = ("bench", "error", tmp_path / "box.obj", "--size", "8x6", "--max-spp", "4", "--repeats", "3", "--reference-spp", "8")
+    result = run_command(*common, "--knobs", "sampler", "--json", "-o", tmp_path)
+    assert result.code == 128 + number and result.err.endswith("interrupted: what was done is kept\n")
+    data = json.loads(result.out)
+    assert len(data["rows"]) == rows and data["interrupted"] == number and len(data["slopes"]) == (1 if rows < 4 else 2)
+    unfinished = "sampler = independent" if rows == 4 else "as it is, sampler = independent"
+    assert data["left_out"] == [f"what was not done when it was interrupted: {unfinished}"]
+    assert "what was not done" in (tmp_path / "box_error.md").read_text()
+    done = 0
+    table = run_command(*common, "--knobs", "sampler")
+    assert "what was not done" in table.out and "1/2 as it is: 1 spp, about 0:" in table.err
+
+
+def test_ctrl_c_before_the_first_row_has_nothing_to_keep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench, "measure", interrupted)
+    Path(tmp_path / "box.obj").write_text(BOX_OBJ)
+    small = ("--size", "8x6", "--max-spp", "2", "--repeats", "3", "--knobs", "sampler")
+    result = run_command("bench", "error", tmp_path / "box.obj", *small)
+    assert result.code == 130 and result.out == "" and result.err.endswith("interrupted\n")
 
 
 # --- the plot ---------------------------------------------------------------------------------------------------------

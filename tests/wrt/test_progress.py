@@ -13,7 +13,7 @@ import pytest
 
 from tests.command_line import BOX_OBJ, wrt
 from wrt.driver import Progress
-from wrt.progress import BUILDING, COMPILING, LINE_EVERY, describe, progress_reporter
+from wrt.progress import BUILDING, COMPILING, LINE_EVERY, TimeLeft, describe, progress_reporter
 
 
 def at(seconds: float, done: int = 50) -> Progress:
@@ -29,6 +29,17 @@ def at(seconds: float, done: int = 50) -> Progress:
 ])
 def test_rays_a_second_and_time_left(progress: Progress, expected: str) -> None:
     assert describe(progress) == expected
+
+
+def test_the_time_left_of_work_of_known_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr("wrt.progress.time.perf_counter", lambda: now)
+    left = TimeLeft(8.0)
+    assert str(left) == ""
+    now, left.done = 130.0, 2.0
+    assert str(left) == ", about 1:30 left"
+    left.done = 9.0  # more than was thought
+    assert str(left) == ", about 0:00 left"
 
 
 def test_quiet_is_silent() -> None:

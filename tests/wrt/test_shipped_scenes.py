@@ -15,6 +15,7 @@ import wrt
 from tests.data import ROOT
 from wrt.accel import ACCELERATORS, Structure
 from wrt.accel.base import any_hit_kernel, closest_hit_kernel
+from wrt.cli_common import depth_hint
 from wrt.device import start
 from wrt.driver import aov_kernel, render_kernel
 from wrt.features import Features, features_of
@@ -64,6 +65,8 @@ def test_a_scene_renders(path: Path) -> None:
     assert film.stats["not_finite"] == 0
     assert np.isfinite(film.pixels).all() and (film.pixels >= 0.0).all()
     assert film.pixels.max() > 0.0
+    visibly_cut = depth_hint(film.stats["visibly_cut"], load(path).settings.max_depth) is not None
+    assert visibly_cut == (path.stem in ("frosted", "metallic_roughness"))  # as docs/concepts.md says
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import signal
 import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from tests.command_line import wrt as run
 from wrt.accel import Geometry
 from wrt.bench import stability
 from wrt.bench import stability_report as report
@@ -150,6 +153,42 @@ def test_the_report_has_a_row_for_each(result, tmp_path) -> None:
     for name in ("stability.txt", "nowhere/stability.md"):
         with pytest.raises(InputError):
             report.check_report(tmp_path / name)
+
+
+def interrupted_after(count: int, monkeypatch, *options):
+    """`stability` on two cases, with Ctrl-C while it is at the row after so many."""
+    rows = []
+    run_case = stability.run_case
+
+    def interrupting(*arguments):
+        if len(rows) == count:
+            signal.raise_signal(signal.SIGINT)
+        rows.append(run_case(*arguments))
+        return rows[-1]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stability, "run_case", interrupting)
+        patch.setattr(stability, "SPEED_RAYS", 2000)
+        return run("stability", "E_grid", "D_published", "--rays", "60", "--sample", "40", "--runs", "1", *options)
+
+
+@pytest.mark.parametrize(("rows", "undone"), [(1, ["E_grid", "D_published"]), (len(own_algorithms()), ["D_published"])])
+def test_ctrl_c_keeps_the_rows_that_are_done(monkeypatch, tmp_path, rows, undone) -> None:
+    path = tmp_path / "stability.md"
+    done = interrupted_after(rows, monkeypatch, "-o", path)
+    assert done.code == 130 and done.err.endswith("interrupted: what was done is kept\n") and str(path) in done.out
+    for text in (done.out, path.read_text()):
+        assert f"Interrupted; not done, or not with all algorithms: {', '.join(undone)}" in text and "A to H" in text
+        assert sum(line.lstrip("| ").startswith("E_grid") for line in text.splitlines()) == rows
+    told = json.loads(interrupted_after(rows, monkeypatch, "--json").out)
+    assert (told["interrupted"], told["undone"], len(told["rows"])) == (signal.SIGINT, undone, rows)
+
+
+def test_ctrl_c_before_the_first_row_has_nothing_to_keep(monkeypatch) -> None:
+    monkeypatch.setattr(stability, "run_case", lambda *arguments: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(stability, "SPEED_RAYS", 2000)
+    done = run("stability", "E_grid", "--rays", "60", "--sample", "40", "--runs", "1")
+    assert done.code == 130 and done.err.endswith("interrupted\n") and "Traceback" not in done.err
 
 
 def test_speed_is_told_with_its_spread(result) -> None:

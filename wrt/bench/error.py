@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+import signal
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,8 +26,10 @@ from wrt.driver import Options, Renderer
 from wrt.errors import InputError
 from wrt.features import Features
 from wrt.film import Film
+from wrt.interrupt import Interrupted
 from wrt.kernels.ray_aabb import RAY_AABB
 from wrt.kernels.ray_triangle import RAY_TRIANGLE
+from wrt.progress import TimeLeft
 from wrt.scene import SAMPLERS, Scene
 from wrt.tables import html_table
 
@@ -171,7 +174,7 @@ def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int
 def finished(film: Film) -> Film:
     """The film, or KeyboardInterrupt where Ctrl-C ended it early."""
     if film.stats["interrupted"]:
-        raise KeyboardInterrupt
+        raise Interrupted(film.stats["signal"] or signal.SIGINT)
     return film
 
 
@@ -282,7 +285,7 @@ def slope_of(rows: Sequence[Row], known: float) -> Slope:
 
 @dataclass
 class Sweep:
-    """Everything that was measured, and what it was measured on."""
+    """Everything that was measured, and what it was measured on. interrupted: the number of the signal that ended it early."""
 
     scene: str
     size: tuple[int, int]
@@ -293,6 +296,7 @@ class Sweep:
     rows: list[Row] = field(default_factory=list)
     slopes: list[Slope] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    interrupted: int | None = None
 
     @property
     def same_pixels(self) -> list[str]:
@@ -314,7 +318,7 @@ class Sweep:
         return {"scene": self.scene, "size": list(self.size), "repeats": self.repeats, "seed": self.seed,
                 "confidence": statistics.CONFIDENCE, "reference": self.reference.as_dict(), "machine": self.machine,
                 "rows": [row.as_dict() for row in self.rows], "slopes": [slope.as_dict() for slope in self.slopes],
-                "same_pixels": self.same_pixels, "left_out": self.left_out}
+                "same_pixels": self.same_pixels, "left_out": self.left_out, "interrupted": self.interrupted}
 
 
 @dataclass
@@ -345,29 +349,42 @@ class Plan:
 
 
 def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], None] = lambda text: None) -> Sweep:
-    """Measure; `report` is told before each step. options.seed decides on all seeds. Raises KeyboardInterrupt at Ctrl-C."""
+    """Measure; `report` is told before each step. options.seed decides on all seeds.
+
+    Interrupted by Ctrl-C, it returns the rows that are done; before the first one, KeyboardInterrupt is raised.
+    """
     words = [int(word) for word in np.random.SeedSequence(options.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     base = Renderer(scene, options)
     found, left_out = variants(scene, options, base.features, plan.knobs or tuple(KNOBS))
     reference_spp = plan.reference_spp or 8 * plan.max_spp
+    for_truth, for_each = REFERENCE_SEEDS * reference_spp, plan.repeats * sum(plan.levels)
+    left = TimeLeft(for_truth + len(found) * for_each)  # in samples, as if all took equally long
     report(f"reference: {REFERENCE_SEEDS} seeds of {reference_spp} spp")
     truth = make_reference(scene, options, reference_spp, words[:REFERENCE_SEEDS])
     machine = {"device": base.device.name or "CPU", "threads": base.threads, "system": platform.machine(),
                "wrt": wrt.__version__}
     result = Sweep(scene.name, scene.settings.size, plan.repeats, options.seed, truth, machine, left_out=left_out)
-    for number, variant in enumerate(found, start=1):
-        renderer = base if variant.knob == "" else Renderer(variant.scene, variant.options)
-        finished(renderer.run(spp=1))  # what a first launch costs is not the variant's
-        rows: list[Row] = []
-        for spp in plan.levels:
-            likely = 2.0 * rows[-1].seconds.value * plan.repeats if rows else 0.0
-            if likely > plan.row_seconds:
-                result.left_out.append(f"{variant.label} from {spp} spp on: a row would take some {likely:.0f} s")
-                break
-            report(f"{number}/{len(found)} {variant.label}: {spp} spp")
-            rows.append(measure(variant, renderer, spp, words[REFERENCE_SEEDS:], truth))
-        result.rows += rows
-        result.slopes.append(slope_of(rows, truth.variance))
+    rows: dict[str, list[Row]] = {variant.label: [] for variant in found}
+    try:
+        for number, variant in enumerate(found):
+            left.done = for_truth + number * for_each
+            renderer = base if variant.knob == "" else Renderer(variant.scene, variant.options)
+            finished(renderer.run(spp=1))  # what a first launch costs is not the variant's
+            for spp in plan.levels:
+                likely = 2.0 * rows[variant.label][-1].seconds.value * plan.repeats if rows[variant.label] else 0.0
+                if likely > plan.row_seconds:
+                    result.left_out.append(f"{variant.label} from {spp} spp on: a row would take some {likely:.0f} s")
+                    break
+                report(f"{number + 1}/{len(found)} {variant.label}: {spp} spp{left}")
+                rows[variant.label].append(measure(variant, renderer, spp, words[REFERENCE_SEEDS:], truth))
+                left.done += plan.repeats * spp
+    except KeyboardInterrupt as stop:
+        if not any(rows.values()):
+            raise
+        result.interrupted = int(getattr(stop, "number", signal.SIGINT))
+        result.left_out.append(f"what was not done when it was interrupted: {', '.join(each.label for each in found[number:])}")
+    result.rows = [row for each in rows.values() for row in each]
+    result.slopes = [slope_of(each, truth.variance) for each in rows.values() if each]
     for i in statistics.pareto_front([(row.seconds.value, row.rmse.value) for row in result.rows]):
         result.rows[i].pareto = True
     return result

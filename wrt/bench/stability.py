@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -27,6 +28,7 @@ from wrt.kernels.query import HitList, RayArrays, Respawn, make_all_hits_kernel,
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.surface import make_surface_at
 from wrt.kernels.traverse import Units
+from wrt.progress import TimeLeft
 from wrt.tables import html_table
 
 ALL_HITS_TESTS = 20_000_000  # ray-primitive tests that a case's all-hits check may take
@@ -87,12 +89,15 @@ class Speed:
 
 @dataclass
 class Result:
-    """All rows, the speeds by algorithm, the peers that were asked for and are not installed, and the seconds it took."""
+    """All rows, the speeds by algorithm, the peers that were asked for and are not installed, and the seconds it took.
+    interrupted: the number of the signal that ended it early; undone: the cases that it has not finished."""
 
     rows: list[Row] = field(default_factory=list)
     speeds: dict[str, Speed] = field(default_factory=dict)
     missing: tuple[str, ...] = ()
     seconds: float = 0.0
+    interrupted: int | None = None
+    undone: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
         from wrt.bench.stability_report import COLUMNS, cells
@@ -100,7 +105,7 @@ class Result:
         return html_table("Stability", COLUMNS, map(cells, self.rows))
 
     def as_dict(self) -> dict[str, Any]:
-        return {"seconds": self.seconds, "not_installed": self.missing,
+        return {"seconds": self.seconds, "not_installed": self.missing, "interrupted": self.interrupted, "undone": self.undone,
                 "speed": {name: speed.as_dict() for name, speed in self.speeds.items()},
                 "rows": [row.as_dict() for row in self.rows]}
 
@@ -111,7 +116,8 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
 
     report: called with each row as it is done; progress: now and then with a line of text, from any thread. executor: a
     concurrent.futures.Executor or a dask.distributed.Client whose workers trace and judge the rays, for the same rows; the speed
-    is measured here all the same. Raises InputError for an unknown case.
+    is measured here all the same. Interrupted by Ctrl-C, it returns the rows that are done; before the first one,
+    KeyboardInterrupt is raised. Raises InputError for an unknown case.
     """
     begin = time.perf_counter()
     names = chosen(plan.cases)
@@ -121,9 +127,16 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
     found.speeds = measure_speed(algorithms, plan.runs)
     rows = _rows(names, algorithms, plan, progress) if executor is None else _spread_rows(
         names, [algorithm.name for algorithm in algorithms], plan, progress, submitter(executor))
-    for row in rows:
-        found.rows.append(row)
-        report(row)
+    try:
+        for row in rows:
+            found.rows.append(row)
+            report(row)
+    except KeyboardInterrupt as stop:
+        if not found.rows:
+            raise
+        found.interrupted = int(getattr(stop, "number", signal.SIGINT))
+        last = found.rows[-1]
+        found.undone = tuple(names[names.index(last.case) + (last.algorithm == algorithms[-1].name):])
     found.seconds = time.perf_counter() - begin
     return found
 
@@ -135,9 +148,11 @@ def all_algorithms(plan: Plan) -> list[Algorithm]:
 
 
 def _rows(names: list[str], algorithms: list[Algorithm], plan: Plan, progress: Callable[[str], None]) -> Iterator[Row]:
+    left = TimeLeft(len(names) * len(algorithms))
     for i, name in enumerate(names):
-        for algorithm in algorithms:
-            progress(f"case {i + 1} of {len(names)}, {name}, {algorithm.name}")
+        for j, algorithm in enumerate(algorithms):
+            left.done = i * len(algorithms) + j
+            progress(f"case {i + 1} of {len(names)}, {name}, {algorithm.name}{left}")
             row = run_case(name, fewer(name, min(plan.sample, plan.rays)), algorithm, plan.seed)
             if row is None:
                 continue
@@ -153,9 +168,11 @@ def _spread_rows(names: list[str], algorithms: list[str], plan: Plan, progress: 
             for name in names for algorithm in algorithms]
     more = {name: [pool.submit(one_at_a_time, DIGEST, more_part, name, plan, index) for index in range(parts(name, plan))]
             for name in names}
+    left = TimeLeft(len(rows))
     try:
         for i, (name, algorithm, future) in enumerate(rows):
-            progress(f"{i} of {len(rows)} are done; {name}, {algorithm}")
+            left.done = i
+            progress(f"{i} of {len(rows)} are done; {name}, {algorithm}{left}")
             row = result(pool, future)
             if row is None:
                 continue

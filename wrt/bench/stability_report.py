@@ -109,7 +109,7 @@ def parts(result: Result, plan: Plan) -> list[Part]:
     command = " ".join(["python -m wrt stability", *plan.cases, f"--rays {plan.rays}", f"--sample {plan.sample}",
                         *(["--peers"] if plan.peers else []), *([f"--seed {plan.seed}"] if plan.seed else [])])
     told = "\n\n".join([f"Machine: {machine(plan)}; {result.seconds:.0f} s in all.", f"To repeat: `{command}`",
-                        LEGEND.format(sample=plan.sample), *(f"{name}: not installed." for name in result.missing)])
+                        LEGEND.format(sample=plan.sample), *(f"{line}." for line in _notes(result))])
     return [Part("Stability of the intersection tests", told), _summary(result),
             Part("Speed against rays lost or wrong", f"None is drawn at {NO_LOSS} rays: the more rays, the lower.", plot="lost"),
             Part("Speed against error of t", "", plot="error"), _groups(result),
@@ -119,7 +119,13 @@ def parts(result: Result, plan: Plan) -> list[Part]:
 def summary(result: Result) -> str:
     """What the terminal gets when all is done."""
     out = [table(part.head, part.lines) for part in (_summary(result), _groups(result))]
-    return "\n\n".join([*out, *(f"{name}: not installed" for name in result.missing)])
+    return "\n\n".join([*out, *_notes(result)])
+
+
+def _notes(result: Result) -> list[str]:
+    """What is not in it."""
+    undone = [f"Interrupted; not done, or not with all algorithms: {', '.join(result.undone)}"] if result.undone else []
+    return [*undone, *(f"{name}: not installed" for name in result.missing)]
 
 
 def machine(plan: Plan) -> str:
