@@ -89,7 +89,8 @@ class Glb:
 # ## Materials
 # All of glTF's materials are one: *metallic-roughness*. The base colour is what a matte surface scatters, or what a metal
 # reflects; `metallic` chooses between the two; `roughness` blurs reflections. Extensions add to it: transmission (glass), volume
-# (coloured glass), IOR, emissive strength.
+# (coloured glass), IOR, emissive strength. In a file with a volume, shadow rays go through glass and take its colour
+# (`glass_shadows="tinted"`): what stands behind it, or in it, is lit. `glass_shadows="opaque"` is for a heavy shadow.
 
 # %%
 glb = Glb()

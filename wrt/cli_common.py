@@ -20,7 +20,7 @@ import click
 from wrt.errors import InputError, SceneWarning
 
 DIGITS = "[0-9]{1,9}"  # more are no pixel, and Python refuses to read thousands
-SEEN = 1e-3  # of the pixels: a patch of 15x15 in a picture of 640x360
+SEEN = 0.003  # of the pixels: a patch of 26x26 in a picture of 640x360; fewer are seen neither as a patch nor told from noise
 
 
 class Size(click.ParamType):
