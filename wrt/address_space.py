@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 
 from wrt.errors import InputError
 from wrt.memory import address_space
@@ -14,16 +16,17 @@ from wrt.memory import address_space
 MODULES = 130 << 20  # NumPy, Pydantic and the like, without
 BLAS_THREAD = 40 << 20  # which OpenBLAS starts for each core when NumPy is imported
 BLAS_THREADS = 64  # at most, in NumPy's wheels
-WARP = 400 << 20  # warp.so and warp-clang.so, and a small scene
+WARP = 512 << 20  # warp.so and warp-clang.so (measured: 356), and a small picture with what writes it
 STACK = 8 << 20  # of a thread, where its limit (ulimit -s) is none
-LLVM = 128 << 20  # while it compiles the largest kernel
+LLVM = 160 << 20  # while it compiles the largest kernel (measured: 100), and a small scene is built meanwhile
 ARENAS = -8  # M_ARENA_MAX of <malloc.h>
+_compiler = threading.Lock()
 
 
 def require_modules() -> None:
     """Raise InputError where the address space does not suffice for what wrt imports; where it is limited, see that threads take
     little of it."""
-    if address_space() == float("inf"):
+    if not is_limited():
         return
     threads = 0 if "numpy" in sys.modules else min(_blas_threads(), BLAS_THREADS)
     require(MODULES + threads * BLAS_THREAD, "NumPy and what else is imported",
@@ -39,9 +42,16 @@ def require_warp(threads: int) -> None:
     require(WARP + threads * _stack(), "Warp")
 
 
-def require_compiler() -> None:
-    """Raise InputError where it does not suffice for a compilation."""
-    require(LLVM, "compiling a kernel")
+@contextmanager
+def room_to_compile() -> Iterator[None]:
+    """For a compilation; where the address space is limited, there is one at a time. Raises InputError where too little is left."""
+    with _compiler if is_limited() else nullcontext():
+        require(LLVM, "compiling a kernel")
+        yield
+
+
+def is_limited() -> bool:
+    return address_space() < float("inf")
 
 
 def require(needed: float, what: str, way_out: str = "") -> None:
@@ -58,8 +68,7 @@ def is_out_of_memory(error: Exception) -> bool:
 
 def told_limit() -> str:
     """What to add to such an error: nothing where the address space is not limited."""
-    left = address_space()
-    return "" if left == float("inf") else f" ({left / 2**20:.0f} MiB of address space are left: raise its limit, ulimit -v)"
+    return f" ({address_space() / 2**20:.0f} MiB of address space are left: raise its limit, ulimit -v)" if is_limited() else ""
 
 
 def _blas_threads() -> int:

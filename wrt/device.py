@@ -22,7 +22,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import warp as wp
 
-from wrt.address_space import require_compiler, require_warp
+from wrt.address_space import LLVM, is_limited, require_warp, room_to_compile
 from wrt.arguments import shown
 from wrt.errors import InputError
 from wrt.memory import available
@@ -104,8 +104,9 @@ def describe_devices() -> list[str]:
 
 
 def free_memory(device: Any) -> float:
-    """Bytes of memory of a device that can still be had; infinite where the system does not tell."""
-    return float(device.free_memory) if device.is_cuda else available()
+    """Bytes of memory of a device that can still be had; infinite where the system does not tell. The compiler, which runs while
+    a scene is built, has its share of the address space where that is limited."""
+    return float(device.free_memory) if device.is_cuda else available() - (LLVM if is_limited() else 0.0)
 
 
 class _Loaded:
@@ -142,8 +143,8 @@ def _load(kernel: Any, device: Any) -> None:
             kernel.module.load(device, block_dim=block_dim)
         else:
             _require_room_to_compile(cache)
-            require_compiler()
-            with compiling(cache, f"{name}_p{os.getpid()}_t{threading.get_ident()}"):  # as Warp calls the folder
+            folder = f"{name}_p{os.getpid()}_t{threading.get_ident()}"  # as Warp calls it
+            with room_to_compile(), compiling(cache, folder):
                 kernel.module.load(device, block_dim=block_dim)
 
 

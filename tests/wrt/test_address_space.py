@@ -14,7 +14,7 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import ROOT
 from wrt import address_space, driver
-from wrt.address_space import require_compiler, require_modules, require_warp
+from wrt.address_space import require_modules, require_warp, room_to_compile
 from wrt.errors import InputError
 
 resource = pytest.importorskip("resource", reason="needs a system with limits")
@@ -86,13 +86,18 @@ def test_a_compiler_without_room_is_not_begun(tmp_path: Path, monkeypatch: pytes
 def test_how_much_is_left_decides(left: float, threads: int, refused: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(address_space, "address_space", lambda: left)
     told = []
-    for ask in (lambda: require_warp(threads), require_compiler):
+
+    def compile() -> None:
+        with room_to_compile():
+            assert address_space._compiler.locked() is (left < float("inf"))
+
+    for ask in (lambda: require_warp(threads), compile):
         try:
             ask()
         except InputError as error:
             told.append(str(error).split()[0])
             assert WAY_OUT in str(error)
-    assert told == refused
+    assert told == refused and not address_space._compiler.locked()
 
 
 def test_a_way_out_is_fewer_threads_of_openblas(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,6 +31,7 @@ from wrt.film import Film
 from wrt.image import read_channels
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
+dask = pytest.importorskip("dask", reason="needs the extra cluster")
 
 HOW: dict[str, Any] = {"tile_size": 24, "pass_size": 8, "aov": "depth"}  # few calls: each takes a hundredth of a second
 
@@ -281,6 +282,43 @@ def test_wrong_addresses(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         done = run("render", mesh, "--cluster", empty.scheduler_address)
         assert done.code == 2 and len(done.errors) == 1 and "no worker at tcp://" in done.err and "dask worker tcp://" in done.err
     assert not list(mesh.parent.glob("*.png"))
+
+
+@pytest.fixture
+def certificate(tmp_path: Path) -> tuple[Path, Path]:
+    """Made as docs/cluster.md says: whoever has both files belongs to the cluster."""
+    if shutil.which("openssl") is None:
+        pytest.skip("needs openssl, to make a certificate")
+    page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"^openssl [^#]*", page, re.MULTILINE)
+    done = subprocess.run(line.split(), cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return tmp_path / "wrt.pem", tmp_path / "wrt.key"
+
+
+def test_tls(certificate: tuple[Path, Path], mesh: Path) -> None:
+    """By Dask's configuration, as the environment gives it: wrt needs no option for it."""
+    file, key = map(str, certificate)
+    page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+    values = {"$PWD/wrt.pem": file, "$PWD/wrt.key": key, "true": True}
+    config = {name.lower().replace("__", "."): values[value] for name, value in re.findall(r"DASK_(DISTRIBUTED__\w+)=(\S+)", page)}
+    assert len(config) == 8 and config["distributed.comm.require_encryption"]
+    with dask.config.set(config), distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, protocol="tls://", security=distributed.Security(), silence_logs=50,
+            dashboard_address=":0") as guarded:
+        address = guarded.scheduler_address
+        assert address.startswith("tls://")
+        small = ("--size", "32x18", "--spp", 2, "-q")
+        assert run("render", mesh, "-o", "here.exr", *small).code == 0
+        done = run("render", mesh, "-o", "there.exr", *small, "--cluster", address)
+        assert done.code == 0, done.err
+        here, there = read_channels("here.exr"), read_channels("there.exr")
+        assert all(np.array_equal(here[layer], there[layer]) for layer in here)
+        with dask.config.set(dict.fromkeys(name for name in config if "scheduler" not in name and "worker" not in name)):
+            for wrong in (address, address.replace("tls://", "tcp://")):
+                done = run("render", mesh, "-o", "a.exr", *small, "--cluster", wrong)
+                assert done.code == 2 and len(done.errors) == 1 and f"no Dask scheduler at '{wrong}'" in done.err, done
+    assert not Path("a.exr").exists()
 
 
 def test_without_distributed(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
