@@ -3,8 +3,7 @@
 import warp as wp
 
 from wrt.kernels.sampling import disk, polygon
-from wrt.kernels.structs import Camera, Ray, make_ray
-from wrt.kernels.surface import lift
+from wrt.kernels.structs import Camera, Ray, lift, make_ray
 
 
 @wp.func

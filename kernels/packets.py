@@ -263,46 +263,38 @@ TRIANGLES = """
                 leave = l < leave ? l : leave;
             }
         };
-        bool padded = false;
         auto padded_interval = [&]() {
             const float e_x = hi[0] - lo[0], e_y = hi[1] - lo[1], e_z = hi[2] - lo[2];
             float pad = e_x > e_y ? e_x : e_y;
             pad = 0x1p-21f * (e_z > pad ? e_z : pad) + 0x1p-148f;
-            for (int k = 0; k < 3 && !padded; ++k) {
+            for (int k = 0; k < 3; ++k) {
                 lo[k] = lo[k] - (pad + 0x1p-22f * __builtin_fabsf(lo[k]));
                 hi[k] = hi[k] + (pad + 0x1p-22f * __builtin_fabsf(hi[k]));
             }
-            padded = true;
             interval();
         };
         auto held = [&]() { const F before = at > leave ? leave : at; return before < enter ? enter : before; };
         auto underflowed = [&](F moved) {
-            const F size = __builtin_elementwise_abs(at), end = __builtin_elementwise_abs(moved);
+            const F size = __builtin_elementwise_abs(at);
             const int far = LANE_MASK(__builtin_elementwise_abs(moved - at) > HELD_ROUNDING * size + 0x1p-149f);
             if ((far & m) == 0) return 0;
-            F steep = inf, grazing = 0.0f, way = end > size ? end : size;
+            F steep = inf, grazing = 0.0f;
             for (int k = 0; k < 3; ++k) {
                 const F inverse = __builtin_elementwise_abs(row(INVERSE_X + 16 * k));
                 steep = inverse < steep ? inverse : steep;
                 grazing = ((inverse > grazing) & (inverse < inf)) ? inverse : grazing;
             }
-            way = steep < way ? steep : way;
-            return far & LANE_MASK(way < 0x1p-120f * grazing);
+            const F least = 0x1p-120f * grazing;
+            return far & LANE_MASK((steep < least) | ((size < least) & (__builtin_elementwise_abs(moved) < least)));
         };
         interval();
-        if (LANE_MASK(~(enter <= leave)) & m) {
-            const F own_enter = enter, own_leave = leave;
-            padded_interval();
-            m &= LANE_MASK((own_enter <= own_leave) | (enter <= leave * FAR_PAD));
-            enter = own_enter <= own_leave ? own_enter : enter;
-            leave = own_enter <= own_leave ? own_leave : leave;
-        }
         F moved = held();
-        const int again = underflowed(moved) & m;
+        const int again = (LANE_MASK(~(enter <= leave)) | underflowed(moved)) & m;
         if (again) {
             padded_interval();
-            const I other = ((again >> lane) & 1) != 0;
-            moved = other ? held() : moved;
+            const I on = ((again >> lane) & 1) != 0;
+            m &= ~again | LANE_MASK(enter <= leave * FAR_PAD);
+            moved = on ? held() : moved;
         }
         at = moved;
         const F best = row(T);

@@ -151,9 +151,8 @@ def underflowed(ray: BoxRay, t: float, moved: float) -> bool:
         inverse = wp.abs(ray.inv_dir[axis])
         steep = wp.where(inverse < steep, inverse, steep)
         grazing = wp.where(inverse > grazing and inverse < wp.inf, inverse, grazing)
-    way = wp.where(wp.abs(moved) > wp.abs(t), wp.abs(moved), wp.abs(t))
-    way = wp.where(steep < way, steep, way)
-    return way < wp.static(2.0**-120) * grazing
+    least = wp.static(2.0**-120) * grazing
+    return steep < least or (wp.abs(t) < least and wp.abs(moved) < least)
 
 
 @wp.func
@@ -168,13 +167,12 @@ def within_bounds(ray: BoxRay, t: float, lo: wp.vec3, hi: wp.vec3) -> float:
     never be in the box. It is in the padded box: t is then only moved into the interval of that.
     """
     interval = slab_interval(ray, lo, hi)
-    if not interval[0] <= interval[1]:
+    moved = held(t, interval)
+    if not interval[0] <= interval[1] or underflowed(ray, t, moved):
         interval = padded_interval(ray, lo, hi)
         if not interval[0] <= interval[1] * FAR_PAD:
             return float(wp.inf)
-    moved = held(t, interval)
-    if underflowed(ray, t, moved):
-        moved = held(t, padded_interval(ray, lo, hi))
+        moved = held(t, interval)
     return moved
 
 

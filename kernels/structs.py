@@ -29,6 +29,18 @@ def gamma(n: float) -> float:
     return n * EPSILON / (1.0 - n * EPSILON)
 
 
+@wp.func
+def largest(v: wp.vec3) -> float:
+    """The largest of the absolute components."""
+    return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
+
+
+@wp.func
+def lift(v: wp.vec3) -> float:
+    """A power of two that brings a very short vector to where its square is no denormal, else 1: scaling by it is exact."""
+    return wp.where(largest(v) < wp.static(2.0**-40), wp.static(2.0**80), 1.0)
+
+
 @wp.struct
 class Ray:
     """The points origin + t * direction for t_min <= t <= t_max; direction need not be of unit length.

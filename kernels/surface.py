@@ -3,7 +3,7 @@
 import warp as wp
 
 from wrt.kernels.sampling import PI, TWO_PI, frame_x
-from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma
+from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift
 
 
 @wp.struct
@@ -124,18 +124,6 @@ def triangle_point(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec
     """The point of face `index` with these barycentrics, in the space of its vertices."""
     face = surfaces.faces[index]
     return (1.0 - u - v) * surfaces.vertices[face[0]] + u * surfaces.vertices[face[1]] + v * surfaces.vertices[face[2]]
-
-
-@wp.func
-def largest(v: wp.vec3) -> float:
-    """The largest of the absolute components."""
-    return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
-
-
-@wp.func
-def lift(v: wp.vec3) -> float:
-    """A power of two that brings a very short vector to where its square is no denormal, else 1: scaling by it is exact."""
-    return wp.where(largest(v) < wp.static(2.0**-40), wp.static(2.0**80), 1.0)
 
 
 @wp.func

@@ -35,7 +35,8 @@ from wrt.shapes import box, icosphere, quad
 pytestmark = pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning", "error::RuntimeWarning")
 LAMP, CHALK = Material(albedo=BLACK, emission=WHITE, name="lamp"), Material(albedo=WHITE)
 SKY = ConstantBackground(WHITE)
-BUMPS = Texture(np.random.default_rng(1).integers(90, 166, (8, 8, 4), dtype=np.uint8) | np.uint8(1), srgb=False)
+PICTURE = Texture(np.random.default_rng(1).integers(90, 166, (8, 8, 4), dtype=np.uint8) | np.uint8(1), srgb=False)
+BUMPY = Material(albedo=WHITE, normal_texture=PICTURE)
 
 
 def moved(y: float) -> np.ndarray:
@@ -62,9 +63,9 @@ UNLIT = {
     "glass mesh": lambda s: {"background": SKY, "objects": (Object(
         box((-0.5 * s, 0.1 * s, -0.5 * s), (0.5 * s, s, 0.5 * s)), (Material("glass", albedo=WHITE),)),)},
     "normal map": lambda s: {"lights": (DirectionalLight((1, -1, 0), WHITE),), "objects": (Object(
-        quad((-s, 0.1 * s, s), (1.6 * s, 0, -0.8 * s), (-0.8 * s, 0, -1.6 * s)), (Material(albedo=WHITE, normal_texture=BUMPS),)),)},
+        quad((-s, 0.1 * s, s), (1.6 * s, 0, -0.8 * s), (-0.8 * s, 0, -1.6 * s)), (BUMPY,)),)},
     "instances": lambda s: {"background": SKY, "lights": (DirectionalLight((1, -1, 0), WHITE),), "objects": tuple(Object(
-        PLATE, (Material(albedo=WHITE, normal_texture=BUMPS),), np.diag([s, s, s, 1.0]) @ moved(0.2 + 0.2 * i)) for i in range(3))},
+        PLATE, (BUMPY,), np.diag([s, s, s, 1.0]) @ moved(0.2 + 0.2 * i)) for i in range(3))},
 }
 PLATE = quad((-0.3, 0, 0.3), (0.5, 0, -0.3), (-0.3, 0, -0.5))
 
