@@ -436,9 +436,8 @@ class Renderer:
                 "accel": {"name": self.options.accel, **asdict(self.accel.stats)}}
 
     def ready(self) -> dict[str, Any]:
-        """What a worker tells when it has made the scene ready. Who asks first is told the seconds; for others it was ready."""
-        seconds, self.seconds = self.seconds, dict.fromkeys(self.seconds, 0.0)
-        return {"facts": self.facts(), "seconds": seconds}
+        """What a worker tells when it has made the scene ready."""
+        return {"facts": self.facts(), "seconds": self.seconds}
 
     def trace_tile(self, work: Work, seed: int, state: list[np.ndarray] | None) -> list[np.ndarray]:
         """The arrays of a film of that rectangle (DeviceFilm.arrays) with those samples added to `state` (None: zeros).

@@ -30,7 +30,7 @@ def loads_since(begin: float) -> list[Span]:
 def seconds_without_loads(begin: float) -> float:
     """Seconds from then until now, without those in which this thread loaded kernels."""
     now, own = time.perf_counter(), threading.get_ident()
-    return now - begin - sum(end - start for thread, (start, end) in tuple(_loads) if thread == own and start >= begin)
+    return max(now - begin - sum(end - start for thread, (start, end) in tuple(_loads) if thread == own and start >= begin), 0.0)
 
 
 def counted_once(phases: Mapping[str, Sequence[Span]]) -> dict[str, float]:

@@ -71,7 +71,7 @@ class SpreadRenderer(Renderer):
         kind = all_told[0][1]
         for reply in all_told:
             _check_kind(reply, kind)
-        return kind, max((reply[2] for reply in all_told), key=lambda ready: sum(ready["seconds"].values()))
+        return kind, all_told[0][2] | {"seconds": _waited_for(all_told, time.perf_counter() - begin)}
 
     def _prepare(self) -> None:
         self.seconds |= self._told[1]["seconds"]
@@ -148,6 +148,13 @@ class SpreadRenderer(Renderer):
         x, y, width, height = rectangle
         x, y = x - self.crop[0], y - self.crop[1]
         return slice(y, y + height), slice(x, x + width)
+
+
+def _waited_for(replies: list[Reply], waited: float) -> dict[str, float]:
+    """The seconds of the worker that took longest; less where it was ready before and nobody waited for it so long."""
+    seconds: dict[str, float] = max((reply[2]["seconds"] for reply in replies), key=lambda each: sum(each.values()))
+    share = min(1.0, waited / max(sum(seconds.values()), 1e-9))
+    return {name: share * value for name, value in seconds.items()}
 
 
 def _check_kind(reply: Reply, kind: str) -> None:
