@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import html
 import os
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +20,9 @@ from wrt.cli_common import ACCEL, SET, load, naming, say, settings_of
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="Where to listen; 0 is any free one")
 @click.option("--host", default="127.0.0.1", show_default=True,
-              help="For which machines: 127.0.0.1 is this one only, 0.0.0.0 all that reach it, and all of them may steer")
+              help="For which machines: 127.0.0.1 is this one only, 0.0.0.0 all that reach it and have the printed address")
+@click.option("--allow-origin", multiple=True, metavar="ORIGIN",
+              help="Another address under which browsers find it, such as https://example.org of a proxy; repeatable")
 @click.option("--open/--no-open", "open_browser", default=True, help="Open a browser  [default: where there is a desktop]")
 @click.option("--spp", type=click.IntRange(1, 1 << 24), default=1024, show_default=True, help="Samples a pixel to refine until")
 @click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
@@ -25,16 +31,19 @@ from wrt.cli_common import ACCEL, SET, load, naming, say, settings_of
 @click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure to begin with")
 @SET
 @click.option("-q", "--quiet", is_flag=True, help="No warnings")
-def view(scene: Path, port: int, host: str, open_browser: bool, spp: int,
+def view(scene: Path, port: int, host: str, allow_origin: tuple[str, ...], open_browser: bool, spp: int,
          given: tuple[tuple[str, Any], ...], quiet: bool, **options: Any) -> None:
     """Look around in SCENE: an orbit camera in the browser, whose picture gets finer while it stands still.
 
-    Needs the extra `viewer`. Ctrl-C ends it.
+    The address that it prints holds a token: whoever has it may look and steer. Needs the extra `viewer`. Ctrl-C ends it.
     """
-    from wrt.viewer_page import Page, check_address, import_viser
+    from wrt.viewer_access import as_origin
+    from wrt.viewer_page import Page
+    from wrt.viewer_server import import_viser, listen
 
     import_viser()
-    check_address(host, port)
+    origins = [as_origin(text) for text in allow_origin]
+    listen(host, port).close()  # told before the scene is read
     from wrt.options import Options
 
     rendering = Options(**options)
@@ -42,21 +51,33 @@ def view(scene: Path, port: int, host: str, open_browser: bool, spp: int,
     loaded = load(scene, quiet).with_settings(**settings)
     with naming(scene):
         loaded.camera(rendering.camera)  # told with the file's name
-    page = Page(loaded, rendering, host, port, spp)
+    page = Page(loaded, rendering, host, port, spp, allow_origins=origins, warn=(lambda text: None) if quiet else say)
     click.echo(page.url)
     if not quiet:
         say("Ctrl-C ends it")
-    if open_browser and has_desktop():
-        import webbrowser
-
-        webbrowser.open(page.url)
     try:
-        page.wait()
+        with in_browser(page.url) if open_browser and has_desktop() else contextlib.nullcontext():
+            page.wait()
     except KeyboardInterrupt:
         pass  # this is how it is meant to end
     finally:
         page.close()
     raise SystemExit(0)  # at once, even if a kernel is being compiled
+
+
+@contextlib.contextmanager
+def in_browser(url: str) -> Iterator[None]:
+    """With a browser that was sent to the address, through a file in a folder of ours: everybody on the machine can read the
+    command line of a browser, and the address holds the token."""
+    import webbrowser
+
+    with tempfile.TemporaryDirectory(prefix="wrt-view-") as folder:  # nobody else may look into it
+        path = Path(folder) / "view.html"
+        address = html.escape(url)
+        path.write_text('<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer"><title>wrt</title>'
+                        f'<meta http-equiv="refresh" content="0; url={address}"><a href="{address}">wrt</a>\n', encoding="utf-8")
+        webbrowser.open(path.as_uri())
+        yield
 
 
 def has_desktop() -> bool:

@@ -5,13 +5,10 @@ Several browsers share the panel; the picture follows the camera that moved last
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
-import socket
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,33 +23,17 @@ from wrt.image import encode_png
 from wrt.options import Options
 from wrt.scene import TONEMAPS, Camera, Scene
 from wrt.viewer import COSTS, Shown, Viewer
+from wrt.viewer_access import access_for
 from wrt.viewer_camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
+from wrt.viewer_server import Door, import_viser, listen, quiet, to_stderr
 
 MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser one
 RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}
 PICTURE = "picture"
 QUALITY = {True: 92, False: 80}  # of JPEG: at full resolution, and coarse
 LEGEND_SIZE = (12, 256)
-
-
-def import_viser() -> Any:
-    """The module; raises InputError that says how to install it."""
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError(f'the viewer needs viser ({error}): pip install "wrt[viewer]"') from error
-    return viser
-
-
-def check_address(host: str, port: int) -> None:
-    """Raise InputError where nobody can listen there: viser itself would take another port without a word."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except OSError as error:
-        raise InputError(f"cannot listen on port {port} of {host} ({error.strerror}); --port and --host choose another") from error
+FARTHEST_FOCUS = 1e9  # in units of the viewport
+MOST_FILES = 4  # that are made at a time
 
 
 def status(shown: Shown, viewer: Viewer) -> str:
@@ -70,22 +51,26 @@ def status(shown: Shown, viewer: Viewer) -> str:
 class Page:
     """A server with the panel and one Viewer. host, port (0: any free one): where it listens. Raises InputError where it cannot.
 
-    `url` is where it is found; `close` ends it.
+    `url` is where it is found, with the token that a browser needs; allow_origins: other addresses of it, such as that of a proxy
+    ("https://example.org"); warn: told of requests and messages that are refused, once of each kind. `close` ends it.
     """
 
-    def __init__(self, scene: Scene, options: Options, host: str = "127.0.0.1", port: int = 8080, spp: int = 1024) -> None:
-        viser = import_viser()
-        check_address(host, port)
+    def __init__(self, scene: Scene, options: Options, host: str = "127.0.0.1", port: int = 8080, spp: int = 1024, *,
+                 allow_origins: Iterable[str] = (), warn: Callable[[str], None] = to_stderr) -> None:
+        import_viser()
         self.viewer = Viewer(scene, options, self._show, self._tell, spp)
         start = self.viewer.view.camera
         self.unit, self.watching, self.name = unit_of(scene, start), -1, scene.name or "picture"
-        with quiet():
-            self.server = viser.ViserServer(host, port, label="wrt", verbose=False)
-        if port and self.server.get_port() != port:  # somebody else was faster
-            self.close()
-            raise InputError(f"port {port} of {host} is in use; --port chooses another")
-        shown_host = "localhost" if host in ("127.0.0.1", "0.0.0.0", "::") else host
-        self.url = f"http://{shown_host}:{self.server.get_port()}"
+        self._saving = threading.BoundedSemaphore(MOST_FILES)
+        listening = listen(host, port)
+        try:
+            address, port = listening.getsockname()[:2]
+            access, self.url = access_for(host, address, port, allow_origins)
+            self.door = Door(access, warn)
+            self.server = self.door.open(listening, "wrt")
+        except BaseException:
+            listening.close()
+            raise
         self._place_camera(start, orbited_point(scene, start))
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True)
         self._panel(start)
@@ -143,7 +128,11 @@ class Page:
         self.watching = viewport.client.client_id
         coarser = max(RESOLUTIONS[self.resolution.value], math.sqrt(width * height / MOST_PIXELS))
         size = max(1, round(width / coarser)), max(1, round(height / coarser))
-        changed = self.viewer.change(camera=lambda camera: from_viewport(camera, viewport, self.unit), size=size)
+        try:
+            changed = self.viewer.change(camera=lambda camera: from_viewport(camera, viewport, self.unit), size=size)
+        except InputError as error:  # its numbers are too large in the scene's units
+            self.door.tell("camera", f"dropped a camera: {error}")
+            return
         if newcomer and not changed:
             self.viewer.again()
 
@@ -173,16 +162,16 @@ class Page:
             depth = gui.add_slider("bounces", 0, self.viewer.deepest, 1, self.viewer.view.max_depth, hint="After the first hit")
             accel = gui.add_dropdown("structure", tuple(ACCELERATORS), initial_value=self.viewer.view.accel,
                                      hint="Built once each; the picture is the same, its speed and cost are not")
-        depth.on_update(lambda event: self.viewer.change(max_depth=int(depth.value)))
-        accel.on_update(lambda event: self.viewer.change(accel=accel.value))
+        depth.on_update(self._safe(lambda event: self.viewer.change(max_depth=int(depth.value))))
+        accel.on_update(self._safe(lambda event: self.viewer.change(accel=accel.value)))
         self._picture_folder()
         with gui.add_folder("Save"):
             png = gui.add_button("picture as PNG", hint="As it is shown")
             self.exr = gui.add_button("picture as EXR", hint="Linear, with variance and samples")
             toml = gui.add_button("camera as TOML", hint="A table for a scene file")
-        png.on_click(lambda event: self._save(event.client, ".png"))
-        self.exr.on_click(lambda event: self._save(event.client, ".exr"))
-        toml.on_click(lambda event: self._give_camera(event.client))
+        png.on_click(self._safe(lambda event: self._save(event.client, ".png")))
+        self.exr.on_click(self._safe(lambda event: self._save(event.client, ".exr")))
+        toml.on_click(self._safe(lambda event: self._give_camera(event.client)))
 
     def _lens_folder(self, camera: Camera) -> None:
         gui, unit = self.server.gui, self.unit
@@ -192,17 +181,14 @@ class Page:
                                    hint="Vertical, degrees")
             aperture = gui.add_slider("aperture", 0.0, widest, widest / 200.0, camera.aperture_radius,
                                       hint="Its radius in scene units; 0 is a pinhole")
-            self.focus = gui.add_number("focus", camera.focus_distance, min=1e-6 * unit, step=nice(0.01 * unit),
+            self.focus = gui.add_number("focus", camera.focus_distance, min=1e-6 * unit, max=FARTHEST_FOCUS * unit,
+                                        step=nice(0.01 * unit),
                                         hint="Distance along the axis to what is sharp, in scene units")
             self.by_click = gui.add_checkbox("click to focus", False, hint="A click into the picture focuses on what is there")
-        angle.on_update(lambda event: self._set_angle(math.radians(angle.value)))
-        aperture.on_update(lambda event: self._set_lens(aperture_radius=float(aperture.value)))
-        self.focus.on_update(lambda event: self._set_lens(focus_distance=float(self.focus.value)))
-
-        @self.server.scene.on_click()
-        def clicked(event: Any) -> None:
-            if self.by_click.value:
-                self._focus_at(*event.screen_pos)
+        angle.on_update(self._safe(lambda event: self._set_angle(math.radians(angle.value))))
+        aperture.on_update(self._safe(lambda event: self._set_lens(aperture_radius=float(aperture.value))))
+        self.focus.on_update(self._safe(lambda event: self._set_lens(focus_distance=float(self.focus.value))))
+        self.server.scene.on_click()(self._safe(self._clicked))
 
     def _picture_folder(self) -> None:
         gui, viewer = self.server.gui, self.viewer
@@ -216,9 +202,9 @@ class Page:
             tonemap = gui.add_dropdown("tone mapping", TONEMAPS, initial_value=viewer.tonemap)
             self.resolution = gui.add_dropdown("resolution", tuple(RESOLUTIONS), initial_value="full",
                                                hint="Of the viewport's pixels")
-        cost.on_update(lambda event: viewer.change(cost="" if cost.value == PICTURE else cost.value))
+        cost.on_update(self._safe(lambda event: viewer.change(cost="" if cost.value == PICTURE else cost.value)))
         for control in (exposure, tonemap):
-            control.on_update(lambda event: viewer.tone(float(exposure.value), tonemap.value))
+            control.on_update(self._safe(lambda event: viewer.tone(float(exposure.value), tonemap.value)))
 
         @self.resolution.on_update
         async def resized(event: Any) -> None:
@@ -226,12 +212,27 @@ class Page:
             if client is not None:
                 await self._moved(client.camera)
 
+    def _safe(self, action: Callable[[Any], Any]) -> Callable[[Any], None]:
+        """The action for a browser's event; that it cannot be done is told in one line."""
+
+        def act(event: Any) -> None:
+            try:
+                action(event)
+            except (InputError, OSError) as error:
+                self.door.tell("action", f"error: {error}")
+
+        return act
+
     def _set_angle(self, fov_y: float) -> None:
         for client in self.server.get_clients().values():
             client.camera.fov = fov_y  # and the client tells that its camera changed
 
     def _set_lens(self, **fields: float) -> None:
         self.viewer.change(camera=lambda camera: replace(camera, **fields))
+
+    def _clicked(self, event: Any) -> None:
+        if self.by_click.value:
+            self._focus_at(*event.screen_pos)
 
     def _focus_at(self, x: float, y: float) -> None:
         distance = self.viewer.focus_at(x, y)
@@ -243,7 +244,13 @@ class Page:
         picture = self.viewer.picture()
         if client is None or picture is None:
             return
-        client.send_file_download(f"{self.name}{suffix}", encoded(picture, suffix), save_immediately=True)
+        if not self._saving.acquire(blocking=False):
+            self.door.tell("saving", f"did not save a picture; {MOST_FILES} are being made")
+            return
+        try:
+            client.send_file_download(f"{self.name}{suffix}", encoded(picture, suffix), save_immediately=True)
+        finally:
+            self._saving.release()
 
     def _give_camera(self, client: Any) -> None:
         if client is None:
@@ -271,10 +278,3 @@ def nice(value: float) -> float:
     """The nearest power of ten times 1, 2 or 5 that is no smaller."""
     power = 10.0 ** math.floor(math.log10(value))
     return next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= value * (1.0 - 1e-9))
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """viser greets on stdout, which is for data."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import http.server
 import io
+import os
 import shutil
 import socket
 import sys
+import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import numpy as np
 import pytest
@@ -20,6 +25,7 @@ from PIL import Image
 from tests.command_line import wrt as run
 from tests.data import ROOT
 from tests.wrt.test_viewer import CAMERA, SCENE
+from tests.wrt.viewer_client import answer
 from wrt.driver import render
 from wrt.options import Options
 
@@ -60,18 +66,71 @@ def test_the_command_serves_until_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Non
 
     def wait(self: Page) -> None:
         seen.append(self)
-        with socket.create_connection(("127.0.0.1", self.server.get_port()), timeout=10.0) as connection:
-            connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
-            assert connection.recv(64).startswith(b"HTTP/1.1 200")
+        port = self.server.get_port()
+        came = answer(port, f"/{self.door.access.token}/", [f"Host: localhost:{port}"])
+        assert came.startswith(b"HTTP/1.1 200") and answer(port, "/", [f"Host: localhost:{port}"]).startswith(b"HTTP/1.1 403")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Page, "wait", wait)
     monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: True)  # this test compiles nothing
     result = run("view", WHITTED, "--port", 0, "--no-open")
-    assert result.code == 0 and result.out == f"{seen[0].url}\n" and seen[0].url.startswith("http://localhost:")
+    assert result.code == 0 and result.out == f"{seen[0].url}\n" and seen[0].url.startswith("http://127.0.0.1:")
+    refused = "viewer: refused a request without the token of the printed address (told once)"
+    assert result.err.splitlines() == ["Ctrl-C ends it", refused]
     seen[0].thread.join(10.0)
     assert not seen[0].thread.is_alive()
     assert "no camera 'nobody'" in run("view", WHITTED, "--camera", "nobody", "--port", 0).err
+
+
+def test_quiet_and_other_origins(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("viser")
+    from wrt.viewer_page import Page
+
+    def wait(self: Page) -> None:
+        port = self.server.get_port()
+        answer(port, "/", [f"Host: localhost:{port}"])
+        assert {"https://example.org", "http://localhost:9000"} <= self.door.access.origins
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Page, "wait", wait)
+    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: True)
+    options = "--port", 0, "--no-open", "-q", "--allow-origin", "https://Example.org", "--allow-origin", "http://localhost:9000"
+    result = run("view", WHITTED, *options)
+    assert result.code == 0 and result.err == ""
+    result = run("view", WHITTED, "--port", 0, "--allow-origin", "example.org")
+    assert result.code == 2 and result.out == "" and len(result.errors) == 1 and "'example.org' is no origin" in result.err
+
+
+def test_the_browsers_command_line_does_not_hold_the_token(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everybody on the machine can read it."""
+    pytest.importorskip("viser")
+    from wrt import cli_view
+    from wrt.viewer_page import Page
+
+    opened: list[Path] = []
+
+    def open_browser(address: str) -> None:
+        path = Path(url2pathname(urlsplit(address).path))
+        opened.append(path)
+        token = urls[0].partition("token=")[2]
+        assert token and token not in address and urls[0] in path.read_text(encoding="utf-8")
+        if os.name == "posix":
+            assert path.parent.stat().st_mode & 0o777 == 0o700
+
+    urls: list[str] = []
+
+    def wait(self: Page) -> None:
+        assert opened[0].exists()
+        raise KeyboardInterrupt
+
+    in_browser = cli_view.in_browser
+    monkeypatch.setattr(cli_view, "in_browser", lambda url: (urls.append(url), in_browser(url))[1])
+    monkeypatch.setattr(cli_view, "has_desktop", lambda: True)
+    monkeypatch.setattr("webbrowser.open", open_browser)
+    monkeypatch.setattr(Page, "wait", wait)
+    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: True)
+    assert run("view", WHITTED, "--port", 0).code == 0
+    assert len(opened) == 1 and not opened[0].exists() and not opened[0].parent.exists()
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
@@ -102,7 +161,7 @@ def browser_page(page: Any) -> Iterator[Any]:
         view.mistakes = []
         view.on("console", lambda message: view.mistakes.append(message.text) if message.type == "error" else None)
         view.on("pageerror", lambda error: view.mistakes.append(str(error)))
-        view.goto(f"{page.url}/?fixedDpr=1")  # else viser draws coarser where the machine is slow
+        view.goto(f"{page.url}&fixedDpr=1")  # else viser draws coarser where the machine is slow
         yield view
         browser.close()
 
@@ -289,3 +348,51 @@ def test_what_is_saved(page: Any, browser_page: Any, tmp_path: Path) -> None:
     until(lambda: "[cameras.view]" in browser_page.inner_text("body"), browser_page)
     browser_page.get_by_role("button", name="close").click()
     assert browser_page.mistakes == []
+
+
+def test_the_file_that_a_browser_is_given_leads_to_the_page(page: Any, browser_page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from wrt import cli_view
+
+    shown = finished(page, browser_page)
+    first, other = page.watching, browser_page.context.browser.new_page(viewport=SIZE)
+    monkeypatch.setattr("webbrowser.open", lambda address: other.goto(address))
+    with cli_view.in_browser(f"{page.url}&fixedDpr=1"):
+        until(lambda: page.watching != first, other)
+    assert other.url.startswith(f"{page.url.partition('?')[0]}{page.door.access.token}/")
+    assert difference(other, finished(page, other, size=shown.view.size)) < ROUGHLY
+    other.reload()
+    second = page.watching
+    until(lambda: page.watching not in (first, second), other)
+    other.close()
+    until(lambda: page.watching == first, browser_page)
+
+
+def test_a_page_of_another_origin_neither_sees_nor_steers(page: Any, browser_page: Any) -> None:
+    """In a real browser, even with the token: a server of somebody else on another port, and one by another name."""
+    port, token = page.server.get_port(), page.door.access.token
+    before = page.server.get_clients().keys()
+
+    class Stranger(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(b"<!doctype html><title>stranger</title>")
+
+        def log_message(self, *rest: Any) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Stranger) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        stranger = browser_page.context.browser.new_page()
+        stranger.goto(f"http://127.0.0.1:{server.server_port}/")
+        for way in (f"/{token}/", f"/?token={token}", "/"):
+            for name in ("127.0.0.1", "localhost"):
+                opened = stranger.evaluate(
+                    "address => new Promise(done => { const s = new WebSocket(address, ['viser-v1.1.1']);"
+                    " s.onopen = () => done('open'); s.onclose = s.onerror = () => done('closed'); })", f"ws://{name}:{port}{way}")
+                read = stranger.evaluate("address => fetch(address).then(r => r.text()).catch(() => 'nothing')",
+                                         f"http://{name}:{port}{way}")
+                assert (opened, read) == ("closed", "nothing"), (name, way)
+        stranger.close()
+        server.shutdown()
+    assert page.server.get_clients().keys() == before

@@ -1,0 +1,435 @@
+"""Who gets into the viewer, and what they can say there. Nothing here needs a browser; tests/wrt/test_viewer_page.py has one."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.wrt.test_viewer import SCENE
+from tests.wrt.viewer_client import Client, answer, client, raw_answer, upgrade
+from wrt.errors import InputError
+from wrt.options import Options
+from wrt.viewer_access import Access, Refused, access_for, as_origin
+from wrt.viewer_messages import check_message
+
+CAMERA = {"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0.0, 0.0, -1.0], "fov": 0.8, "near": 0.01, "far": 1e3,
+          "image_height": 48, "image_width": 64, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 1.0, 0.0]}
+CLICK = {"type": "ScenePointerMessage", "event_type": "click", "ray_origin": [0, 0, 0], "ray_direction": [0, 0, 1],
+         "screen_pos": [[0.5, 0.5]], "modifier": None}
+NONSENSE = (None, True, [], {}, [1.0], {"value": 1}, b"\x00" * 9, "", "x" * 9000, "\x1b[31m\n", math.nan, math.inf, -math.inf,
+            1e308, -1e308, -1, 10**18, 1 << 63, 0.5e-300, "nan", "1")
+BUTTONS = ("picture as PNG", "picture as EXR", "camera as TOML")
+SENSE = {"click to focus": (True,), "exposure": (-1, 0.5e-300), "aperture": (0.5e-300,)} | {name: (True,) for name in BUTTONS}
+
+
+# --- the address ------------------------------------------------------------------------------------------------------
+
+
+def test_the_printed_address_holds_a_new_token_each_time() -> None:
+    access, url = access_for("127.0.0.1", "127.0.0.1", 8080)
+    assert url == f"http://127.0.0.1:8080/?token={access.token}" and len(access.token) >= 43
+    assert access.token not in repr(access) and access_for("127.0.0.1", "127.0.0.1", 8080)[0].token != access.token
+
+
+@pytest.mark.parametrize(("host", "address", "printed", "names"), [
+    ("127.0.0.1", "127.0.0.1", "127.0.0.1", ("127.0.0.1", "localhost", "[::1]")),
+    ("LocalHost", "::1", "[::1]", ("127.0.0.1", "localhost", "[::1]")),
+    ("0.0.0.0", "0.0.0.0", "127.0.0.1", ("127.0.0.1", "localhost", "[::1]")),
+    ("::", "::", "[::1]", ("127.0.0.1", "localhost", "[::1]")),
+    ("Box.lan", "192.168.1.5", "192.168.1.5", ("192.168.1.5", "box.lan")),
+])
+def test_the_names_of_an_address(host: str, address: str, printed: str, names: tuple[str, ...]) -> None:
+    access, url = access_for(host, address, 8080, ["https://Example.org", "http://proxy:9000/"])
+    assert url.startswith(f"http://{printed}:8080/?token=")
+    assert access.origins == {f"http://{name}:8080" for name in names} | {"https://example.org", "http://proxy:9000"}
+    access.check(["192.168.1.7:8080"], ["http://192.168.1.7:8080"], "192.168.1.7")  # a number that the connection came to
+    access.check(["example.org"], ["https://example.org"], address)
+    for name in ("evil.example:8080", "192.168.1.8:8080", "0.0.0.0:8080"):
+        with pytest.raises(Refused):
+            access.check([name], [], "192.168.1.7")
+    assert access_for("127.0.0.1", "127.0.0.1", 80)[1].startswith("http://127.0.0.1/?token=")
+
+
+@pytest.mark.parametrize("text", ["*", "null", "example.org", "https://", "ftp://example.org", "https://example.org/path", "",
+                                  "http://user@example.org", "http://a:0", "http://a:65536", "https://example.org?x", "http://a b"])
+def test_what_is_no_origin(text: str) -> None:
+    with pytest.raises(InputError, match="is no origin"):
+        as_origin(text)
+
+
+def test_where_the_token_may_stand() -> None:
+    access = Access(frozenset(), 80, "secret")
+    assert access.inside("/secret/").path == "/" and access.inside("/secret/").moved == ""
+    assert access.inside("/secret?a=b").moved == "secret/?a=b"
+    assert access.inside("/?a=b&token=secret&c=%20").moved == "secret/?a=b&c=+"
+    assert access.inside("/x?token=secret").path == "/x" and access.inside("/secret/x/y?z").path == "/x/y"
+    for target in ("/", "/?token=", "/?token=Secret", "/?token=secret&token=secret", "/secretx/", "//secret/", "secret/", "*", "",
+                   "/x/secret/", "http://h/secret/", "/?Token=secret", "/\udcff/", "/?token=%ff", "/%73ecret/"):
+        with pytest.raises(Refused):
+            access.inside(target)
+
+
+# --- requests ---------------------------------------------------------------------------------------------------------
+
+
+class Served:
+    """A page, what it warned of, and its port."""
+
+    def __init__(self, **settings: Any) -> None:
+        from wrt.viewer_page import Page
+
+        self.warnings: list[str] = []
+        self.page = Page(SCENE, Options(threads=1), port=0, spp=1, warn=self.warnings.append, **settings)
+        self.port, self.token = self.page.server.get_port(), self.page.door.access.token
+
+
+@pytest.fixture
+def rendering() -> Iterator[Served]:
+    pytest.importorskip("viser")
+    served = Served()
+    yield served
+    served.page.close()
+    served.page.thread.join()
+
+
+@pytest.fixture
+def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+    """Makes no pictures, and so compiles nothing."""
+    pytest.importorskip("viser")
+    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: False)
+    served = Served()
+    yield served
+    served.page.close()
+    served.page.thread.join()
+
+
+def attempts(port: int, token: str) -> list[tuple[str, list[str]]]:
+    """Requests of strangers: target and headers."""
+    me, way = f"127.0.0.1:{port}", f"/?token={token}"
+    hosts = [[], [f"Host: {me}", f"Host: {me}"], ["Host:"], *([f"Host: {value}"] for value in (
+        f"evil.example:{port}", "evil.example", f"EVIL.EXAMPLE:{port}", f"LOCALHOST:{port}", f"localhost.:{port}", "127.0.0.1",
+        "localhost", f"127.0.0.1:{port + 1}", f"127.0.0.1.:{port}", f"127.0.0.1:{port}.", f"0.0.0.0:{port}", f"127.1:{port}",
+        f"2130706433:{port}", f"user@{me}", f"{me}@evil.example", f"{me}, evil.example", f"{me}/", "127.0.0.1.evil.example"))]
+    origins = [[f"Origin: {value}"] for value in (
+        "null", "http://evil.example", f"http://evil.example:{port}", f"HTTP://EVIL.EXAMPLE:{port}", f"https://{me}", me, "",
+        f"http://127.0.0.1:{port + 1}", f"HTTP://{me}", f"http://{me}/", f"http://localhost.:{port}", f"http://LOCALHOST:{port}",
+        "http://localhost:3000", "file://", f"http://{me}.evil.example", f"http://{me}@evil.example", "chrome-extension://abc",
+        "http://127.0.0.1")] + [[f"Origin: http://{me}", "Origin: http://evil.example"]]
+    targets = ["/", "/index.html", "/?token=", "/?token=wrong", f"/?token={token[:-1]}", f"/?token={token}x", f"/#{token}",
+               "/wrong/", f"/?token={token}&token={token}", f"/?Token={token}", f"//{token}/", f"http://{me}/{token}/",
+               f"/x/{token}/", f"/?token={token.swapcase()}", "/?token=%00", f"/?x=token={token}", "/?\udcff", "/" + "a" * 5000]
+    carried = [[f"Cookie: token={token}"], [f"Authorization: token {token}"], [f"X-Token: {token}"], [f"Referer: http://{me}{way}"]]
+    return ([(way, headers) for headers in hosts] + [(way, [f"Host: {me}", *headers]) for headers in origins]
+            + [(target, [f"Host: {me}"]) for target in targets] + [("/", [f"Host: {me}", *headers]) for headers in carried])
+
+
+def test_strangers_get_nothing(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
+    tries = attempts(served.port, served.token)
+    assert len(tries) >= 50
+    for target, headers in tries:
+        for more in ([], upgrade()):
+            came = answer(served.port, target, headers + more)
+            assert came.startswith(b"HTTP/1.1 403 ") and came.endswith(b"\r\n\r\n"), (target, headers, came[:80])
+            assert served.token.encode() not in came and b"viser" not in came and b"Python" not in came
+    assert served.page.server.get_clients() == {}
+    assert len(served.warnings) == 3 and all("\n" not in line for line in served.warnings)
+    assert all(line.startswith("viewer: refused ") for line in served.warnings)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_printed_address_leads_in(served: Served) -> None:
+    port, token = served.port, served.token
+    names = (f"127.0.0.1:{port}", f"localhost:{port}", f"[::1]:{port}")
+    for host in names:
+        moved = answer(port, f"/?token={token}&fixedDpr=1", [f"Host: {host}"])
+        assert moved.startswith(b"HTTP/1.1 303 ") and f"\r\nLocation: {token}/?fixedDpr=1\r\n".encode() in moved
+        page = answer(port, f"/{token}/?fixedDpr=1", [f"Host: {host}"])
+        assert page.startswith(b"HTTP/1.1 200 ") and b"<!doctype html>" in page
+        assert b"\r\nReferrer-Policy: no-referrer\r\n" in page and b"\r\nCache-Control: no-store\r\n" in page
+        assert b"Set-Cookie" not in moved + page
+        for target in (f"/{token}", f"/{token}/", f"/?token={token}"):
+            for origin in ([], *([f"Origin: http://{name}"] for name in names)):
+                assert answer(port, target, [f"Host: {host}", *origin, *upgrade()]).startswith(b"HTTP/1.1 101 ")
+    assert served.warnings == []
+
+
+def test_other_origins_can_be_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("viser")
+    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: False)
+    served = Served(allow_origins=["https://Example.org"])
+    try:
+        target = f"/{served.token}/"
+        for host in ("example.org", f"127.0.0.1:{served.port}"):
+            headers = [f"Host: {host}", "Origin: https://example.org", *upgrade()]
+            assert answer(served.port, target, headers).startswith(b"HTTP/1.1 101 ")
+        for host, origin in (("example.org", "http://example.org"), ("example.org:80", "https://example.org"),
+                             ("www.example.org", "https://example.org"), ("example.org", "https://www.example.org")):
+            headers = [f"Host: {host}", f"Origin: {origin}", *upgrade()]
+            assert answer(served.port, target, headers).startswith(b"HTTP/1.1 403 ")
+    finally:
+        served.page.close()
+    with pytest.raises(InputError, match="is no origin"):
+        Served(allow_origins=["*"])
+
+
+def test_what_is_no_request_is_no_news(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
+    """Not on stdout, and no traceback on stderr."""
+    port, token = served.port, served.token
+    host = [f"Host: 127.0.0.1:{port}"]
+    for request in (b"", b"\r\n\r\n", b"GET\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01", b"GET / HTTP/2\r\n\r\n",
+                    b"GET / HTTP/1.0\r\n\r\n", f"POST /{token}/ HTTP/1.1\r\nContent-Length: 3\r\n\r\nabc".encode(),
+                    b"GET / HTTP/1.1\r\nbad header\r\n\r\n",
+                    b"GET /" + b"a" * 9000 + b" HTTP/1.1\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 200 + b"\r\n"):
+        with socket.create_connection(("127.0.0.1", port), timeout=30.0) as connection:
+            connection.sendall(request)
+            connection.shutdown(socket.SHUT_WR)
+            try:
+                assert connection.recv(100) == b"", request
+            except ConnectionResetError:
+                pass
+    for target in ("a" * 5000, "a" * 150, "..", "../__init__.py", "%2e%2e/%2e%2e/__init__.py", "%00", "\udcff", "con", ".", "a//b"):
+        came = answer(port, f"/{token}/{target}", host)
+        assert came.startswith(b"HTTP/1.1 404 " if target != "." else b"HTTP/1.1 200 "), (target, came[:60])
+    for more in (["Upgrade: websocket"], [*upgrade()[:3], "Sec-WebSocket-Version: 7"], [*upgrade(), "Upgrade: websocket"],
+                 [*upgrade(), "Accept-Encoding: gzip", "Accept-Encoding: br"]):
+        assert answer(port, f"/{token}/", host + more)[9:12] in (b"400", b"426", b"101", b"200")
+    for subprotocol in ("viser-v0.0.1", "chat", "viser-v"):
+        assert answer(port, f"/{token}/", host + upgrade(subprotocol)).startswith(b"HTTP/1.1 101 ")
+    handshake = "\r\n".join([f"GET /{token}/ HTTP/1.1", *host, *upgrade(), "", ""]).encode()
+    for frame in (b"\xff" * 20, b"\x82\x05hello", b"\x81\xfe\x00\x80abcd" + b"\xff" * 128, b"\x82\xff" + b"\x7f" + b"\xff" * 20,
+                  b"\x83\x80abcd", b"\x88\x81abcdx", b"\x89\xfe\x00\xffabcd" + b"x" * 255, b"\x82"):
+        with socket.create_connection(("127.0.0.1", port), timeout=30.0) as connection:
+            connection.sendall(handshake)
+            assert connection.recv(1 << 16).startswith(b"HTTP/1.1 101 ")
+            connection.sendall(frame)
+            connection.shutdown(socket.SHUT_WR)
+            while connection.recv(1 << 16):
+                pass
+    with client(served.page.url) as fine:
+        assert "camera as TOML" in fine.controls()
+    out, err = capfd.readouterr()
+    assert out == "" and "Traceback" not in err and err == "", err
+
+
+def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where viser would serve past the door, there is no viewer."""
+    import viser
+    import websockets.asyncio.server as websockets
+    from websockets.asyncio.server import serve
+
+    from wrt.viewer_page import Page
+
+    assert websockets.serve is serve
+    for version in ("1.0.9", "1.1", "1.2.0", "2.0"):
+        with monkeypatch.context() as patch:
+            patch.setattr(viser, "__version__", version)
+            with pytest.raises(InputError, match=f"cannot guard viser {version}"):
+                Page(SCENE, Options(threads=1), port=0)
+
+    class Other:
+        def __init__(self, *arguments: Any, **settings: Any) -> None:
+            self.stopped = False
+
+        def get_port(self) -> int:
+            return 1
+
+        def stop(self) -> None:
+            Other.stops += 1
+
+        stops = 0
+
+    monkeypatch.setattr(viser, "ViserServer", Other)
+    with pytest.raises(InputError, match="does not let itself be guarded"):
+        Page(SCENE, Options(threads=1), port=0)
+    assert Other.stops == 1 and websockets.serve is serve
+
+
+# --- messages ---------------------------------------------------------------------------------------------------------
+
+
+def test_what_a_browser_says_is_heard() -> None:
+    check_message(CAMERA, lambda uuid: None)
+    check_message(CLICK, lambda uuid: None)
+
+
+@pytest.mark.parametrize("message", [
+    *NONSENSE, {"type": None}, {"type": "Message"}, {"type": "ShareUrlDisconnect"}, {"type": "FileTransferStartUpload"},
+    {"type": "GuiFormSubmitMessage", "uuid": "root"}, {"type": "GetRenderResponseMessage"}, {"type": ["ViewerCameraMessage"]},
+    {"type": "GuiUpdateMessage"}, {"type": "GuiUpdateMessage", "uuid": ["x"], "updates": {"value": 1}},
+    {"type": "GuiUpdateMessage", "uuid": "x", "updates": [1]}, {"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": 1}},
+    {**CAMERA, "extra": 1}, {key: CAMERA[key] for key in CAMERA if key != "fov"}, {**CLICK, "event_type": "rect-select"},
+    {**CLICK, "modifier": ["cmd"]}, {**CLICK, "screen_pos": [[0.5, 1.5]]}, {**CLICK, "screen_pos": [[0.5]]},
+    {**CLICK, "ray_origin": None}, {**CAMERA, "wxyz": [0.0] * 4}, {**CAMERA, "wxyz": [1.0, 1.0, 0.0, 0.0]},
+    {**CAMERA, "fov": 0.0}, {**CAMERA, "fov": math.pi},
+    {**CAMERA, "image_width": 16385}, {**CAMERA, "image_width": 64.0}, {**CAMERA, "image_height": -1},
+    {**CAMERA, "position": [1e10, 0, 0]},
+], ids=lambda message: None)
+def test_what_is_not_heard(message: Any) -> None:
+    with pytest.raises(Refused):
+        check_message(message, lambda uuid: None)
+
+
+@pytest.mark.parametrize("field", CAMERA)
+def test_what_is_no_part_of_a_camera(field: str) -> None:
+    for value in NONSENSE:
+        if field in ("near", "far") and type(value) in (int, float) and math.isfinite(value):
+            continue  # they are not used
+        with pytest.raises(Refused):
+            check_message({**CAMERA, field: value}, lambda uuid: None)
+
+
+def test_the_share_request_opens_nothing(rendering: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    served, asked = rendering, list[str]()
+    monkeypatch.setattr(served.page.server, "request_share_url", lambda *rest, **more: asked.append("request"))
+    monkeypatch.setattr(served.page.server, "disconnect_share_url", lambda *rest, **more: asked.append("disconnect"))
+    with client(served.page.url) as somebody:
+        somebody.look()
+        for _ in range(3):
+            somebody.send(type="ShareUrlRequest")
+            somebody.send(type="ShareUrlDisconnect")
+        somebody.picture()
+        somebody.look(1.0)  # is answered after all that
+        somebody.picture()
+        assert not any("Share" in message["type"] for message in somebody.messages)
+    assert asked == [] and served.page.server._share_tunnel is None
+    shared = [line for line in served.warnings if "share" in line]
+    assert shared == ["viewer: dropped a request to share the viewer on the internet (told once)"]
+
+
+def moves(who: Client, begin: float) -> int:
+    """How many of 20 moves of the camera bring new pictures."""
+    new = set()
+    for move in range(20):
+        who.look(begin + 0.02 * move)
+        new.add(who.picture())
+    return len(new)
+
+
+def test_bad_values_stop_nobodys_pictures(rendering: Served, capfd: pytest.CaptureFixture[str]) -> None:
+    served, page = rendering, rendering.page
+    with client(page.url) as bad, client(page.url) as good:
+        for who in (bad, good):
+            who.look()
+            who.picture()
+        controls = {label: uuid for label, uuid in bad.controls().items() if uuid in page.server.gui._gui_input_handle_from_uuid}
+        assert controls.keys() == {"angle of view", "aperture", "focus", "click to focus", "bounces", "structure", "show",
+                                   "exposure", "tone mapping", "resolution", *BUTTONS}
+        before = {label: page.server.gui._gui_input_handle_from_uuid[uuid].value for label, uuid in controls.items()}
+        for label, uuid in controls.items():
+            for value in NONSENSE:
+                if not any(value is each or (value == each and type(value) is type(each)) for each in SENSE.get(label, ())):
+                    bad.set(uuid, value)
+            bad.send(type="GuiUpdateMessage", uuid=uuid, updates={"removed": True})
+            bad.send(type="GuiUpdateMessage", uuid=uuid, updates={"value": before[label], "update_cb": []})
+        for text in ("no MessagePack", b"\xc1", b"\x91" * 60000, b""):
+            bad.socket.send(text)
+        assert moves(bad, 0.1) == 20 and moves(good, 0.7) == 20
+        after = {label: page.server.gui._gui_input_handle_from_uuid[uuid].value for label, uuid in controls.items()}
+    assert after == before
+    for label in controls:
+        lines = [line for line in served.warnings if line.startswith(f"viewer: dropped {label}: ")]
+        assert len(lines) == 1, label
+    assert all("\n" not in line and len(line) < 200 for line in served.warnings)
+    out, err = capfd.readouterr()
+    assert (out, err) == ("", "") and page.thread.is_alive()
+
+
+def test_values_that_a_control_can_have_arrive(served: Served) -> None:
+    page = served.page
+    with client(page.url) as somebody:
+        somebody.look()
+        uuids = somebody.controls()
+        for label, value in (("bounces", 0), ("bounces", 12.0), ("aperture", 0), ("focus", 2), ("exposure", -8),
+                             ("tone mapping", "reinhard"), ("resolution", "1/4"), ("click to focus", True),
+                             ("structure", "bvh8"), ("show", "nodes")):
+            somebody.set(uuids[label], value)
+            handle = page.server.gui._gui_input_handle_from_uuid[uuids[label]]
+            while handle.value != value:
+                somebody.listen(0.05)
+    assert [line for line in served.warnings if "dropped" in line] == []
+
+
+def test_a_camera_beyond_the_numbers_of_a_scene_is_dropped(rendering: Served) -> None:
+    page = rendering.page
+    page.unit = 1e300
+    with client(page.url) as somebody:
+        somebody.look(1.0, position=[1e9, 0.0, 0.0])
+        page.unit = 4.0
+        somebody.look(2.0)
+        somebody.picture()
+
+
+def test_a_flood_is_slowed_down_and_a_large_message_ends_the_connection(served: Served, monkeypatch: pytest.MonkeyPatch,
+                                                                        capfd: pytest.CaptureFixture[str]) -> None:
+    from websockets.exceptions import ConnectionClosedError
+
+    from wrt import viewer_server as module
+
+    monkeypatch.setattr(module, "MOST_MESSAGES", 20)
+    with client(served.page.url) as flood, client(served.page.url) as other:
+        for i in range(60):
+            flood.look(0.01 * i)
+        other.controls()
+        while not any("slowed down" in line for line in served.warnings):
+            flood.listen(0.05)
+        other.socket.send(b"\xc4" * (module.LARGEST_MESSAGE + 1))
+        with pytest.raises(ConnectionClosedError) as closed:
+            other.until(lambda message: False)
+        assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
+    monkeypatch.setattr(module, "MOST_CONNECTIONS", 2)
+    idle = [socket.create_connection(("127.0.0.1", served.port), timeout=30.0) for _ in range(4)]
+    assert [connection.recv(1) for connection in idle[2:]] == [b"", b""]
+    for connection in idle:
+        connection.close()
+    out, err = capfd.readouterr()
+    assert (out, err) == ("", "")
+
+
+def test_pages_can_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each behind its own door."""
+    pytest.importorskip("viser")
+    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: False)
+    import websockets.asyncio.server as websockets
+    from websockets.asyncio.server import serve
+
+    made: list[Served] = []
+    threads = [threading.Thread(target=lambda: made.append(Served())) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    try:
+        assert websockets.serve is serve and len({served.port for served in made}) == len(made) == 4
+        for served in made:
+            for other in made:
+                came = raw_answer(served.port, f"GET /{other.token}/ HTTP/1.1\r\nHost: 127.0.0.1:{served.port}\r\n\r\n".encode())
+                assert came.startswith(b"HTTP/1.1 200 " if other is served else b"HTTP/1.1 403 ")
+    finally:
+        for served in made:
+            served.page.close()
+
+
+def test_viser_says_nothing_of_those_who_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A picture may be on its way to a browser that is closed meanwhile."""
+    pytest.importorskip("viser")
+    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: False)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        served = Served()
+        with client(served.page.url) as somebody:
+            somebody.look()
+            while not (clients := served.page.server.get_clients()):
+                somebody.listen(0.05)
+        while served.page.server.get_clients():
+            time.sleep(0.01)
+        next(iter(clients.values())).scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
+        served.page.close()
+    assert [str(each.message) for each in caught if "closed connection" in str(each.message)] == []

@@ -1,0 +1,119 @@
+"""Someone who speaks to the viewer without a browser: requests byte by byte, and a WebSocket with viser's messages."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import socket
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+PATIENCE = 300.0  # seconds; on a busy machine kernels may have to be compiled
+
+
+def answer(port: int, target: str, headers: list[str], host: str = "127.0.0.1") -> bytes:
+    """All that comes back for a GET; "" where the connection is just closed. A WebSocket that opens is left at once."""
+    request = "\r\n".join([f"GET {target} HTTP/1.1", *headers, "", ""])
+    return raw_answer(port, request.encode("latin-1", "surrogateescape"), host)
+
+
+def raw_answer(port: int, request: bytes, host: str = "127.0.0.1") -> bytes:
+    with socket.create_connection((host, port), timeout=PATIENCE) as connection:
+        connection.sendall(request)
+        data = b""
+        with contextlib.suppress(ConnectionResetError):
+            while block := connection.recv(1 << 16):
+                data += block
+                if data.startswith(b"HTTP/1.1 101"):
+                    break
+        return data
+
+
+def upgrade(subprotocol: str = "viser-v1.1.1") -> list[str]:
+    """The headers of a WebSocket's handshake."""
+    key = base64.b64encode(b"sixteen bytes...").decode()
+    return ["Upgrade: websocket", "Connection: Upgrade", f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13",
+            f"Sec-WebSocket-Protocol: {subprotocol}"]
+
+
+class Client:
+    """A WebSocket at a page's address, as the page in a browser has one. Keeps what the server says."""
+
+    def __init__(self, url: str, **settings: Any) -> None:
+        import viser
+        from websockets.sync.client import connect
+
+        parts = urlsplit(url)
+        settings = {"subprotocols": [f"viser-v{viser.__version__}"], "origin": f"http://{parts.netloc}", **settings}
+        self.socket = connect(f"ws://{parts.netloc}{parts.path}?{parts.query}", compression=None, max_size=None,
+                              open_timeout=PATIENCE, **settings)
+        self.messages: list[dict[str, Any]] = []
+
+    def send(self, **message: Any) -> None:
+        import msgspec
+
+        self.socket.send(msgspec.msgpack.encode(message))
+
+    def look(self, angle: float = 0.0, **changes: Any) -> None:
+        """Move the camera."""
+        camera = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": [angle, 0.0, -1.0], "fov": 0.8, "near": 0.01, "far": 1000.0,
+                  "image_height": 48, "image_width": 64, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 1.0, 0.0]}
+        self.send(type="ViewerCameraMessage", **camera | changes)
+
+    def set(self, uuid: str, value: Any) -> None:
+        self.send(type="GuiUpdateMessage", uuid=uuid, updates={"value": value})
+
+    def listen(self, seconds: float) -> list[dict[str, Any]]:
+        """What the server says next, if anything within that time."""
+        import msgspec
+        import zstandard
+
+        try:
+            data = self.socket.recv(timeout=seconds)
+        except TimeoutError:
+            return []
+        size = int.from_bytes(data[8:16], "little")
+        messages = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + size]))["messages"]
+        self.messages += messages
+        return messages
+
+    def until(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """The first message from now on that fulfils a condition."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            assert time.monotonic() < deadline, "it never came"
+            for message in self.listen(1.0):
+                if condition(message):
+                    return message
+
+    def picture(self) -> bytes:
+        """The next picture's file that was not seen before."""
+        seen = set(self.pictures)
+        self.until(lambda message: is_picture(message) and message["rgb_data"] not in seen)
+        return self.pictures[-1]
+
+    @property
+    def pictures(self) -> list[bytes]:
+        return [message["rgb_data"] for message in self.messages if is_picture(message)]
+
+    def controls(self) -> dict[str, str]:
+        """The uuid of each control, by its label."""
+        while not any(message.get("props", {}).get("label") == "camera as TOML" for message in self.messages):
+            assert self.listen(PATIENCE), "the panel never came"
+        return {message["props"]["label"]: message["uuid"] for message in self.messages
+                if message["type"].startswith("Gui") and "container_uuid" in message and "label" in message.get("props", {})}
+
+
+def is_picture(message: dict[str, Any]) -> bool:
+    return message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None  # None: viser begins without one
+
+
+@contextlib.contextmanager
+def client(url: str, **settings: Any) -> Iterator[Client]:
+    made = Client(url, **settings)
+    try:
+        yield made
+    finally:
+        made.socket.close()

@@ -1,0 +1,111 @@
+"""What a browser may say to the viewer: a move of the camera, a click into the picture, a value of a control.
+
+All else is dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from wrt.viewer_access import Refused, shown
+
+LARGEST_VIEWPORT = 16384  # pixels a side
+FARTHEST = 1e9  # coordinate, in units of the viewport
+NARROWEST, WIDEST = 1e-5, math.pi - 1e-3  # angle of view, radians
+CAMERA = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3}  # lengths of its vectors
+LENS = ("fov", "near", "far")
+PIXELS = ("image_width", "image_height")
+
+
+def check_message(message: Any, control_of: Callable[[str], Any]) -> None:
+    """Raise Refused unless a decoded message is one that the viewer can follow.
+
+    control_of: viser's handle of the control with a uuid, or None.
+    """
+    kind = message.get("type") if isinstance(message, dict) else None
+    if kind == "ViewerCameraMessage":
+        _check_camera(message)
+    elif kind == "ScenePointerMessage":
+        _check_click(message)
+    elif kind == "GuiUpdateMessage":
+        _check_update(message, control_of)
+    elif kind == "ShareUrlRequest":
+        raise Refused("share", "a request to share the viewer on the internet")
+    else:
+        raise Refused("message", f"a message of the kind {shown(kind)}")
+
+
+def _check_camera(message: dict[str, Any]) -> None:
+    fine = (
+        message.keys() == {"type", *CAMERA, *LENS, *PIXELS}
+        and all(_is_vector(message[name], length) for name, length in CAMERA.items())
+        and abs(math.hypot(*message["wxyz"]) - 1.0) < 0.01
+        and all(_is_number(message[name], -math.inf, math.inf) for name in LENS)
+        and NARROWEST <= message["fov"] <= WIDEST
+        and all(type(message[name]) is int and 0 <= message[name] <= LARGEST_VIEWPORT for name in PIXELS)
+    )
+    if not fine:
+        raise Refused("camera", "a camera that is none")
+
+
+def _check_click(message: dict[str, Any]) -> None:
+    place = message.get("screen_pos")
+    fine = (
+        message.keys() == {"type", "event_type", "ray_origin", "ray_direction", "screen_pos", "modifier"}
+        and message["event_type"] == "click"
+        and _is_vector(message["ray_origin"], 3) and _is_vector(message["ray_direction"], 3)
+        and isinstance(place, list) and len(place) == 1 and _is_vector(place[0], 2, 0.0, 1.0)
+        and (message["modifier"] is None or isinstance(message["modifier"], str))
+    )
+    if not fine:
+        raise Refused("click", "a click that is none")
+
+
+def _check_update(message: dict[str, Any], control_of: Callable[[str], Any]) -> None:
+    updates = message.get("updates")
+    if message.keys() != {"type", "uuid", "updates"} or not isinstance(message["uuid"], str) or not isinstance(updates, dict):
+        raise Refused("control", "a change of a control that is none")
+    control = control_of(message["uuid"])
+    if control is None:
+        raise Refused("no control", "a change of a control that there is not")
+    if updates.keys() != {"value"}:
+        raise Refused(f"control {control.label}", f"{control.label}: a change of something else than its value")
+    check_value(control, updates["value"])
+
+
+def check_value(control: Any, value: Any) -> None:
+    """Raise Refused unless a control can have the value."""
+    import viser
+
+    if control.disabled or not control.visible:
+        problem = "comes while it is disabled"
+    elif isinstance(control, viser.GuiSliderHandle | viser.GuiNumberHandle):
+        problem = _number_problem(control, value)
+    elif isinstance(control, viser.GuiDropdownHandle):
+        problem = "" if isinstance(value, str) and value in control.options else f"is none of {', '.join(control.options)}"
+    elif isinstance(control, viser.GuiCheckboxHandle):
+        problem = "" if isinstance(value, bool) else "is neither true nor false"
+    elif isinstance(control, viser.GuiButtonHandle):
+        problem = "" if value is True else "is no click"
+    else:
+        problem = "is for a control of an unknown kind"
+    if problem:
+        raise Refused(f"control {control.label}", f"{control.label}: {shown(value)} {problem}")
+
+
+def _number_problem(control: Any, value: Any) -> str:
+    low, high = (bound if bound is not None else sign * math.inf for bound, sign in ((control.min, -1.0), (control.max, 1.0)))
+    # The page rounds to seven decimals, and so may the ends be rounded.
+    if not _is_number(value, low - 1e-6 * abs(low), high + 1e-6 * abs(high)):
+        return f"is no number from {low:g} to {high:g}"
+    return "is no whole number" if isinstance(control.value, int) and value != int(value) else ""
+
+
+def _is_number(value: Any, low: float, high: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and low <= value <= high
+
+
+def _is_vector(value: Any, length: int, low: float = -FARTHEST, high: float = FARTHEST) -> bool:
+    return isinstance(value, list) and len(value) == length and all(_is_number(each, low, high) for each in value)
