@@ -150,3 +150,35 @@ def test_a_full_disk_under_the_kernel_cache_is_one_message(tmp_path: Path) -> No
         done = subprocess.run([sys.executable, "-c", FULL_CACHE, limit], cwd=ROOT, capture_output=True, text=True, check=True,
                               env=os.environ | {"WARP_CACHE_PATH": str(tmp_path)})
         assert told in done.stdout, done
+
+
+@pytest.mark.parametrize("environment", [{"WARP_CACHE_PATH": "/dev/null/cache"}, {"HOME": "/dev/null"}], ids=str)
+def test_a_kernel_cache_that_cannot_be_made_is_one_message(environment: dict[str, str]) -> None:
+    without = {name: value for name, value in os.environ.items() if name not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME", "HOME")}
+    done = subprocess.run([sys.executable, "-m", "wrt", "devices"], cwd=ROOT, capture_output=True, text=True,
+                          env={**without, "PYTHONPATH": str(ROOT), **environment})
+    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1, done
+    assert done.stderr.startswith("error: /dev/null/") and done.stderr.endswith("(WARP_CACHE_PATH names another folder)\n")
+
+
+READ_ONLY_CACHE = """
+import os, numpy as np, warp, wrt
+accel = wrt.build(wrt.Mesh(np.eye(3), np.array([[0, 1, 2]])), "brute_force")
+os.chmod(warp.config.kernel_cache_dir, 0o555)
+if os.geteuid() == 0:
+    os.setegid(65534)
+    os.seteuid(65534)  # permissions do not bind the superuser
+try:
+    print(accel.closest_hit(np.zeros((1, 3)), np.ones((1, 3))).t)
+except wrt.InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs the permissions of POSIX")
+def test_a_read_only_kernel_cache_without_the_kernel_is_one_message(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", READ_ONLY_CACHE], cwd=ROOT, capture_output=True, text=True,
+                          env=os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)})
+    (cache,) = tmp_path.iterdir()
+    assert done.stdout == f"{cache}: kernels cannot be compiled: Permission denied (WARP_CACHE_PATH names another folder)\n", done
+    assert not list(cache.iterdir()) and done.stderr == ""
