@@ -13,7 +13,7 @@ from wrt.scene import SMALLEST, DirectionalLight, Scene
 # Where a light has a place in the scene, the square of its distance counts, which is a float32 with all its digits from 2^-63
 # (1.1e-19) on. So in the smallest scene all is lit rightly that is farther from the light than its ten-thousandth part.
 SMALLEST_LIT = 1e-15
-VERTICES_AT_ONCE = 1 << 16
+FACES_AT_ONCE = 1 << 12
 
 
 def require_size(scene: Scene) -> None:
@@ -60,7 +60,6 @@ def _points(scene: Scene) -> Iterator[np.ndarray]:
     for sphere in scene.spheres:
         yield np.array(sphere.center) + sphere.radius * np.array([[-1.0], [1.0]])
     for thing in scene.objects:
-        if len(thing.mesh.faces):
-            for i in range(0, len(thing.mesh.vertices), VERTICES_AT_ONCE):
-                part = thing.mesh.vertices[i:i + VERTICES_AT_ONCE].astype(np.float64)
-                yield part @ thing.transform[:3, :3].T + thing.transform[:3, 3]
+        for i in range(0, len(thing.mesh.faces), FACES_AT_ONCE):
+            corners = thing.mesh.vertices[thing.mesh.faces[i:i + FACES_AT_ONCE].reshape(-1)].astype(np.float64)
+            yield corners @ thing.transform[:3, :3].T + thing.transform[:3, 3]

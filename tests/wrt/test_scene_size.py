@@ -159,6 +159,13 @@ def test_tiny_shapes_far_from_their_light_are_lit() -> None:
     assert np.allclose(lit(1e-20), lit(1.0), atol=1e-5) and lit(1.0).max() > 0.3
 
 
+def test_only_what_can_be_hit_makes_a_scene_large() -> None:
+    unused = wrt.Mesh(np.concatenate([1e-17 * TRIANGLE, [[1.0, 1.0, 1.0]]]).astype(np.float32), np.array([[0, 1, 2]], np.int32))
+    scene = Scene(objects=(Object(unused, (LAMP,)),), cameras=(Camera(),))
+    with pytest.raises(InputError, match=r"1e-17 units across"):
+        wrt.render(scene, size=(4, 4), spp=1)
+
+
 def test_a_single_point_is_rendered_as_nothing() -> None:
     point = Object(wrt.Mesh(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32)), (CHALK,))
     scene = Scene(objects=(point,), background=SKY, cameras=(Camera.look_at((0, 0, 1), (0, 0, 0)),))
