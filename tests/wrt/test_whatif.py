@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -158,7 +159,7 @@ def test_what_there_is_not_is_refused(ball: Path) -> None:
         with pytest.raises(InputError, match=words):
             Plan(**{"study": "order", "mesh": ball, **wrong})  # type: ignore[arg-type]
     deep = base(Geometry.of(icosphere(1)))
-    object.__setattr__(deep, "stats", type(deep.stats)(**{**vars(deep.stats), "depth": 63}))
+    deep._state = replace(deep._state, stats=replace(deep.stats, depth=63))
     with pytest.raises(InputError, match="63 deep"):
         with_traversal(deep, Study(4))
     assert with_traversal(deep, Study(STACK_SIZE)).stats.nodes == deep.stats.nodes

@@ -354,6 +354,7 @@ class Accelerator(ABC):
 
     @property
     def stats(self) -> AccelStats:
+        """What was built, how large it is, and what it costs."""
         return self._state.stats
 
     def _take(self, built: Built, begin: float, built_cost: float) -> None:
