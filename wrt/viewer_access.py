@@ -117,5 +117,5 @@ def as_origin(text: str) -> str:
 def shown(values: Any) -> str:
     """What a stranger sent, for a line of a message."""
     text = ", ".join(map(repr, values)) if isinstance(values, list) else repr(values)
-    text = text or "nobody"
+    text = text or "no name"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -30,6 +30,7 @@ LARGEST_MESSAGE = 1 << 16  # bytes; a browser sends some hundreds
 MOST_MESSAGES = 200  # a second, of one connection; a browser sends about 50
 MOST_CONNECTIONS = 64  # open at a time, with those that have not shown a token yet
 LONGEST_PATH = 200
+LONGEST_LINE = 300  # characters of what is told
 CLOSING = 1.0  # seconds that a browser has to say goodbye
 QUIET = logging.getLogger("wrt.viewer.connections")  # what goes wrong in one connection is no matter of the others
 QUIET.propagate = False
@@ -114,12 +115,12 @@ class Door:
         return server
 
     def tell(self, about: str, text: str) -> None:
-        """Once of each kind."""
+        """In one line, once of each kind."""
         with self._lock:
             if about in self._told:
                 return
             self._told.add(about)
-        self.warn(f"viewer: {text} (told once)")
+        self.warn(f"viewer: {' '.join(text.split())[:LONGEST_LINE]} (told once)")
 
     # --- requests -----------------------------------------------------------------------------------------------------
 

@@ -331,7 +331,7 @@ def test_bad_values_stop_nobodys_pictures(rendering: Served, capfd: pytest.Captu
             bad.send(type="GuiUpdateMessage", uuid=uuid, updates={"value": before[label], "update_cb": []})
         for text in ("no MessagePack", b"\xc1", b"\x91" * 60000, b""):
             bad.socket.send(text)
-        assert moves(bad, 0.1) == 20 and moves(good, 0.7) == 20
+        assert moves(bad, 0.1) == 20 and moves(good, 0.11) == 20
         after = {label: page.server.gui._gui_input_handle_from_uuid[uuid].value for label, uuid in controls.items()}
     assert after == before
     for label in controls:

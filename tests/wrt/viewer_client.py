@@ -45,10 +45,11 @@ class Client:
         import viser
         from websockets.sync.client import connect
 
+        # Without a limit on what was not read yet, it answers the server's pings also while nobody reads.
         parts = urlsplit(url)
         settings = {"subprotocols": [f"viser-v{viser.__version__}"], "origin": f"http://{parts.netloc}", **settings}
         self.socket = connect(f"ws://{parts.netloc}{parts.path}?{parts.query}", compression=None, max_size=None,
-                              open_timeout=PATIENCE, **settings)
+                              max_queue=None, ping_interval=None, open_timeout=PATIENCE, **settings)
         self.messages: list[dict[str, Any]] = []
 
     def send(self, **message: Any) -> None:
