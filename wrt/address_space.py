@@ -24,11 +24,11 @@ _compiler = threading.Lock()
 
 
 def require_modules() -> None:
-    """Raise InputError where the address space does not suffice for what wrt imports; where it is limited, see that threads take
-    little of it."""
-    if not is_limited():
+    """Raise InputError where the address space does not suffice for what wrt imports, if it is still to be; where it is limited,
+    see that threads take little of it."""
+    if "numpy" in sys.modules or not is_limited():
         return
-    threads = 0 if "numpy" in sys.modules else min(_blas_threads(), BLAS_THREADS)
+    threads = min(_blas_threads(), BLAS_THREADS)
     require(MODULES + threads * BLAS_THREAD, "NumPy and what else is imported",
             "; OPENBLAS_NUM_THREADS=1 makes NumPy take less" if threads > 1 else "")
     import ctypes

@@ -312,15 +312,15 @@ def main() -> None:
     except OSError as error:  # from outside of wrt: a path too long for the system, stdout on a full disk
         say(f"error: {error}")
         code = 2
-    except (MemoryError, RuntimeError) as error:
-        if not is_out_of_memory(error):
-            raise
-        say(f"error: not enough memory: {error}{told_limit()}")
-        code = 2
     except (click.Abort, KeyboardInterrupt) as error:  # click makes the first of the second
         cause = error.__cause__ if isinstance(error, click.Abort) else error
         code = exit_code(cause.number if isinstance(cause, Interrupted) else None)
         say("interrupted")
+    except (MemoryError, RuntimeError) as error:  # click.Abort is a RuntimeError, too
+        if not is_out_of_memory(error):
+            raise
+        say(f"error: not enough memory: {error}{told_limit()}")
+        code = 2
     except SystemExit as error:
         code = error.code
         if code == 0:  # said outright: by `view`, whose end is somebody's Ctrl-C

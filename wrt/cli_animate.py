@@ -68,7 +68,7 @@ def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: 
         say_json({"output": str(target), "frames": rows, "seconds": time.perf_counter() - begin})
     elif rows:
         click.echo(target)
-    hint = depth_hint(visibly_cut, loaded.settings.max_depth)
+    hint = depth_hint(visibly_cut, loaded.settings.max_depth, "--set max_depth")
     if hint and not quiet:
         say(hint)
     if len(rows) < frames:

@@ -184,13 +184,13 @@ def _plain(value: Any) -> Any:
     return tuple(value) if isinstance(value, list | tuple) else value
 
 
-def depth_hint(visibly_cut: float, max_depth: int) -> str | None:
+def depth_hint(visibly_cut: float, max_depth: int, option: str = "--max-depth") -> str | None:
     """A line for who may want more bounces: where so many pixels lack light visibly (Film.stats) that somebody would see them."""
     from wrt.scene import MAX_DEPTH
 
     if visibly_cut < SEEN:
         return None
-    advice = "raise --max-depth" if max_depth < MAX_DEPTH else f"{MAX_DEPTH} is the most there is"
+    advice = f"raise {option}" if max_depth < MAX_DEPTH else f"{MAX_DEPTH} is the most there is"
     return f"max_depth {max_depth} leaves {100.0 * visibly_cut:.2g}% of the pixels visibly too dark: {advice}"
 
 

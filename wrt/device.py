@@ -82,7 +82,7 @@ def _stderr_without(text: bytes) -> Iterator[None]:
 @made_once
 def start(device: str) -> Any:
     """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are."""
-    require_warp(thread_count(None) + 2)  # two that prepare
+    require_warp(min(thread_count(None), 4) + 2)  # two that prepare; if more cannot be started, that is told then
     with _stderr_without(b"NVIDIA CUDA driver"):  # where there is no GPU, it says so each time
         with _cache_told():
             wp.init()
@@ -106,7 +106,7 @@ def describe_devices() -> list[str]:
 def free_memory(device: Any) -> float:
     """Bytes of memory of a device that can still be had; infinite where the system does not tell. The compiler, which runs while
     a scene is built, has its share of the address space where that is limited."""
-    return float(device.free_memory) if device.is_cuda else available() - (LLVM if is_limited() else 0.0)
+    return float(device.free_memory) if device.is_cuda else max(available() - (LLVM if is_limited() else 0.0), 0.0)
 
 
 class _Loaded:

@@ -19,6 +19,7 @@ import warp as wp
 
 import wrt
 from wrt.accel import ACCELERATORS, Structure, build, tells_progress
+from wrt.address_space import told_limit
 from wrt.arguments import unknown
 from wrt.checkpoint import Checkpoint
 from wrt.device import free_memory, load_kernel, made_once, start, thread_count
@@ -157,7 +158,7 @@ class Renderer:
         there = free_memory(self.device)
         if film + scene > max(there, SMALL):
             raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {gib(film)} of memory, its scene {gib(scene)};"
-                             f" {self.device} has {gib(there)} free (WRT_MEMORY can say otherwise)")
+                             f" {self.device} has {gib(there)} free (WRT_MEMORY can say otherwise){told_limit()}")
 
     def _checkpoint(self) -> Checkpoint:
         """The file to save to, which says what must be the same to go on with it. Errors of it are told before the work."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import socket
 import threading
-import time
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.wrt.test_viewer import SCENE
-from tests.wrt.viewer_client import Client, answer, client, raw_answer, upgrade
+from tests.wrt.viewer_client import Client, answer, client, raw_answer, upgrade, wait
 from wrt.errors import InputError
 from wrt.options import Options
 from wrt.viewer_access import Access, Refused, access_for, as_origin
@@ -352,8 +351,7 @@ def test_values_that_a_control_can_have_arrive(served: Served) -> None:
                              ("structure", "bvh8"), ("show", "nodes")):
             somebody.set(uuids[label], value)
             handle = page.server.gui._gui_input_handle_from_uuid[uuids[label]]
-            while handle.value != value:
-                somebody.listen(0.05)
+            wait(lambda handle=handle, value=value: handle.value == value, somebody)
     assert [line for line in served.warnings if "dropped" in line] == []
 
 
@@ -375,11 +373,14 @@ def test_a_flood_is_slowed_down_and_a_large_message_ends_the_connection(served: 
 
     monkeypatch.setattr(module, "MOST_MESSAGES", 20)
     with client(served.page.url) as flood, client(served.page.url) as other:
-        for i in range(60):
-            flood.look(0.01 * i)
         other.controls()
-        while not any("slowed down" in line for line in served.warnings):
-            flood.listen(0.05)
+
+        def slowed() -> bool:
+            for i in range(60):
+                flood.look(0.01 * i)
+            return any("slowed down" in line for line in served.warnings)
+
+        wait(slowed, flood)
         other.socket.send(b"\xc4" * (module.LARGEST_MESSAGE + 1))
         with pytest.raises(ConnectionClosedError) as closed:
             other.until(lambda message: False)
@@ -426,10 +427,9 @@ def test_viser_says_nothing_of_those_who_left(monkeypatch: pytest.MonkeyPatch) -
         served = Served()
         with client(served.page.url) as somebody:
             somebody.look()
-            while not (clients := served.page.server.get_clients()):
-                somebody.listen(0.05)
-        while served.page.server.get_clients():
-            time.sleep(0.01)
+            wait(served.page.server.get_clients, somebody)
+            clients = served.page.server.get_clients()
+        wait(lambda: not served.page.server.get_clients())
         next(iter(clients.values())).scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
         served.page.close()
     assert [str(each.message) for each in caught if "closed connection" in str(each.message)] == []

@@ -111,6 +111,17 @@ def is_picture(message: dict[str, Any]) -> bool:
     return message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None  # None: viser begins without one
 
 
+def wait(condition: Callable[[], Any], listening: Client | None = None) -> None:
+    """Until it holds; `listening` takes what the server sends meanwhile."""
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, "it never came"
+        if listening is None:
+            time.sleep(0.01)
+        else:
+            listening.listen(0.05)
+
+
 @contextlib.contextmanager
 def client(url: str, **settings: Any) -> Iterator[Client]:
     made = Client(url, **settings)
