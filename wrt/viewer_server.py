@@ -93,10 +93,8 @@ class Door:
         host, port = listening.getsockname()[:2]
 
         def guarded(handler: Any, *address: Any, **settings: Any) -> Any:
-            if self._serving or not getattr(handler, "__module__", "").startswith("viser"):
-                # Of somebody else who begins at the same time; a second one of viser's is guarded too, and refused for its port.
-                ours = getattr(handler, "__module__", "").startswith("viser")
-                return serve(handler, *address, **settings | (self._settings(None) if ours else {}))
+            if self._serving:
+                return serve(handler, *address, **settings)  # of somebody else who begins at the same time
             self._serving = True
             settings = {key: value for key, value in settings.items() if key not in ("host", "port", "sock")}
             asyncio.get_running_loop().set_exception_handler(self._failed)
