@@ -81,7 +81,7 @@ class Door:
     def __init__(self, access: Access, warn: Callable[[str], None] = to_stderr) -> None:
         self.access, self.warn = access, warn
         self.viser: Any = None  # the ViserServer, when there is one
-        self._serving = False
+        self._thread = 0  # in which viser serves
         self._told: set[str] = set()
         self._lock = threading.Lock()
 
@@ -93,9 +93,9 @@ class Door:
         host, port = listening.getsockname()[:2]
 
         def guarded(handler: Any, *address: Any, **settings: Any) -> Any:
-            if self._serving:
+            self._thread = self._thread or threading.get_ident()
+            if self._thread != threading.get_ident():
                 return serve(handler, *address, **settings)  # of somebody else who begins at the same time
-            self._serving = True
             settings = {key: value for key, value in settings.items() if key not in ("host", "port", "sock")}
             asyncio.get_running_loop().set_exception_handler(self._failed)
             return serve(self._greeting(handler), sock=listening, **settings | self._settings(settings.get("process_request")))
@@ -106,7 +106,7 @@ class Door:
                 server = viser.ViserServer(host, port, label=label, verbose=False)
             finally:
                 websockets.serve = serve
-        if not self._serving or server.get_port() != port:
+        if not self._thread or server.get_port() != port:
             with quiet():
                 server.stop()
             listening.close()
