@@ -30,6 +30,7 @@ from wrt.scene import (
     Camera,
     DirectionalLight,
     Light,
+    Material,
     Object,
     PointLight,
     Scene,
@@ -43,8 +44,8 @@ from wrt.staging import stage
 # Attributes that are read, or named by who wants them (skins, textures), or are the application's own (underscore).
 # TANGENT is named where a normal map would use it: tangents are made from the texture coordinates.
 _NAMED_ELSEWHERE = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_", "JOINTS_", "WEIGHTS_", "_")
-# Of memory, while a mesh is made; an index can be a triangle of its own.
-BYTES_OF_VERTEX, BYTES_OF_INDEX = 60.0, 150.0
+# Of memory, while a mesh is made; an index can be a triangle of its own. And of an object.
+BYTES_OF_VERTEX, BYTES_OF_INDEX, BYTES_OF_OBJECT = 60.0, 150.0, 1200.0
 # What a node's instances may set, and what holds where they do not.
 _INSTANCE_ATTRIBUTES: dict[str, tuple[str, tuple[float, ...]]] = {
     "TRANSLATION": ("VEC3", (0.0, 0.0, 0.0)),
@@ -114,7 +115,14 @@ def _roots(document: Document) -> list[tuple[int, str]]:
     number = gltf.scene or 0
     scene = document.item("scenes", number, "scene")
     document.left_out.add_extensions(scene.extensions, "scene", scene.name or str(number))
-    return [(index, f"scenes[{number}].nodes[{i}]") for i, index in enumerate(scene.nodes)]
+    roots: dict[int, str] = {}
+    for i, index in enumerate(scene.nodes):
+        place = f"scenes[{number}].nodes[{i}]"
+        if index in roots:
+            raise InputError(f"nodes[{index}] is in the scene twice", None, place)
+        document.item("nodes", index, place)
+        roots[index] = place
+    return list(roots.items())
 
 
 def _check_forest(document: Document) -> None:
@@ -178,13 +186,13 @@ def _list_of_triangles(indices: np.ndarray) -> np.ndarray:
 
 
 def _strip(indices: np.ndarray) -> np.ndarray:
-    i = np.arange(max(len(indices) - 2, 0))
+    i = np.arange(max(len(indices) - 2, 0), dtype=indices.dtype)
     odd = i & 1  # every second triangle swaps two corners, so that all face the same way
     return indices[np.stack([i, i + 1 + odd, i + 2 - odd], axis=1)]
 
 
 def _fan(indices: np.ndarray) -> np.ndarray:
-    i = np.arange(max(len(indices) - 2, 0))
+    i = np.arange(max(len(indices) - 2, 0), dtype=indices.dtype)
     return indices[np.stack([i + 1, i + 2, np.zeros_like(i)], axis=1)]
 
 
@@ -200,6 +208,7 @@ class _Meshes:
         self._accessors = Accessors(document)
         self._meshes: dict[tuple[Any, ...], Mesh | None] = {}
         self._meter = Meter()
+        self._instances = 0
 
     def mesh(self, primitive: Any, name: str, place: str) -> Mesh | None:
         """The mesh of a primitive, or None where it holds no triangle with an area."""
@@ -250,7 +259,7 @@ class _Meshes:
 
     def _indices(self, primitive: Any, count: int, place: str) -> np.ndarray:
         if primitive.indices is None:
-            return np.arange(count)
+            return np.arange(count, dtype=np.int32)
         where = f"{place}.indices"
         indices = self._accessors.read(primitive.indices, "SCALAR", where)[:, 0]
         if indices.dtype.kind != "u":
@@ -258,7 +267,7 @@ class _Meshes:
         if indices.max() >= count:
             i = int(np.argmax(indices >= count))
             raise InputError(f"index {i} is {int(indices[i])}, but there are {count} vertices", None, where)
-        return indices.astype(np.int64)
+        return indices.astype(np.int32)  # accessors end at 2^31 - 1
 
     def instances(self, node: Any, place: str) -> np.ndarray | None:
         """(N, 4, 4) transforms of a node's instances, relative to the node, or None where it has just itself."""
@@ -275,8 +284,9 @@ class _Meshes:
         if "ROTATION" in found and not found["ROTATION"].any(axis=1).all():
             raise InputError("must hold unit quaternions, but one is zero", None, f"{place}.ROTATION")
         count = counts.pop()
+        self._instances += count
         with at(place):
-            require_count(count, "instances")
+            require_count(self._instances, "instances")
         return compose(*(found.get(name, np.broadcast_to(default, (count, len(default))))
                          for name, (_, default) in wanted.items()))
 
@@ -289,9 +299,8 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def _require_reach(mesh: Mesh, transforms: np.ndarray) -> None:
     """Raise InputError where a transform takes the mesh so far out that single precision cannot square the distance."""
-    size = float(np.abs(mesh.vertices).max())
     with np.errstate(over="ignore", invalid="ignore"):
-        reach = (np.abs(transforms[:, :3, :3]).sum(axis=2) * size + np.abs(transforms[:, :3, 3])).max(initial=0.0)
+        reach = (np.abs(transforms[:, :3, :3]).sum(axis=2) * mesh.reach + np.abs(transforms[:, :3, 3])).max(initial=0.0)
     if not reach <= MAX_REACH:
         raise InputError(f"the mesh reaches {reach:.3g} units from the origin; at most {MAX_REACH:g} can be traced")
 
@@ -334,6 +343,8 @@ class _Reader:
     def __post_init__(self) -> None:
         self._meshes = _Meshes(self.document)
         self._materials = Materials(self.document)
+        self._parts: dict[int, list[tuple[Mesh, Material]]] = {}  # of each mesh
+        self._meter = Meter()
         lights = self.document.extension(self.document.gltf, "KHR_lights_punctual", PunctualLights, "")
         self._punctual = lights.lights if lights else []
 
@@ -357,13 +368,26 @@ class _Reader:
 
     def _add_mesh(self, node: Any, world: np.ndarray, name: str, place: str) -> None:
         source = self.document.item("meshes", node.mesh, f"{place}.mesh")
-        left_out, mesh_name = self.document.left_out, source.name or f"mesh {node.mesh}"
-        left_out.add_extensions(source.extensions, "mesh", mesh_name)
+        known = node.mesh in self._parts
+        if not known:
+            self.document.left_out.add_extensions(source.extensions, "mesh", source.name or f"mesh {node.mesh}")
         if node.skin is not None:
-            left_out.add("skins", "node", name)
+            self.document.left_out.add("skins", "node", name)
         transforms = self._placements(node, world, name, place)
+        if not known:
+            self._parts[node.mesh] = list(self._parts_of(source, node.mesh))
+        for mesh, material in self._parts[node.mesh]:
+            with at(place):
+                _require_reach(mesh, transforms)
+                require_count(len(self.objects) + len(transforms), "objects")
+                self._meter.take(BYTES_OF_OBJECT * len(transforms), "the scene")
+                self.objects += [Object(mesh, (material,), transform, name=name) for transform in transforms]
+
+    def _parts_of(self, source: Any, number: int) -> Iterator[tuple[Mesh, Material]]:
+        """The mesh and the material of each primitive that has triangles; asked once for all nodes that show them."""
+        left_out, mesh_name = self.document.left_out, source.name or f"mesh {number}"
         for i, primitive in enumerate(source.primitives):
-            where = f"meshes[{node.mesh}].primitives[{i}]"
+            where = f"meshes[{number}].primitives[{i}]"
             # A compressed copy beside plain accessors changes nothing: were it the only one, it would be required.
             extensions = {k: v for k, v in (primitive.extensions or {}).items() if k != "KHR_draco_mesh_compression"}
             left_out.add_extensions(extensions, "mesh", mesh_name)
@@ -372,10 +396,7 @@ class _Reader:
                 material = self._materials.material(primitive.material, f"{where}.material")
                 if "TANGENT" in primitive.attributes and material.normal_texture is not None:
                     left_out.add("TANGENT, in place of which tangents are made from TEXCOORD_0", "mesh", mesh_name)
-                with at(place):
-                    _require_reach(mesh, transforms)
-                    require_count(len(self.objects) + len(transforms), "objects")
-                    self.objects += [Object(mesh, (material,), transform, name=name) for transform in transforms]
+                yield mesh, material
 
     def _placements(self, node: Any, world: np.ndarray, name: str, place: str) -> np.ndarray:
         """(N, 4, 4) world matrices of a node's mesh: one, or one for each instance; without those that flatten it."""

@@ -25,8 +25,12 @@ from wrt.memory import require
 from wrt.read_file import read_file
 
 GLB_MAGIC = b"glTF"
-# Of memory: of a byte of the JSON, of an object in it, of a byte of a .glb file.
-BYTES_OF_JSON, BYTES_OF_OBJECT, BYTES_OF_GLB = 4.0, 1000.0, 3.0
+# Of memory, at most, measured: of a byte of JSON in ASCII, of one where a character can take four bytes, and of each of these
+# marks, which stand for what they begin or part: an object, an array, a member, an element, and half of a text.
+BYTES_OF_ASCII, BYTES_OF_JSON = 3.0, 9.0
+BYTES_OF_MARK = {b"{": 1000.0, b"[": 90.0, b":": 150.0, b",": 40.0, b'"': 30.0}
+BYTES_OF_PERCENT = 60.0  # of a %41 in a data: URI
+BASE64_AT_ONCE = 1 << 22  # characters; a multiple of 4
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 
 SUPPORTED_EXTENSIONS = frozenset({
@@ -128,6 +132,7 @@ class Document:
         if index not in self._buffers:
             buffer = self.item("buffers", index, place)
             where = f"buffers[{index}]"
+            data: bytes | bytearray | memoryview
             if buffer.uri is not None:
                 data = self.resource(buffer.uri, f"{where}.uri")
             elif index == 0 and self._binary is not None:
@@ -140,7 +145,7 @@ class Document:
             self._buffers[index] = np.frombuffer(data, dtype=np.uint8)[:max(buffer.byteLength, 0)]
         return self._buffers[index]
 
-    def resource(self, uri: str, place: str) -> bytes:
+    def resource(self, uri: str, place: str) -> bytes | bytearray:
         """The bytes behind a data: URI or a relative path; nothing outside of the glTF file's folder is read."""
         if uri[:5].lower() == "data:":
             with at(place):
@@ -152,9 +157,9 @@ class Document:
             raise InputError(f"cannot read {name!r}: {str(error).removeprefix('cannot be read: ')}", None, place) from None
 
 
-def _read_container(path: Path) -> tuple[Any, bytes | None]:
+def _read_container(path: Path) -> tuple[Any, bytes | memoryview | None]:
     """The parsed JSON and the binary chunk of a .gltf or .glb file; the first bytes tell which it is."""
-    data = read_file(path, BYTES_OF_GLB)
+    data = read_file(path)
     if data[:4] == GLB_MAGIC:
         return _read_glb(data)
     if path.suffix.lower() == ".glb":
@@ -162,7 +167,7 @@ def _read_container(path: Path) -> tuple[Any, bytes | None]:
     return _parse_json(data), None
 
 
-def _read_glb(data: bytes) -> tuple[Any, bytes | None]:
+def _read_glb(data: bytes) -> tuple[Any, bytes | memoryview | None]:
     if len(data) < 20:
         raise InputError(f"is truncated: a .glb file starts with 20 bytes, this one has {len(data)}", None, "header")
     version, length = struct.unpack_from("<II", data, 4)
@@ -171,23 +176,26 @@ def _read_glb(data: bytes) -> tuple[Any, bytes | None]:
     if length > len(data):
         raise InputError(f"is truncated: {length} bytes according to its header, but there are {len(data)}", None,
                          "header.length")
-    chunks: list[tuple[int, bytes]] = []
+    chunks: list[tuple[int, memoryview]] = []
     offset = 12
     while offset + 8 <= length:
         size, kind = struct.unpack_from("<II", data, offset)
         if offset + 8 + size > length:
             raise InputError(f"is truncated: it ends at byte {offset + 8 + size}, the file at {length}", None,
                              f"chunk {len(chunks)}")
-        chunks.append((kind, data[offset + 8:offset + 8 + size]))
+        if len(chunks) < 2:  # there are no others that mean anything
+            chunks.append((kind, memoryview(data)[offset + 8:offset + 8 + size]))
         offset += 8 + size
     if not chunks or chunks[0][0] != _CHUNK_JSON:
         raise InputError("must be JSON", None, "chunk 0")
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == _CHUNK_BIN else None
-    return _parse_json(chunks[0][1]), binary
+    return _parse_json(bytes(chunks[0][1])), binary
 
 
 def _parse_json(data: bytes) -> Any:
-    require(BYTES_OF_JSON * len(data) + BYTES_OF_OBJECT * data.count(b"{"), "the JSON")
+    ascii_only = data.isascii() and b"\\u" not in data
+    marks = sum(size * data.count(mark) for mark, size in BYTES_OF_MARK.items())
+    require((BYTES_OF_ASCII if ascii_only else BYTES_OF_JSON) * len(data) + marks, "the JSON")
 
     def refuse(constant: str) -> None:
         raise InputError(f"is not valid JSON: it holds {constant}")
@@ -225,17 +233,32 @@ def _check_required_extensions(required: Iterable[str]) -> None:
                          "extensionsRequired")
 
 
-def _decode_data_uri(uri: str) -> bytes:
-    header, comma, payload = uri[5:].partition(",")
-    if not comma:
+def _decode_data_uri(uri: str) -> bytes | bytearray:
+    comma = uri.find(",")
+    if comma < 0:
         raise InputError("is a data: URI without a comma")
-    data = unquote_to_bytes(payload)
-    if not header.lower().endswith(";base64"):
-        return data
+    is_base64 = uri[:comma].lower().endswith(";base64")
+    if is_base64 and "%" not in uri:
+        return _decode_base64(uri, comma + 1)
+    escapes = uri.count("%")
+    require(3.0 * len(uri) + BYTES_OF_PERCENT * escapes, f"a data: URI of {len(uri)} characters")
+    data = unquote_to_bytes(uri[comma + 1:])
+    return _decode_base64(data.decode("latin-1"), 0) if is_base64 else data
+
+
+def _decode_base64(text: str, begin: int) -> bytearray:
+    """What stands behind `begin`, piece by piece: it may be most of the memory."""
+    require(0.75 * (len(text) - begin), f"a data: URI of {len(text)} characters")
+    end = len(text) - 2 if text.endswith("==") else len(text) - 1 if text.endswith("=") else len(text)
+    data = bytearray()
     try:
-        return base64.b64decode(data, validate=True)
+        if text.find("=", begin, end) >= 0:
+            raise ValueError("a = that is not at its end")
+        for first in range(begin, len(text), BASE64_AT_ONCE):
+            data += base64.b64decode(text[first:first + BASE64_AT_ONCE], validate=True)
     except (binascii.Error, ValueError) as error:
         raise InputError(f"is a data: URI that cannot be decoded: {error}") from None
+    return data
 
 
 def _local_name(uri: str, place: str) -> str:

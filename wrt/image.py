@@ -21,7 +21,8 @@ import numpy as np
 from wrt import write_file
 from wrt.errors import InputError, SceneWarning
 from wrt.image_decode import FORMATS as FORMATS_READ
-from wrt.image_decode import check_size, decode_png16, decode_rgba8, png_texts
+from wrt.image_decode import check_size, decode_png16, decode_rgba8, png_texts, size_of
+from wrt.memory import require
 from wrt.read_file import open_regular, read_file
 from wrt.tonemap import decode_srgb, to_codes
 from wrt.write_file import replacing
@@ -37,6 +38,7 @@ PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _MAGIC = {".exr": (b"\x76\x2f\x31\x01",), ".hdr": (b"#?RADIANCE", b"#?RGBE")}
 MAX_LINEAR_PIXELS = 1 << 28  # of an environment: 24576x10922, or 16384x16384
 HALF_MAX = 65504.0
+BYTES_OF_PIXEL = 13.0  # of memory, of a picture of colours
 EXACT_IN_FLOAT = 1 << 24  # every integer up to here is a float32
 
 
@@ -232,8 +234,26 @@ def read_image(path: PathLike) -> np.ndarray:
     with _told(path):
         deep = data[:8] == PNG_MAGIC and data[24:25] == b"\x10"
         codes = decode_png16(data) if deep else decode_rgba8(data, _formats(path))[..., :3]
+        require(BYTES_OF_PIXEL * codes.shape[0] * codes.shape[1], f"a picture of {codes.shape[1]}x{codes.shape[0]}")
+    del data
     levels = np.iinfo(codes.dtype).max
-    return decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)[codes]
+    table = decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)
+    pixels = np.empty(codes.shape, np.float32)
+    for row, line in zip(pixels, codes, strict=True):  # at once, NumPy would make indices of eight bytes of all codes
+        row[:] = table[line]
+    return pixels
+
+
+def picture_size(path: PathLike) -> tuple[int, int]:
+    """Width and height of the picture that `read_image` would read, from the file's header. Raises InputError as it does."""
+    if Path(path).suffix.lower() in LINEAR_SUFFIXES:
+        with _opened(path) as source:
+            return source.spec().width, source.spec().height
+    if Path(path).suffix.lower() not in DISPLAY_SUFFIXES:
+        read_image(path)  # says why not
+    data = _read(path)
+    with _told(path):
+        return size_of(data, _formats(path))
 
 
 def read_rgba8(source: PathLike | bytes, name: str = "") -> np.ndarray:
@@ -256,7 +276,7 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
     with _opened(path) as source:
         spec = source.spec()
         with _told(path):
-            check_size(spec.width, spec.height, 8.0 * spec.nchannels, MAX_LINEAR_PIXELS)
+            check_size(spec.width, spec.height, 8.0 * spec.nchannels + BYTES_OF_PIXEL, MAX_LINEAR_PIXELS)
         if spec.depth > 1 or spec.deep:
             raise InputError("cannot be read as an image: it has no flat pixels", path)
         pixels = source.read_image("float")

@@ -18,7 +18,8 @@ from wrt.memory import require
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF")
 MAX_SIDE = 32768  # pixels
 MAX_PIXELS = 1 << 27  # of codes: 16384x8192
-BYTES_OF_PIXEL = 12.0  # while it is decoded: Pillow's picture, its copy as RGBA, and the array
+# Of memory while it is decoded: Pillow's picture, its copy as RGBA, its bytes and the array; at 16 bits, two pictures and codes.
+BYTES_OF_PIXEL, BYTES_OF_PIXEL16 = 16.0, 24.0
 
 
 def check_size(width: int, height: int, bytes_of_pixel: float, most: int = MAX_PIXELS) -> None:
@@ -48,7 +49,7 @@ def decode_png16(data: bytes) -> np.ndarray:
     Pillow keeps only one byte of each channel of a colour picture: the high one, or the low one where it is told that the file has
     the other order. Grey with alpha has four bytes a pixel: as RGBA, they come all.
     """
-    with _opened(data, ("PNG",)) as picture:
+    with _opened(data, ("PNG",), BYTES_OF_PIXEL16) as picture:
         order = picture.tile[0][3] if picture.tile else ""
         if picture.mode.startswith("I"):
             return np.repeat(np.asarray(picture).astype(np.uint16)[..., None], 3, axis=2)
@@ -60,11 +61,20 @@ def decode_png16(data: bytes) -> np.ndarray:
             with _opened(data, ("PNG",)) as other:
                 other.tile = [(*tile[:3], str(tile[3]).replace(";16B", ";16L")) for tile in other.tile]
                 low = np.asarray(other)[..., :3]
-        return high.astype(np.uint16) << 8 | low
+        codes = high.astype(np.uint16)
+        codes <<= 8
+        codes |= low
+        return codes
+
+
+def size_of(data: bytes, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
+    """Width and height that an encoded picture has by its header. Raises InputError as decode_rgba8 does."""
+    with _opened(data, formats) as picture:
+        return picture.size
 
 
 @contextmanager
-def _opened(data: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
+def _opened(data: bytes, formats: tuple[str, ...], bytes_of_pixel: float = BYTES_OF_PIXEL) -> Iterator[Any]:
     """The picture, whose pixels are decoded when they are asked for."""
     from PIL import Image, UnidentifiedImageError
 
@@ -73,7 +83,7 @@ def _opened(data: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of pictures above half of Pillow's own limit, of metadata that nobody asks for
             with Image.open(io.BytesIO(data), formats=[name for name in formats if name in Image.OPEN]) as picture:
-                check_size(*picture.size, BYTES_OF_PIXEL)
+                check_size(*picture.size, bytes_of_pixel)
                 yield picture
     except InputError:
         raise

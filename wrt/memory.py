@@ -1,7 +1,8 @@
 """How much memory can still be had, and the refusal of work that would take more.
 
 What is free is the smallest of what the system calls available, what the control groups of this process leave it, and its own
-limit of address space. The environment variable WRT_MEMORY ("24G", or bytes) is taken in its place, for more or for less.
+limit of address space. The environment variable WRT_MEMORY ("24G", or bytes) is taken in its place, for more or for less: it is
+what this process may take in all, so that free is what of it has not been taken yet.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ _GROUPS = {"": (Path("/sys/fs/cgroup"), "memory.max", "memory.current", "inactiv
 
 
 def available() -> float:
-    """Bytes of main memory that this process can still take; infinite where the system does not tell. Raises InputError for a
-    WRT_MEMORY that is no size."""
+    """Bytes of main memory that this process can still take; infinite where the system does not tell. What has been taken of
+    WRT_MEMORY is what is resident beyond what was when wrt was imported; 0 where the system does not tell that. Raises InputError
+    for a WRT_MEMORY that is no size."""
     if text := os.environ.get("WRT_MEMORY"):
         match = re.fullmatch(r"\s*([0-9]{1,15}(?:\.[0-9]*)?)\s*([KMGT]?)(?:i?B)?\s*", text, re.IGNORECASE)
         if match is None:
             raise InputError(f"must be a number of bytes such as 24G, got {text!r}", None, "WRT_MEMORY")
-        return float(match[1]) * UNITS[match[2].upper()]
+        return max(0.0, float(match[1]) * UNITS[match[2].upper()] - max(0.0, resident() - _AT_START))
     return min(_of_system(), _of_groups(), address_space())
 
 
@@ -49,6 +51,17 @@ class Meter:
         if self._taken > SMALL:
             require(self._taken, what)
             self._taken = 0.0
+
+
+def resident() -> float:
+    """Bytes of main memory that this process has now; 0 where the system does not tell."""
+    try:
+        return float(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError, IndexError):
+        return 0.0
+
+
+_AT_START = resident()
 
 
 def gib(size: float) -> str:

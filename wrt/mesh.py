@@ -15,11 +15,15 @@ import numpy as np
 
 from wrt.arguments import LARGEST, as_array, as_path, shown
 from wrt.errors import InputError, SceneWarning
+from wrt.memory import require
 from wrt.mesh_clean import clean
 from wrt.tables import html_facts
 
 if TYPE_CHECKING:
     import trimesh
+
+
+BYTES_OF_FACE, BYTES_OF_VERTEX = 60.0, 100.0  # of memory, measured: of a file's mesh while it becomes a Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +202,7 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
     if parts:
         groups, face_group = _part_groups(parts, len(raw.faces), path)
 
+    require(BYTES_OF_FACE * len(raw.faces) + BYTES_OF_VERTEX * len(raw.vertices), "the mesh")
     cleaned = clean(raw.vertices, raw.faces, raw.normals, raw.uvs, face_group)
     if len(cleaned.faces) == 0:
         raise InputError(f"none of its {len(raw.faces)} triangles has any area", path)

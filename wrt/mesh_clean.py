@@ -50,11 +50,11 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     if not used.all():
-        faces = (np.cumsum(used) - 1)[faces]
+        faces = (np.cumsum(used, dtype=np.int32) - np.int32(1))[faces]
         vertices = vertices[used]
         normals = normals[used] if normals is not None else None
         uvs = uvs[used] if uvs is not None else None
-    return Cleaned(vertices, faces.astype(np.int32), normals, uvs, face_group, dropped)
+    return Cleaned(vertices, faces.astype(np.int32, copy=False), normals, uvs, face_group, dropped)
 
 
 def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -153,6 +153,13 @@ def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
 
 def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of faces without area, those with corners in three places; the ends (N, 2) of their longest edge; the third corner."""
+    parts = [_longest_edges_of_few(vertices, faces, flat[first:first + AT_ONCE]) for first in range(0, max(len(flat), 1), AT_ONCE)]
+    flat, ends, middle = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return flat, ends, middle
+
+
+def _longest_edges_of_few(vertices: np.ndarray, faces: np.ndarray,
+                          flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     corners = vertices[faces[flat]].astype(np.float64)
     edges = np.stack([corners[:, (i + 2) % 3] - corners[:, (i + 1) % 3] for i in range(3)], axis=1)  # opposite of corner i
     apart = (edges != 0.0).any(axis=2).all(axis=1)

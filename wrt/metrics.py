@@ -6,17 +6,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from wrt.errors import InputError
+from wrt.memory import require
 from wrt.tonemap import encode_srgb, luminance, tone_map
 
 RELMSE_EPS = 0.01
 PIXELS_PER_DEGREE = 3840 * math.pi / 180  # FLIP's default: a screen 3840 pixels wide, seen from as far as it is wide
 HIGHER_IS_BETTER = ("psnr",)
+PIXELS_AT_ONCE, LEAST_ROWS = 1 << 17, 16  # of a band of rows
+# Of memory, measured: of a pixel of one picture; of a pixel in a comparison beside both pictures; of one of a band.
+BYTES_OF_PICTURE, BYTES_OF_PIXEL, BYTES_IN_BAND = 12.0, 26.0, 400.0
 
 
 def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str = "none") -> dict[str, Any]:
@@ -32,30 +36,89 @@ def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str
     InputError where the sizes differ.
     """
     a, b = _pair(a, b)
-    finite = np.isfinite(a).all(axis=-1) & np.isfinite(b).all(axis=-1)
-    same = ((a == b) | (np.isnan(a) & np.isnan(b))).all(axis=-1)
-    result: dict[str, Any] = {
-        "pixels": int(finite.size),
-        "nonfinite_a": int((~np.isfinite(a)).any(axis=-1).sum()),
-        "nonfinite_b": int((~np.isfinite(b)).any(axis=-1).sum()),
-        "nonfinite_differ": int((~finite & ~same).sum()),
-    }
+    require(bytes_to_compare(a.shape[1], a.shape[0]), f"the comparison of two pictures of {a.shape[1]}x{a.shape[0]}")
+    finite, result = _finite(a, b)
     if not finite.any():
         return result | dict.fromkeys(("mse", "relmse", "max_abs", "mean_ratio", "psnr", "flip"), math.nan)
-    # Pixels that are left out become black in both: FLIP, which filters over neighbours, then sees no difference there.
-    a, b = (np.where(finite[..., None], image, np.float32(0.0)) for image in (a, b))
-    x, y = a[finite].astype(np.float64), b[finite].astype(np.float64)
-    shown_a, shown_b = (tone_map(image, exposure, tonemap) for image in (a, b))
-    shown_error = encode_srgb(shown_a[finite].astype(np.float64)) - encode_srgb(shown_b[finite].astype(np.float64))
-    shown_mse = float(np.mean(shown_error**2))
+
+    def linear(rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        x, y = (image[rows][finite[rows]].astype(np.float64) for image in (a, b))
+        return x, y
+
+    def shown(rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        # Pixels that are left out are black in both: FLIP, which filters over neighbours, then sees no difference there.
+        x, y = (tone_map(np.where(finite[rows][..., None], image[rows], np.float32(0.0)), exposure, tonemap) for image in (a, b))
+        return x, y
+
+    def shown_error(rows: slice) -> np.ndarray:
+        x, y = (encode_srgb(image[finite[rows]].astype(np.float64)) for image in shown(rows))
+        return x - y
+
+    flip = _FlipRows(a.shape[0], shown)
+    count = int(np.count_nonzero(finite))
+    values = np.empty(3 * count)
+
+    def mean(of: Callable[[slice], np.ndarray], length: int = 3 * count) -> float:
+        """Of all values, which `of` gives for a band; all at once, so that they are summed in the same order whatever the bands."""
+        begin = 0
+        for rows in _bands(finite):
+            part = of(rows).reshape(-1)
+            values[begin:begin + len(part)] = part
+            begin += len(part)
+        return float(np.mean(values[:length]))
+
+    def squared(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return (x - y) ** 2
+
+    def relative(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return (x - y) ** 2 / (y**2 + RELMSE_EPS)
+
+    shown_mse = mean(lambda rows: shown_error(rows) ** 2)
     return result | {
-        "mse": float(np.mean((x - y) ** 2)),
-        "relmse": float(np.mean((x - y) ** 2 / (y**2 + RELMSE_EPS))),
-        "max_abs": float(np.abs(x - y).max()),
-        "mean_ratio": _ratio(float(x.mean()), float(y.mean())),
+        "mse": mean(lambda rows: squared(*linear(rows))),
+        "relmse": mean(lambda rows: relative(*linear(rows))),
+        "max_abs": max(float(np.abs(x - y).max(initial=0.0)) for x, y in map(linear, _bands(finite))),
+        "mean_ratio": _ratio(mean(lambda rows: linear(rows)[0]), mean(lambda rows: linear(rows)[1])),
         "psnr": -10.0 * math.log10(shown_mse) if shown_mse > 0.0 else math.inf,
-        "flip": float(flip_map(shown_a, shown_b)[finite].mean()),
+        "flip": mean(lambda rows: flip(rows)[finite[rows]], count),
     }
+
+
+def check_sizes(a: tuple[int, int], b: tuple[int, int]) -> None:
+    """Raise InputError where two pictures of such widths and heights cannot be compared, or not in the memory that there is, before
+    they are read."""
+    if a != b:
+        raise InputError(f"the pictures have different sizes, {a[0]}x{a[1]} and {b[0]}x{b[1]}")
+    require(2.0 * BYTES_OF_PICTURE * a[0] * a[1] + bytes_to_compare(*a), f"the comparison of two pictures of {a[0]}x{a[1]}")
+
+
+def bytes_to_compare(width: int, height: int) -> float:
+    """Memory that `compare` and `difference_image` take at most beside the pictures."""
+    rows = max(LEAST_ROWS, PIXELS_AT_ONCE // width) + 2 * FLIP_REACH
+    return BYTES_OF_PIXEL * width * height + BYTES_IN_BAND * width * min(rows, height)
+
+
+def _bands(picture: np.ndarray) -> Iterator[slice]:
+    """Whole rows, some hundred thousand pixels at a time."""
+    height, width = picture.shape[:2]
+    rows = max(LEAST_ROWS, PIXELS_AT_ONCE // width)
+    for begin in range(0, height, rows):
+        yield slice(begin, min(begin + rows, height))
+
+
+def _finite(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+    """(H, W) whether both are, and how many pixels are not."""
+    finite = np.empty(a.shape[:2], dtype=bool)
+    counts = dict.fromkeys(("nonfinite_a", "nonfinite_b", "nonfinite_differ"), 0)
+    for rows in _bands(finite):
+        x, y = a[rows], b[rows]
+        in_a, in_b = np.isfinite(x).all(axis=-1), np.isfinite(y).all(axis=-1)
+        finite[rows] = in_a & in_b
+        same = ((x == y) | (np.isnan(x) & np.isnan(y))).all(axis=-1)
+        counts["nonfinite_a"] += int((~in_a).sum())
+        counts["nonfinite_b"] += int((~in_b).sum())
+        counts["nonfinite_differ"] += int((~finite[rows] & ~same).sum())
+    return finite, {"pixels": int(finite.size), **counts}
 
 
 def failures(result: Mapping[str, Any], limits: Mapping[str, float | None]) -> list[str]:
@@ -89,8 +152,7 @@ def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
             raise InputError(f"a picture must be (H, W, 3), got {image.shape}")
     if a.shape != b.shape:
-        sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in (a, b))
-        raise InputError(f"the pictures have different sizes, {sizes}")
+        check_sizes(a.shape[1::-1], b.shape[1::-1])
     return a, b
 
 
@@ -126,6 +188,33 @@ def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER
     a, b: (H, W, 3) display-linear in [0, 1] (`tone_map`, or a decoded PNG), finite; the order does not matter.
     pixels_per_degree: of the visual angle. Source: Andersson et al. 2020 (see above).
     """
+    flip = _FlipRows(len(a), lambda rows: (a[rows], b[rows]), pixels_per_degree)
+    result = np.empty(a.shape[:2])
+    for rows in _bands(result):
+        result[rows] = flip(rows)
+    return result
+
+
+class _FlipRows:
+    """FLIP of some rows of two pictures of that height, of which `shown` gives rows: each pixel's is a matter of its neighbours."""
+
+    def __init__(self, height: int, shown: Callable[[slice], tuple[np.ndarray, np.ndarray]],
+                 pixels_per_degree: float = PIXELS_PER_DEGREE) -> None:
+        self.height, self.shown, self.pixels_per_degree = height, shown, pixels_per_degree
+
+    def __call__(self, rows: slice) -> np.ndarray:
+        reach = _flip_reach(self.pixels_per_degree)
+        begin, end = max(0, rows.start - reach), min(self.height, rows.stop + reach)
+        result = _flip(*self.shown(slice(begin, end)), self.pixels_per_degree)
+        return result[rows.start - begin:rows.stop - begin]
+
+
+def _flip_reach(pixels_per_degree: float) -> int:
+    """Pixels to the farthest neighbour that counts."""
+    return max(_blur_radius(pixels_per_degree), math.ceil(3.0 * _feature_sigma(pixels_per_degree)))
+
+
+def _flip(a: np.ndarray, b: np.ndarray, pixels_per_degree: float) -> np.ndarray:
     opponent = [np.clip(image, 0.0, 1.0) @ RGB_TO_OPPONENT.T + OPPONENT_OFFSET for image in (a, b)]
     color = _color_difference(*(_perceived_lab(image, pixels_per_degree) for image in opponent))
     lightness = [(image[..., 0] + 16.0) / 116.0 for image in opponent]
@@ -144,8 +233,7 @@ def _perceived_lab(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray
 
 def _blur(image: np.ndarray, terms: tuple[tuple[float, float], ...], pixels_per_degree: float) -> np.ndarray:
     """A sum of Gaussians a sqrt(pi / b) exp(-pi^2 r^2 / b), r in degrees, of total weight 1; edges are repeated."""
-    widest = max(b for terms in CONTRAST_SENSITIVITY for _, b in terms)
-    radius = math.ceil(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * pixels_per_degree)
+    radius = _blur_radius(pixels_per_degree)
     degrees = np.arange(-radius, radius + 1) / pixels_per_degree
     result, total = np.zeros(image.shape), 0.0
     for a, b in terms:
@@ -155,6 +243,11 @@ def _blur(image: np.ndarray, terms: tuple[tuple[float, float], ...], pixels_per_
         result += weight * _separable(image, kernel, kernel)
         total += weight
     return result / total
+
+
+def _blur_radius(pixels_per_degree: float) -> int:
+    widest = max(b for terms in CONTRAST_SENSITIVITY for _, b in terms)
+    return math.ceil(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * pixels_per_degree)
 
 
 def _separable(image: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
@@ -189,13 +282,20 @@ def _color_difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _features(lightness: np.ndarray, pixels_per_degree: float) -> tuple[np.ndarray, np.ndarray]:
     """How much of an edge and of a point is at each pixel: the size of the first and second Gaussian derivatives."""
-    sigma = 0.5 * FEATURE_WIDTH * pixels_per_degree
+    sigma = _feature_sigma(pixels_per_degree)
     x = np.arange(-math.ceil(3.0 * sigma), math.ceil(3.0 * sigma) + 1.0)
     gauss = np.exp(-(x**2) / (2.0 * sigma**2))
     edge, point = (_balance(kernel) for kernel in (-x * gauss, (x**2 / sigma**2 - 1.0) * gauss))
     gauss /= gauss.sum()
     return (np.hypot(_separable(lightness, edge, gauss), _separable(lightness, gauss, edge)),
             np.hypot(_separable(lightness, point, gauss), _separable(lightness, gauss, point)))
+
+
+def _feature_sigma(pixels_per_degree: float) -> float:
+    return 0.5 * FEATURE_WIDTH * pixels_per_degree
+
+
+FLIP_REACH = _flip_reach(PIXELS_PER_DEGREE)
 
 
 def _balance(kernel: np.ndarray) -> np.ndarray:
@@ -247,18 +347,26 @@ def difference_image(a: np.ndarray, b: np.ndarray, *, limit: float | None = None
     Raises InputError where the sizes differ.
     """
     a, b = _pair(a, b)
-    with np.errstate(invalid="ignore"):  # inf - inf
-        difference = np.where((a == b) | (np.isnan(a) & np.isnan(b)), np.float32(0.0), a - b)
-    finite = np.all(np.isfinite(difference), axis=-1)
-    held = np.where(finite[..., None], difference, np.float32(0.0))
-    signed = np.take_along_axis(held, np.abs(held).argmax(axis=-1)[..., None], axis=-1)[..., 0]
+    require(bytes_to_compare(a.shape[1], a.shape[0]), f"the difference of two pictures of {a.shape[1]}x{a.shape[0]}")
+    height, width = a.shape[:2]
+    signed, finite = np.empty((height, width), np.float32), np.empty((height, width), dtype=bool)
+    for rows in _bands(signed):
+        x, y = a[rows], b[rows]
+        with np.errstate(invalid="ignore"):  # inf - inf
+            difference = np.where((x == y) | (np.isnan(x) & np.isnan(y)), np.float32(0.0), x - y)
+        finite[rows] = np.all(np.isfinite(difference), axis=-1)
+        held = np.where(finite[rows][..., None], difference, np.float32(0.0))
+        signed[rows] = np.take_along_axis(held, np.abs(held).argmax(axis=-1)[..., None], axis=-1)[..., 0]
     if limit is None:
         sizes = np.abs(signed[finite])
         limit = float(np.quantile(sizes, 0.999) or sizes.max()) if sizes.size else 0.0
     scale = limit if limit > 0.0 else 1.0
-    picture = _heat(signed / scale)
-    picture[~finite] = NONFINITE_COLOR
-    return np.concatenate([picture, _bar(picture.shape[1], scale)])
+    picture = np.empty((height + BAR_HEIGHT, width, 3), np.uint8)
+    for rows in _bands(signed):
+        picture[rows] = _heat(signed[rows] / scale)
+    picture[:height][~finite] = NONFINITE_COLOR
+    picture[height:] = _bar(width, scale)
+    return picture
 
 
 def _heat(share: np.ndarray) -> np.ndarray:

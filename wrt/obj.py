@@ -8,8 +8,13 @@ scene file refers to.
 
 from __future__ import annotations
 
+import io
 import os
-from itertools import chain
+import re
+from array import array
+from collections import defaultdict
+from collections.abc import Iterator
+from itertools import chain, count
 from pathlib import Path
 from typing import NoReturn
 
@@ -17,13 +22,18 @@ import numpy as np
 
 from wrt.arguments import short
 from wrt.errors import InputError
+from wrt.memory import Meter, require
 from wrt.mesh import RawMesh
 from wrt.polygons import triangulate
 from wrt.read_file import read_file
 
 # What stands in a corner `v/vt/vn`, and how many numbers of a line of it are kept.
 _KEEP = {"v": 3, "vt": 2, "vn": 3}
-BYTES_OF_TEXT = 25.0  # of memory that a byte of the file takes, measured on meshes
+# Of memory, at most, measured: what a byte of the file takes while it is read, and a name or a corner that is like no other before.
+BYTES_OF_TEXT, BYTES_OF_NAME = 8.0, 300.0
+BYTES_OF_VERTEX, BYTES_OF_CORNER = 150.0, 8.0  # in arrays
+WORDS_AT_ONCE = 1 << 16  # as text; then they are numbers, which take a tenth of the memory
+_SPACE = re.compile(r"\s")
 _CORNER = "face corner {} is not v, v/vt, v//vn or v/vt/vn"
 
 
@@ -32,35 +42,50 @@ class _Text:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.numbers: dict[str, list[str]] = {key: [] for key in _KEEP}
-        self.lines: dict[str, list[int]] = {key: [] for key in _KEEP}
-        self.corners: list[str] = []
-        self.counts: list[int] = []
-        self.face_lines: list[int] = []
-        # of each keyword: (number of the first polygon, name) of every span
-        self.spans: dict[str, list[tuple[int, str]]] = {"usemtl": [], "g": [], "o": []}
+        self.numbers = {key: array("d") for key in _KEEP}
+        self.lines = {key: array("q") for key in _KEEP}
+        self.counts, self.face_lines = array("q"), array("q")
+        # Every different corner by its text, numbered as they come, and which one each corner is.
+        self.different: dict[str, int] = defaultdict(count().__next__)
+        self.corners = array("i")
+        # Of each keyword: every different name, numbered as they come, and of every span the first polygon and which name it has.
+        self.names: dict[str, dict[str, int]] = {key: defaultdict(count().__next__) for key in ("usemtl", "g", "o")}
+        self.spans = {key: (array("q"), array("i")) for key in self.names}
+        self._new_numbers: dict[str, list[str]] = {key: [] for key in _KEEP}
+        self._new_corners: list[str] = []
+        self._meter, self._metered = Meter(), 0
 
     def fail(self, line: int, message: str) -> NoReturn:
         raise InputError(message, self.path, f"line {line}")
 
-    def read(self, text: str) -> None:
-        pending = ""
-        for number, line in enumerate(text.split("\n"), 1):
-            if pending:
-                line, pending = pending + line, ""
-            if line.endswith("\\"):
-                pending = line[:-1] + " "
+    def read(self, data: bytes) -> None:
+        pending = io.StringIO()  # lines that the next one continues: a string would be copied with each
+        number = 0
+        for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace"), 1):
+            if line.endswith(("\\\n", "\\")):
+                pending.write(line.removesuffix("\n")[:-1] + " ")
                 continue
-            words = line.partition("#")[0].split() if "#" in line else line.split()
-            if not words:
-                continue
-            key = words[0]
-            if key in _KEEP:
-                self._numbers(key, words, number)
-            elif key == "f":
-                self._face(words[1:], number)
-            elif key in self.spans:
-                self.spans[key].append((len(self.counts), line.split(None, 1)[1].strip() if len(words) > 1 else ""))
+            if pending.tell():
+                line = pending.getvalue() + line
+                pending = io.StringIO()
+            self._line(line, number)
+        self._line(pending.getvalue(), number)
+        for key in _KEEP:
+            self._to_numbers(key)
+        self._to_indices()
+
+    def _line(self, line: str, number: int) -> None:
+        words = (line.partition("#")[0] if "#" in line else line).split(None, WORDS_AT_ONCE)
+        if not words:
+            return
+        key = words[0]
+        if key in _KEEP:
+            self._numbers(key, words, number)
+        elif key == "f":
+            rest = words.pop() if len(words) > WORDS_AT_ONCE else ""
+            self._face(words[1:], rest, number)
+        elif key in self.names:
+            self._span(key, line.split(None, 1)[1].strip() if len(words) > 1 else "")
 
     def _numbers(self, key: str, words: list[str], line: int) -> None:
         keep = _KEEP[key]
@@ -69,15 +94,61 @@ class _Text:
             if key != "vt" or not given:
                 self.fail(line, f"{key} needs {keep} numbers, got {len(given)}")
             given = [*given, "0"]  # a 1D texture coordinate
-        self.numbers[key] += given
+        self._new_numbers[key] += given
         self.lines[key].append(line)
+        if len(self._new_numbers[key]) > WORDS_AT_ONCE:
+            self._to_numbers(key)
 
-    def _face(self, corners: list[str], line: int) -> None:
-        if any("-" in corner for corner in corners):
-            corners = [self._absolute(corner, line) for corner in corners]
-        self.corners += corners
-        self.counts.append(len(corners))
+    def _to_numbers(self, key: str) -> None:
+        words, done = self._new_numbers[key], len(self.numbers[key])
+        try:
+            self.numbers[key].extend(map(float, words))
+        except ValueError:
+            bad = len(self.numbers[key])  # those before it are in
+            line = self.lines[key][bad // _KEEP[key]]
+            self.fail(line, f"{key} holds {short(words[bad - done])}, which is not a number")
+        words.clear()
+
+    def _face(self, corners: list[str], rest: str, line: int) -> None:
+        """rest: further corners, not yet taken apart."""
+        self._corners(corners, line)
+        total = len(corners)
+        for part in _parts(rest):
+            corners = part.split()
+            self._corners(corners, line)
+            total += len(corners)
+        self.counts.append(total)
         self.face_lines.append(line)
+
+    def _corners(self, corners: list[str], line: int) -> None:
+        if "-" in "".join(corners):
+            corners = [self._absolute(corner, line) for corner in corners]
+        self._new_corners += corners
+        if len(self._new_corners) > WORDS_AT_ONCE:
+            self._to_indices()
+
+    def _to_indices(self) -> None:
+        self.corners.extend(map(self.different.__getitem__, self._new_corners))
+        self._new_corners.clear()
+        self._count_names()
+
+    def _count_names(self) -> None:
+        """Ask for memory for the names and corners that were not known before."""
+        known = len(self.different) + sum(map(len, self.names.values()))
+        self._meter.take(BYTES_OF_NAME * (known - self._metered), "the mesh")
+        self._metered = known
+
+    def _span(self, key: str, name: str) -> None:
+        starts, which = self.spans[key]
+        known = len(self.names[key])
+        number = self.names[key][name]
+        if starts and starts[-1] == len(self.counts):  # nothing is in the one before
+            which[-1] = number
+        else:
+            starts.append(len(self.counts))
+            which.append(number)
+        if number == known and known % 1024 == 0:
+            self._count_names()
 
     def _absolute(self, corner: str, line: int) -> str:
         """A corner with relative indices (-1 is the latest) in absolute ones (1 is the first)."""
@@ -99,31 +170,20 @@ class _Text:
 
     def array(self, key: str) -> np.ndarray:
         """(N, 2 or 3) float64 of all `key` lines."""
-        try:
-            values = np.fromiter(map(float, self.numbers[key]), np.float64, len(self.numbers[key]))
-        except ValueError:
-            keep = _KEEP[key]
-            for i, number in enumerate(self.numbers[key]):
-                try:
-                    float(number)
-                except ValueError:
-                    self.fail(self.lines[key][i // keep], f"{key} holds {short(number)}, which is not a number")
-            raise
-        return values.reshape(-1, _KEEP[key])
+        return np.frombuffer(self.numbers[key], np.float64).reshape(-1, _KEEP[key])
 
     def line_of_corner(self, corner: int) -> int:
         return self.face_lines[int(np.searchsorted(np.cumsum(self.counts), corner, side="right"))]
 
     def triples(self) -> tuple[np.ndarray, np.ndarray]:
-        """(U, 3) int64: every different corner as zero-based v, vt, vn (-1: not given); (C,) which one each corner is.
+        """(U, 3) int64: every different corner as zero-based v, vt, vn (-1: not given); (C,) int32 which one each corner is.
 
         They are sorted by v first, so that the vertices keep the order of the file.
         """
-        place = {corner: i for i, corner in enumerate(dict.fromkeys(self.corners))}
-        index = np.fromiter(map(place.__getitem__, self.corners), np.int64, len(self.corners))
-        different = np.zeros((len(place), 3), dtype=np.int64)
+        index = np.frombuffer(self.corners, np.int32)
+        different = np.zeros((len(self.different), 3), dtype=np.int64)
         keys = list(_KEEP)
-        for corner, i in place.items():
+        for i, corner in enumerate(self.different):
             for k, part in enumerate(corner.split("/")):
                 if k > 2 or (k == 0 and not part):
                     self.fail(self._first_line(index, i), _CORNER.format(short(corner)))
@@ -134,7 +194,7 @@ class _Text:
                         self.fail(self._first_line(index, i), f"face corner {short(corner)}: {keys[k]} index {part[:30]} is not "
                                                               f"in 1 to {len(self.lines[keys[k]])}")
         order = np.lexsort(different.T[::-1])
-        rank = np.empty(len(order), dtype=np.int64)
+        rank = np.empty(len(order), dtype=np.int32)
         rank[order] = np.arange(len(order))
         return different[order] - 1, rank[index]
 
@@ -144,16 +204,27 @@ class _Text:
     def groups(self) -> tuple[tuple[str, ...], np.ndarray | None]:
         """Names of the parts and the part of each polygon: by material, else by group, else by object; () where
         none."""
-        spans = next((self.spans[key] for key in ("usemtl", "g", "o") if self.spans[key]), [])
-        if not spans:
+        key = next((key for key, (starts, _) in self.spans.items() if starts), None)
+        if key is None:
             return (), None
-        starts = np.array([first for first, _ in spans])
-        names = list(dict.fromkeys(chain([""], (name for _, name in spans))))
+        starts, which = self.spans[key]
+        names = list(dict.fromkeys(chain([""], self.names[key])))
         number = {name: i for i, name in enumerate(names)}
-        numbers = np.array([0, *(number[name] for _, name in spans)])
+        renumbered = np.array([number[name] for name in self.names[key]])
+        numbers = np.concatenate([[0], renumbered[np.frombuffer(which, np.int32)]])
         polygon_group = numbers[np.searchsorted(starts, np.arange(len(self.counts)), side="right")]
         used, polygon_group = np.unique(polygon_group, return_inverse=True)
         return tuple(names[i] for i in used), polygon_group
+
+
+def _parts(text: str) -> Iterator[str]:
+    """Parts of a long line, cut between words."""
+    begin = 0
+    while begin < len(text):
+        space = _SPACE.search(text, begin + 4 * WORDS_AT_ONCE)
+        end = space.start() if space else len(text)
+        yield text[begin:end]
+        begin = end
 
 
 def read_obj(path: str | os.PathLike[str]) -> RawMesh:
@@ -166,9 +237,11 @@ def read_obj(path: str | os.PathLike[str]) -> RawMesh:
     number for numbers that are none, indices out of range and positions that are not finite.
     """
     text = _Text(Path(path))
-    text.read(read_file(path, BYTES_OF_TEXT).decode("utf-8", "replace").replace("\r\n", "\n").replace("\r", "\n"))
+    text.read(read_file(path, BYTES_OF_TEXT))
     positions = text.array("v")
+    require(BYTES_OF_VERTEX * len(text.different) + BYTES_OF_CORNER * len(text.corners), "the mesh")
     corner_triples, corners = text.triples()
+    text.different.clear()
     counts = np.array(text.counts, dtype=np.int64)
 
     with np.errstate(over="ignore"):
@@ -180,11 +253,14 @@ def read_obj(path: str | os.PathLike[str]) -> RawMesh:
 
     triangles, polygon = triangulate(corners, counts, vertices)
     groups, polygon_group = text.groups()
+    uvs, flipped = _gather(text.array("vt"), corner_triples[:, 1]), corner_triples[:, 1] >= 0
+    if uvs is not None:
+        uvs[flipped] = uvs[flipped] * (1.0, -1.0) + (0.0, 1.0)
     return RawMesh(
         vertices=vertices,
         faces=corners[triangles],
         normals=_gather(text.array("vn"), corner_triples[:, 2]),
-        uvs=_gather(text.array("vt") * (1.0, -1.0) + (0.0, 1.0), corner_triples[:, 1]),
+        uvs=uvs,
         groups=groups,
         face_group=polygon_group[polygon] if polygon_group is not None else None,
         incomplete=int(np.count_nonzero(counts < 3)),

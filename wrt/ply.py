@@ -1,4 +1,4 @@
-"""PLY files (Stanford polygon format), text and binary: positions, normals, texture coordinates, faces of any size.
+"""PLY files (Stanford polygon format), text and binary: positions, normals, texture coordinates, faces of any size, strips.
 
 Why not trimesh: measured with 5.2, it refuses binary files that mix triangles with other polygons ("unexpected
 length"), puts the second halves of all quads behind the first ones, and computes normals anew where a file has
@@ -8,6 +8,8 @@ texture coordinates.
 from __future__ import annotations
 
 import os
+import re
+from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -29,8 +31,11 @@ _SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # what a lis
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
-# Of memory, measured: what a byte of a text file takes at most, and what a value, or list, of rows that are read one by one does.
-BYTES_OF_TEXT, BYTES_OF_VALUE = 30.0, 200.0
+WORDS_AT_ONCE = 1 << 16  # of a text, before they become numbers
+# Of memory, at most, measured: a byte of a text file; a value, or list, of rows that are read one by one; a vertex; a corner.
+BYTES_OF_TEXT, BYTES_OF_VALUE, BYTES_OF_VERTEX, BYTES_OF_CORNER = 6.0, 300.0, 130.0, 30.0
+BYTES_OF_SPLIT = 150.0  # of a corner with texture coordinates of its own
+_SPACE = re.compile(rb"\s")
 
 
 class _Property(NamedTuple):
@@ -52,7 +57,8 @@ class _Element:
 
 def read_ply(path: str | os.PathLike[str]) -> RawMesh:
     """Read a PLY file's vertices and faces in the order of the file; faces with more than three corners are
-    triangulated.
+    triangulated. Behind the faces come the triangles of `tristrips`: lists of vertices, of which each makes a triangle with the two
+    before it, turned by turns so that all face one way; -1 begins a new strip.
 
     Vertex normals are nx, ny, nz; texture coordinates u, v (or s, t or texture_u, texture_v) of vertices, else
     `texcoord` lists of faces, for which a vertex is split where its faces disagree. Colours and other properties are
@@ -64,9 +70,14 @@ def read_ply(path: str | os.PathLike[str]) -> RawMesh:
     if "vertex" not in elements or not {"x", "y", "z"} <= elements["vertex"].values.keys():
         source.fail(f"holds no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")
     vertex = elements["vertex"].values
+    require(BYTES_OF_VERTEX * elements["vertex"].rows, "the mesh")
     with np.errstate(over="ignore", invalid="ignore"):
         vertices = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32)
     corners, counts, texcoord = _faces(source, elements.get("face"), len(vertices))
+    if "tristrips" in elements:
+        strips = _strips(source, elements["tristrips"], len(vertices))
+        corners, counts = np.concatenate([corners, strips]), np.concatenate([counts, np.full(len(strips) // 3, 3)])
+        texcoord = None  # strips have none
 
     referenced = np.zeros(len(vertices), dtype=bool)
     referenced[corners] = True
@@ -101,25 +112,57 @@ def _faces(source: _Source, face: _Element | None, vertices: int) -> tuple[np.nd
     None."""
     if face is None or face.rows == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64), None
-    name = next((name for name in _INDEX_NAMES if name in face.values), None)
-    if name is None:
-        source.fail(f"has no list {' or '.join(_INDEX_NAMES)}", "element face")
-    given, counts = face.values[name], face.counts[name]
-    with np.errstate(invalid="ignore"):
-        corners = given.astype(np.int64)
-    wrong = (corners < 0) | (corners >= vertices) | (corners != given)
-    if wrong.any():
-        where = int(np.argmax(wrong))
-        row = int(np.searchsorted(np.cumsum(counts), where, side="right"))
-        source.fail(f"index {given[where]:g}, but there are {vertices} vertices", f"face {row}")
+    given, counts = _indices(source, face)
+    corners = _within(source, given, counts, vertices, "face")
     texcoord = None
     if "texcoord" in face.values and (face.counts["texcoord"] == 2 * counts).all():
         texcoord = face.values["texcoord"].reshape(-1, 2).astype(np.float64)
     return corners, counts, texcoord
 
 
+def _strips(source: _Source, strips: _Element, vertices: int) -> np.ndarray:
+    """Corners of the triangles of all strips in a row (3 T,)."""
+    if strips.rows == 0:
+        return np.zeros(0, np.int64)
+    given, counts = _indices(source, strips)
+    ends = given == -1
+    indices = _within(source, np.where(ends, 0, given), counts, vertices, "tristrips")
+    # The strip of each place: lists and -1 part them.
+    first = np.zeros(len(given), dtype=bool)
+    first[(np.cumsum(counts) - counts)[counts > 0]] = True
+    first[1:] |= ends[:-1]
+    begin = np.flatnonzero(first)
+    strip = np.cumsum(first) - 1
+    last = np.arange(2, max(len(given), 2))
+    last = last[(strip[last] == strip[last - 2]) & ~ends[last]]
+    odd = (last - begin[strip[last]]) & 1  # every second triangle swaps two corners, so that all face one way
+    return indices[np.stack([last - 2, last - 1 + odd, last - odd], axis=1)].reshape(-1)
+
+
+def _indices(source: _Source, element: _Element) -> tuple[np.ndarray, np.ndarray]:
+    """The values of the element's lists of vertices, in a row, and how many are in each."""
+    name = next((name for name in _INDEX_NAMES if name in element.values), None)
+    if name is None:
+        source.fail(f"has no list {' or '.join(_INDEX_NAMES)}", f"element {element.name}")
+    require(BYTES_OF_CORNER * len(element.values[name]), "the mesh")
+    return element.values[name], element.counts[name]
+
+
+def _within(source: _Source, given: np.ndarray, counts: np.ndarray, vertices: int, kind: str) -> np.ndarray:
+    """The indices as integers. Raises InputError, with the number of the `kind`, for one that is no vertex's."""
+    with np.errstate(invalid="ignore"):
+        indices: np.ndarray = given.astype(np.int32 if vertices < 1 << 31 else np.int64)
+    wrong = (indices < 0) | (indices >= vertices) | (indices != given)
+    if wrong.any():
+        where = int(np.argmax(wrong))
+        row = int(np.searchsorted(np.cumsum(counts), where, side="right"))
+        source.fail(f"index {given[where]:g}, but there are {vertices} vertices", f"{kind} {row}")
+    return indices
+
+
 def _split(corners: np.ndarray, texcoord: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Make one vertex of each different (vertex, u, v): the vertex it comes from, the new corners, its uv."""
+    require(BYTES_OF_SPLIT * len(corners), "the mesh")
     order = np.lexsort((texcoord[:, 1], texcoord[:, 0], corners))
     rows = np.column_stack([corners, texcoord])[order]
     first = np.ones(len(rows), dtype=bool)
@@ -257,13 +300,17 @@ class _Text:
 
     def __init__(self, source: _Source, begin: int) -> None:
         require(BYTES_OF_TEXT * (len(source.data) - begin), "the mesh")
-        words = source.data[begin:].split()
-        self.at = 0
-        try:
-            self.numbers = np.fromiter(map(float, words), np.float64, len(words))
-        except ValueError:
-            line, word = _first_not_a_number(source.data, begin)
-            source.fail(f"{word!r} is not a number", f"line {line}")
+        numbers, self.at = array("d"), 0
+        while begin < len(source.data):
+            space = _SPACE.search(source.data, begin + 4 * WORDS_AT_ONCE)
+            end = space.start() if space else len(source.data)
+            try:
+                numbers.extend(map(float, source.data[begin:end].split()))
+            except ValueError:
+                line, word = _first_not_a_number(source.data, begin, end)
+                source.fail(f"{word!r} is not a number", f"line {line}")
+            begin = end
+        self.numbers = np.frombuffer(numbers, np.float64)
 
     def take(self, kind: str, count: int) -> np.ndarray | None:
         if self.at + count > len(self.numbers):
@@ -280,9 +327,9 @@ class _Text:
         return np.split(table, np.cumsum(widths)[:-1], axis=1)
 
 
-def _first_not_a_number(data: bytes, begin: int) -> tuple[int, str]:
-    """The line and the word; there must be one."""
-    for number, line in enumerate(data[begin:].split(b"\n"), data.count(b"\n", 0, begin) + 1):
+def _first_not_a_number(data: bytes, begin: int, end: int) -> tuple[int, str]:
+    """The line and the word, in these bytes; there must be one."""
+    for number, line in enumerate(data[begin:end].split(b"\n"), data.count(b"\n", 0, begin) + 1):
         for word in line.split():
             try:
                 float(word)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 
 import numpy as np
 
 from wrt.errors import InputError
+from wrt.memory import require
 
 MAX_CORNERS = 1 << 12  # of a concave polygon: the time grows with their square
+AT_ONCE = 1 << 16  # triangles
+BYTES_OF_TRIANGLE, BYTES_OF_POLYGON = 50.0, 100.0  # of memory, measured
 LOOKS = 2  # at all corners of a polygon that seems to have no ear
 
 
@@ -16,30 +20,31 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
     """Cut polygons into triangles, in the order of the polygons and with their winding.
 
     corners: (C,) integers, the vertex indices of all polygons in a row; counts: (P,) corners of each polygon;
-    vertices: (V, 3) positions. Returns (T, 3) int64 indices into `corners`, and (T,) int64, the polygon each triangle
+    vertices: (V, 3) positions. Returns (T, 3) integers, indices into `corners`, and (T,), the polygon each triangle
     is of. A polygon of n corners gives n - 2 triangles, one with fewer than three gives none. Convex polygons become
     the fan about their first corner. A polygon is concave where a triangle of that fan faces against the polygon's
     own area vector; it is projected along that vector and cut by ear clipping (Meisters 1975). Self-intersecting
     polygons have no right answer: they get triangles all the same. Raises InputError for a concave polygon of more than
-    MAX_CORNERS corners.
+    MAX_CORNERS corners, and where the memory does not suffice.
     """
-    counts = np.asarray(counts, dtype=np.int64)
-    start = np.cumsum(counts) - counts
+    counts, corners = np.asarray(counts, dtype=np.int64), np.asarray(corners)
     fan = np.maximum(counts - 2, 0)
-    polygon = np.repeat(np.arange(len(counts)), fan)
-    step = np.arange(len(polygon)) - np.repeat(np.cumsum(fan) - fan, fan)
-    first = start[polygon]
-    triangles = np.stack([first, first + step + 1, first + step + 2], axis=1)
+    require(BYTES_OF_TRIANGLE * int(fan.sum()) + BYTES_OF_POLYGON * len(counts), "the mesh")
+    small = np.int32 if max(len(corners), len(counts)) < 1 << 31 else np.int64
+    start = np.cumsum(counts) - counts
+    polygon = np.repeat(np.arange(len(counts), dtype=small), fan)
+    step = np.arange(len(polygon), dtype=small) - np.repeat((np.cumsum(fan) - fan).astype(small), fan)
+    triangles = np.empty((len(polygon), 3), small)
+    triangles[:, 0] = start[polygon]
+    for i in (1, 2):
+        np.add(triangles[:, 0], step, out=triangles[:, i])
+        triangles[:, i] += i
+    del step
     if len(polygon) == 0 or counts.max() == 3:
         return triangles, polygon
 
-    several = np.nonzero(counts[polygon] > 3)[0]  # triangles need no second look
-    points = np.asarray(vertices, dtype=np.float64)[np.asarray(corners)[triangles[several]]]
-    with np.errstate(invalid="ignore", over="ignore"):
-        normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-        area = np.stack([np.bincount(polygon[several], normal[:, axis], len(counts)) for axis in range(3)], axis=1)
-        against = (normal * area[polygon[several]]).sum(axis=1) < 0.0
-    for concave in np.unique(polygon[several[against]]):
+    area, against = _areas(corners, counts, np.asarray(vertices, dtype=np.float64), triangles, polygon)
+    for concave in against:
         begin, n = int(start[concave]), int(counts[concave])
         if n > MAX_CORNERS:
             raise InputError(f"is concave and has {n} corners; at most {MAX_CORNERS} can be cut into triangles", None,
@@ -48,6 +53,27 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
         row = int(np.searchsorted(polygon, concave))
         triangles[row:row + n - 2] = begin + _clip_ears(outline, area[concave])
     return triangles, polygon
+
+
+def _areas(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray, triangles: np.ndarray,
+           polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The area vectors (P, 3) of the polygons of more than three corners (twice the area long), and the numbers of those that have
+    a triangle which faces against theirs."""
+    area, against = np.zeros((len(counts), 3)), np.zeros(len(counts), dtype=bool)
+
+    def normals() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for begin in range(0, len(polygon), AT_ONCE):
+            part = slice(begin, begin + AT_ONCE)
+            several = counts[polygon[part]] > 3  # triangles need no second look
+            points = vertices[corners[triangles[part][several]]]
+            yield polygon[part][several], np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+
+    with np.errstate(invalid="ignore", over="ignore"):
+        for of, normal in normals():
+            np.add.at(area, of, normal)
+        for of, normal in normals():
+            against[of[(normal * area[of]).sum(axis=1) < 0.0]] = True
+    return area, np.flatnonzero(against)
 
 
 def _clip_ears(outline: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,6 +28,7 @@ BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 SMALLEST = 1e-30  # of a length that must not be 0
 MAX_OBJECTS = 1 << 20  # and spheres, and lights: a few bytes of a file must not make any number of them
+MANY_VERTICES = 1 << 26  # of all objects together: beyond, where a scene ends is no longer asked of each
 MAX_REACH = 1e18  # of a shape from the origin, in scene units: the square of a distance must be a float32
 
 
@@ -602,18 +606,35 @@ class Scene:
         raise InputError(f"no camera {name!r}; the scene's cameras are {known}")
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner (3,) float64 of all shapes in world space; raises InputError where there are none."""
+        """Lowest and highest corner (3,) float64 of all shapes in world space; raises InputError where there are none. The box of
+        more than MANY_VERTICES (`outlines`) can be larger than need be."""
         corners: list[np.ndarray] = []
-        for thing in self.objects:
-            if len(thing.mesh.faces):
-                points = thing.mesh.vertices.astype(np.float64) @ thing.transform[:3, :3].T + thing.transform[:3, 3]
-                corners += [points.min(axis=0), points.max(axis=0)]
+        for points, transform in self.outlines():
+            points = points @ transform[:3, :3].T + transform[:3, 3]
+            corners += [points.min(axis=0), points.max(axis=0)]
         for sphere in self.spheres:
             center = np.array(sphere.center)
             corners += [center - sphere.radius, center + sphere.radius]
         if not corners:
             raise InputError("the scene has no shapes")
         return np.min(corners, axis=0), np.max(corners, axis=0)
+
+    def outlines(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Of each object with faces, points (N, 3) float64 that hold it and its transform: the vertices of its mesh. Where all
+        objects together have more than MANY_VERTICES, a mesh that several show is held by the corners of its box: else many
+        small nodes of a file that show one large mesh would take hours."""
+        shown = [thing for thing in self.objects if len(thing.mesh.faces)]
+        times = Counter(id(thing.mesh) for thing in shown)
+        many = sum(len(thing.mesh.vertices) for thing in shown) > MANY_VERTICES
+        boxes: dict[int, np.ndarray] = {}
+        for thing in shown:
+            vertices, key = thing.mesh.vertices, id(thing.mesh)
+            if many and times[key] > 1:
+                if key not in boxes:
+                    boxes[key] = np.array(list(product(*zip(vertices.min(axis=0), vertices.max(axis=0), strict=True))), np.float64)
+                yield boxes[key], thing.transform
+            else:
+                yield vertices.astype(np.float64), thing.transform
 
     def with_settings(self, **changes: Any) -> Scene:
         """A copy with some settings changed (None leaves one as it is). Raises InputError for a setting that is none."""

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from wrt.arguments import short, unknown
 from wrt.errors import InputError
+from wrt.memory import require
 
 if TYPE_CHECKING:
     from wrt.scene_schema import SceneTable
 
 MOST = 20  # problems that are told of one file
+BYTES_OF_PROBLEM = 1500.0  # of memory, measured
 # What was expected, by pydantic's type of error; {} is filled from the error's context.
 _EXPECTED = {
     "float_type": "a number", "int_type": "a whole number", "string_type": "text", "bool_type": "true or false",
@@ -35,6 +37,7 @@ def check(data: dict[str, Any], path: Path) -> SceneTable:
     try:
         return SceneTable.model_validate(data, context=known_keys)
     except ValidationError as error:
+        _require_room(error.error_count(), path)
         problems = _lines(error, data, known_keys)
     if not data.get("include"):
         materials = data.get("materials")
@@ -62,6 +65,13 @@ def setting_choices(name: str) -> tuple[str, ...]:
     from wrt.scene_schema import SettingsTable
 
     return tuple(SettingsTable.model_json_schema()["properties"].get(name, {}).get("enum", ()))
+
+
+def _require_room(count: int, path: Path) -> None:
+    try:
+        require(BYTES_OF_PROBLEM * count, f"a list of {count} errors")
+    except InputError as error:
+        raise InputError(str(error), path) from None
 
 
 def _lines(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> list[str]:

@@ -14,12 +14,16 @@ import numpy as np
 
 from wrt.arguments import as_path, shown
 from wrt.errors import InputError, SceneWarning
+from wrt.memory import require
 from wrt.mesh import READERS, Mesh, load_mesh
 from wrt.read_file import read_file
 from wrt.scene import Material, Object, Scene
 from wrt.staging import stage
+from wrt.toml_limits import look_at
 
-BYTES_OF_TOML = 60.0  # of memory that a byte of the file takes at most, measured
+BYTES_OF_TOML = 5.0  # of memory for a byte of the file: itself, and a character
+# Of memory, at most, measured: of a table that is checked and becomes an object, and of an array or a value.
+BYTES_OF_TABLE, BYTES_OF_VALUE = 3500.0, 200.0
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
@@ -97,8 +101,10 @@ LOADERS: dict[str, Callable[[Path], Scene]] = {
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        data = tomllib.loads(read_file(path, BYTES_OF_TOML).decode("utf-8-sig"))
-        _require_int64(data)
+        text = read_file(path, BYTES_OF_TOML).decode("utf-8-sig")
+        require(look_at(text).bytes, "its text")
+        data = tomllib.loads(text)
+        _require_sound(data)
         return data
     except InputError as error:
         raise InputError(str(error), path) from None
@@ -115,15 +121,23 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError("holds a number of thousands of digits", path) from error
 
 
-def _require_int64(data: dict[str, Any]) -> None:
-    """Raise InputError for an integer of more than 64 bits, as TOML demands: others cannot deal with thousands of digits."""
+def _require_sound(data: dict[str, Any]) -> None:
+    """Raise InputError for an integer of more than 64 bits, as TOML demands (others cannot deal with thousands of digits), and
+    where the memory does not suffice to check all values."""
     values: list[Any] = [data]
+    tables = others = 0
     while values:
         value = values.pop()
-        if isinstance(value, dict | list):
-            values += value.values() if isinstance(value, dict) else value
+        if isinstance(value, dict):
+            tables += 1
+            values += value.values()
+            continue
+        others += 1
+        if isinstance(value, list):
+            values += value
         elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
             raise InputError("holds an integer of more than 64 bits")
+    require(BYTES_OF_TABLE * tables + BYTES_OF_VALUE * others, f"a text of {tables} tables and {others} values")
 
 
 def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = ()) -> Scene:

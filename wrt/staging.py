@@ -27,11 +27,9 @@ def bounding_sphere(scene: Scene) -> tuple[np.ndarray, float]:
     low, high = scene.bounds()
     center = 0.5 * low + 0.5 * high
     radius = max((math.dist(sphere.center, center) + sphere.radius for sphere in scene.spheres), default=0.0)
-    for thing in scene.objects:
-        if len(thing.mesh.faces):
-            linear, offset = thing.transform[:3, :3], thing.transform[:3, 3] - center
-            points = thing.mesh.vertices.astype(np.float64) @ linear.T + offset
-            radius = max(radius, math.sqrt(float(np.max(np.einsum("ij,ij->i", points, points)))))
+    for points, transform in scene.outlines():
+        points = points @ transform[:3, :3].T + (transform[:3, 3] - center)
+        radius = max(radius, math.sqrt(float(np.max(np.einsum("ij,ij->i", points, points)))))
     return center, radius
 
 

@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import os
 import re
+from array import array
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 
 from wrt.errors import InputError
-from wrt.memory import require
+from wrt.memory import Meter, require
 from wrt.mesh import RawMesh
 from wrt.read_file import read_file
 
+_LINE = re.compile(rb"[^\r\n]++(?:\r\n|[\r\n]|\Z)|\r\n|[\r\n]")
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-BYTES_OF_TEXT = 20.0  # of memory that a byte of a text file takes at most
+# Of memory, at most, measured: what a byte of a text file takes, and of a binary one; and a solid.
+BYTES_OF_TEXT, BYTES_OF_BINARY, BYTES_OF_SOLID = 8.0, 5.0, 500.0
 
 
 def read_stl(path: str | os.PathLike[str]) -> RawMesh:
@@ -33,7 +36,7 @@ def read_stl(path: str | os.PathLike[str]) -> RawMesh:
     groups: tuple[str, ...] = ()
     sizes: list[int] = []
     if _is_binary(data):
-        require(10.0 * len(data), "the mesh")
+        require(BYTES_OF_BINARY * len(data), "the mesh")
         vertices = np.frombuffer(data, _RECORD, (len(data) - 84) // 50, 84)["corners"].reshape(-1, 3)
     else:
         require(BYTES_OF_TEXT * len(data), "the mesh")
@@ -64,11 +67,13 @@ def _read_text(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...], li
         raise InputError(f"truncated, or no STL file: {message}, and the length is not that of a binary STL file", path,
                          f"line {number}")
 
-    numbers: list[float] = []
+    numbers = array("d")
     names: list[str] = []
     ends: list[int] = []  # of each solid, in vertices
-    number, inside = 0, False
-    for number, line in enumerate(re.split(rb"\r\n|\n|\r", data), 1):
+    meter = Meter()
+    number, inside = 1, False
+    for number, found in enumerate(_LINE.finditer(data), 1):
+        line = found[0]
         words = line.split()
         key = words[0].lower() if words else b""
         if key == b"vertex":
@@ -76,10 +81,11 @@ def _read_text(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...], li
                 x, y, z = map(float, words[1:])
             except ValueError:
                 fail(number, f"cannot read {line[:60].decode('latin-1').strip()!r}")
-            numbers += (x, y, z)
+            numbers.extend((x, y, z))
         elif key == b"solid" and not inside:
             names.append(b" ".join(words[1:]).decode("utf-8", "replace"))
             inside = True
+            meter.take(BYTES_OF_SOLID, "the mesh")
         elif key == b"endsolid" and inside:
             ends.append(len(numbers) // 3)
             inside = False
@@ -89,7 +95,7 @@ def _read_text(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...], li
             fail(number, "a loop that has not three vertices")
     if inside or not names or ends[-1] * 3 != len(numbers):
         fail(number, "no solid that is closed" if inside or not names else "vertices outside of a solid")
-    vertices = np.array(numbers, np.float64).reshape(-1, 3)
+    vertices = np.frombuffer(numbers, np.float64).reshape(-1, 3)
     sizes = [(end - begin) // 3 for begin, end in zip([0, *ends], ends, strict=False)]
     return vertices, _each_once(names), sizes
 

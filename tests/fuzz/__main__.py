@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.fuzz.formats import FORMATS, SLOW_FORMATS, make_case
+from tests.fuzz.formats import ALL_FORMATS, FORMATS, REPEATED_FORMATS, make_case
 
-HANG = 10.0  # seconds of work on a case
+HANG = 40.0  # seconds of work on a case; what repeats something has a limit of its own before
 STUCK = 60.0  # seconds without any
 POLL = 0.1
 START = 300.0  # seconds that a worker may take to compile before its first case
@@ -110,7 +110,7 @@ class Run:
         numbers = self.tally.defects.setdefault(problem.split("\n")[0], [])
         numbers.append(number)
         if len(numbers) <= 3:  # the rest are alike
-            case = make_case({**FORMATS, **SLOW_FORMATS}[self.name], random.Random(f"{self.seed} {self.name} {number}"))
+            case = make_case(ALL_FORMATS[self.name], random.Random(f"{self.seed} {self.name} {number}"))
             self.out.mkdir(parents=True, exist_ok=True)
             (self.out / f"{self.name}-{number}{case.suffix}").write_bytes(case.data)
             (self.out / f"{self.name}-{number}.txt").write_text(problem)
@@ -129,12 +129,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=80_000, help="over all formats together")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--format", action="append", choices=[*FORMATS, *SLOW_FORMATS], help="only these")
+    parser.add_argument("--format", action="append", choices=list(ALL_FORMATS), help="only these")
+    parser.add_argument("--repeat", action="store_true", help="files that repeat one piece thousands of times")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of the first input of each format")
     parser.add_argument("--out", type=Path, default=Path("fuzz-defects"), help="where inputs that show a defect are kept")
     given = parser.parse_args()
-    names = given.format or list(FORMATS)
+    names = given.format or list(REPEATED_FORMATS if given.repeat else FORMATS)
     shutil.rmtree(given.out, ignore_errors=True)
     runs = [Run(name, given.seed, given.out) for name in names]
     begin = time.perf_counter()

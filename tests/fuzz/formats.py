@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
+import re
 import struct
 import tempfile
 import zlib
@@ -19,18 +20,30 @@ from typing import Any
 import numpy as np
 
 from tests.fuzz import seeds
-from tests.fuzz.mutate import BYTES, INTEGERS, TEXT, mutate, mutate_tree
+from tests.fuzz.mutate import (
+    BYTES,
+    INTEGERS,
+    TEXT,
+    mutate,
+    mutate_tree,
+    repeat_bytes,
+    repeat_in_tree,
+    repeat_text,
+    times,
+)
 from tests.fuzz.seeds import Seed
 from tests.gltf_files import pack_glb
 
 
 @dataclass(frozen=True)
 class Format:
-    """seeds: sound files; damaged: a file made of one of them; read: whatever it raises but InputError is a defect."""
+    """seeds: sound files; damaged: a file made of one of them; read: whatever it raises but InputError is a defect; pace: seconds
+    that a byte may take, where a file's time and memory are to be in proportion to its size."""
 
     seeds: Callable[[], list[Seed]]
     damaged: Callable[[Seed, Seed, Random], Seed]
     read: Callable[[Path], object]
+    pace: float | None = None
 
 
 def make_case(form: Format, rng: Random) -> Seed:
@@ -99,17 +112,27 @@ def damaged_gltf(seed: Seed, other: Seed, rng: Random) -> Seed:
     glb = seed.suffix == ".glb"
     if rng.random() < 0.2:
         return Seed(seed.suffix, mutate(seed.data, rng, BYTES if glb else TEXT + BYTES[:2], other.data))
-    length = struct.unpack_from("<I", seed.data, 12)[0]
-    tree = json.loads(seed.data[20 : 20 + length] if glb else seed.data)
-    binary = seed.data[28 + length :] if glb else base64.b64decode(tree["buffers"][0]["uri"].partition(",")[2])
+    tree, binary = gltf_parts(seed)
     if rng.random() < 0.8:
-        tree = mutate_tree(tree, rng, GLTF_WORDS)
-    else:
-        binary = mutate(binary, rng, BYTES)
-        if not glb:
-            tree["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(binary).decode()
+        return gltf_of(seed.suffix, mutate_tree(tree, rng, GLTF_WORDS), binary)
+    return gltf_of(seed.suffix, tree, mutate(binary, rng, BYTES), True)
+
+
+def gltf_parts(seed: Seed) -> tuple[Any, bytes]:
+    """The JSON and the buffer of a sound file."""
+    if seed.suffix == ".gltf":
+        tree = json.loads(seed.data)
+        return tree, base64.b64decode(tree["buffers"][0]["uri"].partition(",")[2])
+    length = struct.unpack_from("<I", seed.data, 12)[0]
+    return json.loads(seed.data[20 : 20 + length]), seed.data[28 + length :]
+
+
+def gltf_of(suffix: str, tree: Any, binary: bytes, new: bool = False) -> Seed:
+    """A file of such JSON and buffer; new: which a .gltf does not hold yet."""
+    if new and suffix == ".gltf":
+        tree["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(binary).decode()
     text = json.dumps(tree).encode()
-    return Seed(".glb", pack_glb(text, binary)) if glb else Seed(".gltf", text)
+    return Seed(suffix, pack_glb(text, binary) if suffix == ".glb" else text)
 
 
 def read_scene(path: Path) -> object:
@@ -145,11 +168,7 @@ def damaged_image(seed: Seed, other: Seed, rng: Random) -> Seed:
 
 def damaged_png(data: bytes, rng: Random) -> bytes:
     """Chunks that are changed, moved, left out or doubled, with checksums that fit."""
-    chunks, begin = [], 8
-    while begin + 8 <= len(data):
-        length = struct.unpack_from(">I", data, begin)[0]
-        chunks.append((data[begin + 4 : begin + 8], data[begin + 8 : begin + 8 + length]))
-        begin += 12 + length
+    chunks = png_chunks(data)
     for _ in range(rng.randint(1, 3)):
         i = rng.randrange(len(chunks))
         kind, body = chunks[i]
@@ -188,7 +207,20 @@ def damaged_png(data: bytes, rng: Random) -> bytes:
         else:
             body = mutate(body, rng, BYTES)
         chunks[i] = (kind, body)
-    return data[:8] + b"".join(
+    return png_of(chunks)
+
+
+def png_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
+    chunks, begin = [], 8
+    while begin + 8 <= len(data):
+        length = struct.unpack_from(">I", data, begin)[0]
+        chunks.append((data[begin + 4 : begin + 8], data[begin + 8 : begin + 8 + length]))
+        begin += 12 + length
+    return chunks
+
+
+def png_of(chunks: list[tuple[bytes, bytes]]) -> bytes:
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
     )
 
@@ -228,8 +260,12 @@ def damaged_checked(seed: Seed, other: Seed, rng: Random) -> Seed:
         header = json.dumps(tree).encode() if rng.random() < 0.9 else mutate(header, rng, TEXT)
     else:
         body = damaged_numbers(body, rng) if rng.random() < 0.8 else mutate(body, rng, BYTES)
-    data = b"\n".join([magic, header, body])
-    return Seed(seed.suffix, data + sha256(data).digest())
+    return signed(seed.suffix, magic, header, body)
+
+
+def signed(suffix: str, *parts: bytes) -> Seed:
+    data = b"\n".join(parts)
+    return Seed(suffix, data + sha256(data).digest())
 
 
 def damaged_numbers(body: bytes, rng: Random) -> bytes:
@@ -373,6 +409,70 @@ def load_scene_with_normals(path: Path) -> Any:
     return scene
 
 
+# --- files that repeat one thing --------------------------------------------------------------------------------------
+
+
+def repeated_toml(seed: Seed, other: Seed, rng: Random) -> Seed:
+    import tomllib
+
+    if rng.random() < 0.6:
+        return Seed(".toml", repeat_text(seed.data, rng))
+    tree = repeat_in_tree(tomllib.loads(seed.data.decode()), rng, toml_text)
+    return Seed(".toml", "\n".join(f"{json.dumps(key)} = {toml_text(value)}" for key, value in tree.items()).encode())
+
+
+def repeated_gltf(seed: Seed, other: Seed, rng: Random) -> Seed:
+    tree, binary = gltf_parts(seed)
+    kind = rng.random()
+    if kind < 0.5:
+        return gltf_of(seed.suffix, repeat_in_tree(tree, rng, json.dumps), binary)
+    if kind < 0.6:
+        return gltf_of(seed.suffix, tree, repeat_bytes(binary, rng), True)
+    if seed.suffix == ".gltf":
+        return Seed(".gltf", repeat_text(seed.data, rng))
+    if kind < 0.9:
+        return Seed(".glb", pack_glb(repeat_text(json.dumps(tree).encode(), rng), binary))
+    return Seed(".glb", repeat_bytes(seed.data, rng))
+
+
+def repeated_mesh(seed: Seed, other: Seed, rng: Random) -> Seed:
+    """Half of the time with the number in the header that fits, or might."""
+    text = b"\0" not in seed.data
+    if not text and seed.suffix == ".stl":
+        count = times(bytes(50), rng)
+        begin = 84 + 50 * rng.randrange(2)
+        return Seed(".stl", seed.data[:80] + struct.pack("<I", count) + seed.data[begin : begin + 50] * count)
+    data = repeat_text(seed.data, rng) if text or rng.random() < 0.2 else repeat_bytes(seed.data, rng)
+    elements = list(re.finditer(rb"(element \w+ )(\d+)\n", data[:4000]))
+    if elements and rng.random() < 0.6:
+        element = rng.choice(elements)
+        count = int(element[2]) + rng.choice((data.count(b"\n"), (len(data) - len(seed.data)) // rng.randint(1, 50), 10**6))
+        data = data[: element.start(2)] + b"%d" % count + data[element.end(2) :]
+    return Seed(seed.suffix, data)
+
+
+def repeated_image(seed: Seed, other: Seed, rng: Random) -> Seed:
+    if seed.data[:4] == b"\x89PNG" and rng.random() < 0.8:
+        chunks = png_chunks(seed.data)
+        i = rng.randrange(len(chunks))
+        kind, body = chunks[i]
+        if rng.random() < 0.4:
+            kind = rng.choice((b"tEXt", b"iTXt", b"zTXt", b"abCd", b"IDAT", b"fcTL", b"fdAT", b"PLTE", b"sPLT", b"eXIf", b"iCCP"))
+            packed = zlib.compress(bytes(1000))
+            body = rng.choice((b"", b"k\0v", b"k\0\0" + packed, b"k\0\1\0\0\0" + packed, body))
+        chunks[i:i] = [(kind, body)] * times(bytes(12) + body, rng)
+        return Seed(seed.suffix, png_of(chunks))
+    return Seed(seed.suffix, repeat_text(seed.data, rng) if seed.suffix == ".hdr" else repeat_bytes(seed.data, rng))
+
+
+def repeated_checked(seed: Seed, other: Seed, rng: Random) -> Seed:
+    magic, header, body = seed.data[:-32].split(b"\n", 2)
+    if rng.random() < 0.5:
+        tree = repeat_in_tree(json.loads(header), rng, json.dumps)
+        return signed(seed.suffix, magic, json.dumps(tree).encode(), body)
+    return signed(seed.suffix, magic, header, repeat_bytes(body, rng))
+
+
 # What is read; and what is done with it, which takes longer and is run only when asked for.
 FORMATS: dict[str, Format] = {
     "toml": Format(seeds.scenes, damaged_toml, read_scene),
@@ -384,4 +484,19 @@ FORMATS: dict[str, Format] = {
     "accel": Format(accel_seeds, damaged_checked, read_accel),
     "checkpoint": Format(checkpoint_seeds, damaged_checked, read_checkpoint),
 }
+# Seconds that a byte may take are many times what it does: of a table that is an object, of a small chunk, of a number.
+REPEATED_FORMATS = {
+    f"{name}-repeated": replace(FORMATS[name], damaged=repeated, pace=pace)
+    for name, repeated, pace in (
+        ("toml", repeated_toml, 2e-4),
+        ("gltf", repeated_gltf, 2e-4),
+        ("obj", repeated_mesh, 1e-5),
+        ("ply", repeated_mesh, 3e-5),
+        ("stl", repeated_mesh, 1e-5),
+        ("image", repeated_image, 3e-5),
+        ("accel", repeated_checked, 3e-5),
+        ("checkpoint", repeated_checked, 3e-5),
+    )
+}
 SLOW_FORMATS = {"render": Format(scene_seeds, damaged_scene, render_scene)}
+ALL_FORMATS = {**FORMATS, **REPEATED_FORMATS, **SLOW_FORMATS}

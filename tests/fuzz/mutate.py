@@ -177,6 +177,97 @@ def swap_mark(out: bytearray, rng: Random) -> None:
 TEXT = (word_to_number, word_to_number, word_to_number, word_to_word, word_to_word, repeat_words, move_lines, move_lines, swap_mark)
 
 
+# --- pieces again and again -------------------------------------------------------------------------------------------
+
+LONGEST = 1 << 17  # bytes of an input that repeats something
+_NUMBER = re.compile(rb"[0-9]+")
+
+
+def length(rng: Random) -> int:
+    """Bytes that what is repeated takes in all: as often one to two thousand as 64 to 128 thousand."""
+    return int(2.0 ** rng.uniform(10.0, 17.0))
+
+
+def times(piece: bytes, rng: Random) -> int:
+    return max(2, length(rng) // max(len(piece), 1))
+
+
+def repeat_piece(piece: bytes, count: int, rng: Random) -> bytes:
+    """`count` times; sometimes each with another number in it, or behind its first word."""
+    if rng.random() < 0.5:
+        return piece * count
+    number = _NUMBER.search(piece) or _WORD.search(piece)
+    end = number.end() if number else 0
+    begin = number.start() if number and rng.random() < 0.5 and piece[number.start() : end].isdigit() else end
+    first = rng.choice((1, 1, 10**6))
+    return b"".join(piece[:begin] + b"%d" % i + piece[end:] for i in range(first, first + count))[: 2 * LONGEST]
+
+
+def repeat_text(data: bytes, rng: Random) -> bytes:
+    """One line, word, mark, part of a key or element of a text, thousands of times at its place."""
+    begin, end, behind = _piece(data, rng)
+    piece = data[begin:end] + behind
+    return data[:begin] + repeat_piece(piece, times(piece, rng), rng) + data[begin if rng.random() < 0.8 else end :]
+
+
+def _piece(data: bytes, rng: Random) -> tuple[int, int, bytes]:
+    """Where a piece begins and ends, and what parts it from the next."""
+    kind = rng.randrange(8)
+    if kind < 3:
+        starts = [0, *(match.end() for match in re.finditer(rb"\n", data))]
+        first = rng.randrange(len(starts))
+        last = min(first + rng.choice((1, 1, 1, 2, 5, 9)), len(starts) - 1)
+        begin, end = starts[first], starts[last] if last > first else len(data)
+        return (begin, end, b"") if kind < 2 else (begin, max(begin, end - 1), b" \\\n")
+    if kind == 3:
+        opens = [i for i, byte in enumerate(data) if byte in b"[{"]
+        if opens:
+            begin = rng.choice(opens)
+            return begin, _closed(data, begin), rng.choice((b",", b",", b"\n", b""))
+    words = list(_WORD.finditer(data))
+    if kind < 7 and words:
+        word = rng.choice(words)
+        return word.start(), word.end(), rng.choice((b" ", b" ", b".", b",", b"/", b"=", b"\n", b""))
+    begin = rng.randrange(len(data)) if data else 0
+    return begin, min(begin + rng.choice((1, 1, 2, 4)), len(data)), b""
+
+
+def _closed(data: bytes, begin: int) -> int:
+    """Behind the bracket that closes the one at `begin`; strings are not known."""
+    depth = 0
+    for i in range(begin, len(data)):
+        depth += (data[i] in b"[{") - (data[i] in b"]}")
+        if depth == 0:
+            return i + 1
+    return len(data)
+
+
+def repeat_bytes(data: bytes, rng: Random) -> bytes:
+    begin = rng.randrange(len(data)) if data else 0
+    end = min(begin + rng.choice((1, 2, 3, 4, 8, 12, 16, 50, 64, 200)), len(data))
+    return data[:begin] + data[begin:end] * times(data[begin:end], rng) + data[begin:]
+
+
+def repeat_in_tree(tree: Any, rng: Random, text_of: Callable[[Any], str]) -> Any:
+    """A copy in which an element, a member or a text stands thousands of times; text_of: an element in the format."""
+    tree = copy.deepcopy(tree)
+    all_places = places(tree)
+    if not all_places:
+        return tree
+    container, key = rng.choice(all_places)
+    value = container[key]
+    count = times(text_of(value).encode() + b"12", rng)
+    if isinstance(value, str) and rng.random() < 0.5:
+        container[key] = value * count
+    elif isinstance(container, list):
+        container[key:key] = [value] * count
+    elif isinstance(value, list) and value and rng.random() < 0.6:
+        container[key] = value * max(2, count)
+    else:
+        container.update({f"{key}{i}": value for i in range(count)})
+    return tree
+
+
 # --- trees of JSON or TOML --------------------------------------------------------------------------------------------
 
 

@@ -10,20 +10,23 @@ import json
 import mmap
 import os
 import random
+import re
 import resource
 import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from tests.fuzz import seeds
-from tests.fuzz.formats import FORMATS, SLOW_FORMATS, Format, make_case
+from tests.fuzz.formats import ALL_FORMATS, Format, make_case
 from wrt.errors import InputError, SceneWarning
 
 ROOM = 1 << 30  # bytes of address space beyond what a worker has when it begins
+# What a file may take where that is to be in proportion to its size: seconds and bytes for any file, and bytes for each byte.
+SECONDS, BYTES, BYTES_OF_BYTE = 1.0, 1 << 26, 1500
 
 
 class Judge:
@@ -55,11 +58,14 @@ class Judge:
         """Write the file and read it: "" where that went well, else what is wrong, its first line without details."""
         path = self.folder / f"case{seed.suffix}"
         path.write_bytes(seed.data)
+        taken = _peak() if self.form.pace else float
         begin = time.process_time()  # who stops the process for a while makes no case slow
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             problem = self._attempt(path)
-        self.slowest = max(self.slowest, (time.process_time() - begin, number))
+        seconds = time.process_time() - begin
+        self.slowest = max(self.slowest, (seconds, number))
+        problem = problem or self._beyond(len(seed.data), seconds, taken())
         problem = problem or next(
             (
                 f"{each.category.__name__} in {each.filename}:{each.lineno}\n{each.message}"
@@ -74,6 +80,14 @@ class Judge:
             self.stderr.seek(0)
             self.stderr.truncate()
         return problem
+
+    def _beyond(self, size: int, seconds: float, taken: float) -> str:
+        """What is wrong where a file of `size` bytes took so much, and that is to be in proportion."""
+        if self.form.pace and seconds > SECONDS + self.form.pace * size:
+            return f"more time than a file of that size may take\n{size} bytes, {seconds:.2f} s"
+        if self.form.pace and taken > BYTES + BYTES_OF_BYTE * size:
+            return f"more memory than a file of that size may take\n{size} bytes, {taken / 2**20:.0f} MiB"
+        return ""
 
     def _attempt(self, path: Path) -> str:
         try:
@@ -91,6 +105,21 @@ class Judge:
         return ""
 
 
+def _peak() -> Callable[[], float]:
+    """Gives the most bytes that were resident since now, beyond those that are; 0 where the system does not tell."""
+
+    def status(key: str) -> float:
+        found = re.search(rf"^{key}:\s+(\d+)", Path("/proc/self/status").read_text(), re.MULTILINE)
+        return 1024.0 * int(found[1]) if found else 0.0
+
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+        before = status("VmRSS")
+    except OSError:
+        return float
+    return lambda: status("VmHWM") - before
+
+
 def _place(error: BaseException) -> str:
     """The last line of the project that it came through."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if "/wrt/" in f.filename or "/tests/" in f.filename]
@@ -98,7 +127,7 @@ def _place(error: BaseException) -> str:
 
 
 def main(name: str, seed: str, first: str, count: str, folder: str) -> None:
-    judge = Judge({**FORMATS, **SLOW_FORMATS}[name], Path(folder))
+    judge = Judge(ALL_FORMATS[name], Path(folder))
     out = os.fdopen(os.dup(1), "w")
     beat_path = Path(folder) / "beat"
     beat_path.write_bytes(b"\0" * 8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -24,8 +25,8 @@ def test_it_is_at_most_what_the_machine_has() -> None:
 
 
 @pytest.mark.parametrize(("text", "size"), [("24G", 24 * 2**30), ("24 GiB", 24 * 2**30), ("100", 100), ("1.5m", 1.5 * 2**20)])
-def test_it_can_be_said(text: str, size: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WRT_MEMORY", text)
+def test_it_can_be_said(text: str, size: float, say_memory: Callable[[str], None]) -> None:
+    say_memory(text)
     assert memory.available() == size
 
 
@@ -36,11 +37,31 @@ def test_what_is_no_size(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
         memory.available()
 
 
-def test_a_refusal_tells_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WRT_MEMORY", "1G")
+def test_a_refusal_tells_both_numbers(say_memory: Callable[[str], None]) -> None:
+    say_memory("1G")
     memory.require(2.0**30, "it")
     with pytest.raises(InputError, match=r"^it takes 1\.5 GiB of memory; 1\.0 GiB are free \(WRT_MEMORY can say otherwise\)$"):
         memory.require(1.5 * 2**30, "it")
+
+
+def test_what_is_said_is_for_all_that_the_process_takes(say_memory: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    say_memory("1G")
+    monkeypatch.setattr(memory, "resident", lambda: memory._AT_START + 0.75 * 2**30)
+    assert memory.available() == 2**28
+    with pytest.raises(InputError, match=r"^it takes 0\.3 GiB of memory; 0\.2 GiB are free"):
+        memory.require(0.3 * 2**30, "it")
+    monkeypatch.setattr(memory, "resident", lambda: memory._AT_START + 2.0**31)
+    assert memory.available() == 0.0
+    monkeypatch.setattr(memory, "resident", lambda: 0.0)  # the system does not tell, or it has been given back
+    assert memory.available() == 2**30
+
+
+def test_resident_is_what_is_in_use() -> None:
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("only Linux tells")
+    before = memory.resident()
+    kept = b"x" * (100 << 20)
+    assert 0.9 * len(kept) < memory.resident() - before < 1.2 * len(kept)
 
 
 def test_the_limit_of_address_space_counts() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -38,8 +39,9 @@ def test_it_grows_with_what_the_scene_holds() -> None:
     assert bytes_of_scene(textured, brute) == pytest.approx(alone + 20000 * BYTES_OF_TEXEL + 200 * BYTES_OF_SKY)
 
 
-def test_a_scene_larger_than_the_memory_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WRT_MEMORY", "100M")
+def test_a_scene_larger_than_the_memory_is_refused_before_any_work(say_memory: Callable[[str], None],
+                                                                       monkeypatch: pytest.MonkeyPatch) -> None:
+    say_memory("100M")
     monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("work was done"))
     scene = replace(SCENE, objects=SCENE.objects * 1000)
     with pytest.raises(InputError, match=r"a picture of 8x8 takes 0 MiB of memory, its scene \d\.\d GiB; cpu has 100 MiB free"):
@@ -48,8 +50,8 @@ def test_a_scene_larger_than_the_memory_is_refused_before_any_work(monkeypatch: 
     Renderer(replace(SCENE, settings=replace(SCENE.settings, size=(8, 8))), Options())
 
 
-def test_so_is_a_structure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WRT_MEMORY", "64M")
+def test_so_is_a_structure(say_memory: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    say_memory("64M")
     monkeypatch.setattr(ACCELERATORS["bvh2"], "bytes_to_build", 1e5)
     with pytest.raises(InputError, match=r"a bvh2 over 1280 primitives takes 0\.1 GiB of memory; 64 MiB are free"):
         build(BALL, "bvh2")

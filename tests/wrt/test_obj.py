@@ -121,3 +121,32 @@ def test_indices_of_any_length_are_told(index: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a\.obj: line 5: face corner '") as caught:
         read_obj(write(tmp_path, f"{SQUARE}f 1 2 {index}\n"))
     assert len(str(caught.value)) < 300 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize("text", ["f 1 2 \\\n3 \\\n4\n",
+                                  "f 1 2 \\\n \\\n\\\n 3 4", "f 1 2 3 4\\", "f 1 2 3 \\\n4\\\n", "f 1 2\\\r\n3 4\r\n"])
+def test_continued_lines(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_bytes((SQUARE + text).encode())
+    assert read_obj(tmp_path / "a.obj").faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+@pytest.mark.parametrize("words", [4, 5, 7, 64])
+def test_what_is_taken_at_a_time_changes_nothing(words: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    corners = " ".join(f"{i % 4 + 1}//{i % 2 + 1}" for i in range(300))
+    relative = " ".join(f"-{i % 4 + 1}" for i in range(300))
+    path = write(tmp_path, f"{SQUARE}vn 0 0 1\nvn 0 1 0\ng a\nf {corners}\ng b\nf {relative} # {corners}\nf 1 2 3\n")
+    whole = read_obj(path)
+    monkeypatch.setattr("wrt.obj.WORDS_AT_ONCE", words)
+    parts = read_obj(path)
+    for name in ("vertices", "faces", "normals", "face_group"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
+    assert whole.groups == parts.groups == ("a", "b") and len(whole.faces) == 298 + 298 + 1
+    for bad, message in (("v 1 x 0\n", "line 5: v holds 'x'"), ("f 1 2 -9 4\n", "line 5: face corner '-9': v index -9")):
+        with pytest.raises(InputError, match=message):
+            read_obj(write(tmp_path, SQUARE + bad + SQUARE))
+
+
+def test_groups_in_which_nothing_is(tmp_path: Path) -> None:
+    """They have no number, but names keep the order in which they are first named."""
+    raw = read_obj(write(tmp_path, SQUARE + "g late\ng x\ng first\nf 1 2 3\ng late\nf 1 3 4\ng x\n"))
+    assert raw.groups == ("late", "first") and raw.face_group is not None and raw.face_group.tolist() == [1, 0]

@@ -153,3 +153,60 @@ def test_absurd_counts(old: bytes, new: bytes, message: str, tmp_path: Path) -> 
         return
     with pytest.raises(InputError, match=message):
         read_ply(path)
+
+
+def strip_by_hand(strip: list[int]) -> list[tuple[int, ...]]:
+    found, run = [], []
+    for index in strip:
+        run = [] if index < 0 else [*run, index]
+        if len(run) > 2:
+            a, b, c = run[-3:]
+            found.append((a, b, c) if len(run) % 2 else (a, c, b))
+    return found
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("strips", [
+    [[0, 1, 3, 2]], [[0, 1, 3, 2, -1, 1, 4, 2, 5]], [[0, 1, 3], [1, 4, 2, 5, -1]], [[-1, -1, 0, 1, -1, 3, 2, 0, -1, 5]],
+    [[0, 1, 3, -1, 2, 5, 4, 1], [], [2], [0, 1, 2]], [[0, 1]],
+])
+def test_strips(form: str, strips: list[list[int]], tmp_path: Path) -> None:
+    data = ply(form, POINTS, [tuple(strip) for strip in strips]).replace(b"element face", b"element tristrips")
+    raw = read_ply(write(tmp_path, data))
+    assert raw.faces.tolist() == [list(triangle) for strip in strips for triangle in strip_by_hand(strip)]
+
+
+def test_a_strip_faces_one_way(tmp_path: Path) -> None:
+    """A flat sheet of two rows: every triangle has the normal of the first, also after a restart."""
+    points = [(float(i // 2), float(i % 2), 0.0) for i in range(12)]
+    data = ply("ascii", points, [(*range(7), -1, *range(5, 12))]).replace(b"element face", b"element tristrips")
+    raw = read_ply(write(tmp_path, data))
+    corners = raw.vertices[raw.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert len(normals) == 10 and (normals[:5, 2] == normals[0, 2]).all() and (normals[5:, 2] == -normals[0, 2]).all()
+
+
+def test_strips_come_behind_faces(tmp_path: Path) -> None:
+    text = ply("ascii", POINTS, [(0, 1, 2, 3)]).decode()
+    head, body = text.split("end_header\n")
+    text = f"{head}element tristrips 1\nproperty list int int vertex_indices\nend_header\n{body}7 1 4 2 5 -1 0 1\n"
+    raw = read_ply(write(tmp_path, text.encode()))
+    assert raw.faces.tolist() == [[0, 1, 2], [0, 2, 3], [1, 4, 2], [4, 5, 2]] and raw.incomplete == 0
+
+
+@pytest.mark.parametrize(("bad", "message"), [("9", "index 9, but there are 6 vertices"), ("-2", "index -2, but there are 6 vert")])
+def test_a_strip_with_a_wrong_index(bad: str, message: str, tmp_path: Path) -> None:
+    data = ply("ascii", POINTS, [(0, 1, 2), (0, 1, int(bad))]).replace(b"element face", b"element tristrips")
+    with pytest.raises(InputError, match=rf"a\.ply: tristrips 1: {message}"):
+        read_ply(write(tmp_path, data))
+
+
+def test_a_text_is_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever their length: the numbers are the same, and a word that is none is found."""
+    data = ply("ascii", POINTS, [(0, 1, 2, 3), (1, 4, 5, 2)])
+    whole = read_ply(write(tmp_path, data))
+    for words in (1, 2, 5):
+        monkeypatch.setattr("wrt.ply.WORDS_AT_ONCE", words)
+        np.testing.assert_array_equal(read_ply(write(tmp_path, data)).faces, whole.faces)
+        with pytest.raises(InputError, match=rf"line {data.count(10) - 1}: 'x4' is not a number"):
+            read_ply(write(tmp_path, data.replace(b" 4 0 1", b" x4 0 1")))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -39,10 +40,10 @@ def test_what_is_no_file(path: str, message: str) -> None:
         read_file(path)
 
 
-def test_a_file_larger_than_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_larger_than_the_memory(tmp_path: Path, say_memory: Callable[[str], None]) -> None:
     with open(tmp_path / "a.obj", "wb") as file:
         file.truncate(1 << 30)  # takes no room on the disk
-    monkeypatch.setenv("WRT_MEMORY", "0.5G")
+    say_memory("0.5G")
     with pytest.raises(InputError, match=r"a\.obj: a file of 1073741824 bytes takes .* of memory; 512 MiB|0\.5 GiB are free"):
         load_scene(tmp_path / "a.obj")
 
