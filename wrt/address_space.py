@@ -13,8 +13,9 @@ from wrt.errors import InputError
 from wrt.memory import address_space
 
 # Bytes, measured with Python 3.11, NumPy 2.4, Warp 1.19 on Linux, and some to spare.
-MODULES = 130 << 20  # NumPy, Pydantic and the like, without
-BLAS_THREAD = 40 << 20  # which OpenBLAS starts for each core when NumPy is imported
+MODULES = 170 << 20  # NumPy, Pydantic and the like, without
+BLAS_THREAD = 40 << 20  # which OpenBLAS starts for each core when NumPy is imported, and when SciPy is
+SCIPY = 60 << 20  # likewise without
 BLAS_THREADS = 64  # at most, in NumPy's wheels
 WARP = 512 << 20  # warp.so and warp-clang.so (measured: 356), and a small picture with what writes it
 STACK = 8 << 20  # of a thread, where its limit (ulimit -s) is none
@@ -24,22 +25,35 @@ _compiler = threading.Lock()
 
 
 def require_modules() -> None:
-    """Raise InputError where the address space does not suffice for what wrt imports, if it is still to be; where it is limited,
-    see that threads take little of it."""
-    if "numpy" in sys.modules or not is_limited():
-        return
-    threads = min(_blas_threads(), BLAS_THREADS)
-    require(MODULES + threads * BLAS_THREAD, "NumPy and what else is imported",
-            "; OPENBLAS_NUM_THREADS=1 makes NumPy take less" if threads > 1 else "")
+    """Before wrt imports them: raise InputError where the address space does not suffice."""
+    if is_limited() and "numpy" not in sys.modules:
+        _require_with_blas(MODULES, "NumPy and what else is imported")
+        _settle()
+
+
+def _settle() -> None:
+    """See that threads take little address space, and that OpenBLAS has what it needs: later, if none is left, it would try for
+    ever."""
     import ctypes
 
     with suppress(AttributeError, OSError, TypeError):  # another C library, which reserves nothing
         ctypes.CDLL(None).mallopt(ARENAS, 1)  # glibc would reserve 64 MiB for each thread
+    import numpy as np
+
+    _ = np.ones((256, 256)) @ np.ones((256, 256))  # its first large product takes a buffer, and keeps it
+
+
+def require_scipy() -> None:
+    """Raise InputError where it does not suffice for SciPy, if that is still to be imported."""
+    if "scipy" not in sys.modules:
+        _require_with_blas(SCIPY, "SciPy")
 
 
 def require_warp(threads: int) -> None:
     """Raise InputError where it does not suffice for Warp and so many threads."""
     require(WARP + threads * _stack(), "Warp")
+    if is_limited():
+        _settle()
 
 
 @contextmanager
@@ -52,6 +66,11 @@ def room_to_compile() -> Iterator[None]:
 
 def is_limited() -> bool:
     return address_space() < float("inf")
+
+
+def _require_with_blas(needed: float, what: str) -> None:
+    threads = min(_blas_threads(), BLAS_THREADS)
+    require(needed + threads * BLAS_THREAD, what, "; OPENBLAS_NUM_THREADS=1 makes it less" if threads > 1 else "")
 
 
 def require(needed: float, what: str, way_out: str = "") -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from wrt.address_space import require_scipy
 from wrt.errors import InputError
 from wrt.memory import require
 from wrt.tonemap import encode_srgb, luminance, tone_map
@@ -251,6 +252,7 @@ def _blur_radius(pixels_per_degree: float) -> int:
 
 
 def _separable(image: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
+    require_scipy()
     from scipy.ndimage import correlate1d
 
     return correlate1d(correlate1d(image, along_x, axis=1, mode="nearest"), along_y, axis=0, mode="nearest")

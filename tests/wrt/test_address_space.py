@@ -15,7 +15,7 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import ROOT
 from wrt import address_space, driver
-from wrt.address_space import require_modules, require_warp, room_to_compile
+from wrt.address_space import require_modules, require_scipy, require_warp, room_to_compile
 from wrt.errors import InputError
 
 resource = pytest.importorskip("resource", reason="needs a system with limits")
@@ -102,19 +102,40 @@ def test_how_much_is_left_decides(left: float, threads: int, refused: list[str],
 
 
 def test_a_way_out_is_fewer_threads_of_openblas(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(address_space, "address_space", lambda: 180 << 20)
+    monkeypatch.setattr(address_space, "address_space", lambda: 230 << 20)
+    monkeypatch.setattr(address_space, "_settle", lambda: None)
     monkeypatch.delitem(sys.modules, "numpy")
+    monkeypatch.delitem(sys.modules, "scipy", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)))
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
     for name in ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(InputError, match=r"takes 450 MiB .*, and 180 are left: .*; OPENBLAS_NUM_THREADS=1 makes NumPy take less$"):
+    with pytest.raises(InputError, match=r"takes 490 MiB .*, and 230 are left: .*; OPENBLAS_NUM_THREADS=1 makes it less$"):
         require_modules()
+    with pytest.raises(InputError, match=r"^SciPy takes 380 MiB .*, and 230 are left: .*; OPENBLAS_NUM_THREADS=1 makes it less$"):
+        require_scipy()
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     require_modules()
+    require_scipy()
     monkeypatch.setattr(address_space, "address_space", lambda: 0)
     monkeypatch.setitem(sys.modules, "numpy", np)
     require_modules()  # it is imported: what else is takes little
+
+
+PRODUCT = """
+import wrt.address_space as space
+space.require_modules()
+import numpy as np
+before = space.address_space()
+np.ones((50000, 3)) @ np.ones((3, 3))
+print(before - space.address_space() < 16 << 20)
+"""
+
+
+def test_openblas_has_its_buffer_before_it_is_needed() -> None:
+    """It asks for one with its first large product, and for ever, where there is no room."""
+    done = limited(4000, "-c", PRODUCT)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", ""), done
 
 
 @pytest.mark.parametrize("error", [RuntimeError("can't start new thread"), MemoryError("of some kind"),

@@ -9,6 +9,8 @@ from functools import cache
 
 import numpy as np
 
+from wrt.address_space import require_scipy
+
 CONFIDENCE = 0.95
 
 
@@ -68,6 +70,7 @@ def jackknife(statistic: Callable[[np.ndarray], float], n: int) -> tuple[float, 
 @cache
 def student_t(freedom: int) -> float:
     """How many standard errors a two-sided interval of CONFIDENCE reaches."""
+    require_scipy()
     from scipy.stats import t
 
     return float(t.ppf(0.5 + 0.5 * CONFIDENCE, freedom))
