@@ -127,7 +127,7 @@ import wrt.address_space as space
 space.require_modules()
 import numpy as np
 before = space.address_space()
-np.ones((50000, 3)) @ np.ones((3, 3))
+np.ones((512, 512)) @ np.ones((512, 512))
 print(before - space.address_space() < 16 << 20)
 """
 
