@@ -3,7 +3,7 @@
 A checkpoint is a checked file (wrt.checked_file): who made it (IDENTITY: everything that can change a pixel), how far it is, and
 the film's arrays. How many samples each pixel has is one of them: rendering goes on from any state in which each pixel is done
 whole. Beside the file lies `.NAME.part`, which is locked while a render runs, and holds the room that the next one needs. The
-header's first entry tells on which system it is written: so a part that a killed render left is known (wrt.write_file).
+header's first entry tells on which system it is written, by which a part that a killed render left is known (wrt.write_file).
 """
 
 from __future__ import annotations

@@ -80,12 +80,17 @@ def _stderr_without(text: bytes) -> Iterator[None]:
 
 
 @made_once
-def start(device: str) -> Any:
-    """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are."""
+def _start_warp() -> None:
     require_warp(min(thread_count(None), 4) + 2)  # two that prepare; if more cannot be started, that is told then
-    with _stderr_without(b"NVIDIA CUDA driver"):  # where there is no GPU, it says so each time
-        with _cache_told():
-            wp.init()
+    with _stderr_without(b"NVIDIA CUDA driver"), _cache_told():  # where there is no GPU, it says so each time
+        wp.init()
+
+
+@made_once
+def start(device: str) -> Any:
+    """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are, and where the
+    kernel cache cannot be made or the address space is too small."""
+    _start_warp()
     try:
         with _stderr_without(b"Warp CUDA error"):  # told by the InputError below
             return wp.get_device(device)

@@ -1,9 +1,9 @@
 """The way out for files: each is written aside, brought to the disk and renamed, so that its name holds a whole file at any moment.
 
-A process that is killed leaves what it wrote aside. Whoever writes in that folder next removes it, if its maker is dead for
-certain: the maker held a lock on it, which ends with him. The name tells on which system he ran, since a lock that a network's
-file system keeps to one machine says nothing of others: what other systems left must also have lain for a month. Where there are
-no such locks (Windows, some file systems), nothing is removed.
+A process that is killed leaves what it wrote aside. The next one that writes in that folder removes it, if its maker is certainly
+dead: a process holds a lock on its file, which ends with the process. The name tells on which system it ran: over a network, a lock
+may not be seen, so that what another system left must also be a month old. Where there are no such locks (Windows, some file
+systems), nothing is removed.
 """
 
 from __future__ import annotations
