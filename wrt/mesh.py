@@ -17,6 +17,7 @@ from wrt.arguments import LARGEST, as_array, as_path, shown
 from wrt.errors import InputError, SceneWarning
 from wrt.memory import require
 from wrt.mesh_clean import clean
+from wrt.read_file import require_file
 from wrt.tables import html_facts
 
 if TYPE_CHECKING:
@@ -189,8 +190,7 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
     path = as_path(path, "path")
     if path.suffix.lower() not in READERS:
         raise InputError(f"is no mesh file: known are {', '.join(READERS)}", path)
-    if not path.exists():
-        raise InputError("no such file", path)
+    require_file(path)
     try:
         raw = _reader(path.suffix.lower())(path)
     except InputError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+from pathlib import Path
 from typing import BinaryIO
 
 from wrt.errors import InputError
@@ -25,6 +26,16 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
         os.close(descriptor)
         raise InputError(f"cannot be read: {'Is a directory' if stat.S_ISDIR(mode) else 'no regular file'}")
     return open(descriptor, "rb")
+
+
+def require_file(path: Path, what: str = "") -> None:
+    """Raise InputError where nothing is at the path, with `what` behind that, or where the system will not look for it."""
+    try:
+        there = path.exists()
+    except OSError as error:  # a name too long, a folder that may not be looked into
+        raise InputError(f"cannot be read: {error.strerror or error}", path) from None
+    if not there:
+        raise InputError(f"no such file{what}", path)
 
 
 def read_file(path: str | os.PathLike[str], factor: float = 1.0) -> bytes:

@@ -16,7 +16,7 @@ from wrt.arguments import as_path, shown
 from wrt.errors import InputError, SceneWarning
 from wrt.memory import require
 from wrt.mesh import READERS, Mesh, load_mesh
-from wrt.read_file import read_file
+from wrt.read_file import read_file, require_file
 from wrt.scene import Material, Object, Scene
 from wrt.staging import stage
 from wrt.toml_limits import look_at
@@ -35,8 +35,7 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     """
     path = as_path(path, "path")
     known = ", ".join(LOADERS)
-    if not path.exists():
-        raise InputError(f"no such file (a scene is one of {known})", path)
+    require_file(path, f" (a scene is one of {known})")
     if path.is_dir():
         raise InputError(f"is a directory, not a scene file ({known})", path)
     if path.suffix.lower() not in LOADERS:

@@ -40,6 +40,15 @@ def test_what_is_no_file(path: str, message: str) -> None:
         read_file(path)
 
 
+@pytest.mark.parametrize("suffix", [".toml", ".obj", ".ply"])
+def test_a_name_too_long_for_the_system(suffix: str, tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text(f"materials.m = {{}}\n[[meshes]]\nmaterial = 'm'\nfile = '{'box.obj' * 1000}{suffix}'")
+    with pytest.raises(InputError, match="name too long") if suffix != ".toml" else pytest.raises(InputError, match="no mesh file"):
+        load_scene(tmp_path / "a.toml")
+    with pytest.raises(InputError, match="name too long"):
+        load_scene(tmp_path / f"{'x' * 5000}{suffix}")
+
+
 def test_a_file_larger_than_the_memory(tmp_path: Path, say_memory: Callable[[str], None]) -> None:
     with open(tmp_path / "a.obj", "wb") as file:
         file.truncate(1 << 30)  # takes no room on the disk
