@@ -2,9 +2,9 @@
 
 import warp as wp
 
+from wrt.kernels.shade.surface import spawn_point
 from wrt.kernels.structs import NO_HIT, Ray, Surfaces, kernel, make_ray
-from wrt.kernels.surface import spawn_point
-from wrt.kernels.traverse import make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.common import make_intersect, make_probe, no_hit
 
 LARGEST = wp.constant(3.4028234663852886e38)  # of float32
 

@@ -6,9 +6,6 @@ the same options.
 
 import warp as wp
 
-if __name__ != "wrt.kernels.structs":  # a second copy of a struct type fails at launch, with a message that helps nobody
-    raise ImportError(f"import wrt.kernels.structs, not {__name__}")
-
 NO_HIT = wp.constant(0x7FFFFFFF)  # prim_id while nothing is hit: larger than any other, so that ties go to a real one
 INF = wp.constant(float("inf"))
 EPSILON = wp.constant(2.0**-24)  # the unit roundoff of float32
@@ -140,7 +137,7 @@ class Texture:
 
 @wp.struct
 class Material:
-    """As wrt.scene.Material; textures are indices, -1 for none."""
+    """As wrt.scene.model.Material; textures are indices, -1 for none."""
 
     kind: int
     albedo: wp.vec3

@@ -24,7 +24,7 @@ import numpy as np
 from PIL import Image
 
 import wrt
-from wrt.shapes import box, icosphere, quad, teapot, torus
+from wrt.scene.shapes import box, icosphere, quad, teapot, torus
 
 QUICK = "WRT_QUICK" in os.environ
 SIZE, SPP = ((160, 90), 4) if QUICK else ((480, 270), 48)

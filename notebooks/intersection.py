@@ -12,10 +12,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.bench.hard_cases import generate, judge
-from wrt.bench.heatmap import heatmap
-from wrt.bench.visibility import terrain
-from wrt.reference import closest
+from wrt.lab.bench.visibility import terrain
+from wrt.lab.hard_cases.cases import generate, judge
+from wrt.lab.oracle.oracle import closest
+from wrt.picture.heatmap import heatmap
 
 QUICK = "WRT_QUICK" in os.environ
 SIZE, RAYS = ((160, 90), 2_000) if QUICK else ((480, 270), 20_000)
@@ -93,7 +93,7 @@ assert not lost["widened"].any()
 # %% [markdown]
 # A box is only a reason to look closer: a ray that is let in for nothing costs a test, a ray that is lost is a hole in the
 # picture. So wrt's default box unit (`box="conservative"`) errs on the safe side only: for boxes of triangles it widens by more
-# than here, since the triangle unit rounds as well (`kernels/ray_aabb.py` counts the errors).
+# than here, since the triangle unit rounds as well (`kernels/units/box.py` counts the errors).
 #
 # ## The triangle unit: Moeller and Trumbore
 # A point of the triangle is $v_0 + u\,e_1 + v\,e_2$ with the edges $e_1 = v_1 - v_0$ and $e_2 = v_2 - v_0$; a point of the ray is
@@ -148,7 +148,7 @@ wrt.side_by_side({f"{name}: {(ids < 0).sum()} lost": palette[ids].reshape(side, 
                  columns=3, scale=4)
 
 # %% [markdown]
-# "exactly" is the oracle: whole numbers decide on which side of an edge a ray passes (`wrt.reference`; directions and corners are
+# "exactly" is the oracle: whole numbers decide on which side of an edge a ray passes (`wrt.lab.oracle.oracle`; directions and corners are
 # float32 values, and taken as exact). No test in float32 finds the edges to the last step. But the watertight test leaves no gap:
 # **an edge may lie beside its place, as long as both of its triangles agree on where**.
 
@@ -218,7 +218,7 @@ wrt.side_by_side(pictures, columns=1 if QUICK else 2)
 
 # %% [markdown]
 # ## How many, over the hard cases
-# `wrt.bench.hard_cases` has 44 kinds of hard rays, most of them with a proof of what the answer must be: a ray that starts inside
+# `wrt.lab.hard_cases.cases` has 44 kinds of hard rays, most of them with a proof of what the answer must be: a ray that starts inside
 # a closed surface must hit it. Lost rays of each test:
 
 # %%

@@ -14,8 +14,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.bench.heatmap import heatmap
-from wrt.shapes import merged, quad, teapot
+from wrt.picture.heatmap import heatmap
+from wrt.scene.shapes import merged, quad, teapot
 
 QUICK = "WRT_QUICK" in os.environ
 SIZE, SPP = ((160, 90), 4) if QUICK else ((480, 270), 64)

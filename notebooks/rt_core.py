@@ -17,14 +17,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.bench import whatif
-from wrt.bench.heatmap import heatmap
-from wrt.bench.profile_report import model_rows
-from wrt.bench.visibility import terrain
-from wrt.profiler import KINDS
-from wrt.rtcore import TERMS
-from wrt.rtcore_parameters import BASE, GPUS
-from wrt.shapes import teapot, torus
+from wrt.lab.bench.visibility import terrain
+from wrt.lab.rtcore import whatif
+from wrt.lab.rtcore.model import TERMS
+from wrt.lab.rtcore.parameters import BASE, GPUS
+from wrt.lab.rtcore.profile_report import model_rows
+from wrt.lab.rtcore.profiler import KINDS
+from wrt.picture.heatmap import heatmap
+from wrt.scene.shapes import teapot, torus
 
 QUICK = "WRT_QUICK" in os.environ
 SIZE, SPP, RAYS = ((160, 90), 1, 1024) if QUICK else ((480, 270), 32, 16384)
@@ -252,7 +252,7 @@ plt.show()
 # %% [markdown]
 # ## Exercises
 # 1. Let the pot be a mirror. Which heat map changes most, and what happens to the range of the model?
-# 2. Which kind of ray is the hardest for the caches? `wrt.bench.profile_work.work_of(profile, "shadow").misses(gpu, BASE)` tells.
+# 2. Which kind of ray is the hardest for the caches? `wrt.lab.rtcore.profile_work.work_of(profile, "shadow").misses(gpu, BASE)` tells.
 # 3. `study("order")` with hills seen from above has little depth. Build a mesh with much (several `terrain`s above each other, by
 #    `wrt.Mesh`), and look at what order and early stop save.
 # 4. Later RT cores than Turing's test triangles at twice the rate. For which structure and rays does the model agree that it

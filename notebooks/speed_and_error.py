@@ -14,11 +14,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.bench import error
-from wrt.bench.heatmap import colored
-from wrt.bench.rays import ray_sets
-from wrt.bench.visibility import terrain
-from wrt.reference import closest, t_bound
+from wrt.lab.bench import error
+from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.visibility import terrain
+from wrt.lab.oracle.oracle import closest, t_bound
+from wrt.picture.heatmap import colored
 
 QUICK = "WRT_QUICK" in os.environ
 SIZE, SMALL = ((96, 54), (48, 27)) if QUICK else ((240, 135), (96, 54))
@@ -46,7 +46,7 @@ wrt.side_by_side({**pictures, **errors}, columns=3)
 
 # %% [markdown]
 # ## How fast does it fall?
-# `wrt.bench.error.sweep` renders with 1, 2, 4 ... samples and several seeds, and holds everything against a reference of its own.
+# `wrt.lab.bench.error.sweep` renders with 1, 2, 4 ... samples and several seeds, and holds everything against a reference of its own.
 # From the seeds come error bars; the error is split into noise, which seeds do not share, and bias, which they do. Here with both
 # samplers: random numbers, and scrambled Sobol points, which are spread evenly.
 
@@ -141,7 +141,7 @@ wrt.side_by_side(shown)
 
 # %% [markdown]
 # ## Beneath the picture: how exact is a hit?
-# The oracle (`wrt.reference`) answers in float64, and where that is not enough in whole numbers: its $t$ is exact to 14 digits.
+# The oracle (`wrt.lab.oracle.oracle`) answers in float64, and where that is not enough in whole numbers: its $t$ is exact to 14 digits.
 # Held against it, the error of each triangle test's $t$ in float32 steps (ulp) of $t$, over rays that start on hills into all
 # directions.
 

@@ -13,11 +13,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.bench import accel as bench
-from wrt.bench.heatmap import heatmap
-from wrt.bench.rays import ray_sets
-from wrt.bench.stadium import in_stadium
-from wrt.shapes import teapot
+from wrt.lab.bench import accel as bench
+from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.stadium import in_stadium
+from wrt.picture.heatmap import heatmap
+from wrt.scene.shapes import teapot
 
 QUICK = "WRT_QUICK" in os.environ
 SIZE, SPP, RAYS = ((160, 90), 1, 2_000) if QUICK else ((390, 220), 16, 20_000)
@@ -112,7 +112,7 @@ plt.show()
 
 # %% [markdown]
 # ## Build against search
-# The report of `wrt.bench.accel` measures both, with memory, and checks every answer: `differ` and `wrong` must be 0. Here the
+# The report of `wrt.lab.bench.accel` measures both, with memory, and checks every answer: `differ` and `wrong` must be 0. Here the
 # pot alone.
 
 # %%

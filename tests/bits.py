@@ -14,7 +14,7 @@ import numpy as np
 import wrt
 from tests.data import ROOT
 from tests.kernel_tools import floats, launch, zeros  # before warp: it silences Warp's banner
-from wrt import shapes
+from wrt.scene import shapes
 
 import warp as wp  # isort: skip
 

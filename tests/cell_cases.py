@@ -3,7 +3,7 @@
 import numpy as np
 
 from wrt.accel import Geometry
-from wrt.mesh import Mesh
+from wrt.scene.mesh import Mesh
 
 NO_SPHERES = np.zeros((0, 4), np.float32)
 

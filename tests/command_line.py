@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 from unittest import mock
 
-from wrt import cli
-from wrt.progress import COMPILING
+from wrt.cli import main as cli
+from wrt.renderer.progress import COMPILING
 
 BOX_OBJ = """\
 v -1 -1 -1
@@ -67,7 +67,7 @@ def largest_file(size: int) -> Iterator[None]:
     """
     import resource
 
-    from wrt.driver import PREPARING
+    from wrt.renderer.renderer import PREPARING
 
     for thread in threading.enumerate():
         if thread.name.startswith(PREPARING):

@@ -15,7 +15,7 @@ def pytest_configure() -> None:
 @pytest.fixture
 def say_memory(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Sets WRT_MEMORY; what the process of the tests has taken so far does not count."""
-    from wrt import memory
+    from wrt.core import memory
 
     def say(text: str) -> None:
         monkeypatch.setenv("WRT_MEMORY", text)

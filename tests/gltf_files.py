@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.errors import SceneWarning
-from wrt.gltf import load_gltf
+from wrt.core.errors import SceneWarning
+from wrt.io.gltf.reader import load_gltf
 
 COMPONENT = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
 KIND = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}

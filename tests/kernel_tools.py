@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wrt.device import start  # isort: skip (before warp: it silences Warp's banner)
+from wrt.core.device import start  # isort: skip (before warp: it silences Warp's banner)
 import warp as wp
 
 CPU = start("cpu")

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
-from wrt.device import load_kernel, upload
-from wrt.kernels.lanes import LANE_PAD
+from wrt.core.device import load_kernel, upload
 from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
-from wrt.kernels.ray_aabb import FAR_PAD
-from wrt.kernels.ray_bounding_sphere import SMALLEST, SPHERE_PAD
-from wrt.kernels.ray_kdop import RAY_PAD
-from wrt.kernels.traverse_kdtree import HELD_GRAZING, HELD_RELATIVE
+from wrt.kernels.traverse.kdtree import HELD_GRAZING, HELD_RELATIVE
+from wrt.kernels.units.bounding_sphere import SMALLEST, SPHERE_PAD
+from wrt.kernels.units.box import FAR_PAD
+from wrt.kernels.units.kdop import RAY_PAD
+from wrt.kernels.wide.lanes import LANE_PAD
 
 INF = np.float32(np.inf)
 REACH = np.float32(2.0**-19)

@@ -19,9 +19,9 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run
 from tests.data import ROOT
 from tests.gltf_files import GltfFile
-from tests.wrt.test_profiler import MIRRORS
-from wrt.cli import cli
-from wrt.mesh import load_mesh
+from tests.wrt.lab.rtcore.test_profiler import MIRRORS
+from wrt.cli.main import cli
+from wrt.scene.mesh import load_mesh
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 # Which CI itself runs (.ci/run), or a test of their own.
@@ -92,7 +92,7 @@ COMMANDS = [(page, line) for page, line in LINES if arguments(line) is not None]
 def test_there_are_command_lines() -> None:
     assert len(COMMANDS) >= 25 and {page for page, _ in COMMANDS} >= {"README.md", "docs/viewer.md", "docs/rt_core.md"}
     shown = {command_of(arguments(line) or [])[0] for _, line in COMMANDS}
-    assert shown - CHEAP.keys() - SLOW.keys() == {"view"}  # which waits for a browser: tests/wrt/test_viewer_page.py
+    assert shown - CHEAP.keys() - SLOW.keys() == {"view"}  # which waits for a browser: tests/wrt/viewer/test_page.py
     known = {name for name, command in cli.commands.items() if not isinstance(command, click.Group)}
     assert known <= shown  # no command is left out of the documentation
 
@@ -129,7 +129,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         gltf.node(camera=camera, translation=[0.2 * i, 0.1, 6.0])
     gltf.node(mesh=gltf.mesh(gltf.primitive(box.vertices, box.faces.ravel())))
     gltf.write(folder, "model.glb")
-    from wrt.image import write_image
+    from wrt.picture.image import write_image
 
     for name in ("a.exr", "b.exr"):
         write_image(folder / name, np.full((18, 32, 3), 0.25, np.float32))
@@ -160,11 +160,11 @@ def test_a_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path: Pat
     shutil.copytree(folder, tmp_path / "here")
     monkeypatch.chdir(tmp_path / "here")
     if "--accel" in words and "runs" in words:
-        pytest.skip("the structure that docs/extending.md makes: tests/wrt/test_extending.py runs it")
+        pytest.skip("the structure that docs/extending.md makes: tests/test_extending.py runs it")
     if words[0] == "profile":
         Path(words[1]).write_text(MIRRORS, encoding="utf-8")  # the kernel that counts its rays serves other tests too
     if "--cluster" in words or any("cuda" in word for word in words):
-        pytest.skip("tests/wrt/test_cluster.py runs it where there is a scheduler; two GPUs are not needed for a test")
+        pytest.skip("tests/wrt/renderer/distributed/test_dask.py runs it where there is a scheduler; two GPUs are not needed for a test")
     result = run(*words)
     assert result.code == 0, result.err
 

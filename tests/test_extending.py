@@ -15,7 +15,7 @@ BLOCK = re.compile(r"^```(python|diff)\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.
 
 TRY_IT = """
 import numpy as np, wrt
-from wrt.shapes import icosphere
+from wrt.scene.shapes import icosphere
 
 ball = icosphere(4)
 rng = np.random.default_rng(0)

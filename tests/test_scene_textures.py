@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.data import ROOT
-from wrt.image import read_image, read_rgba8
+from wrt.picture.image import read_image, read_rgba8
 
 TEXTURES = ROOT / "scenes" / "textures"
 

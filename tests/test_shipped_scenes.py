@@ -15,14 +15,14 @@ import wrt
 from tests.data import ROOT
 from wrt.accel import ACCELERATORS, Structure
 from wrt.accel.base import any_hit_kernel, closest_hit_kernel
-from wrt.cli_common import depth_hint
-from wrt.device import start
-from wrt.driver import aov_kernel, render_kernel
-from wrt.features import Features, features_of
-from wrt.kernels.ray_aabb import RAY_AABB
-from wrt.kernels.ray_triangle import RAY_TRIANGLE
-from wrt.kernels.traverse import Units
-from wrt.scene import Scene
+from wrt.cli.common import depth_hint
+from wrt.core.device import start
+from wrt.kernels.traverse.common import Units
+from wrt.kernels.units.box import RAY_AABB
+from wrt.kernels.units.triangle import RAY_TRIANGLE
+from wrt.renderer.features import Features, features_of
+from wrt.renderer.renderer import aov_kernel, render_kernel
+from wrt.scene.model import Scene
 
 SCENES = sorted((ROOT / "scenes").glob("*.toml"))
 

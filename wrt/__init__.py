@@ -1,59 +1,98 @@
-"""wrt: a Whitted ray tracer on NVIDIA Warp, a model of the RT-core split, and a laboratory for both."""
+"""wrt: a Whitted ray tracer on NVIDIA Warp, a model of the RT-core split, and a laboratory for both.
+
+Rays by themselves: load_mesh, Mesh, build, ACCELERATORS, load_accel, camera_rays.
+Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
+Scenes in Python: Scene, Settings, Camera, Object, Sphere, Material, Texture, Checkerboard, Motion; PointLight,
+DirectionalLight, SpotLight; ConstantBackground, GradientBackground, EnvironmentBackground.
+What a picture costs: profile. What goes wrong: InputError, SceneWarning.
+"""
 
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from wrt.accel import ACCELERATORS as ACCELERATORS
+    from wrt.accel.queries import build as build
+    from wrt.accel.queries import load_accel as load_accel
+    from wrt.core.errors import InputError as InputError
+    from wrt.core.errors import SceneWarning as SceneWarning
+    from wrt.io.load import load_scene as load_scene
+    from wrt.lab.rtcore.profiler import profile as profile
+    from wrt.picture.film import Film as Film
+    from wrt.renderer.options import Options as Options
+    from wrt.renderer.options import Progress as Progress
+    from wrt.renderer.pixel_rays import camera_rays as camera_rays
+    from wrt.renderer.renderer import render as render
+    from wrt.scene.mesh import Mesh as Mesh
+    from wrt.scene.mesh import load_mesh as load_mesh
+    from wrt.scene.model import Camera as Camera
+    from wrt.scene.model import Checkerboard as Checkerboard
+    from wrt.scene.model import ConstantBackground as ConstantBackground
+    from wrt.scene.model import DirectionalLight as DirectionalLight
+    from wrt.scene.model import EnvironmentBackground as EnvironmentBackground
+    from wrt.scene.model import GradientBackground as GradientBackground
+    from wrt.scene.model import Material as Material
+    from wrt.scene.model import Object as Object
+    from wrt.scene.model import PointLight as PointLight
+    from wrt.scene.model import Scene as Scene
+    from wrt.scene.model import Settings as Settings
+    from wrt.scene.model import Sphere as Sphere
+    from wrt.scene.model import SpotLight as SpotLight
+    from wrt.scene.model import Texture as Texture
+    from wrt.scene.motion import Motion as Motion
+    from wrt.viewer.notebook import LiveView as LiveView
+    from wrt.viewer.notebook import side_by_side as side_by_side
 
 __version__ = "0.1.0"
 
-# In a checkout the device code stands beside this package, in kernels/, and is imported as wrt.kernels all the same.
-if not (Path(__file__).parent / "kernels").is_dir():
-    __path__.append(str(Path(__file__).resolve().parent.parent))
-
-# Public names and where they live. They are imported on first use: `python -m wrt --help` must not wait for Warp.
+# The same names at run time, each imported when it is first used: `python -m wrt --help` must not wait for Warp.
 _PUBLIC = {
-    "ACCELERATORS": "wrt.accel",
-    "build": "wrt.queries",
-    "load_accel": "wrt.queries",
-    "Mesh": "wrt.mesh",
-    "load_mesh": "wrt.mesh",
-    "InputError": "wrt.errors",
-    "SceneWarning": "wrt.errors",
-    "load_scene": "wrt.scene_file",
-    "render": "wrt.driver",
-    "LiveView": "wrt.notebook",
-    "side_by_side": "wrt.notebook",
-    "Options": "wrt.options",
-    "Progress": "wrt.options",
-    "Film": "wrt.film",
-    "profile": "wrt.profiler",
-    "camera_rays": "wrt.pixel_rays",
-    "Camera": "wrt.scene",
-    "Checkerboard": "wrt.scene",
-    "ConstantBackground": "wrt.scene",
-    "DirectionalLight": "wrt.scene",
-    "EnvironmentBackground": "wrt.scene",
-    "GradientBackground": "wrt.scene",
-    "Material": "wrt.scene",
-    "Motion": "wrt.motion",
-    "Object": "wrt.scene",
-    "PointLight": "wrt.scene",
-    "Scene": "wrt.scene",
-    "Settings": "wrt.scene",
-    "Sphere": "wrt.scene",
-    "SpotLight": "wrt.scene",
-    "Texture": "wrt.scene",
+    "wrt.accel": ("ACCELERATORS",),
+    "wrt.accel.queries": ("build", "load_accel"),
+    "wrt.core.errors": ("InputError", "SceneWarning"),
+    "wrt.io.load": ("load_scene",),
+    "wrt.lab.rtcore.profiler": ("profile",),
+    "wrt.picture.film": ("Film",),
+    "wrt.renderer.options": ("Options", "Progress"),
+    "wrt.renderer.pixel_rays": ("camera_rays",),
+    "wrt.renderer.renderer": ("render",),
+    "wrt.scene.mesh": ("Mesh", "load_mesh"),
+    "wrt.scene.model": ("Camera", "Checkerboard", "ConstantBackground", "DirectionalLight", "EnvironmentBackground",
+                        "GradientBackground", "Material", "Object", "PointLight", "Scene", "Settings", "Sphere", "SpotLight",
+                        "Texture"),
+    "wrt.scene.motion": ("Motion",),
+    "wrt.viewer.notebook": ("LiveView", "side_by_side"),
 }
-__all__ = ["__version__", *_PUBLIC]
+_HOME = {name: module for module, names in _PUBLIC.items() for name in names}
+__all__ = ["__version__", *_HOME]
+
+
+def _find_kernels() -> None:
+    """In a checkout, wrt/kernels is a symbolic link to kernels/. Where links are not kept (the source distribution, Windows),
+    wrt.kernels is made of that folder itself."""
+    folder = Path(__file__).resolve().parent.parent / "kernels"
+    if (Path(__file__).parent / "kernels").is_dir() or not folder.is_dir():
+        return
+    spec = importlib.util.spec_from_file_location("wrt.kernels", folder / "__init__.py", submodule_search_locations=[str(folder)])
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{folder} is no package")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["wrt.kernels"] = module
+    spec.loader.exec_module(module)
+    globals()["kernels"] = module
+
+
+_find_kernels()
 
 
 def __getattr__(name: str) -> Any:
-    if name in _PUBLIC:
-        if _PUBLIC[name] != "wrt.errors":
-            importlib.import_module("wrt.address_space").require_modules()
-        value = getattr(importlib.import_module(_PUBLIC[name]), name)
+    if name in _HOME:
+        value = getattr(importlib.import_module(_HOME[name]), name)
         globals()[name] = value
         return value
     raise AttributeError(f"module 'wrt' has no attribute {name!r}")

@@ -1,5 +1,5 @@
 """`python -m wrt`: the command line."""
 
-from wrt.cli import main
+from wrt.cli.main import main
 
 main()

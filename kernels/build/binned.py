@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from wrt.kernels.build_records import (
+from wrt.kernels.build.records import (
     MAX_DEPTH,
     BuildData,
     BuildTask,

@@ -6,8 +6,8 @@ launch works depth first, so that it holds no more pieces at a time than lie alo
 
 import warp as wp
 
-from wrt.kernels.build_bsp_cell import Cells, box_cell, cell_area, clip_cell, copy_cell, crossing, plane_side
-from wrt.kernels.build_bsp_split import (
+from wrt.kernels.build.bsp_cell import Cells, box_cell, cell_area, clip_cell, copy_cell, crossing, plane_side
+from wrt.kernels.build.bsp_split import (
     OUTWARDS,
     BspSplit,
     BspTools,
@@ -20,7 +20,7 @@ from wrt.kernels.build_bsp_split import (
     sides_of,
 )
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_bsp import INNER, STACK_SIZE, BspNode
+from wrt.kernels.traverse.bsp import INNER, STACK_SIZE, BspNode
 
 MAX_CORNERS = wp.constant(16)  # a piece of a triangle that would get more keeps those it has, and sticks out of its cell
 CELL_SLOTS = STACK_SIZE + 1

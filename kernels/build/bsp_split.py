@@ -10,8 +10,8 @@ what it does in the traversal unit, whose derivation of why no hit is lost says 
 
 import warp as wp
 
-from wrt.kernels.build_bsp_cell import Cells, plane_side, split_areas
-from wrt.kernels.traverse_bsp import PLANE, SMALLEST
+from wrt.kernels.build.bsp_cell import Cells, plane_side, split_areas
+from wrt.kernels.traverse.bsp import PLANE, SMALLEST
 
 EXACT = wp.constant(24)  # up to so many primitives, planes across an axis are tried at the ends of each; above, at
 STEPS = wp.constant(32)  # so many even steps

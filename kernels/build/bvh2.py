@@ -8,8 +8,8 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.build_binned import split_binned
-from wrt.kernels.build_records import (
+from wrt.kernels.build.binned import split_binned
+from wrt.kernels.build.records import (
     MAX_DEPTH,
     BuildData,
     BuildOptions,
@@ -30,7 +30,7 @@ from wrt.kernels.build_records import (
     tell_parent,
 )
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
 
 @wp.func

@@ -7,8 +7,8 @@ remains is larger by as much again. A leaf without the triangle then never holds
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT
 from wrt.kernels.structs import kernel
+from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT
 
 CLIP_EXTENT = wp.constant(wp.float64(2.0 * PAD_EXTENT))
 CLIP_COORDINATE = wp.constant(wp.float64(PAD_COORDINATE))

@@ -8,7 +8,7 @@ boxes is found by clipping it to them (Sutherland and Hodgman 1974), in float64.
 import warp as wp
 
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_bvh2 import STACK_SIZE
+from wrt.kernels.traverse.bvh2 import STACK_SIZE
 
 MAX_CORNERS = 12  # a triangle, and one more for each of the six planes; rounding may add some
 

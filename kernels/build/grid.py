@@ -6,9 +6,9 @@ the lists do not depend on the number of threads.
 
 import warp as wp
 
+from wrt.kernels.build.triangle_cell import CellSource, TriangleCell, meets_cell, triangle_cell
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_grid import GridCell, GridLayout, grid_plane
-from wrt.kernels.triangle_cell import CellSource, TriangleCell, meets_cell, triangle_cell
+from wrt.kernels.traverse.grid import GridCell, GridLayout, grid_plane
 
 
 @wp.func

@@ -8,9 +8,9 @@ plane are clipped to both cells, sorted by themselves and merged in. The host la
 
 import warp as wp
 
-from wrt.kernels.build_clip import Clippable, clip_to_cell
+from wrt.kernels.build.clip import Clippable, clip_to_cell
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_kdtree import LEAF, STACK_SIZE, KdNode
+from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 
 BOTH = wp.constant(wp.uint8(0))
 LEFT = wp.constant(wp.uint8(1))

@@ -6,9 +6,9 @@ the tree does not depend on the number of threads.
 
 import warp as wp
 
+from wrt.kernels.build.triangle_cell import CellSource, meets_cell, triangle_cell
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_octree import OctreeLayout, octant_corner, octree_planes
-from wrt.kernels.triangle_cell import CellSource, meets_cell, triangle_cell
+from wrt.kernels.traverse.octree import OctreeLayout, octant_corner, octree_planes
 
 
 @wp.func

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from wrt.kernels.lanes import row_type
-from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.wide.lanes import row_type
 
 # From here on a range is halved by number, which takes ceil(log2(n)) more levels, whatever the SAH would like.
 MAX_DEPTH = wp.constant(STACK_SIZE - 2)

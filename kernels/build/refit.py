@@ -3,7 +3,7 @@
 import warp as wp
 
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_bvh2 import Bvh2Node
+from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 
 @kernel

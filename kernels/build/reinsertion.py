@@ -7,9 +7,9 @@ same tree, on all cores; then the moves are made one after the other, the best f
 
 import warp as wp
 
-from wrt.kernels.build_records import BuildOptions, rows_of
+from wrt.kernels.build.records import BuildOptions, rows_of
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_bvh2 import Bvh2Node
+from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 QUEUE = 96
 QUEUE_SIZE = wp.constant(QUEUE)

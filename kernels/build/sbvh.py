@@ -7,8 +7,8 @@ which is shared between its sides in proportion, so that subtrees can be built o
 
 import warp as wp
 
-from wrt.kernels.build_binned import BIN_COUNT, BINS, Split, bin_of, binned_split, bins_of
-from wrt.kernels.build_records import (
+from wrt.kernels.build.binned import BIN_COUNT, BINS, Split, bin_of, binned_split, bins_of
+from wrt.kernels.build.records import (
     MAX_DEPTH,
     BuildData,
     BuildOptions,
@@ -25,9 +25,9 @@ from wrt.kernels.build_records import (
     rows_of,
     tell_parent,
 )
-from wrt.kernels.ray_aabb import box_pad, padded_hi, padded_lo
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
 
 
 @wp.struct

@@ -7,10 +7,10 @@ down, the nodes that this calls for. A leaf costs as much as the full rows of pr
 
 import warp as wp
 
-from wrt.kernels.lanes import EMPTY
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
-from wrt.kernels.traverse_wide import LEAF_RANGE
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.wide.lanes import EMPTY
+from wrt.kernels.wide.traverse import LEAF_RANGE
 
 MAX_WIDTH = wp.constant(8)
 

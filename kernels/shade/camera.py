@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from wrt.kernels.sampling import disk, polygon
+from wrt.kernels.shade.sampling import disk, polygon
 from wrt.kernels.structs import Camera, Ray, lift, make_ray
 
 

@@ -2,10 +2,9 @@
 
 import warp as wp
 
-from wrt.kernels.materials import DIFFUSE, Scatter, blinn_phong
-from wrt.kernels.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, hash_pair, make_sample_2d, search_cdf, triangle
-from wrt.kernels.structs import Background, Light, Lighting, Material, Ray, Surfaces, gamma, make_ray
-from wrt.kernels.surface import (
+from wrt.kernels.shade.materials import DIFFUSE, Scatter, blinn_phong
+from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, hash_pair, make_sample_2d, search_cdf, triangle
+from wrt.kernels.shade.surface import (
     Surface,
     make_place_of,
     spawn_point,
@@ -16,6 +15,7 @@ from wrt.kernels.surface import (
     world_normal,
     world_point,
 )
+from wrt.kernels.structs import Background, Light, Lighting, Material, Ray, Surfaces, gamma, make_ray
 
 LIGHT_POINT = 0
 LIGHT_DIRECTIONAL = 1

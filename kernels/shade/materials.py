@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from wrt.kernels.sampling import PI, ggx_normal, ggx_visible_share
+from wrt.kernels.shade.sampling import PI, ggx_normal, ggx_visible_share
+from wrt.kernels.shade.surface import Surface, make_place_of, make_surface_at
+from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Material, Surfaces
-from wrt.kernels.surface import Surface, make_place_of, make_surface_at
-from wrt.kernels.textures import make_sample_texture
 
 DIFFUSE = 0
 MIRROR = 1

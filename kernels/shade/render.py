@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from wrt.kernels.camera import chief_ray, make_camera_ray
-from wrt.kernels.materials import make_cutout, make_shade
-from wrt.kernels.sampling import hash_pair, make_sample_2d
+from wrt.kernels.shade.camera import chief_ray, make_camera_ray
+from wrt.kernels.shade.materials import make_cutout, make_shade
+from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
+from wrt.kernels.shade.whitted import make_radiance
 from wrt.kernels.structs import AovFilm, Camera, Film, Lighting, Limits, Surfaces, Tile, kernel, make_ray
-from wrt.kernels.whitted import make_radiance
 
 
 @wp.func
@@ -26,7 +26,7 @@ def make_traversals(features, structure):
 def make_render_kernel(features, structure):
     """A kernel that adds samples to the pixels of a tile; it holds only the code that `features` asks for.
 
-    Where the structure's units count, it must be a wrt.kernels.ray_log one, and every ray is logged.
+    Where the structure's units count, it must be a wrt.kernels.study.ray_log one, and every ray is logged.
     """
     accel_struct = structure.struct
     closest_hit, any_hit = make_traversals(features, structure)

@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from wrt.kernels.materials import BLEND, make_is_solid, make_scatter, make_shade
+from wrt.kernels.shade.materials import BLEND, make_is_solid, make_scatter, make_shade
+from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Material, Ray, Surfaces
-from wrt.kernels.surface import Surface, spawn_point
 
 OUTSIDE = wp.constant(-1)  # of any glass
 MAX_TRANSPARENT = wp.constant(256)  # surfaces in a row that a ray may go straight through

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from wrt.kernels.sampling import PI, TWO_PI, frame_x
+from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x
 from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift
 
 

@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.lights import (
+from wrt.kernels.shade.lights import (
     make_background,
     make_light_sample,
     make_light_xi,
@@ -18,12 +18,12 @@ from wrt.kernels.lights import (
     make_sky_sample,
     shadow_ray,
 )
-from wrt.kernels.materials import BLEND, Scatter, make_is_solid, make_scatter, make_shade
-from wrt.kernels.ray_log import label
-from wrt.kernels.sampling import hash_pair, make_sample_2d
-from wrt.kernels.shadows import MAX_TRANSPARENT, OUTSIDE, Shadow, attenuation, make_transmittance
+from wrt.kernels.shade.materials import BLEND, Scatter, make_is_solid, make_scatter, make_shade
+from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
+from wrt.kernels.shade.shadows import MAX_TRANSPARENT, OUTSIDE, Shadow, attenuation, make_transmittance
+from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Lighting, Limits, Material, Ray, Surfaces, make_ray
-from wrt.kernels.surface import Surface, spawn_point
+from wrt.kernels.study.ray_log import label
 
 MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
 UNKNOWN = wp.constant(-2)  # where a camera ray begins: within glass, or not
@@ -127,7 +127,7 @@ def make_direct_light(features, accel_struct, closest_hit, any_hit):
 
 
 def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
-    """The whole tree of rays behind one camera ray. `features`: wrt.features.Features; counting: rays carry a label."""
+    """The whole tree of rays behind one camera ray. `features`: wrt.renderer.features.Features; counting: rays carry a label."""
     Path = make_path(counting)
     sample_2d = make_sample_2d(features)
     surface_at, resolve, shading_normal = make_shade(features)

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import warp as wp
 
-from wrt.kernels.counters import Counts, make_counters
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
-from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
-from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node, box_volumes, make_binary_traversal, make_struct
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node, box_volumes, make_binary_traversal, make_struct
+from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.counters import Counts, make_counters
 
 LEVELS = 62  # of the tree, that a trail has bits for
 TOP = wp.constant(wp.uint64(1 << 63))

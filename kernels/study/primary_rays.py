@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from wrt.kernels.camera import chief_ray
+from wrt.kernels.shade.camera import chief_ray
 from wrt.kernels.structs import Camera, Surfaces, Tile, kernel, make_ray
 
 

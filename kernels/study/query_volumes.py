@@ -5,10 +5,10 @@ from functools import cache
 import warp as wp
 
 from wrt.kernels.query import RayArrays, load_ray
-from wrt.kernels.ray_aabb import box_ray, ray_aabb
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse import Units, make_probe
-from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node, Volumes
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node, Volumes
+from wrt.kernels.traverse.common import Units, make_probe
+from wrt.kernels.units.box import box_ray, ray_aabb
 
 
 @cache

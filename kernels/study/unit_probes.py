@@ -4,9 +4,9 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import RAY_AABB, BoxRay
-from wrt.kernels.ray_triangle import RAY_TRIANGLE, TriangleRay
 from wrt.kernels.structs import Ray, kernel
+from wrt.kernels.units.box import RAY_AABB, BoxRay
+from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay
 
 
 @wp.struct

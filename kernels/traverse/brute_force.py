@@ -4,9 +4,9 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.counters import Counts, Recorder, make_counters
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
-from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 
 
 @cache

@@ -29,10 +29,10 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.counters import Counts, Recorder, make_counters
-from wrt.kernels.ray_aabb import BoxRay, slab_interval
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
-from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.units.box import BoxRay, slab_interval
 
 # The builder keeps the depth at or below this; a path from the root pushes at most one child a level.
 STACK_SIZE = 64

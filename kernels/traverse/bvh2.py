@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.counters import Counts, Recorder, make_counters
-from wrt.kernels.ray_aabb import BoxRay
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
-from wrt.kernels.traverse import Probe, Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.units.box import BoxRay
 
 # Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
 STACK_SIZE = 64

@@ -4,10 +4,10 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.counters import Recorder
-from wrt.kernels.ray_kdop import KdopRay, kdop_ray, ray_kdop
-from wrt.kernels.traverse import Probe, Units
-from wrt.kernels.traverse_bvh2 import STACK_SIZE, Volumes, make_binary_traversal  # noqa: F401 (STACK_SIZE: for the host)
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Volumes, make_binary_traversal  # noqa: F401 (STACK_SIZE: for the host)
+from wrt.kernels.traverse.common import Probe, Units
+from wrt.kernels.traverse.counters import Recorder
+from wrt.kernels.units.kdop import KdopRay, kdop_ray, ray_kdop
 
 
 @wp.struct

@@ -8,7 +8,7 @@ or behind the cells that list it, and a walk goes on so far behind its best hit,
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import FAR_PAD, BoxRay
+from wrt.kernels.units.box import FAR_PAD, BoxRay
 
 
 @wp.func

@@ -4,10 +4,10 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import RAY_AABB, BoxRay, box_ray
-from wrt.kernels.ray_sphere import ray_sphere
-from wrt.kernels.ray_triangle import RAY_TRIANGLE, TriangleRay, triangle_ray
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.units.box import RAY_AABB, BoxRay, box_ray
+from wrt.kernels.units.sphere import ray_sphere
+from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay, triangle_ray
 
 
 class Units(NamedTuple):

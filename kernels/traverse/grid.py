@@ -10,11 +10,11 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.cell_ray import cell_slack, earlier, later, parallel
-from wrt.kernels.counters import Counts, Recorder, make_counters
-from wrt.kernels.ray_aabb import BoxRay, slab_interval
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
-from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.cell_ray import cell_slack, earlier, later, parallel
+from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.units.box import BoxRay, slab_interval
 
 MAILBOX_SIZE = 8
 

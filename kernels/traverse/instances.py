@@ -9,11 +9,11 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.counters import Counts, Recorder, add_counts, make_counters
-from wrt.kernels.ray_aabb import FAR_PAD, BoxRay, box_ray, slab_interval
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
-from wrt.kernels.traverse import Units, no_hit
-from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.traverse.common import Units, no_hit
+from wrt.kernels.traverse.counters import Counts, Recorder, add_counts, make_counters
+from wrt.kernels.units.box import FAR_PAD, BoxRay, box_ray, slab_interval
 
 
 @wp.struct

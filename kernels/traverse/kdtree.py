@@ -14,11 +14,11 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.cell_ray import earlier, later
-from wrt.kernels.counters import Counts, Recorder, make_counters
-from wrt.kernels.ray_aabb import slab_interval
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
-from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.cell_ray import earlier, later
+from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.units.box import slab_interval
 
 # Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
 STACK_SIZE = 64

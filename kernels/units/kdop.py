@@ -7,8 +7,8 @@ Projections are taken from a point in the middle of everything, so that their ro
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import FAR_PAD, BoxRay, slab_interval
 from wrt.kernels.structs import Ray
+from wrt.kernels.units.box import FAR_PAD, BoxRay, slab_interval
 
 # In units of 2^-24. What a projected plane may be off by, of the sum of the origin's coordinates: 9 for where the triangle unit
 # sees the corners along the ray (3 of the distance in each coordinate), 3 for the direction's projection, 2 for the origin's,

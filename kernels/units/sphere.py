@@ -8,9 +8,9 @@ difference of two numbers near its radius.
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import FAR_PAD, BoxRay
-from wrt.kernels.ray_triangle import held, padded_interval
 from wrt.kernels.structs import NO_HIT, Hit, Ray
+from wrt.kernels.units.box import FAR_PAD, BoxRay
+from wrt.kernels.units.triangle import held, padded_interval
 
 
 @wp.func

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import FAR_PAD, BoxRay, box_pad, padded_hi, padded_lo, slab_interval
 from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray
+from wrt.kernels.units.box import FAR_PAD, BoxRay, box_pad, padded_hi, padded_lo, slab_interval
 
-# How far holding t to its box may move it through rounding: seven of them (wrt.reference_bounds), and one step of a denormal t.
+# How far holding t to its box may move it through rounding: seven of them (wrt.lab.oracle.bounds), and one step of a denormal t.
 HELD_ROUNDING = wp.constant(7.0 * 2.0**-24)
 HELD_STEP = wp.constant(2.0**-149)
 
@@ -70,7 +70,7 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
     on a line may no longer be on one after their rounding here (wrt.accel.triangle_data.corners).
 
     Domain: differences of coordinates below 2^127, and a direction whose longest component is between 2^-64 and 2^64
-    (kernels.query brings others there); beyond, rays may be lost. The error bounds are in wrt.reference_bounds.
+    (kernels.query brings others there); beyond, rays may be lost. The error bounds are in wrt.lab.oracle.bounds.
     """
     hit = Hit()
     hit.prim_id = NO_HIT

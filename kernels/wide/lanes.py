@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.ray_aabb import FAR_PAD, BoxRay
+from wrt.kernels.units.box import FAR_PAD, BoxRay
 
 EMPTY = wp.constant(0)  # a child that does not exist: the root is nobody's child
 

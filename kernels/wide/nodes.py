@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.lanes import LANE_PAD, LaneRay, row_type
-from wrt.kernels.ray_aabb import RAY_AABB
+from wrt.kernels.units.box import RAY_AABB
+from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, row_type
 
 
 class Nodes(NamedTuple):

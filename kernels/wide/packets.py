@@ -9,9 +9,9 @@ the last bit: they are its twins, and tests hold the two together.
 import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.ray_aabb import FAR_PAD
-from wrt.kernels.ray_triangle import HELD_ROUNDING
-from wrt.kernels.traverse_wide import STACK_SIZE
+from wrt.kernels.units.box import FAR_PAD
+from wrt.kernels.units.triangle import HELD_ROUNDING
+from wrt.kernels.wide.traverse import STACK_SIZE
 
 LANES = 16
 ROWS = ("origin_x", "origin_y", "origin_z", "inverse_x", "inverse_y", "inverse_z", "far_x", "far_y", "far_z", "t_min", "t",

@@ -10,8 +10,12 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.lanes import make_lanes
-from wrt.kernels.packets import (
+from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.structs import NO_HIT, Hit, Surfaces, kernel
+from wrt.kernels.traverse.common import Probe, Units, make_intersect
+from wrt.kernels.wide.lanes import make_lanes
+from wrt.kernels.wide.nodes import first_reference, make_box_test, node_size
+from wrt.kernels.wide.packets import (
     ENTRY,
     LANES,
     MET,
@@ -38,10 +42,7 @@ from wrt.kernels.packets import (
     write_dark,
     write_hits,
 )
-from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.structs import NO_HIT, Hit, Surfaces, kernel
-from wrt.kernels.traverse import Probe, Units, make_intersect
-from wrt.kernels.traverse_wide import (
+from wrt.kernels.wide.traverse import (
     EMPTY_STACK,
     LEAF_RANGE,
     STACK_SIZE,
@@ -52,7 +53,6 @@ from wrt.kernels.traverse_wide import (
     reference_of,
     t_of,
 )
-from wrt.kernels.wide_nodes import first_reference, make_box_test, node_size
 
 WIDTH = 8
 lowest, number, bits = make_lanes(WIDTH).lowest, make_lanes(WIDTH).value, make_lanes(WIDTH).bits

@@ -11,12 +11,12 @@ from functools import cache
 
 import warp as wp
 
-from wrt.kernels.counters import Counts, Recorder, make_counters
-from wrt.kernels.lanes import EMPTY, LaneRay, make_lanes
-from wrt.kernels.ray_triangle import component
 from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray, Surfaces
-from wrt.kernels.traverse import Probe, Units, make_intersect, make_probe, no_hit
-from wrt.kernels.wide_nodes import first_reference, make_box_test, node_size
+from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.units.triangle import component
+from wrt.kernels.wide.lanes import EMPTY, LaneRay, make_lanes
+from wrt.kernels.wide.nodes import first_reference, make_box_test, node_size
 
 # The builder lets no walk have more entries than this (kernels.build_wide.collapse).
 STACK_SIZE = 64

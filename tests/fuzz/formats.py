@@ -58,7 +58,7 @@ def make_case(form: Format, rng: Random) -> Seed:
 @cache
 def toml_words() -> list[str]:
     """Every key and every choice of the schema."""
-    from wrt.scene_file import schema
+    from wrt.io.load import schema
 
     found: set[str] = set()
     stack: list[Any] = [schema()]
@@ -136,7 +136,7 @@ def gltf_of(suffix: str, tree: Any, binary: bytes, new: bool = False) -> Seed:
 
 
 def read_scene(path: Path) -> object:
-    from wrt.scene_file import load_scene
+    from wrt.io.load import load_scene
 
     return load_scene(path)
 
@@ -150,7 +150,7 @@ def damaged_mesh(seed: Seed, other: Seed, rng: Random) -> Seed:
 
 
 def read_mesh(path: Path) -> object:
-    from wrt.mesh import load_mesh
+    from wrt.scene.mesh import load_mesh
 
     return load_mesh(path)
 
@@ -227,9 +227,9 @@ def png_of(chunks: list[tuple[bytes, bytes]]) -> bytes:
 
 def read_picture(path: Path) -> object:
     """As an environment, as a texture, and what is written about it."""
-    from wrt.errors import InputError
-    from wrt.image import read_image, read_metadata
-    from wrt.image_decode import decode_rgba8
+    from wrt.core.errors import InputError
+    from wrt.picture.decode import decode_rgba8
+    from wrt.picture.image import read_image, read_metadata
 
     results: list[object] = []
     for read in (read_image, lambda path: decode_rgba8(path.read_bytes()), read_metadata):
@@ -288,7 +288,7 @@ def damaged_numbers(body: bytes, rng: Random) -> bytes:
 
 @cache
 def ball() -> Any:
-    from wrt.shapes import icosphere
+    from wrt.scene.shapes import icosphere
 
     return icosphere(1)
 
@@ -329,10 +329,10 @@ IDENTITY = {"seed": 0, "crop": [0, 0, 6, 4], "scene": "x", "kernels": "y"}
 
 
 def checkpoint_of(path: Path, groups: int) -> tuple[Any, Any]:
-    from wrt.checkpoint import Checkpoint
-    from wrt.device import start
-    from wrt.device_film import DeviceFilm
-    from wrt.scene import Settings
+    from wrt.core.device import start
+    from wrt.renderer.checkpoint import Checkpoint
+    from wrt.renderer.film_arrays import DeviceFilm
+    from wrt.scene.model import Settings
 
     film = DeviceFilm(Settings(size=(6, 4)), (0, 0, 6, 4), start("cpu"), 0, groups)
     return film, Checkpoint(path, 60.0, {**IDENTITY, "groups": groups}, area=24, groups=groups, resume=True)
@@ -381,9 +381,9 @@ def render_scene(path: Path) -> object:
     """
     from unittest import mock
 
-    from wrt import driver
-    from wrt.features import STACK_STEP, Features
-    from wrt.scene import EnvironmentBackground
+    from wrt.renderer import renderer as driver
+    from wrt.renderer.features import STACK_STEP, Features
+    from wrt.scene.model import EnvironmentBackground
 
     scene = load_scene_with_normals(path)
     environment = isinstance(scene.background, EnvironmentBackground)
@@ -399,7 +399,7 @@ def render_scene(path: Path) -> object:
 
 
 def load_scene_with_normals(path: Path) -> Any:
-    from wrt.scene_file import load_scene
+    from wrt.io.load import load_scene
 
     scene = load_scene(path)
     if scene.objects and all(thing.mesh.normals is None for thing in scene.objects):

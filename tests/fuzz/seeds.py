@@ -13,7 +13,7 @@ import numpy as np
 
 from tests.command_line import BOX_OBJ
 from tests.gltf_files import one_triangle, rich_file
-from wrt.image import encode_png, write_exr, write_image
+from wrt.picture.image import encode_png, write_exr, write_image
 
 SIDE_FILES = ("a.png", "sky.hdr", "sky.exr", "box.obj", "ball.ply", "part.stl", "thing.glb", "thing.gltf")
 

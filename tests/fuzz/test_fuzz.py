@@ -18,7 +18,7 @@ from tests.data import ROOT
 from tests.fuzz.formats import FORMATS, Format, load_accel_only, make_case
 from tests.fuzz.seeds import Seed
 from tests.fuzz.worker import Judge
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 
 def judge_of(name: str, folder: Path) -> Judge:

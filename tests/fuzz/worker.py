@@ -22,7 +22,7 @@ from typing import Any
 
 from tests.fuzz import seeds
 from tests.fuzz.formats import ALL_FORMATS, Format, make_case
-from wrt.errors import InputError, SceneWarning
+from wrt.core.errors import InputError, SceneWarning
 
 ROOM = 1 << 30  # bytes of address space beyond what a worker has when it begins
 # What a file may take where that is to be in proportion to its size: seconds and bytes for any file, and bytes for each byte.

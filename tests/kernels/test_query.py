@@ -10,9 +10,9 @@ import warp as wp
 
 from wrt.accel import ACCELERATORS, Structure, build
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
-from wrt.kernels.ray_triangle import RAY_TRIANGLE
 from wrt.kernels.structs import Ray, Surfaces, kernel, make_ray
-from wrt.mesh import Mesh
+from wrt.kernels.units.triangle import RAY_TRIANGLE
+from wrt.scene.mesh import Mesh
 
 TRIANGLE = Mesh([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], [[0, 1, 2]])
 STRUCTURES = sorted({cls.name: cls for cls in ACCELERATORS.values()}.items())

@@ -7,10 +7,10 @@ from typing import Any
 
 from wrt.accel.base import Accelerator, AccelStats, Geometry, Hits, Structure
 from wrt.accel.instances import InstancedGeometry, Instances
-from wrt.accel.registry import Registry
 from wrt.accel.store import build_cached, load_accel
-from wrt.mesh import Mesh
-from wrt.structures import STRUCTURES
+from wrt.accel.structures import STRUCTURES
+from wrt.core.registry import Registry
+from wrt.scene.mesh import Mesh
 
 __all__ = ["ACCELERATORS", "AccelStats", "Accelerator", "Geometry", "Hits", "InstancedGeometry", "Instances", "Structure", "build",
            "build_cached", "load_accel", "tells_progress"]

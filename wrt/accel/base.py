@@ -17,22 +17,22 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.accel.streams import launch_stream, stream_kernel
+from wrt.accel.batches import launch_stream, stream_kernel
 from wrt.accel.triangle_data import TRIANGLE_DATA
-from wrt.device import load_kernel, made_once, records, run_all, start, thread_count, upload
-from wrt.errors import InputError
-from wrt.exchange import check_no_gradients, real_numbers, taken, to_numpy, to_warp
-from wrt.kernels import traverse_instances
-from wrt.kernels.counters import SIZE_RANGE, Counts
+from wrt.core.arrays import check_no_gradients, real_numbers, taken, to_numpy, to_warp
+from wrt.core.device import load_kernel, made_once, records, run_all, start, thread_count, upload
+from wrt.core.errors import InputError
+from wrt.core.html import html_facts, html_table
+from wrt.core.memory import require
+from wrt.core.seconds import seconds_without_loads
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
-from wrt.kernels.ray_aabb import PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST, RAY_AABB
-from wrt.kernels.ray_triangle import RAY_TRIANGLE
 from wrt.kernels.structs import Surfaces
-from wrt.kernels.traverse import Units
-from wrt.memory import require
-from wrt.mesh import Mesh
-from wrt.seconds import seconds_without_loads
-from wrt.tables import html_facts, html_table
+from wrt.kernels.traverse import instances as traverse_instances
+from wrt.kernels.traverse.common import Units
+from wrt.kernels.traverse.counters import SIZE_RANGE, Counts
+from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST, RAY_AABB
+from wrt.kernels.units.triangle import RAY_TRIANGLE
+from wrt.scene.mesh import Mesh
 
 RAYS_PER_LAUNCH = 16384
 RECORDS_PER_JOB = 32768
@@ -291,7 +291,7 @@ class Accelerator(ABC):
     Several threads may ask one structure at a time, and one of them may refit it: docs/acceleration.md, "Several threads".
 
     kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts); for the CPU it may have
-    make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.streams), with stream_block and stream_sizes.
+    make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.batches), with stream_block and stream_sizes.
     """
 
     name: ClassVar[str]
@@ -405,12 +405,12 @@ class Accelerator(ABC):
         raise InputError(f"a {self.name} has no end-point overlap: it is no hierarchy of boxes")
 
     def epo(self) -> float:
-        """End-point overlap of a BVH: nodes and primitives visited for nothing at a random point of the surface (wrt.accel.epo).
+        """End-point overlap of a BVH: nodes and primitives visited for nothing at a random point of the surface (wrt.accel.bvh.epo).
 
         It tells of rays that end, as stats.sah_cost does of lines that nothing stops; it takes about as long as a build. Raises
         InputError for structures that are no BVH.
         """
-        from wrt.accel.epo import end_point_overlap
+        from wrt.accel.bvh.epo import end_point_overlap
 
         state = self._state
         return end_point_overlap(self._children(state.built), state.geometry, self.threads)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from wrt.device import empty_aligned, load_kernel, made_once, run_all, upload
-from wrt.kernels.packets import Scratch
+from wrt.core.device import empty_aligned, load_kernel, made_once, run_all, upload
+from wrt.kernels.wide.packets import Scratch
 
 if TYPE_CHECKING:
     from wrt.accel.base import Structure

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from wrt.accel.base import Accelerator, Built
-from wrt.errors import InputError
-from wrt.kernels import traverse_brute_force as kernels
+from wrt.core.errors import InputError
+from wrt.kernels.traverse import brute_force as kernels
 
 
 class BruteForce(Accelerator):

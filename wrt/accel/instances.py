@@ -10,15 +10,15 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Accelerator, AccelStats, Built, Geometry, Refit, State, Structure, array_bytes, check_units
-from wrt.accel.bvh_ranges import in_order, split_ranges
-from wrt.accel.bvh_tree import BinaryTree, BvhOptions
-from wrt.device import records, start, thread_count, upload
-from wrt.errors import InputError
-from wrt.kernels.ray_aabb import PAD_COORDINATE
+from wrt.accel.bvh.top_down import in_order, split_ranges
+from wrt.accel.bvh.tree import BinaryTree, BvhOptions
+from wrt.core.device import records, start, thread_count, upload
+from wrt.core.errors import InputError
+from wrt.core.seconds import seconds_without_loads
 from wrt.kernels.structs import Surfaces
-from wrt.kernels.traverse import Units
-from wrt.kernels.traverse_instances import Placement
-from wrt.seconds import seconds_without_loads
+from wrt.kernels.traverse.common import Units
+from wrt.kernels.traverse.instances import Placement
+from wrt.kernels.units.box import PAD_COORDINATE
 
 ROUNDOFF = 2.0**-24
 SLACK = 32.0 * ROUNDOFF  # see kernels.traverse_instances.enter

@@ -6,9 +6,9 @@ import os
 from typing import Any
 
 from wrt import accel as structures
-from wrt.arguments import as_one, shown
-from wrt.errors import InputError
-from wrt.mesh import Mesh, load_mesh
+from wrt.core.checks import as_one, shown
+from wrt.core.errors import InputError
+from wrt.scene.mesh import Mesh, load_mesh
 
 
 def build(mesh: Mesh | structures.Geometry | str | os.PathLike[str], accel: str = "bvh", device: str = "cpu",

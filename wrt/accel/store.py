@@ -1,6 +1,6 @@
 """Structures in files, to be built once: `wrt build`, `wrt.load_accel`, and a cache keyed by geometry and options.
 
-A file is a checked one (wrt.checked_file), whose header says what is in it and over which geometry. Types come from the
+A file is a checked one (wrt.core.checked_file), whose header says what is in it and over which geometry. Types come from the
 structure's class, and indices are checked before a ray follows them.
 """
 
@@ -18,10 +18,10 @@ import warp as wp
 
 import wrt
 from wrt.accel.base import Accelerator, Built, Geometry
-from wrt.checked_file import read_checked, write_checked
-from wrt.errors import InputError
-from wrt.mesh import Mesh
-from wrt.write_file import check_writable, replacing
+from wrt.core.checked_file import read_checked, write_checked
+from wrt.core.errors import InputError
+from wrt.core.write_file import check_writable, replacing
+from wrt.scene.mesh import Mesh
 
 MAGIC = b"wrt acceleration structure 1\n"
 STATS = ("nodes", "leaves", "depth", "sah_cost")
@@ -30,7 +30,7 @@ STATS = ("nodes", "leaves", "depth", "sah_cost")
 def array_types(accel: type[Accelerator], triangle: str = "watertight") -> dict[str, np.dtype[Any]]:
     """What each array of Built.arrays holds, by the fields of the structure's struct."""
     from wrt.accel.base import Structure
-    from wrt.kernels.traverse import Units
+    from wrt.kernels.traverse.common import Units
 
     struct = Structure(accel, Units(triangle)).struct()
     out = {}

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wrt.mesh_clean import corners_have_area
+from wrt.scene.clean import corners_have_area
 
 
 def corners(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> None:

@@ -8,9 +8,9 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import ACCEL, SET, Size, depth_hint, load, naming, say, say_json, settings_of, warnings_told
-from wrt.errors import InputError
-from wrt.interrupt import exit_code
+from wrt.cli.common import ACCEL, SET, Size, depth_hint, load, naming, say, say_json, settings_of, warnings_told
+from wrt.core.errors import InputError
+from wrt.core.interrupts import exit_code
 
 
 @click.command()
@@ -35,8 +35,8 @@ from wrt.interrupt import exit_code
 def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: float, rebuild_at: float,
             given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool, **options: Any) -> None:
     """A turntable of SCENE, or its motion (`motion` and `morph` of TOML scenes), frame by frame."""
-    from wrt import animate as animation
-    from wrt.options import Options
+    from wrt.renderer import animate as animation
+    from wrt.renderer.options import Options
 
     if not 0.1 <= fps <= 100.0:
         raise InputError(f"fps must be 0.1 to 100, got {fps:g}")

@@ -1,4 +1,4 @@
-"""The commands that measure: `stability` and `bench`. They parse, call and print, as those of wrt.cli do."""
+"""The commands that measure: `stability` and `bench`. They parse, call and print, as those of wrt.cli.main do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import (
+from wrt.cli.common import (
     ACCEL,
     CLUSTER,
     SET,
@@ -27,8 +27,8 @@ from wrt.cli_common import (
     settings_of,
     warnings_told,
 )
-from wrt.errors import InputError
-from wrt.interrupt import exit_code
+from wrt.core.errors import InputError
+from wrt.core.interrupts import exit_code
 
 
 @click.command()
@@ -50,8 +50,8 @@ def stability(output: Path | None, cluster: str | None, quiet: bool, as_json: bo
 
     CASES: names such as E_grid, or the letters of groups; without any, all.
     """
-    from wrt.bench import stability as bench_stability
-    from wrt.bench import stability_report as report
+    from wrt.lab.hard_cases import report
+    from wrt.lab.hard_cases import stability as bench_stability
 
     def told(row: Any) -> None:
         if not as_json:
@@ -83,8 +83,8 @@ def _end(interrupted: int | None) -> None:
 
 
 def by_mesh(run: Callable[..., list[Any]], plan: Any, report: Callable[[Any], None], client: Any) -> list[Any]:
-    """As wrt.bench.sweep.by_mesh."""
-    from wrt.bench import sweep
+    """As wrt.lab.bench.sweep.by_mesh."""
+    from wrt.lab.bench import sweep
 
     return sweep.by_mesh(run, plan, report, client)
 
@@ -93,7 +93,7 @@ def told_of(client: Any, here: str) -> str:
     """What is measured on: this machine, or a cluster's, each mesh on one worker."""
     if client is None:
         return here
-    from wrt.cluster import machines
+    from wrt.renderer.distributed.dask import machines
 
     return f"a cluster, each mesh on one worker: {machines(client)}; started from {here}"
 
@@ -122,8 +122,8 @@ def visibility(meshes: tuple[Path, ...], output: Path | None, cluster: str | Non
 
     MESHES: .obj, .ply or .stl files; without any, a sphere and a terrain.
     """
-    from wrt.bench import visibility as bench_visibility
-    from wrt.bench import visibility_report as report
+    from wrt.lab.bench import visibility as bench_visibility
+    from wrt.lab.bench import visibility_report as report
 
     plan = bench_visibility.Plan(meshes, **options)
     if output is not None:
@@ -163,7 +163,7 @@ def units(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> No
     """
     from dataclasses import asdict
 
-    from wrt.bench import units as bench_units
+    from wrt.lab.bench import units as bench_units
 
     plan = bench_units.Plan(**options)
     if output is not None and (output.suffix.lower() != ".md" or not output.parent.is_dir()):
@@ -199,7 +199,7 @@ def peers(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, qu
 
     MESHES: .obj, .ply or .stl files; without any, a sphere.
     """
-    from wrt.bench import peers as bench_peers
+    from wrt.lab.bench import peers as bench_peers
 
     plan = bench_peers.Plan(meshes, **options)
     if output is not None and (output.suffix.lower() != ".md" or not output.parent.is_dir()):
@@ -244,8 +244,8 @@ def accel(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, qu
     """
     from dataclasses import asdict
 
-    from wrt.bench import accel as bench_accel
-    from wrt.bench import accel_report as report
+    from wrt.lab.bench import accel as bench_accel
+    from wrt.lab.bench import accel_report as report
 
     plan = bench_accel.Plan(meshes, **options)
     if output is not None:
@@ -288,7 +288,7 @@ def bvh(meshes: tuple[Path, ...], cluster: str | None, quiet: bool, as_json: boo
     """Builders of binary BVHs over MESHES: quality, time and memory; and boxes, spheres and 14-DOPs around the same tree."""
     from dataclasses import asdict
 
-    from wrt.bench import bvh as bench_bvh
+    from wrt.lab.bench import bvh as bench_bvh
 
     plan = bench_bvh.Plan(meshes, **options)
     client = client_of(cluster)
@@ -328,9 +328,9 @@ def bvh(meshes: tuple[Path, ...], cluster: str | None, quiet: bool, as_json: boo
 def error(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool, size: tuple[int, int],
           **options: Any) -> None:
     """Speed against error of SCENE over the knobs that a render has: each picture against a converged reference."""
-    from wrt.bench import error as bench_error
-    from wrt.bench import error_report as report
-    from wrt.driver import Options
+    from wrt.lab.bench import error as bench_error
+    from wrt.lab.bench import error_report as report
+    from wrt.renderer.renderer import Options
 
     plan = bench_error.Plan(**{name: options.pop(name) for name in (
         "knobs", "max_spp", "repeats", "reference_spp")}, row_seconds=options.pop("row_limit"))
@@ -378,8 +378,8 @@ def mitsuba(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...]
 
     llvm_ad_rgb gets the LLVM library that DRJIT_LIBLLVM_PATH names, else the newest in the usual places that passes a trial.
     """
-    from wrt.bench import equal_error
-    from wrt.driver import Options
+    from wrt.lab.mitsuba import equal_error
+    from wrt.renderer.renderer import Options
 
     if matte and options["integrator"] == "auto":
         options["integrator"] = "direct"

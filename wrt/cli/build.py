@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import ACCEL, Setting, now_and_then, say, say_json, warnings_told
-from wrt.errors import InputError
+from wrt.cli.common import ACCEL, Setting, now_and_then, say, say_json, warnings_told
+from wrt.core.errors import InputError
 
 
 @click.command()

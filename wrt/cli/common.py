@@ -17,7 +17,7 @@ from typing import Any
 
 import click
 
-from wrt.errors import InputError, SceneWarning
+from wrt.core.errors import InputError, SceneWarning
 
 DIGITS = "[0-9]{1,9}"  # more are no pixel, and Python refuses to read thousands
 SEEN = 0.003  # of the pixels: a patch of 26x26 in a picture of 640x360; fewer are seen neither as a patch nor told from noise
@@ -78,7 +78,7 @@ class Commands(click.Group):
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
             if self.get_command(ctx, args[0]) is None and "No such command" in error.format_message():
-                from wrt.arguments import did_you_mean
+                from wrt.core.checks import did_you_mean
 
                 known = self.list_commands(ctx)
                 ctx.fail(f"No such command {args[0]!r}; {did_you_mean(args[0], known)}there is {', '.join(known)}")
@@ -112,7 +112,7 @@ def _completions(words: Iterable[str], incomplete: str) -> list[Any]:
     return [CompletionItem(word) for word in words if word.startswith(incomplete)]
 
 
-ACCEL = OneOf("wrt.structures:STRUCTURES")
+ACCEL = OneOf("wrt.accel.structures:STRUCTURES")
 
 
 class Setting(click.ParamType):
@@ -139,8 +139,8 @@ class SceneSetting(Setting):
         return name, str(value).partition("=")[2] if name == "size" else parsed  # 0x360 is no number
 
     def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[Any]:
-        from wrt.scene import SETTINGS
-        from wrt.scene_check import setting_choices
+        from wrt.io.toml.report import setting_choices
+        from wrt.scene.model import SETTINGS
 
         name, sign, _ = incomplete.partition("=")
         words = [f"{name}={value}" for value in setting_choices(name)] if sign else [f"{each}=" for each in SETTINGS]
@@ -159,8 +159,8 @@ def settings_of(given: tuple[tuple[str, Any], ...], flags: dict[str, Any] | None
     taken: settings that this command does not take from --set, each with who decides on it. Values are checked as those of a
     scene file are. Raises InputError for them, and where a setting is given twice and not the same.
     """
-    from wrt.arguments import as_size
-    from wrt.scene_check import check_settings
+    from wrt.core.checks import as_size
+    from wrt.io.toml.report import check_settings
 
     if not given:
         return dict(flags or {})
@@ -186,7 +186,7 @@ def _plain(value: Any) -> Any:
 
 def depth_hint(visibly_cut: float, max_depth: int, option: str = "--max-depth") -> str | None:
     """A line for who may want more bounces: where so many pixels lack light visibly (Film.stats) that somebody would see them."""
-    from wrt.scene import MAX_DEPTH
+    from wrt.scene.model import MAX_DEPTH
 
     if visibly_cut < SEEN:
         return None
@@ -208,7 +208,7 @@ def client_of(cluster: str | None) -> Any:
     """A dask.distributed.Client that is open until the command ends; None of None."""
     if cluster is None:
         return None
-    from wrt.cluster import connected
+    from wrt.renderer.distributed.dask import connected
 
     return click.get_current_context().with_resource(connected(cluster))
 
@@ -220,7 +220,7 @@ CLUSTER = click.option("--cluster", metavar="ADDRESS",
 def load(path: Path, quiet: bool, clock: dict[str, float] | None = None) -> Any:
     """The scene, with the loader's warnings on stderr."""
     begin = time.perf_counter()
-    from wrt.scene_file import load_scene
+    from wrt.io.load import load_scene
 
     with warnings_told(quiet):
         scene = load_scene(path)

@@ -20,11 +20,10 @@ from typing import Any, NoReturn
 import click
 
 import wrt
-from wrt.address_space import is_out_of_memory, require_modules, told_limit
-from wrt.cli_animate import animate
-from wrt.cli_bench import bench, stability
-from wrt.cli_build import build
-from wrt.cli_common import (
+from wrt.cli.animate import animate
+from wrt.cli.bench import bench, stability
+from wrt.cli.build import build
+from wrt.cli.common import (
     ACCEL,
     CLUSTER,
     SET,
@@ -43,11 +42,12 @@ from wrt.cli_common import (
     spread_options,
     warnings_told,
 )
-from wrt.cli_profile import profile, whatif
-from wrt.cli_save import check_room, checkpoint_options, save_film
-from wrt.cli_view import view
-from wrt.errors import InputError
-from wrt.interrupt import Interrupted, exit_code, raise_on_termination
+from wrt.cli.profile import profile, whatif
+from wrt.cli.save import check_room, checkpoint_options, save_film
+from wrt.cli.view import view
+from wrt.core.address_space import is_out_of_memory, require_modules, told_limit
+from wrt.core.errors import InputError
+from wrt.core.interrupts import Interrupted, exit_code, raise_on_termination
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -80,16 +80,16 @@ cli.add_command(view)
 @click.option("--camera", help="A camera's name or number  [default: the first]")
 @click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's, 8]")
 @click.option("--min-throughput", type=float, help="Cut rays that carry less than this share  [default: 0.001]")
-@click.option("--filter", "filter_name", type=OneOf("wrt.scene:FILTERS"), help="Pixel filter")
-@click.option("--fresnel", type=OneOf("wrt.scene:FRESNELS"), help="exact, or schlick (cheaper, approximate)")
-@click.option("--sampler", type=OneOf("wrt.scene:SAMPLERS"), help="sobol (evenly spread), or independent (random)")
+@click.option("--filter", "filter_name", type=OneOf("wrt.scene.model:FILTERS"), help="Pixel filter")
+@click.option("--fresnel", type=OneOf("wrt.scene.model:FRESNELS"), help="exact, or schlick (cheaper, approximate)")
+@click.option("--sampler", type=OneOf("wrt.scene.model:SAMPLERS"), help="sobol (evenly spread), or independent (random)")
 @SET
 @click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
-@click.option("--instancing", type=OneOf("wrt.instancing:INSTANCING"), default="auto", show_default=True,
+@click.option("--instancing", type=OneOf("wrt.renderer.instancing:INSTANCING"), default="auto", show_default=True,
               help="Keep shared meshes once: auto (large ones), always or never")
 @click.option("--aov", type=Names(), default=(), help="Also depth, normal, albedo, prim_id, material_id")
 @click.option("--bits", type=int, help="PNG: 8 or 16; EXR: 16 or 32")
-@click.option("--tonemap", type=OneOf("wrt.scene:TONEMAPS"), help="Curve from linear to display  [default: the scene's]")
+@click.option("--tonemap", type=OneOf("wrt.scene.model:TONEMAPS"), help="Curve from linear to display  [default: the scene's]")
 @click.option("--exposure", type=float, help="Stops  [default: the scene's, 0]")
 @click.option("--time-limit", type=Duration(), help="Stop after 30s, 5m, 1h of tracing, with what there is")
 @click.option("--target-error", type=float,
@@ -104,16 +104,16 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
            **options: Any) -> None:
     """Render SCENE (.toml, .gltf, .glb, or a mesh: .obj, .ply, .stl) to a picture."""
     begin = time.perf_counter()
-    from wrt.image import check_writable
+    from wrt.picture.image import check_writable
 
     output = output or Path(f"{scene.stem or 'picture'}.png")
     bits, aov = options.pop("bits"), options["aov"]
     check_writable(output, bits)
-    from wrt.driver import Options, plain_text
-    from wrt.driver import render as render_scene
-    from wrt.film import aov_path
-    from wrt.progress import progress_reporter
-    from wrt.scene import Scene
+    from wrt.picture.film import aov_path
+    from wrt.renderer.progress import progress_reporter
+    from wrt.renderer.renderer import Options, plain_text
+    from wrt.renderer.renderer import render as render_scene
+    from wrt.scene.model import Scene
 
     # Whatever can be wrong with an option is told before a scene is read and a kernel compiled.
     flags = {"filter": options.pop("filter_name")}
@@ -199,7 +199,7 @@ def _seconds(stats: dict[str, Any]) -> str:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def info(scene: Path, camera: str | None, given: tuple[tuple[str, Any], ...], as_json: bool) -> None:
     """Tell what SCENE holds, and which features its kernel is compiled with."""
-    from wrt.features import describe
+    from wrt.renderer.features import describe
 
     settings = settings_of(given)
     loaded = load(scene, quiet=False).with_settings(**settings)
@@ -223,11 +223,11 @@ def info(scene: Path, camera: str | None, given: tuple[tuple[str, Any], ...], as
 def schema(markdown: bool) -> None:
     """Print the JSON Schema of scene files."""
     if markdown:
-        from wrt.scene_reference import scene_format
+        from wrt.io.toml.reference_page import scene_format
 
         click.echo(scene_format(), nl=False)
         return
-    from wrt.scene_file import schema as scene_schema
+    from wrt.io.load import schema as scene_schema
 
     click.echo(json.dumps(scene_schema(), indent=2))
 
@@ -256,15 +256,15 @@ def validate(scenes: tuple[Path, ...]) -> None:
 @click.option("--max-relmse", type=float, help="Fail above this relative mean squared error")
 @click.option("--min-psnr", type=float, help="Fail below this many dB")
 @click.option("--max-flip", type=float, help="Fail above this mean FLIP error")
-@click.option("--tonemap", type=OneOf("wrt.scene:TONEMAPS"), default="none", show_default=True,
+@click.option("--tonemap", type=OneOf("wrt.scene.model:TONEMAPS"), default="none", show_default=True,
               help="For PSNR and FLIP, which see what a display shows")
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, likewise")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float, as_json: bool, **limits: Any) -> None:
     """Measure the error of picture A against the reference B."""
-    from wrt import metrics
-    from wrt.image import check_writable, picture_size, read_image, write_codes
-    from wrt.scene import Settings
+    from wrt.picture import metrics
+    from wrt.picture.image import check_writable, picture_size, read_image, write_codes
+    from wrt.scene.model import Settings
 
     Settings(tonemap=tonemap, exposure=exposure)  # told before the pictures are read
     if output is not None:
@@ -291,7 +291,7 @@ def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float
 @cli.command()
 def devices() -> None:
     """List the devices that Warp can compute on."""
-    from wrt.device import describe_devices
+    from wrt.core.device import describe_devices
 
     for line in describe_devices():
         click.echo(line)

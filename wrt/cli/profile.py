@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from wrt.cli_bench import bench, by_mesh
-from wrt.cli_common import (
+from wrt.cli.bench import bench, by_mesh
+from wrt.cli.common import (
     ACCEL,
     CLUSTER,
     SET,
@@ -23,7 +23,7 @@ from wrt.cli_common import (
     settings_of,
     warnings_told,
 )
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 
 @click.command()
@@ -44,10 +44,10 @@ from wrt.errors import InputError
 def profile(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], gpu: str, quiet: bool, as_json: bool,
             **options: Any) -> None:
     """What every ray of SCENE costs: counters by pixel, kind and depth, and a model of the RT core."""
-    from wrt.arguments import require_known
-    from wrt.bench import profile_report as report
-    from wrt.profiler import profile as measure
-    from wrt.rtcore_parameters import GPUS
+    from wrt.core.checks import require_known
+    from wrt.lab.rtcore import profile_report as report
+    from wrt.lab.rtcore.parameters import GPUS
+    from wrt.lab.rtcore.profiler import profile as measure
 
     require_known(gpu, GPUS, "GPU")
     if output is not None:
@@ -88,7 +88,7 @@ def whatif(study: str, mesh: Path, output: Path | None, quiet: bool, as_json: bo
     STUDY: width (node width, format and volume), stack (entries, with restarts), planes (bits of a box plane), order (nearer
     child first, early stop), sorting (of rays), rates (boxes a clock against triangles a clock).
     """
-    from wrt.bench import whatif as studies
+    from wrt.lab.rtcore import whatif as studies
 
     plan = studies.Plan("width" if study == "rates" else study, mesh, **options)
     check_report(output)
@@ -133,9 +133,9 @@ def check_report(output: Path | None) -> None:
 def rtcore(meshes: tuple[Path, ...], cluster: str | None, software: bool, output: Path | None, quiet: bool, as_json: bool,
            **options: Any) -> None:
     """The model of the RT core on MESHES: what limits it, rays a second as ranges, and which assumption moves them most."""
-    from wrt.bench import rtcore as bench_rtcore
-    from wrt.bench.instructions import software_table
-    from wrt.bench.rtcore_report import LEGEND, cells, parameter_table
+    from wrt.lab.rtcore import meshes as bench_rtcore
+    from wrt.lab.rtcore.instructions import software_table
+    from wrt.lab.rtcore.report import LEGEND, cells, parameter_table
 
     plan = bench_rtcore.Plan(meshes, **options)
     check_report(output)
@@ -167,7 +167,7 @@ def rtcore(meshes: tuple[Path, ...], cluster: str | None, software: bool, output
 def instructions(structures: tuple[str, ...], as_json: bool) -> None:
     """The units in machine code for Turing: instructions of each box and triangle test; registers and code of traversals."""
     from wrt.accel import ACCELERATORS
-    from wrt.bench import instructions as bench_instructions
+    from wrt.lab.rtcore import instructions as bench_instructions
 
     for name in structures:
         ACCELERATORS.check(name)

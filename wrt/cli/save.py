@@ -12,9 +12,9 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import say
-from wrt.errors import InputError
-from wrt.interrupt import held_interrupts
+from wrt.cli.common import say
+from wrt.core.errors import InputError
+from wrt.core.interrupts import held_interrupts
 
 EVERY = 60.0
 SUFFIX = ".checkpoint"  # after the picture's name

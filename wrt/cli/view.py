@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from wrt.cli_common import ACCEL, SET, load, naming, say, settings_of
+from wrt.cli.common import ACCEL, SET, load, naming, say, settings_of
 
 
 @click.command()
@@ -37,14 +37,14 @@ def view(scene: Path, port: int, host: str, allow_origin: tuple[str, ...], open_
 
     The address that it prints holds a token: whoever has it may look and steer. Needs the extra `viewer`. Ctrl-C ends it.
     """
-    from wrt.viewer_access import as_origin
-    from wrt.viewer_page import Page
-    from wrt.viewer_server import import_viser, listen
+    from wrt.viewer.access import as_origin
+    from wrt.viewer.page import Page
+    from wrt.viewer.server import import_viser, listen
 
     import_viser()
     origins = [as_origin(text) for text in allow_origin]
     listen(host, port).close()  # told before the scene is read
-    from wrt.options import Options
+    from wrt.renderer.options import Options
 
     rendering = Options(**options)
     settings = settings_of(given, size="the browser's window", spp="--spp")

@@ -9,8 +9,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 
-from wrt.errors import InputError
-from wrt.memory import address_space
+from wrt.core.errors import InputError
+from wrt.core.memory import address_space
 
 # Bytes, measured with Python 3.11, NumPy 2.4, Warp 1.19 on Linux, and some to spare.
 MODULES = 170 << 20  # NumPy, Pydantic and the like, without

@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 from warp._src import context  # there is no public way to ask whether a tape records
 
-from wrt.arguments import shown
-from wrt.errors import InputError
+from wrt.core.checks import shown
+from wrt.core.errors import InputError
 
 DLPACK_CPU = 1
 REAL = "iufO"  # NumPy's kinds of real numbers, and objects such as fractions: no bool, complex, text or date

@@ -11,9 +11,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.memory import require
-from wrt.read_file import open_regular
+from wrt.core.errors import InputError
+from wrt.core.files import open_regular
+from wrt.core.memory import require
 
 DIGEST_BYTES = 32
 MAX_HEADER = 1 << 16

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 T = TypeVar("T")
 LARGEST = 1e30  # of any number in a scene: what comes near the end of float32 turns into infinities on the device

@@ -22,12 +22,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import warp as wp
 
-from wrt.address_space import LLVM, is_limited, require_warp, room_to_compile
-from wrt.arguments import shown
-from wrt.errors import InputError
-from wrt.memory import available
-from wrt.seconds import loading
-from wrt.write_file import compiling
+from wrt.core.address_space import LLVM, is_limited, require_warp, room_to_compile
+from wrt.core.checks import shown
+from wrt.core.errors import InputError
+from wrt.core.memory import available
+from wrt.core.seconds import loading
+from wrt.core.write_file import compiling
 
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
 

@@ -7,8 +7,8 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-from wrt.errors import InputError
-from wrt.memory import require
+from wrt.core.errors import InputError
+from wrt.core.memory import require
 
 
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:

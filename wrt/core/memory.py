@@ -12,7 +12,7 @@ import os
 import re
 from pathlib import Path
 
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 SMALL = 1 << 26  # bytes that nobody asks about: looking takes longer than they are worth
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}

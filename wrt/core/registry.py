@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any, TypeVar
 
-from wrt.arguments import require_known
+from wrt.core.checks import require_known
 
 T = TypeVar("T")
 

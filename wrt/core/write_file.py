@@ -21,7 +21,7 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 try:
     import fcntl

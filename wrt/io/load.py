@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from wrt.arguments import as_path, shown
-from wrt.errors import InputError, SceneWarning
-from wrt.memory import require
-from wrt.mesh import READERS, Mesh, load_mesh
-from wrt.read_file import read_file, require_file
-from wrt.scene import Material, Object, Scene
-from wrt.staging import stage
-from wrt.toml_limits import look_at
+from wrt.core.checks import as_path, shown
+from wrt.core.errors import InputError, SceneWarning
+from wrt.core.files import read_file, require_file
+from wrt.core.memory import require
+from wrt.io.toml.limits import look_at
+from wrt.scene.defaults import stage
+from wrt.scene.mesh import READERS, Mesh, load_mesh
+from wrt.scene.model import Material, Object, Scene
 
 BYTES_OF_TOML = 5.0  # of memory for a byte of the file: itself, and a character
 # Of memory, at most, measured: of a table that is checked and becomes an object, and of an array or a value.
@@ -60,22 +60,22 @@ def as_scene(value: Scene | Mesh | str | os.PathLike[str]) -> Scene:
 
 def schema() -> dict[str, Any]:
     """The JSON Schema (draft 2020-12) of TOML scene files."""
-    from wrt.scene_schema import SceneTable
+    from wrt.io.toml.schema import SceneTable
 
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {"$schema": dialect, **SceneTable.model_json_schema(), "title": "wrt scene"}
 
 
 def _load_toml(path: Path) -> Scene:
-    from wrt.scene_builder import build
-    from wrt.scene_check import check
+    from wrt.io.toml.build import build
+    from wrt.io.toml.report import check
 
     data = _parse(path)
     return _staged(build(check(data, path), path), path)
 
 
 def _load_gltf(path: Path) -> Scene:
-    from wrt.gltf import load_gltf
+    from wrt.io.gltf.reader import load_gltf
 
     return load_gltf(path)
 

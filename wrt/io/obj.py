@@ -20,12 +20,12 @@ from typing import NoReturn
 
 import numpy as np
 
-from wrt.arguments import short
-from wrt.errors import InputError
-from wrt.memory import Meter, require
-from wrt.mesh import RawMesh
-from wrt.polygons import triangulate
-from wrt.read_file import read_file
+from wrt.core.checks import short
+from wrt.core.errors import InputError
+from wrt.core.files import read_file
+from wrt.core.memory import Meter, require
+from wrt.io.polygons import triangulate
+from wrt.scene.mesh import RawMesh
 
 # What stands in a corner `v/vt/vn`, and how many numbers of a line of it are kept.
 _KEEP = {"v": 3, "vt": 2, "vn": 3}

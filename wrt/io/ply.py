@@ -16,11 +16,11 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.memory import require
-from wrt.mesh import RawMesh
-from wrt.polygons import triangulate
-from wrt.read_file import read_file
+from wrt.core.errors import InputError
+from wrt.core.files import read_file
+from wrt.core.memory import require
+from wrt.io.polygons import triangulate
+from wrt.scene.mesh import RawMesh
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",

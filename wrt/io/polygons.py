@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.memory import require
+from wrt.core.errors import InputError
+from wrt.core.memory import require
 
 MAX_CORNERS = 1 << 12  # of a concave polygon: the time grows with their square
 AT_ONCE = 1 << 16  # triangles

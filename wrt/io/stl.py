@@ -14,10 +14,10 @@ from typing import NoReturn
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.memory import Meter, require
-from wrt.mesh import RawMesh
-from wrt.read_file import read_file
+from wrt.core.errors import InputError
+from wrt.core.files import read_file
+from wrt.core.memory import Meter, require
+from wrt.scene.mesh import RawMesh
 
 _LINE = re.compile(rb"[^\r\n]++(?:\r\n|[\r\n]|\Z)|\r\n|[\r\n]")
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.memory import require
+from wrt.core.errors import InputError
+from wrt.core.memory import require
 
 # Pillow has others, such as EPS, that run programs or have no place here.
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF")

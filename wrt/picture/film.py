@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from wrt.arguments import as_names
-from wrt.errors import InputError
-from wrt.image import (
+from wrt.core.checks import as_names
+from wrt.core.errors import InputError
+from wrt.picture.image import (
     PathLike,
     as_half,
     check_writable,
@@ -22,7 +22,7 @@ from wrt.image import (
     write_exr,
     write_image,
 )
-from wrt.tonemap import to_codes
+from wrt.picture.tonemap import to_codes
 
 # The letters of a layer's channels in an EXR file; a layer that is not named here has one channel, called as itself.
 LETTERS = {"variance": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
@@ -51,7 +51,7 @@ class Film:
         "lost_throughput_per_sample": what rays that were cut would have added in a room of radiance 1; "visibly_cut": the share
         of the pixels that lack 5 % or more of that radiance because of max_depth.
     metadata: what a file says about it (scene, spp, seed, seconds, version).
-    exposure (stops) and tonemap (a name in wrt.tonemap.TONEMAPS): how it wants to be shown.
+    exposure (stops) and tonemap (a name in wrt.picture.tonemap.TONEMAPS): how it wants to be shown.
     np.asarray(film), `from_dlpack(film)` of any library, film.numpy() and film.warp() are the pixels, not a copy of them.
     """
 
@@ -98,7 +98,7 @@ class Film:
         """The pixels as a Warp array, (H, W) vec3, of the same memory."""
         import warp as wp
 
-        from wrt.exchange import to_warp
+        from wrt.core.arrays import to_warp
 
         return to_warp(self.pixels, wp.vec3)
 
@@ -117,7 +117,7 @@ class Film:
     def save(self, path: PathLike, *, bits: int | None = None, aov: str | Iterable[str] | None = None) -> list[Path]:
         """Write the picture, and other layers with it; returns the paths written.
 
-        path: .png gets exposure and tone mapping, .exr and .hdr stay linear. bits: as in wrt.image.write_image. aov:
+        path: .png gets exposure and tone mapping, .exr and .hdr stay linear. bits: as in wrt.picture.image.write_image. aov:
         names in `layers`; None is all of them for EXR and none otherwise. EXR takes them as channels (depth.Z, ...,
         prim_id), with values as they are; next to a PNG or HDR picture each becomes a PNG to look at (AOV_VIEWS),
         `name.depth.png` beside `name.png`. Every file is written whole or not at all. Raises InputError before anything

@@ -1,7 +1,7 @@
 """Image files: PNG (8 and 16 bit), OpenEXR and Radiance HDR, each written whole or not at all.
 
 Rows run from the top down. Colours in memory are linear Rec. 709; a PNG or JPEG file holds sRGB codes. OpenImageIO
-reads and writes EXR and HDR, Pillow reads the rest (wrt.image_decode). PNG is encoded here: Pillow writes no 16-bit RGB, and
+reads and writes EXR and HDR, Pillow reads the rest (wrt.picture.decode). PNG is encoded here: Pillow writes no 16-bit RGB, and
 OpenImageIO's PNG writer spoils text outside of ASCII and reports success on a full disk.
 """
 
@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from wrt import write_file
-from wrt.errors import InputError, SceneWarning
-from wrt.image_decode import FORMATS as FORMATS_READ
-from wrt.image_decode import check_size, decode_png16, decode_rgba8, png_texts, size_of
-from wrt.memory import require
-from wrt.read_file import open_regular, read_file
-from wrt.tonemap import decode_srgb, to_codes
-from wrt.write_file import replacing
+from wrt.core import write_file
+from wrt.core.errors import InputError, SceneWarning
+from wrt.core.files import open_regular, read_file
+from wrt.core.memory import require
+from wrt.core.write_file import replacing
+from wrt.picture.decode import FORMATS as FORMATS_READ
+from wrt.picture.decode import check_size, decode_png16, decode_rgba8, png_texts, size_of
+from wrt.picture.tonemap import decode_srgb, to_codes
 
 PathLike = str | os.PathLike[str]
 

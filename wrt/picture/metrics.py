@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from wrt.address_space import require_scipy
-from wrt.errors import InputError
-from wrt.memory import require
-from wrt.tonemap import encode_srgb, luminance, tone_map
+from wrt.core.address_space import require_scipy
+from wrt.core.errors import InputError
+from wrt.core.memory import require
+from wrt.picture.tonemap import encode_srgb, luminance, tone_map
 
 RELMSE_EPS = 0.01
 PIXELS_PER_DEGREE = 3840 * math.pi / 180  # FLIP's default: a screen 3840 pixels wide, seen from as far as it is wide

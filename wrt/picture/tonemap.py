@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # of linear Rec. 709
 

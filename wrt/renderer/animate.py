@@ -14,15 +14,15 @@ import numpy as np
 
 from wrt.accel import Accelerator, Geometry
 from wrt.accel import build as build_structure
-from wrt.arguments import as_integer
-from wrt.device_scene import upload_scene
-from wrt.driver import Renderer
-from wrt.errors import InputError, SceneWarning
-from wrt.film import Film
-from wrt.motion import moves, scene_at
-from wrt.options import Options
-from wrt.scene import Camera, Scene, as_number
-from wrt.write_file import check_writable, replacing
+from wrt.core.checks import as_integer
+from wrt.core.errors import InputError, SceneWarning
+from wrt.core.write_file import check_writable, replacing
+from wrt.picture.film import Film
+from wrt.renderer.options import Options
+from wrt.renderer.renderer import Renderer
+from wrt.renderer.upload import upload_scene
+from wrt.scene.model import Camera, Scene, as_number
+from wrt.scene.motion import moves, scene_at
 
 REBUILD_AT = 1.5  # growth of the SAH cost by refits (docs/acceleration.md, "Moving meshes")
 MOVIES = {".gif": "GIF", ".png": "PNG", ".apng": "PNG"}

@@ -1,9 +1,9 @@
 """Long renders that survive: the film in a file, written aside, brought to the disk and renamed, so that the file is always whole.
 
-A checkpoint is a checked file (wrt.checked_file): who made it (IDENTITY: everything that can change a pixel), how far it is, and
+A checkpoint is a checked file (wrt.core.checked_file): who made it (IDENTITY: everything that can change a pixel), how far it is, and
 the film's arrays. How many samples each pixel has is one of them: rendering goes on from any state in which each pixel is done
 whole. Beside the file lies `.NAME.part`, which is locked while a render runs, and holds the room that the next one needs. The
-header's first entry tells on which system it is written, by which a part that a killed render left is known (wrt.write_file).
+header's first entry tells on which system it is written, by which a part that a killed render left is known (wrt.core.write_file).
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from wrt.checked_file import DIGEST_BYTES, MAX_HEADER, read_checked, write_checked
-from wrt.device_film import OF_A_GROUP, SHARED, DeviceFilm
-from wrt.errors import InputError
-from wrt.write_file import WINDOWS, is_file_of, remove_leftovers, sync_folder, this_system, try_lock
+from wrt.core.checked_file import DIGEST_BYTES, MAX_HEADER, read_checked, write_checked
+from wrt.core.errors import InputError
+from wrt.core.write_file import WINDOWS, is_file_of, remove_leftovers, sync_folder, this_system, try_lock
+from wrt.renderer.film_arrays import OF_A_GROUP, SHARED, DeviceFilm
 
 MAGIC = b"wrt checkpoint 1\n"
 LOCK_SECONDS = 0.3  # for a lock that is only held for a moment

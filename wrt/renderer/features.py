@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.instancing import instanced_meshes
-from wrt.scene import (
+from wrt.renderer.instancing import instanced_meshes
+from wrt.scene.model import (
     Camera,
     Checkerboard,
     ConstantBackground,

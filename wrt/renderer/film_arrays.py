@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.device import upload
-from wrt.features import filter_icdf
+from wrt.core.device import upload
 from wrt.kernels import structs
-from wrt.scene import Settings
+from wrt.renderer.features import filter_icdf
+from wrt.scene.model import Settings
 
 # Independent sequences a pixel where the error is asked for. Over a picture, four tell the error as well as eight do (what they
 # miss is averaged over the pixels), and long sequences are better than many: eight have up to 1.4 times the error of four.

@@ -9,11 +9,11 @@ import numpy as np
 
 from wrt.accel import Geometry
 from wrt.accel.instances import InstancedGeometry, NumberedGeometry
-from wrt.errors import InputError
-from wrt.instancing import instanced_meshes, is_instance
-from wrt.mesh import Mesh
-from wrt.mesh_clean import flip_collinear
-from wrt.scene import Object, Scene
+from wrt.core.errors import InputError
+from wrt.renderer.instancing import instanced_meshes, is_instance
+from wrt.scene.clean import flip_collinear
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Object, Scene
 
 MOST = 2**31 - 2  # faces, and vertices
 
@@ -73,7 +73,7 @@ class World:
 
 
 def world_of(scene: Scene, instancing: str = "auto") -> World:
-    """The world of a scene, with instances where they are worth it: see `wrt.instancing.instanced_meshes`."""
+    """The world of a scene, with instances where they are worth it: see `wrt.renderer.instancing.instanced_meshes`."""
     meshes = instanced_meshes(scene, instancing)
     return instanced_world(scene, meshes) if meshes else world_mesh(scene)
 
@@ -81,7 +81,7 @@ def world_of(scene: Scene, instancing: str = "auto") -> World:
 def world_mesh(scene: Scene) -> World:
     """Transform and join all objects. Positions are computed in float64 and rounded once.
 
-    Of faces whose corners rounding put on a line, see `wrt.mesh_clean.flip_collinear`.
+    Of faces whose corners rounding put on a line, see `wrt.scene.clean.flip_collinear`.
     """
     index = {id(material): i for i, material in enumerate(scene.materials)}
     joined = _joined(scene.objects, index)

@@ -6,8 +6,8 @@ from collections import defaultdict
 
 import numpy as np
 
-from wrt.arguments import as_choice
-from wrt.scene import Object, Scene
+from wrt.core.checks import as_choice
+from wrt.scene.model import Object, Scene
 
 INSTANCING = ("auto", "always", "never")
 # Copies of one mesh with so many triangles together are worth a second level (docs/acceleration.md, "Instances").

@@ -1,13 +1,13 @@
 """How much memory a scene will take on its way to the device, so that what cannot fit is refused before the work.
 
-The numbers are peaks that were measured on meshes of 330,000 triangles, rounded up; a picture's own are in wrt.driver.
+The numbers are peaks that were measured on meshes of 330,000 triangles, rounded up; a picture's own are in wrt.renderer.renderer.
 """
 
 from __future__ import annotations
 
 from wrt.accel.base import Accelerator
-from wrt.instancing import instanced_meshes, is_instance
-from wrt.scene import EnvironmentBackground, Scene, Texture
+from wrt.renderer.instancing import instanced_meshes, is_instance
+from wrt.scene.model import EnvironmentBackground, Scene, Texture
 
 BYTES_OF_FACE, BYTES_OF_VERTEX = 55.0, 60.0  # of a mesh in the world: joined, turned and uploaded
 BYTES_OF_EMITTER = 120.0  # of a triangle that lights others, beside that

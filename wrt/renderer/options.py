@@ -13,12 +13,12 @@ import numpy as np
 
 from wrt.accel import ACCELERATORS
 from wrt.accel.base import check_units
-from wrt.arguments import as_choice, as_integer, as_names, as_one, as_path, as_tuple, did_you_mean, shown
-from wrt.device import start, thread_count
-from wrt.errors import InputError
-from wrt.film import Film
-from wrt.instancing import INSTANCING
-from wrt.scene import Camera
+from wrt.core.checks import as_choice, as_integer, as_names, as_one, as_path, as_tuple, did_you_mean, shown
+from wrt.core.device import start, thread_count
+from wrt.core.errors import InputError
+from wrt.picture.film import Film
+from wrt.renderer.instancing import INSTANCING
+from wrt.scene.model import Camera
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 
@@ -56,7 +56,7 @@ class Progress:
 class Options:
     """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once (None: chosen); never
     change a pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always
-    taken. instancing: which meshes that several objects share are kept once (wrt.instancing).
+    taken. instancing: which meshes that several objects share are kept once (wrt.renderer.instancing).
 
     devices: several of this machine, of one kind ("cuda:0", "cuda:1"), that share the tiles, in place of `device`. executor: a
     concurrent.futures.Executor or a dask.distributed.Client whose workers trace the tiles on their `device` (docs/cluster.md);
@@ -64,13 +64,13 @@ class Options:
 
     target_error: stop when the estimated error of the picture is no larger: the root mean square, over its pixels and
     channels, of the standard error in linear radiance. It is noise alone: what max_depth and min_throughput cut off is not
-    in it. A pixel's samples are then split over GROUPS independent sequences (wrt.device_film), and spp is the most to take
+    in it. A pixel's samples are then split over GROUPS independent sequences (wrt.renderer.film_arrays), and spp is the most to take
     (rounded down to a multiple of GROUPS; one a group at least). The estimate is looked at when a group has 1, 2, 4, 8 ...
     samples: only then is its sequence as even as it can be.
 
     checkpoint: a file that the work so far is written to every `checkpoint_every` seconds, and when a render ends early or is
     done; it stays. A file that is there already is refused, unless `resume` says to go on with it: the picture is then that of
-    an uninterrupted render, bit for bit. Where there is none, `resume` begins anew (wrt.checkpoint)."""
+    an uninterrupted render, bit for bit. Where there is none, `resume` begins anew (wrt.renderer.checkpoint)."""
 
     seed: int = 0
     device: str = "cpu"

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from wrt.arguments import as_one, as_size
-from wrt.scene import Camera
+from wrt.core.checks import as_one, as_size
+from wrt.scene.model import Camera
 
 
 def camera_rays(camera: Camera, size: tuple[int, int] | str) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from wrt.driver import Progress
+    from wrt.renderer.renderer import Progress
 
 COMPILING = "compiling kernels (first time for this kind of scene) ..."
 BUILDING = "building the structure"

@@ -19,29 +19,29 @@ import warp as wp
 
 import wrt
 from wrt.accel import ACCELERATORS, Structure, build, tells_progress
-from wrt.address_space import told_limit
-from wrt.arguments import unknown
-from wrt.checkpoint import Checkpoint
-from wrt.device import free_memory, load_kernel, made_once, start, thread_count
-from wrt.device_film import BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS, AovFilm, DeviceFilm
-from wrt.device_scene import camera_struct, upload_scene
-from wrt.errors import InputError
-from wrt.features import Features, features_of
-from wrt.film import Film
-from wrt.interrupt import held_interrupts
-from wrt.kernels import render as kernels
+from wrt.core.address_space import told_limit
+from wrt.core.checks import unknown
+from wrt.core.device import free_memory, load_kernel, made_once, start, thread_count
+from wrt.core.errors import InputError
+from wrt.core.interrupts import held_interrupts
+from wrt.core.memory import SMALL, gib
+from wrt.core.seconds import Span, counted_once, loads_since
+from wrt.io.load import as_scene
 from wrt.kernels import structs
-from wrt.kernels.traverse import Units
-from wrt.memory import SMALL, gib
-from wrt.memory_estimate import bytes_of_scene
-from wrt.mesh import Mesh
-from wrt.options import AOVS as AOVS
-from wrt.options import OPTIONS, Options, Progress
-from wrt.scene import SETTINGS, Camera, Scene
-from wrt.scene_digest import camera_digest, scene_digest
-from wrt.scene_file import as_scene
-from wrt.seconds import Span, counted_once, loads_since
-from wrt.tiles import Rectangle, Work, corners, tiles, work_left
+from wrt.kernels.shade import render as kernels
+from wrt.kernels.traverse.common import Units
+from wrt.picture.film import Film
+from wrt.renderer.checkpoint import Checkpoint
+from wrt.renderer.features import Features, features_of
+from wrt.renderer.film_arrays import BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS, AovFilm, DeviceFilm
+from wrt.renderer.memory_estimate import bytes_of_scene
+from wrt.renderer.options import AOVS as AOVS
+from wrt.renderer.options import OPTIONS, Options, Progress
+from wrt.renderer.tiles import Rectangle, Work, corners, tiles, work_left
+from wrt.renderer.upload import camera_struct, upload_scene
+from wrt.scene.digest import camera_digest, scene_digest
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import SETTINGS, Camera, Scene
 
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
 TILE_SIZE = 32
@@ -83,7 +83,7 @@ def renderer_of(scene: Scene, options: Options) -> Renderer:
     """Of the kind that the options ask for."""
     if options.executor is None and options.devices is None:
         return Renderer(scene, options)
-    from wrt.spread import SpreadRenderer
+    from wrt.renderer.distributed.renderer import SpreadRenderer
 
     return SpreadRenderer(scene, options)
 
@@ -134,7 +134,7 @@ class Renderer:
         return structure
 
     def _film_device(self) -> Any:
-        if self.options.executor is not None or self.options.devices is not None:  # wrt.spread's renderer takes them
+        if self.options.executor is not None or self.options.devices is not None:  # wrt.renderer.distributed.renderer's renderer takes them
             raise InputError("an executor or several devices are for wrt.render; this runs on one device")
         return start(self.options.device)
 
@@ -428,7 +428,7 @@ class Renderer:
         self._each_tile([Work(tile, 0, 1) for tile in self._tiles()], trace, lambda done: None)
         return {name: film.picture(name) for name in self.options.aov}
 
-    # --- for tiles that are traced elsewhere (wrt.spread) --------------------------------------------------------------
+    # --- for tiles that are traced elsewhere (wrt.renderer.distributed.renderer) --------------------------------------------------------------
 
     def facts(self) -> dict[str, Any]:
         """What is told of the scene and its structure: counts, and seconds of making them ready."""

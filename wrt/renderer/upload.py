@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.device import records, upload
-from wrt.errors import InputError, SceneWarning
-from wrt.kernels import lights, structs, textures
-from wrt.scene import (
+from wrt.core.device import records, upload
+from wrt.core.errors import InputError, SceneWarning
+from wrt.kernels import structs
+from wrt.kernels.shade import lights, textures
+from wrt.renderer.flatten import Placed, World, world_of
+from wrt.scene.model import (
     ALPHA_MODES,
     MATERIAL_KINDS,
     Camera,
@@ -27,8 +29,7 @@ from wrt.scene import (
     SpotLight,
     Texture,
 )
-from wrt.scene_size import require_size
-from wrt.world import Placed, World, world_of
+from wrt.scene.size import require_size
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 # More area lights than this are sampled as one, by power: a shadow ray to each would cost more than it tells.
@@ -238,7 +239,7 @@ def tell_left_out(scene: Scene) -> None:
 
 
 def upload_scene(scene: Scene, device: Any, instancing: str = "auto") -> DeviceScene:
-    """Put a scene on a device (a Warp device); instancing: see wrt.instancing. Raises InputError where the scene cannot be
+    """Put a scene on a device (a Warp device); instancing: see wrt.renderer.instancing. Raises InputError where the scene cannot be
     rendered."""
     tell_left_out(scene)
     world = world_of(scene, instancing)

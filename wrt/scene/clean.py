@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.reference_exact import whole_numbers
+from wrt.core.errors import InputError
+from wrt.scene.exact import whole_numbers
 
 AT_ONCE = 1 << 15  # faces whose float64 temporaries stay in the cache
 ROUNDS = 64  # of flips; each takes at least one face whose corners are on a line

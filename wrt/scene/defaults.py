@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from wrt.scene import BLACK, SMALLEST, Camera, ConstantBackground, DirectionalLight, GradientBackground, Scene
-from wrt.scene_size import require_size
+from wrt.scene.model import BLACK, SMALLEST, Camera, ConstantBackground, DirectionalLight, GradientBackground, Scene
+from wrt.scene.size import require_size
 
 FOV_Y = math.radians(40.0)
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # from the scene to the camera: glTF's front is +z, its up +y

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wrt.arguments import LARGEST, as_array, as_path, shown
-from wrt.errors import InputError, SceneWarning
-from wrt.memory import require
-from wrt.mesh_clean import clean
-from wrt.read_file import require_file
-from wrt.tables import html_facts
+from wrt.core.checks import LARGEST, as_array, as_path, shown
+from wrt.core.errors import InputError, SceneWarning
+from wrt.core.files import require_file
+from wrt.core.html import html_facts
+from wrt.core.memory import require
+from wrt.scene.clean import clean
 
 if TYPE_CHECKING:
     import trimesh
@@ -172,7 +172,7 @@ def _reader(suffix: str) -> Callable[[str | os.PathLike[str]], RawMesh]:
     return getattr(importlib.import_module(module), function)
 
 
-READERS = {".obj": ("wrt.obj", "read_obj"), ".ply": ("wrt.ply", "read_ply"), ".stl": ("wrt.stl", "read_stl")}
+READERS = {".obj": ("wrt.io.obj", "read_obj"), ".ply": ("wrt.io.ply", "read_ply"), ".stl": ("wrt.io.stl", "read_stl")}
 
 
 def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = ()) -> Mesh:

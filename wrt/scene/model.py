@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from wrt.arguments import LARGEST, as_array, as_choice, as_integer, as_one, as_size, as_tuple, at_thing, unknown
-from wrt.errors import InputError
-from wrt.mesh import Mesh
-from wrt.motion import Motion
-from wrt.tables import html_facts, html_table
+from wrt.core.checks import LARGEST, as_array, as_choice, as_integer, as_one, as_size, as_tuple, at_thing, unknown
+from wrt.core.errors import InputError
+from wrt.core.html import html_facts, html_table
+from wrt.scene.mesh import Mesh
+from wrt.scene.motion import Motion
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wrt.arguments import as_array, as_one
-from wrt.errors import InputError
-from wrt.mesh import Mesh
+from wrt.core.checks import as_array, as_one
+from wrt.core.errors import InputError
+from wrt.scene.mesh import Mesh
 
 if TYPE_CHECKING:
-    from wrt.scene import Object, Scene
+    from wrt.scene.model import Object, Scene
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from wrt import scene as scenes
-from wrt.errors import InputError
-from wrt.mesh import Mesh
-from wrt.scene import Object, Scene
+from wrt.core.errors import InputError
+from wrt.scene import model as scenes
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Object, Scene
 
 KINDS = {kind.__name__: kind for kind in (
     Scene, scenes.Settings, scenes.Camera, Object, Mesh, scenes.Sphere, scenes.Material, scenes.Texture, scenes.Checkerboard,

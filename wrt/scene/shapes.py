@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.memory import require
-from wrt.mesh import Mesh
-from wrt.mesh_clean import clean
-from wrt.scene import as_number, as_vector
+from wrt.core.errors import InputError
+from wrt.core.memory import require
+from wrt.scene.clean import clean
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import as_number, as_vector
 
 Point = Sequence[float] | np.ndarray
 BYTES_OF_FACE = 190.0  # of memory while a shape is made, measured

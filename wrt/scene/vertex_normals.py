@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from wrt.memory import require
-from wrt.mesh import Mesh
+from wrt.core.memory import require
+from wrt.scene.mesh import Mesh
 
 BYTES_OF_FACE, BYTES_OF_VERTEX = 450.0, 100.0  # of memory, measured
 

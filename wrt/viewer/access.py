@@ -16,7 +16,7 @@ from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 ORIGIN = re.compile(r"(https?)://([a-z0-9._-]+|\[[0-9a-f:.]+\])(?::([1-9][0-9]{0,4}))?/?")

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from wrt.viewer_access import Refused, shown
+from wrt.viewer.access import Refused, shown
 
 LARGEST_VIEWPORT = 16384  # pixels a side
 FARTHEST = 1e9  # coordinate, in units of the viewport

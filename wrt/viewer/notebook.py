@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.film import Film
-from wrt.options import Progress
-from wrt.progress import COMPILING, describe
+from wrt.core.errors import InputError
+from wrt.picture.film import Film
+from wrt.renderer.options import Progress
+from wrt.renderer.progress import COMPILING, describe
 
 SHARE = 0.1  # of the time, at most, that showing takes from rendering
 
@@ -70,7 +70,7 @@ def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, sc
     """
     from PIL import Image, ImageDraw
 
-    from wrt.bench.heatmap import INK, font
+    from wrt.picture.heatmap import INK, font
 
     if not pictures or columns < 1 or scale < 1:
         raise InputError("side_by_side needs a picture or more, columns and scale of 1 or more")

@@ -1,4 +1,4 @@
-"""The viewer in a browser: viser's orbit controls and panel before a wrt.viewer.Viewer, whose pictures fill the viewport.
+"""The viewer in a browser: viser's orbit controls and panel before a wrt.viewer.refine.Viewer, whose pictures fill the viewport.
 
 Several browsers share the panel; the picture follows the camera that moved last, in the browser where it moved.
 """
@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 
 from wrt.accel import ACCELERATORS
-from wrt.bench.heatmap import colors, short
-from wrt.errors import InputError
-from wrt.film import Film
-from wrt.image import encode_png
-from wrt.options import Options
-from wrt.scene import TONEMAPS, Camera, Scene
-from wrt.viewer import COSTS, Shown, Viewer
-from wrt.viewer_access import access_for
-from wrt.viewer_camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
-from wrt.viewer_server import Door, import_viser, listen, quiet, to_stderr
+from wrt.core.errors import InputError
+from wrt.picture.film import Film
+from wrt.picture.heatmap import colors, short
+from wrt.picture.image import encode_png
+from wrt.renderer.options import Options
+from wrt.scene.model import TONEMAPS, Camera, Scene
+from wrt.viewer.access import access_for
+from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
+from wrt.viewer.refine import COSTS, Shown, Viewer
+from wrt.viewer.server import Door, import_viser, listen, quiet, to_stderr
 
 MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser one
 RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}

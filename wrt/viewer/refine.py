@@ -1,6 +1,6 @@
 """A picture that follows what is asked of it: coarse at once when anything changes, then finer while nothing does.
 
-It knows nothing of browsers: wrt.viewer_page puts one in front of it.
+It knows nothing of browsers: wrt.viewer.page puts one in front of it.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 
 from wrt.accel import ACCELERATORS
-from wrt.bench.heatmap import colored, top_of
-from wrt.device_scene import camera_struct
-from wrt.driver import Renderer
-from wrt.errors import InputError
-from wrt.film import Film
-from wrt.options import Options, Progress
-from wrt.profiler import COUNTERS, CostCounter
-from wrt.progress import COMPILING
-from wrt.scene import Camera, Scene
-from wrt.scene_digest import camera_digest
-from wrt.tonemap import to_codes
+from wrt.core.errors import InputError
+from wrt.lab.rtcore.profiler import COUNTERS, CostCounter
+from wrt.picture.film import Film
+from wrt.picture.heatmap import colored, top_of
+from wrt.picture.tonemap import to_codes
+from wrt.renderer.options import Options, Progress
+from wrt.renderer.progress import COMPILING
+from wrt.renderer.renderer import Renderer
+from wrt.renderer.upload import camera_struct
+from wrt.scene.digest import camera_digest
+from wrt.scene.model import Camera, Scene
 
 COARSE = 0.08  # seconds that the first picture after a change should take
 PATIENCE = 0.5  # seconds after which it is given up, where the next change is waiting

@@ -21,9 +21,9 @@ from collections.abc import Callable, Iterator
 from http import HTTPStatus
 from typing import Any
 
-from wrt.errors import InputError
-from wrt.viewer_access import Access, Refused, shown
-from wrt.viewer_messages import check_message
+from wrt.core.errors import InputError
+from wrt.viewer.access import Access, Refused, shown
+from wrt.viewer.messages import check_message
 
 VERSIONS = (1, 1, 1), (1, 2)  # from the first on, to before the second
 LARGEST_MESSAGE = 1 << 16  # bytes; a browser sends some hundreds
@@ -32,7 +32,7 @@ MOST_CONNECTIONS = 64  # open at a time, with those that have not shown a token 
 LONGEST_PATH = 200
 LONGEST_LINE = 300  # characters of what is told
 CLOSING = 1.0  # seconds that a browser has to say goodbye
-QUIET = logging.getLogger("wrt.viewer.connections")  # what goes wrong in one connection is no matter of the others
+QUIET = logging.getLogger("wrt.viewer.refine.connections")  # what goes wrong in one connection is no matter of the others
 QUIET.propagate = False
 QUIET.addHandler(logging.NullHandler())
 _ALONE = threading.RLock()  # for what is replaced in the whole process: stdout, and websockets' `serve`

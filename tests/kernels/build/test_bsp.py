@@ -9,10 +9,10 @@ from tests.kernel_tools import CPU, launch, unit  # isort: skip (starts Warp)
 import warp as wp
 from scipy.spatial import ConvexHull
 
-from wrt.accel.bsp import cells_of, pieces_of
-from wrt.kernels.build_bsp import clip_piece
-from wrt.kernels.build_bsp_cell import MAX_FACES, MAX_POINTS, Cells, box_cell, cell_area, clip_cell, split_areas
-from wrt.kernels.build_bsp_split import BspSplit, Pieces, plane_through
+from wrt.accel.cells.bsp import cells_of, pieces_of
+from wrt.kernels.build.bsp import clip_piece
+from wrt.kernels.build.bsp_cell import MAX_FACES, MAX_POINTS, Cells, box_cell, cell_area, clip_cell, split_areas
+from wrt.kernels.build.bsp_split import BspSplit, Pieces, plane_through
 from wrt.kernels.structs import kernel
 
 

@@ -9,16 +9,16 @@ from hypothesis.extra.numpy import arrays
 from tests.kernel_tools import ints, launch, rounded, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from tests.kernels.test_traverse import GEOMETRIES, assert_same_hits, rays_for
+from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for
 from wrt.accel import build
 from wrt.accel.base import Geometry
-from wrt.accel.bvh_build import BVH_BUILDERS, BvhOptions, build_binary, sah_cost
-from wrt.errors import InputError
-from wrt.kernels.build_records import levels
+from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary, sah_cost
+from wrt.core.errors import InputError
+from wrt.kernels.build.records import levels
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse_bvh2 import STACK_SIZE
-from wrt.mesh import Mesh
-from wrt.shapes import icosphere, torus
+from wrt.kernels.traverse.bvh2 import STACK_SIZE
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import icosphere, torus
 
 
 def geometry_of(lo, hi):

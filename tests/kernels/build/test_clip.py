@@ -7,8 +7,8 @@ from tests.kernel_tools import ints, launch, rounded, zeros  # isort: skip (star
 import warp as wp
 
 from wrt.accel import Geometry
-from wrt.accel.kdtree_build import clippable
-from wrt.kernels.build_clip import clip_references
+from wrt.accel.cells.kdtree_build import clippable
+from wrt.kernels.build.clip import clip_references
 
 U = 2.0**-24
 

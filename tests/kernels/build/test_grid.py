@@ -7,9 +7,9 @@ import pytest
 
 from tests.cell_cases import CASES, points_of, random_lines, segments, triangles
 from wrt.accel import build
-from wrt.accel import grid as module
-from wrt.errors import InputError
-from wrt.shapes import icosphere
+from wrt.accel.cells import grid as module
+from wrt.core.errors import InputError
+from wrt.scene.shapes import icosphere
 
 
 def lists(grid):

@@ -7,8 +7,8 @@ import pytest
 
 from tests.cell_cases import CASES, points_of, random_lines, segments, triangles
 from wrt.accel import Geometry, build
-from wrt.errors import InputError
-from wrt.shapes import icosphere
+from wrt.core.errors import InputError
+from wrt.scene.shapes import icosphere
 
 
 def cells_of(octree):

@@ -5,13 +5,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernels.test_build_bvh2 import geometry_of
-from tests.kernels.test_traverse import GEOMETRIES, assert_same_hits, rays_for
+from tests.kernels.build.test_bvh2 import geometry_of
+from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for
 from wrt.accel import build
-from wrt.accel.bvh_build import BVH_BUILDERS, BvhOptions, build_binary
-from wrt.accel.wide_tree import collapse, stack_need
-from wrt.kernels.traverse_wide import STACK_SIZE
-from wrt.shapes import icosphere
+from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
+from wrt.accel.bvh.wide_tree import collapse, stack_need
+from wrt.kernels.wide.traverse import STACK_SIZE
+from wrt.scene.shapes import icosphere
 
 
 def leaf(reference):

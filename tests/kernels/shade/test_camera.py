@@ -8,11 +8,11 @@ import pytest
 from tests.kernel_tools import launch, unit, vec2s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.device_scene import camera_struct
-from wrt.kernels.camera import make_camera_ray
+from wrt.kernels.shade.camera import make_camera_ray
 from wrt.kernels.structs import Camera as DeviceCamera
 from wrt.kernels.structs import Ray, kernel
-from wrt.scene import Camera
+from wrt.renderer.upload import camera_struct
+from wrt.scene.model import Camera
 
 
 @cache

@@ -10,9 +10,7 @@ from tests.kernel_tools import CPU, directions, launch, rounded, sobol_like, uni
 import warp as wp
 
 from wrt.accel import build
-from wrt.device_scene import upload_scene
-from wrt.features import Features
-from wrt.kernels.lights import (
+from wrt.kernels.shade.lights import (
     LightSample,
     environment_radiance,
     make_background,
@@ -20,10 +18,12 @@ from wrt.kernels.lights import (
     make_sky_sample,
     shadow_ray,
 )
+from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Background, Lighting, Ray, Surfaces, kernel
-from wrt.kernels.surface import Surface
-from wrt.mesh import Mesh
-from wrt.scene import (
+from wrt.renderer.features import Features
+from wrt.renderer.upload import upload_scene
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import (
     ConstantBackground,
     DirectionalLight,
     EnvironmentBackground,
@@ -35,7 +35,7 @@ from wrt.scene import (
     Sphere,
     SpotLight,
 )
-from wrt.shapes import icosphere, quad
+from wrt.scene.shapes import icosphere, quad
 
 ALL_LIGHTS = Features(lights=True, point_lights=True, directional_lights=True, spot_lights=True, mesh_lights=True,
                       sphere_lights=True, sky_light=True)
@@ -316,7 +316,7 @@ def radiance_of(background, direction):
 
 
 def bilinear(background, direction):
-    """The look-up by its definition in wrt.scene, float64: middle column along -z, columns run towards +x, row 0 up."""
+    """The look-up by its definition in wrt.scene.model, float64: middle column along -z, columns run towards +x, row 0 up."""
     image = background.image.astype(np.float64)
     height, width = image.shape[:2]
     c, s = np.cos(-background.rotation), np.sin(-background.rotation)

@@ -8,11 +8,9 @@ import pytest
 from tests.kernel_tools import CPU, floats, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
 import warp as wp
 
-from wrt.device import upload
-from wrt.device_scene import TextureTable, material_records
-from wrt.features import Features
+from wrt.core.device import upload
 from wrt.kernels import structs
-from wrt.kernels.materials import (
+from wrt.kernels.shade.materials import (
     Scatter,
     blinn_phong,
     fresnel_conductor,
@@ -21,9 +19,11 @@ from wrt.kernels.materials import (
     fresnel_tint,
     make_scatter,
 )
+from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import kernel
-from wrt.kernels.surface import Surface
-from wrt.scene import CONDUCTORS, MATERIAL_KINDS, Material
+from wrt.renderer.features import Features
+from wrt.renderer.upload import TextureTable, material_records
+from wrt.scene.model import CONDUCTORS, MATERIAL_KINDS, Material
 
 
 @kernel
@@ -328,7 +328,7 @@ def test_interpolated_normals_never_send_a_ray_to_the_wrong_side():
 
 
 def test_every_kind_of_the_scene_has_its_number_on_the_device():
-    from wrt.kernels import materials
+    from wrt.kernels.shade import materials
 
     for number, kind in enumerate(MATERIAL_KINDS):
         assert getattr(materials, kind.upper()) == number

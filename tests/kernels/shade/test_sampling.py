@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.kernel_tools import floats, launch, sobol_like, uints, unit, vec2s, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.kernels.sampling import (
+from wrt.kernels.shade.sampling import (
     cosine_hemisphere,
     disk,
     frame_x,

@@ -1,12 +1,12 @@
-"""Shadow rays through what lets light through, by pictures whose answer is known; tests/wrt/test_tinted_shadows.py has more."""
+"""Shadow rays through what lets light through, by pictures whose answer is known; tests/wrt/renderer/test_tinted_shadows.py has more."""
 
 import numpy as np
 import pytest
 
-from wrt.driver import render
-from wrt.kernels.shadows import MAX_TRANSPARENT
-from wrt.scene import Camera, Color, DirectionalLight, Material, Object, PointLight, Scene, Settings
-from wrt.shapes import box, quad
+from wrt.kernels.shade.shadows import MAX_TRANSPARENT
+from wrt.renderer.renderer import render
+from wrt.scene.model import Camera, Color, DirectionalLight, Material, Object, PointLight, Scene, Settings
+from wrt.scene.shapes import box, quad
 
 ONE: Color = (1.0, 1.0, 1.0)
 WHITE = Material(albedo=ONE)

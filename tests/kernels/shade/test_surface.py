@@ -9,13 +9,13 @@ from tests.kernel_tools import CPU, directions, floats, ints, launch, rounded, u
 import warp as wp
 
 from wrt.accel import build
-from wrt.device_scene import upload_scene
+from wrt.kernels.shade.surface import Surface, make_surface_at, next_away, spawn_point
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
-from wrt.kernels.surface import Surface, make_surface_at, next_away, spawn_point
-from wrt.mesh import Mesh
-from wrt.scene import Material, Object, Scene, Sphere
-from wrt.shapes import icosphere
-from wrt.world import world_mesh
+from wrt.renderer.flatten import world_mesh
+from wrt.renderer.upload import upload_scene
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Material, Object, Scene, Sphere
+from wrt.scene.shapes import icosphere
 
 
 @cache
@@ -225,7 +225,7 @@ def test_spheres(ball):
 
 
 def test_sphere_coordinates():
-    # u runs around +y from -x, v from the top down, as wrt.scene.Sphere says.
+    # u runs around +y from -x, v from the top down, as wrt.scene.model.Sphere says.
     scene = scene_of(spheres=[[0.0, 0.0, 0.0, 2.0]])
     where = np.array([[1, 0, 0], [0, 0, 1], [0, 0, -1], [0.6, 0.8, 0.0], [0.6, -0.8, 0.0], [-0.6, 0.0, 0.8], [0, 1, 0]], float)
     hits = build(upload_scene(scene, CPU).world.geometry, "bvh").closest_hit(4.0 * where, -where)

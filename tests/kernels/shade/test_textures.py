@@ -8,12 +8,12 @@ import pytest
 from tests.kernel_tools import CPU, ints, launch, vec2s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.device import upload
-from wrt.device_scene import TextureTable, srgb_table
+from wrt.core.device import upload
 from wrt.kernels import structs
+from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Surfaces, kernel
-from wrt.kernels.textures import make_sample_texture
-from wrt.scene import Checkerboard, Texture
+from wrt.renderer.upload import TextureTable, srgb_table
+from wrt.scene.model import Checkerboard, Texture
 
 
 @cache

@@ -6,11 +6,11 @@ Kernels are compiled from a scene's features: scenes that share a set of feature
 import numpy as np
 import pytest
 
-from wrt.driver import Options, Renderer, render
-from wrt.kernels.shadows import MAX_TRANSPARENT
-from wrt.kernels.whitted import MAX_RAYS
-from wrt.mesh import Mesh
-from wrt.scene import (
+from wrt.kernels.shade.shadows import MAX_TRANSPARENT
+from wrt.kernels.shade.whitted import MAX_RAYS
+from wrt.renderer.renderer import Options, Renderer, render
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import (
     Camera,
     Checkerboard,
     ConstantBackground,
@@ -24,7 +24,7 @@ from wrt.scene import (
     Sphere,
     SpotLight,
 )
-from wrt.shapes import box, icosphere, quad
+from wrt.scene.shapes import box, icosphere, quad
 
 ONE = (1.0, 1.0, 1.0)
 WHITE_SKY = ConstantBackground(ONE)

@@ -9,13 +9,13 @@ import pytest
 
 from tests.kernel_tools import CPU, launch, zeros  # before warp: it silences Warp's banner
 from wrt.accel import Geometry
-from wrt.bench.rasterizer import NOTHING, Rasterizer, directions_from_pixels, primary_rays_kernel, view_struct
-from wrt.device_scene import camera_struct
-from wrt.kernels import rasterize as kernels
 from wrt.kernels.structs import kernel
-from wrt.mesh import Mesh
-from wrt.scene import Camera
-from wrt.shapes import box, icosphere
+from wrt.kernels.study import rasterize as kernels
+from wrt.lab.bench.rasterizer import NOTHING, Rasterizer, directions_from_pixels, primary_rays_kernel, view_struct
+from wrt.renderer.upload import camera_struct
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Camera
+from wrt.scene.shapes import box, icosphere
 
 import warp as wp  # isort: skip
 

@@ -11,10 +11,10 @@ import warp as wp
 
 from wrt.accel import ACCELERATORS, Geometry, Structure, build
 from wrt.kernels.query import HitArrays, RayArrays, load_ray
-from wrt.kernels.ray_aabb import RAY_AABB
 from wrt.kernels.structs import Surfaces, kernel
-from wrt.mesh import Mesh
-from wrt.shapes import icosphere
+from wrt.kernels.units.box import RAY_AABB
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import icosphere
 
 STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
 TREES = [name for name in STRUCTURES if name != "brute_force"]

@@ -9,8 +9,8 @@ from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 
 from tests.cell_cases import assert_same, soup
 from wrt.accel import build
-from wrt.mesh import Mesh
-from wrt.shapes import icosphere
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import icosphere
 
 
 def corner_planes(grid):

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from tests.kernel_tools import rounded, unit
 from wrt.accel import ACCELERATORS, Geometry, build
 from wrt.accel.instances import InstancedGeometry, NumberedGeometry, place
-from wrt.kernels.traverse_bvh2 import Bvh2Node
-from wrt.shapes import icosphere, torus
+from wrt.kernels.traverse.bvh2 import Bvh2Node
+from wrt.scene.shapes import icosphere, torus
 
 STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
 NO_SPHERES = np.zeros((0, 4), np.float32)

@@ -10,7 +10,7 @@ from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 from tests import rewalk
 from tests.cell_cases import assert_same, soup
 from wrt.accel import build
-from wrt.shapes import icosphere
+from wrt.scene.shapes import icosphere
 
 
 @pytest.mark.parametrize("mailbox", [True, False])

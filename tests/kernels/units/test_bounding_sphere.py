@@ -6,8 +6,8 @@ import pytest
 from tests.kernel_tools import directions, floats, launch, rounded, unit, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.kernels.ray_bounding_sphere import ray_bounding_sphere, sphere_ray
 from wrt.kernels.structs import Ray, kernel
+from wrt.kernels.units.bounding_sphere import ray_bounding_sphere, sphere_ray
 
 
 @kernel

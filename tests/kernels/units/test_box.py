@@ -12,7 +12,8 @@ from hypothesis.extra.numpy import arrays
 from tests.kernel_tools import floats, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.kernels.ray_aabb import (
+from wrt.kernels.structs import Ray, kernel
+from wrt.kernels.units.box import (
     FAR_PAD,
     RAY_AABB,
     box_pad,
@@ -23,7 +24,6 @@ from wrt.kernels.ray_aabb import (
     ray_aabb,
     slab_interval,
 )
-from wrt.kernels.structs import Ray, kernel
 
 INF = np.float32(np.inf)
 

@@ -7,12 +7,12 @@ from tests.kernel_tools import directions, floats, launch, rounded, unit, vec3s,
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.accel.bvh2_volumes import cuts
-from wrt.accel.bvh2_volumes import project as host_project
-from wrt.kernels.ray_aabb import box_ray, ray_aabb
-from wrt.kernels.ray_kdop import kdop_ray, project, ray_kdop
-from wrt.kernels.ray_triangle import ray_triangle, triangle_ray
+from wrt.accel.bvh.volumes import cuts
+from wrt.accel.bvh.volumes import project as host_project
 from wrt.kernels.structs import Ray, kernel
+from wrt.kernels.units.box import box_ray, ray_aabb
+from wrt.kernels.units.kdop import kdop_ray, project, ray_kdop
+from wrt.kernels.units.triangle import ray_triangle, triangle_ray
 
 INF = np.float32(np.inf)
 

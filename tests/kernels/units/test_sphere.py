@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from tests.kernel_tools import directions, floats, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.kernels.ray_aabb import box_ray
-from wrt.kernels.ray_sphere import ray_sphere
 from wrt.kernels.structs import NO_HIT, Hit, Ray, kernel
+from wrt.kernels.units.box import box_ray
+from wrt.kernels.units.sphere import ray_sphere
 
 
 @kernel

@@ -12,9 +12,9 @@ import warp as wp
 
 from wrt.accel import Geometry, build
 from wrt.accel.triangle_data import TRIANGLE_DATA
-from wrt.kernels.ray_aabb import box_ray
-from wrt.kernels.ray_triangle import RAY_TRIANGLE, ray_triangle, triangle_ray, watertight
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, kernel
+from wrt.kernels.units.box import box_ray
+from wrt.kernels.units.triangle import RAY_TRIANGLE, ray_triangle, triangle_ray, watertight
 
 # pbrt-v4, shapes_test, Triangle.BadCases: three collinear points and a ray that must miss them (published numbers).
 BAD_TRIANGLE = [[-1113.45459, -79.049614, -56.2431908], [-1113.45459, -87.0922699, -56.2431908],

@@ -8,15 +8,15 @@ import pytest
 from tests.kernel_tools import CPU, floats, ints, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel.wide_compress import compress
-from wrt.kernels.lanes import LANE_PAD, make_lanes, make_twins, row_type
+from wrt.accel.bvh.compress import compress
 from wrt.kernels.query import RayArrays, load_ray
-from wrt.kernels.ray_aabb import FAR_PAD, box_ray, ray_aabb
 from wrt.kernels.structs import Ray, kernel
-from wrt.kernels.traverse import Units, make_probe
-from wrt.kernels.traverse_wide import lane_ray
-from wrt.kernels.wide_nodes import make_nodes, node_size
-from wrt.kernels.wide_nodes import make_twins as node_twins
+from wrt.kernels.traverse.common import Units, make_probe
+from wrt.kernels.units.box import FAR_PAD, box_ray, ray_aabb
+from wrt.kernels.wide.lanes import LANE_PAD, make_lanes, make_twins, row_type
+from wrt.kernels.wide.nodes import make_nodes, node_size
+from wrt.kernels.wide.nodes import make_twins as node_twins
+from wrt.kernels.wide.traverse import lane_ray
 
 WIDTHS = (4, 8)
 

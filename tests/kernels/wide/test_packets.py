@@ -8,15 +8,15 @@ import pytest
 from tests.kernel_tools import floats, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.kernels import packets
-from wrt.kernels.lanes import LANE_PAD, make_twins, row_type
-from wrt.kernels.packets import ENTRY, LANES, MET, PACKET_SIZE, ROWS, STACK_WORDS, TO_POP
 from wrt.kernels.query import RayArrays, direction_scale, load_ray
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
-from wrt.kernels.trace_packets import COHERENT, PACKETS, SLOTS, WORDS
-from wrt.kernels.traverse import Units, make_intersect, make_probe, no_hit
-from wrt.kernels.traverse_wide import MAX_T, lane_ray
-from wrt.kernels.wide_nodes import make_twins as node_twins
+from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.wide import packets
+from wrt.kernels.wide.lanes import LANE_PAD, make_twins, row_type
+from wrt.kernels.wide.nodes import make_twins as node_twins
+from wrt.kernels.wide.packets import ENTRY, LANES, MET, PACKET_SIZE, ROWS, STACK_WORDS, TO_POP
+from wrt.kernels.wide.stream import COHERENT, PACKETS, SLOTS, WORDS
+from wrt.kernels.wide.traverse import MAX_T, lane_ray
 
 WIDTH = 8
 NOTHING = wp.constant(99)

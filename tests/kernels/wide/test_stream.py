@@ -8,17 +8,18 @@ from tests.data import data_path
 from tests.kernel_tools import CPU, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel import ACCELERATORS, Geometry, build, streams
+from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.accel import batches as streams
 from wrt.accel.base import Built, Structure, any_hit_kernel, closest_hit_kernel
-from wrt.accel.streams import rays_per_launch, stream_kernel
-from wrt.accel.wide_tree import stack_need
-from wrt.bench.rays import ray_sets
-from wrt.kernels.lanes import EMPTY
+from wrt.accel.batches import rays_per_launch, stream_kernel
+from wrt.accel.bvh.wide_tree import stack_need
 from wrt.kernels.query import HitArrays
-from wrt.kernels.traverse import Units
-from wrt.kernels.traverse_wide import LEAF_RANGE, STACK_SIZE
-from wrt.mesh import Mesh, load_mesh
-from wrt.shapes import icosphere
+from wrt.kernels.traverse.common import Units
+from wrt.kernels.wide.lanes import EMPTY
+from wrt.kernels.wide.traverse import LEAF_RANGE, STACK_SIZE
+from wrt.lab.bench.rays import ray_sets
+from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.shapes import icosphere
 
 
 def one_by_one(accel, o, d, t_min, t_max):

@@ -14,14 +14,14 @@ from tests.kernel_tools import CPU, launch, rounded, vec3s, zeros  # isort: skip
 import warp as wp
 
 import wrt
-from tests.kernels.test_ray_aabb import pad_kernel
+from tests.kernels.units.test_box import pad_kernel
 from wrt.accel import ACCELERATORS, Geometry, build
 from wrt.accel.base import RAYS_PER_LAUNCH
-from wrt.device import records
-from wrt.errors import InputError
+from wrt.core.device import records
+from wrt.core.errors import InputError
 from wrt.kernels.structs import Primitive
-from wrt.kernels.traverse import Units
-from wrt.shapes import icosphere, torus
+from wrt.kernels.traverse.common import Units
+from wrt.scene.shapes import icosphere, torus
 
 NAMES = sorted({cls.name for cls in ACCELERATORS.values()})
 BALL = icosphere(2)

@@ -15,20 +15,20 @@ from tests.data import data_path
 from tests.gltf_files import GltfFile
 from wrt.accel import ACCELERATORS, Structure, build
 from wrt.accel.instances import Instances, place
-from wrt.bench.rasterizer import Rasterizer
-from wrt.bench.visibility_check import compare
-from wrt.device import start, upload
-from wrt.device_scene import upload_scene
-from wrt.errors import InputError
-from wrt.film import Film
+from wrt.core.device import start, upload
+from wrt.core.errors import InputError
 from wrt.kernels.query import RayArrays, Respawn, make_respawn_kernel
-from wrt.kernels.surface import make_surface_at
-from wrt.kernels.traverse import Units
-from wrt.mesh import Mesh
-from wrt.scene import Camera, ConstantBackground, Material, Object, Scene, Settings, Sphere, Texture
-from wrt.shapes import icosphere, quad
-from wrt.smooth import smooth
-from wrt.world import world_mesh
+from wrt.kernels.shade.surface import make_surface_at
+from wrt.kernels.traverse.common import Units
+from wrt.lab.bench.rasterizer import Rasterizer
+from wrt.lab.bench.visibility_check import compare
+from wrt.picture.film import Film
+from wrt.renderer.flatten import world_mesh
+from wrt.renderer.upload import upload_scene
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Camera, ConstantBackground, Material, Object, Scene, Settings, Sphere, Texture
+from wrt.scene.shapes import icosphere, quad
+from wrt.scene.vertex_normals import smooth
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 SIZE = (160, 120)

@@ -10,7 +10,7 @@ import pytest
 
 import wrt
 from tests.command_line import BOX_OBJ
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 
 def test_a_path_is_built_as_its_mesh_is(tmp_path: Path) -> None:

@@ -21,9 +21,9 @@ import wrt
 from tests.data import data_path
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, build
 from wrt.accel.base import Counters
-from wrt.accel.bvh_build import BVH_BUILDERS
-from wrt.errors import InputError
-from wrt.shapes import icosphere, torus
+from wrt.accel.bvh.builders import BVH_BUILDERS
+from wrt.core.errors import InputError
+from wrt.scene.shapes import icosphere, torus
 
 REAL = ["small/suzanne.obj", "small/legocar.obj", "medium/stanford_bunny.ply", "medium/sponza_dabrovic.obj",
         "large/dragon_871k.ply"]

@@ -17,9 +17,9 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from wrt.accel import ACCELERATORS, Geometry, build, build_cached
 from wrt.accel.store import MAGIC, load_accel
-from wrt.checked_file import DIGEST_BYTES
-from wrt.errors import InputError
-from wrt.shapes import icosphere
+from wrt.core.checked_file import DIGEST_BYTES
+from wrt.core.errors import InputError
+from wrt.scene.shapes import icosphere
 
 STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
 BALL = icosphere(2)

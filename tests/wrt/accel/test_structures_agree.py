@@ -10,8 +10,8 @@ import pytest
 import wrt
 from tests.data import data_path
 from wrt.accel import ACCELERATORS, Geometry, Hits, build
-from wrt.bench.hard_cases import HARD_CASES, HardCase, generate
-from wrt.errors import InputError
+from wrt.core.errors import InputError
+from wrt.lab.hard_cases.cases import HARD_CASES, HardCase, generate
 
 SMALL = ["meshes/small/suzanne.obj", "meshes/small/cow.obj", "meshes/small/teapot.obj", "meshes/small/legocar.obj",
          "odd/busted.STL", "odd/ADIS16480.STL", "odd/capsule.obj"]

@@ -17,11 +17,11 @@ from wrt.accel import ACCELERATORS, Accelerator, Geometry, build, load_accel
 from wrt.accel.base import RAYS_PER_LAUNCH, Hits
 from wrt.accel.instances import Instances, place
 from wrt.accel.store import array_types
-from wrt.device import load_kernel, made_once, start
-from wrt.errors import InputError
+from wrt.core.device import load_kernel, made_once, start
+from wrt.core.errors import InputError
 from wrt.kernels.structs import kernel
-from wrt.scene import Camera, Material, Object, PointLight, Scene
-from wrt.shapes import icosphere
+from wrt.scene.model import Camera, Material, Object, PointLight, Scene
+from wrt.scene.shapes import icosphere
 
 BALL = icosphere(3)
 SHAPES = BALL.vertices, (BALL.vertices * np.float32([1.0, 0.5, 0.8])).astype(np.float32)

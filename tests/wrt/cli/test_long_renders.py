@@ -17,11 +17,12 @@ import pytest
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run
 from tests.data import ROOT
-from wrt import cli_save, film
-from wrt.checkpoint import read
-from wrt.driver import Renderer
-from wrt.errors import InputError
-from wrt.image import read_channels, read_image
+from wrt.cli import save as cli_save
+from wrt.core.errors import InputError
+from wrt.picture import film
+from wrt.picture.image import read_channels, read_image
+from wrt.renderer.checkpoint import read
+from wrt.renderer.renderer import Renderer
 
 SMALL = ("--size", "32x18", "--spp", 4)
 
@@ -49,13 +50,13 @@ def channels(name: str) -> dict[str, bytes]:
 RENDER = ("render", "box.obj", "--size", "160x90", "--spp", 600, "-o", "a.exr", "--aov", "depth")
 # Tells of each look at the tiles, a tenth of a second apart: seconds of tracing so far.
 TELLING = """
-import sys, wrt.progress
+import sys, wrt.renderer.progress
 from contextlib import contextmanager
 @contextmanager
 def reporter(quiet):
     yield lambda progress: print(progress.stage, progress.seconds, file=sys.stderr, flush=True)
-wrt.progress.progress_reporter = reporter
-from wrt.cli import main
+wrt.renderer.progress.progress_reporter = reporter
+from wrt.cli.main import main
 main()
 """
 

@@ -19,13 +19,14 @@ from PIL import Image
 from tests.command_line import BOX_OBJ, Result, largest_file, without_compiling
 from tests.command_line import wrt as run
 from tests.data import ROOT
-from wrt import __version__, cli_common
-from wrt import film as film_module
-from wrt import progress as progress_module
-from wrt.driver import Progress, Renderer
-from wrt.features import features_of
-from wrt.image import read_channels, read_image, read_metadata, write_image
-from wrt.scene_file import load_scene, schema
+from wrt import __version__
+from wrt.cli import common as cli_common
+from wrt.io.load import load_scene, schema
+from wrt.picture import film as film_module
+from wrt.picture.image import read_channels, read_image, read_metadata, write_image
+from wrt.renderer import progress as progress_module
+from wrt.renderer.features import features_of
+from wrt.renderer.renderer import Progress, Renderer
 
 SMALL = ("--size", "32x18", "--spp", 2)
 TWO_CAMERAS = """\
@@ -210,7 +211,7 @@ WRONG = [
 @pytest.mark.parametrize(("arguments", "message"), WRONG, ids=lambda value: str(value)[:40])
 def test_a_wrong_option_is_told_before_the_scene_is_read(arguments: list[str], message: str,
                                                          monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
     Path("box.png").write_bytes(b"old")
     result = run("render", "box.obj", *arguments)
     refused(result, message)
@@ -230,7 +231,7 @@ def test_a_crop_outside_the_picture(crop: str) -> None:
     ("a" * 300 + ".png", "too long"), ("link.png", "link.png: its folder does not exist"),
 ])
 def test_a_wrong_output_is_told_before_any_work(output: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
     Path("folder.png").mkdir()
     Path("link.png").symlink_to("nowhere/at.png")
     refused(run("render", "box.obj", "-o", output), message)
@@ -250,13 +251,13 @@ def unwritable_folder() -> Iterator[Path]:
 
 
 def test_an_output_folder_that_cannot_be_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
     with unwritable_folder() as closed:
         refused(run("render", "box.obj", "-o", closed / "a.png"), f"error: {closed / 'a.png'}: cannot be written: ")
 
 
 def test_a_layer_that_cannot_be_written_is_told_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
     Path("a.normal.png").mkdir()
     refused(run("render", "box.obj", "-o", "a.png", "--aov", "depth,normal"), "a.normal.png: is a folder")
     assert new_files() == {"a.normal.png"}
@@ -286,7 +287,7 @@ def test_what_is_found_late_names_the_scene_and_leaves_the_old_picture() -> None
 
 
 def test_a_picture_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.driver.free_memory", lambda device: 2.0**20)
+    monkeypatch.setattr("wrt.renderer.renderer.free_memory", lambda device: 2.0**20)
     refused(run("render", "box.obj", "--size", "4000x2000"),
             "box.obj: a picture of 4000x2000 takes 1.0 GiB of memory, its scene 0 MiB; cpu has 1 MiB free (WRT_MEMORY")
 
@@ -380,7 +381,7 @@ def test_ctrl_c_while_saving_waits_for_the_file(name: str, monkeypatch: pytest.M
     assert np.array_equal(read_image(name), read_image(f"expected-{name}"))
 
 
-@pytest.mark.parametrize("where", ["wrt.scene_file.load_scene", "wrt.driver.upload_scene", "wrt.driver.Renderer._aovs"])
+@pytest.mark.parametrize("where", ["wrt.io.load.load_scene", "wrt.renderer.renderer.upload_scene", "wrt.renderer.renderer.Renderer._aovs"])
 def test_ctrl_c_before_the_first_sample_leaves_everything_as_it_was(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("box.png").write_bytes(b"old")
     monkeypatch.setattr(where, lambda *arguments: signal.raise_signal(signal.SIGINT) or {})
@@ -483,7 +484,7 @@ def test_help_and_version() -> None:
 
 def process(*arguments: object, code: str = "", **options: Any) -> subprocess.Popen[str]:
     """`python -m wrt arguments`, or with some code run before."""
-    start = ["-c", f"{code}\nfrom wrt.cli import main; main()"] if code else ["-m", "wrt"]
+    start = ["-c", f"{code}\nfrom wrt.cli.main import main; main()"] if code else ["-m", "wrt"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **options.pop("environment", {})}
     return subprocess.Popen([sys.executable, *start, *map(str, arguments)], text=True, env=environment,
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
@@ -520,7 +521,7 @@ def test_closed_and_full_streams(redirection: str, code: int, out: str, err: str
 
 
 # The real reporter tells of its first look at the tiles at once: then the process is tracing.
-AT_ONCE = "import wrt.progress; wrt.progress.LINE_EVERY = 0.0"
+AT_ONCE = "import wrt.renderer.progress; wrt.renderer.progress.LINE_EVERY = 0.0"
 
 
 @pytest.mark.parametrize("times", [1, 5])
@@ -560,18 +561,18 @@ def test_an_ignored_signal_stays_ignored() -> None:
 
 
 LOADING = """
-import sys, wrt.scene_file
-def slow(path, load=wrt.scene_file.load_scene):
+import sys, wrt.io.load
+def slow(path, load=wrt.io.load.load_scene):
     print("now", file=sys.stderr, flush=True)
     while True: load(path)
-wrt.scene_file.load_scene = slow
+wrt.io.load.load_scene = slow
 """
 COMPILING = """
-import sys, wrt.driver
-def told(kernel, device, load=wrt.driver.load_kernel):
+import sys, wrt.renderer.renderer
+def told(kernel, device, load=wrt.renderer.renderer.load_kernel):
     print("now", file=sys.stderr, flush=True)
     load(kernel, device)
-wrt.driver.load_kernel = told
+wrt.renderer.renderer.load_kernel = told
 """
 
 
@@ -589,11 +590,11 @@ def test_a_process_that_is_interrupted_early_leaves_nothing(code: str, number: i
 
 
 FAILING = """
-import time, wrt.driver
+import time, wrt.renderer.renderer
 def slow(kernel, device):
     while True: time.sleep(1.0)
-def failing(*arguments): raise wrt.driver.InputError("a transform that is found late")
-wrt.driver.load_kernel, wrt.driver.upload_scene = slow, failing
+def failing(*arguments): raise wrt.renderer.renderer.InputError("a transform that is found late")
+wrt.renderer.renderer.load_kernel, wrt.renderer.renderer.upload_scene = slow, failing
 """
 
 

@@ -19,12 +19,13 @@ import wrt
 from tests.command_line import BOX_OBJ, Result
 from tests.command_line import wrt as run
 from tests.data import ROOT
-from wrt import cli_common
-from wrt.cli import cli
-from wrt.cli_common import ACCEL, SceneSetting, depth_hint
-from wrt.device_film import GROUPS, VISIBLE
-from wrt.image import read_image
-from wrt.scene import (
+from wrt.cli import common as cli_common
+from wrt.cli.common import ACCEL, SceneSetting, depth_hint
+from wrt.cli.main import cli
+from wrt.io.toml.report import setting_choices
+from wrt.picture.image import read_image
+from wrt.renderer.film_arrays import GROUPS, VISIBLE
+from wrt.scene.model import (
     FILTERS,
     FRESNELS,
     GLASS_SHADOWS,
@@ -37,8 +38,7 @@ from wrt.scene import (
     Scene,
     Settings,
 )
-from wrt.scene_check import setting_choices
-from wrt.shapes import quad
+from wrt.scene.shapes import quad
 
 SMALL = ("--size", "32x18", "--spp", 2)
 SCENE = """\
@@ -118,7 +118,7 @@ def test_set_wins_over_the_file_and_stands_beside_flags() -> None:
 ], ids=lambda value: str(value)[:40])
 def test_a_wrong_setting_is_told_before_the_scene_is_read(arguments: list[str], message: str,
                                                           monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
     result = run("render", "box.obj", *arguments)
     assert result.code == 2 and result.out == "" and len(result.errors) == 1 and message in result.errors[0], result
     assert not Path("box.png").exists()
@@ -153,8 +153,8 @@ def test_the_other_commands_that_render_take_settings(monkeypatch: pytest.Monkey
         seen.append(scene.settings)
         raise wrt.InputError("seen")
 
-    for place in ("wrt.animate.animate", "wrt.profiler.profile", "wrt.bench.error.sweep", "wrt.bench.equal_error.run",
-                  "wrt.viewer_page.Page"):
+    for place in ("wrt.renderer.animate.animate", "wrt.lab.rtcore.profiler.profile", "wrt.lab.bench.error.sweep", "wrt.lab.mitsuba.equal_error.run",
+                  "wrt.viewer.page.Page"):
         module, name = place.rsplit(".", 1)
         monkeypatch.setattr(importlib.import_module(module), name, stop)
     commands = [("animate", "box.obj", "-o", "a.gif"), ("profile", "box.obj"), ("bench", "error", "box.obj"),
@@ -190,7 +190,7 @@ def test_help_shows_the_names_of_each_table() -> None:
 
 @pytest.mark.parametrize("arguments", ["--help", "render --help", "bench --help", "bench units --help", "rendr"])
 def test_help_does_not_wait_for_warp(arguments: str) -> None:
-    code = ("import sys\nfrom wrt.cli import cli\ntry:\n    cli()\nfinally:\n"
+    code = ("import sys\nfrom wrt.cli.main import cli\ntry:\n    cli()\nfinally:\n"
             "    print({name.split('.')[0] for name in sys.modules} & {'warp', 'scipy', 'trimesh', 'pydantic', 'rich'})")
     done = subprocess.run([sys.executable, "-c", code, *arguments.split()], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stdout.endswith("set()\n"), done

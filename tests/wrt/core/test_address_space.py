@@ -14,9 +14,10 @@ import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import ROOT
-from wrt import address_space, driver
-from wrt.address_space import require_modules, require_scipy, require_warp, room_to_compile
-from wrt.errors import InputError
+from wrt.core import address_space
+from wrt.core.address_space import require_modules, require_scipy, require_warp, room_to_compile
+from wrt.core.errors import InputError
+from wrt.renderer import renderer as driver
 
 resource = pytest.importorskip("resource", reason="needs a system with limits")
 pytestmark = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="what is taken is read from /proc")
@@ -58,7 +59,7 @@ def test_the_package_says_it_too(name: str, outcome: str) -> None:
 
 COMPILING = """
 import numpy as np, resource, wrt
-from wrt.device import start
+from wrt.core.device import start
 accel = wrt.build(wrt.Mesh(np.eye(3), np.array([[0, 1, 2]])), "brute_force")
 start("cpu")
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
@@ -123,7 +124,7 @@ def test_a_way_out_is_fewer_threads_of_openblas(monkeypatch: pytest.MonkeyPatch)
 
 
 PRODUCT = """
-import wrt.address_space as space
+import wrt.core.address_space as space
 space.require_modules()
 import numpy as np
 before = space.address_space()
@@ -150,7 +151,7 @@ def test_what_runs_out_later_is_one_message_too(error: Exception, tmp_path: Path
     done = command("render", "box.obj", "-o", "a.png")
     assert (done.code, done.errors) == (2, [f"error: not enough memory: {error}"])
     monkeypatch.setattr(address_space, "address_space", lambda: 3 << 20)
-    monkeypatch.setattr("wrt.cli.require_modules", lambda: None)
+    monkeypatch.setattr("wrt.cli.main.require_modules", lambda: None)
     assert "(3 MiB of address space are left: raise its limit, ulimit -v)" in command("render", "box.obj", "-o", "a.png").err
 
 

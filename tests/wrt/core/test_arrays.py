@@ -10,10 +10,10 @@ import warp as wp
 
 import wrt
 from wrt.accel.base import Hits
-from wrt.errors import InputError
-from wrt.exchange import to_numpy, to_warp
-from wrt.film import Film
-from wrt.shapes import box
+from wrt.core.arrays import to_numpy, to_warp
+from wrt.core.errors import InputError
+from wrt.picture.film import Film
+from wrt.scene.shapes import box
 
 ORIGINS = np.full((5, 3), (0.1, 0.2, 5.0), np.float32)
 DIRECTIONS = np.array([(0, 0, -1), (0, 0, 1), (0, 1, 0), (0.05, 0, -1), (0, 0.05, -1)], np.float32)

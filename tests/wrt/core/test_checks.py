@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wrt.arguments import shown
-from wrt.driver import render
-from wrt.errors import InputError, SceneWarning
-from wrt.film import Film
-from wrt.mesh import Mesh, load_mesh
-from wrt.queries import build
-from wrt.scene import (
+from wrt.accel.queries import build
+from wrt.core.checks import shown
+from wrt.core.errors import InputError, SceneWarning
+from wrt.io.load import load_scene
+from wrt.picture.film import Film
+from wrt.renderer.renderer import render
+from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.model import (
     Camera,
     EnvironmentBackground,
     Material,
@@ -25,8 +26,7 @@ from wrt.scene import (
     Sphere,
     Texture,
 )
-from wrt.scene_file import load_scene
-from wrt.shapes import box, icosphere, quad
+from wrt.scene.shapes import box, icosphere, quad
 
 GREY = Material(name="grey")
 

@@ -14,11 +14,21 @@ import numpy as np
 import pytest
 
 from tests.data import ROOT
-from wrt.device import _stderr_without, describe_devices, free_memory, records, run_all, run_growing, start, thread_count, upload
+from wrt.core.device import (
+    _stderr_without,
+    describe_devices,
+    free_memory,
+    records,
+    run_all,
+    run_growing,
+    start,
+    thread_count,
+    upload,
+)
 
-import warp as wp  # isort: skip (after wrt.device, which silences Warp's banner)
+import warp as wp  # isort: skip (after wrt.core.device, which silences Warp's banner)
 
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 
 @pytest.mark.parametrize("name", ["nope", "", "cuda:999", "cpu:1", "CPU"])

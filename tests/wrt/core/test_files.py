@@ -11,12 +11,12 @@ import pytest
 from tests.fuzz.seeds import scenes, side_files
 from tests.gltf_files import one_triangle
 from wrt.accel.store import load_accel
-from wrt.checkpoint import read
-from wrt.errors import InputError
-from wrt.image import read_image
-from wrt.read_file import read_file
-from wrt.scene_file import load_scene
-from wrt.shapes import icosphere
+from wrt.core.errors import InputError
+from wrt.core.files import read_file
+from wrt.io.load import load_scene
+from wrt.picture.image import read_image
+from wrt.renderer.checkpoint import read
+from wrt.scene.shapes import icosphere
 
 
 @pytest.fixture

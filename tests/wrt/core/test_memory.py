@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from tests.data import ROOT
-from wrt import memory
-from wrt.errors import InputError
+from wrt.core import memory
+from wrt.core.errors import InputError
 
 
 @pytest.fixture(autouse=True)
@@ -65,7 +65,7 @@ def test_resident_is_what_is_in_use() -> None:
 
 
 def test_the_limit_of_address_space_counts() -> None:
-    code = ("import resource; resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30)); from wrt.memory import available;"
+    code = ("import resource; resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30)); from wrt.core.memory import available;"
             " print(available())")
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True,
                           env=os.environ | {"OPENBLAS_NUM_THREADS": "1"})

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from wrt.accel.registry import Registry
-from wrt.errors import InputError
+from wrt.core.errors import InputError
+from wrt.core.registry import Registry
 
 
 def test_entries_become_what_they_name() -> None:
@@ -37,9 +37,9 @@ def test_names_are_shown_whatever_was_imported() -> None:
 
 
 def test_a_render_imports_only_its_own_structure() -> None:
-    code = ("import sys, wrt; from wrt.shapes import icosphere; wrt.build(icosphere(1)); "
+    code = ("import sys, wrt; from wrt.scene.shapes import icosphere; wrt.build(icosphere(1)); "
             "print(*(name for name in sys.modules if name.startswith('wrt.')))")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = done.stdout.split()
-    assert "wrt.accel.bvh_wide" in loaded
-    assert not {"wrt.accel.bsp", "wrt.accel.kdtree", "wrt.kernels.build_sbvh", "wrt.kernels.build_bsp"} & set(loaded)
+    assert "wrt.accel.bvh.wide" in loaded
+    assert not {"wrt.accel.cells.bsp", "wrt.accel.cells.kdtree", "wrt.kernels.build.sbvh", "wrt.kernels.build.bsp"} & set(loaded)

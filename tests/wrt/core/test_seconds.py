@@ -16,9 +16,9 @@ import pytest
 import wrt
 from tests.command_line import BOX_OBJ
 from tests.data import ROOT
-from wrt import seconds
-from wrt.seconds import counted_once
-from wrt.spread import _waited_for
+from wrt.core import seconds
+from wrt.core.seconds import counted_once
+from wrt.renderer.distributed.renderer import _waited_for
 
 SCENE = ROOT / "scenes" / "conductor.toml"
 

@@ -19,16 +19,18 @@ import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import ROOT
-from tests.wrt.test_checkpoint import SCENE, same
-from wrt import bench, checkpoint, write_file
+from tests.wrt.renderer.test_checkpoint import SCENE, same
 from wrt.accel import build, build_cached
-from wrt.animate import save_movie
-from wrt.bench import memory
-from wrt.driver import render
-from wrt.errors import InputError
-from wrt.image import write_codes, write_image
-from wrt.shapes import icosphere
-from wrt.write_file import LONG_AGO, aside, check_writable, remove_leftovers, replacing, this_system
+from wrt.core import write_file
+from wrt.core.errors import InputError
+from wrt.core.write_file import LONG_AGO, aside, check_writable, remove_leftovers, replacing, this_system
+from wrt.lab import bench
+from wrt.lab.bench import peak_memory as memory
+from wrt.picture.image import write_codes, write_image
+from wrt.renderer import checkpoint
+from wrt.renderer.animate import save_movie
+from wrt.renderer.renderer import render
+from wrt.scene.shapes import icosphere
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 PIXELS = np.full((4, 6, 3), 0.5, np.float32)
@@ -150,7 +152,7 @@ def test_on_the_command_line_before_the_work(tmp_path: Path, monkeypatch: pytest
     assert command("render", "box.obj", "-o", "./b.exr", "--aov", "depth").errors == [f"error: b.exr: {refused}"]
     assert command("build", "box.obj", "-o", "a.accel").errors == [f"error: a.accel: {refused}"]
     refuse(monkeypatch, tmp_path / "frames")
-    monkeypatch.setattr("wrt.animate.animate", lambda *arguments: pytest.fail("the work began"))
+    monkeypatch.setattr("wrt.renderer.animate.animate", lambda *arguments: pytest.fail("the work began"))
     assert command("animate", "box.obj", "-o", "frames").errors == [f"error: frames/frame_000.png: {refused}"]
     monkeypatch.undo()
     assert names(tmp_path) == {"box.obj", "frames"}
@@ -182,7 +184,7 @@ def test_a_damaged_entry_of_a_cache_that_cannot_be_written_is_told(tmp_path: Pat
 
 WRITING = """
 import sys, time
-from wrt.write_file import replacing
+from wrt.core.write_file import replacing
 with replacing(sys.argv[1]) as temporary:
     temporary.write_bytes(b"half")
     print(temporary.name, flush=True)
@@ -190,7 +192,7 @@ with replacing(sys.argv[1]) as temporary:
 """
 SAVING = """
 import sys, time, wrt
-from tests.wrt.test_checkpoint import SCENE
+from tests.wrt.renderer.test_checkpoint import SCENE
 def wait(progress):
     print("runs", flush=True)
     time.sleep(600)

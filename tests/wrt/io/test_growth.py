@@ -22,7 +22,7 @@ import pytest
 from tests.fuzz.formats import read_mesh, read_picture, read_scene
 from tests.fuzz.seeds import Seed, side_files
 from tests.grown import GROWN
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 SIZE, LINES = 2400, 20_000  # bytes of the shortest file, or a fourth of it, or that of it, if it takes more lines
 HIGHEST = 1.4  # exponent: 1 is linear, 2 is what must not be; tables that double when they are full make some difference
@@ -98,7 +98,7 @@ def exponents(works: list[Work]) -> dict[str, float]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in GROWN if name not in UP_TO_A_LIMIT])
 def test_work_and_memory_are_linear(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.scene.MANY_VERTICES", 1 << 10, raising=False)
+    monkeypatch.setattr("wrt.scene.model.MANY_VERTICES", 1 << 10, raising=False)
     side_files(tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -12,15 +12,15 @@ import pytest
 
 from tests.command_line import wrt as command
 from tests.gltf_files import TRIANGLE, GltfFile, one_triangle
-from wrt.errors import InputError, SceneWarning
-from wrt.gltf import load_gltf
-from wrt.memory import Meter
-from wrt.scene import MAX_OBJECTS, Scene, Texture
-from wrt.scene_file import load_scene
-from wrt.shapes import MAX_FACES, icosphere, lathe, teapot, torus, tube
+from wrt.core.errors import InputError, SceneWarning
+from wrt.core.memory import Meter
+from wrt.io.gltf.reader import load_gltf
+from wrt.io.load import load_scene
+from wrt.scene.model import MAX_OBJECTS, Scene, Texture
+from wrt.scene.shapes import MAX_FACES, icosphere, lathe, teapot, torus, tube
 
 SPHERE = "[[spheres]]\ncenter = [0, 0, 0]\nradius = 1\n"
-pytestmark = pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 
 
 @pytest.fixture(autouse=True)
@@ -55,7 +55,7 @@ def test_instances_without_bytes_behind_them(count: int, message: str, tmp_path:
 
 
 def test_nodes_times_instances_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.scene.MAX_OBJECTS", 100)
+    monkeypatch.setattr("wrt.scene.model.MAX_OBJECTS", 100)
     assert len(load_gltf(instanced(50, 2).write(tmp_path)).objects) == 100
     for file in (instanced(50, 3), instanced(40, 1, 3)):
         with pytest.raises(InputError, match=r"nodes\[\d\].*: 1\d\d (objects|instances); a scene holds at most 100"):
@@ -97,7 +97,7 @@ def test_shapes_of_too_many_triangles(shape, arguments: dict) -> None:
 
 def test_many_small_things_are_one_large_thing(say_memory: Callable[[str], None], monkeypatch: pytest.MonkeyPatch,
                                                tmp_path: Path) -> None:
-    monkeypatch.setattr("wrt.memory.SMALL", 1 << 20)
+    monkeypatch.setattr("wrt.core.memory.SMALL", 1 << 20)
     say_memory("1M")
     meter = Meter()
     with pytest.raises(InputError, match=r"pieces takes .* of memory; 1 MiB are free"):
@@ -153,7 +153,7 @@ def test_nothing_outside_of_the_folder_is_read(uri: str, tmp_path: Path, monkeyp
         assert path == file_path, f"{path} was read"
         return path.read_bytes()
 
-    monkeypatch.setattr("wrt.gltf_document.read_file", read)
+    monkeypatch.setattr("wrt.io.gltf.document.read_file", read)
     for array, item in (("buffers", {"byteLength": 36, "uri": uri}), ("images", {"uri": uri})):
         file = one_triangle()
         file.json[array] = [item]

@@ -13,8 +13,10 @@ import pytest
 
 from tests.data import data_path
 from tests.gltf_files import one_triangle
-from wrt.errors import InputError, SceneWarning
-from wrt.scene import (
+from wrt.core.errors import InputError, SceneWarning
+from wrt.io.load import load_scene, schema
+from wrt.renderer.flatten import world_mesh
+from wrt.scene.model import (
     CONDUCTORS,
     Checkerboard,
     DirectionalLight,
@@ -26,8 +28,6 @@ from wrt.scene import (
     SpotLight,
     Texture,
 )
-from wrt.scene_file import load_scene, schema
-from wrt.world import world_mesh
 
 CAMERA = "[cameras.main]\nposition = [0, 0, 5]\ntarget = [0, 0, 0]\n"
 SUN = '[[lights]]\ntype = "directional"\ndirection = [0, -1, 0]\nirradiance = 1\n'
@@ -310,7 +310,7 @@ def test_unread_materials_of_an_obj_file_are_told_once(tmp_path: Path) -> None:
 
 
 def test_environment(tmp_path: Path) -> None:
-    from wrt.image import write_image
+    from wrt.picture.image import write_image
 
     image = np.random.default_rng(0).random((4, 8, 3)).astype(np.float32)
     write_image(tmp_path / "sky.exr", image)
@@ -526,7 +526,7 @@ def test_bare_mesh(tmp_path: Path) -> None:
     assert scene.objects[0].materials[0].kind == "diffuse"
 
 
-@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+@pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 def test_gltf_goes_to_its_reader(tmp_path: Path) -> None:
     gltf(tmp_path / "other.gltf")
     assert load_scene(tmp_path / "other.gltf").cameras[0].name == "theirs"
@@ -563,8 +563,9 @@ def test_schema_describes_every_field() -> None:
 
 
 def test_defaults_and_choices_are_those_of_the_scene() -> None:
-    from wrt import scene, scene_schema
-    from wrt.material_schema import MaterialTable
+    from wrt.io.toml import schema as scene_schema
+    from wrt.io.toml.material_schema import MaterialTable
+    from wrt.scene import model as scene
 
     for table, made in ((MaterialTable(), scene.Material()), (scene_schema.SettingsTable(), scene.Settings())):
         for name in type(table).model_fields:

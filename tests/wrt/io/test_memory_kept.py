@@ -1,6 +1,6 @@
 """WRT_MEMORY is kept: a process that reads a hostile file takes no more than half as much again, or refuses it with one message.
 
-`pytest -m slow -n 0 -s tests/wrt/test_memory_kept.py` prints the table of peaks.
+`pytest -m slow -n 0 -s tests/wrt/io/test_memory_kept.py` prints the table of peaks.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.data import data_path
-from wrt.errors import InputError
-from wrt.obj import read_obj
+from wrt.core.errors import InputError
+from wrt.io.obj import read_obj
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
@@ -136,7 +136,7 @@ def test_what_is_taken_at_a_time_changes_nothing(words: int, tmp_path: Path, mon
     relative = " ".join(f"-{i % 4 + 1}" for i in range(300))
     path = write(tmp_path, f"{SQUARE}vn 0 0 1\nvn 0 1 0\ng a\nf {corners}\ng b\nf {relative} # {corners}\nf 1 2 3\n")
     whole = read_obj(path)
-    monkeypatch.setattr("wrt.obj.WORDS_AT_ONCE", words)
+    monkeypatch.setattr("wrt.io.obj.WORDS_AT_ONCE", words)
     parts = read_obj(path)
     for name in ("vertices", "faces", "normals", "face_group"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))

@@ -10,9 +10,9 @@ import pytest
 
 from tests.command_line import Result, wrt
 from tests.data import DATA, data_path
-from wrt.image import read_image
-from wrt.mesh import load_mesh
-from wrt.scene_file import LOADERS, load_scene
+from wrt.io.load import LOADERS, load_scene
+from wrt.picture.image import read_image
+from wrt.scene.mesh import load_mesh
 
 ODD = DATA / "odd"
 FILES = sorted(path.relative_to(ODD).as_posix() for path in ODD.rglob("*") if path.is_file()) or ["missing"]
@@ -87,7 +87,7 @@ def text_lines(path: Path) -> list[str]:
     return path.read_text().replace("\\\n", " ").splitlines()
 
 
-@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+@pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 @pytest.mark.parametrize("name", [name for name in FILES if name not in REFUSED])
 def test_the_camera_that_is_added_sees_the_whole_scene(name: str) -> None:
     path = odd(name)

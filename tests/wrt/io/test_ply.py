@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.data import data_path
-from wrt.errors import InputError
-from wrt.ply import read_ply
+from wrt.core.errors import InputError
+from wrt.io.ply import read_ply
 
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 POINTS = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0), (2, 1, 0)]
@@ -206,7 +206,7 @@ def test_a_text_is_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     data = ply("ascii", POINTS, [(0, 1, 2, 3), (1, 4, 5, 2)])
     whole = read_ply(write(tmp_path, data))
     for words in (1, 2, 5):
-        monkeypatch.setattr("wrt.ply.WORDS_AT_ONCE", words)
+        monkeypatch.setattr("wrt.io.ply.WORDS_AT_ONCE", words)
         np.testing.assert_array_equal(read_ply(write(tmp_path, data)).faces, whole.faces)
         with pytest.raises(InputError, match=rf"line {data.count(10) - 1}: 'x4' is not a number"):
             read_ply(write(tmp_path, data.replace(b" 4 0 1", b" x4 0 1")))

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wrt.errors import InputError
-from wrt.polygons import MAX_CORNERS, triangulate
+from wrt.core.errors import InputError
+from wrt.io.polygons import MAX_CORNERS, triangulate
 
 
 def area_vectors(points: np.ndarray) -> np.ndarray:

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wrt.errors import InputError
-from wrt.mesh import load_mesh
-from wrt.stl import read_stl
+from wrt.core.errors import InputError
+from wrt.io.stl import read_stl
+from wrt.scene.mesh import load_mesh
 
 
 def binary(triangles: np.ndarray) -> bytes:

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wrt import image
-from wrt.errors import InputError
-from wrt.image_decode import decode_png16, decode_rgba8, png_texts
+from wrt.core.errors import InputError
+from wrt.picture import image
+from wrt.picture.decode import decode_png16, decode_rgba8, png_texts
 
 
 def png(codes: np.ndarray, color_type: int, interlaced: bool = False) -> bytes:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wrt.errors import InputError
-from wrt.film import AOV_VIEWS, Film, aov_path, aov_to_srgb8
-from wrt.image import read_channels, read_image, read_metadata, read_rgba8
-from wrt.tonemap import to_codes
+from wrt.core.errors import InputError
+from wrt.picture.film import AOV_VIEWS, Film, aov_path, aov_to_srgb8
+from wrt.picture.image import read_channels, read_image, read_metadata, read_rgba8
+from wrt.picture.tonemap import to_codes
 
 H, W = 12, 17
 

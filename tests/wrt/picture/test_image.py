@@ -15,8 +15,8 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from tests.command_line import largest_file
-from wrt.errors import InputError, SceneWarning
-from wrt.image import (
+from wrt.core.errors import InputError, SceneWarning
+from wrt.picture.image import (
     EXACT_IN_FLOAT,
     FORMATS,
     check_writable,
@@ -29,7 +29,7 @@ from wrt.image import (
     write_exr,
     write_image,
 )
-from wrt.tonemap import decode_srgb, to_codes
+from wrt.picture.tonemap import decode_srgb, to_codes
 
 H, W = 70, 51  # more rows than are written at a time
 METADATA = {"scene": "scenes/öl auf 漢.toml", "spp": 64, "seed": 3, "seconds": 12.25, "version": "0.1.0"}

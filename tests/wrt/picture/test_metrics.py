@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wrt.errors import InputError
-from wrt.metrics import (
+from wrt.core.errors import InputError
+from wrt.picture.metrics import (
     BAR_HEIGHT,
     NONFINITE_COLOR,
     PIXELS_PER_DEGREE,
@@ -19,7 +19,7 @@ from wrt.metrics import (
     flip_map,
     hdr_flip_map,
 )
-from wrt.tonemap import decode_srgb
+from wrt.picture.tonemap import decode_srgb
 
 H, W = 48, 64
 MEASURES = ("mse", "relmse", "max_abs", "mean_ratio", "psnr", "flip")

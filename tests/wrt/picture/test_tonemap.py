@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wrt import scene
-from wrt.errors import InputError
-from wrt.tonemap import (
+from wrt.core.errors import InputError
+from wrt.picture.tonemap import (
     ACES_IN,
     ACES_OUT,
     AGX_PIVOT,
@@ -20,6 +19,7 @@ from wrt.tonemap import (
     to_codes,
     tone_map,
 )
+from wrt.scene import model as scene
 
 ALL = pytest.mark.parametrize("name", TONEMAPS)
 GREYS = np.repeat(np.logspace(-7, 10, 4001)[:, None], 3, axis=1).astype(np.float32)

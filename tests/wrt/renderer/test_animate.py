@@ -12,12 +12,12 @@ import pytest
 import wrt
 from tests.command_line import wrt as run
 from tests.data import ROOT
-from wrt.animate import Animation, animate, check_output, frame_path, orbited, save_movie
-from wrt.errors import InputError
-from wrt.motion import Motion, scene_at
-from wrt.options import Options
-from wrt.scene import Camera, GradientBackground, Material, Object, Scene, Settings
-from wrt.shapes import icosphere, quad, torus
+from wrt.core.errors import InputError
+from wrt.renderer.animate import Animation, animate, check_output, frame_path, orbited, save_movie
+from wrt.renderer.options import Options
+from wrt.scene.model import Camera, GradientBackground, Material, Object, Scene, Settings
+from wrt.scene.motion import Motion, scene_at
+from wrt.scene.shapes import icosphere, quad, torus
 
 GREY = Material()
 CAMERA = Camera.look_at((0.0, 1.0, 6.0), (0.0, 0.0, 0.0))

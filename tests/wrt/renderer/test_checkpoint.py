@@ -17,14 +17,14 @@ import pytest
 
 import wrt
 from tests.fuzz.formats import checkpoint_of
-from wrt import checkpoint as module
-from wrt.checked_file import read_checked, write_checked
-from wrt.checkpoint import MAGIC, Checkpoint, read
-from wrt.driver import Options, Progress, Renderer, render
-from wrt.errors import InputError
-from wrt.film import Film
-from wrt.scene import Camera, DirectionalLight, GradientBackground, Material, Object, Scene, Settings
-from wrt.shapes import box, quad
+from wrt.core.checked_file import read_checked, write_checked
+from wrt.core.errors import InputError
+from wrt.picture.film import Film
+from wrt.renderer import checkpoint as module
+from wrt.renderer.checkpoint import MAGIC, Checkpoint, read
+from wrt.renderer.renderer import Options, Progress, Renderer, render
+from wrt.scene.model import Camera, DirectionalLight, GradientBackground, Material, Object, Scene, Settings
+from wrt.scene.shapes import box, quad
 
 # The features are those of test_driver.py's scene: its kernel serves.
 SCENE = Scene(
@@ -217,7 +217,7 @@ def test_a_checkpoint_of_another_render_is_refused(path: Path) -> None:
 def test_a_stale_checkpoint_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     render(SCENE, spp=1, checkpoint=path)
     with monkeypatch.context() as patch:
-        patch.setattr("wrt.driver.kernel_hash", lambda kernel, device: "0" * 64)
+        patch.setattr("wrt.renderer.renderer.kernel_hash", lambda kernel, device: "0" * 64)
         refuses("the kernels are another version", path, resume=True)
     monkeypatch.setattr(wrt, "__version__", "99.0")
     refuses(r"version was .*, is 99\.0", path, resume=True)

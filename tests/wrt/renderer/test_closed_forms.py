@@ -1,4 +1,4 @@
-"""Pictures whose every number is known in closed form, beyond those of tests/kernels/test_whitted.py.
+"""Pictures whose every number is known in closed form, beyond those of tests/kernels/shade/test_whitted.py.
 
 Fresnel's curve, total reflection, a ball lens, a thin lens' circle of confusion, the photometric laws, and furnaces.
 """
@@ -13,7 +13,7 @@ import pytest
 
 import wrt
 from tests.data import ROOT
-from wrt.scene import (
+from wrt.scene.model import (
     Camera,
     Color,
     ConstantBackground,
@@ -26,7 +26,7 @@ from wrt.scene import (
     Settings,
     Sphere,
 )
-from wrt.shapes import box, icosphere, quad, torus
+from wrt.scene.shapes import box, icosphere, quad, torus
 
 N = 1.5
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)

@@ -9,10 +9,10 @@ import pytest
 
 from tests.cornell_box import cornell_box
 from tests.data import data_path
-from wrt.driver import render
-from wrt.film import Film
-from wrt.scene import Scene
-from wrt.scene_file import load_scene
+from wrt.io.load import load_scene
+from wrt.picture.film import Film
+from wrt.renderer.renderer import render
+from wrt.scene.model import Scene
 
 SIZE = (48, 48)
 
@@ -39,7 +39,7 @@ def test_each_group_has_its_material(scene: Scene, film: Film) -> None:
 
 def test_light_agrees_with_mitsuba(scene: Scene, film: Film) -> None:
     pytest.importorskip("mitsuba")
-    from wrt.bench.mitsuba import render_mitsuba
+    from wrt.lab.mitsuba.translate import render_mitsuba
 
     theirs = render_mitsuba(scene, size=SIZE, spp=256, integrator="direct")
     lit = np.maximum(film.pixels, theirs.pixels).max(axis=-1) < 1.0  # the lamp's own pixels are mostly noise of its edges

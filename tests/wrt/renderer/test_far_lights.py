@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import wrt
-from wrt.scene import Camera, Material, Object, Scene, Settings, Sphere
-from wrt.shapes import icosphere, quad
+from wrt.scene.model import Camera, Material, Object, Scene, Settings, Sphere
+from wrt.scene.shapes import icosphere, quad
 
 EMITTER = Material(albedo=(0, 0, 0), emission=(1, 1, 1))
 

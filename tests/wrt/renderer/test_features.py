@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wrt.features import STACK_STEP, Features, describe, features_of, filter_icdf
-from wrt.scene import (
+from wrt.renderer.features import STACK_STEP, Features, describe, features_of, filter_icdf
+from wrt.scene.model import (
     FILTERS,
     Camera,
     Checkerboard,
@@ -28,7 +28,7 @@ from wrt.scene import (
     SpotLight,
     Texture,
 )
-from wrt.shapes import icosphere, quad
+from wrt.scene.shapes import icosphere, quad
 
 PICTURE = Texture(np.zeros((2, 2, 4), np.uint8))
 BLACK = Material(albedo=(0.0, 0.0, 0.0))

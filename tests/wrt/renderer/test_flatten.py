@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wrt.instancing import INSTANCING, MIN_SAVED, instanced_meshes
-from wrt.mesh import Mesh
-from wrt.scene import Material, Object, Scene, Sphere
-from wrt.shapes import box, icosphere, quad, torus
-from wrt.world import instanced_world, world_mesh, world_of
+from wrt.renderer.flatten import instanced_world, world_mesh, world_of
+from wrt.renderer.instancing import INSTANCING, MIN_SAVED, instanced_meshes
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Material, Object, Scene, Sphere
+from wrt.scene.shapes import box, icosphere, quad, torus
 
 RED, GREEN, BLUE, GREY = (Material(name=name) for name in ("red", "green", "blue", "grey"))
 

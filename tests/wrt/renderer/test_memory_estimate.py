@@ -13,12 +13,12 @@ import pytest
 
 from tests.data import ROOT
 from wrt.accel import ACCELERATORS, build
-from wrt.driver import Renderer, render
-from wrt.errors import InputError
-from wrt.memory_estimate import BYTES_OF_SKY, BYTES_OF_TEXEL, bytes_of_scene
-from wrt.options import Options
-from wrt.scene import Camera, EnvironmentBackground, Material, Object, PointLight, Scene, Texture
-from wrt.shapes import icosphere
+from wrt.core.errors import InputError
+from wrt.renderer.memory_estimate import BYTES_OF_SKY, BYTES_OF_TEXEL, bytes_of_scene
+from wrt.renderer.options import Options
+from wrt.renderer.renderer import Renderer, render
+from wrt.scene.model import Camera, EnvironmentBackground, Material, Object, PointLight, Scene, Texture
+from wrt.scene.shapes import icosphere
 
 BALL = icosphere(3)
 PLAIN = Material()
@@ -62,12 +62,12 @@ import re, sys
 from pathlib import Path
 import numpy as np
 from wrt.accel import ACCELERATORS, build
-from wrt.device import start
-from wrt.device_scene import upload_scene
-from wrt.memory_estimate import bytes_of_scene
-from wrt.mesh import Mesh
-from wrt.scene import Material, Object, Scene
-from wrt.shapes import icosphere
+from wrt.core.device import start
+from wrt.renderer.upload import upload_scene
+from wrt.renderer.memory_estimate import bytes_of_scene
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Material, Object, Scene
+from wrt.scene.shapes import icosphere
 
 def status(key):
     return int(re.search(rf"^{key}:\\s+(\\d+)", Path("/proc/self/status").read_text(), re.M)[1]) * 1024

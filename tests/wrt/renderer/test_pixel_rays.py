@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import wrt
-from tests.wrt.test_checkpoint import SCENE
-from wrt.errors import InputError
-from wrt.shapes import box
+from tests.wrt.renderer.test_checkpoint import SCENE
+from wrt.core.errors import InputError
+from wrt.scene.shapes import box
 
 
 def test_they_hit_what_the_picture_shows() -> None:

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.command_line import BOX_OBJ, wrt
-from wrt.driver import Progress
-from wrt.progress import BUILDING, COMPILING, LINE_EVERY, TimeLeft, describe, progress_reporter
+from wrt.renderer.progress import BUILDING, COMPILING, LINE_EVERY, TimeLeft, describe, progress_reporter
+from wrt.renderer.renderer import Progress
 
 
 def at(seconds: float, done: int = 50) -> Progress:
@@ -33,7 +33,7 @@ def test_rays_a_second_and_time_left(progress: Progress, expected: str) -> None:
 
 def test_the_time_left_of_work_of_known_size(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
-    monkeypatch.setattr("wrt.progress.time.perf_counter", lambda: now)
+    monkeypatch.setattr("wrt.renderer.progress.time.perf_counter", lambda: now)
     left = TimeLeft(8.0)
     assert str(left) == ""
     now, left.done = 130.0, 2.0

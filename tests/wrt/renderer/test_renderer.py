@@ -16,12 +16,13 @@ import pytest
 
 import wrt
 from tests.command_line import BOX_OBJ
-from wrt import driver
-from wrt.driver import MAX_PASS, Options, Progress, Renderer, plain_text, render
-from wrt.errors import InputError, SceneWarning
-from wrt.film import Film
-from wrt.mesh import load_mesh
-from wrt.scene import (
+from wrt.core.errors import InputError, SceneWarning
+from wrt.io.load import load_scene
+from wrt.picture.film import Film
+from wrt.renderer import renderer as driver
+from wrt.renderer.renderer import MAX_PASS, Options, Progress, Renderer, plain_text, render
+from wrt.scene.mesh import load_mesh
+from wrt.scene.model import (
     Camera,
     Checkerboard,
     DirectionalLight,
@@ -33,8 +34,7 @@ from wrt.scene import (
     Settings,
     Sphere,
 )
-from wrt.scene_file import load_scene
-from wrt.shapes import box, quad
+from wrt.scene.shapes import box, quad
 
 SIZE = (37, 22)  # no multiple of any tile
 # One set of features for nearly all tests here: each other one is a kernel to compile.

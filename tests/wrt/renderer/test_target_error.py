@@ -12,13 +12,13 @@ import pytest
 import wrt
 from tests.command_line import wrt as run_command
 from tests.data import ROOT
-from wrt.device_film import GROUPS
-from wrt.driver import MAX_SPP, Options, Renderer, render
-from wrt.errors import InputError
-from wrt.film import aov_to_srgb8
-from wrt.image import read_channels
-from wrt.scene import Camera, Material, Object, Scene, Settings, Sphere
-from wrt.shapes import quad
+from wrt.core.errors import InputError
+from wrt.picture.film import aov_to_srgb8
+from wrt.picture.image import read_channels
+from wrt.renderer.film_arrays import GROUPS
+from wrt.renderer.renderer import MAX_SPP, Options, Renderer, render
+from wrt.scene.model import Camera, Material, Object, Scene, Settings, Sphere
+from wrt.scene.shapes import quad
 
 FLOOR = Object(quad((-3, 0, 3), (6, 0, 0), (0, 0, -6)), (Material(albedo=(0.6, 0.5, 0.4)),))
 LAMP = Object(quad((-0.5, 2.0, -0.5), (1, 0, 0), (0, 0, 1)), (Material(albedo=(0, 0, 0), emission=(6, 6, 6)),))

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wrt.tiles import Work, tiles, work_left
+from wrt.renderer.tiles import Work, tiles, work_left
 
 
 @given(st.integers(0, 9), st.integers(0, 9), st.integers(1, 40), st.integers(1, 40), st.integers(1, 50))

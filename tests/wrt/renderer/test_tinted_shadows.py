@@ -11,8 +11,8 @@ import pytest
 
 import wrt
 from tests.gltf_files import GltfFile
-from wrt.scene import Camera, ConstantBackground, DirectionalLight, Material, Object, Scene, Settings, Sphere
-from wrt.shapes import box, quad
+from wrt.scene.model import Camera, ConstantBackground, DirectionalLight, Material, Object, Scene, Settings, Sphere
+from wrt.scene.shapes import box, quad
 
 
 def fresnel(angle: float, ior: float) -> float:

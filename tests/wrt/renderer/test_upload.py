@@ -9,7 +9,10 @@ import pytest
 
 from tests.kernel_tools import CPU, unit  # isort: skip (starts Warp)
 
-from wrt.device_scene import (
+from wrt.core.errors import InputError, SceneWarning
+from wrt.kernels.shade import lights
+from wrt.renderer.flatten import world_mesh
+from wrt.renderer.upload import (
     LUMINANCE,
     MAX_MESH_LIGHTS,
     TextureTable,
@@ -19,10 +22,8 @@ from wrt.device_scene import (
     srgb_table,
     upload_scene,
 )
-from wrt.errors import InputError, SceneWarning
-from wrt.kernels import lights
-from wrt.mesh import Mesh
-from wrt.scene import (
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import (
     ALPHA_MODES,
     MATERIAL_KINDS,
     Camera,
@@ -39,8 +40,7 @@ from wrt.scene import (
     SpotLight,
     Texture,
 )
-from wrt.shapes import box, icosphere, quad
-from wrt.world import world_mesh
+from wrt.scene.shapes import box, icosphere, quad
 
 GREY = Material()
 

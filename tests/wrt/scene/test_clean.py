@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wrt.bench.hard_cases_common import sphere
-from wrt.errors import InputError
-from wrt.mesh_clean import clean, flip_collinear, has_area
+from wrt.core.errors import InputError
+from wrt.lab.hard_cases.common import sphere
+from wrt.scene.clean import clean, flip_collinear, has_area
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 

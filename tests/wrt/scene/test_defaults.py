@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wrt.errors import InputError
-from wrt.mesh import Mesh
-from wrt.scene import (
+from wrt.core.errors import InputError
+from wrt.scene.defaults import bounding_sphere, frame_camera, is_lit, stage
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import (
     Camera,
     ConstantBackground,
     DirectionalLight,
@@ -20,7 +21,6 @@ from wrt.scene import (
     Scene,
     Sphere,
 )
-from wrt.staging import bounding_sphere, frame_camera, is_lit, stage
 
 
 def cloud(seed: int, offset=(0.0, 0.0, 0.0), scale=1.0) -> Scene:

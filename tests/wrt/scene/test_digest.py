@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from tests.data import ROOT
-from wrt.scene import (
+from wrt.io.load import load_scene
+from wrt.scene.digest import camera_digest, scene_digest
+from wrt.scene.model import (
     Camera,
     Checkerboard,
     EnvironmentBackground,
@@ -22,9 +24,7 @@ from wrt.scene import (
     SpotLight,
     Texture,
 )
-from wrt.scene_digest import camera_digest, scene_digest
-from wrt.scene_file import load_scene
-from wrt.shapes import box
+from wrt.scene.shapes import box
 
 IMAGE = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.data import DATA, data_path
-from wrt.errors import InputError, SceneWarning
-from wrt.mesh import Mesh, load_mesh
+from wrt.core.errors import InputError, SceneWarning
+from wrt.scene.mesh import Mesh, load_mesh
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import wrt
-from wrt.errors import InputError
-from wrt.mesh import Mesh
-from wrt.motion import Motion, moves, scene_at
-from wrt.scene import Material, Object, Scene
-from wrt.scene_digest import scene_digest
-from wrt.shapes import icosphere, torus
+from wrt.core.errors import InputError
+from wrt.scene.digest import scene_digest
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Material, Object, Scene
+from wrt.scene.motion import Motion, moves, scene_at
+from wrt.scene.shapes import icosphere, torus
 
 GREY = Material()
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from tests.data import ROOT
-from wrt.errors import InputError
-from wrt.scene import Camera, EnvironmentBackground, Material, Object, Scene, Sphere, SpotLight, Texture
-from wrt.scene_arrays import KINDS, pack, unpack
-from wrt.scene_digest import camera_digest, scene_digest
-from wrt.scene_file import load_scene
-from wrt.shapes import box
+from wrt.core.errors import InputError
+from wrt.io.load import load_scene
+from wrt.scene.digest import camera_digest, scene_digest
+from wrt.scene.model import Camera, EnvironmentBackground, Material, Object, Scene, Sphere, SpotLight, Texture
+from wrt.scene.pack import KINDS, pack, unpack
+from wrt.scene.shapes import box
 
 SHIPPED = sorted((ROOT / "scenes").glob("*.toml"))
 
@@ -27,7 +27,7 @@ def sent(scene: Scene) -> Scene:
     return unpack(text, pickle.loads(pickle.dumps(arrays)))
 
 
-@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+@pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_scenes_come_back(path: Any) -> None:
     scene = load_scene(path)

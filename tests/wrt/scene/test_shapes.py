@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import wrt
-from wrt import shapes
-from wrt.errors import InputError
-from wrt.mesh import Mesh
+from wrt.core.errors import InputError
+from wrt.scene import shapes
+from wrt.scene.mesh import Mesh
 
 BALL = [(np.sin(a), -np.cos(a)) for a in np.linspace(0.0, np.pi, 65)]
 BALL[0], BALL[-1] = (0.0, -1.0), (0.0, 1.0)
@@ -136,7 +136,7 @@ def test_senseless_parameters_are_refused(make) -> None:
 
 
 def test_every_shape_can_stand_in_a_scene_file() -> None:
-    from wrt.scene_schema import Shape
+    from wrt.io.toml.schema import Shape
 
     tables = {get_args(model.model_fields["kind"].annotation)[0]: model for model in get_args(get_args(Shape)[0])}
     assert tables.keys() == shapes.SHAPES.keys()

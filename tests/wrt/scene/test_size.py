@@ -12,8 +12,8 @@ import pytest
 import wrt
 from tests.command_line import wrt as command
 from tests.gltf_files import TRIANGLE, GltfFile
-from wrt.errors import InputError
-from wrt.scene import (
+from wrt.core.errors import InputError
+from wrt.scene.model import (
     BLACK,
     SMALLEST,
     WHITE,
@@ -29,10 +29,10 @@ from wrt.scene import (
     SpotLight,
     Texture,
 )
-from wrt.scene_size import SMALLEST_LIT
-from wrt.shapes import box, icosphere, quad
+from wrt.scene.shapes import box, icosphere, quad
+from wrt.scene.size import SMALLEST_LIT
 
-pytestmark = pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning", "error::RuntimeWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning", "error::RuntimeWarning")
 LAMP, CHALK = Material(albedo=BLACK, emission=WHITE, name="lamp"), Material(albedo=WHITE)
 SKY = ConstantBackground(WHITE)
 PICTURE = Texture(np.random.default_rng(1).integers(90, 166, (8, 8, 4), dtype=np.uint8) | np.uint8(1), srgb=False)

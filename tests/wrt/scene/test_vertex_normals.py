@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from wrt.mesh import Mesh
-from wrt.shapes import box, icosphere, torus
-from wrt.smooth import smooth
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import box, icosphere, torus
+from wrt.scene.vertex_normals import smooth
 
 
 def test_close_to_the_normals_of_the_surface() -> None:

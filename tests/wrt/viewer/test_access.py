@@ -1,4 +1,4 @@
-"""Who gets into the viewer, and what they can say there. Nothing here needs a browser; tests/wrt/test_viewer_page.py has one."""
+"""Who gets into the viewer, and what they can say there. Nothing here needs a browser; tests/wrt/viewer/test_page.py has one."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.wrt.test_viewer import SCENE
-from tests.wrt.viewer_client import Client, answer, client, raw_answer, upgrade, wait
-from wrt.errors import InputError
-from wrt.options import Options
-from wrt.viewer_access import Access, Refused, access_for, as_origin
-from wrt.viewer_messages import check_message
+from tests.wrt.viewer.client import Client, answer, client, raw_answer, upgrade, wait
+from tests.wrt.viewer.test_refine import SCENE
+from wrt.core.errors import InputError
+from wrt.renderer.options import Options
+from wrt.viewer.access import Access, Refused, access_for, as_origin
+from wrt.viewer.messages import check_message
 
 CAMERA = {"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0.0, 0.0, -1.0], "fov": 0.8, "near": 0.01, "far": 1e3,
           "image_height": 48, "image_width": 64, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 1.0, 0.0]}
@@ -83,7 +83,7 @@ class Served:
     """A page, what it warned of, and its port."""
 
     def __init__(self, **settings: Any) -> None:
-        from wrt.viewer_page import Page
+        from wrt.viewer.page import Page
 
         self.warnings: list[str] = []
         self.page = Page(SCENE, Options(threads=1), port=0, spp=1, warn=self.warnings.append, **settings)
@@ -103,7 +103,7 @@ def rendering() -> Iterator[Served]:
 def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
     """Makes no pictures, and so compiles nothing."""
     pytest.importorskip("viser")
-    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: False)
+    monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     served = Served()
     yield served
     served.page.close()
@@ -162,7 +162,7 @@ def test_the_printed_address_leads_in(served: Served) -> None:
 
 def test_other_origins_can_be_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("viser")
-    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: False)
+    monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     served = Served(allow_origins=["https://Example.org"])
     try:
         target = f"/{served.token}/"
@@ -224,7 +224,7 @@ def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) 
     import websockets.asyncio.server as websockets
     from websockets.asyncio.server import serve
 
-    from wrt.viewer_page import Page
+    from wrt.viewer.page import Page
 
     assert websockets.serve is serve
     for version in ("1.0.9", "1.1", "1.2.0", "2.0"):
@@ -369,7 +369,7 @@ def test_a_flood_is_slowed_down_and_a_large_message_ends_the_connection(served: 
                                                                         capfd: pytest.CaptureFixture[str]) -> None:
     from websockets.exceptions import ConnectionClosedError
 
-    from wrt import viewer_server as module
+    from wrt.viewer import server as module
 
     monkeypatch.setattr(module, "MOST_MESSAGES", 20)
     with client(served.page.url) as flood, client(served.page.url) as other:
@@ -397,7 +397,7 @@ def test_a_flood_is_slowed_down_and_a_large_message_ends_the_connection(served: 
 def test_pages_can_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each behind its own door."""
     pytest.importorskip("viser")
-    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: False)
+    monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     import websockets.asyncio.server as websockets
     from websockets.asyncio.server import serve
 
@@ -421,7 +421,7 @@ def test_pages_can_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_viser_says_nothing_of_those_who_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """A picture may be on its way to a browser that is closed meanwhile."""
     pytest.importorskip("viser")
-    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: False)
+    monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         served = Served()

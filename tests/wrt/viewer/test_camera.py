@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.wrt.test_viewer import CAMERA, SCENE
-from wrt.errors import SceneWarning
-from wrt.scene import Camera, Scene
-from wrt.scene_file import load_scene
-from wrt.viewer_camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
+from tests.wrt.viewer.test_refine import CAMERA, SCENE
+from wrt.core.errors import SceneWarning
+from wrt.io.load import load_scene
+from wrt.scene.model import Camera, Scene
+from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
 
 
 def random_camera(seed: int, scale: float = 1.0) -> Camera:

@@ -17,14 +17,14 @@ import pytest
 from PIL import Image
 
 import wrt
-from tests.wrt.test_checkpoint import SCENE
+from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.accel.base import AccelStats, Refit
-from wrt.errors import InputError
-from wrt.notebook import LiveView
-from wrt.options import Progress
-from wrt.scene import Material, Object, Scene, Sphere
-from wrt.shapes import box, quad
-from wrt.tables import SHOWN_ROWS, Rows, html_facts, html_table, number
+from wrt.core.errors import InputError
+from wrt.core.html import SHOWN_ROWS, Rows, html_facts, html_table, number
+from wrt.renderer.options import Progress
+from wrt.scene.model import Material, Object, Scene, Sphere
+from wrt.scene.shapes import box, quad
+from wrt.viewer.notebook import LiveView
 
 # --- the picture so far -----------------------------------------------------------------------------------------------
 
@@ -84,7 +84,7 @@ def test_showing_leaves_time_for_rendering(shown: list[tuple[str, str]], monkeyp
         shown.append(("", ""))
         now += 2.0  # a large picture
 
-    monkeypatch.setattr("wrt.notebook.time.monotonic", lambda: now)
+    monkeypatch.setattr("wrt.viewer.notebook.time.monotonic", lambda: now)
     monkeypatch.setattr(LiveView, "_show", show)
     view = LiveView(every=0.5)
     for _ in range(50):
@@ -94,7 +94,7 @@ def test_showing_leaves_time_for_rendering(shown: list[tuple[str, str]], monkeyp
 
 
 def test_before_tracing_there_is_only_text(shown: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.notebook.SHARE", 1e9)
+    monkeypatch.setattr("wrt.viewer.notebook.SHARE", 1e9)
     view = LiveView(every=0.0)
     view(Progress(0, 10, 0, 0.0, stage="compile"))
     view(Progress(3, 10, 0, 1.0, stage="build"))
@@ -227,10 +227,10 @@ def test_a_list_of_rows_is_a_list_with_a_page() -> None:
 
 
 def test_reports_are_tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    from wrt.bench import stability
-    from wrt.profiler import Profile
-    from wrt.rtcore import TERMS, Prediction
-    from wrt.rtcore_parameters import BASE, GPUS
+    from wrt.lab.hard_cases import stability
+    from wrt.lab.rtcore.model import TERMS, Prediction
+    from wrt.lab.rtcore.parameters import BASE, GPUS
+    from wrt.lab.rtcore.profiler import Profile
 
     result = stability.Result(rows=[stability.Row("A_case", EVIL)])
     assert Tables(result._repr_html_()).rows[1][:2] == ["A_case", EVIL]

@@ -24,10 +24,10 @@ from PIL import Image
 
 from tests.command_line import wrt as run
 from tests.data import ROOT
-from tests.wrt.test_viewer import CAMERA, SCENE
-from tests.wrt.viewer_client import answer
-from wrt.driver import render
-from wrt.options import Options
+from tests.wrt.viewer.client import answer
+from tests.wrt.viewer.test_refine import CAMERA, SCENE
+from wrt.renderer.options import Options
+from wrt.renderer.renderer import render
 
 WHITTED = ROOT / "scenes" / "whitted.toml"
 SIZE = {"width": 640, "height": 480}
@@ -60,7 +60,7 @@ def test_where_nobody_can_listen(host: str, port: int | None, part: str) -> None
 
 def test_the_command_serves_until_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("viser")
-    from wrt.viewer_page import Page
+    from wrt.viewer.page import Page
 
     seen: list[Page] = []
 
@@ -72,7 +72,7 @@ def test_the_command_serves_until_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Non
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Page, "wait", wait)
-    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: True)  # this test compiles nothing
+    monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: True)  # this test compiles nothing
     result = run("view", WHITTED, "--port", 0, "--no-open")
     assert result.code == 0 and result.out == f"{seen[0].url}\n" and seen[0].url.startswith("http://127.0.0.1:")
     refused = "viewer: refused a request without the token of the printed address (told once)"
@@ -84,7 +84,7 @@ def test_the_command_serves_until_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_quiet_and_other_origins(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("viser")
-    from wrt.viewer_page import Page
+    from wrt.viewer.page import Page
 
     def wait(self: Page) -> None:
         port = self.server.get_port()
@@ -93,7 +93,7 @@ def test_quiet_and_other_origins(monkeypatch: pytest.MonkeyPatch) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Page, "wait", wait)
-    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: True)
+    monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: True)
     options = "--port", 0, "--no-open", "-q", "--allow-origin", "https://Example.org", "--allow-origin", "http://localhost:9000"
     result = run("view", WHITTED, *options)
     assert result.code == 0 and result.err == ""
@@ -104,8 +104,8 @@ def test_quiet_and_other_origins(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_browsers_command_line_does_not_hold_the_token(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everybody on the machine can read it."""
     pytest.importorskip("viser")
-    from wrt import cli_view
-    from wrt.viewer_page import Page
+    from wrt.cli import view as cli_view
+    from wrt.viewer.page import Page
 
     opened: list[Path] = []
 
@@ -128,7 +128,7 @@ def test_the_browsers_command_line_does_not_hold_the_token(monkeypatch: pytest.M
     monkeypatch.setattr(cli_view, "has_desktop", lambda: True)
     monkeypatch.setattr("webbrowser.open", open_browser)
     monkeypatch.setattr(Page, "wait", wait)
-    monkeypatch.setattr("wrt.viewer.Viewer._prepare", lambda self, view: True)
+    monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: True)
     assert run("view", WHITTED, "--port", 0).code == 0
     assert len(opened) == 1 and not opened[0].exists() and not opened[0].parent.exists()
 
@@ -139,7 +139,7 @@ def test_the_browsers_command_line_does_not_hold_the_token(monkeypatch: pytest.M
 @pytest.fixture(scope="module")
 def page() -> Iterator[Any]:
     pytest.importorskip("viser")
-    from wrt.viewer_page import Page
+    from wrt.viewer.page import Page
 
     page = Page(SCENE, Options(threads=1), port=0, spp=4)
     yield page
@@ -336,7 +336,7 @@ def test_what_is_saved(page: Any, browser_page: Any, tmp_path: Path) -> None:
             with Image.open(path) as image:
                 np.testing.assert_array_equal(np.asarray(image), page.viewer.shown.codes)
         else:
-            from wrt.image import read_image
+            from wrt.picture.image import read_image
 
             np.testing.assert_allclose(read_image(path), page.viewer.picture().pixels, rtol=1e-3, atol=1e-6)
     browser_page.get_by_role("button", name="camera as TOML").click()
@@ -351,7 +351,7 @@ def test_what_is_saved(page: Any, browser_page: Any, tmp_path: Path) -> None:
 
 
 def test_the_file_that_a_browser_is_given_leads_to_the_page(page: Any, browser_page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from wrt import cli_view
+    from wrt.cli import view as cli_view
 
     shown = finished(page, browser_page)
     first, other = page.watching, browser_page.context.browser.new_page(viewport=SIZE)

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 import wrt
-from tests.wrt.test_checkpoint import SCENE as PINHOLE
-from wrt import viewer as module
-from wrt.driver import Renderer
-from wrt.errors import InputError
-from wrt.film import Film
-from wrt.options import Options
-from wrt.profiler import profile
-from wrt.scene import Camera, DirectionalLight, GradientBackground, Material, Object, Scene, Settings
-from wrt.shapes import box, quad
-from wrt.viewer import COARSE, DEEPEST, SCALES, Shown, Viewer
+from tests.wrt.renderer.test_checkpoint import SCENE as PINHOLE
+from wrt.core.errors import InputError
+from wrt.lab.rtcore.profiler import profile
+from wrt.picture.film import Film
+from wrt.renderer.options import Options
+from wrt.renderer.renderer import Renderer
+from wrt.scene.model import Camera, DirectionalLight, GradientBackground, Material, Object, Scene, Settings
+from wrt.scene.shapes import box, quad
+from wrt.viewer import refine as module
+from wrt.viewer.refine import COARSE, DEEPEST, SCALES, Shown, Viewer
 
 # A box on a mirror, through an open lens: as the viewer compiles every scene. One kernel serves all tests here.
 CAMERA = Camera.look_at((2, 2, 4), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)

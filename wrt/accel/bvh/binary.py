@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.base import Accelerator, Built
-from wrt.accel.bvh_build import BvhOptions, build_binary, sah_cost
-from wrt.accel.refit import refit_nodes
+from wrt.accel.bvh.builders import BvhOptions, build_binary, sah_cost
+from wrt.accel.bvh.refit import refit_nodes
 from wrt.accel.store import check_binary
-from wrt.kernels import traverse_bvh2 as kernels
+from wrt.kernels.traverse import bvh2 as kernels
 
 
 class Bvh2(Accelerator):
-    """Options: builder (a name in wrt.accel.bvh_build.BVH_BUILDERS), max_leaf (1 to 64 primitives), cost_traversal and
+    """Options: builder (a name in wrt.accel.bvh.builders.BVH_BUILDERS), max_leaf (1 to 64 primitives), cost_traversal and
     cost_intersection (of the SAH), split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
 
     name = "bvh2"
@@ -39,7 +39,7 @@ class Bvh2(Accelerator):
         return replace(built, arrays={"nodes": nodes}, sah_cost=sah_cost(nodes))
 
     def _children(self, built: Built) -> Any:
-        from wrt.accel.epo import children
+        from wrt.accel.bvh.epo import children
 
         nodes = built.arrays["nodes"]
         lo, hi, first, count = (np.stack([nodes[part + "_0"], nodes[part + "_1"]], axis=1)

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from wrt.accel.base import Geometry
-from wrt.accel.bvh_tree import BinaryTree, BvhOptions, sah_cost
-from wrt.accel.registry import Registry
+from wrt.accel.bvh.tree import BinaryTree, BvhOptions, sah_cost
+from wrt.core.registry import Registry
 
 __all__ = ["BVH_BUILDERS", "BinaryTree", "BvhOptions", "build_binary", "sah_cost"]
 
 BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Registry("builder", {
-    "binned": "wrt.accel.bvh_ranges:build_binned",
-    "sweep": "wrt.accel.bvh_ranges:build_sweep",
-    "sbvh": "wrt.accel.bvh_spatial:build_sbvh",
-    "reinsertion": "wrt.accel.bvh_reinsertion:build_reinsertion",
-    "median": "wrt.accel.bvh_ranges:build_median",
-    "lbvh": "wrt.accel.bvh_ranges:build_lbvh",
+    "binned": "wrt.accel.bvh.top_down:build_binned",
+    "sweep": "wrt.accel.bvh.top_down:build_sweep",
+    "sbvh": "wrt.accel.bvh.spatial:build_sbvh",
+    "reinsertion": "wrt.accel.bvh.reinsertion:build_reinsertion",
+    "median": "wrt.accel.bvh.top_down:build_median",
+    "lbvh": "wrt.accel.bvh.top_down:build_lbvh",
 })
 
 

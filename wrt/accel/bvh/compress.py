@@ -1,5 +1,5 @@
 """Boxes of wide nodes in 8 bits a plane: Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs Through
-Compressed Wide BVHs", section 3.2; the layout is told in kernels/wide_nodes.py."""
+Compressed Wide BVHs", section 3.2; the layout is told in kernels/wide/nodes.py."""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.device import load_kernel, run_all, start, upload
-from wrt.kernels import end_point_overlap as kernels
+from wrt.core.device import load_kernel, run_all, start, upload
+from wrt.kernels.build import end_point_overlap as kernels
 
 TRIANGLES_PER_LAUNCH = 16384
 

@@ -1,4 +1,4 @@
-"""The surface of 14-DOPs (kernels/ray_kdop.py), in closed form, for many at once: what the surface area heuristic wants."""
+"""The surface of 14-DOPs (kernels/units/kdop.py), in closed form, for many at once: what the surface area heuristic wants."""
 
 from __future__ import annotations
 

@@ -6,9 +6,9 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.device import load_kernel, start, upload
-from wrt.kernels.refit_bvh2 import refit
-from wrt.kernels.traverse_bvh2 import Bvh2Node
+from wrt.core.device import load_kernel, start, upload
+from wrt.kernels.build.refit import refit
+from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 
 def refit_nodes(nodes: np.ndarray, order: np.ndarray, geometry: Geometry) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The optimiser of finished trees by reinsertion (the loops are Warp kernels, kernels/build_reinsertion.py)."""
+"""The optimiser of finished trees by reinsertion (the loops are Warp kernels, kernels/build/reinsertion.py)."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.accel.bvh_ranges import build_binned, build_options
-from wrt.accel.bvh_tree import BinaryTree, BvhOptions
-from wrt.device import load_kernel, records, run_all, start, upload
-from wrt.kernels import build_reinsertion as kernels
-from wrt.kernels.traverse_bvh2 import STACK_SIZE, Bvh2Node
+from wrt.accel.bvh.top_down import build_binned, build_options
+from wrt.accel.bvh.tree import BinaryTree, BvhOptions
+from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.kernels.build import reinsertion as kernels
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
 MAX_ROUNDS = 12
 # A round whose moves take off less than this share of the areas is the last one.

@@ -1,4 +1,4 @@
-"""The builder with spatial splits (the loop is a Warp kernel, kernels/build_sbvh.py)."""
+"""The builder with spatial splits (the loop is a Warp kernel, kernels/build/sbvh.py)."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.accel.bvh_ranges import build_options, in_order, run_tasks
-from wrt.accel.bvh_tree import BinaryTree, BvhOptions, small_tree, squeeze
-from wrt.device import records, start, upload
-from wrt.errors import InputError
-from wrt.kernels import build_records
-from wrt.kernels import build_sbvh as kernels
-from wrt.kernels.traverse_bvh2 import Bvh2Node
+from wrt.accel.bvh.top_down import build_options, in_order, run_tasks
+from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
+from wrt.core.device import records, start, upload
+from wrt.core.errors import InputError
+from wrt.kernels.build import records as build_records
+from wrt.kernels.build import sbvh as kernels
+from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 MAX_BUDGET = 8.0
 

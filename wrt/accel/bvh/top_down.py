@@ -1,4 +1,4 @@
-"""Builders from the top down, which split ranges of primitives in place (the loops are Warp kernels, kernels/build_bvh2.py)."""
+"""Builders from the top down, which split ranges of primitives in place (the loops are Warp kernels, kernels/build/bvh2.py)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.accel.bvh_tree import BinaryTree, BvhOptions, small_tree, squeeze
-from wrt.device import load_kernel, records, run_growing, start, upload
-from wrt.kernels import build_bvh2, build_records
-from wrt.kernels.traverse_bvh2 import Bvh2Node
+from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
+from wrt.core.device import load_kernel, records, run_growing, start, upload
+from wrt.kernels.build import bvh2 as build_bvh2
+from wrt.kernels.build import records as build_records
+from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 
 def build_binned(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:

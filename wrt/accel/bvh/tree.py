@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.kernels.traverse_bvh2 import Bvh2Node
+from wrt.core.errors import InputError
+from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 MAX_LEAF = 64
 NODE_DTYPE = np.dtype(Bvh2Node.numpy_dtype())

@@ -9,16 +9,17 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Accelerator, Built, Geometry
-from wrt.accel.bvh2 import Bvh2
-from wrt.accel.bvh_tree import NODE_DTYPE, root_area
-from wrt.accel.kdop_area import kdop_areas
-from wrt.accel.refit import refit_nodes
+from wrt.accel.bvh.binary import Bvh2
+from wrt.accel.bvh.kdop_area import kdop_areas
+from wrt.accel.bvh.refit import refit_nodes
+from wrt.accel.bvh.tree import NODE_DTYPE, root_area
 from wrt.accel.store import check_links
-from wrt.device import load_kernel, records, run_all, start, upload
-from wrt.kernels import build_volumes as fits
-from wrt.kernels import traverse_bvh2_kdop, traverse_bvh2_sphere
-from wrt.kernels.ray_kdop import KDOP_PAD
-from wrt.kernels.traverse_bvh2 import Bvh2Node
+from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.kernels.build import volumes as fits
+from wrt.kernels.traverse import bvh2_kdop as traverse_bvh2_kdop
+from wrt.kernels.traverse import bvh2_sphere as traverse_bvh2_sphere
+from wrt.kernels.traverse.bvh2 import Bvh2Node
+from wrt.kernels.units.kdop import KDOP_PAD
 
 LINKS = ("first_0", "count_0", "first_1", "count_1")
 NODES_PER_LAUNCH = 512
@@ -83,7 +84,7 @@ def boxes_around(built: Built, there: list[np.ndarray], geometry: Geometry) -> n
 
 
 def cost_of(nodes: np.ndarray, areas: np.ndarray) -> float:
-    """As wrt.accel.bvh_tree.sah_cost, of lines that meet the root's box, for volumes with these surfaces, (2, N). Where volumes
+    """As wrt.accel.bvh.tree.sah_cost, of lines that meet the root's box, for volumes with these surfaces, (2, N). Where volumes
     stick out of the root's box, lines that pass it by count too."""
     root = 2.0 * root_area(nodes)
     weight = np.stack([np.maximum(nodes["count_0"], 1), np.maximum(nodes["count_1"], 1)])

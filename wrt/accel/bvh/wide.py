@@ -9,15 +9,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from wrt.accel.base import Accelerator, Built
-from wrt.accel.bvh_build import BvhOptions, build_binary
-from wrt.accel.wide_compress import children_there, compress, decompress
-from wrt.accel.wide_tree import MAX_PLACES, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
-from wrt.device import empty_aligned, record_dtype, run_all
-from wrt.errors import InputError
-from wrt.kernels.lanes import EMPTY
-from wrt.kernels.trace_packets import StreamTraversal
-from wrt.kernels.traverse_wide import LEAF_RANGE, WideTraversal
-from wrt.kernels.wide_nodes import first_reference, node_size
+from wrt.accel.bvh.builders import BvhOptions, build_binary
+from wrt.accel.bvh.compress import children_there, compress, decompress
+from wrt.accel.bvh.wide_tree import MAX_PLACES, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
+from wrt.core.device import empty_aligned, record_dtype, run_all
+from wrt.core.errors import InputError
+from wrt.kernels.wide.lanes import EMPTY
+from wrt.kernels.wide.nodes import first_reference, node_size
+from wrt.kernels.wide.stream import StreamTraversal
+from wrt.kernels.wide.traverse import LEAF_RANGE, WideTraversal
 
 ROWS_PER_JOB = 4096
 
@@ -30,7 +30,7 @@ def aligned(array: np.ndarray) -> np.ndarray:
 
 
 class WideBvh(Accelerator):
-    """Options: builder (of the binary tree, a name in wrt.accel.bvh_build.BVH_BUILDERS), max_leaf (1 to 64 primitives; by default
+    """Options: builder (of the binary tree, a name in wrt.accel.bvh.builders.BVH_BUILDERS), max_leaf (1 to 64 primitives; by default
     as many as a row has lanes), cost_traversal and cost_intersection (of one node visited and of one row of primitives tested),
     split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
 
@@ -128,7 +128,7 @@ class WideBvh(Accelerator):
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
 
     def _children(self, built: Built) -> Any:
-        from wrt.accel.epo import children
+        from wrt.accel.bvh.epo import children
 
         tree = self._tree(built)
         leaf = tree.children < 0

@@ -1,4 +1,4 @@
-"""Wide trees: a binary BVH collapsed into nodes of several children (the loops are Warp kernels, kernels/build_wide.py)."""
+"""Wide trees: a binary BVH collapsed into nodes of several children (the loops are Warp kernels, kernels/build/wide.py)."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.accel.bvh_tree import BinaryTree
-from wrt.device import load_kernel, start, upload
-from wrt.errors import InputError
-from wrt.kernels import build_wide
-from wrt.kernels.lanes import EMPTY
-from wrt.kernels.traverse_bvh2 import Bvh2Node
-from wrt.kernels.traverse_wide import LEAF_RANGE, STACK_SIZE
+from wrt.accel.bvh.tree import BinaryTree
+from wrt.core.device import load_kernel, start, upload
+from wrt.core.errors import InputError
+from wrt.kernels.build import wide as build_wide
+from wrt.kernels.traverse.bvh2 import Bvh2Node
+from wrt.kernels.wide.lanes import EMPTY
+from wrt.kernels.wide.traverse import LEAF_RANGE, STACK_SIZE
 
 MAX_PLACES = 2**31 // LEAF_RANGE  # of leaves' beginnings: what a reference can tell
 

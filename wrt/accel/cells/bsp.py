@@ -11,12 +11,12 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Accelerator, Built, Geometry
-from wrt.device import load_kernel, records, run_all, start, upload
-from wrt.errors import InputError
-from wrt.kernels import build_bsp
-from wrt.kernels import traverse_bsp as kernels
-from wrt.kernels.build_bsp_cell import MAX_FACES, MAX_POINTS, Cells
-from wrt.kernels.build_bsp_split import BspOptions, BspTools, Pieces
+from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.core.errors import InputError
+from wrt.kernels.build import bsp as build_bsp
+from wrt.kernels.build.bsp_cell import MAX_FACES, MAX_POINTS, Cells
+from wrt.kernels.build.bsp_split import BspOptions, BspTools, Pieces
+from wrt.kernels.traverse import bsp as kernels
 
 MAX_DEPTH = 60  # below the traversal unit's stack
 ROOM = 8  # pieces at a time, nodes and references for each primitive; more where that is not enough

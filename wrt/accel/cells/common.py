@@ -9,10 +9,10 @@ import warp as wp
 
 from wrt.accel.base import Accelerator, Built, Geometry
 from wrt.accel.store import row_type
-from wrt.device import start, upload
-from wrt.errors import InputError
-from wrt.kernels.ray_aabb import PAD_EXTENT
-from wrt.kernels.triangle_cell import CellSource
+from wrt.core.device import start, upload
+from wrt.core.errors import InputError
+from wrt.kernels.build.triangle_cell import CellSource
+from wrt.kernels.units.box import PAD_EXTENT
 
 
 def cell_source(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray]) -> Any:

@@ -10,12 +10,12 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Accelerator, Built, Geometry
-from wrt.accel.cells import cell_source, check_numbers, check_references, one_row, triangle_reach
-from wrt.device import load_kernel, records, run_all, start, upload
-from wrt.errors import InputError
-from wrt.kernels import build_grid
-from wrt.kernels import traverse_grid as kernels
-from wrt.kernels.ray_aabb import PAD_EXTENT
+from wrt.accel.cells.common import cell_source, check_numbers, check_references, one_row, triangle_reach
+from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.core.errors import InputError
+from wrt.kernels.build import grid as build_grid
+from wrt.kernels.traverse import grid as kernels
+from wrt.kernels.units.box import PAD_EXTENT
 
 MAX_CELLS = 1 << 25
 MAX_REFERENCES = 1 << 27

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.base import Accelerator, Built
-from wrt.accel.kdtree_build import KdOptions, build_tree
-from wrt.errors import InputError
-from wrt.kernels import traverse_kdtree as kernels
+from wrt.accel.cells.kdtree_build import KdOptions, build_tree
+from wrt.core.errors import InputError
+from wrt.kernels.traverse import kdtree as kernels
 
 
 class KdTree(Accelerator):

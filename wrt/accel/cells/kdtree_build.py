@@ -9,11 +9,11 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.device import load_kernel, records, run_all, start, upload
-from wrt.errors import InputError
-from wrt.kernels import build_kdtree as kernels
-from wrt.kernels.build_clip import Clippable, clip_references
-from wrt.kernels.traverse_kdtree import LEAF, STACK_SIZE, KdNode
+from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.core.errors import InputError
+from wrt.kernels.build import kdtree as kernels
+from wrt.kernels.build.clip import Clippable, clip_references
+from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 
 BINS = 64
 # Triangles beyond are put into cells by their boxes: the margin of clipping would underflow, or be all of space.
@@ -24,7 +24,7 @@ MAX_INDEX = 1 << 29  # a node's word has 29 bits for it
 
 @dataclass(frozen=True)
 class KdOptions:
-    """Those of wrt.accel.kdtree.KdTree. Raises InputError for values out of range."""
+    """Those of wrt.accel.cells.kdtree.KdTree. Raises InputError for values out of range."""
 
     max_leaf: int = 1
     max_depth: int | None = None

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from wrt.accel.base import Accelerator, Built
-from wrt.accel.cells import check_numbers, check_references, one_row, triangle_reach
-from wrt.accel.octree_build import OctreeOptions, build_tree
-from wrt.errors import InputError
-from wrt.kernels import traverse_octree as kernels
+from wrt.accel.cells.common import check_numbers, check_references, one_row, triangle_reach
+from wrt.accel.cells.octree_build import OctreeOptions, build_tree
+from wrt.core.errors import InputError
+from wrt.kernels.traverse import octree as kernels
 
 
 class Octree(Accelerator):

@@ -10,12 +10,12 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Geometry
-from wrt.accel.cells import cell_source
-from wrt.device import load_kernel, records, run_all, start, upload
-from wrt.errors import InputError
-from wrt.kernels import build_octree
-from wrt.kernels.ray_aabb import PAD_EXTENT
-from wrt.kernels.traverse_octree import MAX_LEVELS, OctreeLayout, OctreeNode
+from wrt.accel.cells.common import cell_source
+from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.core.errors import InputError
+from wrt.kernels.build import octree as build_octree
+from wrt.kernels.traverse.octree import MAX_LEVELS, OctreeLayout, OctreeNode
+from wrt.kernels.units.box import PAD_EXTENT
 
 REFERENCES_PER_LAUNCH = 16384
 CELLS_PER_LAUNCH = 4096
@@ -25,7 +25,7 @@ OCTANTS = np.arange(8)[:, None] >> np.arange(3) & 1  # (8, 3): which half, in x,
 
 @dataclass(frozen=True)
 class OctreeOptions:
-    """As in wrt.accel.octree.Octree; with max_growth there are never more than MAX_REFERENCES either. Raises InputError."""
+    """As in wrt.accel.cells.octree.Octree; with max_growth there are never more than MAX_REFERENCES either. Raises InputError."""
 
     max_leaf: int
     max_depth: int

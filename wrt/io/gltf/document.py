@@ -18,11 +18,11 @@ from urllib.parse import unquote_to_bytes
 
 import numpy as np
 
-from wrt.arguments import short
-from wrt.errors import InputError
-from wrt.gltf_schema import at, read_as
-from wrt.memory import require
-from wrt.read_file import read_file
+from wrt.core.checks import short
+from wrt.core.errors import InputError
+from wrt.core.files import read_file
+from wrt.core.memory import require
+from wrt.io.gltf.schema import at, read_as
 
 GLB_MAGIC = b"glTF"
 # Of memory, at most, measured: of a byte of JSON in ASCII, of one where a character can take four bytes, and of each of these

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.gltf_document import Document
-from wrt.gltf_schema import (
+from wrt.core.errors import InputError
+from wrt.core.memory import Meter
+from wrt.io.gltf.document import Document
+from wrt.io.gltf.schema import (
     EmissiveStrength,
     Ior,
     TextureSource,
@@ -26,9 +27,8 @@ from wrt.gltf_schema import (
     at,
     exactly,
 )
-from wrt.image_decode import decode_rgba8
-from wrt.memory import Meter
-from wrt.scene import BLACK, Color, Material, Texture, as_number, as_vector
+from wrt.picture.decode import decode_rgba8
+from wrt.scene.model import BLACK, Color, Material, Texture, as_number, as_vector
 
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728

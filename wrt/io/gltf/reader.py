@@ -17,15 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from wrt.errors import InputError, SceneWarning
-from wrt.gltf_accessors import Accessors
-from wrt.gltf_document import Document
-from wrt.gltf_materials import Materials
-from wrt.gltf_schema import Instancing, PunctualLightOfNode, PunctualLights, SpotCone, at, exactly
-from wrt.memory import Meter
-from wrt.mesh import Mesh
-from wrt.mesh_clean import clean
-from wrt.scene import (
+from wrt.core.errors import InputError, SceneWarning
+from wrt.core.memory import Meter
+from wrt.io.gltf.accessors import Accessors
+from wrt.io.gltf.document import Document
+from wrt.io.gltf.materials import Materials
+from wrt.io.gltf.schema import Instancing, PunctualLightOfNode, PunctualLights, SpotCone, at, exactly
+from wrt.scene.clean import clean
+from wrt.scene.defaults import stage
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import (
     MAX_REACH,
     Camera,
     DirectionalLight,
@@ -39,7 +40,6 @@ from wrt.scene import (
     as_transform,
     require_count,
 )
-from wrt.staging import stage
 
 # Attributes that are read, or named by who wants them (skins, textures), or are the application's own (underscore).
 # TANGENT is named where a normal map would use it: tangents are made from the texture coordinates.
@@ -58,7 +58,7 @@ def load_gltf(path: str | os.PathLike[str], *, staged: bool = True) -> Scene:
     """Read a glTF 2.0 file.
 
     Meshes, materials and textures that the file shares are shared objects in the scene. staged: a file without a camera
-    or light gets one (see `wrt.staging`), and one without triangles is refused; False: the scene is as in the file, as
+    or light gets one (see `wrt.scene.defaults`), and one without triangles is refused; False: the scene is as in the file, as
     another file includes it. Everything that is left out or added is named in one SceneWarning.
     The scene's settings are the defaults, but for glass_shadows = "tinted" where the file has solid glass (KHR_materials_volume).
     Raises InputError that names the file and the place in its JSON.

@@ -16,8 +16,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from wrt.arguments import short
-from wrt.errors import InputError
+from wrt.core.checks import short
+from wrt.core.errors import InputError
 
 
 @contextmanager

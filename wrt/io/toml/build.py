@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wrt import shapes
-from wrt.arguments import unknown
-from wrt.errors import InputError
-from wrt.memory import Meter
-from wrt.mesh import Mesh, load_mesh
-from wrt.motion import Motion
-from wrt.read_file import read_file
-from wrt.scene import (
+from wrt.core.checks import unknown
+from wrt.core.errors import InputError
+from wrt.core.files import read_file
+from wrt.core.memory import Meter
+from wrt.io.toml.report import raise_all, unknown_materials
+from wrt.scene import shapes
+from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.model import (
     BLACK,
     CONDUCTORS,
     SMALLEST,
@@ -41,12 +41,12 @@ from wrt.scene import (
     as_vector,
     require_count,
 )
-from wrt.scene_check import raise_all, unknown_materials
-from wrt.smooth import smooth
+from wrt.scene.motion import Motion
+from wrt.scene.vertex_normals import smooth
 
 if TYPE_CHECKING:
-    from wrt import scene_schema as tables
-    from wrt.material_schema import MaterialTable
+    from wrt.io.toml import schema as tables
+    from wrt.io.toml.material_schema import MaterialTable
 
 _COLOR_SLOTS = ("albedo_texture", "emission_texture")
 _DATA_SLOTS = ("metallic_roughness_texture", "transmission_texture", "normal_texture")
@@ -155,7 +155,7 @@ class _Builder:
     # --- included files ---
 
     def included(self, entry: str | tables.IncludeTable, place: str, before: int) -> list[Scene]:
-        from wrt.gltf import load_gltf
+        from wrt.io.gltf.reader import load_gltf
 
         name, to_world = (entry, None) if isinstance(entry, str) else (entry.file, entry.transform)
         with self.at(place):
@@ -215,7 +215,7 @@ class _Builder:
         return self._textures[key]
 
     def image(self, path: Path) -> np.ndarray:
-        from wrt.image_decode import decode_rgba8
+        from wrt.picture.decode import decode_rgba8
 
         if path not in self._images:
             try:
@@ -226,7 +226,7 @@ class _Builder:
         return self._images[path]
 
     def background(self, table: tables.SceneTable) -> Background:
-        from wrt.image import read_image
+        from wrt.picture.image import read_image
 
         given = table.background
         if given is None:
@@ -276,7 +276,7 @@ class _Builder:
             keys = np.array([[key.translate, key.rotate, key.scale] for key in table.motion])
         target = None
         if table.morph is not None:
-            from wrt import scene_schema
+            from wrt.io.toml import schema as scene_schema
 
             given = {name: getattr(table.morph, name) for name in ("file", "shape")} | {"smooth": table.smooth}
             target = self.mesh(scene_schema.MeshTable.model_construct(**given))

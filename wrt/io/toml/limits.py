@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 MAX_PARTS = 16  # of a dotted key; scenes need five. tomllib keeps a copy of every beginning of a key.
 MAX_WORD = 4096  # characters of a name without quotes, or of a number

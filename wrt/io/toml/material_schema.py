@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, model_validator
 
-from wrt import scene
+from wrt.scene import model as scene
 
 # --- values -----------------------------------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import json
 import re
 from typing import Any
 
-from wrt.scene_file import schema
+from wrt.io.load import schema
 
 Schema = dict[str, Any]
 TOP = "SceneTable"

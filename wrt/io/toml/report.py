@@ -8,12 +8,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wrt.arguments import short, unknown
-from wrt.errors import InputError
-from wrt.memory import require
+from wrt.core.checks import short, unknown
+from wrt.core.errors import InputError
+from wrt.core.memory import require
 
 if TYPE_CHECKING:
-    from wrt.scene_schema import SceneTable
+    from wrt.io.toml.schema import SceneTable
 
 MOST = 20  # problems that are told of one file
 BYTES_OF_PROBLEM = 1500.0  # of memory, measured
@@ -31,7 +31,7 @@ def check(data: dict[str, Any], path: Path) -> SceneTable:
     """The file's tables as models. Raises one InputError that lists everything that is wrong."""
     from pydantic import ValidationError
 
-    from wrt.scene_schema import SceneTable
+    from wrt.io.toml.schema import SceneTable
 
     known_keys: dict[int, list[str]] = {}
     try:
@@ -50,7 +50,7 @@ def check_settings(values: dict[str, Any], origin: str) -> dict[str, Any]:
     """Settings by name, checked as [settings] of a file is. Raises one InputError that lists everything that is wrong."""
     from pydantic import ValidationError
 
-    from wrt.scene_schema import SettingsTable
+    from wrt.io.toml.schema import SettingsTable
 
     known_keys: dict[int, list[str]] = {}
     try:
@@ -62,7 +62,7 @@ def check_settings(values: dict[str, Any], origin: str) -> dict[str, Any]:
 
 def setting_choices(name: str) -> tuple[str, ...]:
     """The words that a setting may be; none where it is no choice between words."""
-    from wrt.scene_schema import SettingsTable
+    from wrt.io.toml.schema import SettingsTable
 
     return tuple(SettingsTable.model_json_schema()["properties"].get(name, {}).get("enum", ()))
 

@@ -1,6 +1,6 @@
 """What may stand in a TOML scene file: pydantic models, and the JSON Schema that comes from them.
 
-Names, bounds and defaults are those of `wrt.scene`. Angles are in degrees here and in radians there; lengths have the
+Names, bounds and defaults are those of `wrt.scene.model`. Angles are in degrees here and in radians there; lengths have the
 scene's own unit; colours are linear Rec. 709. Wherever a colour stands, one number is a grey.
 """
 
@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from wrt import scene
-from wrt.material_schema import (
+from wrt.io.toml.material_schema import (
     DEGREES,
     LENGTH,
     Angle,
@@ -32,6 +31,7 @@ from wrt.material_schema import (
     require_one,
     unit,
 )
+from wrt.scene import model as scene
 
 # --- cameras, background, settings ------------------------------------------------------------------------------------
 

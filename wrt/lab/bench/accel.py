@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
-from wrt.arguments import require_known
-from wrt.bench.memory import peak_bytes
-from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
-from wrt.bench.stadium import in_stadium
-from wrt.bench.visibility import TERRAINS, fit, terrain
-from wrt.device import thread_count
-from wrt.errors import InputError
-from wrt.mesh import Mesh, as_mesh
-from wrt.shapes import icosphere
-from wrt.tables import Rows
+from wrt.core.checks import require_known
+from wrt.core.device import thread_count
+from wrt.core.errors import InputError
+from wrt.core.html import Rows
+from wrt.lab.bench.peak_memory import peak_bytes
+from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
+from wrt.lab.bench.stadium import in_stadium
+from wrt.lab.bench.visibility import TERRAINS, fit, terrain
+from wrt.scene.mesh import Mesh, as_mesh
+from wrt.scene.shapes import icosphere
 
 YARDSTICK = "bvh2"  # every ray is compared with it, and as many as YARDSTICK_TESTS allow with brute force
 BRUTE_FORCE_TESTS = 200_000_000
@@ -116,7 +116,7 @@ def meshes(plan: Plan) -> Iterator[Mesh]:
 
 def run(plan: Plan, report: Callable[[Row | Refused], None] | None = None) -> Rows[Row | Refused]:
     """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a structure)."""
-    from wrt.bench.accel_report import page
+    from wrt.lab.bench.accel_report import page
 
     out: list[Row | Refused] = []
     for mesh in meshes(plan):

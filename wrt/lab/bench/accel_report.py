@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 import wrt
-from wrt.bench.accel import YARDSTICK, Plan, Refused, Row, growth
-from wrt.bench.plot import LogLogPlot, Series
-from wrt.bench.visibility_report import spread, table
-from wrt.device import describe_devices
-from wrt.errors import InputError
-from wrt.image import check_writable, write_codes
-from wrt.mesh import Mesh
-from wrt.tables import html_table
+from wrt.core.device import describe_devices
+from wrt.core.errors import InputError
+from wrt.core.html import html_table
+from wrt.lab.bench.accel import YARDSTICK, Plan, Refused, Row, growth
+from wrt.lab.bench.plot import LogLogPlot, Series
+from wrt.lab.bench.visibility_report import spread, table
+from wrt.picture.image import check_writable, write_codes
+from wrt.scene.mesh import Mesh
 
 REPORT = "accel.md"
 PLOTS = ("accel-build.png", "accel-memory.png", "accel-growth.png")

@@ -14,20 +14,20 @@ import numpy as np
 import warp as wp
 
 from wrt.accel import Accelerator, Geometry, build
-from wrt.accel.bvh_build import BVH_BUILDERS, BvhOptions, build_binary
-from wrt.accel.bvh_tree import half_areas
-from wrt.accel.kdop_area import kdop_areas
-from wrt.bench.memory import peak_bytes
-from wrt.bench.rays import RaySet, endless, unit
-from wrt.bench.visibility_report import spread, table
-from wrt.device import describe_devices, load_kernel, thread_count, upload
-from wrt.errors import InputError
+from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
+from wrt.accel.bvh.kdop_area import kdop_areas
+from wrt.accel.bvh.tree import half_areas
+from wrt.core.device import describe_devices, load_kernel, thread_count, upload
+from wrt.core.errors import InputError
 from wrt.kernels.query import RayArrays
-from wrt.kernels.query_volumes import count_popped, make_enter_kernel
-from wrt.kernels.traverse_bvh2 import box_volumes
-from wrt.kernels.traverse_bvh2_kdop import kdop_volumes
-from wrt.kernels.traverse_bvh2_sphere import sphere_volumes
-from wrt.mesh import load_mesh
+from wrt.kernels.study.query_volumes import count_popped, make_enter_kernel
+from wrt.kernels.traverse.bvh2 import box_volumes
+from wrt.kernels.traverse.bvh2_kdop import kdop_volumes
+from wrt.kernels.traverse.bvh2_sphere import sphere_volumes
+from wrt.lab.bench.peak_memory import peak_bytes
+from wrt.lab.bench.rays import RaySet, endless, unit
+from wrt.lab.bench.visibility_report import spread, table
+from wrt.scene.mesh import load_mesh
 
 VOLUMES = ("bvh2", "bvh2_sphere", "bvh2_kdop")
 TESTED_RAYS, TESTED_NODES = 1024, 1024

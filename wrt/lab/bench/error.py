@@ -17,21 +17,21 @@ from typing import Any, Literal
 import numpy as np
 
 import wrt
-from wrt import metrics
 from wrt.accel import ACCELERATORS
-from wrt.arguments import did_you_mean
-from wrt.bench import error_statistics as statistics
-from wrt.bench.error_statistics import UNKNOWN, Estimate
-from wrt.driver import Options, Renderer
-from wrt.errors import InputError
-from wrt.features import Features
-from wrt.film import Film
-from wrt.interrupt import Interrupted
-from wrt.kernels.ray_aabb import RAY_AABB
-from wrt.kernels.ray_triangle import RAY_TRIANGLE
-from wrt.progress import TimeLeft
-from wrt.scene import SAMPLERS, Scene
-from wrt.tables import html_table
+from wrt.core.checks import did_you_mean
+from wrt.core.errors import InputError
+from wrt.core.html import html_table
+from wrt.core.interrupts import Interrupted
+from wrt.kernels.units.box import RAY_AABB
+from wrt.kernels.units.triangle import RAY_TRIANGLE
+from wrt.lab.bench import error_statistics as statistics
+from wrt.lab.bench.error_statistics import UNKNOWN, Estimate
+from wrt.picture import metrics
+from wrt.picture.film import Film
+from wrt.renderer.features import Features
+from wrt.renderer.progress import TimeLeft
+from wrt.renderer.renderer import Options, Renderer
+from wrt.scene.model import SAMPLERS, Scene
 
 REFERENCE_SEEDS = 8
 REFERENCE_DEPTH, REFERENCE_THROUGHPUT = 32, 1e-5
@@ -44,7 +44,7 @@ BASE = "as it is"
 
 @dataclass(frozen=True)
 class Knob:
-    """What a user can turn: a field of wrt.scene.Settings or of wrt.driver.Options, and the values to try.
+    """What a user can turn: a field of wrt.scene.model.Settings or of wrt.renderer.renderer.Options, and the values to try.
 
     matters: whether it changes anything in this scene.
     """
@@ -309,7 +309,7 @@ class Sweep:
         return [label for label, equal in same.items() if equal]
 
     def _repr_html_(self) -> str:
-        from wrt.bench.error_report import COLUMNS, SLOPE_COLUMNS, cells, slope_cells
+        from wrt.lab.bench.error_report import COLUMNS, SLOPE_COLUMNS, cells, slope_cells
 
         return html_table(f"Speed against error: {self.scene}", COLUMNS, map(cells, self.rows)) + html_table(
             "How fast the error falls", SLOPE_COLUMNS, map(slope_cells, self.slopes))

@@ -8,11 +8,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from wrt.bench.error import Row, Slope, Sweep
-from wrt.bench.error_statistics import CONFIDENCE, Estimate
-from wrt.bench.plot import LogLogPlot, Series
-from wrt.errors import InputError
-from wrt.image import check_writable, write_codes
+from wrt.core.errors import InputError
+from wrt.lab.bench.error import Row, Slope, Sweep
+from wrt.lab.bench.error_statistics import CONFIDENCE, Estimate
+from wrt.lab.bench.plot import LogLogPlot, Series
+from wrt.picture.image import check_writable, write_codes
 
 COLUMNS = ("setting", "spp", "seconds", "RMSE", "bias", "noise", "relMSE", "FLIP", "efficiency", "front")
 SLOPE_COLUMNS = ("setting", "slope of MSE", "slope of noise", "theory")

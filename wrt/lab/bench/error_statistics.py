@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from wrt.address_space import require_scipy
+from wrt.core.address_space import require_scipy
 
 CONFIDENCE = 0.95
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.bench.heatmap import font, short
-from wrt.bench.plot import COLORS, GRID, INK, PALE
+from wrt.lab.bench.plot import COLORS, GRID, INK, PALE
+from wrt.picture.heatmap import font, short
 
 PANEL = (400, 250)
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 30, 34

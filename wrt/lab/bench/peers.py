@@ -16,15 +16,15 @@ import numpy as np
 
 import wrt
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
-from wrt.arguments import require_known
-from wrt.bench.accel import warm_up
-from wrt.bench.algorithms import PEERS, Embree, Open3D, Peer, WarpMesh
-from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
-from wrt.bench.visibility_report import spread, table
-from wrt.device import describe_devices, load_kernel, run_all, thread_count
-from wrt.errors import InputError
-from wrt.mesh import Mesh, load_mesh
-from wrt.shapes import icosphere
+from wrt.core.checks import require_known
+from wrt.core.device import describe_devices, load_kernel, run_all, thread_count
+from wrt.core.errors import InputError
+from wrt.lab.bench.accel import warm_up
+from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
+from wrt.lab.bench.visibility_report import spread, table
+from wrt.lab.hard_cases.contestants import PEERS, Embree, Open3D, Peer, WarpMesh
+from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.shapes import icosphere
 
 SAME_T = 1e-4  # two triangles may meet a ray at the same place: another prim_id there is a tie
 THREADS = ("one", "all", "both")
@@ -140,7 +140,7 @@ class Own(Contestant):
 
 
 class Rival(Contestant):
-    """A library of wrt.bench.algorithms."""
+    """A library of wrt.lab.hard_cases.contestants."""
 
     def __init__(self, peer: Peer, geometry: Geometry) -> None:
         self.peer, self.name = peer, peer.name
@@ -193,7 +193,7 @@ def _warp_search(peer: WarpMesh, rays: RaySet) -> Callable[[], list[Any]]:
     """Warp wants unit directions, and its any-hit query a length beside them."""
     import warp as wp
 
-    from wrt.kernels.peers import warp_mesh_any, warp_mesh_query
+    from wrt.kernels.study.peers import warp_mesh_any, warp_mesh_query
 
     n, device = len(rays), peer.device
     length = np.linalg.norm(rays.directions.astype(np.float64), axis=1)

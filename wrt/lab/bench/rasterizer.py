@@ -14,13 +14,13 @@ import warp as wp
 
 from wrt.accel import ACCELERATORS, Geometry, build
 from wrt.accel.base import Structure
-from wrt.device import load_kernel, run_all, start, thread_count, upload
-from wrt.device_scene import camera_struct
-from wrt.errors import InputError
-from wrt.kernels import rasterize as kernels
-from wrt.kernels.primary_rays import make_primary_rays_kernel
+from wrt.core.device import load_kernel, run_all, start, thread_count, upload
+from wrt.core.errors import InputError
 from wrt.kernels.structs import Surfaces, Tile
-from wrt.scene import Camera
+from wrt.kernels.study import rasterize as kernels
+from wrt.kernels.study.primary_rays import make_primary_rays_kernel
+from wrt.renderer.upload import camera_struct
+from wrt.scene.model import Camera
 
 NOTHING = np.uint64(0x7F800000_FFFFFFFF)  # depth inf, prim_id -1
 TRIANGLES_PER_LAUNCH = 65536

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.mesh import Mesh
+from wrt.scene.mesh import Mesh
 
 TIMES = 1000.0
 

@@ -11,19 +11,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from wrt.crews import worker_name
-from wrt.errors import InputError
-from wrt.installed import DIGEST
-from wrt.mesh import Mesh
+from wrt.core.errors import InputError
+from wrt.renderer.distributed.installed import DIGEST
+from wrt.renderer.distributed.workers import worker_name
+from wrt.scene.mesh import Mesh
 
 _alone = threading.Lock()
 
 
 def submitter(executor: Any) -> Any:
-    """An Executor as it is; for a dask.distributed.Client, its wrt.cluster.Submitter."""
+    """An Executor as it is; for a dask.distributed.Client, its wrt.renderer.distributed.dask.Submitter."""
     if not hasattr(executor, "get_executor"):
         return executor
-    from wrt.cluster import Submitter
+    from wrt.renderer.distributed.dask import Submitter
 
     return Submitter(executor)
 

@@ -13,16 +13,16 @@ import numpy as np
 
 import wrt
 from wrt.accel import ACCELERATORS, Geometry, build
-from wrt.bench.hard_cases_common import soup, unit_vectors
-from wrt.bench.price import Quartiles, alternate, quartiles, shown
-from wrt.bench.visibility import terrain
-from wrt.bench.visibility_report import table
-from wrt.device import describe_devices
-from wrt.errors import InputError
-from wrt.kernels.ray_aabb import RAY_AABB
-from wrt.kernels.ray_triangle import RAY_TRIANGLE
-from wrt.mesh import Mesh, load_mesh
-from wrt.shapes import icosphere, teapot
+from wrt.core.device import describe_devices
+from wrt.core.errors import InputError
+from wrt.kernels.units.box import RAY_AABB
+from wrt.kernels.units.triangle import RAY_TRIANGLE
+from wrt.lab.bench.timing import Quartiles, alternate, quartiles, shown
+from wrt.lab.bench.visibility import terrain
+from wrt.lab.bench.visibility_report import table
+from wrt.lab.hard_cases.common import soup, unit_vectors
+from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.shapes import icosphere, teapot
 
 ALONE = 64  # triangles without a structure: the triangle unit by itself
 

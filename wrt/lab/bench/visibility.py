@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from wrt.accel import ACCELERATORS, Geometry, build
-from wrt.bench.rasterizer import Rasterizer, RayCaster
-from wrt.bench.visibility_check import Agreement, agreement
-from wrt.device import start, thread_count
-from wrt.errors import InputError
-from wrt.mesh import Mesh, load_mesh
-from wrt.scene import Camera, Material, Object, Scene
-from wrt.shapes import icosphere
-from wrt.staging import frame_camera
+from wrt.core.device import start, thread_count
+from wrt.core.errors import InputError
+from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
+from wrt.lab.bench.visibility_check import Agreement, agreement
+from wrt.scene.defaults import frame_camera
+from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.model import Camera, Material, Object, Scene
+from wrt.scene.shapes import icosphere
 
 MIN_SIDE = 64  # pixels; the sweep over pixels doubles it
 SWEEP_TRIANGLES = 80_000  # about as many in the sweep over pixels

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 import wrt
-from wrt.bench.plot import LogLogPlot, Series
-from wrt.bench.visibility import Plan, Row, crossings, fits, series
-from wrt.device import describe_devices, thread_count
-from wrt.errors import InputError
-from wrt.image import check_writable, write_codes
+from wrt.core.device import describe_devices, thread_count
+from wrt.core.errors import InputError
+from wrt.lab.bench.plot import LogLogPlot, Series
+from wrt.lab.bench.visibility import Plan, Row, crossings, fits, series
+from wrt.picture.image import check_writable, write_codes
 
 REPORT = "visibility.md"
 PLOTS = {"triangles": "visibility-triangles.png", "pixels": "visibility-pixels.png"}

@@ -17,11 +17,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
-from wrt.bench import hard_cases_closed as inside
-from wrt.bench import hard_cases_open as outside
-from wrt.bench.hard_cases_common import AIMS, ASK, HIT, MISS, HardCase, Seed
-from wrt.bench.hard_cases_judge import Verdict, check, judge, judge_all_hits, judge_next
-from wrt.errors import InputError
+from wrt.core.errors import InputError
+from wrt.lab.hard_cases import closed as inside
+from wrt.lab.hard_cases import open as outside
+from wrt.lab.hard_cases.common import AIMS, ASK, HIT, MISS, HardCase, Seed
+from wrt.lab.hard_cases.judge import Verdict, check, judge, judge_all_hits, judge_next
 
 __all__ = ["ASK", "HARD_CASES", "HIT", "MISS", "HardCase", "Verdict", "check", "chunks", "generate", "judge",
            "judge_all_hits", "judge_next"]

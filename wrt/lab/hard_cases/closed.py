@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 
 from wrt.accel.base import Geometry
-from wrt.bench.hard_cases_common import (
+from wrt.lab.hard_cases.common import (
     HIT,
     HardCase,
     Seed,
@@ -31,8 +31,8 @@ from wrt.bench.hard_cases_common import (
     surface,
     unit_vectors,
 )
-from wrt.mesh_clean import flip_collinear
-from wrt.shapes import teapot
+from wrt.scene.clean import flip_collinear
+from wrt.scene.shapes import teapot
 
 POSITIONS = {"origin": (0.0, 0.0, 0.0), "1e4": (1e4, 1e4, 1e4), "far": (148376.0, 1234.0, -223423.0)}
 APEX_FACES = 10_000
@@ -53,7 +53,7 @@ def _dense(position: str) -> Geometry:
 def dense_sphere(seed: Seed, n: int, *, position: str, aim: str) -> HardCase:
     """A: a sphere of radius 2 with 159,200 triangles. The origins are in the cube of side 2 around its centre, whose corners
     are 0.26 from the surface; float32 moves a point 2e5 from 0 by 0.012 at most. "far", rounding leaves 2356 faces with their
-    corners on a line, which are flipped as every scene's are (wrt.mesh_clean.flip_collinear)."""
+    corners on a line, which are flipped as every scene's are (wrt.scene.clean.flip_collinear)."""
     rng = np.random.default_rng(seed)
     center = np.array(POSITIONS[position])
     return inside(_dense(position), center + rng.uniform(-1.0, 1.0, (n, 3)), rng, aim)

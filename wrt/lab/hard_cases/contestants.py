@@ -10,7 +10,7 @@ import numpy as np
 
 from wrt.accel import Accelerator, Hits, build
 from wrt.accel.base import Geometry
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 
 class Algorithm(ABC):
@@ -110,7 +110,7 @@ class WarpMesh(Peer):
     def load(self, geometry: Geometry) -> None:
         import warp as wp
 
-        from wrt.device import start
+        from wrt.core.device import start
 
         self.device = start("cpu")
         points = wp.array(geometry.vertices.copy(), dtype=wp.vec3, device=self.device)
@@ -120,7 +120,7 @@ class WarpMesh(Peer):
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
         import warp as wp
 
-        from wrt.kernels.peers import warp_mesh_query
+        from wrt.kernels.study.peers import warp_mesh_query
 
         n = len(origins)
         length = np.linalg.norm(directions.astype(np.float64), axis=1)
@@ -164,8 +164,8 @@ def _cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min
 
 def own_algorithms() -> list[Own]:
     """Every triangle test with conservative boxes, and the default test with every other box test."""
-    from wrt.kernels.ray_aabb import RAY_AABB
-    from wrt.kernels.ray_triangle import RAY_TRIANGLE
+    from wrt.kernels.units.box import RAY_AABB
+    from wrt.kernels.units.triangle import RAY_TRIANGLE
 
     return [Own(triangle) for triangle in RAY_TRIANGLE] + [Own(box=box) for box in RAY_AABB if box != "conservative"]
 

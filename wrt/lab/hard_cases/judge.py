@@ -2,7 +2,7 @@
 
 Three things can be wrong whatever is meant to be allowed: a *miss* (a hit that must be found is not), a *false hit* (the
 ray passes the triangle by more than the unit's rounding, or lies outside of the segment), a *wrong prim_id* (a nearer one had
-to be found). Where the derived error bound (wrt.reference_bounds) cannot tell, nothing is wrong, but it is counted apart:
+to be found). Where the derived error bound (wrt.lab.oracle.bounds) cannot tell, nothing is wrong, but it is counted apart:
 borderline misses and hits, ties (exactly equal t) and near ties (within the bound).
 """
 
@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.bench.hard_cases_common import ASK, HIT, MISS, HardCase
-from wrt.reference import AllHits, Place, Reference, reference_of, sure
+from wrt.lab.hard_cases.common import ASK, HIT, MISS, HardCase
+from wrt.lab.oracle.oracle import AllHits, Place, Reference, reference_of, sure
 
 RAYS_AT_ONCE = 1 << 16
 EXAMPLES = 8

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from wrt.accel.base import Geometry
-from wrt.bench.hard_cases_common import (
+from wrt.lab.hard_cases.common import (
     ASK,
     HIT,
     MISS,

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 
 import wrt
-from wrt.bench.hard_cases import Verdict
-from wrt.bench.plot import LogLogPlot, Series
-from wrt.bench.price import shown
-from wrt.bench.stability import ASKED, Plan, Result, Row
-from wrt.bench.visibility_report import table
-from wrt.device import describe_devices, thread_count
-from wrt.errors import InputError
-from wrt.image import check_writable, write_codes
-from wrt.write_file import replacing
+from wrt.core.device import describe_devices, thread_count
+from wrt.core.errors import InputError
+from wrt.core.write_file import replacing
+from wrt.lab.bench.plot import LogLogPlot, Series
+from wrt.lab.bench.timing import shown
+from wrt.lab.bench.visibility_report import table
+from wrt.lab.hard_cases.cases import Verdict
+from wrt.lab.hard_cases.stability import ASKED, Plan, Result, Row
+from wrt.picture.image import check_writable, write_codes
 
 COLUMNS = ("case", "algorithm", "rays", "judged", "misses", "false hits", "wrong prim", "self-hits", "duplicates", "ties",
            "near ties", "borderline", "t ulp max", "t ulp 99.9 %", "t / bound")

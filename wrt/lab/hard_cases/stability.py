@@ -16,20 +16,20 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Structure
-from wrt.bench.algorithms import PEERS, Algorithm, Own, own_algorithms
-from wrt.bench.hard_cases import ASK, HARD_CASES, HardCase, Verdict, check, chunks, generate, judge, judge_all_hits, judge_next
-from wrt.bench.price import Quartiles, alternate, quartiles
-from wrt.bench.sweep import cancel, one_at_a_time, result, submitter
-from wrt.crews import worker_name
-from wrt.device import load_kernel, thread_count, upload
-from wrt.errors import InputError
-from wrt.installed import DIGEST
+from wrt.core.device import load_kernel, thread_count, upload
+from wrt.core.errors import InputError
+from wrt.core.html import html_table
 from wrt.kernels.query import HitList, RayArrays, Respawn, make_all_hits_kernel, make_respawn_kernel
+from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
-from wrt.kernels.surface import make_surface_at
-from wrt.kernels.traverse import Units
-from wrt.progress import TimeLeft
-from wrt.tables import html_table
+from wrt.kernels.traverse.common import Units
+from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
+from wrt.lab.bench.timing import Quartiles, alternate, quartiles
+from wrt.lab.hard_cases.cases import ASK, HARD_CASES, HardCase, Verdict, check, chunks, generate, judge, judge_all_hits, judge_next
+from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own, own_algorithms
+from wrt.renderer.distributed.installed import DIGEST
+from wrt.renderer.distributed.workers import worker_name
+from wrt.renderer.progress import TimeLeft
 
 ALL_HITS_TESTS = 20_000_000  # ray-primitive tests that a case's all-hits check may take
 ALL_HITS_RAYS = 2000
@@ -100,7 +100,7 @@ class Result:
     undone: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
-        from wrt.bench.stability_report import COLUMNS, cells
+        from wrt.lab.hard_cases.report import COLUMNS, cells
 
         return html_table("Stability", COLUMNS, map(cells, self.rows))
 
@@ -291,7 +291,7 @@ def _sum(found: Iterable[tuple[Verdict, int]]) -> tuple[Verdict, int]:
 
 def _is_refused(case: HardCase, algorithm: Algorithm) -> bool:
     """Whether input that is not finite gives an InputError: rays by the query, vertices by Mesh."""
-    from wrt.mesh import Mesh
+    from wrt.scene.mesh import Mesh
 
     try:
         Mesh(case.geometry.vertices, case.geometry.faces)

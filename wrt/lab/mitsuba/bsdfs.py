@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.features import is_rough
-from wrt.scene import Checkerboard, Color, Material, Texture
+from wrt.renderer.features import is_rough
+from wrt.scene.model import Checkerboard, Color, Material, Texture
 
 
 def bsdf(mi: Any, material: Material, notes: Any) -> dict[str, Any]:

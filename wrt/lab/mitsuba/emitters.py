@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.errors import InputError
-from wrt.scene import (
+from wrt.core.errors import InputError
+from wrt.scene.model import (
     Background,
     ConstantBackground,
     DirectionalLight,

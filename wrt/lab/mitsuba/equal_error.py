@@ -19,17 +19,17 @@ from typing import Any
 
 import numpy as np
 
-from wrt.bench import error_statistics as statistics
-from wrt.bench.error import REFERENCE_SEEDS, Reference, finished, make_reference
-from wrt.bench.mitsuba import INTEGRATORS
-from wrt.bench.mitsuba_llvm import NotAvailable
-from wrt.bench.mitsuba_process import VARIANTS, Job, MitsubaProcess, environment_of
-from wrt.bench.price import Quartiles, quartiles, shown
-from wrt.bench.visibility_report import table
-from wrt.device import thread_count
-from wrt.driver import Options, Renderer
-from wrt.errors import InputError
-from wrt.scene import Material, Scene
+from wrt.core.device import thread_count
+from wrt.core.errors import InputError
+from wrt.lab.bench import error_statistics as statistics
+from wrt.lab.bench.error import REFERENCE_SEEDS, Reference, finished, make_reference
+from wrt.lab.bench.timing import Quartiles, quartiles, shown
+from wrt.lab.bench.visibility_report import table
+from wrt.lab.mitsuba.llvm import NotAvailable
+from wrt.lab.mitsuba.process import VARIANTS, Job, MitsubaProcess, environment_of
+from wrt.lab.mitsuba.translate import INTEGRATORS
+from wrt.renderer.renderer import Options, Renderer
+from wrt.scene.model import Material, Scene
 
 PILOT_SPP = 16
 SAME = 0.25  # of the squared error compared at: a squared bias beyond it means that the pictures are not of the same light
@@ -38,7 +38,7 @@ SAME = 0.25  # of the squared error compared at: a squared bias beyond it means 
 @dataclass(frozen=True)
 class Plan:
     """spp: wrt's samples. repeats: pictures of each. reference_spp: of each of its seeds (None: 8 spp). rival_seconds: no
-    picture of Mitsuba's takes longer. integrator: Mitsuba's, see wrt.bench.mitsuba. variants: Mitsuba's. starts: how often a
+    picture of Mitsuba's takes longer. integrator: Mitsuba's, see wrt.lab.mitsuba.translate. variants: Mitsuba's. starts: how often a
     whole process is timed (0: not at all). Raises InputError."""
 
     spp: int = 64

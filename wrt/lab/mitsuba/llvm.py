@@ -14,7 +14,7 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"  # where Mitsuba's compiler, Dr.Jit, looks for it
 CACHE_VARIABLE = "DRJIT_CACHE_DIR"

@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import wrt
-from wrt.bench.mitsuba import Options, mitsuba, translate
-from wrt.bench.mitsuba_llvm import PATH_VARIABLE, NotAvailable, ended, llvm_library
-from wrt.errors import InputError
-from wrt.scene import Camera, Scene
+from wrt.core.errors import InputError
+from wrt.lab.mitsuba.llvm import PATH_VARIABLE, NotAvailable, ended, llvm_library
+from wrt.lab.mitsuba.translate import Options, mitsuba, translate
+from wrt.scene.model import Camera, Scene
 
 VARIANTS = ("scalar_rgb", "llvm_ad_rgb")
 SECONDS_TO_END = 10.0
@@ -31,7 +31,7 @@ SECONDS_TO_END = 10.0
 
 class Job(NamedTuple):
     """What a process renders: a variant (of VARIANTS), the scene, its camera (or that by name or number), an integrator of
-    wrt.bench.mitsuba, and how many threads it may use."""
+    wrt.lab.mitsuba.translate, and how many threads it may use."""
 
     variant: str
     scene: Scene

@@ -25,12 +25,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wrt.bench.mitsuba_emitters import background_emitter, light_emitter
-from wrt.bench.mitsuba_shapes import Part, object_parts, raw_mesh, sphere_shape
-from wrt.errors import InputError, SceneWarning
-from wrt.features import is_rough
-from wrt.mesh import Mesh
-from wrt.scene import Camera, Material, Scene
+from wrt.core.errors import InputError, SceneWarning
+from wrt.lab.mitsuba.emitters import background_emitter, light_emitter
+from wrt.lab.mitsuba.shapes import Part, object_parts, raw_mesh, sphere_shape
+from wrt.renderer.features import is_rough
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Camera, Material, Scene
 
 VARIANT = "scalar_rgb"
 INTEGRATORS = ("auto", "whitted", "path", "direct", "volpath")
@@ -196,7 +196,7 @@ def _check_light_transport(scene: Scene, integrator: str, notes: Approximations)
 def _integrator(mi: Any, name: str, scene: Scene, options: Options, lit: bool, parts: dict[str, Part]) -> Any:
     max_depth = scene.settings.max_depth if options.max_depth is None else options.max_depth
     if name == "whitted":
-        from wrt.bench.mitsuba_whitted import whitted_integrator
+        from wrt.lab.mitsuba.whitted import whitted_integrator
 
         inside = {key: part.material.absorption for key, part in parts.items() if max(part.material.absorption) > 0.0}
         blended = {key for key, part in parts.items() if part.material.alpha_mode == "blend"}

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wrt.reference_exact import Crossings
+from wrt.scene.exact import Crossings
 
 UNIT_32 = 2.0**-24
 TINY_32 = 2.0**-149

@@ -3,8 +3,8 @@
 What counts as a hit: the ray o + t d, t in the closed segment [t_min, t_max], meets the closed triangle and is not parallel
 to its plane. So a ray that lies in the plane does not hit, and a triangle without area, or with a coordinate that is not
 finite, never does. A sphere is hit where the ray enters and where it leaves it, and where it only touches it, once.
-Both sides count. Coordinates are float32 values, taken as exact; see `wrt.reference_exact` for how signs are decided and
-`wrt.reference_bounds` for how far a float32 unit may be off.
+Both sides count. Coordinates are float32 values, taken as exact; see `wrt.scene.exact` for how signs are decided and
+`wrt.lab.oracle.bounds` for how far a float32 unit may be off.
 
 >>> answer = closest(mesh, origins, directions)         # mesh: anything with vertices, faces and perhaps spheres
 >>> answer.prim_id[answer.tie]                          # rays that meet several triangles at exactly the same t
@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.reference_bounds import Bounds, sphere_bounds, sure, triangle_bounds
-from wrt.reference_exact import (
+from wrt.lab.oracle.bounds import Bounds, sphere_bounds, sure, triangle_bounds
+from wrt.scene.exact import (
     UNIT,
     Crossings,
     Place,
@@ -367,7 +367,7 @@ def classify(origins: Any, directions: Any, triangles: Any) -> np.ndarray:
 
 def t_bound(origins: Any, directions: Any, triangles: Any) -> np.ndarray:
     """How far the t that the watertight test reports for ray i and triangle i may be from the exact one: (N,) float64, inf
-    where it may be anything. See `wrt.reference_bounds`."""
+    where it may be anything. See `wrt.lab.oracle.bounds`."""
     rays = _Rays.of(origins, directions, 0.0, np.inf)
     corners = _columns(triangles)
     return triangle_bounds(rays.origin, rays.direction, corners,

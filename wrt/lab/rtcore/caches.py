@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.device import load_kernel, run_all, start, thread_count, upload
-from wrt.errors import InputError
-from wrt.kernels.cache_lru import Caches, Missed, Trace, replay_lru, replay_warps
-from wrt.kernels.counters import PRIMITIVE_SPACE
+from wrt.core.device import load_kernel, run_all, start, thread_count, upload
+from wrt.core.errors import InputError
+from wrt.kernels.study.cache_lru import Caches, Missed, Trace, replay_lru, replay_warps
+from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 
 LINE = 128  # bytes: of a cache line on NVIDIA's GPUs since Volta
 

@@ -11,7 +11,7 @@ import struct
 from collections import Counter
 from dataclasses import dataclass
 
-from wrt.errors import InputError
+from wrt.core.errors import InputError
 
 # By class, the operations that Turing has for it.
 CLASSES: dict[str, dict[int, str]] = {

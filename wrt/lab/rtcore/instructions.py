@@ -16,13 +16,13 @@ import warp as wp
 
 from wrt.accel import ACCELERATORS, Structure
 from wrt.accel.base import closest_hit_kernel
-from wrt.bench.visibility_report import table
-from wrt.cubin import CLASSES, INSTRUCTION, KernelCode, read_cubin
-from wrt.device import start
-from wrt.errors import InputError
-from wrt.kernels.ray_aabb import RAY_AABB
-from wrt.kernels.ray_triangle import RAY_TRIANGLE
-from wrt.kernels.unit_probes import make_box_probe, make_triangle_probe
+from wrt.core.device import start
+from wrt.core.errors import InputError
+from wrt.kernels.study.unit_probes import make_box_probe, make_triangle_probe
+from wrt.kernels.units.box import RAY_AABB
+from wrt.kernels.units.triangle import RAY_TRIANGLE
+from wrt.lab.bench.visibility_report import table
+from wrt.lab.rtcore.cubin import CLASSES, INSTRUCTION, KernelCode, read_cubin
 
 ARCH = 75
 FEW, MANY = 8, 16  # so many that the compiler holds the body once, and does not unroll the loop over the grid around it
@@ -110,7 +110,7 @@ def traversal_table(codes: dict[str, KernelCode]) -> str:
 
 # --- what software needs for the same rays ----------------------------------------------------------------------------
 
-LANES_PER_SECOND = 28 * 128 * 1.582e9  # GTX 1080 Ti: instructions of a lane, see wrt.rtcore_parameters.PARAMETERS
+LANES_PER_SECOND = 28 * 128 * 1.582e9  # GTX 1080 Ti: instructions of a lane, see wrt.lab.rtcore.parameters.PARAMETERS
 CLAIMED = 1.1e9  # rays a second that NVIDIA says it traces
 
 

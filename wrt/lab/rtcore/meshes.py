@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, build
-from wrt.arguments import require_known
-from wrt.bench.instructions import Software, box_unit, software, triangle_unit
-from wrt.bench.rays import RAY_KINDS, RaySet, ray_sets
-from wrt.bench.rtcore_report import COLUMNS, ModelRow, cells, model_row
-from wrt.bench.visibility_report import table
-from wrt.errors import InputError
-from wrt.mesh import Mesh, as_mesh
-from wrt.rtcore import Work, simt, trace_rays
-from wrt.rtcore_parameters import GPUS
-from wrt.simt import WARP, blocks
-from wrt.tables import Rows, html_table
+from wrt.core.checks import require_known
+from wrt.core.errors import InputError
+from wrt.core.html import Rows, html_table
+from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
+from wrt.lab.bench.visibility_report import table
+from wrt.lab.rtcore.instructions import Software, box_unit, software, triangle_unit
+from wrt.lab.rtcore.model import Work, simt, trace_rays
+from wrt.lab.rtcore.parameters import GPUS
+from wrt.lab.rtcore.report import COLUMNS, ModelRow, cells, model_row
+from wrt.lab.rtcore.warps import WARP, blocks
+from wrt.scene.mesh import Mesh, as_mesh
 
 
 @dataclass(frozen=True)

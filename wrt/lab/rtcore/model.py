@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.base import Accelerator, Counters
-from wrt.cache_sim import LINE, Level1, Misses, Warps, first_level, second_level
-from wrt.errors import InputError
-from wrt.rtcore_parameters import BASE, SWEEPS, Core, Gpu
-from wrt.simt import WARP, by_coherence, efficiency, longest_of, packed
-from wrt.tables import html_table
+from wrt.core.errors import InputError
+from wrt.core.html import html_table
+from wrt.lab.rtcore.caches import LINE, Level1, Misses, Warps, first_level, second_level
+from wrt.lab.rtcore.parameters import BASE, SWEEPS, Core, Gpu
+from wrt.lab.rtcore.warps import WARP, by_coherence, efficiency, longest_of, packed
 
 TERMS = ("box", "triangle", "L1", "L2", "DRAM", "latency")
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wrt.cache_sim import Cache
-from wrt.errors import InputError
+from wrt.core.errors import InputError
+from wrt.lab.rtcore.caches import Cache
 
 PUBLISHED, DERIVED, ASSUMED = "published", "derived", "assumed"
 TURING = "NVIDIA Turing GPU Architecture, WP-09183-001 (2018)"

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from wrt.bench.histogram import histograms
-from wrt.bench.profile_work import GROUPS, efficiency_rows, warp_order, work_of
-from wrt.bench.rtcore_report import LEGEND, ModelRow, model_page, model_row, model_table, simt_table
-from wrt.bench.visibility_report import table
-from wrt.errors import InputError
-from wrt.image import check_writable, write_codes, write_exr
-from wrt.profiler import KINDS, PICTURES, Profile
-from wrt.rtcore import simt
-from wrt.rtcore_parameters import Gpu
-from wrt.tables import Rows
+from wrt.core.errors import InputError
+from wrt.core.html import Rows
+from wrt.lab.bench.histogram import histograms
+from wrt.lab.bench.visibility_report import table
+from wrt.lab.rtcore.model import simt
+from wrt.lab.rtcore.parameters import Gpu
+from wrt.lab.rtcore.profile_work import GROUPS, efficiency_rows, warp_order, work_of
+from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile
+from wrt.lab.rtcore.report import LEGEND, ModelRow, model_page, model_row, model_table, simt_table
+from wrt.picture.image import check_writable, write_codes, write_exr
 
 TITLES = {
     "probes": "ray probes", "nodes": "nodes fetched", "boxes": "box tests", "box_operations": "operations of the box unit",

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from wrt.accel.base import Counters
-from wrt.profiler import KINDS, Profile
-from wrt.rtcore import Work
-from wrt.simt import WARP, blocks
+from wrt.lab.rtcore.model import Work
+from wrt.lab.rtcore.profiler import KINDS, Profile
+from wrt.lab.rtcore.warps import WARP, blocks
 
 GROUPS = {"primary": ("primary",), "shadow": ("shadow",), "secondary": ("reflection", "refraction", "straight"), "all": KINDS}
 

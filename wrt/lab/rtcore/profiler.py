@@ -14,18 +14,18 @@ import warp as wp
 
 from wrt.accel import Structure
 from wrt.accel.base import copied
-from wrt.cache_sim import distinct_lines
-from wrt.device import free_memory, run_all, upload
-from wrt.device_film import DeviceFilm
-from wrt.driver import OPTIONS, Options, Renderer
-from wrt.errors import InputError
-from wrt.kernels import ray_log
-from wrt.kernels.counters import SIZE_RANGE, Counts, Recorder
-from wrt.mesh import Mesh
-from wrt.scene import SETTINGS, Scene
-from wrt.scene_file import as_scene
-from wrt.tables import html_table
-from wrt.tiles import Rectangle, Work
+from wrt.core.device import free_memory, run_all, upload
+from wrt.core.errors import InputError
+from wrt.core.html import html_table
+from wrt.io.load import as_scene
+from wrt.kernels.study import ray_log
+from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
+from wrt.lab.rtcore.caches import distinct_lines
+from wrt.renderer.film_arrays import DeviceFilm
+from wrt.renderer.renderer import OPTIONS, Options, Renderer
+from wrt.renderer.tiles import Rectangle, Work
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import SETTINGS, Scene
 
 KINDS = ("primary", "reflection", "refraction", "straight", "shadow")
 COUNTERS = tuple(Counts.vars)
@@ -115,8 +115,8 @@ class Profile:
         """One of `maps` as a picture with its scale, a PIL image, which a notebook shows. Raises InputError for another name."""
         from PIL import Image
 
-        from wrt.bench.heatmap import heatmap
-        from wrt.bench.profile_report import TITLES
+        from wrt.lab.rtcore.profile_report import TITLES
+        from wrt.picture.heatmap import heatmap
 
         if name not in PICTURES:
             raise InputError(f"no picture {name!r}; there is {', '.join(PICTURES)}")

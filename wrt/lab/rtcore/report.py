@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from wrt.bench.visibility_report import table
-from wrt.rtcore import TERMS, Prediction, Work, predict, sensitivity, span, sweep
-from wrt.rtcore_parameters import PARAMETERS, SWEEPS, Gpu
-from wrt.tables import html_table
+from wrt.core.html import html_table
+from wrt.lab.bench.visibility_report import table
+from wrt.lab.rtcore.model import TERMS, Prediction, Work, predict, sensitivity, span, sweep
+from wrt.lab.rtcore.parameters import PARAMETERS, SWEEPS, Gpu
 
 RANGE = ("boxes", "triangles", "warps")  # what the reported range is swept over
 COLUMNS = ("rays", "nodes", "boxes", "triangles", "lines", *TERMS, "limit", "Grays/s", "range", "moved most by")
@@ -48,7 +48,7 @@ class ModelRow:
 
 
 def model_row(work: Work, gpu: Gpu, simt: dict[str, float]) -> ModelRow:
-    """Everything that the model says of this work; simt: as wrt.rtcore.simt gives it."""
+    """Everything that the model says of this work; simt: as wrt.lab.rtcore.model.simt gives it."""
     prediction = predict(work, gpu)
     low, high = span(sweep(work, gpu, names=RANGE))
     lines = work.misses(gpu, prediction.core).accesses / len(work)

@@ -10,10 +10,10 @@ import numpy as np
 
 from wrt.accel import Accelerator, Geometry
 from wrt.accel.base import Built, Counters
-from wrt.accel.bvh2 import Bvh2
-from wrt.errors import InputError
-from wrt.kernels.counters import PRIMITIVE_SPACE
-from wrt.kernels.traverse_bvh2_study import LEVELS, STACK_SIZE, Study
+from wrt.accel.bvh.binary import Bvh2
+from wrt.core.errors import InputError
+from wrt.kernels.study.bvh2_study import LEVELS, STACK_SIZE, Study
+from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 
 FRAME_BYTES = 16  # of a node with quantised planes: its corner (12) and an exponent of the step for each axis
 REFERENCE_BYTES = 16  # of a binary node, as Bvh2Node has them

@@ -16,10 +16,10 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 import wrt
-from wrt.crews import Reply, Workers
-from wrt.device import describe_devices
-from wrt.errors import InputError
-from wrt.installed import INSTALLED, difference
+from wrt.core.device import describe_devices
+from wrt.core.errors import InputError
+from wrt.renderer.distributed.installed import INSTALLED, difference
+from wrt.renderer.distributed.workers import Reply, Workers
 
 CONNECT_SECONDS = 5.0  # to find the scheduler
 WORKER_SECONDS = 10.0  # for a first worker to come
@@ -71,7 +71,7 @@ def check_workers(client: Any) -> None:
     except TimeoutError as error:
         raise InputError(f"no worker at {where}: start some with `dask worker {where}`") from error
     # A function that workers without wrt have too, and before what is compared, what every version of wrt has.
-    for name in ("wrt:__version__", "wrt.installed:INSTALLED"):
+    for name in ("wrt:__version__", "wrt.renderer.distributed.installed:INSTALLED"):
         for worker, found in client.run(pkgutil.resolve_name, name, on_error="return").items():
             if isinstance(found, BaseException):
                 raise InputError(f"worker {worker} has no such wrt ({found}): wrt {wrt.__version__} must be installed there")

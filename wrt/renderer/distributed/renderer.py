@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from wrt.crews import Crew, Devices, Job, Reply, Workers, packaged
-from wrt.device import start
-from wrt.device_scene import tell_left_out
-from wrt.driver import PREPARING_TOLD, Renderer
-from wrt.errors import InputError
-from wrt.film import Film
-from wrt.options import Progress
-from wrt.tiles import Rectangle, Work, tiles
+from wrt.core.device import start
+from wrt.core.errors import InputError
+from wrt.picture.film import Film
+from wrt.renderer.distributed.workers import Crew, Devices, Job, Reply, Workers, packaged
+from wrt.renderer.options import Progress
+from wrt.renderer.renderer import PREPARING_TOLD, Renderer
+from wrt.renderer.tiles import Rectangle, Work, tiles
+from wrt.renderer.upload import tell_left_out
 
 TILES_EACH = 4  # of a pass, for each that traces: the last one to come must not be long
 SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # pixels: smaller tiles are not worth sending, larger ones take long
@@ -50,7 +50,7 @@ class SpreadRenderer(Renderer):
             return Devices(scene, options)
         key, package = packaged(scene, options, self.kernels_hash())
         if hasattr(options.executor, "get_executor"):
-            from wrt.cluster import ClusterWorkers
+            from wrt.renderer.distributed.dask import ClusterWorkers
 
             return ClusterWorkers(options.executor, key, package)
         assert options.executor is not None

@@ -19,13 +19,13 @@ from hashlib import sha256
 from queue import SimpleQueue
 from typing import Any
 
-from wrt.driver import Renderer
-from wrt.errors import InputError, SceneWarning
-from wrt.installed import INSTALLED, Installed, difference
-from wrt.options import Options
-from wrt.scene import Scene
-from wrt.scene_arrays import pack, unpack
-from wrt.scene_digest import scene_digest
+from wrt.core.errors import InputError, SceneWarning
+from wrt.renderer.distributed.installed import INSTALLED, Installed, difference
+from wrt.renderer.options import Options
+from wrt.renderer.renderer import Renderer
+from wrt.scene.digest import scene_digest
+from wrt.scene.model import Scene
+from wrt.scene.pack import pack, unpack
 
 QUEUED = 3  # calls that wait or run, for each that can run at once: nobody waits for us
 SLOTS = 32  # calls at once, of an executor that does not tell

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from wrt.accel import Accelerator, Geometry, build
-from wrt.errors import InputError
-from wrt.kernels.traverse_wide import LEAF_RANGE
-from wrt.mesh import Mesh
-from wrt.shapes import icosphere
+from wrt.core.errors import InputError
+from wrt.kernels.wide.traverse import LEAF_RANGE
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import icosphere
 
 Node = tuple[np.ndarray, np.ndarray, int, set[int]]  # box, cost, the primitives below it
 

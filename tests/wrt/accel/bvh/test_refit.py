@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from wrt.accel import Geometry, build
-from wrt.accel.bvh_build import BVH_BUILDERS
-from wrt.accel.refit import refit_nodes
-from wrt.errors import InputError
-from wrt.shapes import icosphere
+from wrt.accel.bvh.builders import BVH_BUILDERS
+from wrt.accel.bvh.refit import refit_nodes
+from wrt.core.errors import InputError
+from wrt.scene.shapes import icosphere
 
 BALL = icosphere(3)
 

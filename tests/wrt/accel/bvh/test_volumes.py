@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-from tests.kernels.test_traverse import GEOMETRIES
+from tests.kernels.traverse.test_common import GEOMETRIES
 from wrt.accel import Geometry, build
-from wrt.accel.bvh2_volumes import cuts, project
-from wrt.accel.kdop_area import kdop_area
-from wrt.errors import InputError
-from wrt.shapes import icosphere
+from wrt.accel.bvh.kdop_area import kdop_area
+from wrt.accel.bvh.volumes import cuts, project
+from wrt.core.errors import InputError
+from wrt.scene.shapes import icosphere
 
 BALL = icosphere(3)
 KINDS = ["soup", "coincident", "flat", "progression", "mixed", "only_spheres", "one", "one_sphere"]

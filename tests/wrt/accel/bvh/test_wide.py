@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from wrt.accel import Geometry, build
-from wrt.accel.wide_compress import compress, decompress
-from wrt.accel.wide_tree import check_wide, lanes_of, packed
-from wrt.errors import InputError
-from wrt.shapes import icosphere
+from wrt.accel.bvh.compress import compress, decompress
+from wrt.accel.bvh.wide_tree import check_wide, lanes_of, packed
+from wrt.core.errors import InputError
+from wrt.scene.shapes import icosphere
 
 WIDE = {"bvh4": 4, "bvh8": 8, "bvh8c": 8}
 BALL = icosphere(3)

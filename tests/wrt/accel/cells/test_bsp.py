@@ -12,16 +12,16 @@ import pytest
 from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 import warp as wp
 
-import wrt.accel.bsp as module
-from tests.kernels.test_traverse import GEOMETRIES, assert_same_hits, rays_for, soup, triangles
+import wrt.accel.cells.bsp as module
+from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, soup, triangles
 from wrt.accel import Geometry, build, build_cached
 from wrt.accel.base import HitArrays
-from wrt.accel.bsp import Bsp
-from wrt.errors import InputError
+from wrt.accel.cells.bsp import Bsp
+from wrt.core.errors import InputError
 from wrt.kernels.query import make_closest_hit_kernel
 from wrt.kernels.structs import Surfaces
-from wrt.kernels.traverse_bsp import PLANE, STACK_SIZE
-from wrt.shapes import icosphere
+from wrt.kernels.traverse.bsp import PLANE, STACK_SIZE
+from wrt.scene.shapes import icosphere
 
 
 @pytest.mark.parametrize(("option", "value"), [

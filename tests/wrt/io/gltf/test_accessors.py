@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.gltf_files import COMPONENT, KIND, GltfFile
-from wrt.errors import InputError
-from wrt.gltf_accessors import Accessors
-from wrt.gltf_document import Document
+from wrt.core.errors import InputError
+from wrt.io.gltf.accessors import Accessors
+from wrt.io.gltf.document import Document
 
 
 def read(file: GltfFile, folder: Path, kind: str, index: int = 0) -> np.ndarray:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tests.gltf_files import TRIANGLE, one_triangle, pack_glb
-from wrt.errors import InputError
-from wrt.gltf import load_gltf
-from wrt.gltf_document import LeftOut
-from wrt.gltf_schema import read_as
+from wrt.core.errors import InputError
+from wrt.io.gltf.document import LeftOut
+from wrt.io.gltf.reader import load_gltf
+from wrt.io.gltf.schema import read_as
 
 GLB = pack_glb(b'{"asset":{"version":"2.0"}}')
 TEXT = GLB[20:]

@@ -15,10 +15,10 @@ import pytest
 from PIL import Image
 
 from tests.gltf_files import GltfFile, encode, load_warned, one_material, one_triangle
-from wrt.errors import InputError, SceneWarning
-from wrt.gltf import load_gltf
-from wrt.image_decode import MAX_SIDE, decode_rgba8
-from wrt.scene import BLACK, Material, Scene
+from wrt.core.errors import InputError, SceneWarning
+from wrt.io.gltf.reader import load_gltf
+from wrt.picture.decode import MAX_SIDE, decode_rgba8
+from wrt.scene.model import BLACK, Material, Scene
 
 PIXELS = np.arange(4 * 6 * 4, dtype=np.uint8).reshape(4, 6, 4) * 2
 

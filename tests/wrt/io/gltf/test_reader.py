@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.gltf_files import TRIANGLE, GltfFile, load_warned, one_triangle, with_light
-from wrt.errors import InputError
-from wrt.gltf import load_gltf
-from wrt.scene import DirectionalLight, PointLight, Scene, SpotLight
+from wrt.core.errors import InputError
+from wrt.io.gltf.reader import load_gltf
+from wrt.scene.model import DirectionalLight, PointLight, Scene, SpotLight
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 

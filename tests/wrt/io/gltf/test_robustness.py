@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.data import DATA, data_path
 from tests.gltf_files import TRIANGLE, GltfFile, load_warned, one_triangle, rich_file, with_light
-from wrt.errors import InputError, SceneWarning
-from wrt.gltf import load_gltf
+from wrt.core.errors import InputError, SceneWarning
+from wrt.io.gltf.reader import load_gltf
 
 # --- what is left out, and what is added ------------------------------------------------------------------------------
 
@@ -81,7 +81,7 @@ def places(value: Any) -> list[tuple[Any, Any]]:
 JUNK = [None, True, -1, 0, 1, 3, 1.5, 2**31, 10**30, 1e300, -1e-300, "", "x", "VEC3", [], [0], [[]], {}, {"index": 0}]
 
 
-@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+@pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 def test_any_value_may_be_wrong(tmp_path):
     """Each value of the JSON in turn becomes something else, or goes: a scene or an InputError, and nothing else."""
     file = rich_file()
@@ -100,7 +100,7 @@ def test_any_value_may_be_wrong(tmp_path):
     assert min(outcomes.values()) > 50
 
 
-@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+@pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 def test_any_byte_may_be_wrong(tmp_path):
     path = rich_file().write(tmp_path)
     data = path.read_bytes()
@@ -147,7 +147,7 @@ def index_counts() -> dict[str, int]:
 
 
 @pytest.mark.parametrize("name", FILES or ["scenes/gltf"])
-@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+@pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 def test_every_file_loads_with_its_triangles_or_is_refused(name):
     path = data_path(name)
     if name in REFUSED:
@@ -163,7 +163,7 @@ def test_every_file_loads_with_its_triangles_or_is_refused(name):
 
 @pytest.mark.parametrize("name", [name for name in FILES if name not in REFUSED and "Instancing" not in name
                                   and "MeshPrimitiveModes" not in name] or ["scenes/gltf"])
-@pytest.mark.filterwarnings("ignore::wrt.errors.SceneWarning")
+@pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 def test_world_bounds_agree_with_trimesh(name):
     trimesh = pytest.importorskip("trimesh")
     theirs = trimesh.load(data_path(name), process=False).bounds

@@ -10,8 +10,8 @@ import pytest
 
 from tests.fuzz.seeds import SCENE, SMALL_SCENE
 from tests.grown import GROWN
-from wrt.errors import InputError
-from wrt.toml_limits import MAX_PARTS, MAX_WORD, look_at
+from wrt.core.errors import InputError
+from wrt.io.toml.limits import MAX_PARTS, MAX_WORD, look_at
 
 LONG = ".".join("a" * MAX_PARTS)
 

@@ -13,9 +13,9 @@ import pytest
 
 from tests.command_line import wrt as run
 from tests.data import ROOT
-from wrt.scene_check import check
-from wrt.scene_file import load_scene, schema
-from wrt.scene_reference import EXAMPLE, scene_format
+from wrt.io.load import load_scene, schema
+from wrt.io.toml.reference_page import EXAMPLE, scene_format
+from wrt.io.toml.report import check
 
 PAGE = ROOT / "docs" / "scene_format.md"
 # Numbers that are measured in nothing: shares, counts, factors, directions of any length, indices of refraction.

@@ -12,12 +12,12 @@ import pytest
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from wrt.accel import ACCELERATORS
-from wrt.bench import accel as bench
-from wrt.bench import accel_report as report
-from wrt.bench.accel import Plan, Refused, Row, growth, run
-from wrt.errors import InputError
-from wrt.mesh import Mesh
-from wrt.shapes import icosphere
+from wrt.core.errors import InputError
+from wrt.lab.bench import accel as bench
+from wrt.lab.bench import accel_report as report
+from wrt.lab.bench.accel import Plan, Refused, Row, growth, run
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import icosphere
 
 
 @pytest.fixture

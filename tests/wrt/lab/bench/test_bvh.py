@@ -12,13 +12,13 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import data_path
 from wrt.accel import Geometry, build
-from wrt.accel.bvh_build import BVH_BUILDERS
-from wrt.bench import bvh as bench
-from wrt.bench.bvh import VOLUMES, BuilderRow, Plan, VolumeRow, inward, published_cost, run
-from wrt.bench.memory import peak_bytes
-from wrt.errors import InputError
-from wrt.mesh import load_mesh
-from wrt.shapes import icosphere
+from wrt.accel.bvh.builders import BVH_BUILDERS
+from wrt.core.errors import InputError
+from wrt.lab.bench import bvh as bench
+from wrt.lab.bench.bvh import VOLUMES, BuilderRow, Plan, VolumeRow, inward, published_cost, run
+from wrt.lab.bench.peak_memory import peak_bytes
+from wrt.scene.mesh import load_mesh
+from wrt.scene.shapes import icosphere
 
 # Of legocar.obj, by tinybvh: SAH cost and the cost of 262,144 cosine-inward rays, with C_trav = C_int = 1.
 PUBLISHED = {"binned": (30.27, 13.4), "sweep": (30.07, 13.5), "sbvh": (29.58, 12.7)}

@@ -17,17 +17,17 @@ from hypothesis import strategies as st
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run_command
 from wrt.accel import ACCELERATORS
-from wrt.bench import error as bench
-from wrt.bench import error_report as report
-from wrt.bench import error_statistics as statistics
-from wrt.bench import plot
-from wrt.driver import Options
-from wrt.errors import InputError
-from wrt.features import features_of
-from wrt.image import read_image
-from wrt.interrupt import Interrupted
-from wrt.scene import Camera, ConstantBackground, GradientBackground, Material, Object, Scene, Settings, Sphere
-from wrt.shapes import box, quad
+from wrt.core.errors import InputError
+from wrt.core.interrupts import Interrupted
+from wrt.lab.bench import error as bench
+from wrt.lab.bench import error_report as report
+from wrt.lab.bench import error_statistics as statistics
+from wrt.lab.bench import plot
+from wrt.picture.image import read_image
+from wrt.renderer.features import features_of
+from wrt.renderer.renderer import Options
+from wrt.scene.model import Camera, ConstantBackground, GradientBackground, Material, Object, Scene, Settings, Sphere
+from wrt.scene.shapes import box, quad
 
 # --- statistics -------------------------------------------------------------------------------------------------------
 

@@ -12,13 +12,13 @@ import pytest
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from wrt.accel import Geometry, Hits, build
-from wrt.bench import peers
-from wrt.bench.algorithms import PEERS
-from wrt.bench.peers import Plan, Row, differing, means, ratio, run
-from wrt.bench.rays import ray_sets
-from wrt.device import thread_count
-from wrt.errors import InputError
-from wrt.shapes import icosphere
+from wrt.core.device import thread_count
+from wrt.core.errors import InputError
+from wrt.lab.bench import peers
+from wrt.lab.bench.peers import Plan, Row, differing, means, ratio, run
+from wrt.lab.bench.rays import ray_sets
+from wrt.lab.hard_cases.contestants import PEERS
+from wrt.scene.shapes import icosphere
 
 RIVALS = [name for name, peer in PEERS.items() if peer.is_installed()]
 

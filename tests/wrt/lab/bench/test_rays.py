@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from wrt.accel import build
-from wrt.bench.rays import RAY_KINDS, ray_sets
-from wrt.mesh import Mesh
-from wrt.shapes import icosphere
+from wrt.lab.bench.rays import RAY_KINDS, ray_sets
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import icosphere
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from wrt.accel import build
-from wrt.bench.rays import ray_sets
-from wrt.bench.stadium import in_stadium, stands
-from wrt.shapes import icosphere
+from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.stadium import in_stadium, stands
+from wrt.scene.shapes import icosphere
 
 
 def test_the_stands_are_steps_all_around() -> None:

@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
-from wrt.bench import rtcore, stability
-from wrt.bench.sweep import by_mesh
-from wrt.errors import InputError
-from wrt.shapes import box, icosphere
+from wrt.core.errors import InputError
+from wrt.lab.bench.sweep import by_mesh
+from wrt.lab.hard_cases import stability
+from wrt.lab.rtcore import meshes as rtcore
+from wrt.scene.shapes import box, icosphere
 
 
 @pytest.fixture

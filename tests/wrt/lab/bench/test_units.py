@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from wrt.accel import Geometry, build
-from wrt.bench import units
-from wrt.bench.price import alternate, quartiles, shown
-from wrt.bench.visibility import terrain
-from wrt.errors import InputError
-from wrt.kernels.ray_aabb import RAY_AABB
-from wrt.kernels.ray_triangle import RAY_TRIANGLE
-from wrt.shapes import icosphere
+from wrt.core.errors import InputError
+from wrt.kernels.units.box import RAY_AABB
+from wrt.kernels.units.triangle import RAY_TRIANGLE
+from wrt.lab.bench import units
+from wrt.lab.bench.timing import alternate, quartiles, shown
+from wrt.lab.bench.visibility import terrain
+from wrt.scene.shapes import icosphere
 
 
 def test_jobs_run_by_turns_and_the_first_run_is_not_counted() -> None:

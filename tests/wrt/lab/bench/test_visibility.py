@@ -17,14 +17,14 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import data_path
 from wrt.accel import Geometry
-from wrt.bench import visibility_report
-from wrt.bench.rasterizer import Rasterizer, RayCaster
-from wrt.bench.visibility import Plan, Row, crossings, fit, fits, framing, run, series, subdivided, surfaces, terrain
-from wrt.bench.visibility_check import Agreement, agreement, compare
-from wrt.errors import InputError
-from wrt.mesh import Mesh
-from wrt.scene import Camera, Material, Object, Scene
-from wrt.shapes import box, icosphere, merged, prism, quad, teapot, torus
+from wrt.core.errors import InputError
+from wrt.lab.bench import visibility_report
+from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
+from wrt.lab.bench.visibility import Plan, Row, crossings, fit, fits, framing, run, series, subdivided, surfaces, terrain
+from wrt.lab.bench.visibility_check import Agreement, agreement, compare
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Camera, Material, Object, Scene
+from wrt.scene.shapes import box, icosphere, merged, prism, quad, teapot, torus
 
 SIZE = (160, 120)
 WIDE = math.radians(80.0)

@@ -14,8 +14,11 @@ from tests.kernel_tools import launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel import Accelerator, Geometry, Hits, build
-from wrt.bench import hard_cases_open
-from wrt.bench.hard_cases import (
+from wrt.core.errors import InputError
+from wrt.kernels.shade.surface import make_surface_at, spawn_point
+from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
+from wrt.lab.hard_cases import open as hard_cases_open
+from wrt.lab.hard_cases.cases import (
     ASK,
     HARD_CASES,
     HIT,
@@ -28,13 +31,10 @@ from wrt.bench.hard_cases import (
     judge_all_hits,
     judge_next,
 )
-from wrt.bench.hard_cases_common import sphere
-from wrt.bench.hard_cases_judge import winding_number
-from wrt.errors import InputError
-from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
-from wrt.kernels.surface import make_surface_at, spawn_point
-from wrt.mesh import Mesh
-from wrt.reference import Place, Reference, all_hits, reference_of
+from wrt.lab.hard_cases.common import sphere
+from wrt.lab.hard_cases.judge import winding_number
+from wrt.lab.oracle.oracle import Place, Reference, all_hits, reference_of
+from wrt.scene.mesh import Mesh
 
 REFUSED = ("I_rays_not_finite", "I_mesh_not_finite")
 

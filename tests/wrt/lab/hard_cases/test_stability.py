@@ -12,13 +12,12 @@ import pytest
 
 from tests.command_line import wrt as run
 from wrt.accel import Geometry
-from wrt.bench import stability
-from wrt.bench import stability_report as report
-from wrt.bench.algorithms import PEERS, Embree, EmbreeFast, Open3D, Own, WarpMesh, own_algorithms
-from wrt.bench.hard_cases import generate
-from wrt.errors import InputError
-from wrt.kernels.ray_aabb import RAY_AABB
-from wrt.kernels.ray_triangle import RAY_TRIANGLE
+from wrt.core.errors import InputError
+from wrt.kernels.units.box import RAY_AABB
+from wrt.kernels.units.triangle import RAY_TRIANGLE
+from wrt.lab.hard_cases import report, stability
+from wrt.lab.hard_cases.cases import generate
+from wrt.lab.hard_cases.contestants import PEERS, Embree, EmbreeFast, Open3D, Own, WarpMesh, own_algorithms
 
 
 @pytest.mark.parametrize("name", ["B_jittered_vertices", "C_triangles", "C_spheres", "E_grid", "G_fan_edges"])

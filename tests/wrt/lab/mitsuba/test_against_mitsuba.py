@@ -11,8 +11,9 @@ import pytest
 
 import wrt
 from tests.data import data_path
-from wrt.bench.mitsuba import aov_mitsuba, camera_rays, render_mitsuba
-from wrt.scene import (
+from wrt.lab.mitsuba.translate import aov_mitsuba, camera_rays, render_mitsuba
+from wrt.scene.defaults import frame_camera
+from wrt.scene.model import (
     CONDUCTORS,
     Camera,
     Checkerboard,
@@ -26,8 +27,7 @@ from wrt.scene import (
     Sphere,
     SpotLight,
 )
-from wrt.shapes import box, quad, torus
-from wrt.staging import frame_camera
+from wrt.scene.shapes import box, quad, torus
 
 pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')
 

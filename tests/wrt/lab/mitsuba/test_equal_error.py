@@ -15,14 +15,14 @@ import pytest
 
 from tests import command_line
 from tests.data import ROOT
-from wrt.bench import equal_error
-from wrt.bench.equal_error import Plan, Result, matte
-from wrt.bench.mitsuba_llvm import PATH_VARIABLE, NotAvailable
-from wrt.bench.mitsuba_process import VARIANTS, MitsubaProcess
-from wrt.driver import Options
-from wrt.errors import InputError
-from wrt.scene import Camera, Material, Object, PointLight, Scene, Settings, Sphere
-from wrt.shapes import box
+from wrt.core.errors import InputError
+from wrt.lab.mitsuba import equal_error
+from wrt.lab.mitsuba.equal_error import Plan, Result, matte
+from wrt.lab.mitsuba.llvm import PATH_VARIABLE, NotAvailable
+from wrt.lab.mitsuba.process import VARIANTS, MitsubaProcess
+from wrt.renderer.renderer import Options
+from wrt.scene.model import Camera, Material, Object, PointLight, Scene, Settings, Sphere
+from wrt.scene.shapes import box
 
 pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')
 

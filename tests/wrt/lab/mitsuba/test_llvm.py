@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wrt.bench import mitsuba_llvm as llvm
-from wrt.bench import mitsuba_process
-from wrt.bench.mitsuba import render_mitsuba
-from wrt.bench.mitsuba_llvm import NotAvailable, candidates, llvm_library, trial
-from wrt.bench.mitsuba_process import Job, MitsubaProcess
-from wrt.errors import InputError
-from wrt.scene import Camera, ConstantBackground, Material, Scene, Settings, Sphere
+from wrt.core.errors import InputError
+from wrt.lab.mitsuba import llvm
+from wrt.lab.mitsuba import process as mitsuba_process
+from wrt.lab.mitsuba.llvm import NotAvailable, candidates, llvm_library, trial
+from wrt.lab.mitsuba.process import Job, MitsubaProcess
+from wrt.lab.mitsuba.translate import render_mitsuba
+from wrt.scene.model import Camera, ConstantBackground, Material, Scene, Settings, Sphere
 
 SCENE = Scene(
     spheres=(Sphere((0.0, 0.0, 0.0), 0.5, Material("glass", albedo=(0.9, 0.6, 0.9))),

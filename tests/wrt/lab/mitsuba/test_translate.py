@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wrt.errors import InputError, SceneWarning
-from wrt.mesh import Mesh
-from wrt.scene import (
+from wrt.core.errors import InputError, SceneWarning
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import (
     Camera,
     Checkerboard,
     ConstantBackground,
@@ -30,7 +30,7 @@ from wrt.scene import (
 
 pytest.importorskip("mitsuba", reason='needs Mitsuba 3 (pip install "wrt[peers]")')
 
-from wrt.bench.mitsuba import (
+from wrt.lab.mitsuba.translate import (
     aov_mitsuba,
     camera_rays,
     mitsuba,

@@ -9,9 +9,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from wrt.reference import Place, Reference, all_hits, classify, closest, cross, reference_of, sure, t_bound
-from wrt.reference_bounds import triangle_bounds
-from wrt.reference_exact import sphere_crossings, triangle_crossings
+from wrt.lab.oracle.bounds import triangle_bounds
+from wrt.lab.oracle.oracle import Place, Reference, all_hits, classify, closest, cross, reference_of, sure, t_bound
+from wrt.scene.exact import sphere_crossings, triangle_crossings
 
 Row = list[Fraction]
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from wrt.accel import build
-from wrt.cache_sim import LINE, Cache, Misses, Warps, distinct_lines, first_level, lines_of, replay, second_level
-from wrt.errors import InputError
-from wrt.kernels.counters import PRIMITIVE_SPACE
-from wrt.shapes import icosphere
+from wrt.core.errors import InputError
+from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.lab.rtcore.caches import LINE, Cache, Misses, Warps, distinct_lines, first_level, lines_of, replay, second_level
+from wrt.scene.shapes import icosphere
 
 
 def plain_replay(line: list[int], cache: Cache) -> list[bool]:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from wrt.cubin import read_cubin
-from wrt.errors import InputError
+from wrt.core.errors import InputError
+from wrt.lab.rtcore.cubin import read_cubin
 
 
 @wp.kernel(module="unique", enable_backward=False)

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from wrt.bench.instructions import UnitCode, box_unit, compiled, of_one, software, software_table, unit_table
-from wrt.cubin import CLASSES, OPERATIONS, read_cubin
-from wrt.errors import InputError
+from wrt.core.errors import InputError
+from wrt.lab.rtcore.cubin import CLASSES, OPERATIONS, read_cubin
+from wrt.lab.rtcore.instructions import UnitCode, box_unit, compiled, of_one, software, software_table, unit_table
 
 
 @wp.kernel(module="unique", enable_backward=False)

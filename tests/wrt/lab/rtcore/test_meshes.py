@@ -11,10 +11,10 @@ import pytest
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from wrt.accel import build
-from wrt.bench.rays import ray_sets
-from wrt.bench.rtcore import Plan, bvhs, in_warps, markdown, run
-from wrt.errors import InputError
-from wrt.shapes import icosphere
+from wrt.core.errors import InputError
+from wrt.lab.bench.rays import ray_sets
+from wrt.lab.rtcore.meshes import Plan, bvhs, in_warps, markdown, run
+from wrt.scene.shapes import icosphere
 
 
 def test_rays_stand_in_blocks_of_the_picture() -> None:

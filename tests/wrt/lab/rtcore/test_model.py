@@ -9,13 +9,13 @@ import pytest
 
 from wrt.accel import build
 from wrt.accel.base import Counters
-from wrt.cache_sim import LINE, Cache
-from wrt.errors import InputError
-from wrt.kernels.counters import PRIMITIVE_SPACE, Counts
-from wrt.rtcore import TERMS, Work, lanes_busy, predict, sensitivity, simt, span, sweep, trace_rays
-from wrt.rtcore_parameters import ASSUMED, DERIVED, GPUS, PARAMETERS, PUBLISHED, SWEEPS, Core, Gpu
-from wrt.shapes import icosphere
-from wrt.simt import packed
+from wrt.core.errors import InputError
+from wrt.kernels.traverse.counters import PRIMITIVE_SPACE, Counts
+from wrt.lab.rtcore.caches import LINE, Cache
+from wrt.lab.rtcore.model import TERMS, Work, lanes_busy, predict, sensitivity, simt, span, sweep, trace_rays
+from wrt.lab.rtcore.parameters import ASSUMED, DERIVED, GPUS, PARAMETERS, PUBLISHED, SWEEPS, Core, Gpu
+from wrt.lab.rtcore.warps import packed
+from wrt.scene.shapes import icosphere
 
 SMALL = Gpu("small", 2, 1e9, 64e9, Cache(64 * LINE, 4), Cache(256 * LINE, 4))  # DRAM: 32 bytes a clock and SM
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from tests.command_line import wrt as command
-from tests.wrt.test_profiler import MIRRORS
-from wrt.bench.heatmap import colors, heatmap, short, step_of, top_of
-from wrt.bench.histogram import bins, histograms
-from wrt.bench.profile_report import model_rows
-from wrt.bench.profile_work import GROUPS, warp_order, work_of
-from wrt.errors import InputError
-from wrt.image import read_channels, read_image
-from wrt.profiler import KINDS, PICTURES, Profile, profile
-from wrt.rtcore import lanes_busy
-from wrt.rtcore_parameters import GPUS
+from tests.wrt.lab.rtcore.test_profiler import MIRRORS
+from wrt.core.errors import InputError
+from wrt.lab.bench.histogram import bins, histograms
+from wrt.lab.rtcore.model import lanes_busy
+from wrt.lab.rtcore.parameters import GPUS
+from wrt.lab.rtcore.profile_report import model_rows
+from wrt.lab.rtcore.profile_work import GROUPS, warp_order, work_of
+from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
+from wrt.picture.heatmap import colors, heatmap, short, step_of, top_of
+from wrt.picture.image import read_channels, read_image
 
 
 @pytest.fixture(scope="module")

@@ -13,13 +13,13 @@ import warp as wp
 import wrt
 from tests.rewalk import REWALK, rays
 from wrt.accel import ACCELERATORS, Structure
-from wrt.cubin import read_cubin
-from wrt.driver import render_kernel
-from wrt.errors import InputError
-from wrt.features import features_of
-from wrt.kernels.traverse import Units
-from wrt.profiler import COUNTERS, KINDS, PICTURES, Profile, profile
-from wrt.scene import Scene
+from wrt.core.errors import InputError
+from wrt.kernels.traverse.common import Units
+from wrt.lab.rtcore.cubin import read_cubin
+from wrt.lab.rtcore.profiler import COUNTERS, KINDS, PICTURES, Profile, profile
+from wrt.renderer.features import features_of
+from wrt.renderer.renderer import render_kernel
+from wrt.scene.model import Scene
 
 # Left, a matte wall under one lamp; right, two mirrors that face each other with the camera between them.
 MIRRORS = """
@@ -127,7 +127,7 @@ def test_what_a_profile_cannot_do_is_refused(scene: Scene, monkeypatch: pytest.M
     for name in ("aov", "nonsense"):
         with pytest.raises(InputError, match=f"no argument '{name}'"):
             profile(scene, **{name: "depth"})
-    monkeypatch.setattr("wrt.profiler.free_memory", lambda device: 1000.0)
+    monkeypatch.setattr("wrt.lab.rtcore.profiler.free_memory", lambda device: 1000.0)
     with pytest.raises(InputError, match="million rays"):
         profile(scene)
 
@@ -139,7 +139,7 @@ def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None
     modules = {}
     for name in ("whitted", "render"):
         text = without_counting((folder / f"{name}.py").read_text())
-        (tmp_path / f"{name}.py").write_text(text.replace("wrt.kernels.whitted", "wrt.kernels.bare_whitted"))
+        (tmp_path / f"{name}.py").write_text(text.replace("wrt.kernels.shade.whitted", "wrt.kernels.bare_whitted"))
         spec = importlib.util.spec_from_file_location(f"wrt.kernels.bare_{name}", tmp_path / f"{name}.py")
         assert spec is not None and spec.loader is not None and "counting" not in text
         modules[name] = importlib.util.module_from_spec(spec)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wrt.simt import WARP, blocks, by_coherence, efficiency, longest_of, morton, packed
+from wrt.lab.rtcore.warps import WARP, blocks, by_coherence, efficiency, longest_of, morton, packed
 
 
 def test_efficiency_by_hand() -> None:

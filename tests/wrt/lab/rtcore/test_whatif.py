@@ -12,14 +12,14 @@ import pytest
 from tests.command_line import wrt as command
 from tests.kernel_tools import rounded
 from wrt.accel import Geometry, build
-from wrt.bench.whatif import MANY_WARPS, STUDIES, Plan, markdown, rates, rates_markdown, run
-from wrt.bench.whatif_structures import base, quantised, resized, with_planes, with_traversal
-from wrt.errors import InputError
-from wrt.kernels.counters import PRIMITIVE_SPACE
-from wrt.kernels.traverse_bvh2_study import STACK_SIZE, Study
-from wrt.mesh import Mesh
-from wrt.rtcore_parameters import SWEEPS
-from wrt.shapes import icosphere
+from wrt.core.errors import InputError
+from wrt.kernels.study.bvh2_study import STACK_SIZE, Study
+from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.lab.rtcore.parameters import SWEEPS
+from wrt.lab.rtcore.whatif import MANY_WARPS, STUDIES, Plan, markdown, rates, rates_markdown, run
+from wrt.lab.rtcore.whatif_structures import base, quantised, resized, with_planes, with_traversal
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import icosphere
 
 BITS = ("prim_id", "t", "u", "v")
 
@@ -134,7 +134,7 @@ def test_a_study_has_a_row_for_each_variant_and_no_ray_differs(study: str) -> No
 
 
 def test_twice_the_triangles_pay_only_where_triangles_decide(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.bench.whatif.bvhs", lambda: ["bvh2"])
+    monkeypatch.setattr("wrt.lab.rtcore.whatif.bvhs", lambda: ["bvh2"])
     rows = rates(Plan("width", ball, ("primary",), 1024))
     assert len(rows) == len(SWEEPS["boxes"]) * len(SWEEPS["triangles"])
     for row in rows:

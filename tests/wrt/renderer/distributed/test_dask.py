@@ -22,13 +22,15 @@ import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run
 from tests.data import ROOT
-from tests.wrt.test_checkpoint import SCENE, same
-from wrt import cluster, crews, installed
-from wrt.bench import sweep
-from wrt.driver import render
-from wrt.errors import InputError
-from wrt.film import Film
-from wrt.image import read_channels
+from tests.wrt.renderer.test_checkpoint import SCENE, same
+from wrt.core.errors import InputError
+from wrt.lab.bench import sweep
+from wrt.picture.film import Film
+from wrt.picture.image import read_channels
+from wrt.renderer.distributed import dask as cluster
+from wrt.renderer.distributed import installed
+from wrt.renderer.distributed import workers as crews
+from wrt.renderer.renderer import render
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 dask = pytest.importorskip("dask", reason="needs the extra cluster")
@@ -57,7 +59,7 @@ def whole() -> Film:
 
 def dies_in_a_tile(flags: list[str]) -> None:
     """On a worker: one process for each flag is killed while it traces a tile."""
-    from wrt.driver import Renderer
+    from wrt.renderer.renderer import Renderer
 
     trace = Renderer.trace_tile
 
@@ -108,7 +110,7 @@ def threads() -> Iterator[Any]:
 
 def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
     def fails() -> None:
-        from wrt.driver import Renderer
+        from wrt.renderer.renderer import Renderer
 
         def trace_tile(self: Any, work: Any, *rest: Any) -> Any:
             raise ZeroDivisionError("as it happens") if work.first else InputError("not this scene", "a.toml")
@@ -116,7 +118,7 @@ def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
         Renderer.kept, Renderer.trace_tile = Renderer.trace_tile, trace_tile  # type: ignore
 
     def works() -> None:
-        from wrt.driver import Renderer
+        from wrt.renderer.renderer import Renderer
 
         Renderer.trace_tile = Renderer.kept  # type: ignore
 
@@ -131,17 +133,17 @@ def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
 @pytest.mark.parametrize(("change", "said"), [
     (lambda: sys.modules["wrt"].__dict__.update(__version__="0.0.9"), r"worker tcp://.* has wrt 0\.0\.9 \(here "),
     (lambda: sys.modules.update(wrt=None), r"worker tcp://.* has no such wrt \(.*\): wrt .* must be installed there"),  # type: ignore
-    (lambda: sys.modules.update({"wrt.installed": None}), r"worker tcp://.* has no such wrt \(.*wrt\.installed.*\)"),
+    (lambda: sys.modules.update({"wrt.renderer.distributed.installed": None}), r"worker tcp://.* has no such wrt \(.*wrt\.installed.*\)"),
 ])
 def test_a_worker_that_cannot_serve(client: Any, change: Any, said: str) -> None:
     version, first = wrt.__version__, next(iter(client.scheduler_info()["workers"]))
 
     def put_back() -> None:
         if sys.modules["wrt"] is None:
-            sys.modules["wrt"] = sys.modules["wrt.driver"].wrt
+            sys.modules["wrt"] = sys.modules["wrt.renderer.renderer"].wrt
         sys.modules["wrt"].__version__ = version  # type: ignore[attr-defined]
-        if sys.modules.get("wrt.installed", 0) is None:
-            sys.modules["wrt.installed"] = sys.modules["wrt"].installed  # type: ignore[attr-defined]
+        if sys.modules.get("wrt.renderer.distributed.installed", 0) is None:
+            sys.modules["wrt.renderer.distributed.installed"] = sys.modules["wrt"].installed  # type: ignore[attr-defined]
 
     render(SCENE, executor=client, spp=1)
     client.run(change, workers=[first])

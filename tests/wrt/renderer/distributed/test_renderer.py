@@ -22,15 +22,18 @@ import pytest
 
 import wrt
 from tests.data import ROOT
-from tests.wrt.test_checkpoint import SCENE, same
-from wrt import crews, device_scene, profile, spread
-from wrt.animate import Animation, animate
-from wrt.driver import Options, Progress, Renderer, render
-from wrt.errors import InputError, SceneWarning
-from wrt.film import Film
-from wrt.installed import INSTALLED, difference
-from wrt.scene import Material, Object
-from wrt.shapes import box
+from tests.wrt.renderer.test_checkpoint import SCENE, same
+from wrt import profile
+from wrt.core.errors import InputError, SceneWarning
+from wrt.picture.film import Film
+from wrt.renderer import upload as device_scene
+from wrt.renderer.animate import Animation, animate
+from wrt.renderer.distributed import renderer as spread
+from wrt.renderer.distributed import workers as crews
+from wrt.renderer.distributed.installed import INSTALLED, difference
+from wrt.renderer.renderer import Options, Progress, Renderer, render
+from wrt.scene.model import Material, Object
+from wrt.scene.shapes import box
 
 # Fewer pixels than a tile that is worth sending has: a side is asked for.
 HOW: dict[str, Any] = {"tile_size": 16}
@@ -241,11 +244,11 @@ def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
     """A checkout has them beside the package, a wheel in it: the same names and digests, so that both can work together."""
     shutil.copytree(ROOT / "wrt", tmp_path / "wrt", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "kernels", tmp_path / "wrt" / "kernels", ignore=shutil.ignore_patterns("__pycache__"))
-    done = subprocess.run([sys.executable, "-c", "import json, wrt.installed; print(json.dumps(wrt.installed.INSTALLED))"],
+    done = subprocess.run([sys.executable, "-c", "import json, wrt.renderer.distributed.installed; print(json.dumps(wrt.renderer.distributed.installed.INSTALLED))"],
                           cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=True)
     wheel = json.loads(done.stdout)
     assert difference(INSTALLED, wheel) == "" and list(wheel["files"]) == list(INSTALLED["files"])
-    assert {"driver.py", "accel/store.py", "bench/memory.py", "kernels/render.py"} <= INSTALLED["files"].keys()
+    assert {"driver.py", "accel/store.py", "bench/memory.py", "kernels/shade/render.py"} <= INSTALLED["files"].keys()
     assert len(INSTALLED["files"]) == sum(path.suffix in (".py", ".h") for folder in ("wrt", "kernels")
                                           for path in (ROOT / folder).rglob("*"))
 

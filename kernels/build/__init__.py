@@ -1,0 +1,1 @@
+"""Inner loops of the builders that run on the host."""

@@ -1,0 +1,1 @@
+"""The RT core's test units: a ray against a box, a triangle, a sphere, and other bounding volumes."""

@@ -1,0 +1,1 @@
+"""Bounding volume hierarchies: binary and wide, their builders, refit and measures."""

@@ -1,0 +1,1 @@
+"""Structures that split space: uniform grid, octree, k-d tree, BSP tree."""

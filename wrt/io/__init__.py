@@ -1,0 +1,1 @@
+"""Files to meshes and scenes: OBJ, PLY, STL, TOML and glTF."""

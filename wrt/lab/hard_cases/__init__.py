@@ -1,0 +1,1 @@
+"""Rays that are hard to get right, and who gets them right."""

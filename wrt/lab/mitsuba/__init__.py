@@ -1,0 +1,1 @@
+"""The same scene in Mitsuba 3: translated, rendered, compared."""

@@ -1,0 +1,1 @@
+"""What rays cost on an RT core: counters, caches, warps, machine code, and a model of rays a second."""

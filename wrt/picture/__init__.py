@@ -1,0 +1,1 @@
+"""Films and images: files, tone mapping, metrics, heat maps."""

@@ -1,0 +1,1 @@
+"""One picture by several workers: GPUs, executors, a Dask cluster."""

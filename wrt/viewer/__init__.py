@@ -1,0 +1,1 @@
+"""A look around in a scene: in a browser and in notebooks."""
