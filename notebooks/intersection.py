@@ -148,9 +148,9 @@ wrt.side_by_side({f"{name}: {(ids < 0).sum()} lost": palette[ids].reshape(side, 
                  columns=3, scale=4)
 
 # %% [markdown]
-# "exactly" is the oracle: whole numbers decide on which side of an edge a ray passes (`wrt.lab.oracle.oracle`; directions and corners are
-# float32 values, and taken as exact). No test in float32 finds the edges to the last step. But the watertight test leaves no gap:
-# **an edge may lie beside its place, as long as both of its triangles agree on where**.
+# "exactly" is the oracle: whole numbers decide on which side of an edge a ray passes (`wrt.lab.oracle.oracle`; directions and
+# corners are float32 values, and taken as exact). No test in float32 finds the edges to the last step. But the watertight test
+# leaves no gap: **an edge may lie beside its place, as long as both of its triangles agree on where**.
 
 # %%
 for name in TESTS:
@@ -218,8 +218,8 @@ wrt.side_by_side(pictures, columns=1 if QUICK else 2)
 
 # %% [markdown]
 # ## How many, over the hard cases
-# `wrt.lab.hard_cases.cases` has 44 kinds of hard rays, most of them with a proof of what the answer must be: a ray that starts inside
-# a closed surface must hit it. Lost rays of each test:
+# `wrt.lab.hard_cases.cases` has 44 kinds of hard rays, most of them with a proof of what the answer must be: a ray that starts
+# inside a closed surface must hit it. Lost rays of each test:
 
 # %%
 CASES = {"A_origin_vertices": "dense sphere, at vertices", "A_far_uniform": "the same, far from 0",

@@ -46,9 +46,9 @@ wrt.side_by_side({**pictures, **errors}, columns=3)
 
 # %% [markdown]
 # ## How fast does it fall?
-# `wrt.lab.bench.error.sweep` renders with 1, 2, 4 ... samples and several seeds, and holds everything against a reference of its own.
-# From the seeds come error bars; the error is split into noise, which seeds do not share, and bias, which they do. Here with both
-# samplers: random numbers, and scrambled Sobol points, which are spread evenly.
+# `wrt.lab.bench.error.sweep` renders with 1, 2, 4 ... samples and several seeds, and holds everything against a reference of
+# its own. From the seeds come error bars; the error is split into noise, which seeds do not share, and bias, which they do. Here
+# with both samplers: random numbers, and scrambled Sobol points, which are spread evenly.
 
 # %%
 small = room.with_settings(size=SMALL)
@@ -141,9 +141,9 @@ wrt.side_by_side(shown)
 
 # %% [markdown]
 # ## Beneath the picture: how exact is a hit?
-# The oracle (`wrt.lab.oracle.oracle`) answers in float64, and where that is not enough in whole numbers: its $t$ is exact to 14 digits.
-# Held against it, the error of each triangle test's $t$ in float32 steps (ulp) of $t$, over rays that start on hills into all
-# directions.
+# The oracle (`wrt.lab.oracle.oracle`) answers in float64, and where that is not enough in whole numbers: its $t$ is exact to 14
+# digits. Held against it, the error of each triangle test's $t$ in float32 steps (ulp) of $t$, over rays that start on hills into
+# all directions.
 
 # %%
 hills = terrain(40 if QUICK else 150)

@@ -164,7 +164,7 @@ def test_a_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path: Pat
     if words[0] == "profile":
         Path(words[1]).write_text(MIRRORS, encoding="utf-8")  # the kernel that counts its rays serves other tests too
     if "--cluster" in words or any("cuda" in word for word in words):
-        pytest.skip("tests/wrt/renderer/distributed/test_dask.py runs it where there is a scheduler; two GPUs are not needed for a test")
+        pytest.skip("test_dask.py runs it where there is a scheduler; two GPUs are not needed for a test")
     result = run(*words)
     assert result.code == 0, result.err
 

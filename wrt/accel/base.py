@@ -405,7 +405,8 @@ class Accelerator(ABC):
         raise InputError(f"a {self.name} has no end-point overlap: it is no hierarchy of boxes")
 
     def epo(self) -> float:
-        """End-point overlap of a BVH: nodes and primitives visited for nothing at a random point of the surface (wrt.accel.bvh.epo).
+        """End-point overlap of a BVH: nodes and primitives visited for nothing at a random point of the surface
+        (wrt.accel.bvh.epo).
 
         It tells of rays that end, as stats.sah_cost does of lines that nothing stops; it takes about as long as a build. Raises
         InputError for structures that are no BVH.

@@ -1,7 +1,7 @@
 """Long renders that survive: the film in a file, written aside, brought to the disk and renamed, so that the file is always whole.
 
-A checkpoint is a checked file (wrt.core.checked_file): who made it (IDENTITY: everything that can change a pixel), how far it is, and
-the film's arrays. How many samples each pixel has is one of them: rendering goes on from any state in which each pixel is done
+A checkpoint is a checked file (wrt.core.checked_file): who made it (IDENTITY: everything that can change a pixel), how far it is,
+and the film's arrays. How many samples each pixel has is one of them: rendering goes on from any state in which each pixel is done
 whole. Beside the file lies `.NAME.part`, which is locked while a render runs, and holds the room that the next one needs. The
 header's first entry tells on which system it is written, by which a part that a killed render left is known (wrt.core.write_file).
 """

@@ -64,8 +64,8 @@ class Options:
 
     target_error: stop when the estimated error of the picture is no larger: the root mean square, over its pixels and
     channels, of the standard error in linear radiance. It is noise alone: what max_depth and min_throughput cut off is not
-    in it. A pixel's samples are then split over GROUPS independent sequences (wrt.renderer.film_arrays), and spp is the most to take
-    (rounded down to a multiple of GROUPS; one a group at least). The estimate is looked at when a group has 1, 2, 4, 8 ...
+    in it. A pixel's samples are then split over GROUPS independent sequences (wrt.renderer.film_arrays), and spp is the most to
+    take (rounded down to a multiple of GROUPS; one a group at least). The estimate is looked at when a group has 1, 2, 4, 8 ...
     samples: only then is its sequence as even as it can be.
 
     checkpoint: a file that the work so far is written to every `checkpoint_every` seconds, and when a render ends early or is

@@ -134,7 +134,7 @@ class Renderer:
         return structure
 
     def _film_device(self) -> Any:
-        if self.options.executor is not None or self.options.devices is not None:  # wrt.renderer.distributed.renderer's renderer takes them
+        if self.options.executor is not None or self.options.devices is not None:  # SpreadRenderer takes them
             raise InputError("an executor or several devices are for wrt.render; this runs on one device")
         return start(self.options.device)
 
@@ -428,7 +428,7 @@ class Renderer:
         self._each_tile([Work(tile, 0, 1) for tile in self._tiles()], trace, lambda done: None)
         return {name: film.picture(name) for name in self.options.aov}
 
-    # --- for tiles that are traced elsewhere (wrt.renderer.distributed.renderer) --------------------------------------------------------------
+    # --- for tiles that are traced elsewhere (wrt.renderer.distributed.renderer) ---
 
     def facts(self) -> dict[str, Any]:
         """What is told of the scene and its structure: counts, and seconds of making them ready."""

@@ -1,4 +1,4 @@
-"""Shadow rays through what lets light through, by pictures whose answer is known; tests/wrt/renderer/test_tinted_shadows.py has more."""
+"""Shadow rays through what lets light through, by pictures whose answer is known; renderer/test_tinted_shadows.py has more."""
 
 import numpy as np
 import pytest

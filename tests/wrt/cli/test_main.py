@@ -381,7 +381,8 @@ def test_ctrl_c_while_saving_waits_for_the_file(name: str, monkeypatch: pytest.M
     assert np.array_equal(read_image(name), read_image(f"expected-{name}"))
 
 
-@pytest.mark.parametrize("where", ["wrt.io.load.load_scene", "wrt.renderer.renderer.upload_scene", "wrt.renderer.renderer.Renderer._aovs"])
+@pytest.mark.parametrize("where", ["wrt.io.load.load_scene", "wrt.renderer.renderer.upload_scene",
+                                   "wrt.renderer.renderer.Renderer._aovs"])
 def test_ctrl_c_before_the_first_sample_leaves_everything_as_it_was(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("box.png").write_bytes(b"old")
     monkeypatch.setattr(where, lambda *arguments: signal.raise_signal(signal.SIGINT) or {})

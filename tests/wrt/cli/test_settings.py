@@ -153,8 +153,8 @@ def test_the_other_commands_that_render_take_settings(monkeypatch: pytest.Monkey
         seen.append(scene.settings)
         raise wrt.InputError("seen")
 
-    for place in ("wrt.renderer.animate.animate", "wrt.lab.rtcore.profiler.profile", "wrt.lab.bench.error.sweep", "wrt.lab.mitsuba.equal_error.run",
-                  "wrt.viewer.page.Page"):
+    for place in ("wrt.renderer.animate.animate", "wrt.lab.rtcore.profiler.profile", "wrt.lab.bench.error.sweep",
+                  "wrt.lab.mitsuba.equal_error.run", "wrt.viewer.page.Page"):
         module, name = place.rsplit(".", 1)
         monkeypatch.setattr(importlib.import_module(module), name, stop)
     commands = [("animate", "box.obj", "-o", "a.gif"), ("profile", "box.obj"), ("bench", "error", "box.obj"),

@@ -30,9 +30,9 @@ def aligned(array: np.ndarray) -> np.ndarray:
 
 
 class WideBvh(Accelerator):
-    """Options: builder (of the binary tree, a name in wrt.accel.bvh.builders.BVH_BUILDERS), max_leaf (1 to 64 primitives; by default
-    as many as a row has lanes), cost_traversal and cost_intersection (of one node visited and of one row of primitives tested),
-    split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
+    """Options: builder (of the binary tree, a name in wrt.accel.bvh.builders.BVH_BUILDERS), max_leaf (1 to 64 primitives; by
+    default as many as a row has lanes), cost_traversal and cost_intersection (of one node visited and of one row of primitives
+    tested), split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
 
     width: ClassVar[int]
     compressed: ClassVar[bool] = False

@@ -38,8 +38,8 @@ SAME = 0.25  # of the squared error compared at: a squared bias beyond it means 
 @dataclass(frozen=True)
 class Plan:
     """spp: wrt's samples. repeats: pictures of each. reference_spp: of each of its seeds (None: 8 spp). rival_seconds: no
-    picture of Mitsuba's takes longer. integrator: Mitsuba's, see wrt.lab.mitsuba.translate. variants: Mitsuba's. starts: how often a
-    whole process is timed (0: not at all). Raises InputError."""
+    picture of Mitsuba's takes longer. integrator: Mitsuba's, see wrt.lab.mitsuba.translate. variants: Mitsuba's. starts: how
+    often a whole process is timed (0: not at all). Raises InputError."""
 
     spp: int = 64
     repeats: int = 7

@@ -133,7 +133,8 @@ def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
 @pytest.mark.parametrize(("change", "said"), [
     (lambda: sys.modules["wrt"].__dict__.update(__version__="0.0.9"), r"worker tcp://.* has wrt 0\.0\.9 \(here "),
     (lambda: sys.modules.update(wrt=None), r"worker tcp://.* has no such wrt \(.*\): wrt .* must be installed there"),  # type: ignore
-    (lambda: sys.modules.update({"wrt.renderer.distributed.installed": None}), r"worker tcp://.* has no such wrt \(.*wrt\.installed.*\)"),
+    (lambda: sys.modules.update({"wrt.renderer.distributed.installed": None}),
+     r"worker tcp://.* has no such wrt \(.*distributed\.installed.*\)"),
 ])
 def test_a_worker_that_cannot_serve(client: Any, change: Any, said: str) -> None:
     version, first = wrt.__version__, next(iter(client.scheduler_info()["workers"]))

@@ -244,7 +244,8 @@ def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
     """A checkout has them beside the package, a wheel in it: the same names and digests, so that both can work together."""
     shutil.copytree(ROOT / "wrt", tmp_path / "wrt", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "kernels", tmp_path / "wrt" / "kernels", ignore=shutil.ignore_patterns("__pycache__"))
-    done = subprocess.run([sys.executable, "-c", "import json, wrt.renderer.distributed.installed; print(json.dumps(wrt.renderer.distributed.installed.INSTALLED))"],
+    code = "import json; from wrt.renderer.distributed.installed import INSTALLED; print(json.dumps(INSTALLED))"
+    done = subprocess.run([sys.executable, "-c", code],
                           cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=True)
     wheel = json.loads(done.stdout)
     assert difference(INSTALLED, wheel) == "" and list(wheel["files"]) == list(INSTALLED["files"])
