@@ -92,6 +92,8 @@ _find_kernels()
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
+        if _HOME[name] != "wrt.core.errors":
+            importlib.import_module("wrt.core.address_space").require_modules()
         value = getattr(importlib.import_module(_HOME[name]), name)
         globals()[name] = value
         return value
