@@ -137,7 +137,7 @@ class Texture:
 
 @wp.struct
 class Material:
-    """As wrt.scene.model.Material; textures are indices, -1 for none."""
+    """As wrt.scene.materials.Material; textures are indices, -1 for none."""
 
     kind: int
     albedo: wp.vec3

@@ -28,23 +28,23 @@ if TYPE_CHECKING:
     from wrt.renderer.options import Progress as Progress
     from wrt.renderer.pixel_rays import camera_rays as camera_rays
     from wrt.renderer.renderer import render as render
+    from wrt.scene.backgrounds import ConstantBackground as ConstantBackground
+    from wrt.scene.backgrounds import EnvironmentBackground as EnvironmentBackground
+    from wrt.scene.backgrounds import GradientBackground as GradientBackground
+    from wrt.scene.cameras import Camera as Camera
+    from wrt.scene.lights import DirectionalLight as DirectionalLight
+    from wrt.scene.lights import PointLight as PointLight
+    from wrt.scene.lights import SpotLight as SpotLight
+    from wrt.scene.materials import Checkerboard as Checkerboard
+    from wrt.scene.materials import Material as Material
+    from wrt.scene.materials import Texture as Texture
     from wrt.scene.mesh import Mesh as Mesh
     from wrt.scene.mesh import load_mesh as load_mesh
-    from wrt.scene.model import Camera as Camera
-    from wrt.scene.model import Checkerboard as Checkerboard
-    from wrt.scene.model import ConstantBackground as ConstantBackground
-    from wrt.scene.model import DirectionalLight as DirectionalLight
-    from wrt.scene.model import EnvironmentBackground as EnvironmentBackground
-    from wrt.scene.model import GradientBackground as GradientBackground
-    from wrt.scene.model import Material as Material
     from wrt.scene.model import Object as Object
-    from wrt.scene.model import PointLight as PointLight
     from wrt.scene.model import Scene as Scene
-    from wrt.scene.model import Settings as Settings
     from wrt.scene.model import Sphere as Sphere
-    from wrt.scene.model import SpotLight as SpotLight
-    from wrt.scene.model import Texture as Texture
     from wrt.scene.motion import Motion as Motion
+    from wrt.scene.settings import Settings as Settings
     from wrt.viewer.notebook import LiveView as LiveView
     from wrt.viewer.notebook import side_by_side as side_by_side
 
@@ -61,11 +61,14 @@ _PUBLIC = {
     "wrt.renderer.options": ("Options", "Progress"),
     "wrt.renderer.pixel_rays": ("camera_rays",),
     "wrt.renderer.renderer": ("render",),
+    "wrt.scene.backgrounds": ("ConstantBackground", "EnvironmentBackground", "GradientBackground"),
+    "wrt.scene.cameras": ("Camera",),
+    "wrt.scene.lights": ("DirectionalLight", "PointLight", "SpotLight"),
+    "wrt.scene.materials": ("Checkerboard", "Material", "Texture"),
     "wrt.scene.mesh": ("Mesh", "load_mesh"),
-    "wrt.scene.model": ("Camera", "Checkerboard", "ConstantBackground", "DirectionalLight", "EnvironmentBackground",
-                        "GradientBackground", "Material", "Object", "PointLight", "Scene", "Settings", "Sphere", "SpotLight",
-                        "Texture"),
+    "wrt.scene.model": ("Object", "Scene", "Sphere"),
     "wrt.scene.motion": ("Motion",),
+    "wrt.scene.settings": ("Settings",),
     "wrt.viewer.notebook": ("LiveView", "side_by_side"),
 }
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names}

@@ -332,7 +332,7 @@ def checkpoint_of(path: Path, groups: int) -> tuple[Any, Any]:
     from wrt.core.device import start
     from wrt.renderer.checkpoint import Checkpoint
     from wrt.renderer.film_arrays import DeviceFilm
-    from wrt.scene.model import Settings
+    from wrt.scene.settings import Settings
 
     film = DeviceFilm(Settings(size=(6, 4)), (0, 0, 6, 4), start("cpu"), 0, groups)
     return film, Checkpoint(path, 60.0, {**IDENTITY, "groups": groups}, area=24, groups=groups, resume=True)
@@ -383,7 +383,7 @@ def render_scene(path: Path) -> object:
 
     from wrt.renderer import renderer as driver
     from wrt.renderer.features import STACK_STEP, Features
-    from wrt.scene.model import EnvironmentBackground
+    from wrt.scene.backgrounds import EnvironmentBackground
 
     scene = load_scene_with_normals(path)
     environment = isinstance(scene.background, EnvironmentBackground)

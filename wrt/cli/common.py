@@ -140,7 +140,7 @@ class SceneSetting(Setting):
 
     def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[Any]:
         from wrt.io.toml.report import setting_choices
-        from wrt.scene.model import SETTINGS
+        from wrt.scene.settings import SETTINGS
 
         name, sign, _ = incomplete.partition("=")
         words = [f"{name}={value}" for value in setting_choices(name)] if sign else [f"{each}=" for each in SETTINGS]
@@ -186,7 +186,7 @@ def _plain(value: Any) -> Any:
 
 def depth_hint(visibly_cut: float, max_depth: int, option: str = "--max-depth") -> str | None:
     """A line for who may want more bounces: where so many pixels lack light visibly (Film.stats) that somebody would see them."""
-    from wrt.scene.model import MAX_DEPTH
+    from wrt.scene.settings import MAX_DEPTH
 
     if visibly_cut < SEEN:
         return None

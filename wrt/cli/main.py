@@ -80,16 +80,16 @@ cli.add_command(view)
 @click.option("--camera", help="A camera's name or number  [default: the first]")
 @click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's, 8]")
 @click.option("--min-throughput", type=float, help="Cut rays that carry less than this share  [default: 0.001]")
-@click.option("--filter", "filter_name", type=OneOf("wrt.scene.model:FILTERS"), help="Pixel filter")
-@click.option("--fresnel", type=OneOf("wrt.scene.model:FRESNELS"), help="exact, or schlick (cheaper, approximate)")
-@click.option("--sampler", type=OneOf("wrt.scene.model:SAMPLERS"), help="sobol (evenly spread), or independent (random)")
+@click.option("--filter", "filter_name", type=OneOf("wrt.scene.settings:FILTERS"), help="Pixel filter")
+@click.option("--fresnel", type=OneOf("wrt.scene.settings:FRESNELS"), help="exact, or schlick (cheaper, approximate)")
+@click.option("--sampler", type=OneOf("wrt.scene.settings:SAMPLERS"), help="sobol (evenly spread), or independent (random)")
 @SET
 @click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
 @click.option("--instancing", type=OneOf("wrt.renderer.instancing:INSTANCING"), default="auto", show_default=True,
               help="Keep shared meshes once: auto (large ones), always or never")
 @click.option("--aov", type=Names(), default=(), help="Also depth, normal, albedo, prim_id, material_id")
 @click.option("--bits", type=int, help="PNG: 8 or 16; EXR: 16 or 32")
-@click.option("--tonemap", type=OneOf("wrt.scene.model:TONEMAPS"), help="Curve from linear to display  [default: the scene's]")
+@click.option("--tonemap", type=OneOf("wrt.scene.settings:TONEMAPS"), help="Curve from linear to display  [default: the scene's]")
 @click.option("--exposure", type=float, help="Stops  [default: the scene's, 0]")
 @click.option("--time-limit", type=Duration(), help="Stop after 30s, 5m, 1h of tracing, with what there is")
 @click.option("--target-error", type=float,
@@ -256,7 +256,7 @@ def validate(scenes: tuple[Path, ...]) -> None:
 @click.option("--max-relmse", type=float, help="Fail above this relative mean squared error")
 @click.option("--min-psnr", type=float, help="Fail below this many dB")
 @click.option("--max-flip", type=float, help="Fail above this mean FLIP error")
-@click.option("--tonemap", type=OneOf("wrt.scene.model:TONEMAPS"), default="none", show_default=True,
+@click.option("--tonemap", type=OneOf("wrt.scene.settings:TONEMAPS"), default="none", show_default=True,
               help="For PSNR and FLIP, which see what a display shows")
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, likewise")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
@@ -264,7 +264,7 @@ def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float
     """Measure the error of picture A against the reference B."""
     from wrt.picture import metrics
     from wrt.picture.image import check_writable, picture_size, read_image, write_codes
-    from wrt.scene.model import Settings
+    from wrt.scene.settings import Settings
 
     Settings(tonemap=tonemap, exposure=exposure)  # told before the pictures are read
     if output is not None:

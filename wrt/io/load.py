@@ -18,8 +18,9 @@ from wrt.core.files import read_file, require_file
 from wrt.core.memory import require
 from wrt.io.toml.limits import look_at
 from wrt.scene.defaults import stage
+from wrt.scene.materials import Material
 from wrt.scene.mesh import READERS, Mesh, load_mesh
-from wrt.scene.model import Material, Object, Scene
+from wrt.scene.model import Object, Scene
 
 BYTES_OF_TOML = 5.0  # of memory for a byte of the file: itself, and a character
 # Of memory, at most, measured: of a table that is checked and becomes an object, and of an array or a value.

@@ -21,8 +21,10 @@ from wrt.picture.film import Film
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
 from wrt.renderer.upload import upload_scene
-from wrt.scene.model import Camera, Scene, as_number
+from wrt.scene.cameras import Camera
+from wrt.scene.model import Scene
 from wrt.scene.motion import moves, scene_at
+from wrt.scene.values import as_number
 
 REBUILD_AT = 1.5  # growth of the SAH cost by refits (docs/acceleration.md, "Moving meshes")
 MOVIES = {".gif": "GIF", ".png": "PNG", ".apng": "PNG"}

@@ -10,19 +10,11 @@ from typing import Any
 import numpy as np
 
 from wrt.renderer.instancing import instanced_meshes
-from wrt.scene.model import (
-    Camera,
-    Checkerboard,
-    ConstantBackground,
-    DirectionalLight,
-    EnvironmentBackground,
-    GradientBackground,
-    Material,
-    PointLight,
-    Scene,
-    SpotLight,
-    Texture,
-)
+from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import Checkerboard, Material, Texture
+from wrt.scene.model import Scene
 
 STACK_STEP = 16
 

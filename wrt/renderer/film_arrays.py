@@ -11,7 +11,7 @@ import warp as wp
 from wrt.core.device import upload
 from wrt.kernels import structs
 from wrt.renderer.features import filter_icdf
-from wrt.scene.model import Settings
+from wrt.scene.settings import Settings
 
 # Independent sequences a pixel where the error is asked for. Over a picture, four tell the error as well as eight do (what they
 # miss is averaged over the pixels), and long sequences are better than many: eight have up to 1.4 times the error of four.

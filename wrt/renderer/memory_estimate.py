@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from wrt.accel.base import Accelerator
 from wrt.renderer.instancing import instanced_meshes, is_instance
-from wrt.scene.model import EnvironmentBackground, Scene, Texture
+from wrt.scene.backgrounds import EnvironmentBackground
+from wrt.scene.materials import Texture
+from wrt.scene.model import Scene
 
 BYTES_OF_FACE, BYTES_OF_VERTEX = 55.0, 60.0  # of a mesh in the world: joined, turned and uploaded
 BYTES_OF_EMITTER = 120.0  # of a triangle that lights others, beside that

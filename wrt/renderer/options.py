@@ -18,7 +18,7 @@ from wrt.core.device import start, thread_count
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.renderer.instancing import INSTANCING
-from wrt.scene.model import Camera
+from wrt.scene.cameras import Camera
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from wrt.core.checks import as_one, as_size
-from wrt.scene.model import Camera
+from wrt.scene.cameras import Camera
 
 
 def camera_rays(camera: Camera, size: tuple[int, int] | str) -> tuple[np.ndarray, np.ndarray]:

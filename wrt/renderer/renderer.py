@@ -39,9 +39,11 @@ from wrt.renderer.options import AOVS as AOVS
 from wrt.renderer.options import OPTIONS, Options, Progress
 from wrt.renderer.tiles import Rectangle, Work, corners, tiles, work_left
 from wrt.renderer.upload import camera_struct, upload_scene
+from wrt.scene.cameras import Camera
 from wrt.scene.digest import camera_digest, scene_digest
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import SETTINGS, Camera, Scene
+from wrt.scene.model import Scene
+from wrt.scene.settings import SETTINGS
 
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
 TILE_SIZE = 32

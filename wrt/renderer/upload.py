@@ -15,20 +15,11 @@ from wrt.core.errors import InputError, SceneWarning
 from wrt.kernels import structs
 from wrt.kernels.shade import lights, textures
 from wrt.renderer.flatten import Placed, World, world_of
-from wrt.scene.model import (
-    ALPHA_MODES,
-    MATERIAL_KINDS,
-    Camera,
-    Checkerboard,
-    ConstantBackground,
-    DirectionalLight,
-    GradientBackground,
-    Material,
-    PointLight,
-    Scene,
-    SpotLight,
-    Texture,
-)
+from wrt.scene.backgrounds import ConstantBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import ALPHA_MODES, MATERIAL_KINDS, Checkerboard, Material, Texture
+from wrt.scene.model import Scene
 from wrt.scene.size import require_size
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])

@@ -7,8 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from wrt.scene.model import BLACK, SMALLEST, Camera, ConstantBackground, DirectionalLight, GradientBackground, Scene
+from wrt.scene.backgrounds import ConstantBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight
+from wrt.scene.model import Scene
 from wrt.scene.size import require_size
+from wrt.scene.values import BLACK, SMALLEST
 
 FOV_Y = math.radians(40.0)
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # from the scene to the camera: glTF's front is +z, its up +y

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from wrt.scene.cameras import Camera
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Camera, Object, Scene
+from wrt.scene.model import Object, Scene
 
 # What of them changes no pixel, beside names.
 NO_PIXEL = {Scene: ("cameras", "settings"), Mesh: ("groups", "face_group", "dropped"), Object: ("motion",)}

@@ -10,13 +10,18 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.scene import model as scenes
+from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
+from wrt.scene.settings import Settings
 
 KINDS = {kind.__name__: kind for kind in (
-    Scene, scenes.Settings, scenes.Camera, Object, Mesh, scenes.Sphere, scenes.Material, scenes.Texture, scenes.Checkerboard,
-    scenes.PointLight, scenes.DirectionalLight, scenes.SpotLight, scenes.ConstantBackground, scenes.GradientBackground,
-    scenes.EnvironmentBackground)}
+    Scene, Settings, Camera, Object, Mesh, scenes.Sphere, Material, Texture, Checkerboard,
+    PointLight, DirectionalLight, SpotLight, ConstantBackground, GradientBackground,
+    EnvironmentBackground)}
 LEFT_OUT: dict[type, tuple[str, ...]] = {Object: ("motion",)}  # a picture shows the object without
 
 

@@ -12,7 +12,7 @@ from wrt.core.errors import InputError
 from wrt.core.memory import require
 from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import as_number, as_vector
+from wrt.scene.values import as_number, as_vector
 
 Point = Sequence[float] | np.ndarray
 BYTES_OF_FACE = 190.0  # of memory while a shape is made, measured

@@ -8,7 +8,9 @@ import numpy as np
 
 from wrt.core.checks import at_thing
 from wrt.core.errors import InputError
-from wrt.scene.model import SMALLEST, DirectionalLight, Scene
+from wrt.scene.lights import DirectionalLight
+from wrt.scene.model import Scene
+from wrt.scene.values import SMALLEST
 
 # Where a light has a place in the scene, the square of its distance counts, which is a float32 with all its digits from 2^-63
 # (1.1e-19) on. So in the smallest scene all is lit rightly that is farther from the light than its ten-thousandth part.

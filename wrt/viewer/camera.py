@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from wrt.scene.cameras import Camera
 from wrt.scene.defaults import bounding_sphere
-from wrt.scene.model import Camera, Scene
+from wrt.scene.model import Scene
 
 PARALLEL = 0.999  # cosine from which on +y is no up any more
 LEVEL = 1e-6  # how far a camera's x axis may be from level to count as upright

@@ -21,7 +21,9 @@ from wrt.picture.film import Film
 from wrt.picture.heatmap import colors, short
 from wrt.picture.image import encode_png
 from wrt.renderer.options import Options
-from wrt.scene.model import TONEMAPS, Camera, Scene
+from wrt.scene.cameras import Camera
+from wrt.scene.model import Scene
+from wrt.scene.settings import TONEMAPS
 from wrt.viewer.access import access_for
 from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
 from wrt.viewer.refine import COSTS, Shown, Viewer

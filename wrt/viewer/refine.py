@@ -23,8 +23,9 @@ from wrt.renderer.options import Options, Progress
 from wrt.renderer.progress import COMPILING
 from wrt.renderer.renderer import Renderer
 from wrt.renderer.upload import camera_struct
+from wrt.scene.cameras import Camera
 from wrt.scene.digest import camera_digest
-from wrt.scene.model import Camera, Scene
+from wrt.scene.model import Scene
 
 COARSE = 0.08  # seconds that the first picture after a change should take
 PATIENCE = 0.5  # seconds after which it is given up, where the next change is waiting

@@ -12,7 +12,7 @@ from wrt.kernels.shade.camera import make_camera_ray
 from wrt.kernels.structs import Camera as DeviceCamera
 from wrt.kernels.structs import Ray, kernel
 from wrt.renderer.upload import camera_struct
-from wrt.scene.model import Camera
+from wrt.scene.cameras import Camera
 
 
 @cache

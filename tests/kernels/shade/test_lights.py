@@ -22,19 +22,10 @@ from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Background, Lighting, Ray, Surfaces, kernel
 from wrt.renderer.features import Features
 from wrt.renderer.upload import upload_scene
+from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground, Object, Scene, Sphere
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import (
-    ConstantBackground,
-    DirectionalLight,
-    EnvironmentBackground,
-    GradientBackground,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Sphere,
-    SpotLight,
-)
 from wrt.scene.shapes import icosphere, quad
 
 ALL_LIGHTS = Features(lights=True, point_lights=True, directional_lights=True, spot_lights=True, mesh_lights=True,
@@ -316,7 +307,7 @@ def radiance_of(background, direction):
 
 
 def bilinear(background, direction):
-    """The look-up by its definition in wrt.scene.model, float64: middle column along -z, columns run towards +x, row 0 up."""
+    """The look-up by its definition in wrt.scene.backgrounds, float64: middle column along -z, columns run towards +x, row 0 up."""
     image = background.image.astype(np.float64)
     height, width = image.shape[:2]
     c, s = np.cos(-background.rotation), np.sin(-background.rotation)

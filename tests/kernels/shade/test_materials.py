@@ -23,7 +23,7 @@ from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import kernel
 from wrt.renderer.features import Features
 from wrt.renderer.upload import TextureTable, material_records
-from wrt.scene.model import CONDUCTORS, MATERIAL_KINDS, Material
+from wrt.scene.materials import CONDUCTORS, MATERIAL_KINDS, Material
 
 
 @kernel

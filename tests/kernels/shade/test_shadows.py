@@ -5,8 +5,13 @@ import pytest
 
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT
 from wrt.renderer.renderer import render
-from wrt.scene.model import Camera, Color, DirectionalLight, Material, Object, PointLight, Scene, Settings
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
+from wrt.scene.values import Color
 
 ONE: Color = (1.0, 1.0, 1.0)
 WHITE = Material(albedo=ONE)

@@ -13,8 +13,9 @@ from wrt.kernels.shade.surface import Surface, make_surface_at, next_away, spawn
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 from wrt.renderer.flatten import world_mesh
 from wrt.renderer.upload import upload_scene
+from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Material, Object, Scene, Sphere
+from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import icosphere
 
 

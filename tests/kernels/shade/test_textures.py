@@ -13,7 +13,7 @@ from wrt.kernels import structs
 from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.renderer.upload import TextureTable, srgb_table
-from wrt.scene.model import Checkerboard, Texture
+from wrt.scene.materials import Checkerboard, Texture
 
 
 @cache

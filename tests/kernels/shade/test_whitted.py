@@ -9,21 +9,13 @@ import pytest
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT
 from wrt.kernels.shade.whitted import MAX_RAYS
 from wrt.renderer.renderer import Options, Renderer, render
+from wrt.scene.backgrounds import ConstantBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import Checkerboard, Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import (
-    Camera,
-    Checkerboard,
-    ConstantBackground,
-    DirectionalLight,
-    GradientBackground,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Settings,
-    Sphere,
-    SpotLight,
-)
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, icosphere, quad
 
 ONE = (1.0, 1.0, 1.0)

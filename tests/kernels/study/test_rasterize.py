@@ -13,8 +13,8 @@ from wrt.kernels.structs import kernel
 from wrt.kernels.study import rasterize as kernels
 from wrt.lab.bench.rasterizer import NOTHING, Rasterizer, directions_from_pixels, primary_rays_kernel, view_struct
 from wrt.renderer.upload import camera_struct
+from wrt.scene.cameras import Camera
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Camera
 from wrt.scene.shapes import box, icosphere
 
 import warp as wp  # isort: skip

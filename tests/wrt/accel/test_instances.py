@@ -25,8 +25,12 @@ from wrt.lab.bench.visibility_check import compare
 from wrt.picture.film import Film
 from wrt.renderer.flatten import world_mesh
 from wrt.renderer.upload import upload_scene
+from wrt.scene.backgrounds import ConstantBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.materials import Material, Texture
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Camera, ConstantBackground, Material, Object, Scene, Settings, Sphere, Texture
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import icosphere, quad
 from wrt.scene.vertex_normals import smooth
 

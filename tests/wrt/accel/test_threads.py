@@ -20,7 +20,10 @@ from wrt.accel.store import array_types
 from wrt.core.device import load_kernel, made_once, start
 from wrt.core.errors import InputError
 from wrt.kernels.structs import kernel
-from wrt.scene.model import Camera, Material, Object, PointLight, Scene
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import PointLight
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import icosphere
 
 BALL = icosphere(3)

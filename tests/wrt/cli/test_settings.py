@@ -25,19 +25,11 @@ from wrt.cli.main import cli
 from wrt.io.toml.report import setting_choices
 from wrt.picture.image import read_image
 from wrt.renderer.film_arrays import GROUPS, VISIBLE
-from wrt.scene.model import (
-    FILTERS,
-    FRESNELS,
-    GLASS_SHADOWS,
-    MAX_DEPTH,
-    SETTINGS,
-    Camera,
-    ConstantBackground,
-    Material,
-    Object,
-    Scene,
-    Settings,
-)
+from wrt.scene.backgrounds import ConstantBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene
+from wrt.scene.settings import FILTERS, FRESNELS, GLASS_SHADOWS, MAX_DEPTH, SETTINGS, Settings
 from wrt.scene.shapes import quad
 
 SMALL = ("--size", "32x18", "--spp", 2)

@@ -14,18 +14,13 @@ from wrt.core.errors import InputError, SceneWarning
 from wrt.io.load import load_scene
 from wrt.picture.film import Film
 from wrt.renderer.renderer import render
+from wrt.scene.backgrounds import EnvironmentBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import PointLight
+from wrt.scene.materials import Material, Texture
 from wrt.scene.mesh import Mesh, load_mesh
-from wrt.scene.model import (
-    Camera,
-    EnvironmentBackground,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Settings,
-    Sphere,
-    Texture,
-)
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, icosphere, quad
 
 GREY = Material(name="grey")

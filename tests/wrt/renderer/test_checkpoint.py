@@ -23,7 +23,12 @@ from wrt.picture.film import Film
 from wrt.renderer import checkpoint as module
 from wrt.renderer.checkpoint import MAGIC, Checkpoint, read
 from wrt.renderer.renderer import Options, Progress, Renderer, render
-from wrt.scene.model import Camera, DirectionalLight, GradientBackground, Material, Object, Scene, Settings
+from wrt.scene.backgrounds import GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 
 # The features are those of test_driver.py's scene: its kernel serves.

@@ -13,20 +13,14 @@ import pytest
 
 import wrt
 from tests.data import ROOT
-from wrt.scene.model import (
-    Camera,
-    Color,
-    ConstantBackground,
-    DirectionalLight,
-    GradientBackground,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Settings,
-    Sphere,
-)
+from wrt.scene.backgrounds import ConstantBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, icosphere, quad, torus
+from wrt.scene.values import Color
 
 N = 1.5
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)

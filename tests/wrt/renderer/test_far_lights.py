@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 import wrt
-from wrt.scene.model import Camera, Material, Object, Scene, Settings, Sphere
+from wrt.scene.cameras import Camera
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import icosphere, quad
 
 EMITTER = Material(albedo=(0, 0, 0), emission=(1, 1, 1))

@@ -11,23 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wrt.renderer.features import STACK_STEP, Features, describe, features_of, filter_icdf
-from wrt.scene.model import (
-    FILTERS,
-    Camera,
-    Checkerboard,
-    ConstantBackground,
-    DirectionalLight,
-    EnvironmentBackground,
-    GradientBackground,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Settings,
-    Sphere,
-    SpotLight,
-    Texture,
-)
+from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import Checkerboard, Material, Texture
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import FILTERS, Settings
 from wrt.scene.shapes import icosphere, quad
 
 PICTURE = Texture(np.zeros((2, 2, 4), np.uint8))

@@ -7,8 +7,9 @@ import pytest
 
 from wrt.renderer.flatten import instanced_world, world_mesh, world_of
 from wrt.renderer.instancing import INSTANCING, MIN_SAVED, instanced_meshes
+from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Material, Object, Scene, Sphere
+from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import box, icosphere, quad, torus
 
 RED, GREEN, BLUE, GREY = (Material(name=name) for name in ("red", "green", "blue", "grey"))

@@ -17,7 +17,11 @@ from wrt.core.errors import InputError
 from wrt.renderer.memory_estimate import BYTES_OF_SKY, BYTES_OF_TEXEL, bytes_of_scene
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer, render
-from wrt.scene.model import Camera, EnvironmentBackground, Material, Object, PointLight, Scene, Texture
+from wrt.scene.backgrounds import EnvironmentBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import PointLight
+from wrt.scene.materials import Material, Texture
+from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import icosphere
 
 BALL = icosphere(3)

@@ -21,19 +21,13 @@ from wrt.io.load import load_scene
 from wrt.picture.film import Film
 from wrt.renderer import renderer as driver
 from wrt.renderer.renderer import MAX_PASS, Options, Progress, Renderer, plain_text, render
+from wrt.scene.backgrounds import EnvironmentBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight
+from wrt.scene.materials import Checkerboard, Material
 from wrt.scene.mesh import load_mesh
-from wrt.scene.model import (
-    Camera,
-    Checkerboard,
-    DirectionalLight,
-    EnvironmentBackground,
-    GradientBackground,
-    Material,
-    Object,
-    Scene,
-    Settings,
-    Sphere,
-)
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 
 SIZE = (37, 22)  # no multiple of any tile

@@ -17,7 +17,10 @@ from wrt.picture.film import aov_to_srgb8
 from wrt.picture.image import read_channels
 from wrt.renderer.film_arrays import GROUPS
 from wrt.renderer.renderer import MAX_SPP, Options, Renderer, render
-from wrt.scene.model import Camera, Material, Object, Scene, Settings, Sphere
+from wrt.scene.cameras import Camera
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import quad
 
 FLOOR = Object(quad((-3, 0, 3), (6, 0, 0), (0, 0, -6)), (Material(albedo=(0.6, 0.5, 0.4)),))

@@ -11,7 +11,12 @@ import pytest
 
 import wrt
 from tests.gltf_files import GltfFile
-from wrt.scene.model import Camera, ConstantBackground, DirectionalLight, Material, Object, Scene, Settings, Sphere
+from wrt.scene.backgrounds import ConstantBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 
 

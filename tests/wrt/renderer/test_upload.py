@@ -22,24 +22,12 @@ from wrt.renderer.upload import (
     srgb_table,
     upload_scene,
 )
+from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import ALPHA_MODES, MATERIAL_KINDS, Checkerboard, Material, Texture
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import (
-    ALPHA_MODES,
-    MATERIAL_KINDS,
-    Camera,
-    Checkerboard,
-    ConstantBackground,
-    DirectionalLight,
-    EnvironmentBackground,
-    GradientBackground,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Sphere,
-    SpotLight,
-    Texture,
-)
+from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import box, icosphere, quad
 
 GREY = Material()

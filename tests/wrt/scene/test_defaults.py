@@ -8,19 +8,13 @@ import numpy as np
 import pytest
 
 from wrt.core.errors import InputError
+from wrt.scene.backgrounds import ConstantBackground, GradientBackground
+from wrt.scene.cameras import Camera
 from wrt.scene.defaults import bounding_sphere, frame_camera, is_lit, stage
+from wrt.scene.lights import DirectionalLight, PointLight
+from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import (
-    Camera,
-    ConstantBackground,
-    DirectionalLight,
-    GradientBackground,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Sphere,
-)
+from wrt.scene.model import Object, Scene, Sphere
 
 
 def cloud(seed: int, offset=(0.0, 0.0, 0.0), scale=1.0) -> Scene:

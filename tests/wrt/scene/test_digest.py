@@ -10,20 +10,13 @@ import pytest
 
 from tests.data import ROOT
 from wrt.io.load import load_scene
+from wrt.scene.backgrounds import EnvironmentBackground
+from wrt.scene.cameras import Camera
 from wrt.scene.digest import camera_digest, scene_digest
-from wrt.scene.model import (
-    Camera,
-    Checkerboard,
-    EnvironmentBackground,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Settings,
-    Sphere,
-    SpotLight,
-    Texture,
-)
+from wrt.scene.lights import PointLight, SpotLight
+from wrt.scene.materials import Checkerboard, Material, Texture
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box
 
 IMAGE = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)

@@ -10,8 +10,9 @@ import pytest
 import wrt
 from wrt.core.errors import InputError
 from wrt.scene.digest import scene_digest
+from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Material, Object, Scene
+from wrt.scene.model import Object, Scene
 from wrt.scene.motion import Motion, moves, scene_at
 from wrt.scene.shapes import icosphere, torus
 

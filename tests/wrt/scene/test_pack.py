@@ -13,8 +13,12 @@ import pytest
 from tests.data import ROOT
 from wrt.core.errors import InputError
 from wrt.io.load import load_scene
+from wrt.scene.backgrounds import EnvironmentBackground
+from wrt.scene.cameras import Camera
 from wrt.scene.digest import camera_digest, scene_digest
-from wrt.scene.model import Camera, EnvironmentBackground, Material, Object, Scene, Sphere, SpotLight, Texture
+from wrt.scene.lights import SpotLight
+from wrt.scene.materials import Material, Texture
+from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.pack import KINDS, pack, unpack
 from wrt.scene.shapes import box
 

@@ -13,24 +13,15 @@ import wrt
 from tests.command_line import wrt as command
 from tests.gltf_files import TRIANGLE, GltfFile
 from wrt.core.errors import InputError
-from wrt.scene.model import (
-    BLACK,
-    SMALLEST,
-    WHITE,
-    Camera,
-    ConstantBackground,
-    DirectionalLight,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Settings,
-    Sphere,
-    SpotLight,
-    Texture,
-)
+from wrt.scene.backgrounds import ConstantBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import Material, Texture
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, icosphere, quad
 from wrt.scene.size import SMALLEST_LIT
+from wrt.scene.values import BLACK, SMALLEST, WHITE
 
 pytestmark = pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning", "error::RuntimeWarning")
 LAMP, CHALK = Material(albedo=BLACK, emission=WHITE, name="lamp"), Material(albedo=WHITE)

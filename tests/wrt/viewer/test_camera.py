@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from tests.wrt.viewer.test_refine import CAMERA, SCENE
 from wrt.core.errors import SceneWarning
 from wrt.io.load import load_scene
-from wrt.scene.model import Camera, Scene
+from wrt.scene.cameras import Camera
+from wrt.scene.model import Scene
 from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
 
 

@@ -22,7 +22,8 @@ from wrt.accel.base import AccelStats, Refit
 from wrt.core.errors import InputError
 from wrt.core.html import SHOWN_ROWS, Rows, html_facts, html_table, number
 from wrt.renderer.options import Progress
-from wrt.scene.model import Material, Object, Scene, Sphere
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import box, quad
 from wrt.viewer.notebook import LiveView
 

@@ -18,7 +18,12 @@ from wrt.lab.rtcore.profiler import profile
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
-from wrt.scene.model import Camera, DirectionalLight, GradientBackground, Material, Object, Scene, Settings
+from wrt.scene.backgrounds import GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 from wrt.viewer import refine as module
 from wrt.viewer.refine import COARSE, DEEPEST, SCALES, Shown, Viewer

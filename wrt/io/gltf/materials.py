@@ -28,7 +28,8 @@ from wrt.io.gltf.schema import (
     exactly,
 )
 from wrt.picture.decode import decode_rgba8
-from wrt.scene.model import BLACK, Color, Material, Texture, as_number, as_vector
+from wrt.scene.materials import Material, Texture
+from wrt.scene.values import BLACK, Color, as_number, as_vector
 
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728

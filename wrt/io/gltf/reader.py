@@ -23,23 +23,15 @@ from wrt.io.gltf.accessors import Accessors
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.materials import Materials
 from wrt.io.gltf.schema import Instancing, PunctualLightOfNode, PunctualLights, SpotCone, at, exactly
+from wrt.scene.cameras import Camera
 from wrt.scene.clean import clean
 from wrt.scene.defaults import stage
+from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
+from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import (
-    MAX_REACH,
-    Camera,
-    DirectionalLight,
-    Light,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Settings,
-    SpotLight,
-    as_transform,
-    require_count,
-)
+from wrt.scene.model import Object, Scene
+from wrt.scene.settings import Settings
+from wrt.scene.values import MAX_REACH, as_transform, require_count
 
 # Attributes that are read, or named by who wants them (skins, textures), or are the application's own (underscore).
 # TANGENT is named where a normal map would use it: tangents are made from the texture coordinates.

@@ -17,31 +17,15 @@ from wrt.core.files import read_file
 from wrt.core.memory import Meter
 from wrt.io.toml.report import raise_all, unknown_materials
 from wrt.scene import shapes
+from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
+from wrt.scene.materials import CONDUCTORS, Checkerboard, Material, Texture
 from wrt.scene.mesh import Mesh, load_mesh
-from wrt.scene.model import (
-    BLACK,
-    CONDUCTORS,
-    SMALLEST,
-    Background,
-    Camera,
-    Checkerboard,
-    ConstantBackground,
-    DirectionalLight,
-    EnvironmentBackground,
-    GradientBackground,
-    Light,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Settings,
-    Sphere,
-    SpotLight,
-    Texture,
-    as_vector,
-    require_count,
-)
+from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.motion import Motion
+from wrt.scene.settings import Settings
+from wrt.scene.values import BLACK, SMALLEST, as_vector, require_count
 from wrt.scene.vertex_normals import smooth
 
 if TYPE_CHECKING:

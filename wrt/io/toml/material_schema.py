@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, model_validator
 
-from wrt.scene import model as scene
+from wrt.scene.materials import WRAPS, Checkerboard, Material
 
 # --- values -----------------------------------------------------------------------------------------------------------
 
@@ -53,7 +53,7 @@ Scale2 = Annotated[list[float], Field(min_length=2, max_length=2), BeforeValidat
 WrapMode = Literal["repeat", "clamp", "mirror"]
 Wraps = Annotated[list[WrapMode], Field(min_length=2, max_length=2),
                   BeforeValidator(lambda value: [value] * 2 if isinstance(value, str) else value),
-                  _or_one({"type": "string", "enum": list(scene.WRAPS)}, 2)]
+                  _or_one({"type": "string", "enum": list(WRAPS)}, 2)]
 Subdivisions = Annotated[int, Field(ge=0, le=9)]
 Segments = Annotated[int, Field(ge=3, le=4096)]
 
@@ -85,7 +85,7 @@ def require_one(table: Table, *choices: tuple[str, ...]) -> None:
 
 # --- textures ---------------------------------------------------------------------------------------------------------
 
-_CHECKER = scene.Checkerboard()
+_CHECKER = Checkerboard()
 
 
 class CheckerboardTable(Table):
@@ -128,7 +128,7 @@ class ColorTextureTable(_PlacedImage):
 
 # --- materials --------------------------------------------------------------------------------------------------------
 
-_MATERIAL = scene.Material()
+_MATERIAL = Material()
 _KINDS_THAT_USE: dict[str, tuple[str, ...]] = {
     "specular": ("diffuse",), "exponent": ("diffuse",),
     "metal": ("conductor",), "eta": ("conductor",), "k": ("conductor",),

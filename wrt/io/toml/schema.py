@@ -1,7 +1,7 @@
 """What may stand in a TOML scene file: pydantic models, and the JSON Schema that comes from them.
 
-Names, bounds and defaults are those of `wrt.scene.model`. Angles are in degrees here and in radians there; lengths have the
-scene's own unit; colours are linear Rec. 709. Wherever a colour stands, one number is a grey.
+Names, bounds and defaults are those of the dataclasses in wrt/scene/. Angles are in degrees here and in radians there; lengths
+have the scene's own unit; colours are linear Rec. 709. Wherever a colour stands, one number is a grey.
 """
 
 from __future__ import annotations
@@ -31,12 +31,14 @@ from wrt.io.toml.material_schema import (
     require_one,
     unit,
 )
-from wrt.scene import model as scene
+from wrt.scene.backgrounds import GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.settings import MAX_DEPTH, Settings
 
 # --- cameras, background, settings ------------------------------------------------------------------------------------
 
-_CAMERA = scene.Camera()
-_SETTINGS = scene.Settings()
+_CAMERA = Camera()
+_SETTINGS = Settings()
 RADIANCE = unit("radiance")
 
 
@@ -94,8 +96,8 @@ class GradientTable(Table):
     """Linear in the direction's y."""
 
     type: Literal["gradient"]
-    bottom: Annotated[Radiance, RADIANCE] = Field(list(scene.GradientBackground().bottom), description="from straight below (-y)")
-    top: Annotated[Radiance, RADIANCE] = Field(list(scene.GradientBackground().top), description="from straight above (+y)")
+    bottom: Annotated[Radiance, RADIANCE] = Field(list(GradientBackground().bottom), description="from straight below (-y)")
+    top: Annotated[Radiance, RADIANCE] = Field(list(GradientBackground().top), description="from straight above (+y)")
 
 
 class EnvironmentTable(Table):
@@ -113,7 +115,7 @@ class SettingsTable(Table):
     size: Annotated[list[Annotated[int, Field(ge=1, le=32768)]], Field(min_length=2, max_length=2)] = Field(
         list(_SETTINGS.size), json_schema_extra={"unit": "pixels"}, description="width and height")
     spp: int = Field(_SETTINGS.spp, ge=1, le=1 << 24, description="samples per pixel")
-    max_depth: int = Field(_SETTINGS.max_depth, ge=0, le=scene.MAX_DEPTH, description="bounces after the first hit")
+    max_depth: int = Field(_SETTINGS.max_depth, ge=0, le=MAX_DEPTH, description="bounces after the first hit")
     min_throughput: Unit = Field(_SETTINGS.min_throughput, description="a ray that carries less is cut")
     filter: Literal["box", "gaussian", "blackman-harris"] = Field("blackman-harris", description="pixel filter")
     fresnel: Literal["exact", "schlick"] = Field("exact", description="of dielectrics")

@@ -31,7 +31,8 @@ from wrt.picture.film import Film
 from wrt.renderer.features import Features
 from wrt.renderer.progress import TimeLeft
 from wrt.renderer.renderer import Options, Renderer
-from wrt.scene.model import SAMPLERS, Scene
+from wrt.scene.model import Scene
+from wrt.scene.settings import SAMPLERS
 
 REFERENCE_SEEDS = 8
 REFERENCE_DEPTH, REFERENCE_THROUGHPUT = 32, 1e-5
@@ -44,7 +45,7 @@ BASE = "as it is"
 
 @dataclass(frozen=True)
 class Knob:
-    """What a user can turn: a field of wrt.scene.model.Settings or of wrt.renderer.renderer.Options, and the values to try.
+    """What a user can turn: a field of wrt.scene.settings.Settings or of wrt.renderer.renderer.Options, and the values to try.
 
     matters: whether it changes anything in this scene.
     """

@@ -20,7 +20,7 @@ from wrt.kernels.structs import Surfaces, Tile
 from wrt.kernels.study import rasterize as kernels
 from wrt.kernels.study.primary_rays import make_primary_rays_kernel
 from wrt.renderer.upload import camera_struct
-from wrt.scene.model import Camera
+from wrt.scene.cameras import Camera
 
 NOTHING = np.uint64(0x7F800000_FFFFFFFF)  # depth inf, prim_id -1
 TRIANGLES_PER_LAUNCH = 65536

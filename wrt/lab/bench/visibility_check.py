@@ -10,7 +10,7 @@ import numpy as np
 from wrt.accel import Geometry
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster, directions_from_pixels
 from wrt.renderer.upload import camera_struct
-from wrt.scene.model import Camera
+from wrt.scene.cameras import Camera
 
 # How far the ray units' rounding can move the place of a corner, as a share of its distance: the direction's sum and length,
 # the offset from the origin, the shear. Each is a few units of roundoff; together they stay below this many.

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from wrt.renderer.features import is_rough
-from wrt.scene.model import Checkerboard, Color, Material, Texture
+from wrt.scene.materials import Checkerboard, Material, Texture
+from wrt.scene.values import Color
 
 
 def bsdf(mi: Any, material: Material, notes: Any) -> dict[str, Any]:

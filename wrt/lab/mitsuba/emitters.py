@@ -8,16 +8,8 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.scene.model import (
-    Background,
-    ConstantBackground,
-    DirectionalLight,
-    EnvironmentBackground,
-    GradientBackground,
-    Light,
-    PointLight,
-    SpotLight,
-)
+from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 
 # Rows of a gradient's picture: linear interpolation of a cosine over steps of pi / 1024 errs by at most 1.2e-6.
 GRADIENT_ROWS = 1025

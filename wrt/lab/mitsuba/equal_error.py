@@ -29,7 +29,8 @@ from wrt.lab.mitsuba.llvm import NotAvailable
 from wrt.lab.mitsuba.process import VARIANTS, Job, MitsubaProcess, environment_of
 from wrt.lab.mitsuba.translate import INTEGRATORS
 from wrt.renderer.renderer import Options, Renderer
-from wrt.scene.model import Material, Scene
+from wrt.scene.materials import Material
+from wrt.scene.model import Scene
 
 PILOT_SPP = 16
 SAME = 0.25  # of the squared error compared at: a squared bias beyond it means that the pictures are not of the same light

@@ -23,7 +23,8 @@ import wrt
 from wrt.core.errors import InputError
 from wrt.lab.mitsuba.llvm import PATH_VARIABLE, NotAvailable, ended, llvm_library
 from wrt.lab.mitsuba.translate import Options, mitsuba, translate
-from wrt.scene.model import Camera, Scene
+from wrt.scene.cameras import Camera
+from wrt.scene.model import Scene
 
 VARIANTS = ("scalar_rgb", "llvm_ad_rgb")
 SECONDS_TO_END = 10.0

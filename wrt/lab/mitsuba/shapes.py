@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wrt.lab.mitsuba.bsdfs import bsdf, emission
+from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Material, Object, Sphere
+from wrt.scene.model import Object, Sphere
 
 # The back of a two-sided light is a second mesh, this share of the mesh's extent behind the first.
 BACK_OFFSET = 1e-5

@@ -29,8 +29,10 @@ from wrt.core.errors import InputError, SceneWarning
 from wrt.lab.mitsuba.emitters import background_emitter, light_emitter
 from wrt.lab.mitsuba.shapes import Part, object_parts, raw_mesh, sphere_shape
 from wrt.renderer.features import is_rough
+from wrt.scene.cameras import Camera
+from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Camera, Material, Scene
+from wrt.scene.model import Scene
 
 VARIANT = "scalar_rgb"
 INTEGRATORS = ("auto", "whitted", "path", "direct", "volpath")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from wrt.scene.model import Color
+from wrt.scene.values import Color
 
 MAX_TRANSPARENT = 256  # surfaces in a row that a ray may go straight through
 

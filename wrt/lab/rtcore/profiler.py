@@ -25,7 +25,8 @@ from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.renderer import OPTIONS, Options, Renderer
 from wrt.renderer.tiles import Rectangle, Work
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import SETTINGS, Scene
+from wrt.scene.model import Scene
+from wrt.scene.settings import SETTINGS
 
 KINDS = ("primary", "reflection", "refraction", "straight", "shadow")
 COUNTERS = tuple(Counts.vars)

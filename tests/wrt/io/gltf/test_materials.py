@@ -18,7 +18,9 @@ from tests.gltf_files import GltfFile, encode, load_warned, one_material, one_tr
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.gltf.reader import load_gltf
 from wrt.picture.decode import MAX_SIDE, decode_rgba8
-from wrt.scene.model import BLACK, Material, Scene
+from wrt.scene.materials import Material
+from wrt.scene.model import Scene
+from wrt.scene.values import BLACK
 
 PIXELS = np.arange(4 * 6 * 4, dtype=np.uint8).reshape(4, 6, 4) * 2
 

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from tests.gltf_files import TRIANGLE, GltfFile, load_warned, one_triangle, with_light
 from wrt.core.errors import InputError
 from wrt.io.gltf.reader import load_gltf
-from wrt.scene.model import DirectionalLight, PointLight, Scene, SpotLight
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.model import Scene
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 

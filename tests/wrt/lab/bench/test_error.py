@@ -26,7 +26,11 @@ from wrt.lab.bench import plot
 from wrt.picture.image import read_image
 from wrt.renderer.features import features_of
 from wrt.renderer.renderer import Options
-from wrt.scene.model import Camera, ConstantBackground, GradientBackground, Material, Object, Scene, Settings, Sphere
+from wrt.scene.backgrounds import ConstantBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 
 # --- statistics -------------------------------------------------------------------------------------------------------

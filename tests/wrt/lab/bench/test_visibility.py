@@ -22,8 +22,10 @@ from wrt.lab.bench import visibility_report
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
 from wrt.lab.bench.visibility import Plan, Row, crossings, fit, fits, framing, run, series, subdivided, surfaces, terrain
 from wrt.lab.bench.visibility_check import Agreement, agreement, compare
+from wrt.scene.cameras import Camera
+from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Camera, Material, Object, Scene
+from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import box, icosphere, merged, prism, quad, teapot, torus
 
 SIZE = (160, 120)

@@ -12,21 +12,13 @@ import pytest
 import wrt
 from tests.data import data_path
 from wrt.lab.mitsuba.translate import aov_mitsuba, camera_rays, render_mitsuba
+from wrt.scene.backgrounds import EnvironmentBackground
+from wrt.scene.cameras import Camera
 from wrt.scene.defaults import frame_camera
-from wrt.scene.model import (
-    CONDUCTORS,
-    Camera,
-    Checkerboard,
-    DirectionalLight,
-    EnvironmentBackground,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Settings,
-    Sphere,
-    SpotLight,
-)
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import CONDUCTORS, Checkerboard, Material
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad, torus
 
 pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')

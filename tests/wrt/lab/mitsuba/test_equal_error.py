@@ -21,7 +21,11 @@ from wrt.lab.mitsuba.equal_error import Plan, Result, matte
 from wrt.lab.mitsuba.llvm import PATH_VARIABLE, NotAvailable
 from wrt.lab.mitsuba.process import VARIANTS, MitsubaProcess
 from wrt.renderer.renderer import Options
-from wrt.scene.model import Camera, Material, Object, PointLight, Scene, Settings, Sphere
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import PointLight
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box
 
 pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')

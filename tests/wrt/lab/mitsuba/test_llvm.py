@@ -16,7 +16,11 @@ from wrt.lab.mitsuba import process as mitsuba_process
 from wrt.lab.mitsuba.llvm import NotAvailable, candidates, llvm_library, trial
 from wrt.lab.mitsuba.process import Job, MitsubaProcess
 from wrt.lab.mitsuba.translate import render_mitsuba
-from wrt.scene.model import Camera, ConstantBackground, Material, Scene, Settings, Sphere
+from wrt.scene.backgrounds import ConstantBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.materials import Material
+from wrt.scene.model import Scene, Sphere
+from wrt.scene.settings import Settings
 
 SCENE = Scene(
     spheres=(Sphere((0.0, 0.0, 0.0), 0.5, Material("glass", albedo=(0.9, 0.6, 0.9))),

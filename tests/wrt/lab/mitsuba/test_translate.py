@@ -10,23 +10,13 @@ import numpy as np
 import pytest
 
 from wrt.core.errors import InputError, SceneWarning
+from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import (
-    Camera,
-    Checkerboard,
-    ConstantBackground,
-    DirectionalLight,
-    EnvironmentBackground,
-    GradientBackground,
-    Material,
-    Object,
-    PointLight,
-    Scene,
-    Settings,
-    Sphere,
-    SpotLight,
-    Texture,
-)
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.settings import Settings
 
 pytest.importorskip("mitsuba", reason='needs Mitsuba 3 (pip install "wrt[peers]")')
 

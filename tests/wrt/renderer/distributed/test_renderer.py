@@ -32,7 +32,8 @@ from wrt.renderer.distributed import renderer as spread
 from wrt.renderer.distributed import workers as crews
 from wrt.renderer.distributed.installed import INSTALLED, difference
 from wrt.renderer.renderer import Options, Progress, Renderer, render
-from wrt.scene.model import Material, Object
+from wrt.scene.materials import Material
+from wrt.scene.model import Object
 from wrt.scene.shapes import box
 
 # Fewer pixels than a tile that is worth sending has: a side is asked for.

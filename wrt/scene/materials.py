@@ -1,0 +1,157 @@
+"""What surfaces are made of: materials and their textures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from wrt.core.checks import LARGEST, as_array, as_choice, as_one, at_thing
+from wrt.core.errors import InputError
+from wrt.scene.values import BLACK, Color, as_number, as_vector
+
+WRAPS = ("repeat", "clamp", "mirror")
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """An 8-bit image, sampled bilinearly.
+
+    image: (H, W, 4) uint8, row 0 on top; srgb: RGB is sRGB-encoded (alpha never is); wrap: per axis (u, v);
+    uv_transform: (2, 3), maps a mesh's (u, v, 1) to the texture's. (u, v) = (0, 0) is the image's top left corner, as in
+    glTF; readers of formats with v upwards (OBJ, PLY) flip v when they load the mesh.
+    """
+
+    image: np.ndarray = field(repr=False)
+    srgb: bool = True
+    wrap: tuple[str, str] = ("repeat", "repeat")
+    uv_transform: np.ndarray = field(default_factory=lambda: np.eye(2, 3), repr=False)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        image = np.ascontiguousarray(self.image)
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 4 or image.size == 0:
+            raise InputError(at_thing("texture", self.name) + f"image must be (H, W, 4) uint8, got {image.shape} {image.dtype}")
+        for wrap in self.wrap:
+            as_choice(wrap, WRAPS, at_thing("texture", self.name) + "wrap")
+        transform = as_array(self.uv_transform, np.float64, at_thing("texture", self.name) + "uv_transform")
+        if transform.shape != (2, 3) or not (np.abs(transform) <= LARGEST).all():
+            raise InputError(at_thing("texture", self.name) + f"uv_transform must be a 2x3 matrix of numbers up to {LARGEST:g}")
+        object.__setattr__(self, "image", image)
+        object.__setattr__(self, "uv_transform", transform)
+
+
+@dataclass(frozen=True)
+class Checkerboard:
+    """Two colours in turn; `scale` squares to one unit of u and of v."""
+
+    color_a: Color = (0.8, 0.8, 0.8)
+    color_b: Color = (0.2, 0.2, 0.2)
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "color_a", as_vector(self.color_a, "checkerboard color_a", low=0.0))
+        object.__setattr__(self, "color_b", as_vector(self.color_b, "checkerboard color_b", low=0.0))
+        object.__setattr__(self, "scale", as_number(self.scale, "checkerboard scale", low=1e-6))
+
+
+MATERIAL_KINDS = ("diffuse", "mirror", "conductor", "glass", "metallic_roughness")
+ALPHA_MODES = ("opaque", "mask", "blend")
+# Complex index of refraction at 630, 532 and 465 nm, rounded to three digits (optical tables of the pure metals).
+CONDUCTORS: dict[str, tuple[Color, Color]] = {
+    "gold": ((0.183, 0.422, 1.373), (3.424, 2.346, 1.771)),
+    "silver": ((0.155, 0.117, 0.138), (4.828, 3.122, 2.147)),
+    "copper": ((0.200, 0.924, 1.102), (3.912, 2.452, 2.142)),
+    "aluminium": ((1.657, 0.880, 0.521), (9.224, 6.270, 4.837)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """How a surface answers light. Compared by identity: two objects share a material when they hold the same one.
+
+    kind
+        diffuse: Lambert with `albedo`, plus a normalised Blinn-Phong highlight of colour `specular` and `exponent`.
+        mirror: reflects `albedo` of what comes in, at every angle.
+        conductor: exact Fresnel reflection of `eta` + i `k` per channel (CONDUCTORS has presets); `roughness`.
+        glass: dielectric of index `ior`; splits into reflection and refraction; `albedo` tints what is transmitted;
+            `absorption` per unit length inside (Beer-Lambert); `thin`: an infinitely thin pane (no bending, both faces'
+            reflections summed); `roughness`.
+        metallic_roughness: glTF 2.0's model, from `albedo` (base colour), `metallic`, `roughness`, `ior`, `transmission`.
+    textures: `albedo_texture` multiplies albedo (its alpha multiplies `alpha`); `metallic_roughness_texture`: g is
+        roughness, b is metallic; `transmission_texture`: r; `emission_texture` multiplies emission; `normal_texture` is a
+        tangent-space normal map scaled by `normal_scale`.
+    roughness: glTF's perceptual one in [0, 1]; the GGX alpha is its square. 0 is a perfect mirror.
+    emission: radiance, linear. The front side (counter-clockwise) emits, both where `two_sided`.
+    emits_light: emissive surfaces of this material light others (False: they are only seen, as glTF's unlit ones are). With
+        an emission_texture, or alpha, they are only seen in any case: `lights_others`.
+    alpha_mode: opaque; mask (a hit with alpha < `alpha_cutoff` is no hit); blend (the ray goes on with 1 - alpha).
+    """
+
+    kind: str = "diffuse"
+    name: str = ""
+    albedo: Color = (0.8, 0.8, 0.8)
+    specular: Color = BLACK
+    exponent: float = 50.0
+    eta: Color = CONDUCTORS["silver"][0]
+    k: Color = CONDUCTORS["silver"][1]
+    ior: float = 1.5
+    absorption: Color = BLACK
+    thin: bool = False
+    metallic: float = 0.0
+    roughness: float = 0.0
+    transmission: float = 0.0
+    emission: Color = BLACK
+    two_sided: bool = False
+    emits_light: bool = True
+    alpha: float = 1.0
+    alpha_mode: str = "opaque"
+    alpha_cutoff: float = 0.5
+    normal_scale: float = 1.0
+    albedo_texture: Texture | Checkerboard | None = None
+    metallic_roughness_texture: Texture | None = None
+    transmission_texture: Texture | None = None
+    emission_texture: Texture | Checkerboard | None = None
+    normal_texture: Texture | None = None
+
+    def __post_init__(self) -> None:
+        at = at_thing("material", self.name)
+        as_choice(self.kind, MATERIAL_KINDS, at + "kind")
+        as_choice(self.alpha_mode, ALPHA_MODES, at + "alpha_mode")
+        bounds: dict[str, tuple[float, float]] = {
+            "albedo": (0.0, 1.0), "specular": (0.0, 1.0), "eta": (0.0, 1e3), "k": (0.0, 1e3),
+            "absorption": (0.0, math.inf), "emission": (0.0, math.inf),
+        }
+        for name, (low, high) in bounds.items():
+            object.__setattr__(self, name, as_vector(getattr(self, name), at + name, low=low, high=high))
+        scalars: dict[str, tuple[float, float]] = {
+            "exponent": (0.0, 1e6), "ior": (1.0, 10.0), "metallic": (0.0, 1.0), "roughness": (0.0, 1.0),
+            "transmission": (0.0, 1.0), "alpha": (0.0, 1.0), "alpha_cutoff": (0.0, 1.0), "normal_scale": (-1e3, 1e3),
+        }
+        for name, (low, high) in scalars.items():
+            object.__setattr__(self, name, as_number(getattr(self, name), at + name, low=low, high=high))
+        for name in ("albedo", "emission", "metallic_roughness", "transmission", "normal"):
+            slot = f"{name}_texture"
+            if getattr(self, slot) is not None:
+                kinds = (Texture, Checkerboard) if name in ("albedo", "emission") else (Texture,)
+                as_one(getattr(self, slot), kinds, at + slot)
+
+    @property
+    def is_emissive(self) -> bool:
+        """Whether it emits anything, textures aside."""
+        return max(self.emission) > 0.0
+
+    @property
+    def lights_others(self) -> bool:
+        """Whether its emission is sampled as a light: not where a texture or its alpha says where it emits, since lights are
+        chosen by power, not by picture."""
+        plain = self.emission_texture is None and self.alpha_mode == "opaque"
+        return self.is_emissive and self.emits_light and plain
+
+    @property
+    def textures(self) -> tuple[Texture | Checkerboard, ...]:
+        """Those that it has, in no order to rely on."""
+        slots = (self.albedo_texture, self.metallic_roughness_texture, self.transmission_texture,
+                 self.emission_texture, self.normal_texture)
+        return tuple(texture for texture in slots if texture is not None)
