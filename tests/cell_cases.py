@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wrt.accel import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.scene.mesh import Mesh
 
 NO_SPHERES = np.zeros((0, 4), np.float32)

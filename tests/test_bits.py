@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests import bits
-from wrt.accel import ACCELERATORS
+from wrt.accel.structures import ACCELERATORS
 
 
 def test_every_shipped_scene_is_held() -> None:

@@ -13,8 +13,8 @@ import warp as wp
 
 import wrt
 from tests.data import ROOT
-from wrt.accel import ACCELERATORS, Structure
-from wrt.accel.base import any_hit_kernel, closest_hit_kernel
+from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
+from wrt.accel.structures import ACCELERATORS
 from wrt.cli.common import depth_hint
 from wrt.core.device import start
 from wrt.kernels.traverse.common import Units

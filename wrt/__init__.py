@@ -15,10 +15,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from wrt.core.version import VERSION as __version__
+
 if TYPE_CHECKING:
-    from wrt.accel import ACCELERATORS as ACCELERATORS
-    from wrt.accel.queries import build as build
-    from wrt.accel.queries import load_accel as load_accel
+    from wrt.accel.build import build as build
+    from wrt.accel.build import load_accel as load_accel
+    from wrt.accel.structures import ACCELERATORS as ACCELERATORS
     from wrt.core.errors import InputError as InputError
     from wrt.core.errors import SceneWarning as SceneWarning
     from wrt.io.load import load_scene as load_scene
@@ -48,12 +50,11 @@ if TYPE_CHECKING:
     from wrt.viewer.notebook import LiveView as LiveView
     from wrt.viewer.notebook import side_by_side as side_by_side
 
-__version__ = "0.1.0"
 
 # The same names at run time, each imported when it is first used: `python -m wrt --help` must not wait for Warp.
 _PUBLIC = {
-    "wrt.accel": ("ACCELERATORS",),
-    "wrt.accel.queries": ("build", "load_accel"),
+    "wrt.accel.build": ("build", "load_accel"),
+    "wrt.accel.structures": ("ACCELERATORS",),
     "wrt.core.errors": ("InputError", "SceneWarning"),
     "wrt.io.load": ("load_scene",),
     "wrt.lab.rtcore.profiler": ("profile",),

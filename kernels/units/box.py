@@ -16,7 +16,7 @@ from wrt.kernels.structs import Ray
 # rounding of sheared vertices adds in proportion to the distance; `padded` covers the rest.
 FAR_PAD = wp.constant(1.0 + 2.0 * (7.0 * 2.0**-24) / (1.0 - 7.0 * 2.0**-24))
 
-# Powers of two, so that the host computes the same box to the last bit (wrt.accel.base.Geometry.bounds).
+# Powers of two, so that the host computes the same box to the last bit (wrt.accel.geometry.Geometry.bounds).
 PAD_EXTENT = 2.0**-21
 PAD_COORDINATE = 2.0**-22
 PAD_SMALLEST = 2.0**-148

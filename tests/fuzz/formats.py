@@ -301,7 +301,8 @@ def rays() -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def accel_seeds() -> list[Seed]:
-    from wrt.accel import ACCELERATORS, build
+    from wrt.accel.build import build
+    from wrt.accel.structures import ACCELERATORS
 
     found = []
     with tempfile.TemporaryDirectory() as name:
@@ -320,7 +321,7 @@ def read_accel(path: Path) -> object:
 
 
 def load_accel_only(path: Path) -> Any:
-    from wrt.accel.store import load_accel
+    from wrt.accel.build import load_accel
 
     return load_accel(path, ball(), threads=1)
 

@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 from tests.kernel_tools import CPU, floats, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel import ACCELERATORS, Structure, build
+from wrt.accel.build import build
+from wrt.accel.structure import Structure
+from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
 from wrt.kernels.structs import Ray, Surfaces, kernel, make_ray
 from wrt.kernels.units.triangle import RAY_TRIANGLE

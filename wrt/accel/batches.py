@@ -1,21 +1,21 @@
-"""Many rays at a time on the CPU, where a structure's traversal module has a form for them (make_stream)."""
+"""A query's rays in launches, spread over threads: one ray at a time, or many, where a structure's traversal module has a form for
+them (make_stream)."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import warp as wp
 
+from wrt.accel.structure import Structure
 from wrt.core.device import empty_aligned, load_kernel, made_once, run_all, upload
 from wrt.kernels.wide.packets import Scratch
-
-if TYPE_CHECKING:
-    from wrt.accel.base import Structure
 
 # Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Fewer than
 # FEWEST in all are not divided.
 FEWEST, SOME, MOST = 8192, 32768, 131072
+RAYS_PER_LAUNCH = 16384  # one at a time
 
 
 @made_once
@@ -66,3 +66,16 @@ def launch_stream(structure: Structure, kernel: Any, inputs: list[Any], n: int, 
 
     run_all([partial(job, first) for first in firsts], threads)
     _free.extend(mine)  # not after an error: a thread may still be at work in one
+
+
+def launch(kernel: Any, inputs: list[Any], n: int, device: Any, threads: int) -> None:
+    """Trace rays 0 .. n - 1, one at a time. inputs: the kernel's first ones, up to where the hits go."""
+    if device.is_cuda:
+        wp.launch(kernel, dim=n, inputs=[*inputs, 0], device=device, record_tape=False)
+        return
+    load_kernel(kernel, device)
+
+    def job(first: int) -> None:
+        wp.launch(kernel, dim=min(RAYS_PER_LAUNCH, n - first), inputs=[*inputs, first], device=device, record_tape=False)
+
+    run_all([partial(job, first) for first in range(0, n, RAYS_PER_LAUNCH)], threads)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.accel.base import Accelerator, Built
+from wrt.accel.base import Accelerator
+from wrt.accel.built import Built
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import brute_force as kernels
 

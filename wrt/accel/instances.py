@@ -9,9 +9,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator, AccelStats, Built, Geometry, Refit, State, Structure, array_bytes, check_units
+from wrt.accel.answers import AccelStats, Refit
+from wrt.accel.base import Accelerator, array_bytes
+from wrt.accel.built import Built, State
 from wrt.accel.bvh.top_down import in_order, split_ranges
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions
+from wrt.accel.geometry import Geometry
+from wrt.accel.structure import Structure, check_units
 from wrt.core.device import records, start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import seconds_without_loads

@@ -1,4 +1,4 @@
-"""Structures in files, to be built once: `wrt build`, `wrt.load_accel`, and a cache keyed by geometry and options.
+"""Structures in files, to be built once: what `wrt build` writes and `wrt.load_accel` reads.
 
 A file is a checked one (wrt.core.checked_file), whose header says what is in it and over which geometry. Types come from the
 structure's class, and indices are checked before a ray follows them.
@@ -6,32 +6,29 @@ structure's class, and indices are checked before a ray follows them.
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-import wrt
-from wrt.accel.base import Accelerator, Built, Geometry
+from wrt.accel.built import Built, State
+from wrt.accel.geometry import Geometry
+from wrt.accel.structure import Kind, Structure
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.errors import InputError
+from wrt.core.version import VERSION
 from wrt.core.write_file import check_writable, replacing
-from wrt.scene.mesh import Mesh
+from wrt.kernels.traverse.common import Units
 
 MAGIC = b"wrt acceleration structure 1\n"
 STATS = ("nodes", "leaves", "depth", "sah_cost")
 
 
-def array_types(accel: type[Accelerator], triangle: str = "watertight") -> dict[str, np.dtype[Any]]:
+def array_types(accel: type[Kind], triangle: str = "watertight") -> dict[str, np.dtype[Any]]:
     """What each array of Built.arrays holds, by the fields of the structure's struct."""
-    from wrt.accel.base import Structure
-    from wrt.kernels.traverse.common import Units
-
     struct = Structure(accel, Units(triangle)).struct()
     out = {}
     for name, field in struct._cls.vars.items():
@@ -56,28 +53,24 @@ def check_target(path: str | os.PathLike[str]) -> None:
     check_writable(path)
 
 
-def save(accel: Accelerator, path: str | os.PathLike[str]) -> None:
+def save(structure: Structure, state: State, path: str | os.PathLike[str]) -> None:
     """Write it whole or not at all. Raises InputError where the system refuses."""
     check_target(path)
-    units, state = accel.structure.units, accel._state
-    built = state.built
+    units, built = structure.units, state.built
     rows = {name: np.ascontiguousarray(np.atleast_1d(array)) for name, array in built.arrays.items()}
-    types = array_types(type(accel), units.triangle)
+    types = array_types(structure.accel, units.triangle)
     body = [rows[name].astype(types[name].base, copy=False).tobytes() for name in types]
     body.append(built.order.astype("<i4").tobytes())
-    header = {"accel": accel.name, "triangle": units.triangle, "box": units.box, "wrt": wrt.__version__,
+    header = {"accel": structure.accel.name, "triangle": units.triangle, "box": units.box, "wrt": VERSION,
               "geometry": state.geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
               "order": len(built.order)} | {name: getattr(built, name) for name in STATS}
     with replacing(path) as temporary, open(temporary, "wb") as file:
         write_checked(file, MAGIC, header, body)
 
 
-def load_accel(path: str | os.PathLike[str], mesh: Mesh | Geometry, device: str = "cpu", threads: int | None = None) -> Accelerator:
-    """A structure from a file that `save` wrote, over the same mesh. Raises InputError for a file that is missing, foreign,
+def read(path: str | os.PathLike[str], geometry: Geometry, device: str = "cpu", threads: int | None = None) -> Any:
+    """An Accelerator from a file that `save` wrote, over the same geometry. Raises InputError for a file that is missing, foreign,
     damaged, of another version or over another mesh."""
-    from wrt.accel import ACCELERATORS
-
-    geometry = Geometry.of(mesh) if isinstance(mesh, Mesh) else mesh
     header, body = read_checked(path, MAGIC, "acceleration structure")
     try:
         cls = ACCELERATORS.get(header["accel"])
@@ -94,7 +87,7 @@ def load_accel(path: str | os.PathLike[str], mesh: Mesh | Geometry, device: str 
         raise InputError(f"is no structure of this version ({type(error).__name__}: {error})", path) from error
 
 
-def read_arrays(cls: type[Accelerator], header: dict[str, Any], body: memoryview) -> Built:
+def read_arrays(cls: type[Kind], header: dict[str, Any], body: memoryview) -> Built:
     types = array_types(cls, header["triangle"])
     arrays, at = {}, 0
     for name, dtype in types.items():
@@ -108,29 +101,6 @@ def read_arrays(cls: type[Accelerator], header: dict[str, Any], body: memoryview
     order = np.frombuffer(body[at:], "<i4").astype(np.int32)
     nodes, leaves, depth, sah_cost = (header[name] for name in STATS)
     return Built(arrays, order, int(nodes), int(leaves), int(depth), float(sah_cost))
-
-
-def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: str = "bvh", device: str = "cpu",
-                 threads: int | None = None, **options: Any) -> Accelerator:
-    """As wrt.build, but from `folder` where the same geometry was built with the same options before; else it is built, and left
-    there. A damaged file there is written anew. Raises InputError as build does, and where the folder cannot be written."""
-    from wrt.accel import build
-
-    geometry = Geometry.of(mesh) if isinstance(mesh, Mesh) else mesh
-    chosen = {name: value for name, value in options.items() if name != "progress"}
-    key = json.dumps([geometry.digest(), accel, chosen, wrt.__version__], sort_keys=True)
-    path = Path(folder) / f"{sha256(key.encode()).hexdigest()[:32]}.accel"
-    if path.is_file():
-        with contextlib.suppress(InputError):  # a damaged one is replaced below
-            return load_accel(path, geometry, device, threads)
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made: {error.strerror}", folder) from error
-    check_target(path)
-    structure = build(geometry, accel, device, threads, **options)
-    structure.save(path)
-    return structure
 
 
 def check_binary(nodes: np.ndarray, n_primitives: int, max_depth: int) -> None:

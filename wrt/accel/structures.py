@@ -1,8 +1,13 @@
-"""The acceleration structures by name, and where each one is. The command line's help reads it too, and must not wait for Warp."""
+"""The table of acceleration structures: by name, where each one is. Each is imported when it is first asked for: the command line's
+help must not wait for Warp."""
 
 from __future__ import annotations
 
-STRUCTURES = {
+from typing import Any
+
+from wrt.core.registry import Registry
+
+ACCELERATORS: Registry[type[Any]] = Registry("structure", {
     "bvh": "wrt.accel.bvh.wide:Bvh8",  # the default: the best one there is
     "bvh2": "wrt.accel.bvh.binary:Bvh2",
     "bvh4": "wrt.accel.bvh.wide:Bvh4",
@@ -15,4 +20,4 @@ STRUCTURES = {
     "brute_force": "wrt.accel.brute_force:BruteForce",
     "grid": "wrt.accel.cells.grid:Grid",
     "octree": "wrt.accel.cells.octree:Octree",
-}
+})

@@ -25,12 +25,12 @@ def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any],
     from dataclasses import asdict
 
     import wrt
-    from wrt.accel import tells_progress
+    from wrt.accel.build import reports_progress
     from wrt.accel.store import check_target
 
     check_target(output)
     options = settled(settings)
-    if tells_progress(accel):
+    if reports_progress(accel):
         tell = now_and_then(quiet)
         options["progress"] = lambda done: tell(f"{accel}: {100.0 * done:.0f} % built")
     with warnings_told(quiet):

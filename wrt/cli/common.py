@@ -112,7 +112,7 @@ def _completions(words: Iterable[str], incomplete: str) -> list[Any]:
     return [CompletionItem(word) for word in words if word.startswith(incomplete)]
 
 
-ACCEL = OneOf("wrt.accel.structures:STRUCTURES")
+ACCEL = OneOf("wrt.accel.structures:ACCELERATORS")
 
 
 class Setting(click.ParamType):

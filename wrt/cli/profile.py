@@ -166,7 +166,7 @@ def rtcore(meshes: tuple[Path, ...], cluster: str | None, software: bool, output
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def instructions(structures: tuple[str, ...], as_json: bool) -> None:
     """The units in machine code for Turing: instructions of each box and triangle test; registers and code of traversals."""
-    from wrt.accel import ACCELERATORS
+    from wrt.accel.structures import ACCELERATORS
     from wrt.lab.rtcore import instructions as bench_instructions
 
     for name in structures:

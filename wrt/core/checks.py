@@ -9,7 +9,8 @@ import re
 from collections.abc import Collection, Iterable
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
@@ -138,3 +139,13 @@ def short(value: Any, most: int = 60) -> str:
 
 def _a(name: str) -> str:
     return f"{'an' if name[:1] in 'AEIOaeio' else 'a'} {name}"
+
+
+def accepts(kind: Any, value: Any) -> bool:
+    """Whether a value is of an annotation's type: a class, or a union of some. A whole number is a float too, and a bool is no
+    number. What is no class (a callable) is not looked at."""
+    if get_origin(kind) in (Union, UnionType):
+        return any(accepts(each, value) for each in get_args(kind))
+    if not isinstance(kind, type):
+        return True
+    return isinstance(value, (int, float) if kind is float else kind) and (kind is bool or not isinstance(value, bool))

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import Accelerator, Geometry
-from wrt.accel import build as build_structure
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build as build_structure
+from wrt.accel.geometry import Geometry
 from wrt.core.checks import as_integer
 from wrt.core.errors import InputError, SceneWarning
 from wrt.core.write_file import check_writable, replacing

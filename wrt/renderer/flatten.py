@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.accel.instances import InstancedGeometry, NumberedGeometry
 from wrt.core.errors import InputError
 from wrt.renderer.instancing import instanced_meshes, is_instance

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import ACCELERATORS
-from wrt.accel.base import check_units
+from wrt.accel.structure import check_units
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_choice, as_integer, as_names, as_one, as_path, as_tuple, did_you_mean, shown
 from wrt.core.device import start, thread_count
 from wrt.core.errors import InputError

@@ -18,7 +18,9 @@ import numpy as np
 import warp as wp
 
 import wrt
-from wrt.accel import ACCELERATORS, Structure, build, tells_progress
+from wrt.accel.build import build, reports_progress
+from wrt.accel.structure import Structure
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.address_space import told_limit
 from wrt.core.checks import unknown
 from wrt.core.device import free_memory, load_kernel, made_once, start, thread_count
@@ -214,7 +216,7 @@ class Renderer:
         self.device_scene = upload_scene(self.scene, self.device, self.options.instancing)
         uploaded = time.perf_counter()
         options = {"triangle": self.options.triangle, "box": self.options.box, **self.options.accel_options}
-        if tells_progress(self.options.accel):
+        if reports_progress(self.options.accel):
             options = {"progress": partial(setattr, self, "fraction_built"), **options}
         self.accel = build(self.device_scene.world.geometry, self.options.accel, self.options.device, self.threads, **options)
         self.spans = {"upload": [(begin, uploaded)], "build": [(uploaded, time.perf_counter())]}

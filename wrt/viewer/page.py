@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import ACCELERATORS
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.picture.heatmap import colors, short

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import ACCELERATORS
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.lab.rtcore.profiler import COUNTERS, CostCounter
 from wrt.picture.film import Film

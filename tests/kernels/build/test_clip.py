@@ -6,8 +6,8 @@ import pytest
 from tests.kernel_tools import ints, launch, rounded, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel import Geometry
 from wrt.accel.cells.kdtree_build import clippable
+from wrt.accel.geometry import Geometry
 from wrt.kernels.build.clip import clip_references
 
 U = 2.0**-24

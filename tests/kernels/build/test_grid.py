@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.cell_cases import CASES, points_of, random_lines, segments, triangles
-from wrt.accel import build
+from wrt.accel.build import build
 from wrt.accel.cells import grid as module
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere

@@ -6,7 +6,7 @@ import pytest
 from tests.kernel_tools import launch, vec3s, zeros  # isort: skip
 import warp as wp
 
-from wrt.accel import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.kernels.build.triangle_cell import meets_cell, triangle_cell
 from wrt.kernels.structs import kernel
 

@@ -9,7 +9,7 @@ import pytest
 from tests.kernel_tools import CPU, directions, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
 import warp as wp
 
-from wrt.accel import build
+from wrt.accel.build import build
 from wrt.kernels.shade.lights import (
     LightSample,
     environment_radiance,

@@ -8,7 +8,7 @@ import pytest
 from tests.kernel_tools import CPU, directions, floats, ints, launch, rounded, unit, vec3s, zeros  # isort: skip
 import warp as wp
 
-from wrt.accel import build
+from wrt.accel.build import build
 from wrt.kernels.shade.surface import Surface, make_surface_at, next_away, spawn_point
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 from wrt.renderer.flatten import world_mesh

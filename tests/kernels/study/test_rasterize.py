@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.kernel_tools import CPU, launch, zeros  # before warp: it silences Warp's banner
-from wrt.accel import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.kernels.structs import kernel
 from wrt.kernels.study import rasterize as kernels
 from wrt.lab.bench.rasterizer import NOTHING, Rasterizer, directions_from_pixels, primary_rays_kernel, view_struct
@@ -328,7 +328,7 @@ def test_turn_has_the_exact_sign() -> None:
 
 
 def test_kernels_compile_for_turing_and_hopper(tmp_path: Path) -> None:
-    from wrt.accel import build
+    from wrt.accel.build import build
 
     cast = primary_rays_kernel(build(Mesh(np.eye(3), np.array([[0, 1, 2]]))).structure)
     for each in (kernels.project, kernels.bound, kernels.rasterize, cast):

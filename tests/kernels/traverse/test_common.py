@@ -9,7 +9,10 @@ import pytest
 from tests.kernel_tools import CPU, directions, floats, ints, launch, rounded, unit, vec3s, zeros  # isort: skip
 import warp as wp
 
-from wrt.accel import ACCELERATORS, Geometry, Structure, build
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.structure import Structure
+from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.query import HitArrays, RayArrays, load_ray
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.units.box import RAY_AABB

@@ -11,7 +11,10 @@ import warp as wp
 from tests.data import data_path
 from tests.kernel_tools import rounded
 from tests.rewalk import PRIMITIVE_BYTES, REWALK, rays
-from wrt.accel import ACCELERATORS, Geometry, Structure, build
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.structure import Structure
+from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.query import make_closest_hit_kernel
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse import bvh2 as traverse_bvh2

@@ -6,9 +6,9 @@ import pytest
 from tests.kernel_tools import directions, floats, launch, rounded, unit, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel.base import Geometry
 from wrt.accel.bvh.volumes import cuts
 from wrt.accel.bvh.volumes import project as host_project
+from wrt.accel.geometry import Geometry
 from wrt.kernels.structs import Ray, kernel
 from wrt.kernels.units.box import box_ray, ray_aabb
 from wrt.kernels.units.kdop import kdop_ray, project, ray_kdop

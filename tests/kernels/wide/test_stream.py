@@ -8,11 +8,14 @@ from tests.data import data_path
 from tests.kernel_tools import CPU, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel import ACCELERATORS, Geometry, build
 from wrt.accel import batches as streams
-from wrt.accel.base import Built, Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.batches import rays_per_launch, stream_kernel
+from wrt.accel.build import build
+from wrt.accel.built import Built
 from wrt.accel.bvh.wide_tree import stack_need
+from wrt.accel.geometry import Geometry
+from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
+from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.query import HitArrays
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.wide.lanes import EMPTY

@@ -13,8 +13,11 @@ from scipy.spatial.transform import Rotation
 import wrt
 from tests.data import data_path
 from tests.gltf_files import GltfFile
-from wrt.accel import ACCELERATORS, Structure, build
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances, place
+from wrt.accel.structure import Structure
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import RayArrays, Respawn, make_respawn_kernel
@@ -187,7 +190,7 @@ def test_nodes_and_instances_of_a_gltf_file_share_their_mesh(tmp_path) -> None:
 
 def test_instances_have_neither_files_nor_refit(tmp_path) -> None:
     ball = icosphere(1)
-    accel = build(place(*((wrt.accel.Geometry.of(ball), np.eye(4)),) * 2), "bvh")
+    accel = build(place(*((Geometry.of(ball), np.eye(4)),) * 2), "bvh")
     assert isinstance(accel, Instances) and "160 primitives in 1 instances" not in repr(accel)
     with pytest.raises(InputError, match="cannot be written"):
         accel.save(tmp_path / "x.accel")

@@ -15,8 +15,10 @@ from hypothesis import strategies as st
 import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
-from wrt.accel import ACCELERATORS, Geometry, build, build_cached
-from wrt.accel.store import MAGIC, load_accel
+from wrt.accel.build import build, build_cached, load_accel
+from wrt.accel.geometry import Geometry
+from wrt.accel.store import MAGIC
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import DIGEST_BYTES
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere

@@ -9,7 +9,10 @@ import pytest
 
 import wrt
 from tests.data import data_path
-from wrt.accel import ACCELERATORS, Geometry, Hits, build
+from wrt.accel.answers import Hits
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.lab.hard_cases.cases import HARD_CASES, HardCase, generate
 

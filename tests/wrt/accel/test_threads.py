@@ -13,10 +13,14 @@ import pytest
 import warp as wp
 
 import wrt
-from wrt.accel import ACCELERATORS, Accelerator, Geometry, build, load_accel
-from wrt.accel.base import RAYS_PER_LAUNCH, Hits
+from wrt.accel.answers import Hits
+from wrt.accel.base import Accelerator
+from wrt.accel.batches import RAYS_PER_LAUNCH
+from wrt.accel.build import build, load_accel
+from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances, place
 from wrt.accel.store import array_types
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import load_kernel, made_once, start
 from wrt.core.errors import InputError
 from wrt.kernels.structs import kernel

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 import wrt
-from wrt.accel.base import Hits
+from wrt.accel.answers import Hits
 from wrt.core.arrays import to_numpy, to_warp
 from wrt.core.errors import InputError
 from wrt.picture.film import Film

@@ -20,7 +20,7 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import ROOT
 from tests.wrt.renderer.test_checkpoint import SCENE, same
-from wrt.accel import build, build_cached
+from wrt.accel.build import build, build_cached
 from wrt.core import write_file
 from wrt.core.errors import InputError
 from wrt.core.write_file import LONG_AGO, aside, check_writable, remove_leftovers, replacing, this_system

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from tests.data import ROOT
-from wrt.accel import ACCELERATORS, build
+from wrt.accel.build import build
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.renderer.memory_estimate import BYTES_OF_SKY, BYTES_OF_TEXEL, bytes_of_scene
 from wrt.renderer.options import Options

@@ -18,7 +18,7 @@ from PIL import Image
 
 import wrt
 from tests.wrt.renderer.test_checkpoint import SCENE
-from wrt.accel.base import AccelStats, Refit
+from wrt.accel.answers import AccelStats, Refit
 from wrt.core.errors import InputError
 from wrt.core.html import SHOWN_ROWS, Rows, html_facts, html_table, number
 from wrt.renderer.options import Progress

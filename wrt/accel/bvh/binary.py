@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.base import Accelerator, Built
+from wrt.accel.base import Accelerator
+from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BvhOptions, build_binary, sah_cost
 from wrt.accel.bvh.refit import refit_nodes
 from wrt.accel.store import check_binary

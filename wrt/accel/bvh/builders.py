@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from wrt.accel.base import Geometry
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, sah_cost
+from wrt.accel.geometry import Geometry
 from wrt.core.registry import Registry
 
 __all__ = ["BVH_BUILDERS", "BinaryTree", "BvhOptions", "build_binary", "sah_cost"]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.core.device import load_kernel, run_all, start, upload
 from wrt.kernels.build import end_point_overlap as kernels
 

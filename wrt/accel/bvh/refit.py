@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.core.device import load_kernel, start, upload
 from wrt.kernels.build.refit import refit
 from wrt.kernels.traverse.bvh2 import Bvh2Node

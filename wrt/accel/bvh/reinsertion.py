@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Geometry
 from wrt.accel.bvh.top_down import build_binned, build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions
+from wrt.accel.geometry import Geometry
 from wrt.core.device import load_kernel, records, run_all, start, upload
 from wrt.kernels.build import reinsertion as kernels
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Geometry
 from wrt.accel.bvh.top_down import build_options, in_order, run_tasks
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
+from wrt.accel.geometry import Geometry
 from wrt.core.device import records, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import records as build_records

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Geometry
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
+from wrt.accel.geometry import Geometry
 from wrt.core.device import load_kernel, records, run_growing, start, upload
 from wrt.kernels.build import bvh2 as build_bvh2
 from wrt.kernels.build import records as build_records

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator, Built, Geometry
+from wrt.accel.base import Accelerator
+from wrt.accel.built import Built
 from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.refit import refit_nodes
 from wrt.accel.bvh.tree import NODE_DTYPE, root_area
+from wrt.accel.geometry import Geometry
 from wrt.accel.store import check_links
 from wrt.core.device import load_kernel, records, run_all, start, upload
 from wrt.kernels.build import volumes as fits

@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from wrt.accel.base import Accelerator, Built
+from wrt.accel.base import Accelerator
+from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.bvh.compress import children_there, compress, decompress
 from wrt.accel.bvh.wide_tree import MAX_PLACES, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Geometry
 from wrt.accel.bvh.tree import BinaryTree
+from wrt.accel.geometry import Geometry
 from wrt.core.device import load_kernel, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import wide as build_wide

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator, Built, Geometry
+from wrt.accel.base import Accelerator
+from wrt.accel.built import Built
+from wrt.accel.geometry import Geometry
 from wrt.core.device import load_kernel, records, run_all, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import bsp as build_bsp

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.base import Accelerator, Built
+from wrt.accel.base import Accelerator
+from wrt.accel.built import Built
 from wrt.accel.cells.kdtree_build import KdOptions, build_tree
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import kdtree as kernels

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.core.device import load_kernel, records, run_all, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import kdtree as kernels

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.accel.base import Accelerator, Built
+from wrt.accel.base import Accelerator
+from wrt.accel.built import Built
 from wrt.accel.cells.common import check_numbers, check_references, one_row, triangle_reach
 from wrt.accel.cells.octree_build import OctreeOptions, build_tree
 from wrt.core.errors import InputError

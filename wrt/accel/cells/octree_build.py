@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Geometry
 from wrt.accel.cells.common import cell_source
+from wrt.accel.geometry import Geometry
 from wrt.core.device import load_kernel, records, run_all, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import octree as build_octree

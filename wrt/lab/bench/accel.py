@@ -12,7 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
+from wrt.accel.answers import Hits
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import require_known
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError

@@ -13,10 +13,12 @@ from time import perf_counter, process_time
 import numpy as np
 import warp as wp
 
-from wrt.accel import Accelerator, Geometry, build
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build
 from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
 from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.tree import half_areas
+from wrt.accel.geometry import Geometry
 from wrt.core.device import describe_devices, load_kernel, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import RayArrays

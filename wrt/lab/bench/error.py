@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 import wrt
-from wrt.accel import ACCELERATORS
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import did_you_mean
 from wrt.core.errors import InputError
 from wrt.core.html import html_table

@@ -15,7 +15,11 @@ from typing import Any
 import numpy as np
 
 import wrt
-from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
+from wrt.accel.answers import Hits
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import require_known
 from wrt.core.device import describe_devices, load_kernel, run_all, thread_count
 from wrt.core.errors import InputError

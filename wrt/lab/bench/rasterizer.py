@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel import ACCELERATORS, Geometry, build
-from wrt.accel.base import Structure
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.structure import Structure
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import load_kernel, run_all, start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.kernels.structs import Surfaces, Tile

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wrt.accel import Accelerator
+from wrt.accel.base import Accelerator
 
 SEEN = 0.55  # half of the picture's height, over distance: a field of view of 58 degrees
 

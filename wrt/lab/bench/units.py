@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 import wrt
-from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
 from wrt.kernels.units.box import RAY_AABB

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start, thread_count
 from wrt.core.errors import InputError
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster, directions_from_pixels
 from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera

@@ -16,7 +16,7 @@ from functools import cache
 
 import numpy as np
 
-from wrt.accel.base import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.lab.hard_cases.common import (
     HIT,
     HardCase,

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from wrt.accel.base import Geometry
+from wrt.accel.geometry import Geometry
 
 HIT, ASK, MISS = 1, 0, -1  # what a ray's exact answer must be; ASK: the oracle knows
 AIMS = ("uniform", "vertices", "edges")

@@ -8,8 +8,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from wrt.accel import Accelerator, Hits, build
-from wrt.accel.base import Geometry
+from wrt.accel.answers import Hits
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 
 
@@ -31,7 +33,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
-        """As wrt.accel.Accelerator.closest_hit."""
+        """As wrt.accel.base.Accelerator.closest_hit."""
 
 
 class Own(Algorithm):

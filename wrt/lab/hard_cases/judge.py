@@ -125,7 +125,7 @@ class _Claims:
 
 
 def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool = True) -> Verdict:
-    """The verdict on closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.Hits).
+    """The verdict on closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.answers.Hits).
 
     lowest: of triangles that are the same, the one with the lowest prim_id must be told: wrt's own rule, not a peer's.
 

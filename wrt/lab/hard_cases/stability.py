@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Structure
+from wrt.accel.structure import Structure
 from wrt.core.device import load_kernel, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table

@@ -14,8 +14,8 @@ from typing import Any
 
 import warp as wp
 
-from wrt.accel import ACCELERATORS, Structure
-from wrt.accel.base import closest_hit_kernel
+from wrt.accel.structure import Structure, closest_hit_kernel
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start
 from wrt.core.errors import InputError
 from wrt.kernels.study.unit_probes import make_box_probe, make_triangle_probe

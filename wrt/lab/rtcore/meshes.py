@@ -9,7 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import ACCELERATORS, Accelerator, Geometry, build
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import require_known
 from wrt.core.errors import InputError
 from wrt.core.html import Rows, html_table

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.base import Accelerator, Counters
+from wrt.accel.answers import Counters
+from wrt.accel.base import Accelerator
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.lab.rtcore.caches import LINE, Level1, Misses, Warps, first_level, second_level

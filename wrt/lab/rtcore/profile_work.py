@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.accel.base import Counters
+from wrt.accel.answers import Counters
 from wrt.lab.rtcore.model import Work
 from wrt.lab.rtcore.profiler import KINDS, Profile
 from wrt.lab.rtcore.warps import WARP, blocks

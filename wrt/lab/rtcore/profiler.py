@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.accel import Structure
-from wrt.accel.base import copied
+from wrt.accel.counting import copied
+from wrt.accel.structure import Structure
 from wrt.core.device import free_memory, run_all, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
@@ -62,7 +62,7 @@ class Rays:
     rays: as kernels.ray_log.LoggedRay; counts: as kernels.counters.Counts; pixel: row * width + column; kind: index in KINDS
     ("straight": goes on unbent through a blended surface); depth: bounces behind it (a shadow ray's: of the ray whose hit it
     starts from); lines: distinct cache lines. trace_rows: the rays whose fetches were kept, trace_first: where each one's
-    begin; address, size: of each fetch, in bytes, as in wrt.accel.base.Counters.
+    begin; address, size: of each fetch, in bytes, as in wrt.accel.answers.Counters.
     """
 
     rays: np.ndarray

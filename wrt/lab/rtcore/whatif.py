@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import Accelerator, Geometry, build
-from wrt.accel.base import Counters
+from wrt.accel.answers import Counters
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
 from wrt.core.checks import require_known
 from wrt.core.errors import InputError
 from wrt.core.html import Rows, html_table

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel import Accelerator, Geometry
-from wrt.accel.base import Built, Counters
+from wrt.accel.answers import Counters
+from wrt.accel.base import Accelerator
+from wrt.accel.built import Built
 from wrt.accel.bvh.binary import Bvh2
+from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.kernels.study.bvh2_study import LEVELS, STACK_SIZE, Study
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE

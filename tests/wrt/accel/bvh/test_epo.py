@@ -8,7 +8,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from wrt.accel import Accelerator, Geometry, build
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.kernels.wide.traverse import LEAF_RANGE
 from wrt.scene.mesh import Mesh

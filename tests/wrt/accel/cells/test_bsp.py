@@ -14,11 +14,13 @@ import warp as wp
 
 import wrt.accel.cells.bsp as module
 from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, soup, triangles
-from wrt.accel import Geometry, build, build_cached
-from wrt.accel.base import HitArrays
+from wrt.accel.build import build, build_cached
 from wrt.accel.cells.bsp import Bsp
+from wrt.accel.counting import counted
+from wrt.accel.geometry import Geometry
+from wrt.accel.rays import rays_on
 from wrt.core.errors import InputError
-from wrt.kernels.query import make_closest_hit_kernel
+from wrt.kernels.query import HitArrays, make_closest_hit_kernel
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.bsp import PLANE, STACK_SIZE
 from wrt.scene.shapes import icosphere
@@ -239,11 +241,12 @@ def test_random_lines_cost_what_the_heuristic_says(kind: str, options: dict[str,
     rng = np.random.default_rng(5)
     tree = build(HARD[kind](rng), "bsp", **options)
     lo, hi = (np.array(tree.built.arrays[name], np.float64) for name in ("lo", "hi"))
-    rays, _ = tree._rays(*lines_through(lo, hi, rng, 40_000), 0.0, np.inf)
+    rays, _ = rays_on(tree.device, *lines_through(lo, hi, rng, 40_000), 0.0, np.inf)
     hits = HitArrays()
     hits.t, hits.u, hits.v = (wp.zeros(len(rays.t_min), dtype=wp.float32, device="cpu") for _ in range(3))
     hits.prim_id = wp.zeros(len(rays.t_min), dtype=wp.int32, device="cpu")
-    counts = tree._counted(lambda structure: refusing_kernel(), tree.data, rays, hits, False, 1).counts
+    inputs = [tree.data, tree._surfaces, rays, hits]
+    counts = counted(lambda structure: refusing_kernel(), tree.structure, inputs, len(rays.t_min), trace=False, threads=1).counts
     steps = counts["nodes"] + counts["primitives"]
     assert abs(steps.mean() - tree.stats.sah_cost) < 3.0 * steps.std() / np.sqrt(len(steps))
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
-from wrt.accel import ACCELERATORS
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.lab.bench import accel as bench
 from wrt.lab.bench import accel_report as report

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run_command
-from wrt.accel import ACCELERATORS
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted
 from wrt.lab.bench import error as bench

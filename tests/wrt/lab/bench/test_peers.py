@@ -11,7 +11,9 @@ import pytest
 
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
-from wrt.accel import Geometry, Hits, build
+from wrt.accel.answers import Hits
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.lab.bench import peers

@@ -7,7 +7,8 @@ import time
 import numpy as np
 import pytest
 
-from wrt.accel import Geometry, build
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE

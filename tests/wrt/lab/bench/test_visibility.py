@@ -16,7 +16,7 @@ import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import data_path
-from wrt.accel import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.lab.bench import visibility_report
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.command_line import wrt as run
-from wrt.accel import Geometry
+from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE

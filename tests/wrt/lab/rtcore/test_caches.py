@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from wrt.accel import build
+from wrt.accel.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.rtcore.caches import LINE, Cache, Misses, Warps, distinct_lines, first_level, lines_of, replay, second_level

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wrt.accel import build
-from wrt.accel.base import Counters
+from wrt.accel.answers import Counters
+from wrt.accel.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE, Counts
 from wrt.lab.rtcore.caches import LINE, Cache

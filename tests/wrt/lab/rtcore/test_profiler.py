@@ -12,7 +12,8 @@ import warp as wp
 
 import wrt
 from tests.rewalk import REWALK, rays
-from wrt.accel import ACCELERATORS, Structure
+from wrt.accel.structure import Structure
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.kernels.traverse.common import Units
 from wrt.lab.rtcore.cubin import read_cubin

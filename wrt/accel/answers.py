@@ -1,0 +1,108 @@
+"""What a structure answers, and what it says of itself: hits, counters, sizes, refits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from wrt.core.arrays import to_numpy, to_warp
+from wrt.core.html import html_facts, html_table
+
+
+@dataclass(frozen=True)
+class AccelStats:
+    """build_seconds: wall clock, without those in which the builder's kernels were compiled; nodes, leaves, depth: 0 where there is
+    no tree; references: primitives in all leaves together, more than there are where a structure splits space; bytes: on the
+    device, triangles included; sah_cost: expected cost of a random line through the root box, one node visited and one
+    primitive tested costing 1 each (NaN where nobody knows)."""
+
+    build_seconds: float
+    nodes: int
+    leaves: int
+    depth: int
+    references: int
+    bytes: int
+    sah_cost: float
+
+    def _repr_html_(self) -> str:
+        return html_facts("Structure", asdict(self))
+
+
+@dataclass(frozen=True)
+class Refit:
+    """What Accelerator.refit did: seconds; growth: SAH cost of the refitted tree over that of the tree when it was built; rebuilt:
+    whether that was too much, and a new tree was built."""
+
+    seconds: float
+    growth: float
+    rebuilt: bool
+
+    def _repr_html_(self) -> str:
+        return html_facts("Refit", asdict(self))
+
+
+@dataclass(frozen=True, eq=False)
+class Counters:
+    """What each ray cost, (N,) each, as in kernels.counters.Counts; trace: the fetches of all rays one after another, those of
+    ray i from first[i] to first[i + 1]: address (int64, bytes; primitives from PRIMITIVE_SPACE on) and size (int64, bytes)."""
+
+    counts: np.ndarray
+    first: np.ndarray
+    address: np.ndarray
+    size: np.ndarray
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        if name.startswith("_") or name not in (self.counts.dtype.names or ()):
+            raise AttributeError(name)
+        return self.counts[name]
+
+    def __repr__(self) -> str:
+        means = ", ".join(f"{name} {self.counts[name].mean():.2f}" for name in self.counts.dtype.names or ())
+        return f"Counters({len(self.counts)} rays; a ray: {means})" if len(self.counts) else "Counters(0 rays)"
+
+    def _repr_html_(self) -> str:
+        names = (self.counts.dtype.names or ()) if len(self.counts) else ()
+        rows = [(name, float(self.counts[name].mean()), int(self.counts[name].max()), int(self.counts[name].sum(dtype=np.int64)))
+                for name in names]
+        return html_table(f"Counters of {len(self.counts)} rays", ("", "a ray", "largest", "sum"), rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """t: (N,) float32, in units of |direction|, inf on a miss; prim_id: (N,) int32, -1 on a miss; u, v: (N,) float32:
+    the point is (1 - u - v) v0 + u v1 + v v2 (0 on a miss and on spheres). NumPy arrays, or Warp's if the rays were.
+    counters: what each ray cost, where that was asked for."""
+
+    t: Any
+    u: Any
+    v: Any
+    prim_id: Any
+    counters: Counters | None = None
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __repr__(self) -> str:
+        return f"Hits({len(self)} rays)"
+
+    def _repr_html_(self) -> str:
+        hits = self.numpy()
+        t = hits.t[hits.prim_id >= 0]
+        facts: dict[str, Any] = {"rays": len(self), "hits": len(t), "misses": len(self) - len(t)}
+        if len(t):
+            facts |= {"nearest t": float(t.min()), "farthest t": float(t.max())}
+        return html_facts("Hits", facts) + (self.counters._repr_html_() if self.counters else "")
+
+    def numpy(self) -> Hits:
+        """The same with NumPy arrays; of hits on the CPU they share the memory."""
+        return self._each(to_numpy)
+
+    def warp(self) -> Hits:
+        """The same with Warp arrays; of hits on the CPU they share the memory."""
+        return self._each(to_warp)
+
+    def _each(self, convert: Callable[[Any], Any]) -> Hits:
+        return replace(self, **{name: convert(getattr(self, name)) for name in ("t", "u", "v", "prim_id")})

@@ -1,0 +1,94 @@
+"""What is hit: the triangles and spheres that a structure is built over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from hashlib import sha256
+
+import numpy as np
+
+from wrt.accel.triangle_data import TRIANGLE_DATA
+from wrt.core.device import records, run_all
+from wrt.kernels.traverse.common import Units
+from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST
+from wrt.scene.mesh import Mesh
+
+RECORDS_PER_JOB = 32768
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """What is hit, in world space: vertices (V, 3) float32, faces (F, 3) int32, spheres (S, 4) float32 (center, radius).
+
+    prim_id counts the faces first, then the spheres.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    spheres: np.ndarray
+
+    @staticmethod
+    def of(mesh: Mesh) -> Geometry:
+        """Of a mesh alone; prim_ids are indices into its faces."""
+        return Geometry(mesh.vertices, mesh.faces, np.zeros((0, 4), np.float32))
+
+    def __len__(self) -> int:
+        return len(self.faces) + len(self.spheres)
+
+    @property
+    def n_triangles(self) -> int:
+        """How many of the primitives are triangles: they come before the spheres."""
+        return len(self.faces)
+
+    def digest(self) -> str:
+        """SHA-256 of the arrays: the same for the same geometry, whatever file it came from."""
+        out = sha256()
+        for array in (self.vertices, self.faces, self.spheres):
+            out.update(f"{array.shape}{array.dtype.str}".encode() + np.ascontiguousarray(array).tobytes())
+        return out.hexdigest()
+
+    def bounds(self, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of every primitive's padded box, two (N, 3) float32."""
+        lo, hi = (np.empty((len(self), 3), np.float32) for _ in range(2))
+        self.write_bounds(lo, hi, threads)
+        return lo, hi
+
+    def write_bounds(self, lo: np.ndarray, hi: np.ndarray, threads: int = 1) -> None:
+        """The same into arrays that there are, (N, 3) float32.
+
+        To the last bit what the units take (kernels.ray_triangle.within_bounds): a hit is never outside its box.
+        """
+        def fill(first: int) -> None:
+            some, n = slice(first, first + RECORDS_PER_JOB), len(self.faces)
+            corners = [self.vertices.take(self.faces[some, i], axis=0) for i in range(3)]
+            spheres = self.spheres[max(first - n, 0) : max(first + RECORDS_PER_JOB - n, 0)]
+            low, high = (np.concatenate([end(end(corners[0], corners[1]), corners[2]), spheres[:, :3] + sign * spheres[:, 3:]])
+                         for end, sign in ((np.minimum, np.float32(-1.0)), (np.maximum, np.float32(1.0))))
+            with np.errstate(over="ignore"):  # near the end of float32 the padded box is all of space
+                x, y, z = (high - low).T
+                pad = np.float32(PAD_EXTENT) * np.maximum(np.maximum(x, y), z)[:, None] + np.float32(PAD_SMALLEST)
+                lo[some] = low - (pad + np.float32(PAD_COORDINATE) * np.abs(low))
+                hi[some] = high + (pad + np.float32(PAD_COORDINATE) * np.abs(high))
+
+        run_all([partial(fill, first) for first in range(0, len(self), RECORDS_PER_JOB)], threads)
+
+    def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
+        """What the triangle test of `units` reads, in the given order of prim_id, or in their own."""
+        if order is not None and len(order) > len(self):  # what stands more than once is made once
+            return self.primitives(units, None, threads)[order]
+        prim_id = np.arange(len(self), dtype=np.int32) if order is None else order
+        out = records(units.triangle_test.record, len(prim_id))
+        out["prim_id"] = prim_id
+
+        def fill(first: int) -> None:
+            some = slice(first, first + RECORDS_PER_JOB)
+            triangle = prim_id[some] < len(self.faces) if units.spheres else slice(None)
+            part = out[some][triangle]
+            faces = self.faces.take(part["prim_id"], axis=0)
+            TRIANGLE_DATA[units.triangle](part, *(self.vertices.take(faces[:, i], axis=0) for i in range(3)))
+            if units.spheres:
+                out[some][triangle] = part
+
+        run_all([partial(fill, first) for first in range(0, len(prim_id), RECORDS_PER_JOB)], threads)
+        return out

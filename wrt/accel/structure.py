@@ -1,0 +1,69 @@
+"""A kind of structure together with its test units: what a kernel is made from."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+from wrt.core.device import made_once
+from wrt.core.errors import InputError
+from wrt.kernels.query import make_any_hit_kernel, make_closest_hit_kernel
+from wrt.kernels.traverse import instances as traverse_instances
+from wrt.kernels.traverse.common import Units
+from wrt.kernels.units.box import RAY_AABB
+from wrt.kernels.units.triangle import RAY_TRIANGLE
+
+
+def check_units(triangle: str, box: str) -> None:
+    """Raise InputError where there is no triangle test or box test of that name."""
+    for choice, table, what in ((triangle, RAY_TRIANGLE, "triangle test"), (box, RAY_AABB, "box test")):
+        if choice not in table:
+            raise InputError(f"no {what} {choice!r}; there is {', '.join(table)}")
+
+
+class Kind(Protocol):
+    """What is asked of an Accelerator class: its traversal's module."""
+
+    name: ClassVar[str]
+    kernels: ClassVar[Any]
+
+
+class Structure(NamedTuple):
+    """A kind of structure together with the units that walk it: what a kernel is made from. Hashable. Where the units walk
+    instances, it is a tree over structures of this kind (wrt.accel.instances)."""
+
+    accel: type[Kind]
+    units: Units = Units()
+
+    @property
+    def struct(self) -> Any:
+        """The Warp struct of the structure's arrays."""
+        return struct_of(self)
+
+    @property
+    def bottom(self) -> Any:
+        """The struct of one structure, also where there are instances of several."""
+        return struct_of(self._replace(units=self.units._replace(instances=False)))
+
+    def traversal(self, *, any_hit: bool, accepts: Any = None) -> Any:
+        """The traversal unit as a Warp function (accel, surfaces, ray) -> Hit."""
+        traverse = self.accel.kernels.make_traversal(self.units, any_hit, accepts)
+        if self.units.instances:
+            return traverse_instances.make_traversal(self.units, any_hit, traverse, self.bottom)
+        return traverse
+
+
+@made_once
+def struct_of(structure: Structure) -> Any:
+    if structure.units.instances:
+        return traverse_instances.make_struct(structure.bottom)
+    return structure.accel.kernels.make_struct(structure.units.triangle_test.record)
+
+
+@made_once
+def closest_hit_kernel(structure: Structure) -> Any:
+    return make_closest_hit_kernel(structure.struct, structure.traversal(any_hit=False))
+
+
+@made_once
+def any_hit_kernel(structure: Structure) -> Any:
+    return make_any_hit_kernel(structure.struct, structure.traversal(any_hit=True))
