@@ -1,82 +1,196 @@
-"""The house rules that a reader relies on: who imports whom, and that everything is packaged."""
+"""The house rules that a reader relies on: who imports whom, how large things are, and that everything is packaged."""
 
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
-import tomllib
+import sysconfig
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from tests.data import ROOT
 
-KERNELS = sorted((ROOT / "kernels").glob("*.py"))
-HOST = sorted((ROOT / "wrt").rglob("*.py"))
-ALLOWED = {"warp", "functools", "typing"}
-USE_KERNELS = ("accel/", "device.py", "device_film.py", "device_scene.py", "driver.py", "profiler.py",
-               "cache_sim.py", "rtcore.py", "bench/")
+KERNELS = sorted((ROOT / "kernels").rglob("*.py"))
+HOST = sorted(path for path in (ROOT / "wrt").rglob("*.py") if not path.is_relative_to(ROOT / "wrt" / "kernels"))
+# The folders of wrt/, and from which others each may import. `kernels` stands at the top of the project.
+BELOW_WRT = {
+    "core": set(),
+    "scene": {"core"},
+    "picture": {"core"},
+    "io": {"scene", "picture", "core"},
+    "accel": {"io", "kernels", "scene", "core"},
+    "renderer": {"accel", "kernels", "io", "scene", "picture", "core"},
+    "viewer": {"renderer", "accel", "io", "scene", "picture", "core"},
+    "lab": {"renderer", "accel", "kernels", "io", "scene", "picture", "core"},
+    "cli": {"lab", "viewer", "renderer", "accel", "io", "scene", "picture", "core"},
+}
+# The folders of kernels/, and from which others each may import; `structs` is below all of them.
+BELOW_KERNELS = {
+    "structs": set(),
+    "units": {"structs"},
+    "traverse": {"units", "structs"},
+    "wide": {"query", "traverse", "units", "structs"},
+    "shade": {"traverse", "units", "structs"},
+    "query": {"traverse", "units", "structs"},
+    "build": {"wide", "traverse", "units", "structs"},
+    "study": {"query", "shade", "wide", "build", "traverse", "units", "structs"},
+}
+LIBRARIES_OF_KERNELS = {"warp", "functools", "typing", "collections", "math", "pathlib"}
 
 
-def imports(path: Path) -> set[str]:
-    """Every module that a file imports, anywhere in it."""
+def module(path: Path) -> str:
+    name = path.relative_to(ROOT).with_suffix("").as_posix().removesuffix("/__init__").replace("/", ".")
+    return f"wrt.{name}" if name.startswith("kernels") else name
+
+
+FILES = {module(path): path for path in (*HOST, *KERNELS)}
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
+def imports(path: Path) -> frozenset[str]:
+    """Every module that a file imports, anywhere in it, if only for its types."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            found.add(node.module or "")
-    return found
+            base = node.module or ""
+            found |= {f"{base}.{alias.name}" if f"{base}.{alias.name}" in FILES else base for alias in node.names}
+    return frozenset(found)
 
 
-@pytest.mark.parametrize("path", KERNELS, ids=lambda path: path.name)
-def test_kernels_never_import_the_host_side(path: Path) -> None:
-    assert all(name in ALLOWED or name.startswith("wrt.kernels.") for name in imports(path))
+def ids(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
 
 
-@pytest.mark.parametrize("path", KERNELS, ids=lambda path: path.name)
+def folder(name: str, below: str) -> str:
+    """The part of a module's name that follows `below`: wrt.accel.bvh.tree below wrt is in accel."""
+    rest = name.removeprefix(below).strip(".")
+    return rest.split(".")[0]
+
+
+@pytest.mark.parametrize("path", [path for path in HOST if path.parent != ROOT / "wrt"], ids=ids)
+def test_host_folders_import_downward_only(path: Path) -> None:
+    here = folder(module(path), "wrt")
+    there = {folder(name, "wrt") for name in imports(path) if name == "wrt" or name.startswith("wrt.")}
+    assert there - {here, ""} <= BELOW_WRT[here]
+
+
+@pytest.mark.parametrize("path", [path for path in KERNELS if path.name != "__init__.py"], ids=ids)
+def test_kernels_import_downward_only_and_never_the_host_side(path: Path) -> None:
+    here = folder(module(path), "wrt.kernels")
+    own = {name for name in imports(path) if name.startswith("wrt.kernels.")}
+    assert {folder(name, "wrt.kernels") for name in own} - {here} <= BELOW_KERNELS[here]
+    assert {name.split(".")[0] for name in imports(path) - own} <= LIBRARIES_OF_KERNELS
+
+
+@pytest.mark.parametrize("path", KERNELS, ids=ids)
 def test_kernels_have_no_postponed_annotations(path: Path) -> None:
     assert "__future__" not in imports(path)  # a factory's annotation that is a closure variable would not be found
 
 
-@pytest.mark.parametrize("path", HOST, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_only_some_host_modules_import_kernels(path: Path) -> None:
-    allowed = path.relative_to(ROOT / "wrt").as_posix().startswith(USE_KERNELS)
-    assert allowed or not any(name.startswith("wrt.kernels") for name in imports(path))
+def circles() -> Iterator[list[str]]:
+    """Groups of modules that import each other in a loop (Tarjan 1972)."""
+    edges = {name: sorted(imports(path) & FILES.keys() - {name}) for name, path in FILES.items()}
+    number: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+
+    def visit(name: str) -> Iterator[list[str]]:
+        number[name] = low[name] = len(number)
+        stack.append(name)
+        for other in edges[name]:
+            if other not in number:
+                yield from visit(other)
+                low[name] = min(low[name], low[other])
+            elif other in stack:
+                low[name] = min(low[name], number[other])
+        if low[name] == number[name]:
+            group = stack[stack.index(name):]
+            del stack[-len(group):]
+            if len(group) > 1:
+                yield group
+
+    # The face of the package names what is public, each by its home, for type checkers: it is not imported from below.
+    edges["wrt"] = []
+    for name in edges:
+        if name not in number:
+            yield from visit(name)
 
 
-@pytest.mark.parametrize("path", [p for p in HOST if p.name not in ("__main__.py", "cli.py")], ids=lambda p: p.name)
+def test_nothing_imports_in_circles() -> None:
+    assert list(circles()) == []
+
+
+@pytest.mark.parametrize("path", [p for p in HOST if p.name != "__main__.py" and p.parent.name != "cli"], ids=ids)
 def test_nothing_imports_the_command_line(path: Path) -> None:
-    assert "wrt.cli.main" not in imports(path)
+    assert not any(name.startswith("wrt.cli") for name in imports(path))
 
 
-def test_units_come_before_traversals_before_the_integrator() -> None:
-    layers = [("structs",), ("ray_", "sampling", "camera"), ("counters", "lanes", "wide_nodes", "triangle_cell", "cell_ray"),
-              ("textures", "surface", "materials", "traverse", "lights"),
-              ("shadows", "whitted", "query", "packets", "trace_packets", "build_", "refit_", "cache_lru", "end_point_overlap",
-               "peers"),
-              ("render", "rasterize", "primary_rays", "unit_probes")]
-
-    def layer(name: str) -> int:
-        return next(i for i, starts in enumerate(layers) if name.startswith(starts))
-
-    for path in KERNELS:
-        for name in imports(path) - ALLOWED:
-            assert layer(name.removeprefix("wrt.kernels.")) <= layer(path.stem), f"{path.name} imports {name}"
+def test_the_package_shows_its_folders() -> None:
+    top = sorted((ROOT / "wrt").iterdir())
+    assert len([path for path in top if path.is_dir() and path.name != "__pycache__"]) <= 10
+    assert len([path for path in top if path.suffix == ".py"]) <= 6
+    for path in {path.parent for path in (*HOST, *KERNELS)}:
+        assert ast.get_docstring(tree(path / "__init__.py")), f"{path} does not say what is in it"
 
 
-def test_the_package_list_matches_the_tree() -> None:
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
-    folders = {path.parent.relative_to(ROOT).as_posix().replace("/", ".") for path in HOST}
-    assert set(listed) == folders | {"wrt.kernels"}
-    assert not (ROOT / "kernels" / "__init__.py").exists()
+@pytest.mark.parametrize("path", [*HOST, *KERNELS], ids=ids)
+def test_nothing_is_too_large_to_read(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= 400
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.ClassDef):
+            assert (node.end_lineno or 0) - node.lineno < 200, f"class {node.name}"
+        elif isinstance(node, ast.FunctionDef) and not any("kernel" in ast.unparse(each) for each in node.decorator_list):
+            names = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            assert len([each for each in names if each.arg not in ("self", "cls")]) <= 9, f"function {node.name}"
 
 
 def test_kernels_refuse_a_second_name() -> None:
     code = "import sys; sys.path.insert(0, '.'); import kernels.structs"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert result.returncode == 1 and "import wrt.kernels.structs" in result.stderr
+    assert result.returncode == 1 and "import wrt.kernels" in result.stderr
+
+
+def copied(to: Path) -> None:
+    """The package as a place without symbolic links holds it: device code beside it, and nothing in it."""
+    for path in (*HOST, *KERNELS):
+        target = to / path.relative_to(ROOT)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(path.read_bytes())
+
+
+def run(code: str, folder: Path, path: Path | str = "") -> str:
+    environment = {**os.environ, "PYTHONPATH": str(path)}
+    result = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False, env=environment)
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip()
+
+
+def test_kernels_are_found_without_symbolic_links(tmp_path: Path) -> None:
+    copied(tmp_path)
+    code = "import wrt.kernels.structs as s, wrt; print(s.__name__, s.__file__, wrt.__path__)"
+    assert run(code, tmp_path, tmp_path) == f"wrt.kernels.structs {tmp_path / 'kernels' / 'structs.py'} ['{tmp_path / 'wrt'}']"
+
+
+def test_a_clone_called_wrt_does_not_hide_the_package(tmp_path: Path) -> None:
+    copied(tmp_path / "wrt")
+    site = tmp_path / "site"
+    site.mkdir()
+    (site / "wrt.pth").write_text(str(tmp_path / "wrt"))  # what an editable install writes
+    start = f"import site; site.addsitedir({str(site)!r}); "
+    assert run(start + "import wrt; print(wrt.__version__)", tmp_path) == "0.1.0"
+    assert sysconfig.get_path("purelib")  # where pip would write it
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -91,6 +205,17 @@ def test_public_names_exist() -> None:
 
     for name in wrt.__all__:
         assert getattr(wrt, name) is not None
-        assert not any((Path(folder) / f"{name}.py").exists() for folder in wrt.__path__)  # its import would hide the name
+        assert not any((Path(folder) / name).exists() or (Path(folder) / f"{name}.py").exists() for folder in wrt.__path__), (
+            f"the import of a module wrt.{name} would hide the public name")
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = wrt.nothing
+
+
+def test_type_checkers_see_the_public_names_where_they_are() -> None:
+    import wrt
+
+    guarded = next(node for node in tree(ROOT / "wrt" / "__init__.py").body
+                   if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+    seen = {alias.asname: node.module for node in guarded.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert seen == wrt._HOME
+    assert all(name in (wrt.__doc__ or "") for name in seen)  # help(wrt) begins with them
