@@ -8,14 +8,15 @@ from typing import Any
 from wrt import accel as structures
 from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.io.mesh_file import load_mesh
+from wrt.scene.mesh import Mesh
 
 
 def build(mesh: Mesh | structures.Geometry | str | os.PathLike[str], accel: str = "bvh", device: str = "cpu",
           threads: int | None = None, **options: Any) -> structures.Accelerator:
     """An acceleration structure over a mesh, ready for `closest_hit` and `any_hit`.
 
-    mesh: a Mesh, a Geometry, or the path of an .obj, .ply or .stl file. accel: a name in ACCELERATORS. options: `triangle` and
+    mesh: a Mesh, a Geometry, or the path of a mesh file. accel: a name in ACCELERATORS. options: `triangle` and
     `box`, the intersection tests, and the structure's own (see its class). Raises InputError that names the argument.
     """
     if isinstance(mesh, str | os.PathLike):

@@ -15,13 +15,14 @@ import wrt
 from wrt.accel import ACCELERATORS, Geometry, build
 from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
+from wrt.io.mesh_file import load_mesh
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench.timing import Quartiles, alternate, quartiles, shown
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.bench.visibility_report import table
 from wrt.lab.hard_cases.common import soup, unit_vectors
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere, teapot
 
 ALONE = 64  # triangles without a structure: the triangle unit by itself
