@@ -21,7 +21,7 @@ from tests.data import ROOT
 from tests.gltf_files import GltfFile
 from tests.wrt.lab.rtcore.test_profiler import MIRRORS
 from wrt.cli.main import cli
-from wrt.scene.mesh import load_mesh
+from wrt.io.mesh_file import load_mesh
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 # Which CI itself runs (.ci/run), or a test of their own.

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from wrt.core.errors import InputError as InputError
     from wrt.core.errors import SceneWarning as SceneWarning
     from wrt.io.load import load_scene as load_scene
+    from wrt.io.mesh_file import load_mesh as load_mesh
     from wrt.lab.rtcore.profiler import profile as profile
     from wrt.picture.film import Film as Film
     from wrt.renderer.options import Options as Options
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
     from wrt.scene.materials import Material as Material
     from wrt.scene.materials import Texture as Texture
     from wrt.scene.mesh import Mesh as Mesh
-    from wrt.scene.mesh import load_mesh as load_mesh
     from wrt.scene.model import Object as Object
     from wrt.scene.model import Scene as Scene
     from wrt.scene.model import Sphere as Sphere
@@ -57,6 +57,7 @@ _PUBLIC = {
     "wrt.accel.structures": ("ACCELERATORS",),
     "wrt.core.errors": ("InputError", "SceneWarning"),
     "wrt.io.load": ("load_scene",),
+    "wrt.io.mesh_file": ("load_mesh",),
     "wrt.lab.rtcore.profiler": ("profile",),
     "wrt.picture.film": ("Film",),
     "wrt.renderer.options": ("Options", "Progress"),
@@ -66,7 +67,7 @@ _PUBLIC = {
     "wrt.scene.cameras": ("Camera",),
     "wrt.scene.lights": ("DirectionalLight", "PointLight", "SpotLight"),
     "wrt.scene.materials": ("Checkerboard", "Material", "Texture"),
-    "wrt.scene.mesh": ("Mesh", "load_mesh"),
+    "wrt.scene.mesh": ("Mesh",),
     "wrt.scene.model": ("Object", "Scene", "Sphere"),
     "wrt.scene.motion": ("Motion",),
     "wrt.scene.settings": ("Settings",),

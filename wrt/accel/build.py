@@ -18,7 +18,8 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.io.mesh_file import load_mesh
+from wrt.scene.mesh import Mesh
 
 
 def reports_progress(accel: str) -> bool:
@@ -30,7 +31,7 @@ def build(mesh: Mesh | Geometry | InstancedGeometry | str | os.PathLike[str], ac
           threads: int | None = None, **options: Any) -> Accelerator:
     """An acceleration structure over a mesh, ready for `closest_hit` and `any_hit`.
 
-    mesh: a Mesh, a Geometry, or the path of an .obj, .ply or .stl file; over an InstancedGeometry it is a tree over structures of
+    mesh: a Mesh, a Geometry, or the path of a mesh file; over an InstancedGeometry it is a tree over structures of
     the kind, one for each mesh. accel: a name in ACCELERATORS. options: `triangle` and `box`, the intersection tests (names in
     wrt.kernels.units.triangle.RAY_TRIANGLE and wrt.kernels.units.box.RAY_AABB), and the structure's own (see its class). Raises
     InputError that names the argument.

@@ -120,7 +120,7 @@ def visibility(meshes: tuple[Path, ...], output: Path | None, cluster: str | Non
                **options: Any) -> None:
     """Rasterising against ray casting, as triangles and pixels grow: the cost of both, and where they differ.
 
-    MESHES: .obj, .ply or .stl files; without any, a sphere and a terrain.
+    MESHES: mesh files; without any, a sphere and a terrain.
     """
     from wrt.lab.bench import visibility as bench_visibility
     from wrt.lab.bench import visibility_report as report
@@ -159,7 +159,7 @@ def visibility(meshes: tuple[Path, ...], output: Path | None, cluster: str | Non
 def units(output: Path | None, quiet: bool, as_json: bool, **options: Any) -> None:
     """The default triangle and box tests beside the others: what they cost, as ratios with their spread, on one thread.
 
-    MESHES: .obj, .ply or .stl files; without any, a sphere, a terrain and a teapot.
+    MESHES: mesh files; without any, a sphere, a terrain and a teapot.
     """
     from dataclasses import asdict
 
@@ -197,7 +197,7 @@ def peers(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, qu
     """wrt beside Embree (robust and fast) and Warp's mesh_query_ray: the same rays by turns, on one thread and on all, with ratios
     and answers that differ.
 
-    MESHES: .obj, .ply or .stl files; without any, a sphere.
+    MESHES: mesh files; without any, a sphere.
     """
     from wrt.lab.bench import peers as bench_peers
 
@@ -240,7 +240,7 @@ def peers(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, qu
 def accel(meshes: tuple[Path, ...], output: Path | None, cluster: str | None, quiet: bool, as_json: bool, **options: Any) -> None:
     """Structure against structure: time to build, memory, steps and time to search, and answers that differ (none may).
 
-    MESHES: .obj, .ply or .stl files; without any, a terrain that grows from a thousand triangles on.
+    MESHES: mesh files; without any, a terrain that grows from a thousand triangles on.
     """
     from dataclasses import asdict
 

@@ -9,9 +9,10 @@ import click
 
 from wrt.cli.common import ACCEL, Setting, now_and_then, say, say_json, warnings_told
 from wrt.core.errors import InputError
+from wrt.io.meshes import SUFFIXES
 
 
-@click.command()
+@click.command(help=f"Build a structure over MESH ({SUFFIXES}) once, and write it to a file for wrt.load_accel.")
 @click.argument("mesh", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write: .accel")
 @click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
@@ -21,7 +22,6 @@ from wrt.core.errors import InputError
 @click.option("--json", "as_json", is_flag=True, help="Print the statistics as JSON")
 def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any], ...], threads: int | None, quiet: bool,
           as_json: bool) -> None:
-    """Build a structure over MESH (.obj, .ply or .stl) once, and write it to a file for wrt.load_accel."""
     from dataclasses import asdict
 
     import wrt

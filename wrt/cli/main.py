@@ -48,6 +48,7 @@ from wrt.cli.view import view
 from wrt.core.address_space import is_out_of_memory, require_modules, told_limit
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code, raise_on_termination
+from wrt.io.meshes import SUFFIXES
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -66,7 +67,7 @@ cli.add_command(whatif)
 cli.add_command(view)
 
 
-@cli.command()
+@cli.command(help=f"Render SCENE (.toml, .gltf, .glb, or a mesh: {SUFFIXES}) to a picture.")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Picture to write: .png, .exr or .hdr  [default: the scene's name with .png]")
@@ -102,7 +103,6 @@ cli.add_command(view)
 @click.option("--json", "as_json", is_flag=True, help="Print the statistics as JSON")
 def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool,
            **options: Any) -> None:
-    """Render SCENE (.toml, .gltf, .glb, or a mesh: .obj, .ply, .stl) to a picture."""
     begin = time.perf_counter()
     from wrt.picture.image import check_writable
 

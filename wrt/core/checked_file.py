@@ -47,7 +47,7 @@ def read_checked(path: str | os.PathLike[str], magic: bytes, what: str,
     except OSError as error:
         raise InputError(error.strerror or str(error), path) from error
     except InputError as error:
-        raise InputError(str(error), path) from None
+        raise error.at(path) from error
     end = bytes(data[: len(magic) + MAX_HEADER]).find(b"\n", len(magic))
     if end < 0 or sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
         raise InputError("is damaged: its checksum does not fit", path)

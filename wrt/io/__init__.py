@@ -1,1 +1,1 @@
-"""Files to meshes and scenes: OBJ, PLY, STL, TOML and glTF."""
+"""Files to meshes and scenes."""

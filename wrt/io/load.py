@@ -16,10 +16,11 @@ from wrt.core.checks import as_path, shown
 from wrt.core.errors import InputError, SceneWarning
 from wrt.core.files import read_file, require_file
 from wrt.core.memory import require
+from wrt.io.mesh_file import MESH_FORMATS, load_mesh
 from wrt.io.toml.limits import look_at
 from wrt.scene.defaults import stage
 from wrt.scene.materials import Material
-from wrt.scene.mesh import READERS, Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 BYTES_OF_TOML = 5.0  # of memory for a byte of the file: itself, and a character
@@ -28,21 +29,22 @@ BYTES_OF_TABLE, BYTES_OF_VALUE = 3500.0, 200.0
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
-    """Read a scene: TOML (.toml), glTF 2.0 (.gltf, .glb), or one mesh in light grey (.obj, .ply, .stl).
+    """Read a scene: TOML (.toml), glTF 2.0 (.gltf, .glb), or one mesh (MESH_FORMATS) in light grey.
 
     A scene without a camera gets one that frames it, one without any light gets lights; each such addition is named
     in a SceneWarning. Raises InputError that names the file and the place; for TOML it lists all that is wrong at
     once, each with its path in the file, its value and what was expected.
     """
     path = as_path(path, "path")
-    known = ", ".join(LOADERS)
+    known = ", ".join([*LOADERS, *MESH_FORMATS])
     require_file(path, f" (a scene is one of {known})")
     if path.is_dir():
         raise InputError(f"is a directory, not a scene file ({known})", path)
-    if path.suffix.lower() not in LOADERS:
+    load = LOADERS.get(path.suffix.lower(), _load_bare_mesh if path.suffix.lower() in MESH_FORMATS else None)
+    if load is None:
         raise InputError(f"is no scene file: known are {known}", path)
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused by whoever is to hold it
-        return LOADERS[path.suffix.lower()](path)
+        return load(path)
 
 
 def as_scene(value: Scene | Mesh | str | os.PathLike[str]) -> Scene:
@@ -94,9 +96,7 @@ def _bare(mesh: Mesh, name: str, path: str | os.PathLike[str]) -> Scene:
     return _staged(Scene(objects=(Object(mesh, (grey,), name=name),), name=name), path, notes)
 
 
-LOADERS: dict[str, Callable[[Path], Scene]] = {
-    ".toml": _load_toml, ".gltf": _load_gltf, ".glb": _load_gltf, **dict.fromkeys(READERS, _load_bare_mesh),
-}
+LOADERS: dict[str, Callable[[Path], Scene]] = {".toml": _load_toml, ".gltf": _load_gltf, ".glb": _load_gltf}
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def _parse(path: Path) -> dict[str, Any]:
         _require_sound(data)
         return data
     except InputError as error:
-        raise InputError(str(error), path) from None
+        raise error.at(path) from error
     except UnicodeDecodeError as error:
         raise InputError(f"byte {error.start} is not UTF-8 text", path) from error
     except RecursionError:
@@ -145,7 +145,7 @@ def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = (
     try:
         scene, added = stage(scene)
     except InputError as error:
-        raise InputError(str(error), path) from error
+        raise error.at(path) from error
     if notes or added:
         warnings.warn(f"{os.fspath(path)}: {'; '.join([*notes, *added])}", SceneWarning, stacklevel=4)
     return scene

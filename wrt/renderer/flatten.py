@@ -12,7 +12,7 @@ from wrt.accel.instances import InstancedGeometry, NumberedGeometry
 from wrt.core.errors import InputError
 from wrt.renderer.instancing import instanced_meshes, is_instance
 from wrt.scene.clean import flip_collinear
-from wrt.scene.mesh import Mesh
+from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.model import Object, Scene
 
 MOST = 2**31 - 2  # faces, and vertices
@@ -231,7 +231,5 @@ def _transformed(thing: Object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
         faces = faces[:, [0, 2, 1]]
     if mesh.normals is not None:
         cofactors = np.stack([np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])])
-        turned = normals.astype(np.float64) @ cofactors.T * (-1.0 if mirrored else 1.0)
-        length = np.linalg.norm(turned, axis=1, keepdims=True)
-        normals = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0.0).astype(np.float32)
+        normals = unit_rows(normals.astype(np.float64) @ cofactors.T * (-1.0 if mirrored else 1.0))
     return vertices, faces, normals, uvs

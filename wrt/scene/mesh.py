@@ -1,30 +1,19 @@
-"""A triangle mesh: what it must hold to be traced, and how OBJ, PLY and STL files become one."""
+"""A triangle mesh: what it must hold to be traced, and its way to and from trimesh."""
 
 from __future__ import annotations
 
-import importlib
-import os
-import warnings
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wrt.core.checks import LARGEST, as_array, as_path, shown
-from wrt.core.errors import InputError, SceneWarning
-from wrt.core.files import require_file
+from wrt.core.checks import LARGEST, as_array, shown
+from wrt.core.errors import InputError
 from wrt.core.html import html_facts
-from wrt.core.memory import require
-from wrt.scene.clean import clean
 
 if TYPE_CHECKING:
     import trimesh
-
-
-BYTES_OF_FACE, BYTES_OF_VERTEX = 60.0, 100.0  # of memory, measured: of a file's mesh while it becomes a Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,113 +138,8 @@ def _require_finite(array: np.ndarray, name: str, attribute: str) -> None:
                          name or None, attribute)
 
 
-@dataclass(frozen=True, eq=False)
-class RawMesh:
-    """What a file holds, triangulated and with every index in range, but not yet cleaned.
-
-    The arrays are those of `Mesh`; incomplete: faces with fewer than three corners; positions: how many the file has.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    normals: np.ndarray | None = None
-    uvs: np.ndarray | None = None
-    groups: tuple[str, ...] = ()
-    face_group: np.ndarray | None = None
-    incomplete: int = 0
-    positions: int = 0
-
-
-def _reader(suffix: str) -> Callable[[str | os.PathLike[str]], RawMesh]:
-    """The function that reads such files; modules are imported when they are needed."""
-    module, function = READERS[suffix]
-    return getattr(importlib.import_module(module), function)
-
-
-READERS = {".obj": ("wrt.io.obj", "read_obj"), ".ply": ("wrt.io.ply", "read_ply"), ".stl": ("wrt.io.stl", "read_stl")}
-
-
-def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = ()) -> Mesh:
-    """Read an OBJ, PLY or STL file.
-
-    Nothing is merged or reordered: faces and vertices keep the order of the file, except that faces without area and
-    vertices without a face are dropped (`Mesh.dropped` counts the faces). Polygons become triangles. Normals and uvs
-    are those of the file, or None; normals are made unit length, v is flipped so that (0, 0) is the top left of a
-    picture. parts: ranges (first, count) of the file's triangles, counted before any is dropped; they become `groups`
-    "0", "1" ... in place of the file's own, the triangles in none of them the last group, "rest". Raises InputError
-    that names the file, and the place where it is known: a file that is missing, truncated or has no triangles, an
-    index out of range, a position that is NaN or infinite. Normals and uvs that are not finite are replaced by zero
-    with one SceneWarning.
-    """
-    path = as_path(path, "path")
-    if path.suffix.lower() not in READERS:
-        raise InputError(f"is no mesh file: known are {', '.join(READERS)}", path)
-    require_file(path)
-    try:
-        raw = _reader(path.suffix.lower())(path)
-    except InputError as error:
-        raise error if error.path is not None else InputError(str(error), path) from None
-    if len(raw.faces) == 0:
-        raise InputError(f"holds no triangles ({raw.positions} positions, {raw.incomplete} faces of fewer than 3 "
-                         "corners)", path)
-    groups, face_group = raw.groups, raw.face_group
-    if parts:
-        groups, face_group = _part_groups(parts, len(raw.faces), path)
-
-    require(BYTES_OF_FACE * len(raw.faces) + BYTES_OF_VERTEX * len(raw.vertices), "the mesh")
-    cleaned = clean(raw.vertices, raw.faces, raw.normals, raw.uvs, face_group)
-    if len(cleaned.faces) == 0:
-        raise InputError(f"none of its {len(raw.faces)} triangles has any area", path)
-    return Mesh(
-        vertices=cleaned.vertices,
-        faces=cleaned.faces,
-        normals=_unit(_finite(cleaned.normals, "normals", path)),
-        uvs=_finite(cleaned.uvs, "uvs", path),
-        groups=groups,
-        face_group=cleaned.face_group,
-        dropped=cleaned.dropped + raw.incomplete,
-        name=os.fspath(path),
-    )
-
-
-def as_mesh(value: Mesh | str | os.PathLike[str]) -> Mesh:
-    """A Mesh as it is; the mesh of a file by its path (load_mesh). Raises InputError for anything else, or no triangles."""
-    if not isinstance(value, Mesh | str | os.PathLike):
-        raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(value)}")
-    mesh = value if isinstance(value, Mesh) else load_mesh(value)
-    if not len(mesh.faces):
-        raise InputError("there are no triangles to hit", None if isinstance(value, Mesh) else value)
-    return mesh
-
-
-def _part_groups(parts: Sequence[tuple[int, int]], faces: int, path: Path) -> tuple[tuple[str, ...], np.ndarray]:
-    group = np.full(faces, len(parts), dtype=np.int32)
-    for number, (first, count) in enumerate(parts):
-        if first < 0 or count < 0 or first + count > faces:
-            raise InputError(f"triangles {first} to {first + count - 1}, but the file has {faces}", path,
-                             f"part {number}")
-        group[first:first + count] = number
-    return (*(str(number) for number in range(len(parts))), "rest"), group
-
-
-def _finite(array: np.ndarray | None, attribute: str, path: Path) -> np.ndarray | None:
-    """The array as float32, with zeros in rows that are not finite: a bad normal must not cost the whole mesh."""
-    if array is None:
-        return None
-    with np.errstate(over="ignore"):
-        array = np.asarray(array, dtype=np.float32)
-    bad = ~np.isfinite(array).all(axis=1)
-    if bad.any():
-        warnings.warn(f"{path}: {int(bad.sum())} {attribute} are not finite and taken as zero", SceneWarning,
-                      stacklevel=3)
-        array = np.where(bad[:, None], np.float32(0.0), array)
-    return array
-
-
-def _unit(normals: np.ndarray | None) -> np.ndarray | None:
-    """Rows scaled to unit length; rows of zeros stay."""
-    if normals is None:
-        return None
-    wide = normals.astype(np.float64)
+def unit_rows(vectors: np.ndarray) -> np.ndarray:
+    """Each row at length 1, float32; rows of zeros stay."""
+    wide = vectors.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
-    return (wide / np.where(length > 0.0, length, 1.0)).astype(np.float32)
+    return np.divide(wide, length, out=np.zeros_like(wide), where=length > 0.0).astype(np.float32)

@@ -12,13 +12,14 @@ from wrt.accel.build import build
 from wrt.core.checks import shown
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.load import load_scene
+from wrt.io.mesh_file import load_mesh
 from wrt.picture.film import Film
 from wrt.renderer.renderer import render
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import PointLight
 from wrt.scene.materials import Material, Texture
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, icosphere, quad

@@ -18,6 +18,7 @@ import wrt
 from tests.command_line import BOX_OBJ
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.load import load_scene
+from wrt.io.mesh_file import load_mesh
 from wrt.picture.film import Film
 from wrt.renderer import renderer as driver
 from wrt.renderer.renderer import MAX_PASS, Options, Progress, Renderer, plain_text, render
@@ -25,7 +26,6 @@ from wrt.scene.backgrounds import EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
 from wrt.scene.materials import Checkerboard, Material
-from wrt.scene.mesh import load_mesh
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad

@@ -28,7 +28,7 @@ from wrt.scene.clean import clean
 from wrt.scene.defaults import stage
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 from wrt.scene.materials import Material
-from wrt.scene.mesh import Mesh
+from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.model import Object, Scene
 from wrt.scene.settings import Settings
 from wrt.scene.values import MAX_REACH, as_transform, require_count
@@ -62,7 +62,7 @@ def load_gltf(path: str | os.PathLike[str], *, staged: bool = True) -> Scene:
             raise InputError(f"the scene has no triangles{_but(document)}")
         scene, added = stage(scene) if staged else (scene, [])
     except InputError as error:
-        raise InputError(str(error), path) from None
+        raise error.at(path) from error
     left_out = document.left_out.sentence()
     sentences = ([f"not supported and left out: {left_out}"] if left_out else []) + added
     if sentences:
@@ -240,7 +240,7 @@ class _Meshes:
             cleaned = clean(positions, TRIANGULATE[primitive.mode](indices), normals, uvs)
             if not len(cleaned.faces):
                 return None
-            normals = None if cleaned.normals is None else _unit(cleaned.normals)
+            normals = None if cleaned.normals is None else unit_rows(cleaned.normals)  # quantised ones are off by a percent
             return Mesh(cleaned.vertices, cleaned.faces, normals, cleaned.uvs, dropped=cleaned.dropped, name=name)
 
     def _attribute(self, primitive: Any, attribute: str, kind: str, place: str) -> np.ndarray | None:
@@ -281,12 +281,6 @@ class _Meshes:
             require_count(self._instances, "instances")
         return compose(*(found.get(name, np.broadcast_to(default, (count, len(default))))
                          for name, (_, default) in wanted.items()))
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Each row at length 1, float32; rows of zeros stay. Quantised normals are off by up to a percent."""
-    length = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros(vectors.shape), where=length > 0.0).astype(np.float32)
 
 
 def _require_reach(mesh: Mesh, transforms: np.ndarray) -> None:

@@ -26,7 +26,7 @@ def at(place: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise InputError(str(error), None, place) from None
+        raise error.at(place=place) from error
 
 
 # --- the extensions that wrt reads ------------------------------------------------------------------------------------

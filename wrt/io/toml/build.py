@@ -15,13 +15,14 @@ from wrt.core.checks import unknown
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
 from wrt.core.memory import Meter
+from wrt.io.mesh_file import load_mesh
 from wrt.io.toml.report import raise_all, unknown_materials
 from wrt.scene import shapes
 from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 from wrt.scene.materials import CONDUCTORS, Checkerboard, Material, Texture
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.motion import Motion
 from wrt.scene.settings import Settings
@@ -46,7 +47,7 @@ def build(table: tables.SceneTable, path: Path) -> Scene:
     try:
         scene = builder.scene(table)
     except InputError as error:
-        raise InputError(str(error), path) from None
+        raise error.at(path) from error
     raise_all(builder.problems, path)
     assert scene is not None
     return scene
@@ -206,7 +207,7 @@ class _Builder:
                 self._images[path] = decode_rgba8(read_file(path))
                 self.meter.take(self._images[path].nbytes, "the images")
             except InputError as error:
-                raise InputError(str(error), path) from None
+                raise error.at(path) from error
         return self._images[path]
 
     def background(self, table: tables.SceneTable) -> Background:

@@ -71,7 +71,7 @@ def _require_room(count: int, path: Path) -> None:
     try:
         require(BYTES_OF_PROBLEM * count, f"a list of {count} errors")
     except InputError as error:
-        raise InputError(str(error), path) from None
+        raise error.at(path) from error
 
 
 def _lines(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> list[str]:

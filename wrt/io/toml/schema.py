@@ -279,7 +279,7 @@ class KeyTable(Table):
 
 
 class MeshTable(Table):
-    """A mesh from a file (OBJ, PLY, STL) or made by a formula."""
+    """A mesh from a file or made by a formula."""
 
     file: str | None = Field(None, description="mesh file, relative to the scene file")
     shape: Shape | None = Field(None, description="in place of a file")

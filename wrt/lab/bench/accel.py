@@ -21,11 +21,12 @@ from wrt.core.checks import require_known
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.core.html import Rows
+from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.peak_memory import peak_bytes
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.lab.bench.stadium import in_stadium
 from wrt.lab.bench.visibility import TERRAINS, fit, terrain
-from wrt.scene.mesh import Mesh, as_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 YARDSTICK = "bvh2"  # every ray is compared with it, and as many as YARDSTICK_TESTS allow with brute force

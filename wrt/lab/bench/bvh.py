@@ -21,6 +21,7 @@ from wrt.accel.bvh.tree import half_areas
 from wrt.accel.geometry import Geometry
 from wrt.core.device import describe_devices, load_kernel, thread_count, upload
 from wrt.core.errors import InputError
+from wrt.io.mesh_file import MESH_FORMATS, load_mesh
 from wrt.kernels.query import RayArrays
 from wrt.kernels.study.query_volumes import count_popped, make_enter_kernel
 from wrt.kernels.traverse.bvh2 import box_volumes
@@ -29,7 +30,6 @@ from wrt.kernels.traverse.bvh2_sphere import sphere_volumes
 from wrt.lab.bench.peak_memory import peak_bytes
 from wrt.lab.bench.rays import RaySet, endless, unit
 from wrt.lab.bench.visibility_report import spread, table
-from wrt.scene.mesh import load_mesh
 
 VOLUMES = ("bvh2", "bvh2_sphere", "bvh2_kdop")
 TESTED_RAYS, TESTED_NODES = 1024, 1024
@@ -61,7 +61,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         if not self.meshes:
-            raise InputError("name the meshes: .obj, .ply or .stl files")
+            raise InputError(f"name the meshes: {', '.join(MESH_FORMATS)} files")
         for name in self.builders:
             BVH_BUILDERS.check(name)
         for name, high in (("rays", 2**26), ("builds", 100), ("runs", 1000)):

@@ -23,11 +23,12 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import require_known
 from wrt.core.device import describe_devices, load_kernel, run_all, thread_count
 from wrt.core.errors import InputError
+from wrt.io.mesh_file import load_mesh
 from wrt.lab.bench.accel import warm_up
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.lab.bench.visibility_report import spread, table
 from wrt.lab.hard_cases.contestants import PEERS, Embree, Open3D, Peer, WarpMesh
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 SAME_T = 1e-4  # two triangles may meet a ray at the same place: another prim_id there is a tie

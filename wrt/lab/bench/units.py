@@ -17,13 +17,14 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
+from wrt.io.mesh_file import load_mesh
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench.timing import Quartiles, alternate, quartiles, shown
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.bench.visibility_report import table
 from wrt.lab.hard_cases.common import soup, unit_vectors
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere, teapot
 
 ALONE = 64  # triangles without a structure: the triangle unit by itself

@@ -17,12 +17,13 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start, thread_count
 from wrt.core.errors import InputError
+from wrt.io.mesh_file import load_mesh
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
 from wrt.lab.bench.visibility_check import Agreement, agreement
 from wrt.scene.cameras import Camera
 from wrt.scene.defaults import frame_camera
 from wrt.scene.materials import Material
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import icosphere
 

@@ -16,6 +16,7 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import require_known
 from wrt.core.errors import InputError
 from wrt.core.html import Rows, html_table
+from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.lab.bench.visibility_report import table
 from wrt.lab.rtcore.instructions import Software, box_unit, software, triangle_unit
@@ -23,7 +24,7 @@ from wrt.lab.rtcore.model import Work, simt, trace_rays
 from wrt.lab.rtcore.parameters import GPUS
 from wrt.lab.rtcore.report import COLUMNS, ModelRow, cells, model_row
 from wrt.lab.rtcore.warps import WARP, blocks
-from wrt.scene.mesh import Mesh, as_mesh
+from wrt.scene.mesh import Mesh
 
 
 @dataclass(frozen=True)

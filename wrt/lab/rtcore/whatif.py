@@ -19,6 +19,7 @@ from wrt.accel.geometry import Geometry
 from wrt.core.checks import require_known
 from wrt.core.errors import InputError
 from wrt.core.html import Rows, html_table
+from wrt.io.mesh_file import as_mesh
 from wrt.kernels.study.bvh2_study import STACK_SIZE, Study
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.lab.bench.visibility_report import table
@@ -27,7 +28,7 @@ from wrt.lab.rtcore.model import TERMS, Prediction, Work, predict, simt
 from wrt.lab.rtcore.parameters import BASE, GPUS, SWEEPS, Core, Gpu
 from wrt.lab.rtcore.warps import by_coherence, packed
 from wrt.lab.rtcore.whatif_structures import base, resized, with_planes, with_traversal
-from wrt.scene.mesh import Mesh, as_mesh
+from wrt.scene.mesh import Mesh
 
 MANY_WARPS = replace(BASE, warps=32, warm=True)  # beside BASE: where latency is hidden and the L2 full, units and lines decide
 ENTRIES = (STACK_SIZE, 8, 4, 2, 1, 0)

@@ -15,10 +15,10 @@ from wrt.accel.build import build
 from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
+from wrt.io.mesh_file import load_mesh
 from wrt.lab.bench import bvh as bench
 from wrt.lab.bench.bvh import VOLUMES, BuilderRow, Plan, VolumeRow, inward, published_cost, run
 from wrt.lab.bench.peak_memory import peak_bytes
-from wrt.scene.mesh import load_mesh
 from wrt.scene.shapes import icosphere
 
 # Of legocar.obj, by tinybvh: SAH cost and the cost of 262,144 cosine-inward rays, with C_trav = C_int = 1.

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from wrt.core.errors import InputError
-from wrt.io.stl import read_stl
-from wrt.scene.mesh import load_mesh
+from wrt.io.mesh_file import load_mesh
+from wrt.io.meshes.stl import read as read_stl
 
 
 def binary(triangles: np.ndarray) -> bytes:
@@ -74,4 +74,4 @@ def test_positions_must_be_finite(tmp_path: Path, triangles: np.ndarray, value: 
     path = tmp_path / "a.stl"
     path.write_bytes(form(triangles))
     with pytest.raises(InputError, match=r"a\.stl: triangle 4: position .* not finite"):
-        read_stl(path)
+        load_mesh(path)

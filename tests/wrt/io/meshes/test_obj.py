@@ -7,7 +7,8 @@ import pytest
 
 from tests.data import data_path
 from wrt.core.errors import InputError
-from wrt.io.obj import read_obj
+from wrt.io.mesh_file import load_mesh
+from wrt.io.meshes.obj import read as read_obj
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
@@ -83,7 +84,7 @@ def test_groups(tmp_path: Path, lines: str, names: tuple[str, ...], index: list[
 def test_errors_name_file_and_line(tmp_path: Path, lines: str, line: int, says: str) -> None:
     path = write(tmp_path, SQUARE + lines)
     with pytest.raises(InputError) as caught:
-        read_obj(path)
+        load_mesh(path)
     assert str(caught.value).startswith(f"{path}: line {line}: ") and says in str(caught.value)
 
 
@@ -119,7 +120,7 @@ def test_same_triangles_as_trimesh(name: str) -> None:
 @pytest.mark.parametrize("index", ["99999999999999999999", "9" * 5000, "-" + "9" * 5000])
 def test_indices_of_any_length_are_told(index: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a\.obj: line 5: face corner '") as caught:
-        read_obj(write(tmp_path, f"{SQUARE}f 1 2 {index}\n"))
+        load_mesh(write(tmp_path, f"{SQUARE}f 1 2 {index}\n"))
     assert len(str(caught.value)) < 300 + len(str(tmp_path))
 
 
@@ -136,14 +137,14 @@ def test_what_is_taken_at_a_time_changes_nothing(words: int, tmp_path: Path, mon
     relative = " ".join(f"-{i % 4 + 1}" for i in range(300))
     path = write(tmp_path, f"{SQUARE}vn 0 0 1\nvn 0 1 0\ng a\nf {corners}\ng b\nf {relative} # {corners}\nf 1 2 3\n")
     whole = read_obj(path)
-    monkeypatch.setattr("wrt.io.obj.WORDS_AT_ONCE", words)
+    monkeypatch.setattr("wrt.io.meshes.obj.WORDS_AT_ONCE", words)
     parts = read_obj(path)
     for name in ("vertices", "faces", "normals", "face_group"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
     assert whole.groups == parts.groups == ("a", "b") and len(whole.faces) == 298 + 298 + 1
     for bad, message in (("v 1 x 0\n", "line 5: v holds 'x'"), ("f 1 2 -9 4\n", "line 5: face corner '-9': v index -9")):
         with pytest.raises(InputError, match=message):
-            read_obj(write(tmp_path, SQUARE + bad + SQUARE))
+            load_mesh(write(tmp_path, SQUARE + bad + SQUARE))
 
 
 def test_groups_in_which_nothing_is(tmp_path: Path) -> None:

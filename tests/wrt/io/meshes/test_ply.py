@@ -8,7 +8,8 @@ import pytest
 
 from tests.data import data_path
 from wrt.core.errors import InputError
-from wrt.io.ply import read_ply
+from wrt.io.mesh_file import load_mesh
+from wrt.io.meshes.ply import read as read_ply
 
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 POINTS = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0), (2, 1, 0)]
@@ -90,7 +91,7 @@ def test_every_truncation_is_refused(tmp_path: Path, form: str) -> None:
             cut = whole[:end]
         path = write(tmp_path, cut)
         with pytest.raises(InputError, match=r"a\.ply"):
-            read_ply(path)
+            load_mesh(path)
 
 
 @pytest.mark.parametrize(("old", "new", "place"), [
@@ -115,7 +116,7 @@ def test_errors_name_the_place(tmp_path: Path, old: bytes, new: bytes, place: st
     assert data.count(old) == 1
     path = write(tmp_path, data.replace(old, new))
     with pytest.raises(InputError) as caught:
-        read_ply(path)
+        load_mesh(path)
     assert str(caught.value).startswith(f"{path}: ") and place in str(caught.value)
 
 
@@ -152,7 +153,7 @@ def test_absurd_counts(old: bytes, new: bytes, message: str, tmp_path: Path) -> 
         assert len(read_ply(path).faces) == 1
         return
     with pytest.raises(InputError, match=message):
-        read_ply(path)
+        load_mesh(path)
 
 
 def strip_by_hand(strip: list[int]) -> list[tuple[int, ...]]:
@@ -198,7 +199,7 @@ def test_strips_come_behind_faces(tmp_path: Path) -> None:
 def test_a_strip_with_a_wrong_index(bad: str, message: str, tmp_path: Path) -> None:
     data = ply("ascii", POINTS, [(0, 1, 2), (0, 1, int(bad))]).replace(b"element face", b"element tristrips")
     with pytest.raises(InputError, match=rf"a\.ply: tristrips 1: {message}"):
-        read_ply(write(tmp_path, data))
+        load_mesh(write(tmp_path, data))
 
 
 def test_a_text_is_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,7 +207,7 @@ def test_a_text_is_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     data = ply("ascii", POINTS, [(0, 1, 2, 3), (1, 4, 5, 2)])
     whole = read_ply(write(tmp_path, data))
     for words in (1, 2, 5):
-        monkeypatch.setattr("wrt.io.ply.WORDS_AT_ONCE", words)
+        monkeypatch.setattr("wrt.io.meshes.ply.WORDS_AT_ONCE", words)
         np.testing.assert_array_equal(read_ply(write(tmp_path, data)).faces, whole.faces)
         with pytest.raises(InputError, match=rf"line {data.count(10) - 1}: 'x4' is not a number"):
-            read_ply(write(tmp_path, data.replace(b" 4 0 1", b" x4 0 1")))
+            load_mesh(write(tmp_path, data.replace(b" 4 0 1", b" x4 0 1")))

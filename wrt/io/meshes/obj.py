@@ -9,7 +9,6 @@ scene file refers to.
 from __future__ import annotations
 
 import io
-import os
 import re
 from array import array
 from collections import defaultdict
@@ -24,8 +23,8 @@ from wrt.core.checks import short
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
 from wrt.core.memory import Meter, require
+from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
-from wrt.scene.mesh import RawMesh
 
 # What stands in a corner `v/vt/vn`, and how many numbers of a line of it are kept.
 _KEEP = {"v": 3, "vt": 2, "vn": 3}
@@ -40,8 +39,7 @@ _CORNER = "face corner {} is not v, v/vt, v//vn or v/vt/vn"
 class _Text:
     """The lines of one OBJ file, sorted by what they are; indices are absolute from here on."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self) -> None:
         self.numbers = {key: array("d") for key in _KEEP}
         self.lines = {key: array("q") for key in _KEEP}
         self.counts, self.face_lines = array("q"), array("q")
@@ -56,7 +54,7 @@ class _Text:
         self._meter, self._metered = Meter(), 0
 
     def fail(self, line: int, message: str) -> NoReturn:
-        raise InputError(message, self.path, f"line {line}")
+        raise InputError(message, None, f"line {line}")
 
     def read(self, data: bytes) -> None:
         pending = io.StringIO()  # lines that the next one continues: a string would be copied with each
@@ -227,7 +225,7 @@ def _parts(text: str) -> Iterator[str]:
         begin = end
 
 
-def read_obj(path: str | os.PathLike[str]) -> RawMesh:
+def read(path: Path) -> RawMesh:
     """Read the faces of an OBJ file as it has them: nothing is merged or put in another order.
 
     Each different combination of position, texture coordinate and normal becomes one vertex. A corner without a
@@ -236,7 +234,7 @@ def read_obj(path: str | os.PathLike[str]) -> RawMesh:
     first have the name "". Vertex colours, lines, points and curves are not read. Raises InputError with the line's
     number for numbers that are none, indices out of range and positions that are not finite.
     """
-    text = _Text(Path(path))
+    text = _Text()
     text.read(read_file(path, BYTES_OF_TEXT))
     positions = text.array("v")
     require(BYTES_OF_VERTEX * len(text.different) + BYTES_OF_CORNER * len(text.corners), "the mesh")

@@ -7,7 +7,6 @@ texture coordinates.
 
 from __future__ import annotations
 
-import os
 import re
 from array import array
 from dataclasses import dataclass, field
@@ -19,8 +18,8 @@ import numpy as np
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
 from wrt.core.memory import require
+from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
-from wrt.scene.mesh import RawMesh
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -55,7 +54,7 @@ class _Element:
     counts: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-def read_ply(path: str | os.PathLike[str]) -> RawMesh:
+def read(path: Path) -> RawMesh:
     """Read a PLY file's vertices and faces in the order of the file; faces with more than three corners are
     triangulated. Behind the faces come the triangles of `tristrips`: lists of vertices, of which each makes a triangle with the two
     before it, turned by turns so that all face one way; -1 begins a new strip.
@@ -65,7 +64,7 @@ def read_ply(path: str | os.PathLike[str]) -> RawMesh:
     not read. Raises InputError that names the header's line, or the element and row of what is truncated, not a
     number, or out of range.
     """
-    source = _Source(Path(path))
+    source = _Source(path)
     elements = {element.name: element for element in source.elements}
     if "vertex" not in elements or not {"x", "y", "z"} <= elements["vertex"].values.keys():
         source.fail(f"holds no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")
@@ -176,7 +175,6 @@ class _Source:
     """A PLY file: its header, then the elements read with it."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         self.data = read_file(path)
         form, self.elements, begin = self._header()
         binary = form != "ascii"
@@ -186,7 +184,7 @@ class _Source:
                 self._read(element)
 
     def fail(self, message: str, place: str | None = None) -> NoReturn:
-        raise InputError(message, self.path, place)
+        raise InputError(message, None, place)
 
     def _header(self) -> tuple[str, list[_Element], int]:
         """The format, the elements without their data, and where the data begin."""

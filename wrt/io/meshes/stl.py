@@ -6,7 +6,6 @@ for each facet normal that is no number, and lets NumPy warn of positions that a
 
 from __future__ import annotations
 
-import os
 import re
 from array import array
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
 from wrt.core.memory import Meter, require
-from wrt.scene.mesh import RawMesh
+from wrt.io.mesh_file import RawMesh
 
 _LINE = re.compile(rb"[^\r\n]++(?:\r\n|[\r\n]|\Z)|\r\n|[\r\n]")
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -25,13 +24,12 @@ _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribut
 BYTES_OF_TEXT, BYTES_OF_BINARY, BYTES_OF_SOLID = 8.0, 5.0, 500.0
 
 
-def read_stl(path: str | os.PathLike[str]) -> RawMesh:
+def read(path: Path) -> RawMesh:
     """Read the triangles of an STL file in the order of the file; each has three vertices of its own.
 
     The solids of a text file become groups. Facet normals are not read: they say no more than the winding does. Raises
     InputError for a file that is truncated or no STL, and for a position that is not finite.
     """
-    path = Path(path)
     data = read_file(path)
     groups: tuple[str, ...] = ()
     sizes: list[int] = []
@@ -40,11 +38,11 @@ def read_stl(path: str | os.PathLike[str]) -> RawMesh:
         vertices = np.frombuffer(data, _RECORD, (len(data) - 84) // 50, 84)["corners"].reshape(-1, 3)
     else:
         require(BYTES_OF_TEXT * len(data), "the mesh")
-        vertices, groups, sizes = _read_text(data, path)
+        vertices, groups, sizes = _read_text(data)
     with np.errstate(over="ignore"):
         bad = np.nonzero(~np.isfinite(vertices.astype(np.float32)).all(axis=1))[0]
     if len(bad):
-        raise InputError(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", path, f"triangle {bad[0] // 3}")
+        raise InputError(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", None, f"triangle {bad[0] // 3}")
     return RawMesh(
         vertices=vertices,
         faces=np.arange(len(vertices)).reshape(-1, 3),
@@ -59,12 +57,12 @@ def _is_binary(data: bytes) -> bool:
     return len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
 
 
-def _read_text(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
+def _read_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
     """Positions (3 T, 3) float64, the names of the solids, and how many triangles each has. Solids of one name stay apart: the
     later ones are called name_1, name_2 ..."""
 
     def fail(number: int, message: str) -> NoReturn:
-        raise InputError(f"truncated, or no STL file: {message}, and the length is not that of a binary STL file", path,
+        raise InputError(f"truncated, or no STL file: {message}, and the length is not that of a binary STL file", None,
                          f"line {number}")
 
     numbers = array("d")

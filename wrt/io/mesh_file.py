@@ -1,0 +1,124 @@
+"""Mesh files become a `Mesh`; MESH_FORMATS says by their suffix who reads them."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wrt.core.checks import as_path, shown
+from wrt.core.errors import InputError, SceneWarning
+from wrt.core.files import require_file
+from wrt.core.memory import require
+from wrt.core.registry import Registry
+from wrt.io.meshes import PLACES
+from wrt.scene.clean import clean
+from wrt.scene.mesh import Mesh, unit_rows
+
+BYTES_OF_FACE, BYTES_OF_VERTEX = 60.0, 100.0  # of memory, measured: of a file's mesh while it becomes a Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class RawMesh:
+    """What a file holds, triangulated and with every index in range, but not yet cleaned.
+
+    The arrays are those of `Mesh`; incomplete: faces with fewer than three corners; positions: how many the file has.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None = None
+    uvs: np.ndarray | None = None
+    groups: tuple[str, ...] = ()
+    face_group: np.ndarray | None = None
+    incomplete: int = 0
+    positions: int = 0
+
+
+Reader = Callable[[Path], RawMesh]
+MESH_FORMATS: Registry[Reader] = Registry("mesh format", PLACES)
+
+
+def register_mesh_format(suffix: str, read: Reader) -> None:
+    """Take files of that suffix (".off") for meshes, wherever one can be named. read raises InputError, without the path, for a
+    file that it cannot read; what it gives is checked and cleaned as every mesh is."""
+    if not suffix.startswith(".") or suffix != suffix.lower():
+        raise InputError(f"suffix must begin with a dot and be in small letters, got {shown(suffix)}")
+    MESH_FORMATS[suffix] = read
+
+
+def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = ()) -> Mesh:
+    """Read a mesh file of one of MESH_FORMATS.
+
+    Nothing is merged or reordered: faces and vertices keep the order of the file, except that faces without area and
+    vertices without a face are dropped (`Mesh.dropped` counts the faces). Polygons become triangles. Normals and uvs
+    are those of the file, or None; normals are made unit length, v is flipped so that (0, 0) is the top left of a
+    picture. parts: ranges (first, count) of the file's triangles, counted before any is dropped; they become `groups`
+    "0", "1" ... in place of the file's own, the triangles in none of them the last group, "rest". Raises InputError
+    that names the file, and the place where it is known: a file that is missing, truncated or has no triangles, an
+    index out of range, a position that is NaN or infinite. Normals and uvs that are not finite are replaced by zero
+    with one SceneWarning.
+    """
+    path = as_path(path, "path")
+    if path.suffix.lower() not in MESH_FORMATS:
+        raise InputError(f"is no mesh file: known are {', '.join(MESH_FORMATS)}", path)
+    require_file(path)
+    try:
+        raw = MESH_FORMATS[path.suffix.lower()](path)
+        if len(raw.faces) == 0:
+            raise InputError(f"holds no triangles ({raw.positions} positions, {raw.incomplete} faces of fewer than 3 corners)")
+        groups, face_group = _part_groups(parts, len(raw.faces)) if parts else (raw.groups, raw.face_group)
+    except InputError as error:
+        raise error.at(path) from error
+    require(BYTES_OF_FACE * len(raw.faces) + BYTES_OF_VERTEX * len(raw.vertices), "the mesh")
+    cleaned = clean(raw.vertices, raw.faces, raw.normals, raw.uvs, face_group)
+    if len(cleaned.faces) == 0:
+        raise InputError(f"none of its {len(raw.faces)} triangles has any area", path)
+    normals = _finite(cleaned.normals, "normals", path)
+    return Mesh(
+        vertices=cleaned.vertices,
+        faces=cleaned.faces,
+        normals=None if normals is None else unit_rows(normals),
+        uvs=_finite(cleaned.uvs, "uvs", path),
+        groups=groups,
+        face_group=cleaned.face_group,
+        dropped=cleaned.dropped + raw.incomplete,
+        name=os.fspath(path),
+    )
+
+
+def as_mesh(value: Mesh | str | os.PathLike[str]) -> Mesh:
+    """A Mesh as it is; the mesh of a file by its path (load_mesh). Raises InputError for anything else, or no triangles."""
+    if not isinstance(value, Mesh | str | os.PathLike):
+        raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(value)}")
+    mesh = value if isinstance(value, Mesh) else load_mesh(value)
+    if not len(mesh.faces):
+        raise InputError("there are no triangles to hit", None if isinstance(value, Mesh) else value)
+    return mesh
+
+
+def _part_groups(parts: Sequence[tuple[int, int]], faces: int) -> tuple[tuple[str, ...], np.ndarray]:
+    group = np.full(faces, len(parts), dtype=np.int32)
+    for number, (first, count) in enumerate(parts):
+        if first < 0 or count < 0 or first + count > faces:
+            raise InputError(f"triangles {first} to {first + count - 1}, but the file has {faces}", None, f"part {number}")
+        group[first:first + count] = number
+    return (*(str(number) for number in range(len(parts))), "rest"), group
+
+
+def _finite(array: np.ndarray | None, attribute: str, path: Path) -> np.ndarray | None:
+    """The array as float32, with zeros in rows that are not finite: a bad normal must not cost the whole mesh."""
+    if array is None:
+        return None
+    with np.errstate(over="ignore"):
+        array = np.asarray(array, dtype=np.float32)
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        warnings.warn(f"{path}: {int(bad.sum())} {attribute} are not finite and taken as zero", SceneWarning,
+                      stacklevel=3)
+        array = np.where(bad[:, None], np.float32(0.0), array)
+    return array
