@@ -20,6 +20,10 @@ class InputError(ValueError):
         parts = [os.fspath(path) if path is not None else None, place, message]
         super().__init__(": ".join(part for part in parts if part))
 
+    def at(self, path: str | os.PathLike[str] | None = None, place: str | None = None) -> InputError:
+        """The same message behind a path and a place, to `raise error.at(path) from error`."""
+        return InputError(str(self), path, place)
+
 
 class SceneWarning(UserWarning):
     """Something in a scene file that wrt leaves out or replaces; the picture may differ from the author's."""
