@@ -248,7 +248,7 @@ def naming(path: Path) -> Iterator[None]:
     except InputError as error:
         if error.path is not None:
             raise
-        raise InputError(str(error), path) from error
+        raise error.at(path) from error
 
 
 def say_json(value: Any) -> None:

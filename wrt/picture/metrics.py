@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.address_space import require_scipy
 from wrt.core.errors import InputError
 from wrt.core.memory import require
-from wrt.picture.tonemap import encode_srgb, luminance, tone_map
+from wrt.picture.tonemap import encode_srgb, tone_map
 
 RELMSE_EPS = 0.01
 PIXELS_PER_DEGREE = 3840 * math.pi / 180  # FLIP's default: a screen 3840 pixels wide, seen from as far as it is wide
+FLIP_REACH = 10  # rows and columns to the farthest neighbour that counts, at that many pixels a degree
 HIGHER_IS_BETTER = ("psnr",)
 PIXELS_AT_ONCE, LEAST_ROWS = 1 << 17, 16  # of a band of rows
 # Of memory, measured: of a pixel of one picture; of a pixel in a comparison beside both pictures; of one of a band.
@@ -55,7 +55,11 @@ def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str
         x, y = (encode_srgb(image[finite[rows]].astype(np.float64)) for image in shown(rows))
         return x - y
 
-    flip = _FlipRows(a.shape[0], shown)
+    def flip(rows: slice) -> np.ndarray:
+        """A pixel's is a matter of its neighbours: with rows around, all bands together are that of the whole."""
+        begin, end = max(0, rows.start - FLIP_REACH), min(len(finite), rows.stop + FLIP_REACH)
+        return flip_map(*shown(slice(begin, end)))[rows.start - begin:rows.stop - begin]
+
     count = int(np.count_nonzero(finite))
     values = np.empty(3 * count)
 
@@ -158,177 +162,23 @@ def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 # --- FLIP -------------------------------------------------------------------------------------------------------------
-# Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom, Fairchild: "FLIP: A Difference Evaluator for Alternating
-# Images", HPG 2020: a colour part, a part for edges and points, and their combination. The constants are the paper's.
-
-# Contrast sensitivity as Gaussians (weight a, width b) of YCxCz: achromatic, red-green, blue-yellow.
-CONTRAST_SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
-COLOR_EXPONENT, FEATURE_EXPONENT = 0.7, 0.5
-KNEE_AT, KNEE_VALUE = 0.4, 0.95  # the share of the largest colour distance that is mapped to the value
-FEATURE_WIDTH = 0.082  # degrees
-
-
-def _rgb_to_xyz() -> np.ndarray:
-    """Linear Rec. 709 to XYZ, from the chromaticities of the primaries and of D65 white (0.3127, 0.3290)."""
-    primaries = np.array([[x / y, 1.0, (1.0 - x - y) / y] for x, y in ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))]).T
-    white = np.array([0.3127 / 0.3290, 1.0, (1.0 - 0.3127 - 0.3290) / 0.3290])
-    return primaries * np.linalg.solve(primaries, white)
-
-
-RGB_TO_XYZ = _rgb_to_xyz()
-XYZ_WHITE = RGB_TO_XYZ.sum(axis=1)
-# YCxCz is linear in XYZ: rows of (X, Y, Z) / white, and the offset of the first row.
-XYZ_TO_OPPONENT = np.array([[0.0, 116.0, 0.0], [500.0, -500.0, 0.0], [0.0, 200.0, -200.0]])
-RGB_TO_OPPONENT = XYZ_TO_OPPONENT @ (RGB_TO_XYZ / XYZ_WHITE[:, None])
-OPPONENT_OFFSET = np.array([-16.0, 0.0, 0.0])
 
 
 def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
     """LDR-FLIP: the difference seen when `a` and `b` alternate on a screen, (H, W) in [0, 1]; 0 is none.
 
     a, b: (H, W, 3) display-linear in [0, 1] (`tone_map`, or a decoded PNG), finite; the order does not matter.
-    pixels_per_degree: of the visual angle. Source: Andersson et al. 2020 (see above).
+    pixels_per_degree: of the visual angle. Source: Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom, Fairchild, "FLIP: A
+    Difference Evaluator for Alternating Images", HPG 2020, as OpenImageIO computes it.
     """
-    flip = _FlipRows(len(a), lambda rows: (a[rows], b[rows]), pixels_per_degree)
-    result = np.empty(a.shape[:2])
-    for rows in _bands(result):
-        result[rows] = flip(rows)
-    return result
+    import OpenImageIO as oiio
 
+    def buffer(image: np.ndarray) -> oiio.ImageBuf:
+        out = oiio.ImageBuf(oiio.ImageSpec(image.shape[1], image.shape[0], 3, "float"))
+        out.set_pixels(oiio.ROI(), np.ascontiguousarray(np.clip(image, 0.0, 1.0), dtype=np.float32))
+        return out
 
-class _FlipRows:
-    """FLIP of some rows of two pictures of that height, of which `shown` gives rows: each pixel's is a matter of its neighbours."""
-
-    def __init__(self, height: int, shown: Callable[[slice], tuple[np.ndarray, np.ndarray]],
-                 pixels_per_degree: float = PIXELS_PER_DEGREE) -> None:
-        self.height, self.shown, self.pixels_per_degree = height, shown, pixels_per_degree
-
-    def __call__(self, rows: slice) -> np.ndarray:
-        reach = _flip_reach(self.pixels_per_degree)
-        begin, end = max(0, rows.start - reach), min(self.height, rows.stop + reach)
-        result = _flip(*self.shown(slice(begin, end)), self.pixels_per_degree)
-        return result[rows.start - begin:rows.stop - begin]
-
-
-def _flip_reach(pixels_per_degree: float) -> int:
-    """Pixels to the farthest neighbour that counts."""
-    return max(_blur_radius(pixels_per_degree), math.ceil(3.0 * _feature_sigma(pixels_per_degree)))
-
-
-def _flip(a: np.ndarray, b: np.ndarray, pixels_per_degree: float) -> np.ndarray:
-    opponent = [np.clip(image, 0.0, 1.0) @ RGB_TO_OPPONENT.T + OPPONENT_OFFSET for image in (a, b)]
-    color = _color_difference(*(_perceived_lab(image, pixels_per_degree) for image in opponent))
-    lightness = [(image[..., 0] + 16.0) / 116.0 for image in opponent]
-    edges, points = zip(*(_features(image, pixels_per_degree) for image in lightness), strict=True)
-    feature = np.maximum(np.abs(edges[0] - edges[1]), np.abs(points[0] - points[1])) / math.sqrt(2.0)
-    return color ** (1.0 - feature**FEATURE_EXPONENT)
-
-
-def _perceived_lab(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
-    """YCxCz blurred by the eye's contrast sensitivity, as L*a*b* with the Hunt adjustment (chroma times lightness)."""
-    blurred = np.stack([_blur(opponent[..., i], terms, pixels_per_degree)
-                        for i, terms in enumerate(CONTRAST_SENSITIVITY)], axis=-1)
-    rgb = np.clip((blurred - OPPONENT_OFFSET) @ np.linalg.inv(RGB_TO_OPPONENT).T, 0.0, 1.0)
-    return _hunt_lab(rgb)
-
-
-def _blur(image: np.ndarray, terms: tuple[tuple[float, float], ...], pixels_per_degree: float) -> np.ndarray:
-    """A sum of Gaussians a sqrt(pi / b) exp(-pi^2 r^2 / b), r in degrees, of total weight 1; edges are repeated."""
-    radius = _blur_radius(pixels_per_degree)
-    degrees = np.arange(-radius, radius + 1) / pixels_per_degree
-    result, total = np.zeros(image.shape), 0.0
-    for a, b in terms:
-        kernel = np.exp(-(math.pi**2) * degrees**2 / b)
-        weight = a * math.sqrt(math.pi / b) * kernel.sum() ** 2  # of the two-dimensional Gaussian
-        kernel /= kernel.sum()
-        result += weight * _separable(image, kernel, kernel)
-        total += weight
-    return result / total
-
-
-def _blur_radius(pixels_per_degree: float) -> int:
-    widest = max(b for terms in CONTRAST_SENSITIVITY for _, b in terms)
-    return math.ceil(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * pixels_per_degree)
-
-
-def _separable(image: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
-    require_scipy()
-    from scipy.ndimage import correlate1d
-
-    return correlate1d(correlate1d(image, along_x, axis=1, mode="nearest"), along_y, axis=0, mode="nearest")
-
-
-def _hunt_lab(rgb: np.ndarray) -> np.ndarray:
-    relative = rgb @ (RGB_TO_XYZ / XYZ_WHITE[:, None]).T
-    delta = 6.0 / 29.0
-    root = np.where(relative > delta**3, np.cbrt(relative), relative / (3.0 * delta**2) + 4.0 / 29.0)
-    light = 116.0 * root[..., 1] - 16.0
-    chroma = 0.01 * light
-    return np.stack([light, chroma * 500.0 * (root[..., 0] - root[..., 1]),
-                     chroma * 200.0 * (root[..., 1] - root[..., 2])], axis=-1)
-
-
-def _hyab(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    difference = a - b
-    return np.abs(difference[..., 0]) + np.hypot(difference[..., 1], difference[..., 2])
-
-
-def _color_difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """HyAB distance, compressed, and mapped to [0, 1] with a knee; the distance of pure green and blue becomes 1."""
-    green, blue = _hunt_lab(np.array([0.0, 1.0, 0.0])), _hunt_lab(np.array([0.0, 0.0, 1.0]))
-    largest = _hyab(green, blue) ** COLOR_EXPONENT
-    share = _hyab(a, b) ** COLOR_EXPONENT / largest
-    above = KNEE_VALUE + (share - KNEE_AT) / (1.0 - KNEE_AT) * (1.0 - KNEE_VALUE)
-    return np.where(share < KNEE_AT, share * KNEE_VALUE / KNEE_AT, above)
-
-
-def _features(lightness: np.ndarray, pixels_per_degree: float) -> tuple[np.ndarray, np.ndarray]:
-    """How much of an edge and of a point is at each pixel: the size of the first and second Gaussian derivatives."""
-    sigma = _feature_sigma(pixels_per_degree)
-    x = np.arange(-math.ceil(3.0 * sigma), math.ceil(3.0 * sigma) + 1.0)
-    gauss = np.exp(-(x**2) / (2.0 * sigma**2))
-    edge, point = (_balance(kernel) for kernel in (-x * gauss, (x**2 / sigma**2 - 1.0) * gauss))
-    gauss /= gauss.sum()
-    return (np.hypot(_separable(lightness, edge, gauss), _separable(lightness, gauss, edge)),
-            np.hypot(_separable(lightness, point, gauss), _separable(lightness, gauss, point)))
-
-
-def _feature_sigma(pixels_per_degree: float) -> float:
-    return 0.5 * FEATURE_WIDTH * pixels_per_degree
-
-
-FLIP_REACH = _flip_reach(PIXELS_PER_DEGREE)
-
-
-def _balance(kernel: np.ndarray) -> np.ndarray:
-    """Scaled so that the positive weights sum to 1 and the negative ones to -1."""
-    return np.where(kernel > 0.0, kernel / kernel[kernel > 0.0].sum(), -kernel / kernel[kernel < 0.0].sum())
-
-
-def hdr_flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
-    """HDR-FLIP: the largest FLIP over all exposures that the reference `b` asks for, (H, W) in [0, 1].
-
-    a, b: (H, W, 3) linear, finite. The exposures run in steps of about one stop from the one that shows b's brightest
-    pixel to the one that shows its median, both at 0.85 of a filmic curve (Narkowicz's fit of ACES). Source: Andersson,
-    Nilsson, Shirley, Akenine-Moller, "Visualizing Errors in Rendered High Dynamic Range Images", Eurographics 2021.
-    """
-    a, b = _pair(a, b)
-    bright = luminance(b)
-    tiny = float(np.finfo(np.float32).eps)
-    # (2.51 x^2 + 0.03 x) / (2.43 x^2 + 0.59 x + 0.14) = 0.85, for x = 0.6 times the exposed luminance
-    target = max(np.roots([2.51 - 0.85 * 2.43, 0.03 - 0.85 * 0.59, -0.85 * 0.14]).real) / 0.6
-    start, stop = (math.log2(target / max(level, tiny)) for level in (float(bright.max()), float(np.median(bright))))
-    result = np.zeros(bright.shape)
-    for exposure in np.linspace(start, stop, max(2, math.ceil(stop - start))):
-        shown_a, shown_b = (_narkowicz(image * np.float32(2.0**exposure)) for image in (a, b))
-        result = np.maximum(result, flip_map(shown_a, shown_b, pixels_per_degree))
-    return result
-
-
-def _narkowicz(linear: np.ndarray) -> np.ndarray:
-    """K. Narkowicz, "ACES Filmic Tone Mapping Curve" (2016), with its exposure of 0.6: [0, inf) to [0, 1]."""
-    x = np.clip(0.6 * linear, 0.0, 1e9)
-    return np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
+    return oiio.ImageBufAlgo.FLIP_diff(buffer(b), buffer(a), hdr=0, ppd=pixels_per_degree).get_pixels()[..., 0]
 
 
 # --- difference image -------------------------------------------------------------------------------------------------
