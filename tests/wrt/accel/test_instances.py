@@ -17,8 +17,9 @@ from wrt.accel import ACCELERATORS, Structure, build
 from wrt.accel.instances import Instances, place
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
-from wrt.kernels.query import RayArrays, Respawn, make_respawn_kernel
+from wrt.kernels.query import RayArrays
 from wrt.kernels.shade.surface import make_surface_at
+from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
 from wrt.kernels.traverse.common import Units
 from wrt.lab.bench.rasterizer import Rasterizer
 from wrt.lab.bench.visibility_check import compare
