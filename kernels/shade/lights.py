@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from wrt.kernels.shade.materials import DIFFUSE, Scatter, blinn_phong
+from wrt.kernels.shade.materials import Scatter, blinn_phong
 from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, hash_pair, make_sample_2d, search_cdf, triangle
 from wrt.kernels.shade.surface import (
     Surface,
@@ -15,7 +15,7 @@ from wrt.kernels.shade.surface import (
     world_normal,
     world_point,
 )
-from wrt.kernels.structs import Background, Light, Lighting, Material, Ray, Surfaces, gamma, make_ray
+from wrt.kernels.structs import Background, Light, Lighting, Ray, Surfaces, gamma, make_ray
 
 LIGHT_POINT = 0
 LIGHT_DIRECTIONAL = 1
@@ -290,8 +290,10 @@ def shadow_ray(s: Surface, sample: LightSample) -> Ray:
     return ray
 
 
-def make_reflected_light(features, light_sample, sky_sample):
+def make_reflected_light(features):
     """The light that one sample sends to the eye, before shadows, and which sample that is."""
+    light_sample = make_light_sample(features)
+    sky_sample = make_sky_sample(features, make_background(features))
 
     @wp.func
     def choose(lighting: Lighting, surfaces: Surfaces, i: int, s: Surface, xi: wp.vec2) -> LightSample:
@@ -306,14 +308,14 @@ def make_reflected_light(features, light_sample, sky_sample):
         return sample
 
     @wp.func
-    def reflected(sample: LightSample, m: Material, s: Surface, scatter: Scatter, wo: wp.vec3) -> wp.vec3:
+    def reflected(sample: LightSample, s: Surface, scatter: Scatter, wo: wp.vec3) -> wp.vec3:
         cosine = wp.dot(s.shading, sample.wi)
         if cosine <= 0.0 or wp.dot(s.geometric, sample.wi) <= 0.0:
             return wp.vec3(0.0, 0.0, 0.0)
         value = scatter.diffuse / PI
         if wp.static(features.highlight):
             # A traced reflection finds lights that have an area by itself; the background is no small light.
-            if sample.area == 0 or (m.kind == wp.static(DIFFUSE) and sample.distant == 0):
+            if sample.area == 0 or (scatter.traced == 0 and sample.distant == 0):
                 if wp.max(scatter.highlight) > 0.0:
                     value = value + scatter.highlight * blinn_phong(s.shading, sample.wi, wo, scatter.exponent)
         return cosine * wp.cw_mul(value, sample.weight)

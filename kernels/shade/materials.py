@@ -1,5 +1,7 @@
 """Materials: what a surface sends back, and where rays go on from it."""
 
+from typing import Any, NamedTuple
+
 import warp as wp
 
 from wrt.kernels.shade.sampling import PI, ggx_normal, ggx_visible_share
@@ -93,7 +95,8 @@ class Scatter:
     """Where rays go on from a surface; a weight of 0 means that none does.
 
     reflected: towards `reflection`, on the side the ray came from; transmitted: towards `refraction`, through the surface.
-    diffuse: what is left for Lambert's law; highlight and exponent: for lights that no ray can hit.
+    diffuse: what is left for Lambert's law; highlight and exponent: for lights that no ray can hit. traced: 1 where the highlight
+    stands for a reflection whose rays find the other lights.
     """
 
     reflected: wp.vec3
@@ -104,6 +107,7 @@ class Scatter:
     diffuse: wp.vec3
     highlight: wp.vec3
     exponent: float
+    traced: int
 
 
 def make_resolve(features, sample_texture):
@@ -175,8 +179,19 @@ def make_bump(features, sample_texture):
     return bump
 
 
-def make_shade(features):
-    """Surface and material at a hit, and the scattering there: shared by the integrator, shadow rays and AOVs."""
+class Shading(NamedTuple):
+    """What is known at a hit: surface_at(surfaces, ray, hit); resolve(surfaces, surface) -> Material; shading_normal(surfaces,
+    material, surface, wo); scatter(material, surface, wo, xi) -> Scatter; is_solid(material)."""
+
+    surface_at: Any
+    resolve: Any
+    shading_normal: Any
+    scatter: Any
+    is_solid: Any
+
+
+def make_shading(features):
+    """Once for a kernel: the integrator's step, shadow rays and AOVs share it."""
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
     uvs = features.textures or features.checkerboards
     surface_at = make_surface_at(features.spheres, features.smooth, uvs, features.normal_maps, features.instances)
@@ -195,7 +210,7 @@ def make_shade(features):
                 n = wp.normalize(n + (1.0e-3 - facing) * wo)
         return n
 
-    return surface_at, resolve, shading_normal
+    return Shading(surface_at, resolve, shading_normal, make_scatter(features), make_is_solid(features))
 
 
 def make_is_solid(features):
@@ -295,6 +310,7 @@ def make_scatter(features):
                 # No ray can hit a point light: its reflection is Blinn's, of the same width (Walter et al. 2007, eq. 41).
                 out.highlight = out.reflected
                 out.exponent = wp.min(2.0 / (alpha * alpha) - 2.0, 1.0e5)
+                out.traced = 1
 
         out.reflection = 2.0 * wp.dot(n, wo) * n - wo
         if rough:

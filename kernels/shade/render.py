@@ -3,9 +3,9 @@
 import warp as wp
 
 from wrt.kernels.shade.camera import chief_ray, make_camera_ray
-from wrt.kernels.shade.materials import make_cutout, make_shade
+from wrt.kernels.shade.loop import make_radiance
+from wrt.kernels.shade.materials import make_cutout, make_shading
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
-from wrt.kernels.shade.whitted import make_radiance
 from wrt.kernels.structs import AovFilm, Camera, Film, Lighting, Limits, Surfaces, Tile, kernel, make_ray
 
 
@@ -93,7 +93,7 @@ def make_aov_kernel(features, structure):
     """What the ray through each pixel's centre (and the lens' centre) meets first."""
     accel_struct = structure.struct
     closest_hit, _ = make_traversals(features, structure)
-    surface_at, resolve, shading_normal = make_shade(features)
+    surface_at, resolve, shading_normal, _, _ = make_shading(features)
 
     @kernel
     def aovs(accel: accel_struct, surfaces: Surfaces, camera: Camera, film: AovFilm, tile: Tile):

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from wrt.kernels.shade.materials import BLEND, make_is_solid, make_scatter, make_shade
+from wrt.kernels.shade.materials import BLEND
 from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Material, Ray, Surfaces
 
@@ -61,10 +61,8 @@ def left(p: Passage) -> Passage:
     return out
 
 
-def make_pass_surface(features):
+def make_pass_surface(features, scatter, is_solid):
     """One more surface on light's way."""
-    scatter = make_scatter(features)
-    is_solid = make_is_solid(features)
 
     @wp.func
     def let_through(m: Material, from_outside: Surface, wo: wp.vec3) -> wp.vec3:
@@ -116,10 +114,10 @@ def make_pass_surface(features):
     return pass_surface
 
 
-def make_transmittance(features, accel_struct, closest_hit, any_hit):
+def make_transmittance(features, shading, accel_struct, closest_hit, any_hit):
     """Shadow rays: one any-hit query, or where a scene lets light through surfaces, one closest hit after another."""
-    surface_at, resolve, shading_normal = make_shade(features)
-    pass_surface = make_pass_surface(features)
+    surface_at, resolve, shading_normal, scatter, is_solid = shading
+    pass_surface = make_pass_surface(features, scatter, is_solid)
 
     @wp.func
     def through_surfaces(accel: accel_struct, surfaces: Surfaces, first: Ray, end: wp.vec3) -> Shadow:

@@ -10,18 +10,10 @@ import warp as wp
 
 from wrt.kernels.structs import Hit, Ray, Surfaces
 
-BRANCHES = wp.constant(4)  # camera, reflection, refraction, straight on: as whitted.child numbers them
-
-
-@wp.func
-def label(branch: int, depth: int) -> int:
-    """What Ray.slot of a path's ray holds until it is logged. A shadow ray has 0: it belongs to the path's ray before it."""
-    return 1 + branch + BRANCHES * depth
-
 
 @wp.struct
 class LoggedRay:
-    """As structs.Ray; label: as above; any_hit: 1 where only whether was asked; hit: 1 where there was one."""
+    """As structs.Ray; label: of shade.step.label; any_hit: 1 where only whether was asked; hit: 1 where there was one."""
 
     origin: wp.vec3
     direction: wp.vec3

@@ -20,8 +20,9 @@ from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
-from wrt.kernels.query import RayArrays, Respawn, make_respawn_kernel
+from wrt.kernels.query import RayArrays
 from wrt.kernels.shade.surface import make_surface_at
+from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
 from wrt.kernels.traverse.common import Units
 from wrt.lab.bench.rasterizer import Rasterizer
 from wrt.lab.bench.visibility_check import compare

@@ -19,9 +19,10 @@ from wrt.accel.structure import Structure
 from wrt.core.device import load_kernel, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
-from wrt.kernels.query import HitList, RayArrays, Respawn, make_all_hits_kernel, make_respawn_kernel
+from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
 from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
+from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
 from wrt.kernels.traverse.common import Units
 from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
 from wrt.lab.bench.timing import Quartiles, alternate, quartiles

@@ -18,6 +18,7 @@ from wrt.core.device import free_memory, run_all, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.io.load import as_scene
+from wrt.kernels.shade.step import BRANCHES
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
 from wrt.lab.rtcore.caches import distinct_lines
@@ -254,8 +255,8 @@ class Profiler(Renderer):
         label = rays["label"]
         path = np.maximum.accumulate(np.where(label > 0, np.arange(len(rays)), 0))  # a shadow ray's: the one before it
         shadow = KINDS.index("shadow")
-        kind = np.where(label > 0, (label - 1) % int(ray_log.BRANCHES), shadow).astype(np.int8)
-        depth = (label[path] - 1) // int(ray_log.BRANCHES)
+        kind = np.where(label > 0, (label - 1) % int(BRANCHES), shadow).astype(np.int8)
+        depth = (label[path] - 1) // int(BRANCHES)
         trace = [tile.trace for tile in tiles if tile.trace is not None]
         kept = np.concatenate([np.full(len(tile.rays), tile.trace is not None) for tile in tiles])
         length = counts["nodes"][kept].astype(np.int64) + counts["primitives"][kept]

@@ -136,11 +136,13 @@ def test_what_a_profile_cannot_do_is_refused(scene: Scene, monkeypatch: pytest.M
 def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None:
     """The machine code for Turing is that of a source without a word on counting, to the last byte."""
     features, structure = features_of(scene, scene.camera(None)), Structure(ACCELERATORS["bvh"], Units())
-    folder = Path(wrt.__file__).parent.parent / "kernels"
+    folder = Path(wrt.__file__).parent.parent / "kernels" / "shade"
     modules = {}
-    for name in ("whitted", "render"):
+    for name in ("step", "loop", "render"):
         text = without_counting((folder / f"{name}.py").read_text())
-        (tmp_path / f"{name}.py").write_text(text.replace("wrt.kernels.shade.whitted", "wrt.kernels.bare_whitted"))
+        for other in ("step", "loop"):
+            text = text.replace(f"wrt.kernels.shade.{other}", f"wrt.kernels.bare_{other}")
+        (tmp_path / f"{name}.py").write_text(text)
         spec = importlib.util.spec_from_file_location(f"wrt.kernels.bare_{name}", tmp_path / f"{name}.py")
         assert spec is not None and spec.loader is not None and "counting" not in text
         modules[name] = importlib.util.module_from_spec(spec)
@@ -165,7 +167,7 @@ def without_counting(text: str) -> str:
         if depth is None:
             out.append(line)
     bare = "\n".join(out) + "\n"
-    for old, new in ((", counting=False", ""), (", counting)", ")"), ("make_path(counting)", "make_path()"),
+    for old, new in (("counting=False", ""), (", counting)", ")"), ("(counting)", "()"), (", )", ")"),
                      ("    counting = structure.units.counters\n", "")):
         bare = bare.replace(old, new)
     return "".join(line + "\n" for line in bare.splitlines() if "counting" not in line)

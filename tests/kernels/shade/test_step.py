@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT
-from wrt.kernels.shade.whitted import MAX_RAYS
+from wrt.kernels.shade.step import MAX_RAYS
 from wrt.renderer.renderer import Options, Renderer, render
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera

@@ -1,0 +1,332 @@
+"""The integrator's step: what a surface does with a path that meets it. Nothing here traces a ray.
+
+Whitted 1980, "An Improved Illumination Model for Shaded Display", without recursion. At a hit: emission and the ambient term,
+a shadow ray asked for each light, and at most three new paths: straight on through what is partly transparent, reflected, and
+refracted. Each carries what it will be worth (throughput); a path is cut at max_depth bounces, after MAX_TRANSPARENT surfaces
+that it went straight through, or below min_throughput, and counted. So is what comes after MAX_RAYS: where nothing is cut by
+throughput, a tree of 64 levels has no end. loop.py traces.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from wrt.kernels.shade.lights import make_light_xi, make_reflected_light, shadow_ray
+from wrt.kernels.shade.materials import BLEND, Scatter
+from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
+from wrt.kernels.shade.shadows import MAX_TRANSPARENT, OUTSIDE, attenuation
+from wrt.kernels.shade.surface import Surface, spawn_point
+from wrt.kernels.structs import Hit, Lighting, Limits, Material, Ray, Surfaces, make_ray
+
+MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
+UNKNOWN = wp.constant(-2)  # where a camera ray begins: within glass, or not
+BRANCHES = wp.constant(4)  # camera, reflection, refraction, straight on: the numbers that make_step gives its new paths
+
+
+@wp.func
+def label(branch: int, depth: int) -> int:
+    """What Ray.slot of a path's ray holds until it is logged. A shadow ray has 0: it belongs to the path's ray before it."""
+    return 1 + branch + BRANCHES * depth
+
+
+@cache
+def make_path(counting):
+    """A pending ray; `counting`: it also knows what kind of ray it is."""
+
+    @wp.struct
+    class Path:
+        """How much its light counts, how many bounces it has behind it and how many surfaces in a row it went straight
+        through, which solid glass it is in (a material, OUTSIDE or UNKNOWN), its samples' key, 1 + the triangle that it starts
+        on (0: none), and where rays are counted the branch that made it (0: the camera)."""
+
+        origin: wp.vec3
+        direction: wp.vec3
+        throughput: wp.vec3
+        depth: int
+        passed: int
+        medium: int
+        exclude_plus_one: int
+        key: wp.uint32
+        if counting:
+            branch: int
+
+    return Path
+
+
+@cache
+def make_shaded(counting):
+    """What `shade` makes of a path and a hit."""
+    path_struct = make_path(counting)
+
+    @wp.struct
+    class Shaded:
+        """light: emission and the ambient term; throughput: what light from here is worth in the picture. surface, scatter, key:
+        what the lights are asked with. onward, reflected, refracted: the new paths; a throughput of 0 is none."""
+
+        light: wp.vec3
+        throughput: wp.vec3
+        surface: Surface
+        scatter: Scatter
+        wo: wp.vec3
+        key: wp.uint32
+        onward: path_struct
+        reflected: path_struct
+        refracted: path_struct
+
+    return Shaded
+
+
+@wp.struct
+class ShadowRequest:
+    """value: the light that one lamp sends to the eye by way of a surface, if nothing is between them; 0: none, and nothing to
+    trace. ray: the segment to look along, and end: where it ends."""
+
+    value: wp.vec3
+    ray: Ray
+    end: wp.vec3
+
+
+@wp.struct
+class Sample:
+    """The radiance along one camera ray, and what it took.
+
+    lost: what the rays that were cut would have added to it in a room of radiance 1 (ior^2 within glass), channels' mean.
+    """
+
+    radiance: wp.vec3
+    rays: int
+    cut_depth: int
+    cut_throughput: int
+    lost: float
+
+
+@wp.func
+def mean3(v: wp.vec3) -> float:
+    return (v[0] + v[1] + v[2]) / 3.0
+
+
+@wp.func
+def absorbed(surfaces: Surfaces, throughput: wp.vec3, medium: int, distance: float) -> wp.vec3:
+    """What is left of it after so far a way (world units) in a medium, which may be none."""
+    if medium < 0:
+        return throughput
+    return wp.cw_mul(throughput, attenuation(surfaces, medium, distance))
+
+
+@wp.func
+def emitted(m: Material, s: Surface) -> wp.vec3:
+    if s.front != 0 or m.two_sided != 0:
+        return m.emission
+    return wp.vec3(0.0, 0.0, 0.0)
+
+
+class Step(NamedTuple):
+    """What a loop is made of.
+
+    Path: the struct; first_path(ray, key); ray_of(path). shade(surfaces, lighting, path, ray, hit, index) -> Shaded.
+    shadow_requests: how many lights there are beside those of `lighting` (the background is one), and shadow_request(surfaces,
+    lighting, shaded, i, index) -> ShadowRequest to each. keep(path, limits, traced): whether a new path is followed, and
+    tally(sample, surfaces, path, verdict) counts those that are not.
+    """
+
+    Path: Any
+    first_path: Any
+    ray_of: Any
+    shade: Any
+    extra_lights: int
+    shadow_request: Any
+    keep: Any
+    tally: Any
+
+
+def make_step(features, shading, counting=False):
+    """The step of a scene's kernel. `features`: wrt.renderer.features.Features; `shading`: of make_shading."""
+    Path = make_path(counting)
+    first_path, ray_of, child = make_paths(counting)
+    return Step(Path, first_path, ray_of, make_shade(features, shading, child, counting), 1 if features.sky_light else 0,
+                make_shadow_request(features, counting), *make_keep(features, counting))
+
+
+def make_paths(counting=False):
+    """Where paths begin: at the camera, or at a surface."""
+    Path = make_path(counting)
+
+    @wp.func
+    def first_path(camera_ray: Ray, key: wp.uint32) -> Path:
+        path = Path()
+        path.origin = camera_ray.origin
+        path.direction = camera_ray.direction
+        path.throughput = wp.vec3(1.0, 1.0, 1.0)
+        path.medium = UNKNOWN
+        path.key = key
+        return path
+
+    @wp.func
+    def ray_of(path: Path) -> Ray:
+        ray = make_ray(path.origin, path.direction)
+        ray.exclude_plus_one = path.exclude_plus_one
+        if wp.static(counting):
+            ray.slot = label(path.branch, path.depth)
+        return ray
+
+    @wp.func
+    def child(path: Path, s: Surface, direction: wp.vec3, throughput: wp.vec3, branch: int) -> Path:
+        out = Path()
+        out.origin = spawn_point(s.point, s.error, s.geometric, direction)
+        out.direction = direction
+        out.throughput = throughput
+        out.depth = path.depth + 1
+        out.medium = path.medium
+        out.exclude_plus_one = s.exclude_plus_one
+        out.key = hash_pair(path.key, wp.uint32(branch))
+        if wp.static(counting):
+            out.branch = branch
+        return out
+
+    return first_path, ray_of, child
+
+
+def make_missing(features, is_solid):
+    """How far a blended surface is not there."""
+
+    @wp.func
+    def missing(m: Material, s: Surface, medium: int) -> float:
+        """Share of a ray for which the surface is not there: 1 - alpha.
+
+        Blended solid glass is there as a whole or not at all, which is decided where a ray enters: what did not enter it meets
+        nothing at its back, and what did meets all of it. Else a ray could go in unbent and come out with ior^2 of its light.
+        """
+        if m.alpha_mode != wp.static(BLEND):
+            return 0.0
+        if wp.static(features.refraction):
+            if s.front == 0 and medium != UNKNOWN and is_solid(m):
+                return wp.where(medium == s.material, 0.0, 1.0)
+        return 1.0 - m.alpha
+
+    return missing
+
+
+def make_shade(features, shading, child, counting=False):
+    """One device function from a path and its hit to everything that follows from them."""
+    Path, Shaded = make_path(counting), make_shaded(counting)
+    surface_at, resolve, shading_normal, scatter_at, is_solid = shading
+    sample_2d = make_sample_2d(features)
+    missing = make_missing(features, is_solid)
+
+    @wp.func
+    def medium_at(m: Material, s: Surface, medium: int) -> int:
+        """The solid glass on the ray's side of a surface. A back is seen from within, whatever the path knows of."""
+        if not is_solid(m):
+            return medium
+        return wp.where(s.front == 0, s.material, wp.where(medium == UNKNOWN, OUTSIDE, medium))
+
+    @wp.func
+    def straight_on(surfaces: Surfaces, path: Path, m: Material, s: Surface, share: float, distance: float) -> Path:
+        """The part of a path that finds nothing at a blended surface. It takes no bounce."""
+        onward = child(path, s, path.direction, share * path.throughput, 3)
+        onward.depth = path.depth
+        onward.passed = path.passed + 1
+        if wp.static(features.refraction):
+            if path.medium == UNKNOWN and is_solid(m):
+                onward.medium = OUTSIDE
+        if wp.static(features.absorption):
+            onward.throughput = absorbed(surfaces, onward.throughput, path.medium, distance)
+        return onward
+
+    @wp.func
+    def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, ray: Ray, hit: Hit, index: wp.uint32) -> Shaded:
+        """hit: of `ray` (of ray_of), with prim_id >= 0; index: of the sample."""
+        out = Shaded()
+        path = arriving
+        s = surface_at(surfaces, ray, hit)
+        m = resolve(surfaces, s)
+        out.wo = -path.direction
+        s.shading = shading_normal(surfaces, m, s, out.wo)
+        if wp.static(features.blend):
+            share = missing(m, s, path.medium)
+            if share > 0.0:
+                out.onward = straight_on(surfaces, path, m, s, share, hit.t)
+                if share >= 1.0:
+                    return out
+                path.throughput = (1.0 - share) * path.throughput
+        if wp.static(features.refraction):
+            path.medium = medium_at(m, s, path.medium)
+        if wp.static(features.absorption):
+            path.throughput = absorbed(surfaces, path.throughput, path.medium, hit.t)
+        xi = wp.vec2(0.0, 0.0)
+        if wp.static(features.rough):
+            xi = sample_2d(path.key, index, 2)
+        scatter = scatter_at(m, s, out.wo, xi)
+        out.throughput = path.throughput
+        out.surface = s
+        out.scatter = scatter
+        out.key = path.key
+        if wp.static(features.ambient):
+            out.light = wp.cw_mul(scatter.diffuse, lighting.ambient)
+        if wp.static(features.emission):
+            out.light += emitted(m, s)
+        if wp.static(features.reflection):
+            out.reflected = child(path, s, scatter.reflection, wp.cw_mul(path.throughput, scatter.reflected), 1)
+        if wp.static(features.refraction):
+            out.refracted = child(path, s, scatter.refraction, wp.cw_mul(path.throughput, scatter.transmitted), 2)
+            if scatter.bends != 0:
+                out.refracted.medium = wp.where(s.front != 0, s.material, OUTSIDE)
+        return out
+
+    return shade
+
+
+def make_shadow_request(features, counting=False):
+    """What a surface asks of a light."""
+    Shaded = make_shaded(counting)
+    light_xi = make_light_xi(features)
+    choose, reflected = make_reflected_light(features)
+
+    @wp.func
+    def shadow_request(surfaces: Surfaces, lighting: Lighting, shaded: Shaded, i: int, index: wp.uint32) -> ShadowRequest:
+        """Lights are numbered; the background comes after the last one."""
+        out = ShadowRequest()
+        s = shaded.surface
+        sample = choose(lighting, surfaces, i, s, light_xi(shaded.key, index, i))
+        out.value = reflected(sample, s, shaded.scatter, shaded.wo)
+        if wp.max(out.value) > 0.0:
+            out.ray = shadow_ray(s, sample)
+            out.end = sample.end
+        return out
+
+    return shadow_request
+
+
+def make_keep(features, counting=False):
+    """Which paths are followed, and the count of those that are not."""
+    Path = make_path(counting)
+
+    @wp.func
+    def keep(next: Path, limits: Limits, traced: int) -> int:
+        """0: carries nothing; 1: to be followed; 2: cut by depth, or by the number of rays so far; 3: cut by throughput."""
+        largest = wp.max(next.throughput)
+        if largest <= 0.0:
+            return 0
+        if next.depth > limits.max_depth or next.passed > MAX_TRANSPARENT or traced >= MAX_RAYS:
+            return 2
+        return wp.where(largest < limits.min_throughput, 3, 1)
+
+    @wp.func
+    def tally(before: Sample, surfaces: Surfaces, next: Path, verdict: int) -> Sample:
+        """Keeps the count of rays that were cut."""
+        out = before
+        if verdict < 2:
+            return out
+        if verdict == 2:
+            out.cut_depth += 1
+        else:
+            out.cut_throughput += 1
+        worth = mean3(next.throughput)
+        if wp.static(features.refraction):
+            if next.medium >= 0:  # within, light is denser, and the throughput was divided by as much
+                worth = worth * surfaces.materials[next.medium].ior * surfaces.materials[next.medium].ior
+        out.lost += worth
+        return out
+
+    return keep, tally
