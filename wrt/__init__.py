@@ -15,6 +15,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from wrt.core.version import VERSION as __version__
+
 if TYPE_CHECKING:
     from wrt.accel import ACCELERATORS as ACCELERATORS
     from wrt.accel.queries import build as build
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from wrt.renderer.options import Options as Options
     from wrt.renderer.options import Progress as Progress
     from wrt.renderer.pixel_rays import camera_rays as camera_rays
-    from wrt.renderer.renderer import render as render
+    from wrt.renderer.render import render as render
     from wrt.scene.backgrounds import ConstantBackground as ConstantBackground
     from wrt.scene.backgrounds import EnvironmentBackground as EnvironmentBackground
     from wrt.scene.backgrounds import GradientBackground as GradientBackground
@@ -48,8 +50,6 @@ if TYPE_CHECKING:
     from wrt.viewer.notebook import LiveView as LiveView
     from wrt.viewer.notebook import side_by_side as side_by_side
 
-__version__ = "0.1.0"
-
 # The same names at run time, each imported when it is first used: `python -m wrt --help` must not wait for Warp.
 _PUBLIC = {
     "wrt.accel": ("ACCELERATORS",),
@@ -60,7 +60,7 @@ _PUBLIC = {
     "wrt.picture.film": ("Film",),
     "wrt.renderer.options": ("Options", "Progress"),
     "wrt.renderer.pixel_rays": ("camera_rays",),
-    "wrt.renderer.renderer": ("render",),
+    "wrt.renderer.render": ("render",),
     "wrt.scene.backgrounds": ("ConstantBackground", "EnvironmentBackground", "GradientBackground"),
     "wrt.scene.cameras": ("Camera",),
     "wrt.scene.lights": ("DirectionalLight", "PointLight", "SpotLight"),

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-import wrt
 from wrt.accel.base import Accelerator, Built, Geometry
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.errors import InputError
+from wrt.core.version import VERSION
 from wrt.core.write_file import check_writable, replacing
 from wrt.scene.mesh import Mesh
 
@@ -65,7 +65,7 @@ def save(accel: Accelerator, path: str | os.PathLike[str]) -> None:
     types = array_types(type(accel), units.triangle)
     body = [rows[name].astype(types[name].base, copy=False).tobytes() for name in types]
     body.append(built.order.astype("<i4").tobytes())
-    header = {"accel": accel.name, "triangle": units.triangle, "box": units.box, "wrt": wrt.__version__,
+    header = {"accel": accel.name, "triangle": units.triangle, "box": units.box, "wrt": VERSION,
               "geometry": state.geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
               "order": len(built.order)} | {name: getattr(built, name) for name in STATS}
     with replacing(path) as temporary, open(temporary, "wb") as file:
@@ -118,7 +118,7 @@ def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: s
 
     geometry = Geometry.of(mesh) if isinstance(mesh, Mesh) else mesh
     chosen = {name: value for name, value in options.items() if name != "progress"}
-    key = json.dumps([geometry.digest(), accel, chosen, wrt.__version__], sort_keys=True)
+    key = json.dumps([geometry.digest(), accel, chosen, VERSION], sort_keys=True)
     path = Path(folder) / f"{sha256(key.encode()).hexdigest()[:32]}.accel"
     if path.is_file():
         with contextlib.suppress(InputError):  # a damaged one is replaced below

@@ -26,8 +26,9 @@ from wrt.scene.model import Scene
 from wrt.scene.settings import TONEMAPS
 from wrt.viewer.access import access_for
 from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
-from wrt.viewer.refine import COSTS, Shown, Viewer
+from wrt.viewer.refine import COSTS, Viewer
 from wrt.viewer.server import Door, import_viser, listen, quiet, to_stderr
+from wrt.viewer.view import Shown
 
 MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser one
 RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}
@@ -39,7 +40,7 @@ MOST_FILES = 4  # that are made at a time
 
 
 def status(shown: Shown, viewer: Viewer) -> str:
-    """What the panel tells of a picture, as Markdown."""
+    """What the panel says of a picture, as Markdown."""
     height, width = shown.codes.shape[:2]
     rays = f"{shown.speed / 1e6:.2f} Mray/s, {shown.rays_per_sample:.1f} rays a sample"
     if shown.view.cost:
@@ -60,7 +61,7 @@ class Page:
     def __init__(self, scene: Scene, options: Options, host: str = "127.0.0.1", port: int = 8080, spp: int = 1024, *,
                  allow_origins: Iterable[str] = (), warn: Callable[[str], None] = to_stderr) -> None:
         import_viser()
-        self.viewer = Viewer(scene, options, self._show, self._tell, spp)
+        self.viewer = Viewer(scene, options, self._show, self._report, spp)
         start = self.viewer.view.camera
         self.unit, self.watching, self.name = unit_of(scene, start), -1, scene.name or "picture"
         self._saving = threading.BoundedSemaphore(MOST_FILES)
@@ -150,7 +151,7 @@ class Page:
         if shown.view.cost:
             self.marks.content = f"0 (dark) to {short(shown.top)} (light)"
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         self.doing.content, self.doing.visible = text, bool(text)
 
     # --- the panel ----------------------------------------------------------------------------------------------------
@@ -227,7 +228,7 @@ class Page:
 
     def _set_angle(self, fov_y: float) -> None:
         for client in self.server.get_clients().values():
-            client.camera.fov = fov_y  # and the client tells that its camera changed
+            client.camera.fov = fov_y  # and the client reports that its camera changed
 
     def _set_lens(self, **fields: float) -> None:
         self.viewer.change(camera=lambda camera: replace(camera, **fields))

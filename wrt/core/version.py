@@ -1,0 +1,3 @@
+"""Which wrt this is."""
+
+VERSION = "0.1.0"
