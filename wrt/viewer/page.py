@@ -55,7 +55,7 @@ class Page:
     """A server with the panel and one Viewer. host, port (0: any free one): where it listens. Raises InputError where it cannot.
 
     `url` is where it is found, with the token that a browser needs; allow_origins: other addresses of it, such as that of a proxy
-    ("https://example.org"); warn: told of requests and messages that are refused, once of each kind. `close` ends it.
+    ("https://example.org"); warn: hears of requests and messages that are refused, once of each kind. `close` ends it.
     """
 
     def __init__(self, scene: Scene, options: Options, host: str = "127.0.0.1", port: int = 8080, spp: int = 1024, *,
@@ -134,7 +134,7 @@ class Page:
         try:
             changed = self.viewer.change(camera=lambda camera: from_viewport(camera, viewport, self.unit), size=size)
         except InputError as error:  # its numbers are too large in the scene's units
-            self.door.tell("camera", f"dropped a camera: {error}")
+            self.door.report("camera", f"dropped a camera: {error}")
             return
         if newcomer and not changed:
             self.viewer.again()
@@ -216,13 +216,13 @@ class Page:
                 await self._moved(client.camera)
 
     def _safe(self, action: Callable[[Any], Any]) -> Callable[[Any], None]:
-        """The action for a browser's event; that it cannot be done is told in one line."""
+        """The action for a browser's event; that it cannot be done is reported in one line."""
 
         def act(event: Any) -> None:
             try:
                 action(event)
             except (InputError, OSError) as error:
-                self.door.tell("action", f"error: {error}")
+                self.door.report("action", f"error: {error}")
 
         return act
 
@@ -248,7 +248,7 @@ class Page:
         if client is None or picture is None:
             return
         if not self._saving.acquire(blocking=False):
-            self.door.tell("saving", f"did not save a picture; {MOST_FILES} are being made")
+            self.door.report("saving", f"did not save a picture; {MOST_FILES} are being made")
             return
         try:
             client.send_file_download(f"{self.name}{suffix}", encoded(picture, suffix), save_immediately=True)

@@ -245,7 +245,7 @@ def test_a_worker_that_has_something_else_says_so(change: dict[str, str], said: 
 
 def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
     """A checkout has them beside the package, a wheel in it: the same names and digests, so that both can work together."""
-    shutil.copytree(ROOT / "wrt", tmp_path / "wrt", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "wrt", tmp_path / "wrt", ignore=shutil.ignore_patterns("__pycache__", "kernels"))
     shutil.copytree(ROOT / "kernels", tmp_path / "wrt" / "kernels", ignore=shutil.ignore_patterns("__pycache__"))
     code = "import json; from wrt.renderer.distributed.installed import INSTALLED; print(json.dumps(INSTALLED))"
     done = subprocess.run([sys.executable, "-c", code],
