@@ -67,7 +67,7 @@ def largest_file(size: int) -> Iterator[None]:
     """
     import resource
 
-    from wrt.renderer.renderer import PREPARING
+    from wrt.renderer.prepare import PREPARING
 
     for thread in threading.enumerate():
         if thread.name.startswith(PREPARING):

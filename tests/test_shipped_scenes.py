@@ -21,7 +21,8 @@ from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.renderer.features import Features, features_of
-from wrt.renderer.renderer import aov_kernel, render_kernel
+from wrt.renderer.instancing import instanced_meshes
+from wrt.renderer.plan import aov_kernel, render_kernel
 from wrt.scene.model import Scene
 
 SCENES = sorted((ROOT / "scenes").glob("*.toml"))
@@ -36,7 +37,7 @@ def load(path: Path) -> Scene:
 
 def features(path: Path) -> set[Features]:
     scene = load(path)
-    return {features_of(scene, camera) for camera in scene.cameras}
+    return {features_of(scene, camera, instanced_meshes(scene)) for camera in scene.cameras}
 
 
 @pytest.mark.parametrize("name", Features().switches())

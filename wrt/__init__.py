@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from wrt.renderer.options import Options as Options
     from wrt.renderer.options import Progress as Progress
     from wrt.renderer.pixel_rays import camera_rays as camera_rays
-    from wrt.renderer.renderer import render as render
+    from wrt.renderer.render import render as render
     from wrt.scene.backgrounds import ConstantBackground as ConstantBackground
     from wrt.scene.backgrounds import EnvironmentBackground as EnvironmentBackground
     from wrt.scene.backgrounds import GradientBackground as GradientBackground
@@ -62,7 +62,7 @@ _PUBLIC = {
     "wrt.picture.film": ("Film",),
     "wrt.renderer.options": ("Options", "Progress"),
     "wrt.renderer.pixel_rays": ("camera_rays",),
-    "wrt.renderer.renderer": ("render",),
+    "wrt.renderer.render": ("render",),
     "wrt.scene.backgrounds": ("ConstantBackground", "EnvironmentBackground", "GradientBackground"),
     "wrt.scene.cameras": ("Camera",),
     "wrt.scene.lights": ("DirectionalLight", "PointLight", "SpotLight"),

@@ -382,8 +382,9 @@ def render_scene(path: Path) -> object:
     """
     from unittest import mock
 
-    from wrt.renderer import renderer as driver
+    from wrt.renderer import plan
     from wrt.renderer.features import STACK_STEP, Features
+    from wrt.renderer.render import render
     from wrt.scene.backgrounds import EnvironmentBackground
 
     scene = load_scene_with_normals(path)
@@ -392,8 +393,8 @@ def render_scene(path: Path) -> object:
     switches |= {"environment": environment, "gradient": not environment}
     switches |= dict.fromkeys(("instances", "independent", "schlick"), False)
     features = Features(**switches, stack_size=9 * STACK_STEP)
-    with mock.patch.object(driver, "features_of", lambda *arguments: features):
-        film = driver.render(scene, size=(8, 8), spp=1, instancing="never", threads=1, aov=("depth", "normal"))
+    with mock.patch.object(plan, "features_of", lambda *arguments: features):
+        film = render(scene, size=(8, 8), spp=1, instancing="never", threads=1, aov=("depth", "normal"))
     if not np.isfinite(film.pixels).all() or np.isnan(film.aov["depth"]).any() or not np.isfinite(film.aov["normal"]).all():
         raise ArithmeticError("the picture is not finite")
     return film

@@ -330,7 +330,7 @@ def error(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], 
     """Speed against error of SCENE over the knobs that a render has: each picture against a converged reference."""
     from wrt.lab.bench import error as bench_error
     from wrt.lab.bench import error_report as report
-    from wrt.renderer.renderer import Options
+    from wrt.renderer.options import Options
 
     plan = bench_error.Plan(**{name: options.pop(name) for name in (
         "knobs", "max_spp", "repeats", "reference_spp")}, row_seconds=options.pop("row_limit"))
@@ -379,7 +379,7 @@ def mitsuba(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...]
     llvm_ad_rgb gets the LLVM library that DRJIT_LIBLLVM_PATH names, else the newest in the usual places that passes a trial.
     """
     from wrt.lab.mitsuba import equal_error
-    from wrt.renderer.renderer import Options
+    from wrt.renderer.options import Options
 
     if matte and options["integrator"] == "auto":
         options["integrator"] = "direct"

@@ -110,9 +110,10 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
     bits, aov = options.pop("bits"), options["aov"]
     check_writable(output, bits)
     from wrt.picture.film import aov_path
+    from wrt.renderer.options import Options
     from wrt.renderer.progress import progress_reporter
-    from wrt.renderer.renderer import Options, plain_text
-    from wrt.renderer.renderer import render as render_scene
+    from wrt.renderer.render import render as render_scene
+    from wrt.renderer.result import plain_text
     from wrt.scene.model import Scene
 
     # Whatever can be wrong with an option is told before a scene is read and a kernel compiled.

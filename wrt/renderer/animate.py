@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
-from wrt.accel.build import build as build_structure
-from wrt.accel.geometry import Geometry
 from wrt.core.checks import as_integer
-from wrt.core.errors import InputError, SceneWarning
+from wrt.core.errors import InputError
 from wrt.core.write_file import check_writable, replacing
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
-from wrt.renderer.upload import upload_scene
 from wrt.scene.cameras import Camera
 from wrt.scene.model import Scene
-from wrt.scene.motion import moves, scene_at
+from wrt.scene.moving import moves, scene_at
 from wrt.scene.values import as_number
 
 REBUILD_AT = 1.5  # growth of the SAH cost by refits (docs/acceleration.md, "Moving meshes")
@@ -62,16 +56,16 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
         options = replace(options, instancing="never")
     renderer = Renderer(scene_at(scene, 0.0), options)
     start, middle = renderer.camera, np.mean(scene.bounds(), axis=0)
-    told = {"structure": "built", "seconds": renderer.accel.stats.build_seconds, "growth": 1.0}
+    done = {"structure": "built", "seconds": renderer.accel.stats.build_seconds, "growth": 1.0}
     for frame in range(animation.frames):
         time = frame / animation.frames
         if frame and moves(scene):
-            told = follow(renderer, scene_at(scene, time), animation.rebuild_at)
+            done = renderer.follow(scene_at(scene, time), animation.rebuild_at)
         elif frame:
-            told = {"structure": "kept", "seconds": 0.0, "growth": 1.0}
+            done = {"structure": "kept", "seconds": 0.0, "growth": 1.0}
         renderer.aim(orbited(start, middle, degrees * time))
         film = renderer.run()
-        film.stats["frame"] = {"number": frame, "time": time, **told}
+        film.stats["frame"] = {"number": frame, "time": time, **done}
         yield film
         if film.stats["interrupted"]:
             return
@@ -90,29 +84,6 @@ def orbited(camera: Camera, middle: np.ndarray, degrees: float) -> Camera:
     turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
     turn[:3, 3] = pivot - turn[:3, :3] @ pivot
     return replace(camera, camera_to_world=turn @ pose)
-
-
-def follow(renderer: Renderer, scene: Scene, rebuild_at: float) -> dict[str, Any]:
-    """Bring a renderer to a scene with the same objects in other places: its surfaces are uploaded anew, and its structure is
-    refitted, or where it cannot be, or has grown too costly, built anew."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SceneWarning)  # told of the first frame
-        renderer.device_scene = upload_scene(scene, renderer.device, renderer.options.instancing)
-    renderer.scene = scene
-    geometry: Any = renderer.device_scene.world.geometry
-    if can_refit(renderer.accel, geometry):
-        refit = asdict(renderer.accel.refit(geometry.vertices, rebuild_at))
-        return {"structure": "rebuilt" if refit["rebuilt"] else "refitted", "seconds": refit["seconds"], "growth": refit["growth"]}
-    options = renderer.options
-    renderer.accel = build_structure(geometry, options.accel, options.device, renderer.threads, triangle=options.triangle,
-                                     box=options.box, **options.accel_options)
-    return {"structure": "rebuilt", "seconds": renderer.accel.stats.build_seconds, "growth": float("nan")}
-
-
-def can_refit(accel: Accelerator, geometry: Geometry) -> bool:
-    """Whether it is a structure that follows vertices, over the same faces; rounding may have put a face's corners on a line."""
-    return (type(accel)._refit is not Accelerator._refit and np.array_equal(accel.geometry.faces, geometry.faces)
-            and accel.geometry.vertices.shape == geometry.vertices.shape)
 
 
 def check_output(path: str | os.PathLike[str]) -> Path:

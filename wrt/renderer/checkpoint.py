@@ -3,7 +3,7 @@
 A checkpoint is a checked file (wrt.core.checked_file): who made it (IDENTITY: everything that can change a pixel), how far it is,
 and the film's arrays. How many samples each pixel has is one of them: rendering goes on from any state in which each pixel is done
 whole. Beside the file lies `.NAME.part`, which is locked while a render runs, and holds the room that the next one needs. The
-header's first entry tells on which system it is written, by which a part that a killed render left is known (wrt.core.write_file).
+header's first entry says on which system it is written, by which a part that a killed render left is known (wrt.core.write_file).
 """
 
 from __future__ import annotations
@@ -24,12 +24,20 @@ import numpy as np
 
 from wrt.core.checked_file import DIGEST_BYTES, MAX_HEADER, read_checked, write_checked
 from wrt.core.errors import InputError
+from wrt.core.version import VERSION
 from wrt.core.write_file import WINDOWS, is_file_of, remove_leftovers, sync_folder, this_system, try_lock
 from wrt.renderer.film_arrays import OF_A_GROUP, SHARED, DeviceFilm
+from wrt.renderer.options import OPTIONS
+from wrt.renderer.plan import Plan
+from wrt.scene.digest import camera_digest, scene_digest
+from wrt.scene.settings import SETTINGS
 
 MAGIC = b"wrt checkpoint 1\n"
 LOCK_SECONDS = 0.3  # for a lock that is only held for a moment
-# What is told of a value that differs: the rest are told with both values.
+# What may change between a checkpoint and going on with it; and the camera and the device, which are compared by what they are.
+NO_PIXEL = ("spp", "exposure", "tonemap", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size", "progress",
+            "checkpoint", "checkpoint_every", "resume", "camera", "device", "devices", "executor")
+# What is said of a value that differs; of the rest, both values are shown.
 OTHER = {"scene": "the scene is another", "camera": "the camera is another", "kernels": "the kernels are another version"}
 
 
@@ -60,11 +68,11 @@ class Checkpoint:
     """The file of one render. identity: what must be the same for going on, as JSON has it; area: pixels; groups: of samples.
 
     With `resume` a file that is there is read, and refused where it is not of this render; without, any file that is there is
-    refused. Both, and whether there is room for two (the old one stays until the new one is whole), are told before the work.
+    refused. Both, and whether there is room for two (the old one stays until the new one is whole), are reported before the work.
     """
 
     def __init__(self, path: Path, every: float, identity: dict[str, Any], *, area: int, groups: int, resume: bool) -> None:
-        self.path, self.every = Path(os.path.realpath(path)), every
+        self.path, self.every, self.groups = Path(os.path.realpath(path)), every, groups
         self.part = self.path.with_name(f".{self.path.name}.part")
         self.identity = json.loads(json.dumps(identity, default=str))
         pixel = sum(_bytes(kind) for kind in SHARED.values()) + groups * sum(_bytes(kind) for kind in OF_A_GROUP.values())
@@ -86,12 +94,17 @@ class Checkpoint:
         differ = [name for name in {**self.identity, **saved.identity} if self.identity.get(name) != saved.identity.get(name)]
         if differ != ["kernels"]:
             differ = [name for name in differ if name != "kernels"]  # other settings can need other kernels
-        told = [OTHER.get(name, f"{name} was {saved.identity.get(name)}, is {self.identity.get(name)}") for name in differ]
-        if told:
-            raise InputError(f"is a checkpoint of another render: {'; '.join(told)}", self.path)
+        reported = [OTHER.get(name, f"{name} was {saved.identity.get(name)}, is {self.identity.get(name)}") for name in differ]
+        if reported:
+            raise InputError(f"is a checkpoint of another render: {'; '.join(reported)}", self.path)
         if len(saved.body) != self.body_bytes or not 0 <= saved.samples[0] <= saved.samples[1]:
             raise InputError("is damaged: its arrays do not fit", self.path)
         return saved
+
+    def facts(self) -> dict[str, Any]:
+        """What a film's stats say of it."""
+        resumed = None if self.saved is None else {"samples": self.saved.samples[0] * self.groups, "seconds": self.saved.seconds}
+        return {"checkpoint": None if self.problem else str(self.path), "resumed": resumed}
 
     # --- writing ------------------------------------------------------------------------------------------------------
 
@@ -197,6 +210,24 @@ class Checkpoint:
         if any((each != samples[0]).any() for each in samples) or (samples[0].min(), samples[0].max()) != self.saved.samples:
             raise InputError("is damaged: its samples do not fit", self.path)
         self.saved = replace(self.saved, body=memoryview(b""))  # the file may go now
+
+
+def checkpoint_of(plan: Plan, kind: str) -> Checkpoint | None:
+    """The file that the plan's options ask for. kind: of the device (wrt.renderer.prepare.kind_of). Raises InputError where it
+    cannot be written, or gone on with."""
+    options, settings = plan.options, plan.scene.settings
+    if options.checkpoint is None:
+        return None
+    identity = {name: getattr(settings, name) for name in SETTINGS if name not in NO_PIXEL}
+    identity |= {name: getattr(options, name) for name in OPTIONS if name not in NO_PIXEL}
+    identity |= {"crop": plan.crop, "groups of samples": plan.groups, "scene": scene_digest(plan.scene),
+                 "camera": camera_digest(plan.camera), "device": kind, "version": VERSION, "kernels": plan.kernels_hash()}
+    file = Checkpoint(Path(options.checkpoint), options.checkpoint_every, identity, area=plan.area, groups=plan.groups,
+                      resume=options.resume)
+    taken = 0 if file.saved is None else file.saved.samples[1]
+    if taken > max(1, settings.spp // plan.groups):
+        raise InputError(f"holds {taken * plan.groups} samples a pixel already; spp is {settings.spp}", file.path)
+    return file
 
 
 def _bytes(kind: Any) -> int:

@@ -81,8 +81,8 @@ def is_rough(material: Material) -> bool:
     return material.roughness > 0.01 and material.kind in ("conductor", "glass", "metallic_roughness")
 
 
-def features_of(scene: Scene, camera: Camera, instancing: str = "auto") -> Features:
-    """The features that this scene needs through this camera, with its settings."""
+def features_of(scene: Scene, camera: Camera, meshes: frozenset[int] = frozenset()) -> Features:
+    """The features that this scene needs through this camera, with its settings. meshes: those kept once (instancing.py)."""
     settings, materials = scene.settings, scene.materials
     textures = [texture for material in materials for texture in material.textures]
     kinds = {material.kind for material in materials}
@@ -115,7 +115,7 @@ def features_of(scene: Scene, camera: Camera, instancing: str = "auto") -> Featu
         blades=camera.aperture_radius > 0.0 and camera.blades > 0,
         filter=settings.filter != "box",
         independent=settings.sampler == "independent",
-        instances=bool(instanced_meshes(scene, instancing)),
+        instances=bool(meshes),
         spheres=bool(scene.spheres),
         smooth=any(thing.mesh.normals is not None for thing in scene.objects),
         textures=any(isinstance(texture, Texture) for texture in textures),
@@ -188,5 +188,5 @@ def describe(scene: Scene, camera: str | int | None = None) -> dict[str, Any]:
         "spp": scene.settings.spp,
         "bounds_low": low,
         "bounds_high": high,
-        "features": features_of(scene, scene.camera(camera)).switches(),
+        "features": features_of(scene, scene.camera(camera), instanced_meshes(scene)).switches(),
     }

@@ -34,7 +34,7 @@ class DeviceFilm:
     """
 
     def __init__(self, settings: Settings, crop: tuple[int, int, int, int], device: Any, seed: int, groups: int = 1) -> None:
-        self.crop = crop
+        self.crop, self.seed = crop, seed
         self.seeds = [seed] if groups == 1 else [int(s) for s in np.random.SeedSequence(seed).generate_state(groups)]
         x0, y0, x1, y1 = crop
         self.shape = y1 - y0, x1 - x0
@@ -142,7 +142,11 @@ class AovFilm:
         for name, dtype in OF_AOVS.items():
             setattr(self.struct, name, wp.zeros(self.shape[0] * self.shape[1], dtype=dtype, device=device))
 
-    def picture(self, name: str) -> np.ndarray:
-        """A copy of one AOV, (H, W) or (H, W, 3)."""
+    def view(self, name: str) -> np.ndarray:
+        """One AOV, (H, W) or (H, W, 3); on the CPU without a copy."""
         array = getattr(self.struct, name).numpy()
-        return array.reshape(*self.shape, *array.shape[1:]).copy()
+        return array.reshape(*self.shape, *array.shape[1:])
+
+    def picture(self, name: str) -> np.ndarray:
+        """A copy of `view`."""
+        return self.view(name).copy()

@@ -10,7 +10,7 @@ import numpy as np
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import InstancedGeometry, NumberedGeometry
 from wrt.core.errors import InputError
-from wrt.renderer.instancing import instanced_meshes, is_instance
+from wrt.renderer.instancing import is_instance
 from wrt.scene.clean import flip_collinear
 from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.model import Object, Scene
@@ -72,9 +72,8 @@ class World:
         return run, prim_id - self.placed.first_prim[run]
 
 
-def world_of(scene: Scene, instancing: str = "auto") -> World:
-    """The world of a scene, with instances where they are worth it: see `wrt.renderer.instancing.instanced_meshes`."""
-    meshes = instanced_meshes(scene, instancing)
+def world_of(scene: Scene, meshes: frozenset[int] = frozenset()) -> World:
+    """The world of a scene; meshes: the id()s of those that are kept once (wrt.renderer.instancing)."""
     return instanced_world(scene, meshes) if meshes else world_mesh(scene)
 
 

@@ -1,12 +1,21 @@
-"""How much memory a scene will take on its way to the device, so that what cannot fit is refused before the work.
+"""How much memory a render will take, so that what cannot fit is refused before the work.
 
-The numbers are peaks that were measured on meshes of 330,000 triangles, rounded up; a picture's own are in wrt.renderer.renderer.
+The numbers of a scene are peaks that were measured on meshes of 330,000 triangles, rounded up.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 from wrt.accel.base import Accelerator
-from wrt.renderer.instancing import instanced_meshes, is_instance
+from wrt.accel.structures import ACCELERATORS
+from wrt.core.address_space import told_limit
+from wrt.core.device import free_memory
+from wrt.core.errors import InputError
+from wrt.core.memory import SMALL, gib
+from wrt.renderer.film_arrays import BYTES_OF_FILM, BYTES_OF_GROUP
+from wrt.renderer.instancing import is_instance
+from wrt.renderer.plan import Plan
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.materials import Texture
 from wrt.scene.model import Scene
@@ -14,11 +23,25 @@ from wrt.scene.model import Scene
 BYTES_OF_FACE, BYTES_OF_VERTEX = 55.0, 60.0  # of a mesh in the world: joined, turned and uploaded
 BYTES_OF_EMITTER = 120.0  # of a triangle that lights others, beside that
 BYTES_OF_OBJECT, BYTES_OF_TEXEL, BYTES_OF_SKY = 1000.0, 12.0, 40.0
+BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
 
 
-def bytes_of_scene(scene: Scene, accel: type[Accelerator], instancing: str = "auto") -> float:
-    """Bytes that the scene's arrays and its structure take at most while they are made, beside the scene itself."""
-    kept_once = instanced_meshes(scene, instancing)
+def require_memory(plan: Plan, device: Any) -> None:
+    """Raise InputError for a render that does not fit: better now than by the system after an hour, which ends whoever takes too
+    much."""
+    x0, y0, x1, y1 = plan.crop
+    pixel = BYTES_OF_FILM + BYTES_OF_GROUP * (plan.groups - 1) + (BYTES_OF_AOVS if plan.options.aov else 0)
+    film = plan.area * (pixel + BYTES_OF_RESULT)
+    scene = bytes_of_scene(plan.scene, ACCELERATORS[plan.options.accel], plan.meshes)
+    free = free_memory(device)
+    if film + scene > max(free, SMALL):
+        raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {gib(film)} of memory, its scene {gib(scene)};"
+                         f" {device} has {gib(free)} free (WRT_MEMORY can say otherwise){told_limit()}")
+
+
+def bytes_of_scene(scene: Scene, accel: type[Accelerator], kept_once: frozenset[int] = frozenset()) -> float:
+    """Bytes that the scene's arrays and its structure take at most while they are made, beside the scene itself. kept_once: the
+    id()s of the meshes that are (wrt.renderer.instancing)."""
     meshes = {id(thing.mesh): thing.mesh for thing in scene.objects if is_instance(thing, kept_once)}
     copied = [thing.mesh for thing in scene.objects if not is_instance(thing, kept_once)]
     every = [*meshes.values(), *copied]

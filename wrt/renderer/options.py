@@ -1,4 +1,4 @@
-"""What a render is asked for beyond the scene, and what it tells of itself while it runs."""
+"""What a render is asked for beyond the scene, and what it reports while it runs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ class Progress:
     """How far a render is: samples done and to do (summed over pixels), rays so far, seconds of tracing.
 
     Of a resumed render, what was done before counts in all four. stage: "trace"; or before anything is traced, where that takes
-    longer than driver.PREPARING_TOLD: "compile", once, or "build", with done of total steps of a structure that is slow to build.
+    longer than wrt.renderer.prepare.PREPARING_REPORTED: "compile", once, or "build", with done of total steps of a structure that
+    is slow to build.
     note: what goes wrong meanwhile; "" is nothing. picture: makes a Film of what there is (pixels, variance, samples), while
     it is traced; tiles that run are half done in it.
     """

@@ -1,4 +1,4 @@
-"""The rays of a picture as arrays, for who asks a structure himself instead of rendering."""
+"""The rays of a picture as arrays, for asking a structure directly instead of rendering."""
 
 from __future__ import annotations
 

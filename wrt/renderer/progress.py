@@ -1,4 +1,4 @@
-"""How a render tells of itself on a terminal: a bar where there is one, a line now and then where there is none."""
+"""How a render reports on a terminal: a bar where there is one, a line now and then where there is none."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from wrt.renderer.renderer import Progress
+    from wrt.renderer.options import Progress
 
 COMPILING = "compiling kernels (first time for this kind of scene) ..."
 BUILDING = "building the structure"
@@ -24,7 +24,7 @@ def describe(progress: Progress) -> str:
 
 
 def time_left(seconds: float) -> str:
-    """Minutes and seconds; "?" where they cannot be told."""
+    """Minutes and seconds; "?" where they are not known."""
     return f"{int(seconds // 60)}:{int(seconds % 60):02d} left" if seconds < 1e6 else "?"
 
 

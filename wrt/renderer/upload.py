@@ -229,11 +229,11 @@ def tell_left_out(scene: Scene) -> None:
                       f" {', '.join(unreached)} (emits_light = false says that it is meant)", SceneWarning, stacklevel=3)
 
 
-def upload_scene(scene: Scene, device: Any, instancing: str = "auto") -> DeviceScene:
-    """Put a scene on a device (a Warp device); instancing: see wrt.renderer.instancing. Raises InputError where the scene cannot be
-    rendered."""
+def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()) -> DeviceScene:
+    """Put a scene on a device (a Warp device); meshes: the id()s of those that are kept once (wrt.renderer.instancing). Raises
+    InputError where the scene cannot be rendered."""
     tell_left_out(scene)
-    world = world_of(scene, instancing)
+    world = world_of(scene, meshes)
     table = TextureTable()
     materials = material_records(scene.materials, table)
     s = structs.Surfaces()

@@ -1,19 +1,15 @@
-"""How an object moves within one period, and what a scene is at a moment of it."""
+"""How an object moves within one period."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wrt.core.checks import as_array, as_one
 from wrt.core.errors import InputError
 from wrt.scene.mesh import Mesh
-
-if TYPE_CHECKING:
-    from wrt.scene.model import Object, Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,17 +78,3 @@ def _turn(axis: int, angle: float) -> np.ndarray:
     matrix[i, i] = matrix[j, j] = math.cos(angle)
     matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
     return matrix
-
-
-def moves(scene: Scene) -> bool:
-    return any(thing.motion is not None for thing in scene.objects)
-
-
-def scene_at(scene: Scene, time: float) -> Scene:
-    """The scene at a time in [0, 1] of its period: the same objects, faces and materials, in other places."""
-    objects = (thing if thing.motion is None else _moved(thing, thing.motion, time) for thing in scene.objects)
-    return replace(scene, objects=tuple(objects))
-
-
-def _moved(thing: Object, motion: Motion, time: float) -> Object:
-    return replace(thing, mesh=motion.mesh(thing.mesh, time), transform=thing.transform @ motion.transform(time), motion=None)

@@ -26,8 +26,9 @@ from wrt.scene.model import Scene
 from wrt.scene.settings import TONEMAPS
 from wrt.viewer.access import access_for
 from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
-from wrt.viewer.refine import COSTS, Shown, Viewer
+from wrt.viewer.refine import COSTS, Viewer
 from wrt.viewer.server import Door, import_viser, listen, quiet, to_stderr
+from wrt.viewer.view import Shown
 
 MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser one
 RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}
@@ -39,7 +40,7 @@ MOST_FILES = 4  # that are made at a time
 
 
 def status(shown: Shown, viewer: Viewer) -> str:
-    """What the panel tells of a picture, as Markdown."""
+    """What the panel says of a picture, as Markdown."""
     height, width = shown.codes.shape[:2]
     rays = f"{shown.speed / 1e6:.2f} Mray/s, {shown.rays_per_sample:.1f} rays a sample"
     if shown.view.cost:
@@ -54,13 +55,13 @@ class Page:
     """A server with the panel and one Viewer. host, port (0: any free one): where it listens. Raises InputError where it cannot.
 
     `url` is where it is found, with the token that a browser needs; allow_origins: other addresses of it, such as that of a proxy
-    ("https://example.org"); warn: told of requests and messages that are refused, once of each kind. `close` ends it.
+    ("https://example.org"); warn: hears of requests and messages that are refused, once of each kind. `close` ends it.
     """
 
     def __init__(self, scene: Scene, options: Options, host: str = "127.0.0.1", port: int = 8080, spp: int = 1024, *,
                  allow_origins: Iterable[str] = (), warn: Callable[[str], None] = to_stderr) -> None:
         import_viser()
-        self.viewer = Viewer(scene, options, self._show, self._tell, spp)
+        self.viewer = Viewer(scene, options, self._show, self._report, spp)
         start = self.viewer.view.camera
         self.unit, self.watching, self.name = unit_of(scene, start), -1, scene.name or "picture"
         self._saving = threading.BoundedSemaphore(MOST_FILES)
@@ -133,7 +134,7 @@ class Page:
         try:
             changed = self.viewer.change(camera=lambda camera: from_viewport(camera, viewport, self.unit), size=size)
         except InputError as error:  # its numbers are too large in the scene's units
-            self.door.tell("camera", f"dropped a camera: {error}")
+            self.door.report("camera", f"dropped a camera: {error}")
             return
         if newcomer and not changed:
             self.viewer.again()
@@ -150,7 +151,7 @@ class Page:
         if shown.view.cost:
             self.marks.content = f"0 (dark) to {short(shown.top)} (light)"
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         self.doing.content, self.doing.visible = text, bool(text)
 
     # --- the panel ----------------------------------------------------------------------------------------------------
@@ -215,19 +216,19 @@ class Page:
                 await self._moved(client.camera)
 
     def _safe(self, action: Callable[[Any], Any]) -> Callable[[Any], None]:
-        """The action for a browser's event; that it cannot be done is told in one line."""
+        """The action for a browser's event; that it cannot be done is reported in one line."""
 
         def act(event: Any) -> None:
             try:
                 action(event)
             except (InputError, OSError) as error:
-                self.door.tell("action", f"error: {error}")
+                self.door.report("action", f"error: {error}")
 
         return act
 
     def _set_angle(self, fov_y: float) -> None:
         for client in self.server.get_clients().values():
-            client.camera.fov = fov_y  # and the client tells that its camera changed
+            client.camera.fov = fov_y  # and the client reports that its camera changed
 
     def _set_lens(self, **fields: float) -> None:
         self.viewer.change(camera=lambda camera: replace(camera, **fields))
@@ -247,7 +248,7 @@ class Page:
         if client is None or picture is None:
             return
         if not self._saving.acquire(blocking=False):
-            self.door.tell("saving", f"did not save a picture; {MOST_FILES} are being made")
+            self.door.report("saving", f"did not save a picture; {MOST_FILES} are being made")
             return
         try:
             client.send_file_download(f"{self.name}{suffix}", encoded(picture, suffix), save_immediately=True)

@@ -15,17 +15,16 @@ import numpy as np
 
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
-from wrt.lab.rtcore.profiler import COUNTERS, CostCounter
 from wrt.picture.film import Film
 from wrt.picture.heatmap import colored, top_of
 from wrt.picture.tonemap import to_codes
+from wrt.renderer.costs import COUNTERS
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.progress import COMPILING
-from wrt.renderer.renderer import Renderer
-from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera
-from wrt.scene.digest import camera_digest
 from wrt.scene.model import Scene
+from wrt.viewer.renderers import Renderers
+from wrt.viewer.view import Shown, View
 
 COARSE = 0.08  # seconds that the first picture after a change should take
 PATIENCE = 0.5  # seconds after which it is given up, where the next change is waiting
@@ -33,42 +32,6 @@ EVERY = 0.25  # seconds between two pictures of the same view, while it is refin
 SCALES = (1, 2, 4, 8, 16, 32)  # pixels a side of the picture to one of a coarse one
 DEEPEST = 12  # bounces that can be chosen, if the scene has no more itself
 COSTS = ("nodes", "primitives", "probes", "boxes", "stack", "node_bytes")  # counters that are offered as heat maps
-TILE_SIZE = 16  # a tile that runs is waited for before the next view
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """What is asked for. size: (width, height) in pixels when it is fine; accel: a name in ACCELERATORS; cost: "" for the
-    picture, or a counter of COUNTERS, of which a heat map is made."""
-
-    camera: Camera
-    size: tuple[int, int]
-    max_depth: int
-    accel: str
-    cost: str = ""
-
-    def same(self, other: View) -> bool:
-        """Whether the picture would be the same."""
-        mine, others = ((v.size, v.max_depth, v.accel, v.cost, camera_digest(v.camera)) for v in (self, other))
-        return mine == others
-
-
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """A picture to put before the eyes. codes: (h, w, 3) uint8 as a display takes them; scale: pixels of the view a side to one of
-    it; spp: samples of each pixel at least; speed: rays a second; done: it will get no finer. Of a heat map: its value with the
-    last colour, the mean and the largest value."""
-
-    codes: np.ndarray
-    view: View
-    scale: int
-    spp: int
-    speed: float = 0.0
-    rays_per_sample: float = 0.0
-    done: bool = False
-    top: float = 0.0
-    mean: float = 0.0
-    largest: float = 0.0
 
 
 @dataclass(eq=False)
@@ -81,26 +44,45 @@ class _Work:
     shown: float = -np.inf
 
 
+class Pace:
+    """seconds: that a sample took last, by structure, and of the picture (False) or of heat maps (True)."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[tuple[str, bool], float] = {}
+
+    def note(self, view: View, samples: int, seconds: float) -> None:
+        if samples:
+            self.seconds[view.accel, bool(view.cost)] = seconds / samples
+
+    def scales(self, view: View) -> list[int]:
+        """From the first that is likely to take no longer than COARSE down to 1."""
+        pace = self.seconds.get((view.accel, bool(view.cost)))
+        first = SCALES[3]
+        if pace is not None:
+            seconds = pace * view.size[0] * view.size[1]
+            first = next((scale for scale in SCALES if seconds / scale**2 <= COARSE), SCALES[-1])
+        return [scale for scale in SCALES[::-1] if scale <= first]
+
+
 class Viewer:
     """Renders what `change` asked for last. `run` does so until `stop`, for a thread of its own; all else may be called from
     any thread, and never waits for a picture.
 
-    show: gets every picture; tell: gets a word on what is going on, "" when nothing is to be said. Both are called by `run`.
+    show: gets every picture; report: gets a word on what is going on, "" when nothing is to be said. Both are called by `run`.
     scene, options: as for a Renderer; options.camera is the view to begin with. spp: where refining ends.
     """
 
     def __init__(self, scene: Scene, options: Options, show: Callable[[Shown], None],
-                 tell: Callable[[str], None] = lambda text: None, spp: int = 1024) -> None:
-        self.scene, self.options, self.show, self.tell, self.spp = scene, options, show, tell, spp
+                 report: Callable[[str], None] = lambda text: None, spp: int = 1024) -> None:
+        self.scene, self.show, self.report, self.spp = scene, show, report, spp
         settings = scene.settings
         camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
         self.deepest = max(settings.max_depth, DEEPEST)
         self.view = View(camera, settings.size, settings.max_depth, options.accel)
         self.exposure, self.tonemap = settings.exposure, settings.tonemap
         self.shown: Shown | None = None  # last
-        self._renderers: dict[str, Renderer] = {}
-        self._counters: dict[str, CostCounter] = {}
-        self._pace: dict[tuple[str, bool], float] = {}  # seconds a sample took last, of the picture and of heat maps
+        self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._hear)
+        self._pace = Pace()
         self._condition = threading.Condition()
         self._number = self._done = 0  # of changes, so far and rendered
         self._looked_at = self._toned = self._stopped = False
@@ -157,24 +139,12 @@ class Viewer:
             self._condition.notify_all()
 
     def focus_at(self, x: float, y: float) -> float | None:
-        """The distance, along the axis, of what stands at a place of the picture (0 to 1 from its top left corner): what a
-        camera must focus on to see it sharp. None where there is nothing, or nothing was built yet."""
-        camera, (width, height) = self.view.camera, self.view.size
-        renderer = self._renderers.get(self.view.accel)
-        if renderer is None:
-            return None
-        tangent = np.tan(0.5 * camera.fov_y)
-        toward = np.array([(2.0 * x - 1.0) * tangent * width / height, (1.0 - 2.0 * y) * tangent, -1.0])
-        pose = camera.camera_to_world
-        hits = renderer.accel.closest_hit(pose[None, :3, 3].astype(np.float32), (pose[:3, :3] @ toward)[None].astype(np.float32))
-        return float(hits.t[0]) if hits.prim_id[0] >= 0 else None
+        """What a camera must focus on to see a place of the picture sharp: as Renderers.focus_at."""
+        return self.renderers.focus_at(self.view, x, y)
 
     def structure(self, accel: str) -> str:
         """A structure in a few words."""
-        if accel not in self._renderers:
-            return accel
-        stats = self._renderers[accel].accel.stats
-        return f"{accel}: {stats.nodes:,} nodes, {stats.bytes / 2**20:.1f} MiB, {stats.build_seconds:.2f} s"
+        return self.renderers.describe(accel)
 
     def picture(self) -> Film | np.ndarray | None:
         """What was shown last, to be saved: a Film (with exposure and tone mapping), or the codes (h, w, 3) of a heat map."""
@@ -216,44 +186,24 @@ class Viewer:
     def _refine(self, work: _Work) -> None:
         if not self._prepare(work.view) or self._number != work.number:
             return
-        self.tell("")
+        self.report("")
         self._work = work
         try:
-            for scale in self._scales(work.view):
+            for scale in self._pace.scales(work.view):
                 work.scale = scale
                 if not (self._count(work) if work.view.cost else self._trace(work)):
                     return
         except InputError as error:
-            self.tell(f"error: {error}")
+            self.report(f"error: {error}")
 
     def _prepare(self, view: View) -> bool:
         """Make the renderer that the view needs, if there is none; whether there is one then."""
         try:
-            if view.accel not in self._renderers:
-                camera = replace(view.camera, aperture_radius=view.camera.aperture_radius or 1.0)  # compiles the lens
-                scene = self.scene.with_settings(max_depth=self.deepest)
-                options = replace(self.options, accel=view.accel, camera=camera, tile_size=TILE_SIZE, progress=self._report)
-                self._renderers[view.accel] = Renderer(scene, options)
-            if view.cost and view.accel not in self._counters:
-                self._counters[view.accel] = CostCounter(self._renderers[view.accel])
+            self.renderers.prepare(view)
         except InputError as error:
-            self.tell(f"error: {error}")
+            self.report(f"error: {error}")
             return False
         return True
-
-    def _scales(self, view: View) -> list[int]:
-        """From the first that is likely to take no longer than COARSE down to 1."""
-        pace = self._pace.get((view.accel, bool(view.cost)))
-        first = SCALES[3]
-        if pace is not None:
-            seconds = pace * view.size[0] * view.size[1]
-            first = next((scale for scale in SCALES if seconds / scale**2 <= COARSE), SCALES[-1])
-        return [scale for scale in SCALES[::-1] if scale <= first]
-
-    def _aim(self, renderer: Renderer, work: _Work, spp: int) -> None:
-        width, height = (max(1, -(-side // work.scale)) for side in work.view.size)
-        renderer.aim(work.view.camera, size=(width, height), spp=spp, max_depth=work.view.max_depth)
-        renderer.device_camera = camera_struct(work.view.camera, work.view.size)  # a rounded size must not change the angles
 
     def _given_up(self, work: _Work, seconds: float) -> bool:
         """Whether something else is asked for, and this view has been seen or has had its time."""
@@ -261,32 +211,26 @@ class Viewer:
 
     def _trace(self, work: _Work) -> bool:
         """The picture at one scale, if it was not given up."""
-        renderer = self._renderers[work.view.accel]
-        self._aim(renderer, work, self.spp if work.scale == 1 else 1)
-        film = renderer.run()
+        film = self.renderers.picture(work.view, work.scale, self.spp if work.scale == 1 else 1)
         if film.stats["interrupted"]:
             return False
         self._show_film(work, film, film.stats["rays"], film.stats["seconds"]["trace"], done=work.scale == 1)
         return True
 
-    def _report(self, progress: Progress) -> None:
-        """A renderer's progress. KeyboardInterrupt is how it is told to end."""
+    def _hear(self, progress: Progress) -> None:
+        """A renderer's progress. KeyboardInterrupt is how it is made to end."""
         if progress.stage != "trace" or self._work is None:
             done = f" {progress.done / progress.total:.0%}" if progress.stage == "build" else ""
-            self.tell("building the structure ..." + done if progress.stage == "build" else COMPILING)
+            self.report("building the structure ..." + done if progress.stage == "build" else COMPILING)
             return
         work = self._work
-        size = self._renderers[work.view.accel].scene.settings.size
-        self._note_pace(work, progress.done, progress.seconds)
+        pixels = work.view.size[0] * work.view.size[1]
+        self._pace.note(work.view, progress.done, progress.seconds)
         if self._given_up(work, progress.seconds):
             raise KeyboardInterrupt
-        if (work.scale == 1 and size[0] * size[1] <= progress.done < progress.total and progress.picture is not None
+        if (work.scale == 1 and pixels <= progress.done < progress.total and progress.picture is not None
                 and time.perf_counter() - work.shown >= EVERY):
             self._show_film(work, progress.picture(), progress.rays, progress.seconds)
-
-    def _note_pace(self, work: _Work, samples: int, seconds: float) -> None:
-        if samples:
-            self._pace[work.view.accel, bool(work.view.cost)] = seconds / samples
 
     def _show_film(self, work: _Work, film: Film, rays: int, seconds: float, done: bool = False) -> None:
         codes = to_codes(film.pixels, self.exposure, self.tonemap)
@@ -301,21 +245,19 @@ class Viewer:
 
     def _count(self, work: _Work) -> bool:
         """The heat map at one scale, if it was not given up."""
-        counter = self._counters[work.view.accel]
-        self._aim(counter, work, 1)
         begin = time.perf_counter()
 
         def go_on(done: int) -> bool:
             seconds = time.perf_counter() - begin
-            self._note_pace(work, done, seconds)
+            self._pace.note(work.view, done, seconds)
             return not self._given_up(work, seconds)
 
-        costs = counter.costs(go_on)
+        costs = self.renderers.costs(work.view, work.scale, go_on)
         if costs is None:
             return False
         values = costs[work.view.cost]
         top = top_of(values)
-        speed = int(costs["probes"].sum(dtype=np.int64)) / counter.seconds["trace"]
+        speed = int(costs["probes"].sum(dtype=np.int64)) / (time.perf_counter() - begin)
         self._put(Shown(colored(values, top), work.view, work.scale, 1, speed, float(costs["probes"].mean()), work.scale == 1,
                         top, float(values.mean()), float(values.max())), None)
         work.shown = time.perf_counter()

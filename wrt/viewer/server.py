@@ -30,7 +30,7 @@ LARGEST_MESSAGE = 1 << 16  # bytes; a browser sends some hundreds
 MOST_MESSAGES = 200  # a second, of one connection; a browser sends about 50
 MOST_CONNECTIONS = 64  # open at a time, with those that have not shown a token yet
 LONGEST_PATH = 200
-LONGEST_LINE = 300  # characters of what is told
+LONGEST_LINE = 300  # characters of what is reported
 CLOSING = 1.0  # seconds that a browser has to say goodbye
 QUIET = logging.getLogger("wrt.viewer.refine.connections")  # what goes wrong in one connection is no matter of the others
 QUIET.propagate = False
@@ -75,7 +75,7 @@ def quiet() -> Iterator[None]:
 
 
 class Door:
-    """Checks every request and every message to a viser server, which `open` starts. warn: told of what is refused, once of each
+    """Checks every request and every message to a viser server, which `open` starts. warn: hears of what is refused, once of each
     kind."""
 
     def __init__(self, access: Access, warn: Callable[[str], None] = to_stderr) -> None:
@@ -114,7 +114,7 @@ class Door:
         self.viser = server
         return server
 
-    def tell(self, about: str, text: str) -> None:
+    def report(self, about: str, text: str) -> None:
         """In one line, once of each kind."""
         with self._lock:
             if about in self._told:
@@ -143,7 +143,7 @@ class Door:
             self.access.check(headers.get_all("Host"), headers.get_all("Origin"), connection.local_address[0].partition("%")[0])
             inside = self.access.inside(request.path)
         except Refused as refused:
-            self.tell(refused.about, f"refused {refused}")
+            self.report(refused.about, f"refused {refused}")
             return _response(HTTPStatus.FORBIDDEN)
         if [value.lower() for value in headers.get_all("Upgrade")] == ["websocket"]:
             return None
@@ -159,14 +159,14 @@ class Door:
         return answer
 
     def _greeting(self, handler: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """viser's handler for the browsers that speak its language; it would tell of others on stdout."""
+        """viser's handler for the browsers that speak its language; it would report others on stdout."""
         import viser
 
         async def greet(connection: Any) -> None:
             if connection.subprotocol == f"viser-v{viser.__version__}":
                 await handler(connection)
             else:
-                self.tell("version", f"closed a WebSocket of the protocol {shown(connection.subprotocol)}; load the page again")
+                self.report("version", f"closed a WebSocket of the protocol {shown(connection.subprotocol)}; load the page again")
                 await connection.close(1002, f"Version mismatch: the server is viser {viser.__version__}")
 
         return greet
@@ -174,11 +174,11 @@ class Door:
     # --- messages -----------------------------------------------------------------------------------------------------
 
     def lets_in(self, data: str | bytes) -> bool:
-        """Whether viser is to get a message; of one that it is not to get, this tells."""
+        """Whether viser is to get a message; one that it is not to get is reported."""
         try:
             check_message(_decoded(data), self._control)
         except Refused as refused:
-            self.tell(refused.about, f"dropped {refused}")
+            self.report(refused.about, f"dropped {refused}")
             return False
         return True
 
@@ -193,7 +193,7 @@ class Door:
         """In place of asyncio's traceback."""
         error = context.get("exception")
         what = context.get("message") if error is None else f"{type(error).__name__}: {error}"
-        self.tell(f"failure {type(error).__name__}", f"error: {what}")
+        self.report(f"failure {type(error).__name__}", f"error: {what}")
 
 
 class _Paced:
@@ -205,7 +205,7 @@ class _Paced:
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)  # type: ignore[misc]
         if len(self.server.handlers) > MOST_CONNECTIONS:  # type: ignore[attr-defined]
-            self.door.tell("connections", f"closed a connection; there are {MOST_CONNECTIONS} already")
+            self.door.report("connections", f"closed a connection; there are {MOST_CONNECTIONS} already")
             transport.abort()
 
     async def recv(self, *arguments: Any, **settings: Any) -> Any:
@@ -221,7 +221,7 @@ class _Paced:
             self._since, self._count = now, 0
         self._count += 1
         if self._count > MOST_MESSAGES:
-            self.door.tell("pace", f"slowed down a browser that sends more than {MOST_MESSAGES} messages a second")
+            self.door.report("pace", f"slowed down a browser that sends more than {MOST_MESSAGES} messages a second")
             await asyncio.sleep(self._since + 1.0 - now)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT
-from wrt.renderer.renderer import render
+from wrt.renderer.render import render
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, PointLight
 from wrt.scene.materials import Material

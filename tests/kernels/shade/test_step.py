@@ -8,7 +8,9 @@ import pytest
 
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT
 from wrt.kernels.shade.step import MAX_RAYS
-from wrt.renderer.renderer import Options, Renderer, render
+from wrt.renderer.options import Options
+from wrt.renderer.plan import plan_of
+from wrt.renderer.render import render
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
@@ -386,5 +388,5 @@ def test_variance_is_that_of_the_mean(reference):
 
 
 def test_the_kernel_holds_only_what_the_scene_needs():
-    bare = Renderer(MIRROR_BOX, Options()).features
+    bare = plan_of(MIRROR_BOX, Options()).features
     assert {name for name, on in bare.switches().items() if on} == {"mirror", "reflection", "emission"}

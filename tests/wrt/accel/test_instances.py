@@ -28,6 +28,7 @@ from wrt.lab.bench.rasterizer import Rasterizer
 from wrt.lab.bench.visibility_check import compare
 from wrt.picture.film import Film
 from wrt.renderer.flatten import world_mesh
+from wrt.renderer.instancing import instanced_meshes
 from wrt.renderer.upload import upload_scene
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
@@ -151,7 +152,8 @@ def test_no_new_ray_meets_the_surface_it_leaves(scale: float, far: float, aside:
         matrix[:3, 3] -= matrix[:3, :3] @ np.full(3, aside) - np.array([0.0, 0.0, away])
         objects.append(Object(moved, (Material(),), matrix))
     device = start("cpu")
-    scene = upload_scene(Scene(tuple(objects)), device, "always")
+    described = Scene(tuple(objects))
+    scene = upload_scene(described, device, instanced_meshes(described, "always"))
     accel = build(scene.world.geometry, "bvh")
     origin = rng.normal(size=(n, 3))
     origin *= 4.0 * scale / np.linalg.norm(origin, axis=1, keepdims=True)

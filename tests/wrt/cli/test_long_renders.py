@@ -22,7 +22,6 @@ from wrt.core.errors import InputError
 from wrt.picture import film
 from wrt.picture.image import read_channels, read_image
 from wrt.renderer.checkpoint import read
-from wrt.renderer.renderer import Renderer
 
 SMALL = ("--size", "32x18", "--spp", 4)
 
@@ -201,7 +200,7 @@ def test_resume_without_a_checkpoint_says_that_it_begins() -> None:
     (["--checkpoint-file", "box.obj", "--resume"], "box.obj: is no checkpoint of this version"),
 ])
 def test_what_is_refused_before_the_work(arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("the work began"))
+    monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("the work began"))
     result = run("render", "box.obj", *SMALL, "-o", "a.png", *arguments)
     assert result.code == 2 and message in result.err and result.out == "" and new_files() == set()
     assert "error: box.obj: /" not in result.err  # the scene has no part in it
@@ -274,7 +273,7 @@ def test_no_answer_is_no_loss(answer: Any, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_disk_without_room_for_the_picture_is_told_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("the work began"))
+    monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("the work began"))
     usage = cli_save.shutil.disk_usage(".")
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage._replace(free=100_000))
     result = run("render", "box.obj", "--size", "640x480", "-o", "a.exr")

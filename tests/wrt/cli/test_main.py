@@ -26,7 +26,8 @@ from wrt.picture import film as film_module
 from wrt.picture.image import read_channels, read_image, read_metadata, write_image
 from wrt.renderer import progress as progress_module
 from wrt.renderer.features import features_of
-from wrt.renderer.renderer import Progress, Renderer
+from wrt.renderer.options import Progress
+from wrt.renderer.result import film_of
 
 SMALL = ("--size", "32x18", "--spp", 2)
 TWO_CAMERAS = """\
@@ -287,16 +288,16 @@ def test_what_is_found_late_names_the_scene_and_leaves_the_old_picture() -> None
 
 
 def test_a_picture_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.renderer.renderer.free_memory", lambda device: 2.0**20)
+    monkeypatch.setattr("wrt.renderer.memory_estimate.free_memory", lambda device: 2.0**20)
     refused(run("render", "box.obj", "--size", "4000x2000"),
             "box.obj: a picture of 4000x2000 takes 1.0 GiB of memory, its scene 0 MiB; cpu has 1 MiB free (WRT_MEMORY")
 
 
 def test_no_memory_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: Renderer) -> None:
+    def fail(*arguments: Any) -> None:
         raise MemoryError("Unable to allocate 9 GiB")
 
-    monkeypatch.setattr(Renderer, "_prepare", fail)
+    monkeypatch.setattr("wrt.renderer.renderer.prepare", fail)
     refused(run("render", "box.obj"), "not enough memory: Unable to allocate 9 GiB")
 
 
@@ -324,13 +325,12 @@ def test_layers_of_a_picture_do_not_take_it_with_them_where_the_disk_is_full() -
 
 
 def test_warnings_while_writing_are_told_like_all_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    def spoiled(self: Renderer, *arguments: Any) -> Any:
-        film = original(self, *arguments)
+    def spoiled(*arguments: Any) -> Any:
+        film = film_of(*arguments)
         film.pixels[0, 0] = np.nan
         return film
 
-    original = Renderer._result
-    monkeypatch.setattr(Renderer, "_result", spoiled)
+    monkeypatch.setattr("wrt.renderer.schedule.film_of", spoiled)
     result = run("render", "box.obj", *SMALL, "-o", "a.png")
     assert result.code == 0 and "warning: a.png: 1 pixel NaN or infinite, written as black or white\n" in result.err
     assert "SceneWarning" not in result.err
@@ -381,8 +381,8 @@ def test_ctrl_c_while_saving_waits_for_the_file(name: str, monkeypatch: pytest.M
     assert np.array_equal(read_image(name), read_image(f"expected-{name}"))
 
 
-@pytest.mark.parametrize("where", ["wrt.io.load.load_scene", "wrt.renderer.renderer.upload_scene",
-                                   "wrt.renderer.renderer.Renderer._aovs"])
+@pytest.mark.parametrize("where", ["wrt.io.load.load_scene", "wrt.renderer.prepare.upload_scene",
+                                   "wrt.renderer.schedule.Run._take_aovs"])
 def test_ctrl_c_before_the_first_sample_leaves_everything_as_it_was(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("box.png").write_bytes(b"old")
     monkeypatch.setattr(where, lambda *arguments: signal.raise_signal(signal.SIGINT) or {})
@@ -569,11 +569,11 @@ def slow(path, load=wrt.io.load.load_scene):
 wrt.io.load.load_scene = slow
 """
 COMPILING = """
-import sys, wrt.renderer.renderer
-def told(kernel, device, load=wrt.renderer.renderer.load_kernel):
+import sys, wrt.renderer.prepare
+def reported(kernel, device, load=wrt.renderer.prepare.load_kernel):
     print("now", file=sys.stderr, flush=True)
     load(kernel, device)
-wrt.renderer.renderer.load_kernel = told
+wrt.renderer.prepare.load_kernel = reported
 """
 
 
@@ -591,11 +591,12 @@ def test_a_process_that_is_interrupted_early_leaves_nothing(code: str, number: i
 
 
 FAILING = """
-import time, wrt.renderer.renderer
+import time, wrt.renderer.prepare
+from wrt.core.errors import InputError
 def slow(kernel, device):
     while True: time.sleep(1.0)
-def failing(*arguments): raise wrt.renderer.renderer.InputError("a transform that is found late")
-wrt.renderer.renderer.load_kernel, wrt.renderer.renderer.upload_scene = slow, failing
+def failing(*arguments): raise InputError("a transform that is found late")
+wrt.renderer.prepare.load_kernel, wrt.renderer.prepare.upload_scene = slow, failing
 """
 
 

@@ -17,7 +17,7 @@ from tests.data import ROOT
 from wrt.core import address_space
 from wrt.core.address_space import require_modules, require_scipy, require_warp, room_to_compile
 from wrt.core.errors import InputError
-from wrt.renderer import renderer as driver
+from wrt.renderer import render as rendering
 
 resource = pytest.importorskip("resource", reason="needs a system with limits")
 pytestmark = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="what is taken is read from /proc")
@@ -147,7 +147,7 @@ def test_what_runs_out_later_is_one_message_too(error: Exception, tmp_path: Path
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "box.obj").write_text(BOX_OBJ)
-    monkeypatch.setattr(driver, "render", fail)
+    monkeypatch.setattr(rendering, "render", fail)
     done = command("render", "box.obj", "-o", "a.png")
     assert (done.code, done.errors) == (2, [f"error: not enough memory: {error}"])
     monkeypatch.setattr(address_space, "address_space", lambda: 3 << 20)
@@ -162,6 +162,6 @@ def test_other_errors_are_not_taken_for_it(tmp_path: Path, monkeypatch: pytest.M
     def fail(*arguments: object, **options: object) -> wrt.Film:
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr(driver, "render", fail)
+    monkeypatch.setattr(rendering, "render", fail)
     with pytest.raises(RuntimeError, match="a defect"):
         command("render", "box.obj", "-o", "a.png")

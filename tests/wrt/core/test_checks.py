@@ -14,7 +14,7 @@ from wrt.core.errors import InputError, SceneWarning
 from wrt.io.load import load_scene
 from wrt.io.mesh_file import load_mesh
 from wrt.picture.film import Film
-from wrt.renderer.renderer import render
+from wrt.renderer.render import render
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import PointLight

@@ -29,7 +29,7 @@ from wrt.lab.bench import peak_memory as memory
 from wrt.picture.image import write_codes, write_image
 from wrt.renderer import checkpoint
 from wrt.renderer.animate import save_movie
-from wrt.renderer.renderer import render
+from wrt.renderer.render import render
 from wrt.scene.shapes import icosphere
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}

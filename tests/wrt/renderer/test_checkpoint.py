@@ -22,7 +22,10 @@ from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.renderer import checkpoint as module
 from wrt.renderer.checkpoint import MAGIC, Checkpoint, read
-from wrt.renderer.renderer import Options, Progress, Renderer, render
+from wrt.renderer.options import Options, Progress
+from wrt.renderer.render import render
+from wrt.renderer.renderer import Renderer
+from wrt.renderer.schedule import LocalTracer, Run, Steps
 from wrt.scene.backgrounds import GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
@@ -31,7 +34,7 @@ from wrt.scene.model import Object, Scene
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 
-# The features are those of test_driver.py's scene: its kernel serves.
+# The features are those of test_renderer.py's scene: its kernel serves.
 SCENE = Scene(
     objects=(Object(box(), (Material(albedo=(0.7, 0.6, 0.5)),)),
              Object(quad((-4, -1, -4), (0, 0, 8), (8, 0, 0)), (Material(albedo=(0.2, 0.4, 0.8)),))),
@@ -82,7 +85,7 @@ def files(path: Path) -> list[str]:
 ], ids=str)
 def test_a_resumed_render_is_that_of_one_go(first: dict[str, Any], then: dict[str, Any], path: Path, whole: Film,
                                             monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Renderer, "_each_tile", slowly(Renderer._each_tile))
+    monkeypatch.setattr(LocalTracer, "_steps", slowly(LocalTracer._steps))
     part = render(SCENE, checkpoint=path, progress=stop_at(0.3), aov="depth", **first)
     assert part.stats["interrupted"] and part.stats["checkpoint"] == str(path) and part.stats["resumed"] is None
     assert 0 < part.stats["samples"] < whole.stats["samples"] and files(path) == [path.name]
@@ -95,20 +98,20 @@ def test_a_resumed_render_is_that_of_one_go(first: dict[str, Any], then: dict[st
     assert again.stats["seconds"]["trace"] > saved.seconds and read(path).samples == (24, 24)
 
 
-def slowly(each_tile: Any) -> Any:
-    """_each_tile with reports after a tile or two, not after tenths of a second: an interruption falls within a pass."""
+def slowly(steps: Any) -> Any:
+    """LocalTracer._steps with a step after a tile or two, not after tenths of a second: an interruption falls within a pass."""
 
-    def traced(self: Renderer, work: list[Any], trace: Any, report: Any) -> None:
+    def traced(self: LocalTracer, work: list[Any], trace: Any, due: Any) -> Steps:
         done = 0
         for i in range(0, len(work), 3):
-            each_tile(self, work[i : i + 3], trace, lambda n, done=done: report(done + n))
+            yield from ((done + n, at_rest) for n, at_rest in steps(self, work[i : i + 3], trace, due))
             done += sum(job.total for job in work[i : i + 3])
 
     return traced
 
 
 def test_an_interruption_within_a_pass_leaves_differing_pixels(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Renderer, "_each_tile", slowly(Renderer._each_tile))  # what the test above rests on
+    monkeypatch.setattr(LocalTracer, "_steps", slowly(LocalTracer._steps))  # what the test above rests on
     part = render(SCENE, checkpoint=path, progress=stop_at(0.3), pass_size=24, tile_size=4)
     assert set(np.unique(part.samples)) == {0, 24} and read(path).samples == (0, 24)
 
@@ -122,7 +125,7 @@ def test_many_resumes_with_a_target_error(path: Path, monkeypatch: pytest.Monkey
     options: dict[str, Any] = {"target_error": 0.012, "tile_size": 8}
     expected = render(SCENE, **options)
     assert expected.stats["target_reached"] and expected.metadata["spp"] > 8
-    monkeypatch.setattr(Renderer, "_each_tile", slowly(Renderer._each_tile))
+    monkeypatch.setattr(LocalTracer, "_steps", slowly(LocalTracer._steps))
     shares = iter((0.05, 0.1, 0.4))
     film = render(SCENE, checkpoint=path, progress=stop_at(next(shares)), **options)
     while film.stats["interrupted"]:
@@ -160,7 +163,7 @@ def test_a_crop_and_groups(path: Path) -> None:
 def test_ctrl_c_before_anything_keeps_what_was_there(path: Path, whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:
     render(SCENE, spp=10, checkpoint=path)
     with monkeypatch.context() as patch:
-        patch.setattr(Renderer, "_aovs", lambda self: signal.raise_signal(signal.SIGINT) or {})
+        patch.setattr(Run, "_take_aovs", lambda self: signal.raise_signal(signal.SIGINT))
         film = render(SCENE, checkpoint=path, resume=True, aov="depth")
     assert film.stats["interrupted"] and (film.samples == 10).all() and read(path).samples == (10, 10)
     assert same(render(SCENE, checkpoint=path, resume=True, aov="depth"), whole)
@@ -222,9 +225,9 @@ def test_a_checkpoint_of_another_render_is_refused(path: Path) -> None:
 def test_a_stale_checkpoint_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     render(SCENE, spp=1, checkpoint=path)
     with monkeypatch.context() as patch:
-        patch.setattr("wrt.renderer.renderer.kernel_hash", lambda kernel, device: "0" * 64)
+        patch.setattr("wrt.renderer.plan.kernel_hash", lambda kernel, device: "0" * 64)
         refuses("the kernels are another version", path, resume=True)
-    monkeypatch.setattr(wrt, "__version__", "99.0")
+    monkeypatch.setattr(module, "VERSION", "99.0")
     refuses(r"version was .*, is 99\.0", path, resume=True)
 
 
@@ -311,7 +314,7 @@ def test_a_full_disk_is_told_before_the_work(path: Path, monkeypatch: pytest.Mon
     def full(*arguments: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("the work began"))
+    monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("the work began"))
     monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
     refuses("a checkpoint cannot be written: No space left on device", path)
 
@@ -326,7 +329,7 @@ def test_a_disk_that_fills_up_costs_neither_the_render_nor_the_last_checkpoint(p
             raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(module.os, "fsync", sometimes)
-    monkeypatch.setattr(Renderer, "_each_tile", slowly(Renderer._each_tile))
+    monkeypatch.setattr(LocalTracer, "_steps", slowly(LocalTracer._steps))
     film = render(SCENE, checkpoint=path, checkpoint_every=1e-9, aov="depth", progress=told.append)
     notes = {progress.note for progress in told}
     assert same(film, whole) and notes == {"", f"{path}: the checkpoint cannot be written: No space left on device"}

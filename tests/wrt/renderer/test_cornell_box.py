@@ -11,7 +11,7 @@ from tests.cornell_box import cornell_box
 from tests.data import data_path
 from wrt.io.load import load_scene
 from wrt.picture.film import Film
-from wrt.renderer.renderer import render
+from wrt.renderer.render import render
 from wrt.scene.model import Scene
 
 SIZE = (48, 48)

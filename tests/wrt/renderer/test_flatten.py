@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wrt.renderer.flatten import instanced_world, world_mesh, world_of
+from wrt.renderer.flatten import World, instanced_world, world_mesh, world_of
 from wrt.renderer.instancing import INSTANCING, MIN_SAVED, instanced_meshes
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
@@ -67,14 +67,18 @@ def test_the_rule_counts_what_copies_would_take() -> None:
         instanced_meshes(Scene(objects), "sometimes")
 
 
+def shared_world(scene: Scene) -> World:
+    return world_of(scene, instanced_meshes(scene, "always"))
+
+
 def test_objects_that_cannot_be_instances_are_copied() -> None:
     """A shear by 1e5, and two that flatten: what rays lose on their way there is too much."""
     ball, shear, flat = icosphere(1), np.eye(4), np.diag([1.0, 0.0, 1.0, 1.0])
     shear[0, 1] = 1e5
     objects = tuple(Object(ball, (RED,), matrix) for matrix in (np.eye(4), shear, flat, flat, placed(1e-9, 0.0, 0.0, 0.0)))
-    world = world_of(Scene(objects), "always")
+    world = shared_world(Scene(objects))
     assert world.geometry.part.tolist() == [0, 1, 1] and len(world.geometry.parts[0]) == 3 * 80
-    assert world_of(Scene(objects[1:4]), "always").placed is None
+    assert shared_world(Scene(objects[1:4])).placed is None
 
 
 def test_corners_on_a_line_are_parted_in_a_mesh_of_its_own_space_too() -> None:
@@ -84,7 +88,7 @@ def test_corners_on_a_line_are_parted_in_a_mesh_of_its_own_space_too() -> None:
     which = np.array([0, 1, 2, 2], np.int32)
     turned = np.array([[0.0, 1.0, 0.0, 5.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     scene = Scene(tuple(Object(mesh, (RED, GREEN, BLUE), matrix, which) for matrix in (np.eye(4), turned)))
-    flat, world = world_mesh(scene), world_of(scene, "always")
+    flat, world = world_mesh(scene), shared_world(scene)
     assert world.placed is not None
     prim_id = np.arange(8)
     np.testing.assert_array_equal(world.materials(prim_id), flat.materials(prim_id))

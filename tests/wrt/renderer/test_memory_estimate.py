@@ -15,9 +15,11 @@ from tests.data import ROOT
 from wrt.accel.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
+from wrt.renderer.instancing import instanced_meshes
 from wrt.renderer.memory_estimate import BYTES_OF_SKY, BYTES_OF_TEXEL, bytes_of_scene
 from wrt.renderer.options import Options
-from wrt.renderer.renderer import Renderer, render
+from wrt.renderer.render import render
+from wrt.renderer.renderer import Renderer
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import PointLight
@@ -36,8 +38,8 @@ def test_it_grows_with_what_the_scene_holds() -> None:
     assert len(BALL.faces) * 50 < alone < len(BALL.faces) * 500 < bytes_of_scene(SCENE, kdtree)
     moved = [replace(SCENE.objects[0], transform=np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) * i) for i in range(9)]
     nine = replace(SCENE, objects=tuple(moved))
-    assert bytes_of_scene(nine, brute, "never") == pytest.approx(9 * alone)
-    assert bytes_of_scene(nine, brute, "always") == pytest.approx(alone + 8000.0)
+    assert bytes_of_scene(nine, brute) == pytest.approx(9 * alone)
+    assert bytes_of_scene(nine, brute, instanced_meshes(nine, "always")) == pytest.approx(alone + 8000.0)
     picture = Texture(np.zeros((100, 200, 4), np.uint8))
     twice = Material(albedo_texture=picture, emission_texture=replace(picture, srgb=False))
     textured = replace(SCENE, objects=(Object(BALL, (twice,)),), background=EnvironmentBackground(np.zeros((10, 20, 3))))
@@ -47,11 +49,11 @@ def test_it_grows_with_what_the_scene_holds() -> None:
 def test_a_scene_larger_than_the_memory_is_refused_before_any_work(say_memory: Callable[[str], None],
                                                                        monkeypatch: pytest.MonkeyPatch) -> None:
     say_memory("100M")
-    monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("work was done"))
+    monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("work was done"))
     scene = replace(SCENE, objects=SCENE.objects * 1000)
     with pytest.raises(InputError, match=r"a picture of 8x8 takes 0 MiB of memory, its scene \d\.\d GiB; cpu has 100 MiB free"):
         render(scene, size=(8, 8), instancing="never")
-    monkeypatch.setattr(Renderer, "_prepare", lambda self: None)
+    monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: None)
     Renderer(replace(SCENE, settings=replace(SCENE.settings, size=(8, 8))), Options())
 
 

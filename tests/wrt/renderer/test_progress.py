@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.command_line import BOX_OBJ, wrt
+from wrt.renderer.options import Progress
 from wrt.renderer.progress import BUILDING, COMPILING, LINE_EVERY, TimeLeft, describe, progress_reporter
-from wrt.renderer.renderer import Progress
 
 
 def at(seconds: float, done: int = 50) -> Progress:

@@ -20,8 +20,12 @@ from wrt.core.errors import InputError, SceneWarning
 from wrt.io.load import load_scene
 from wrt.io.mesh_file import load_mesh
 from wrt.picture.film import Film
-from wrt.renderer import renderer as driver
-from wrt.renderer.renderer import MAX_PASS, Options, Progress, Renderer, plain_text, render
+from wrt.renderer import prepare, schedule
+from wrt.renderer.options import AOVS, Options, Progress
+from wrt.renderer.render import render
+from wrt.renderer.renderer import Renderer
+from wrt.renderer.result import plain_text
+from wrt.renderer.schedule import MAX_PASS, Run
 from wrt.scene.backgrounds import EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
@@ -58,7 +62,7 @@ def counts(film: Film) -> list[Any]:
 
 @pytest.fixture(scope="module")
 def reference() -> Film:
-    return render(SCENE, aov=driver.AOVS)
+    return render(SCENE, aov=AOVS)
 
 
 @pytest.mark.parametrize("options", [
@@ -67,14 +71,14 @@ def reference() -> Film:
     {"threads": 2, "tile_size": 3, "pass_size": 4},
 ], ids=lambda options: " ".join(f"{name}={'...' if callable(value) else value}" for name, value in options.items()))
 def test_no_way_of_dividing_the_work_changes_a_pixel(options: dict[str, Any], reference: Film) -> None:
-    film = render(SCENE, aov=driver.AOVS, **options)
+    film = render(SCENE, aov=AOVS, **options)
     assert same(film, reference) and counts(film) == counts(reference)
 
 
 @pytest.mark.parametrize("crop", [(0, 0, 37, 22), (3, 5, 20, 6), (36, 21, 37, 22), (0, 7, 37, 8)], ids=str)
 def test_a_crop_is_that_part_of_the_whole_picture(crop: tuple[int, int, int, int], reference: Film) -> None:
     x0, y0, x1, y1 = crop
-    film = render(SCENE, aov=driver.AOVS, crop=crop)
+    film = render(SCENE, aov=AOVS, crop=crop)
     assert film.pixels.shape == (y1 - y0, x1 - x0, 3) and film.stats["samples"] == 5 * (y1 - y0) * (x1 - x0)
     part = {name: getattr(reference, name)[y0:y1, x0:x1] for name in ("pixels", "variance", "samples")}
     assert same(film, Film(**part, aov={name: array[y0:y1, x0:x1] for name, array in reference.aov.items()}))
@@ -87,7 +91,7 @@ def test_crops_make_up_the_whole_picture(reference: Film) -> None:
 
 
 def test_the_seed_changes_the_noise_and_nothing_else(reference: Film) -> None:
-    assert same(render(SCENE, aov=driver.AOVS, seed=0), reference)
+    assert same(render(SCENE, aov=AOVS, seed=0), reference)
     films = [render(SCENE, seed=seed, spp=16) for seed in (1, 2, 2**32 - 1)]
     for a, b in itertools.combinations(films, 2):
         differ = (a.pixels != b.pixels).any(axis=-1)
@@ -142,7 +146,7 @@ def test_aovs_are_what_the_pixels_see() -> None:
     scene = Scene(objects=(Object(quad((-1, -1, 0), (2, 0, 0), (0, 2, 0)), (Material(albedo=(0.1, 0.5, 0.9)),)),),
                   lights=SCENE.lights, background=SCENE.background,
                   cameras=(Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=2 * np.arctan(2 / 3)),))  # 4 wide and high at z = 0
-    film = render(scene, size=(9, 9), spp=1, aov=driver.AOVS)
+    film = render(scene, size=(9, 9), spp=1, aov=AOVS)
     center = (np.arange(9) + 0.5) / 9 * 4 - 2
     x, y = np.meshgrid(center, -center)
     inside = (np.abs(x) < 1) & (np.abs(y) < 1)
@@ -180,7 +184,7 @@ def test_cameras_by_name_number_and_themselves() -> None:
 
 
 def test_kernels_are_made_once_for_each_set_of_features() -> None:
-    kernels = [Renderer(SCENE.with_settings(spp=spp), Options(aov=["depth"])).kernels for spp in (1, 2)]
+    kernels = [Renderer(SCENE.with_settings(spp=spp), Options(aov=["depth"])).prepared.kernels for spp in (1, 2)]
     assert [id(kernel) for kernel in kernels[0]] == [id(kernel) for kernel in kernels[1]]
 
 
@@ -208,17 +212,17 @@ class Clock:
 def passes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[list[int], Film]]:
     """The sizes of the passes that a render would take if a sample of all pixels took so many seconds, and its film."""
     clock = Clock()
-    monkeypatch.setattr(driver, "time", clock)
+    monkeypatch.setattr(schedule, "time", clock)
 
     def taken(spp: int, seconds: float = 1.0, **options: Any) -> tuple[list[int], Film]:
         sizes: list[int] = []
 
-        def run_pass(self: Renderer, first: int, count: int) -> None:
+        def take(self: Run, first: int, count: int) -> None:
             assert first == sum(sizes)
             sizes.append(count)
             clock.now += count * seconds
 
-        monkeypatch.setattr(Renderer, "_run_pass", run_pass)
+        monkeypatch.setattr(Run, "_take", take)
         return sizes, render(SCENE, spp=spp, **options)
 
     return taken
@@ -311,7 +315,7 @@ def test_ctrl_c_at_the_very_end_is_not_lost() -> None:
 
 
 def test_ctrl_c_before_the_first_sample(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Renderer, "_aovs", lambda self: signal.raise_signal(signal.SIGINT) or {})
+    monkeypatch.setattr(Run, "_take_aovs", lambda self: signal.raise_signal(signal.SIGINT))
     film = render(SCENE, aov=["depth"])
     assert film.stats["interrupted"] and film.stats["samples"] == 0 and not film.pixels.any()
     assert np.isposinf(film.variance).all()
@@ -326,7 +330,7 @@ def test_ctrl_c_while_compiling_does_not_wait_for_the_compiler(monkeypatch: pyte
         may_end.wait(10.0)
         ended.set()
 
-    monkeypatch.setattr(driver, "load_kernel", compile_for_ever)
+    monkeypatch.setattr(prepare, "load_kernel", compile_for_ever)
     try:
         with pytest.raises(KeyboardInterrupt):
             render(SCENE)
@@ -337,7 +341,7 @@ def test_ctrl_c_while_compiling_does_not_wait_for_the_compiler(monkeypatch: pyte
 
 def test_an_error_of_the_scene_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     may_end, ended = threading.Event(), threading.Event()
-    monkeypatch.setattr(driver, "load_kernel", lambda kernel, device: (may_end.wait(10.0), ended.set()))
+    monkeypatch.setattr(prepare, "load_kernel", lambda kernel, device: (may_end.wait(10.0), ended.set()))
     holes = Material(alpha_mode="mask", albedo_texture=Checkerboard())
     scene = replace(SCENE, spheres=(Sphere((0, 0, 0), 1.0, holes, name="sieve"),))
     try:
@@ -369,7 +373,7 @@ def test_who_handles_ctrl_c_goes_on_handling_it() -> None:
 
 def test_renders_in_other_threads(reference: Film) -> None:
     films: list[Film] = []
-    threads = [threading.Thread(target=lambda: films.append(render(SCENE, aov=driver.AOVS))) for _ in range(3)]
+    threads = [threading.Thread(target=lambda: films.append(render(SCENE, aov=AOVS))) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -465,12 +469,12 @@ def test_progress_is_told_once_of_a_compiler_that_takes_long(monkeypatch: pytest
         sleep(0.5)
         load(kernel, device)
 
-    load = driver.load_kernel
-    monkeypatch.setattr(driver, "PREPARING_TOLD", 0.2)
+    load = prepare.load_kernel
+    monkeypatch.setattr(prepare, "PREPARING_REPORTED", 0.2)
     seen: list[Progress] = []
     render(SCENE, spp=2, progress=seen.append)
     quick = len([each for each in seen if each.stage == "compile"])
-    monkeypatch.setattr(driver, "load_kernel", slow)
+    monkeypatch.setattr(prepare, "load_kernel", slow)
     render(SCENE, spp=2, progress=seen.append)
     told = [each for each in seen if each.stage == "compile"]
     assert len(told) == quick + 1 and (told[-1].done, told[-1].rays) == (0, 0) and seen[-1].stage == "trace"
@@ -483,9 +487,9 @@ def test_progress_is_told_of_a_structure_that_is_slow_to_build(monkeypatch: pyte
             sleep(0.3)
         return make(geometry, accel, device, threads, **options)
 
-    make = driver.build
-    monkeypatch.setattr(driver, "PREPARING_TOLD", 0.0)
-    monkeypatch.setattr(driver, "build", slow)
+    make = prepare.build
+    monkeypatch.setattr(prepare, "PREPARING_REPORTED", 0.0)
+    monkeypatch.setattr(prepare, "build", slow)
     seen: list[Progress] = []
     render(SCENE, spp=1, accel="bsp", progress=seen.append)
     told = [(each.done, each.total) for each in seen if each.stage == "build"]
@@ -493,8 +497,8 @@ def test_progress_is_told_of_a_structure_that_is_slow_to_build(monkeypatch: pyte
 
 
 def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driver, "free_memory", lambda device: 2.0**30)
-    monkeypatch.setattr(Renderer, "_prepare", lambda self: pytest.fail("work was done"))
+    monkeypatch.setattr("wrt.renderer.memory_estimate.free_memory", lambda device: 2.0**30)
+    monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("work was done"))
     with pytest.raises(InputError, match=r"4096x4096 takes 2\.1 GiB of memory, its scene 0 MiB; cpu has 1\.0 GiB free"):
         render(SCENE, size=(4096, 4096))
 

@@ -16,7 +16,9 @@ from wrt.core.errors import InputError
 from wrt.picture.film import aov_to_srgb8
 from wrt.picture.image import read_channels
 from wrt.renderer.film_arrays import GROUPS
-from wrt.renderer.renderer import MAX_SPP, Options, Renderer, render
+from wrt.renderer.options import Options
+from wrt.renderer.render import MAX_SPP, render
+from wrt.renderer.renderer import Renderer
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene, Sphere

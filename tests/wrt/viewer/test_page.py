@@ -27,7 +27,7 @@ from tests.data import ROOT
 from tests.wrt.viewer.client import answer
 from tests.wrt.viewer.test_refine import CAMERA, SCENE
 from wrt.renderer.options import Options
-from wrt.renderer.renderer import render
+from wrt.renderer.render import render
 
 WHITTED = ROOT / "scenes" / "whitted.toml"
 SIZE = {"width": 640, "height": 480}

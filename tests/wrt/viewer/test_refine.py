@@ -13,6 +13,7 @@ import pytest
 
 import wrt
 from tests.wrt.renderer.test_checkpoint import SCENE as PINHOLE
+from wrt.accel.build import build
 from wrt.core.errors import InputError
 from wrt.lab.rtcore.profiler import profile
 from wrt.picture.film import Film
@@ -26,7 +27,9 @@ from wrt.scene.model import Object, Scene
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 from wrt.viewer import refine as module
-from wrt.viewer.refine import COARSE, DEEPEST, SCALES, Shown, Viewer
+from wrt.viewer import renderers
+from wrt.viewer.refine import COARSE, DEEPEST, SCALES, Viewer
+from wrt.viewer.view import Shown
 
 # A box on a mirror, through an open lens: as the viewer compiles every scene. One kernel serves all tests here.
 CAMERA = Camera.look_at((2, 2, 4), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)
@@ -83,8 +86,8 @@ def test_a_coarse_picture_covers_the_same_view() -> None:
     fine = eye.see(size=(61, 34))
     coarse = next(shown for shown in eye.pictures if shown.scale == 8)
     tangent = np.tan(0.5 * CAMERA.fov_y)
-    renderer = eye.viewer._renderers["bvh"]
-    assert renderer.device_camera.tan_x == pytest.approx(tangent * 61 / 34) and fine.scale == 1
+    prepared = eye.viewer.renderers.by_accel["bvh"].prepared
+    assert prepared.camera.tan_x == pytest.approx(tangent * 61 / 34) and fine.scale == 1
     x = np.linspace(0.0, 1.0, 8, endpoint=False) + 1 / 16
     y = np.linspace(0.0, 1.0, 5, endpoint=False) + 1 / 10
     sampled = fine.codes[(y * 34).astype(int)][:, (x * 61).astype(int)].astype(float)
@@ -122,13 +125,13 @@ def test_what_takes_too_long_is_given_up_unseen(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(module, "PATIENCE", -1.0)
     eye = Eye()
     eye.see(size=(61, 34))
-    renderer, pictures = eye.viewer._renderers["bvh"], len(eye.pictures)
+    renderer, pictures = eye.viewer.renderers.by_accel["bvh"], len(eye.pictures)
 
     def report(progress: Any) -> None:
         eye.viewer.change(camera=turned(5.0))
-        eye.viewer._report(progress)
+        eye.viewer._hear(progress)
 
-    renderer.options.progress = report
+    renderer.prepared.plan.options.progress = report
     eye.see(camera=turned(1.0))
     assert len(eye.pictures) == pictures
 
@@ -137,21 +140,20 @@ def test_the_first_picture_is_as_fine_as_there_is_time_for() -> None:
     eye = Eye()
     view = replace(eye.viewer.view, size=(1280, 720))
     for scale in SCALES:
-        eye.viewer._pace["bvh", False] = 0.99 * COARSE * scale**2 / (1280 * 720)
-        assert eye.viewer._scales(view) == [each for each in SCALES[::-1] if each <= scale]
-    eye.viewer._pace["bvh", False] = 1.0
-    assert eye.viewer._scales(view) == list(SCALES[::-1])
+        eye.viewer._pace.seconds["bvh", False] = 0.99 * COARSE * scale**2 / (1280 * 720)
+        assert eye.viewer._pace.scales(view) == [each for each in SCALES[::-1] if each <= scale]
+    eye.viewer._pace.seconds["bvh", False] = 1.0
+    assert eye.viewer._pace.scales(view) == list(SCALES[::-1])
 
 
 def test_a_structure_is_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
 
-    class Counted(Renderer):
-        def _build(self) -> None:
-            made.append(self.options.accel)
-            super()._build()
+    def counted(geometry: Any, accel: str, *arguments: Any, **options: Any) -> Any:
+        made.append(accel)
+        return build(geometry, accel, *arguments, **options)
 
-    monkeypatch.setattr(module, "Renderer", Counted)
+    monkeypatch.setattr("wrt.renderer.prepare.build", counted)
     eye = Eye(spp=1)
     pinhole = replace(CAMERA, aperture_radius=0.0)
     for changes in ({"size": (61, 34)}, {"size": (30, 40)}, {"camera": turned(30.0)}, {"max_depth": DEEPEST}, {"camera": pinhole},
@@ -215,7 +217,7 @@ def test_a_heat_map_is_the_profile_of_the_picture() -> None:
     order = np.argsort(values[below], kind="stable")
     assert (np.diff(brightness[below][order]) >= -2).all() and brightness[~below].min() >= brightness[below].max()
     eye.react = lambda shown: eye.viewer.change(cost="")
-    eye.viewer._pace["bvh", True] = 1.0
+    eye.viewer._pace.seconds["bvh", True] = 1.0
     assert eye.see(cost="primitives").scale == SCALES[-1]  # the rest was given up
     eye.viewer.step()
     assert isinstance(eye.viewer.picture(), Film)
@@ -244,7 +246,7 @@ def test_what_there_is_not_is_refused_and_what_cannot_be_built_is_told(monkeypat
     def refuse(*arguments: Any) -> None:
         raise InputError("too many triangles")
 
-    monkeypatch.setattr(module, "Renderer", refuse)
+    monkeypatch.setattr(renderers, "Renderer", refuse)
     eye.see(accel="kdtree")
     assert eye.words[-1] == "error: too many triangles" and len(eye.pictures) == pictures
     assert eye.see(accel="bvh", max_depth=1).done and eye.words[-1] == ""

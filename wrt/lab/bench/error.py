@@ -29,8 +29,9 @@ from wrt.lab.bench.error_statistics import UNKNOWN, Estimate
 from wrt.picture import metrics
 from wrt.picture.film import Film
 from wrt.renderer.features import Features
+from wrt.renderer.options import Options
 from wrt.renderer.progress import TimeLeft
-from wrt.renderer.renderer import Options, Renderer
+from wrt.renderer.renderer import Renderer
 from wrt.scene.model import Scene
 from wrt.scene.settings import SAMPLERS
 
@@ -45,7 +46,7 @@ BASE = "as it is"
 
 @dataclass(frozen=True)
 class Knob:
-    """What a user can turn: a field of wrt.scene.settings.Settings or of wrt.renderer.renderer.Options, and the values to try.
+    """What a user can turn: a field of wrt.scene.settings.Settings or of wrt.renderer.options.Options, and the values to try.
 
     matters: whether it changes anything in this scene.
     """
@@ -356,13 +357,13 @@ def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], No
     """
     words = [int(word) for word in np.random.SeedSequence(options.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     base = Renderer(scene, options)
-    found, left_out = variants(scene, options, base.features, plan.knobs or tuple(KNOBS))
+    found, left_out = variants(scene, options, base.prepared.plan.features, plan.knobs or tuple(KNOBS))
     reference_spp = plan.reference_spp or 8 * plan.max_spp
     for_truth, for_each = REFERENCE_SEEDS * reference_spp, plan.repeats * sum(plan.levels)
     left = TimeLeft(for_truth + len(found) * for_each)  # in samples, as if all took equally long
     report(f"reference: {REFERENCE_SEEDS} seeds of {reference_spp} spp")
     truth = make_reference(scene, options, reference_spp, words[:REFERENCE_SEEDS])
-    machine = {"device": base.device.name or "CPU", "threads": base.threads, "system": platform.machine(),
+    machine = {"device": base.prepared.device.name or "CPU", "threads": base.prepared.threads, "system": platform.machine(),
                "wrt": wrt.__version__}
     result = Sweep(scene.name, scene.settings.size, plan.repeats, options.seed, truth, machine, left_out=left_out)
     rows: dict[str, list[Row]] = {variant.label: [] for variant in found}

@@ -28,7 +28,8 @@ from wrt.lab.bench.visibility_report import table
 from wrt.lab.mitsuba.llvm import NotAvailable
 from wrt.lab.mitsuba.process import VARIANTS, Job, MitsubaProcess, environment_of
 from wrt.lab.mitsuba.translate import INTEGRATORS
-from wrt.renderer.renderer import Options, Renderer
+from wrt.renderer.options import Options
+from wrt.renderer.renderer import Renderer
 from wrt.scene.materials import Material
 from wrt.scene.model import Scene
 
@@ -254,7 +255,7 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
                 ours.add(*our_picture(seed))
         report("whole processes")
         rivals.each(lambda rival: rival.time_starts(starts))
-    prepare = sum(renderer.seconds.get(part, 0.0) for part in ("compile", "upload", "build"))
+    prepare = sum(renderer.prepared.seconds.get(part, 0.0) for part in ("compile", "upload", "build"))
     side = ours.side(truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
     found = {variant: measured.result(side, truth) for variant, measured in rivals.measured.items()}
     return Result(scene.name, scene.settings.size, plan.integrator, threads, side, found, rivals.not_available, truth)

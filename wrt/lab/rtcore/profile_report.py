@@ -1,4 +1,4 @@
-"""What `profile` tells and writes: tables, heat maps with their scale, EXR layers, histograms, and the model's summary."""
+"""What `profile` reports and writes: tables, heat maps with their scale, EXR layers, histograms, and the model's summary."""
 
 from __future__ import annotations
 
@@ -15,16 +15,10 @@ from wrt.lab.bench.visibility_report import table
 from wrt.lab.rtcore.model import simt
 from wrt.lab.rtcore.parameters import Gpu
 from wrt.lab.rtcore.profile_work import GROUPS, efficiency_rows, warp_order, work_of
-from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile
+from wrt.lab.rtcore.profiler import KINDS, PICTURES, TITLES, Profile
 from wrt.lab.rtcore.report import LEGEND, ModelRow, model_page, model_row, model_table, simt_table
 from wrt.picture.image import check_writable, write_codes, write_exr
 
-TITLES = {
-    "probes": "ray probes", "nodes": "nodes fetched", "boxes": "box tests", "box_operations": "operations of the box unit",
-    "primitives": "triangle tests", "leaves": "leaves entered", "pushes": "stack pushes", "pops": "stack pops",
-    "stack": "most entries on the stack", "node_bytes": "bytes of nodes", "primitive_bytes": "bytes of triangles",
-    "lines": "distinct cache lines, ray by ray", **{f"probes_{kind}": f"{kind} rays" for kind in KINDS},
-}
 PER_RAY = ("nodes", "boxes", "primitives", "leaves", "stack", "lines")
 LAYERS, HISTOGRAMS, REPORT = "counters.exr", "histograms.png", "profile.md"
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from wrt.accel.counting import copied
-from wrt.accel.structure import Structure
-from wrt.core.device import free_memory, run_all, upload
+from wrt.core.device import free_memory, start, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.io.load import as_scene
@@ -22,38 +19,28 @@ from wrt.kernels.shade.step import BRANCHES
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
 from wrt.lab.rtcore.caches import distinct_lines
-from wrt.renderer.film_arrays import DeviceFilm
-from wrt.renderer.renderer import OPTIONS, Options, Renderer
-from wrt.renderer.tiles import Rectangle, Work
+from wrt.renderer.costs import COUNTERS, CostCounter
+from wrt.renderer.memory_estimate import require_memory
+from wrt.renderer.options import OPTIONS, Options
+from wrt.renderer.plan import plan_of
+from wrt.renderer.tiles import Rectangle
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 from wrt.scene.settings import SETTINGS
 
 KINDS = ("primary", "reflection", "refraction", "straight", "shadow")
-COUNTERS = tuple(Counts.vars)
 PICTURES = (*COUNTERS, "lines", *(f"probes_{kind}" for kind in KINDS))
+TITLES = {
+    "probes": "ray probes", "nodes": "nodes fetched", "boxes": "box tests", "box_operations": "operations of the box unit",
+    "primitives": "triangle tests", "leaves": "leaves entered", "pushes": "stack pushes", "pops": "stack pops",
+    "stack": "most entries on the stack", "node_bytes": "bytes of nodes", "primitive_bytes": "bytes of triangles",
+    "lines": "distinct cache lines, ray by ray", **{f"probes_{kind}": f"{kind} rays" for kind in KINDS},
+}
 LEFT_OUT = ("aov", "time_limit", "target_error", "progress", "pass_size", "checkpoint", "checkpoint_every",
             "resume", "devices", "executor")  # options of a render that a profile has no use for
 TILE_SIZE = 64
 BYTES_OF_RAY = 200  # with what is made of it
 TRACE_LIMIT = 4_000_000  # fetches that are kept
-
-
-class LoggedStructure(NamedTuple):
-    """A structure with a log before it. Hashable, as Structure."""
-
-    inner: Structure
-
-    @property
-    def units(self) -> Any:
-        return self.inner.units
-
-    @property
-    def struct(self) -> Any:
-        return ray_log.make_struct(self.inner.struct)
-
-    def traversal(self, *, any_hit: bool, accepts: Any = None) -> Any:
-        return ray_log.make_traversal(self.inner.struct, self.inner.traversal(any_hit=any_hit, accepts=accepts), any_hit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +104,6 @@ class Profile:
         """One of `maps` as a picture with its scale, a PIL image, which a notebook shows. Raises InputError for another name."""
         from PIL import Image
 
-        from wrt.lab.rtcore.profile_report import TITLES
         from wrt.picture.heatmap import heatmap
 
         if name not in PICTURES:
@@ -166,74 +152,50 @@ class _Tile:
     trace: np.ndarray | None = None
 
 
-class Profiler(Renderer):
+class Profiler:
     """Three runs a tile: how many rays each pixel takes, those rays with their counters, and what they fetch."""
 
-    def _structure(self, structure: Any) -> Any:
-        self.logged = LoggedStructure(structure._replace(units=structure.units._replace(counters=True)))
-        return self.logged
+    def __init__(self, scene: Scene, options: Options) -> None:
+        device, plan = start(options.device), plan_of(scene, options)
+        require_memory(plan, device)
+        self.counter = CostCounter(plan, device)
+        self.prepared, self.plan = self.counter.prepared, plan
 
     def measure(self) -> Profile:
         begin = time.perf_counter()
-        settings = self.scene.settings
-        self.limits = self._limits(self.options.seed)
         # The same samples three times over: only one film is looked at.
-        self.films = [DeviceFilm(settings, self.crop, self.device, self.options.seed) for _ in range(3)]
+        self.films = [self.counter.film() for _ in range(3)]
         tiles: list[_Tile] = []
-        self._over(lambda rectangle: tiles.append(self._count(rectangle)), list(self._tiles()))
+        self.counter.each(lambda rectangle: tiles.append(self._count(rectangle)), self.prepared.tiles())
         tiles.sort(key=lambda tile: tile.rectangle[1::-1])
         total = sum(int(tile.used.sum(dtype=np.int64)) for tile in tiles)
-        if total * BYTES_OF_RAY > 0.5 * free_memory(self.device):
+        if total * BYTES_OF_RAY > 0.5 * free_memory(self.prepared.device):
             raise InputError(f"a profile of {total / 1e6:.0f} million rays takes {total * BYTES_OF_RAY / 2**30:.0f} GiB;"
                              " take a smaller size, fewer samples or a crop")
         step = max(1, -(-sum(tile.fetches for tile in tiles) // TRACE_LIMIT))
-        self._over(self._record, [(tile, i % step == step // 2) for i, tile in enumerate(tiles)])
-        pixels = self.films[0].pixels_and_variance()[0]
-        self.seconds["trace"] = time.perf_counter() - begin
-        x0, y0, x1, y1 = self.crop
-        return Profile(self.scene.name, (x1 - x0, y1 - y0), settings.spp, pixels, self._gather(tiles), self.accel, self.seconds)
-
-    def _over(self, work: Callable[[Any], Any], items: list[Any]) -> None:
-        def task(item: Any) -> Callable[[], None]:
-            return lambda: work(item)
-
-        run_all([task(item) for item in items], 1 if self.device.is_cuda else self.threads)
-
-    def _run(self, tile: Rectangle, film: int, recorder: Any, log: Any) -> None:
-        data = copied(self.accel.data)  # since every tile has a recorder of its own
-        data.recorder = recorder
-        accel = self.logged.struct()
-        accel.accel, accel.log = data, log
-        world = [accel, self.device_scene.surfaces, self.device_scene.lighting, self.device_camera, self.limits]
-        self._launch(self.kernels[0], [*world, self.films[film].groups[0]], Work(tile, 0, self.scene.settings.spp))
-
-    def _zeros(self, n: int, dtype: Any) -> Any:
-        return wp.zeros(n, dtype=dtype, device=self.device)
-
-    def _totals(self, rectangle: Rectangle) -> tuple[np.ndarray, np.ndarray]:
-        """Of each pixel of a tile, row by row: how many rays it takes, and their counters together."""
-        n = rectangle[2] * rectangle[3]
-        recorder, log = Recorder(), ray_log.RayLog()
-        recorder.counts, log.used = self._zeros(n, Counts), self._zeros(n, wp.int32)
-        self._run(rectangle, 0, recorder, log)
-        return log.used.numpy(), recorder.counts.numpy()
+        self.counter.each(self._record, [(tile, i % step == step // 2) for i, tile in enumerate(tiles)])
+        seconds = {**self.prepared.seconds, "trace": time.perf_counter() - begin}
+        x0, y0, x1, y1 = self.plan.crop
+        return Profile(self.plan.scene.name, (x1 - x0, y1 - y0), self.plan.scene.settings.spp,
+                       self.films[0].pixels_and_variance()[0], self._gather(tiles), self.prepared.accel, seconds)
 
     def _count(self, rectangle: Rectangle) -> _Tile:
-        used, counts = self._totals(rectangle)
+        used, counts = self.counter.totals(rectangle, self.films[0])
         fetches = int(counts["nodes"].sum(dtype=np.int64) + counts["primitives"].sum(dtype=np.int64))
         return _Tile(rectangle, used.copy(), fetches)
 
     def _record(self, job: tuple[_Tile, bool]) -> None:
         tile, keep = job
+        zeros, device = self.counter.zeros, self.prepared.device
         first = np.cumsum(tile.used, dtype=np.int64) - tile.used
         n = int(tile.used.sum(dtype=np.int64))
 
         def run(film: int, recorder: Any) -> Any:
-            recorder.counts = self._zeros(n, Counts)
+            recorder.counts = zeros(n, Counts)
             log = ray_log.RayLog()
-            log.used = self._zeros(len(tile.used), wp.int32)
-            log.first, log.rays = upload(first, wp.int64, self.device), self._zeros(n, ray_log.LoggedRay)
-            self._run(tile.rectangle, film, recorder, log)
+            log.used = zeros(len(tile.used), wp.int32)
+            log.first, log.rays = upload(first, wp.int64, device), zeros(n, ray_log.LoggedRay)
+            self.counter.trace(tile.rectangle, self.films[film], recorder, log)
             return log
 
         recorder = Recorder()
@@ -242,7 +204,7 @@ class Profiler(Renderer):
         length = tile.counts["nodes"].astype(np.int64) + tile.counts["primitives"]
         at = np.concatenate([[0], np.cumsum(length)])
         recorder = Recorder()
-        recorder.first, recorder.fetches = upload(at, wp.int64, self.device), self._zeros(int(at[-1]), wp.int64)
+        recorder.first, recorder.fetches = upload(at, wp.int64, device), zeros(int(at[-1]), wp.int64)
         run(2, recorder)
         trace = recorder.fetches.numpy()
         tile.lines = distinct_lines(at, trace // int(SIZE_RANGE), trace % int(SIZE_RANGE))
@@ -266,48 +228,7 @@ class Profiler(Renderer):
 
     def _pixels(self, rectangle: Rectangle) -> np.ndarray:
         """The pixels of a tile, row by row, as numbers within the crop."""
-        x0, y0, x1, _ = self.crop
+        x0, y0, x1, _ = self.plan.crop
         x, y, width, height = rectangle
         column, row = np.meshgrid(np.arange(x - x0, x - x0 + width), np.arange(y - y0, y - y0 + height))
         return (row * (x1 - x0) + column).ravel().astype(np.int64)
-
-
-class CostCounter(Profiler):
-    """What each pixel costs, and nothing of its rays one by one: one run a tile, over the structure of another renderer."""
-
-    def __init__(self, built: Renderer) -> None:
-        self.built = built
-        super().__init__(built.scene, replace(built.options, camera=built.camera))
-
-    def _build(self) -> None:
-        self.device_scene, self.accel = self.built.device_scene, self.built.accel
-
-    def costs(self, go_on: Callable[[int], bool] = lambda done: True) -> dict[str, np.ndarray] | None:
-        """COUNTERS, (H, W) int32 each, of the first sample of each pixel: summed over its rays (stack: the deepest).
-
-        go_on: asked after each tile, with the number of pixels that are done, and from several threads; where it says no, the
-        tiles that are left are not traced, and the result is None.
-        """
-        settings = self.scene.settings
-        self.limits = self._limits(self.options.seed)
-        self.films = [DeviceFilm(settings, self.crop, self.device, self.options.seed)]
-        x0, y0, x1, y1 = self.crop
-        out = {name: np.zeros((y1 - y0, x1 - x0), np.int32) for name in COUNTERS}
-        done: list[int] = []
-        stopped: list[bool] = []
-
-        def work(rectangle: Rectangle) -> None:
-            if stopped:
-                return
-            x, y, width, height = rectangle
-            _, counts = self._totals(rectangle)
-            for name, values in out.items():
-                values[y - y0 : y - y0 + height, x - x0 : x - x0 + width] = counts[name].reshape(height, width)
-            done.append(width * height)
-            if not go_on(sum(done)):
-                stopped.append(True)
-
-        begin = time.perf_counter()
-        self._over(work, list(self._tiles()))
-        self.seconds["trace"] = time.perf_counter() - begin
-        return None if stopped else out

@@ -15,11 +15,11 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from typing import Any
 
-import wrt
 from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
+from wrt.core.version import VERSION
 from wrt.renderer.distributed.installed import INSTALLED, difference
-from wrt.renderer.distributed.workers import Reply, Workers
+from wrt.renderer.distributed.workers import ExecutorWorkers, Reply
 
 CONNECT_SECONDS = 5.0  # to find the scheduler
 WORKER_SECONDS = 10.0  # for a first worker to come
@@ -36,7 +36,7 @@ def connected(address: str) -> Iterator[Any]:
     except ImportError:
         raise InputError("a cluster needs dask.distributed: pip install 'wrt[cluster]'") from None
     for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is told in our words
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is reported in our words
     try:
         kind = asyncio.run(asyncio.wait_for(_identity(address), CONNECT_SECONDS))
         if kind != "Scheduler":
@@ -74,28 +74,28 @@ def check_workers(client: Any) -> None:
     for name in ("wrt:__version__", "wrt.renderer.distributed.installed:INSTALLED"):
         for worker, found in client.run(pkgutil.resolve_name, name, on_error="return").items():
             if isinstance(found, BaseException):
-                raise InputError(f"worker {worker} has no such wrt ({found}): wrt {wrt.__version__} must be installed there")
-            if isinstance(found, str) and found != wrt.__version__:
-                raise InputError(f"worker {worker} has wrt {found} (here {wrt.__version__}): all must have the same")
-            if isinstance(found, dict) and (told := difference(INSTALLED, found)):
-                raise InputError(f"worker {worker} has {told}: all must have the same")
+                raise InputError(f"worker {worker} has no such wrt ({found}): wrt {VERSION} must be installed there")
+            if isinstance(found, str) and found != VERSION:
+                raise InputError(f"worker {worker} has wrt {found} (here {VERSION}): all must have the same")
+            if isinstance(found, dict) and (differs := difference(INSTALLED, found)):
+                raise InputError(f"worker {worker} has {differs}: all must have the same")
 
 
 def machines(client: Any) -> str:
     """What the workers run on, as far as it differs."""
-    told = [lines[0] for lines in client.run(describe_devices).values()]
-    return "; ".join(f"{told.count(line)} workers of {line}" for line in dict.fromkeys(told))
+    devices = [lines[0] for lines in client.run(describe_devices).values()]
+    return "; ".join(f"{devices.count(line)} workers of {line}" for line in dict.fromkeys(devices))
 
 
 class Submitter:
-    """A dask.distributed.Client with the little of an Executor that a sweep takes: its own futures tell of every end there is."""
+    """A dask.distributed.Client with the little of an Executor that a sweep takes: its own futures know of every end there is."""
 
     def __init__(self, client: Any) -> None:
         check_workers(client)
         self.client, self.address = client, str(client.scheduler.address)
 
     def submit(self, function: Any, *arguments: Any) -> Any:
-        with self.telling():
+        with self.guarded():
             return self.client.submit(function, *arguments, pure=False)
 
     def cancel(self, futures: Iterable[Any]) -> None:
@@ -104,7 +104,7 @@ class Submitter:
                 self.client.cancel(list(futures))
 
     @contextmanager
-    def telling(self) -> Iterator[None]:
+    def guarded(self) -> Iterator[None]:
         """A connection that breaks shows in errors of many kinds: all of them are `lost`."""
         try:
             yield
@@ -121,7 +121,7 @@ class Submitter:
         return InputError("the connection to the Dask scheduler is lost", self.address)
 
 
-class ClusterWorkers(Workers):
+class ClusterWorkers(ExecutorWorkers):
     """The workers of a dask.distributed.Client."""
 
     def __init__(self, client: Any, key: str, package: dict[str, Any]) -> None:
@@ -134,7 +134,7 @@ class ClusterWorkers(Workers):
         self.alone_since: float | None = None
 
     def slots(self) -> int:
-        with self.submitter.telling():
+        with self.submitter.guarded():
             return max(1, sum(self.client.nthreads().values()))
 
     def _scene(self) -> Any:
@@ -178,7 +178,7 @@ class ClusterWorkers(Workers):
         self.ready()
         if not waiting:
             time.sleep(0.1)
-        with self.submitter.telling(), suppress(TimeoutError, CancelledError), self.client.as_current():
+        with self.submitter.guarded(), suppress(TimeoutError, CancelledError), self.client.as_current():
             wait(waiting, timeout=0.1, return_when="FIRST_COMPLETED")
         done = [future for future in waiting if future.status != "pending"]
         self.fetched = self._fetched([future for future in done if future.status == "finished"])
@@ -190,7 +190,7 @@ class ClusterWorkers(Workers):
         async def together() -> list[Any]:
             return await self.client.gather(futures, errors="skip", asynchronous=True)
 
-        with self.submitter.telling(), suppress(TimeoutError, CancelledError):
+        with self.submitter.guarded(), suppress(TimeoutError, CancelledError):
             replies = self.client.sync(together, callback_timeout=RESULT_SECONDS) if futures else []
             if len(replies) == len(futures):
                 return {future.key: reply for future, reply in zip(futures, replies, strict=True)}

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-import wrt
+from wrt.core.version import VERSION
 
 CODE = (".py", ".h", ".cpp", ".cu")
 SHOWN = 3  # files that a message names
@@ -22,7 +22,7 @@ Installed = dict[str, dict[str, str]]
 
 def _files() -> dict[str, str]:
     """A digest of each file of code, by its name in the package: kernels/ too, wherever it stands."""
-    folders = [("", Path(wrt.__file__).parent), *(("kernels/", Path(folder)) for folder in import_module("wrt.kernels").__path__)]
+    folders = [("", Path(__file__).parents[2]), *(("kernels/", Path(folder)) for folder in import_module("wrt.kernels").__path__)]
     digests = {before + path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest()[:16]
                for before, folder in folders for path in folder.rglob("*") if path.suffix in CODE}
     return dict(sorted(digests.items()))
@@ -31,7 +31,7 @@ def _files() -> dict[str, str]:
 # Read when wrt is asked for it first, and no more: files that are changed later are not what runs.
 INSTALLED: Installed = {
     # Of Python, the minor version changes arithmetic (3.12: sum() of floats).
-    "versions": {"wrt": wrt.__version__, "Python": "{}.{}".format(*sys.version_info), "NumPy": np.__version__,
+    "versions": {"wrt": VERSION, "Python": "{}.{}".format(*sys.version_info), "NumPy": np.__version__,
                  "Warp": wp.__version__},
     "files": _files(),
 }
@@ -41,9 +41,9 @@ DIGEST = sha256(repr(INSTALLED).encode()).hexdigest()
 def difference(here: Installed, there: Installed) -> str:
     """What is installed there and is not as here, in words; "" where all is the same."""
     ours, theirs = here["versions"], there["versions"]
-    told = [f"{name} {theirs.get(name)} (here {version})" for name, version in ours.items() if theirs.get(name) != version]
+    differ = [f"{name} {theirs.get(name)} (here {version})" for name, version in ours.items() if theirs.get(name) != version]
     files = sorted(name for name in {**here["files"], **there["files"]} if here["files"].get(name) != there["files"].get(name))
     if files and ours["wrt"] == theirs.get("wrt"):  # in another version, many are others
         more = f" and {len(files) - SHOWN} more" if len(files) > SHOWN else ""
-        told.append(f"other code of wrt {ours['wrt']} ({', '.join(files[:SHOWN])}{more})")
-    return "; ".join(told)
+        differ.append(f"other code of wrt {ours['wrt']} ({', '.join(files[:SHOWN])}{more})")
+    return "; ".join(differ)

@@ -6,148 +6,128 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
-
-import numpy as np
 
 from wrt.core.device import start
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
-from wrt.renderer.distributed.workers import Crew, Devices, Job, Reply, Workers, packaged
-from wrt.renderer.options import Progress
-from wrt.renderer.renderer import PREPARING_TOLD, Renderer
+from wrt.renderer.checkpoint import checkpoint_of
+from wrt.renderer.distributed.workers import DeviceWorkers, ExecutorWorkers, Job, Reply, Workers, packaged
+from wrt.renderer.film_arrays import AovFilm, DeviceFilm
+from wrt.renderer.memory_estimate import require_memory
+from wrt.renderer.options import Options, Progress
+from wrt.renderer.plan import Plan, plan_of
+from wrt.renderer.prepare import PREPARING_REPORTED
+from wrt.renderer.schedule import Run, Steps
 from wrt.renderer.tiles import Rectangle, Work, tiles
 from wrt.renderer.upload import tell_left_out
+from wrt.scene.model import Scene
 
 TILES_EACH = 4  # of a pass, for each that traces: the last one to come must not be long
 SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # pixels: smaller tiles are not worth sending, larger ones take long
-REPORT_EVERY = 0.1  # seconds
+STEP_SECONDS = 0.1
 
 
-class SpreadRenderer(Renderer):
-    """A Renderer for options with `devices` or an `executor`."""
+class DistributedRenderer:
+    """A scene made ready by workers, for options with `devices` or an `executor`; a Tracer for its own runs."""
 
-    def _film_device(self) -> Any:
-        return start("cpu")
+    def __init__(self, scene: Scene, options: Options) -> None:
+        self.device = start("cpu")  # of the film
+        self.plan = plan_of(scene, options)
+        require_memory(self.plan, self.device)
+        tell_left_out(scene)
+        self.workers = workers_for(self.plan)
+        self.tiles_by: Counter[str] = Counter()
+        self.kind, self.seconds, self.counts = self._made_ready()
+        self.checkpoint = checkpoint_of(self.plan, self.kind)
 
-    def kind(self) -> str:
-        return self._told[0]
+    def run(self) -> Film:
+        """Take all samples (or as many as time allows, or as the target error needs) and return the film."""
+        self.tiles_by.clear()
+        return Run(self, self.checkpoint).film()
 
-    @property
-    def _on_cuda(self) -> bool:
-        return self.options.device.startswith("cuda")
+    def _made_ready(self) -> tuple[str, dict[str, float], dict[str, Any]]:
+        """The kind of the workers' devices, and seconds and facts (Prepared.ready) of those who have the scene ready."""
+        begin, reported, replies = time.perf_counter(), self.plan.options.progress is None, []
+        for done in self.workers.run([("ready",)] * self.workers.slots()):
+            seconds = time.perf_counter() - begin
+            if done is not None:
+                replies.append(done[1])
+            elif not reported and seconds >= PREPARING_REPORTED:
+                assert self.plan.options.progress is not None
+                self.plan.options.progress(Progress(0, 100, 0, seconds, stage="compile"))
+                reported = True
+        kind = replies[0][1]
+        for reply in replies:
+            _check_kind(reply, kind)
+        return kind, _waited_for(replies, time.perf_counter() - begin), replies[0][2]["facts"]
+
+    # --- a Tracer (wrt.renderer.schedule) ---
 
     def facts(self) -> dict[str, Any]:
-        return {**self._told[1]["facts"], "workers": dict(self.tiles_by)}
+        return {**self.counts, "workers": dict(self.tiles_by)}
 
-    @cached_property
-    def crew(self) -> Crew:
-        scene, options = replace(self.scene, cameras=(self.camera,)), replace(self.options, camera=None)
-        if options.devices is not None:
-            return Devices(scene, options)
-        key, package = packaged(scene, options, self.kernels_hash())
-        if hasattr(options.executor, "get_executor"):
-            from wrt.renderer.distributed.dask import ClusterWorkers
+    def tiles(self) -> Iterator[Rectangle]:
+        low, high = SIDES["cuda" if self.plan.options.device.startswith("cuda") else "cpu"]
+        side = math.ceil(math.sqrt(self.plan.area / (TILES_EACH * self.workers.slots())))
+        return tiles(self.plan.crop, self.plan.options.tile_size or min(max(side, low), high))
 
-            return ClusterWorkers(options.executor, key, package)
-        assert options.executor is not None
-        return Workers(options.executor, key, package)
-
-    @cached_property
-    def _told(self) -> tuple[str, dict[str, Any]]:
-        """The kind of the workers' devices, and what one of them tells (Renderer.ready) when they have the scene ready."""
-        tell_left_out(self.scene)
-        begin, told, all_told = time.perf_counter(), False, []
-        for done in self.crew.run([("ready",)] * self.crew.slots()):
-            seconds = time.perf_counter() - begin
-            if done is None and not told and seconds >= PREPARING_TOLD and self.options.progress is not None:
-                self.options.progress(Progress(0, 100, 0, seconds, stage="compile"))
-                told = True
-            if done is not None:
-                all_told.append(done[1])
-        kind = all_told[0][1]
-        for reply in all_told:
-            _check_kind(reply, kind)
-        return kind, all_told[0][2] | {"seconds": _waited_for(all_told, time.perf_counter() - begin)}
-
-    def _prepare(self) -> None:
-        self.seconds |= self._told[1]["seconds"]
-        self.tiles_by: Counter[str] = Counter()
-
-    def run(self, *, seed: int | None = None, spp: int | None = None) -> Film:
-        self.tiles_by.clear()
-        return super().run(seed=seed, spp=spp)
-
-    def _tiles(self) -> Iterator[Rectangle]:
-        x0, y0, x1, y1 = self.crop
-        low, high = SIDES["cuda" if self._on_cuda else "cpu"]
-        side = math.ceil(math.sqrt((x1 - x0) * (y1 - y0) / (TILES_EACH * self.crew.slots())))
-        return tiles(self.crop, self.options.tile_size or min(max(side, low), high))
-
-    def _run_pass(self, first: int, count: int) -> None:
-        """What ends a pass leaves a checkpoint."""
-        try:
-            super()._run_pass(first, count)
-        except Exception as error:
-            if self.checkpoint is not None:
-                self.checkpoint.save(self.film, self._seconds())
-                if isinstance(error, InputError) and not self.checkpoint.problem:
-                    told = InputError(f"{error}; {self.checkpoint.path} has what was done")
-                    told.path = error.path
-                    raise told from error
-            raise
-
-    def _trace(self, work: list[Work], report: Callable[[int], None]) -> None:
-        views = [self.film.view(array) for _, array in self.film.arrays()]
-        jobs = (("trace_tile", job, self.seed, [view[self._place(job.rectangle)] for view in views] if job.first else None)
+    def trace(self, film: DeviceFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
+        views = [film.view(array) for _, array in film.arrays()]
+        jobs = (("trace_tile", job, film.seed, [view[self._place(job.rectangle)] for view in views] if job.first else None)
                 for job in work)
-        done, due = 0, 0.0
-        for job, arrays in self._replies(jobs):
-            if job is not None:
-                for view, array in zip(views, arrays, strict=True):
-                    view[self._place(job[1].rectangle)] = array
-                done += job[1].total
-            if time.monotonic() >= due:
-                report(done)
-                due = time.monotonic() + REPORT_EVERY
-        report(done)
 
-    def _aovs(self) -> dict[str, np.ndarray]:
-        shape = self.film.shape
-        out: dict[str, np.ndarray] = {}
-        for job, arrays in self._replies(("aov_tile", rectangle) for rectangle in self._tiles()):
-            for name, array in zip(self.options.aov, arrays or (), strict=False):
-                if name not in out:
-                    out[name] = np.zeros((*shape, *array.shape[2:]), array.dtype)
-                out[name][self._place(job[1])] = array
-        return {name: out[name] for name in self.options.aov}
+        def put(job: Job, arrays: Any) -> int:
+            for view, array in zip(views, arrays, strict=True):
+                view[self._place(job[1].rectangle)] = array
+            return int(job[1].total)
 
-    def _replies(self, jobs: Iterator[Job]) -> Iterator[tuple[Any, Any]]:
-        """Each job and what came of it; (None, None) where nothing came for a while. KeyboardInterrupt where Ctrl-C came: the
-        tiles that run are given up, and those that came are in the film."""
-        running = self.crew.run(jobs)
-        try:
+        return self._steps(jobs, put)
+
+    def trace_aovs(self, film: AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
+        def put(job: Job, arrays: Any) -> int:
+            for name, array in zip(self.plan.options.aov, arrays, strict=True):
+                film.view(name)[self._place(job[1])] = array
+            return int(job[1][2] * job[1][3])
+
+        return self._steps((("aov_tile", job.rectangle) for job in work), put)
+
+    def _steps(self, jobs: Iterable[Job], put: Callable[[Job, Any], int]) -> Steps:
+        """No pixel of the film is ever half done: `put` writes whole tiles, here. Closed early, tiles that run are given up."""
+        total, due = 0, 0.0
+        running: Generator[tuple[Job, Reply] | None, None, None] = self.workers.run(jobs)
+        with closing(running):
             for done in running:
-                if done is None:
-                    yield None, None
-                else:
+                if done is not None:
                     job, reply = done
-                    _check_kind(reply, self.kind())  # a worker may have come later
+                    _check_kind(reply, self.kind)  # a worker may have come later
                     self.tiles_by[reply[0]] += 1
-                    yield job, reply[2]
-                self._save_if_due()
-                if self.interrupts:
-                    raise KeyboardInterrupt
-        finally:
-            running.close()
+                    total += put(job, reply[2])
+                if time.monotonic() >= due:
+                    yield total, True
+                    due = time.monotonic() + STEP_SECONDS
+            yield total, True
 
     def _place(self, rectangle: Rectangle) -> tuple[slice, slice]:
         x, y, width, height = rectangle
-        x, y = x - self.crop[0], y - self.crop[1]
+        x, y = x - self.plan.crop[0], y - self.plan.crop[1]
         return slice(y, y + height), slice(x, x + width)
+
+
+def workers_for(plan: Plan) -> Workers:
+    """Those that the plan's options name."""
+    scene, options = replace(plan.scene, cameras=(plan.camera,)), replace(plan.options, camera=None)
+    if options.devices is not None:
+        return DeviceWorkers(scene, options)
+    key, package = packaged(scene, options, plan.kernels_hash())
+    if hasattr(options.executor, "get_executor"):
+        from wrt.renderer.distributed.dask import ClusterWorkers
+
+        return ClusterWorkers(options.executor, key, package)
+    return ExecutorWorkers(options.executor, key, package)
 
 
 def _waited_for(replies: list[Reply], waited: float) -> dict[str, float]:

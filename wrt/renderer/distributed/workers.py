@@ -1,7 +1,7 @@
-"""Who traces the tiles of a render that is spread: the devices of this machine, or the workers of an executor.
+"""Who traces the tiles of a distributed render: the devices of this machine, or the workers of an executor.
 
-A tile is a pure function of the scene, its samples and what it had before (Renderer.trace_tile), so that it can be computed
-anywhere, and again where somebody died over it. A worker process makes a scene ready once, and keeps it by its digest.
+A tile is a pure function of the scene, its samples and what it had before (Prepared.trace_tile), so that it can be computed
+anywhere, and again where a worker died over it. A worker process makes a scene ready once, and keeps it by its digest.
 """
 
 from __future__ import annotations
@@ -19,27 +19,30 @@ from hashlib import sha256
 from queue import SimpleQueue
 from typing import Any
 
+from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
 from wrt.renderer.distributed.installed import INSTALLED, Installed, difference
+from wrt.renderer.memory_estimate import require_memory
 from wrt.renderer.options import Options
-from wrt.renderer.renderer import Renderer
+from wrt.renderer.plan import plan_of
+from wrt.renderer.prepare import Prepared, prepare
 from wrt.scene.digest import scene_digest
 from wrt.scene.model import Scene
 from wrt.scene.pack import pack, unpack
 
-QUEUED = 3  # calls that wait or run, for each that can run at once: nobody waits for us
-SLOTS = 32  # calls at once, of an executor that does not tell
+QUEUED = 3  # calls that wait or run, for each that can run at once, so that no worker waits for the next one
+SLOTS = 32  # calls at once, of an executor that does not say how many
 DEAD_SECONDS = 5.0  # of a process of a pool that has not noticed
-KEPT = 2  # scenes that a worker process keeps ready
-SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "instancing", "accel_options")  # options that workers need
-OURS: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, "resume": False, "progress": None}
+KEPT_READY = 2  # scenes that a worker process keeps ready
+OPTIONS_SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "instancing", "accel_options")  # what workers need
+LOCAL: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, "resume": False, "progress": None}
 
-Job = tuple[Any, ...]  # the name of a method of Renderer, and its arguments
-Reply = tuple[str, str, Any]  # who answers, on what kind of device (Renderer.kind), and what
+Job = tuple[Any, ...]  # the name of a method of Prepared, and its arguments
+Reply = tuple[str, str, Any]  # who answers, on what kind of device (Prepared.kind), and what
 
 
-class Crew:
-    """Somebody who can do many jobs at once."""
+class Workers:
+    """Whoever can do many jobs at once."""
 
     def slots(self) -> int:
         """How many."""
@@ -93,14 +96,14 @@ class Crew:
             future.cancel()
 
 
-class Devices(Crew):
+class DeviceWorkers(Workers):
     """Several devices of this machine: a thread for each, which makes the scene ready on its device and keeps it."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         assert options.devices is not None
-        self.scene, self.options, self.names = scene, replace(options, **OURS), options.devices
+        self.scene, self.options, self.names = scene, replace(options, **LOCAL), options.devices
         self.pool = ThreadPoolExecutor(len(self.names))
-        self.free: SimpleQueue[tuple[int, Renderer | None]] = SimpleQueue()  # one is for every thread
+        self.free: SimpleQueue[tuple[int, Prepared | None]] = SimpleQueue()  # one is for every thread
         for i in range(len(self.names)):
             self.free.put((i, None))
         self.lock = threading.Lock()
@@ -112,17 +115,17 @@ class Devices(Crew):
         return self.pool.submit(self._call, *job)
 
     def _call(self, method: str, *arguments: Any) -> Reply:
-        i, renderer = self.free.get()
+        i, prepared = self.free.get()
         try:
-            if renderer is None:
+            if prepared is None:
                 with self.lock:  # the second device of a kind finds the kernels compiled
-                    renderer = _made_ready(self.scene, replace(self.options, device=self.names[i]))
-            return f"{self.names[i]} ({i})", renderer.kind(), getattr(renderer, method)(*arguments)
+                    prepared = _made_ready(self.scene, replace(self.options, device=self.names[i]))
+            return f"{self.names[i]} ({i})", prepared.kind(), getattr(prepared, method)(*arguments)
         finally:
-            self.free.put((i, renderer))
+            self.free.put((i, prepared))
 
 
-class Workers(Crew):
+class ExecutorWorkers(Workers):
     """The workers of any concurrent.futures.Executor: threads, processes, or those of other machines that have wrt.
 
     Jobs go with the scene's digest alone; a worker process that does not know it asks for the scene.
@@ -178,49 +181,51 @@ def packaged(scene: Scene, options: Options, kernels: str) -> tuple[str, dict[st
     kernels: their hash, which must be that of the workers' kernels.
     """
     text, arrays = pack(scene)
-    package = {"installed": INSTALLED, "kernels": kernels, "options": {name: getattr(options, name) for name in SENT},
+    package = {"installed": INSTALLED, "kernels": kernels, "options": {name: getattr(options, name) for name in OPTIONS_SENT},
                "scene": text}
     key = sha256(f"{package}{scene_digest(scene)}".encode()).hexdigest()
     return key, {**package, "arrays": arrays}
 
 
-_ready: OrderedDict[str, Renderer] = OrderedDict()
+_ready: OrderedDict[str, Prepared] = OrderedDict()
 _lock = threading.Lock()
 
 
 def call(key: str, package: dict[str, Any] | None, method: str, *arguments: Any) -> Reply | None:
-    """On a worker: a method of the Renderer of that key, made ready from the package where it is not yet; None: it is not, and
-    there is no package. Raises InputError where what is installed here is not what asks."""
+    """On a worker: a method of what is Prepared for that key, by the package where it is not yet; None: it is not, and there is no
+    package. Raises InputError where what is installed here is not what asks."""
     with _lock:
         if key not in _ready:
             if package is None:
                 return None
             _ready[key] = _unpacked(package)
         _ready.move_to_end(key)
-        while len(_ready) > KEPT:
+        while len(_ready) > KEPT_READY:
             _ready.popitem(last=False)
-        renderer = _ready[key]
-    return worker_name(), renderer.kind(), getattr(renderer, method)(*arguments)
+        prepared = _ready[key]
+    return worker_name(), prepared.kind(), getattr(prepared, method)(*arguments)
 
 
-def _unpacked(package: dict[str, Any]) -> Renderer:
+def _unpacked(package: dict[str, Any]) -> Prepared:
     check_installed(package["installed"])
-    renderer = _made_ready(unpack(package["scene"], package["arrays"]), Options(**package["options"]))
-    if renderer.kernels_hash() != package["kernels"]:
+    prepared = _made_ready(unpack(package["scene"], package["arrays"]), Options(**package["options"]))
+    if prepared.plan.kernels_hash() != package["kernels"]:
         raise InputError(f"worker {worker_name()} makes other kernels of the same code: install the same warp-lang everywhere")
-    return renderer
+    return prepared
 
 
 def check_installed(there: Installed) -> None:
     """On a worker: raise InputError where what is installed here is not what is there, with those who ask."""
-    if told := difference(there, INSTALLED):
-        raise InputError(f"worker {worker_name()} has {told}: all must have the same")
+    if differs := difference(there, INSTALLED):
+        raise InputError(f"worker {worker_name()} has {differs}: all must have the same")
 
 
-def _made_ready(scene: Scene, options: Options) -> Renderer:
+def _made_ready(scene: Scene, options: Options) -> Prepared:
+    plan, device = plan_of(scene, options), start(options.device)
+    require_memory(plan, device)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SceneWarning)  # told where the render was asked for
-        return Renderer(scene, options)
+        warnings.simplefilter("ignore", SceneWarning)  # reported where the render was asked for
+        return prepare(plan, device)
 
 
 def worker_name() -> str:

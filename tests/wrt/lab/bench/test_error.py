@@ -25,7 +25,7 @@ from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench import plot
 from wrt.picture.image import read_image
 from wrt.renderer.features import features_of
-from wrt.renderer.renderer import Options
+from wrt.renderer.options import Options
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material

@@ -20,7 +20,7 @@ from wrt.lab.mitsuba import equal_error
 from wrt.lab.mitsuba.equal_error import Plan, Result, matte
 from wrt.lab.mitsuba.llvm import PATH_VARIABLE, NotAvailable
 from wrt.lab.mitsuba.process import VARIANTS, MitsubaProcess
-from wrt.renderer.renderer import Options
+from wrt.renderer.options import Options
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import PointLight
 from wrt.scene.materials import Material

@@ -17,9 +17,10 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.kernels.traverse.common import Units
 from wrt.lab.rtcore.cubin import read_cubin
-from wrt.lab.rtcore.profiler import COUNTERS, KINDS, PICTURES, Profile, profile
+from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
+from wrt.renderer.costs import COUNTERS
 from wrt.renderer.features import features_of
-from wrt.renderer.renderer import render_kernel
+from wrt.renderer.plan import render_kernel
 from wrt.scene.model import Scene
 
 # Left, a matte wall under one lamp; right, two mirrors that face each other with the camera between them.

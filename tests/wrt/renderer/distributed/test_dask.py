@@ -28,9 +28,8 @@ from wrt.lab.bench import sweep
 from wrt.picture.film import Film
 from wrt.picture.image import read_channels
 from wrt.renderer.distributed import dask as cluster
-from wrt.renderer.distributed import installed
-from wrt.renderer.distributed import workers as crews
-from wrt.renderer.renderer import render
+from wrt.renderer.distributed import installed, workers
+from wrt.renderer.render import render
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 dask = pytest.importorskip("dask", reason="needs the extra cluster")
@@ -59,9 +58,9 @@ def whole() -> Film:
 
 def dies_in_a_tile(flags: list[str]) -> None:
     """On a worker: one process for each flag is killed while it traces a tile."""
-    from wrt.renderer.renderer import Renderer
+    from wrt.renderer.prepare import Prepared
 
-    trace = Renderer.trace_tile
+    trace = Prepared.trace_tile
 
     def deadly(self: Any, work: Any, *rest: Any) -> Any:
         arrays = trace(self, work, *rest)
@@ -73,7 +72,7 @@ def dies_in_a_tile(flags: list[str]) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         return arrays
 
-    Renderer.trace_tile = deadly  # type: ignore[method-assign]
+    Prepared.trace_tile = deadly  # type: ignore[method-assign]
 
 
 def test_the_picture_is_the_same(client: Any, whole: Film) -> None:
@@ -110,17 +109,17 @@ def threads() -> Iterator[Any]:
 
 def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
     def fails() -> None:
-        from wrt.renderer.renderer import Renderer
+        from wrt.renderer.prepare import Prepared
 
         def trace_tile(self: Any, work: Any, *rest: Any) -> Any:
             raise ZeroDivisionError("as it happens") if work.first else InputError("not this scene", "a.toml")
 
-        Renderer.kept, Renderer.trace_tile = Renderer.trace_tile, trace_tile  # type: ignore
+        Prepared.kept, Prepared.trace_tile = Prepared.trace_tile, trace_tile  # type: ignore
 
     def works() -> None:
-        from wrt.renderer.renderer import Renderer
+        from wrt.renderer.prepare import Prepared
 
-        Renderer.trace_tile = Renderer.kept  # type: ignore
+        Prepared.trace_tile = Prepared.kept  # type: ignore
 
     client.run(fails)
     try:
@@ -132,7 +131,8 @@ def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
 
 @pytest.mark.parametrize(("change", "said"), [
     (lambda: sys.modules["wrt"].__dict__.update(__version__="0.0.9"), r"worker tcp://.* has wrt 0\.0\.9 \(here "),
-    (lambda: sys.modules.update(wrt=None), r"worker tcp://.* has no such wrt \(.*\): wrt .* must be installed there"),  # type: ignore
+    (lambda: sys.modules.update(kept=sys.modules["wrt"], wrt=None),  # type: ignore
+     r"worker tcp://.* has no such wrt \(.*\): wrt .* must be installed there"),
     (lambda: sys.modules.update({"wrt.renderer.distributed.installed": None}),
      r"worker tcp://.* has no such wrt \(.*distributed\.installed.*\)"),
 ])
@@ -141,10 +141,10 @@ def test_a_worker_that_cannot_serve(client: Any, change: Any, said: str) -> None
 
     def put_back() -> None:
         if sys.modules["wrt"] is None:
-            sys.modules["wrt"] = sys.modules["wrt.renderer.renderer"].wrt
+            sys.modules["wrt"] = sys.modules.pop("kept")
         sys.modules["wrt"].__version__ = version  # type: ignore[attr-defined]
         if sys.modules.get("wrt.renderer.distributed.installed", 0) is None:
-            sys.modules["wrt.renderer.distributed.installed"] = sys.modules["wrt"].installed  # type: ignore[attr-defined]
+            sys.modules["wrt.renderer.distributed.installed"] = sys.modules["wrt"].renderer.distributed.installed  # type: ignore[attr-defined]
 
     render(SCENE, executor=client, spp=1)
     client.run(change, workers=[first])
@@ -157,10 +157,10 @@ def test_a_worker_that_cannot_serve(client: Any, change: Any, said: str) -> None
 
 @contextmanager
 def workers_of_other_code(address: str, folder: Path, **env: str) -> Iterator[str]:
-    """A `dask worker` process whose wrt has one more line in driver.py; yields the name of its folder."""
+    """A `dask worker` process whose wrt has one more line in io/obj.py; yields the name of its folder."""
     for name in ("wrt", "kernels"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-    with open(folder / "wrt" / "driver.py", "a", encoding="utf-8") as file:
+    with open(folder / "wrt" / "io" / "obj.py", "a", encoding="utf-8") as file:
         file.write("TILE_SIZE = 31\n")
     command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny",
                "--name", "other", "--local-directory", str(folder)]
@@ -177,7 +177,7 @@ def test_a_worker_whose_code_differs_in_a_line_is_refused_by_name(threads: Any, 
                                                                                         mesh.parent / "other"):
         one.wait_for_workers(2, timeout=60)
         (address,) = [where for where, worker in one.scheduler_info(n_workers=-1)["workers"].items() if worker["id"] == "other"]
-        said = f"worker {address} has other code of wrt {wrt.__version__} (driver.py): all must have the same"
+        said = f"worker {address} has other code of wrt {wrt.__version__} (io/obj.py): all must have the same"
         with pytest.raises(InputError, match=f"^{re.escape(said)}$"):
             render(SCENE, executor=one)
         done = run("render", mesh, "-o", "a.png", "--cluster", threads.scheduler_address)
@@ -190,7 +190,7 @@ def test_a_worker_that_comes_later_is_compared_too(threads: Any, tmp_path: Path,
                                                                                         tmp_path / "other"):
         one.wait_for_workers(2, timeout=60)
         monkeypatch.setattr(cluster, "check_workers", lambda client: None)  # it was not there when they were looked at
-        with pytest.raises(InputError, match=r"^worker \S+ has other code of wrt \S+ \(driver\.py\): all must have the same$"):
+        with pytest.raises(InputError, match=r"^worker \S+ has other code of wrt \S+ \(io/obj\.py\): all must have the same$"):
             render(SCENE, executor=one, spp=256, tile_size=16, pass_size=4)
         (other,) = [where for where, worker in one.scheduler_info(n_workers=-1)["workers"].items() if worker["id"] == "other"]
         task = one.submit(sweep.one_at_a_time, installed.DIGEST, os.getpid, workers=[other], pure=False)
@@ -200,7 +200,7 @@ def test_a_worker_that_comes_later_is_compared_too(threads: Any, tmp_path: Path,
 
 def test_a_scene_that_is_lost_is_sent_again(threads: Any, whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:
     """As by the death of all workers that held it."""
-    monkeypatch.setattr(crews, "_ready", type(crews._ready)())
+    monkeypatch.setattr(workers, "_ready", type(workers._ready)())
     sent: list[Any] = []
     with distributed.Client(threads, set_as_default=False) as one:
         scatter = one.scatter

@@ -26,12 +26,14 @@ from tests.wrt.renderer.test_checkpoint import SCENE, same
 from wrt import profile
 from wrt.core.errors import InputError, SceneWarning
 from wrt.picture.film import Film
-from wrt.renderer import upload as device_scene
+from wrt.renderer import upload
 from wrt.renderer.animate import Animation, animate
-from wrt.renderer.distributed import renderer as spread
-from wrt.renderer.distributed import workers as crews
+from wrt.renderer.distributed import renderer as module
+from wrt.renderer.distributed import workers
 from wrt.renderer.distributed.installed import INSTALLED, difference
-from wrt.renderer.renderer import Options, Progress, Renderer, render
+from wrt.renderer.options import Options, Progress
+from wrt.renderer.prepare import Prepared
+from wrt.renderer.render import render
 from wrt.scene.materials import Material
 from wrt.scene.model import Object
 from wrt.scene.shapes import box
@@ -54,7 +56,7 @@ def threads() -> Iterator[Executor]:
 @pytest.fixture(autouse=True)
 def nothing_known(monkeypatch: pytest.MonkeyPatch) -> None:
     """This process as a worker that has not seen a scene."""
-    monkeypatch.setattr(crews, "_ready", type(crews._ready)())
+    monkeypatch.setattr(workers, "_ready", type(workers._ready)())
 
 
 class Deaf(Executor):
@@ -98,19 +100,19 @@ def test_processes(whole: Film) -> None:
 
 def die_late() -> None:
     """In a worker process: killed at a tile's sample 64."""
-    trace = Renderer.trace_tile
+    trace = Prepared.trace_tile
 
-    def deadly(self: Renderer, work: Any, *rest: Any) -> Any:
+    def deadly(self: Prepared, work: Any, *rest: Any) -> Any:
         if work.first >= 64:
             os.kill(os.getpid(), signal.SIGKILL)
         return trace(self, work, *rest)
 
-    Renderer.trace_tile = deadly  # type: ignore[method-assign]
+    Prepared.trace_tile = deadly  # type: ignore[method-assign]
 
 
 def test_a_pool_that_waits_for_a_dead_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """As Python's does when it was killed while it wrote."""
-    monkeypatch.setattr(crews, "DEAD_SECONDS", 0.2)
+    monkeypatch.setattr(workers, "DEAD_SECONDS", 0.2)
 
     class Waiting(Deaf):
         _processes = {1: SimpleNamespace(is_alive=lambda: False)}
@@ -126,7 +128,7 @@ def test_an_executor_that_tells_nothing_gets_the_scene_once(whole: Film) -> None
     executor = Deaf()
     assert same(render(SCENE, executor=executor, aov=["depth", "normal", "material_id"], **HOW), whole)
     first = executor.packages
-    assert 1 <= first <= crews.QUEUED * crews.SLOTS  # those that were asked before one had it
+    assert 1 <= first <= workers.QUEUED * workers.SLOTS  # those that were asked before one had it
     render(SCENE, executor=executor, aov=["depth", "normal", "material_id"], **HOW)
     assert executor.packages == first
 
@@ -136,12 +138,12 @@ def test_a_worker_that_forgot_asks_again(whole: Film, monkeypatch: pytest.Monkey
 
     def forgetful(*arguments: Any, **rest: Any) -> Any:
         if forgetful.calls % 7 == 3:  # type: ignore[attr-defined]
-            crews._ready.clear()
+            workers._ready.clear()
         forgetful.calls += 1  # type: ignore[attr-defined]
         return call(*arguments, **rest)
 
-    call, forgetful.calls = crews.call, 0  # type: ignore[attr-defined]
-    monkeypatch.setattr(crews, "call", forgetful)
+    call, forgetful.calls = workers.call, 0  # type: ignore[attr-defined]
+    monkeypatch.setattr(workers, "call", forgetful)
     assert same(render(SCENE, executor=Deaf(), aov=["depth", "normal", "material_id"], **HOW), whole)
     assert forgetful.calls > 50  # type: ignore[attr-defined]
 
@@ -150,7 +152,7 @@ def test_few_scenes_are_kept(threads: Executor) -> None:
     for color in (0.1, 0.2, 0.3):
         material = Material(albedo=(color, 0.5, 0.5))
         render(replace(SCENE, objects=(Object(box(), (material,)),)), executor=threads, spp=1)
-    assert len(crews._ready) == crews.KEPT
+    assert len(workers._ready) == workers.KEPT_READY
 
 
 # --- what belongs to a render ----------------------------------------------------------------------------------------
@@ -175,8 +177,8 @@ def test_an_interrupted_render_keeps_whole_tiles(where: str, threads: Executor) 
         if progress.done > 0:
             raise KeyboardInterrupt
 
-    spread: dict[str, Any] = {"executor": threads} if where == "executor" else {"devices": ["cpu", "cpu"]}
-    film = render(SCENE, spp=1 << 16, size=(200, 150), progress=stop, pass_size=4, **spread, **HOW)
+    how: dict[str, Any] = {"executor": threads} if where == "executor" else {"devices": ["cpu", "cpu"]}
+    film = render(SCENE, spp=1 << 16, size=(200, 150), progress=stop, pass_size=4, **how, **HOW)
     assert film.stats["interrupted"] and 0 < film.stats["samples"] < 200 * 150 << 16
     spp = int(film.samples.max())
     done = film.samples == spp
@@ -204,17 +206,17 @@ def test_a_checkpoint_from_threads_is_finished_by_others_and_back(tmp_path: Path
 
 
 def test_a_worker_s_error_is_told_and_the_work_is_saved(tmp_path: Path, threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
-    trace, path = Renderer.trace_tile, tmp_path / "a.checkpoint"
+    trace, path = Prepared.trace_tile, tmp_path / "a.checkpoint"
 
-    def fails(self: Renderer, work: Any, *rest: Any) -> Any:
+    def fails(self: Prepared, work: Any, *rest: Any) -> Any:
         if work.first >= 4:
             raise ZeroDivisionError("as it happens")
         return trace(self, work, *rest)
 
-    monkeypatch.setattr(Renderer, "trace_tile", fails)
+    monkeypatch.setattr(Prepared, "trace_tile", fails)
     with pytest.raises(ZeroDivisionError, match="as it happens"):
         render(SCENE, executor=threads, checkpoint=path, **HOW)
-    monkeypatch.setattr(Renderer, "trace_tile", trace)
+    monkeypatch.setattr(Prepared, "trace_tile", trace)
     film = render(SCENE, executor=threads, checkpoint=path, resume=True, **HOW)
     assert film.stats["resumed"]["samples"] == 4 and same(film, render(SCENE))
 
@@ -228,29 +230,29 @@ def other(part: str, **changes: str) -> dict[str, Any]:
     (other("versions", wrt="0.0.9"), rf"has wrt {wrt.__version__} \(here 0\.0\.9\): all must"),
     (other("versions", NumPy="1.0"), rf"has NumPy {np.__version__} \(here 1\.0\): all must"),
     (other("versions", Python="3.4"), r"has Python 3\.\d+ \(here 3\.4\): all must"),
-    (other("files", **{"driver.py": "0"}), rf"has other code of wrt {wrt.__version__} \(driver\.py\): all must"),
+    (other("files", **{"io/obj.py": "0"}), rf"has other code of wrt {wrt.__version__} \(io/obj\.py\): all must"),
     (other("files", **{"kernels/new.py": "0"}), r"has other code of wrt .* \(kernels/new\.py\): all must"),
     (other("files", **{name: "0" for name in ("a.py", "b.py", "c.py", "d.py")}), r"\(a\.py, b\.py, c\.py and 1 more\)"),
     ({"kernels": "0" * 64}, "makes other kernels of the same code"),
 ], ids=range(7))
 def test_a_worker_that_has_something_else_says_so(change: dict[str, str], said: str, threads: Executor,
                                              monkeypatch: pytest.MonkeyPatch) -> None:
-    unpacked = crews._unpacked
-    monkeypatch.setattr(crews, "_unpacked", lambda package: unpacked({**package, **change}))
+    unpacked = workers._unpacked
+    monkeypatch.setattr(workers, "_unpacked", lambda package: unpacked({**package, **change}))
     with pytest.raises(InputError, match=said):
         render(SCENE, executor=threads)
 
 
 def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
     """A checkout has them beside the package, a wheel in it: the same names and digests, so that both can work together."""
-    shutil.copytree(ROOT / "wrt", tmp_path / "wrt", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "wrt", tmp_path / "wrt", ignore=shutil.ignore_patterns("__pycache__", "kernels"))
     shutil.copytree(ROOT / "kernels", tmp_path / "wrt" / "kernels", ignore=shutil.ignore_patterns("__pycache__"))
     code = "import json; from wrt.renderer.distributed.installed import INSTALLED; print(json.dumps(INSTALLED))"
     done = subprocess.run([sys.executable, "-c", code],
                           cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=True)
     wheel = json.loads(done.stdout)
     assert difference(INSTALLED, wheel) == "" and list(wheel["files"]) == list(INSTALLED["files"])
-    assert {"driver.py", "accel/store.py", "bench/memory.py", "kernels/shade/render.py"} <= INSTALLED["files"].keys()
+    assert {"accel/store.py", "lab/bench/peak_memory.py", "kernels/shade/render.py"} <= INSTALLED["files"].keys()
     assert len(INSTALLED["files"]) == sum(path.suffix in (".py", ".h") for folder in ("wrt", "kernels")
                                           for path in (ROOT / folder).rglob("*"))
 
@@ -258,8 +260,8 @@ def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
 @pytest.mark.parametrize("alike", [1, 5])
 def test_workers_on_devices_of_several_kinds_are_refused(alike: int, threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that are there first, and those that come later."""
-    told: list[str] = []
-    monkeypatch.setattr(Renderer, "kind", lambda self: told.append("") or f"cuda, sm_{80 + (len(told) > alike)}")
+    asked: list[str] = []
+    monkeypatch.setattr(Prepared, "kind", lambda self: asked.append("") or f"cuda, sm_{80 + (len(asked) > alike)}")
     with pytest.raises(InputError, match=r"several kinds.*: cuda, sm_8., and at .* cuda, sm_8."):
         render(SCENE, executor=threads, **HOW)
 
@@ -295,8 +297,8 @@ def test_a_closed_executor(threads: Executor) -> None:
 
 
 def test_what_a_picture_leaves_out_is_told_once(threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (spread, device_scene):
-        monkeypatch.setattr(module, "tell_left_out", lambda scene: warnings.warn("left out", SceneWarning, stacklevel=1))
+    for place in (module, upload):
+        monkeypatch.setattr(place, "tell_left_out", lambda scene: warnings.warn("left out", SceneWarning, stacklevel=1))
     for how in ({"executor": threads}, {"devices": ["cpu", "cpu"]}):
         with pytest.warns(SceneWarning, match="left out") as told:
             render(SCENE, spp=1, **how)

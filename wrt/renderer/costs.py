@@ -1,0 +1,107 @@
+"""What a picture costs: the render kernel over a structure that counts, with a log of the rays before it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.counting import copied
+from wrt.accel.structure import Structure
+from wrt.core.device import run_all
+from wrt.kernels.study import ray_log
+from wrt.kernels.traverse.counters import Counts, Recorder
+from wrt.renderer.film_arrays import DeviceFilm
+from wrt.renderer.plan import Plan
+from wrt.renderer.prepare import Prepared, prepare
+from wrt.renderer.tiles import Rectangle, Work
+from wrt.scene.cameras import Camera
+
+COUNTERS = tuple(Counts.vars)
+
+
+class LoggedStructure(NamedTuple):
+    """A structure with a log before it. Hashable, as Structure."""
+
+    inner: Structure
+
+    @property
+    def units(self) -> Any:
+        return self.inner.units
+
+    @property
+    def struct(self) -> Any:
+        return ray_log.make_struct(self.inner.struct)
+
+    def traversal(self, *, any_hit: bool, accepts: Any = None) -> Any:
+        return ray_log.make_traversal(self.inner.struct, self.inner.traversal(any_hit=any_hit, accepts=accepts), any_hit)
+
+
+class CostCounter:
+    """A render that counts. built: what is prepared already for the same scene, of which the structure is taken."""
+
+    def __init__(self, plan: Plan, device: Any, built: Prepared | None = None) -> None:
+        counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
+        self.prepared = prepare(replace(plan, structure=LoggedStructure(counting)), device, built)
+
+    def aim(self, camera: Camera, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
+        """As Prepared.aimed."""
+        self.prepared = self.prepared.aimed(camera, angles_of, **settings)
+
+    def film(self) -> DeviceFilm:
+        plan = self.prepared.plan
+        return DeviceFilm(plan.scene.settings, plan.crop, self.prepared.device, plan.options.seed)
+
+    def each(self, work: Callable[[Any], Any], items: Iterable[Any]) -> None:
+        """Call `work` with each of the items, on all threads."""
+        run_all([partial(work, item) for item in items], 1 if self.prepared.device.is_cuda else self.prepared.threads)
+
+    def trace(self, rectangle: Rectangle, film: DeviceFilm, recorder: Any, log: Any) -> None:
+        """Take all samples of a tile into the film, the counters into a Recorder, and the rays into a RayLog."""
+        data = copied(self.prepared.accel.data)  # since every tile has a recorder of its own
+        data.recorder = recorder
+        accel = self.prepared.plan.structure.struct()
+        accel.accel, accel.log = data, log
+        (arguments,) = self.prepared.render_arguments(film, accel)
+        self.prepared.launch(self.prepared.kernels[0], arguments, Work(rectangle, 0, self.prepared.plan.scene.settings.spp))
+
+    def zeros(self, n: int, dtype: Any) -> Any:
+        return wp.zeros(n, dtype=dtype, device=self.prepared.device)
+
+    def totals(self, rectangle: Rectangle, film: DeviceFilm) -> tuple[np.ndarray, np.ndarray]:
+        """Of each pixel of a tile, row by row: how many rays it takes, and their counters together."""
+        n = rectangle[2] * rectangle[3]
+        recorder, log = Recorder(), ray_log.RayLog()
+        recorder.counts, log.used = self.zeros(n, Counts), self.zeros(n, wp.int32)
+        self.trace(rectangle, film, recorder, log)
+        return log.used.numpy(), recorder.counts.numpy()
+
+    def costs(self, go_on: Callable[[int], bool] = lambda done: True) -> dict[str, np.ndarray] | None:
+        """COUNTERS, (H, W) int32 each: of each pixel summed over its rays (stack: the deepest).
+
+        go_on: asked after each tile, with the number of pixels that are done, and from several threads; where it says no, the
+        tiles that are left are not traced, and the result is None.
+        """
+        film = self.film()
+        x0, y0, x1, y1 = self.prepared.plan.crop
+        out = {name: np.zeros((y1 - y0, x1 - x0), np.int32) for name in COUNTERS}
+        done: list[int] = []
+        stopped: list[bool] = []
+
+        def work(rectangle: Rectangle) -> None:
+            if stopped:
+                return
+            x, y, width, height = rectangle
+            _, counts = self.totals(rectangle, film)
+            for name, values in out.items():
+                values[y - y0 : y - y0 + height, x - x0 : x - x0 + width] = counts[name].reshape(height, width)
+            done.append(width * height)
+            if not go_on(sum(done)):
+                stopped.append(True)
+
+        self.each(work, self.prepared.tiles())
+        return None if stopped else out

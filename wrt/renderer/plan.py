@@ -1,0 +1,116 @@
+"""What is to be rendered and how, settled before any work: camera, features, crop, and which kernels that takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from wrt.accel.structure import Structure
+from wrt.accel.structures import ACCELERATORS
+from wrt.core.device import made_once
+from wrt.core.errors import InputError
+from wrt.kernels import structs
+from wrt.kernels.shade import render as kernels
+from wrt.kernels.traverse.common import Units
+from wrt.renderer.features import Features, features_of
+from wrt.renderer.film_arrays import GROUPS
+from wrt.renderer.instancing import instanced_meshes
+from wrt.renderer.options import Options
+from wrt.scene.cameras import Camera
+from wrt.scene.model import Scene
+from wrt.scene.settings import Settings
+
+AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that no kernel is compiled from
+
+
+@made_once
+def render_kernel(features: Features, structure: Any) -> Any:
+    return kernels.make_render_kernel(features, structure)
+
+
+@made_once
+def aov_kernel(features: Features, structure: Any) -> Any:
+    return kernels.make_aov_kernel(features, structure)
+
+
+def kernel_hash(kernel: Any, device: str) -> str:
+    """Of the kernel's whole code, the same in every process."""
+    return str(kernel.module.get_module_hash(1 if device == "cpu" else None).hex())
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """meshes: the id()s of those that are kept once (wrt.renderer.instancing); structure: what the kernels are made for, a
+    Structure or one with a log before it (wrt.renderer.costs); crop: x0, y0, x1, y1 in pixels; deepest: the bounces that the
+    kernels have room for."""
+
+    scene: Scene
+    options: Options
+    camera: Camera
+    meshes: frozenset[int]
+    features: Features
+    structure: Any
+    crop: tuple[int, int, int, int]
+    deepest: int
+
+    @property
+    def groups(self) -> int:
+        """Independent sequences of samples a pixel (wrt.renderer.film_arrays)."""
+        return 1 if self.options.target_error is None else GROUPS
+
+    @property
+    def area(self) -> int:
+        """Pixels of the crop."""
+        x0, y0, x1, y1 = self.crop
+        return (x1 - x0) * (y1 - y0)
+
+    @property
+    def kernels(self) -> list[Any]:
+        """The render kernel, and the AOV kernel where AOVs are asked for."""
+        kernels = [render_kernel(self.features, self.structure)]
+        return [*kernels, aov_kernel(self.features, self.structure)] if self.options.aov else kernels
+
+    def kernels_hash(self) -> str:
+        return kernel_hash(self.kernels[0], self.options.device)
+
+    def limits(self, seed: int) -> Any:
+        """The kernels' record of the same name."""
+        limits = structs.Limits()
+        limits.max_depth, limits.min_throughput = self.scene.settings.max_depth, self.scene.settings.min_throughput
+        limits.seed = seed
+        return limits
+
+    def aimed(self, camera: Camera, **settings: Any) -> Plan:
+        """Another camera and other settings (of AIMED), for the same kernels. Raises InputError for what they were not made for:
+        an aperture where there was a pinhole, more bounces."""
+        scene = self.scene.with_settings(**settings)
+        lacks = [name for name, needed, has in (
+            ("an aperture", camera.aperture_radius > 0.0, self.features.lens),
+            ("an aperture with blades", camera.aperture_radius > 0.0 and camera.blades > 0, self.features.blades),
+            ("so many bounces", scene.settings.max_depth > self.deepest, False),
+            ("other settings than " + ", ".join(AIMED), bool(settings.keys() - AIMED), False)) if needed and not has]
+        if lacks:
+            raise InputError(f"this renderer was not made for {lacks[0]}")
+        return replace(self, scene=scene, camera=camera, crop=_crop(scene.settings, self.options))
+
+    def moved(self, scene: Scene) -> Plan:
+        """The same objects in other places."""
+        return replace(self, scene=scene, meshes=instanced_meshes(scene, self.options.instancing))
+
+
+def plan_of(scene: Scene, options: Options) -> Plan:
+    """Raises InputError for a camera or a crop that there is not."""
+    camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
+    meshes = instanced_meshes(scene, options.instancing)
+    features = features_of(scene, camera, meshes)
+    units = Units(options.triangle, options.box, features.spheres, instances=features.instances)
+    return Plan(scene, options, camera, meshes, features, Structure(ACCELERATORS[options.accel], units),
+                _crop(scene.settings, options), scene.settings.max_depth)
+
+
+def _crop(settings: Settings, options: Options) -> tuple[int, int, int, int]:
+    width, height = settings.size
+    x0, y0, x1, y1 = (0, 0, width, height) if options.crop is None else options.crop
+    if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
+        raise InputError(f"crop {x0},{y0},{x1},{y1} is not within the picture of {width}x{height}")
+    return x0, y0, x1, y1

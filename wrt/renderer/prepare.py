@@ -1,0 +1,177 @@
+"""A scene made ready to trace on one device: its kernels compiled, its arrays uploaded, its structure built."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build, reports_progress
+from wrt.core.device import load_kernel, thread_count
+from wrt.core.seconds import Span, counted_once, loads_since
+from wrt.kernels import structs
+from wrt.renderer.film_arrays import AovFilm, DeviceFilm
+from wrt.renderer.memory_estimate import require_memory
+from wrt.renderer.options import Progress
+from wrt.renderer.plan import Plan
+from wrt.renderer.tiles import Rectangle, Work, corners, tiles
+from wrt.renderer.upload import DeviceScene, camera_struct, upload_scene
+from wrt.scene.cameras import Camera
+
+TILE_SIZE = 32
+PREPARING = "wrt prepares"  # what the threads that compile and build are called
+PREPARING_REPORTED = 1.0  # seconds of compiling and building before `progress` hears of it
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """kernels: as Plan.kernels, compiled; arrays: the scene on the device; camera: the device's record of plan.camera; seconds: of
+    "compile", "upload" and "build"."""
+
+    plan: Plan
+    device: Any
+    threads: int
+    kernels: list[Any]
+    arrays: DeviceScene
+    accel: Accelerator
+    camera: Any
+    seconds: dict[str, float]
+
+    def aimed(self, camera: Camera, angles_of: tuple[int, int] | None = None, **settings: Any) -> Prepared:
+        """For another camera and other settings: as Plan.aimed. angles_of: a size with the picture's shape, where the picture's
+        own is rounded: that would change the angle of view."""
+        plan = self.plan.aimed(camera, **settings)
+        require_memory(plan, self.device)
+        return replace(self, plan=plan, camera=camera_struct(camera, angles_of or plan.scene.settings.size))
+
+    def kind(self) -> str:
+        """Of the device: pictures of two of the same kind have the same bits."""
+        return kind_of(self.device)
+
+    def facts(self) -> dict[str, Any]:
+        """Counts of the scene and its structure."""
+        return {"triangles": self.accel.geometry.n_triangles, "stored_triangles": len(self.arrays.world.faces),
+                "spheres": len(self.accel.geometry.spheres),
+                "accel": {"name": self.plan.options.accel, **asdict(self.accel.stats)}}
+
+    def tiles(self) -> Iterator[Rectangle]:
+        """What one launch traces: the whole crop on CUDA."""
+        x0, y0, x1, y1 = self.plan.crop
+        side = max(x1 - x0, y1 - y0) if self.device.is_cuda else self.plan.options.tile_size or TILE_SIZE
+        return tiles(self.plan.crop, side)
+
+    def render_arguments(self, film: DeviceFilm, accel: Any = None) -> list[list[Any]]:
+        """Of the render kernel, for each group of the film; accel: the structure's record, where it is not the structure's own."""
+        world = [self.accel.data if accel is None else accel, self.arrays.surfaces, self.arrays.lighting, self.camera]
+        return [[*world, self.plan.limits(seed), group] for seed, group in zip(film.seeds, film.groups, strict=True)]
+
+    def aov_arguments(self, film: AovFilm) -> list[Any]:
+        return [self.accel.data, self.arrays.surfaces, self.camera, film.struct]
+
+    def launch(self, kernel: Any, arguments: list[Any], work: Work) -> None:
+        tile = structs.Tile()
+        tile.x, tile.y, tile.width, height = work.rectangle
+        tile.first_sample, tile.n_samples = work.first, work.n
+        wp.launch(kernel, dim=tile.width * height, inputs=[*arguments, tile], device=self.device)
+
+    # --- what a worker is asked for (wrt.renderer.distributed) ---
+
+    def ready(self) -> dict[str, Any]:
+        return {"facts": self.facts(), "seconds": self.seconds}
+
+    def trace_tile(self, work: Work, seed: int, state: list[np.ndarray] | None) -> list[np.ndarray]:
+        """The arrays of a film of that rectangle (DeviceFilm.arrays) with those samples added to `state` (None: zeros).
+
+        It changes nothing here, so that it can be called in several threads, and again."""
+        film = DeviceFilm(self.plan.scene.settings, corners(work.rectangle), self.device, seed, self.plan.groups)
+        for (_, array), values in zip(film.arrays(), state or (), strict=False):
+            film.put(array, values)
+        for arguments in self.render_arguments(film):
+            self.launch(self.kernels[0], arguments, work)
+        return [film.picture(array) for _, array in film.arrays()]
+
+    def aov_tile(self, rectangle: Rectangle) -> list[np.ndarray]:
+        """The AOVs that were asked for, in their order, of a rectangle."""
+        film = AovFilm(self.plan.scene.settings, corners(rectangle), self.device)
+        self.launch(self.kernels[1], self.aov_arguments(film), Work(rectangle, 0, 1))
+        return [film.picture(name) for name in self.plan.options.aov]
+
+
+def kind_of(device: Any) -> str:
+    return f"cuda, sm_{device.arch}" if device.is_cuda else "cpu"
+
+
+def prepare(plan: Plan, device: Any, built: Prepared | None = None) -> Prepared:
+    """Compile and build for a device of Warp's. built: whose arrays and structure are taken, for other kernels over them.
+
+    Raises InputError where the scene cannot be rendered."""
+    work = _Preparation(plan, device)
+    work.run([work.compile] if built is not None else [work.compile, work.build])
+    arrays, accel = (work.arrays, work.accel) if built is None else (built.arrays, built.accel)
+    return Prepared(plan, device, work.threads, work.kernels, arrays, accel, camera_struct(plan.camera, plan.scene.settings.size),
+                    work.seconds)
+
+
+class _Preparation:
+    """Two threads: one compiles, which takes longest, and meanwhile the other uploads and builds."""
+
+    arrays: DeviceScene
+    accel: Accelerator
+    seconds: dict[str, float]
+
+    def __init__(self, plan: Plan, device: Any) -> None:
+        self.plan, self.device, self.kernels = plan, device, plan.kernels
+        self.threads = thread_count(plan.options.threads)
+        self.spans: dict[str, list[Span]] = {}
+        self.compiled, self.fraction_built = False, 0.0
+
+    def run(self, jobs: list[Callable[[], None]]) -> None:
+        """Neither Ctrl-C nor an error waits for the compiler, and no wait is long: Python may hear of Ctrl-C only between two."""
+        begin, reported = time.perf_counter(), ("", 0.0)
+        pool = ThreadPoolExecutor(2, thread_name_prefix=PREPARING)
+        pending = {pool.submit(job) for job in jobs}
+        try:
+            while pending:
+                finished, pending = wait(pending, timeout=0.1, return_when=FIRST_EXCEPTION)
+                for job in finished:
+                    job.result()
+                seconds = time.perf_counter() - begin
+                if pending and seconds >= PREPARING_REPORTED:
+                    reported = self._report(seconds, reported)
+        finally:
+            pool.shutdown(wait=False)
+        self.seconds = counted_once({"compile": loads_since(begin), **self.spans})
+
+    def _report(self, seconds: float, before: tuple[str, float]) -> tuple[str, float]:
+        """Call `progress` where there is something new."""
+        state = ("build", self.fraction_built) if self.fraction_built > 0.0 else ("compile", 0.0)
+        progress = self.plan.options.progress
+        if progress is None or state == before or (state[0] == "compile" and self.compiled):
+            return before
+        progress(Progress(int(100.0 * state[1]), 100, 0, seconds, stage=state[0]))
+        return state
+
+    def compile(self) -> None:
+        for kernel in self.kernels:
+            load_kernel(kernel, self.device)
+        self.compiled = True
+
+    def build(self) -> None:
+        options = self.plan.options
+        begin = time.perf_counter()
+        self.arrays = upload_scene(self.plan.scene, self.device, self.plan.meshes)
+        uploaded = time.perf_counter()
+        chosen = {"triangle": options.triangle, "box": options.box, **options.accel_options}
+        if reports_progress(options.accel):
+            chosen = {"progress": self._built, **chosen}
+        self.accel = build(self.arrays.world.geometry, options.accel, options.device, self.threads, **chosen)
+        self.spans = {"upload": [(begin, uploaded)], "build": [(uploaded, time.perf_counter())]}
+
+    def _built(self, fraction: float) -> None:
+        self.fraction_built = fraction

@@ -1,0 +1,57 @@
+"""From the film's arrays to what `render` gives back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from wrt.core.version import VERSION
+from wrt.picture.film import Film
+from wrt.renderer.film_arrays import DeviceFilm
+from wrt.renderer.plan import Plan
+from wrt.scene.model import Scene
+
+
+def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray], seconds: dict[str, float],
+            facts: dict[str, Any]) -> Film:
+    """The film with its statistics. facts: of the scene, its structure and the run's end, which go into them as they are."""
+    options, settings, samples = plan.options, plan.scene.settings, arrays.samples()
+    total = max(int(samples.sum()), 1)
+    rays = arrays.count("rays")
+    stats: dict[str, Any] = {
+        "seconds": seconds, "rays": rays, "rays_per_sample": rays / total,
+        "rays_per_second": rays / seconds["trace"] if seconds["trace"] > 0.0 else 0.0,
+        "cut_by_depth": arrays.count("cut_depth"), "cut_by_throughput": arrays.count("cut_throughput"),
+        "lost_throughput_per_sample": arrays.lost() / total,
+        "visibly_cut": arrays.visibly_cut(_most_cut_by_throughput(plan.scene)) if plan.features.reflection else 0.0,
+        "not_finite": arrays.count("not_finite"), "samples": int(samples.sum()), **facts,
+    }
+    if options.target_error is not None:
+        error = arrays.error()
+        stats |= {"estimated_error": error, "target_error": options.target_error,
+                  "target_reached": error <= options.target_error and int(samples.min()) > 0}
+    metadata = {
+        "scene": plain_text(plan.scene.name), "camera": plain_text(plan.camera.name), "spp": int(samples.max()), "seed": seed,
+        "seconds": round(seconds["trace"], 3), "version": VERSION, "max_depth": settings.max_depth, "filter": settings.filter,
+        "accel": options.accel, "device": ",".join(options.devices or [options.device]),
+    }
+    return replace(film_so_far(plan, arrays), aov=aov, stats=stats, metadata=metadata)
+
+
+def film_so_far(plan: Plan, arrays: DeviceFilm) -> Film:
+    """The pixels alone."""
+    settings = plan.scene.settings
+    return Film(*arrays.pixels_and_variance(), arrays.samples(), exposure=settings.exposure, tonemap=settings.tonemap)
+
+
+def plain_text(name: str) -> str:
+    """A name that a file can hold: names out of glTF files and of the system may have lone surrogates, which become "?"."""
+    return name.encode("utf-8", "replace").decode()
+
+
+def _most_cut_by_throughput(scene: Scene) -> float:
+    """What a ray that is cut by its throughput is worth at most: in glass, light is denser."""
+    glass = [m.ior for m in scene.materials if m.kind == "glass" or m.transmission > 0.0]
+    return scene.settings.min_throughput * max(glass, default=1.0) ** 2

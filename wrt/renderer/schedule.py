@@ -1,0 +1,265 @@
+"""What is traced when: the passes of a run and their tiles, until samples, time or the target error end it, or Ctrl-C does."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import closing, nullcontext
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from wrt.core.errors import InputError
+from wrt.core.interrupts import held_interrupts
+from wrt.picture.film import Film
+from wrt.renderer.checkpoint import Checkpoint
+from wrt.renderer.film_arrays import AovFilm, DeviceFilm
+from wrt.renderer.options import Options, Progress
+from wrt.renderer.plan import Plan
+from wrt.renderer.prepare import Prepared
+from wrt.renderer.result import film_of, film_so_far
+from wrt.renderer.tiles import Rectangle, Work, work_left
+
+MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
+# Samples (summed over pixels) that are done, and whether no tile runs at the moment: then each pixel is done whole.
+Steps = Generator[tuple[int, bool], None, None]
+
+
+class Tracer(Protocol):
+    """Who traces the tiles of a run: threads of this process, or others (wrt.renderer.distributed).
+
+    seconds: of making the scene ready. `trace` and `trace_aovs` give a step every tenth of a second or so, and one in the end;
+    where `due()` is true, one in which no tile runs. Closed early, they end the tiles that run and begin no others.
+    """
+
+    @property
+    def plan(self) -> Plan: ...
+
+    @property
+    def device(self) -> Any:
+        """Of the film."""
+
+    @property
+    def seconds(self) -> Mapping[str, float]: ...
+
+    def facts(self) -> dict[str, Any]:
+        """Counts of the scene and its structure."""
+        ...
+
+    def tiles(self) -> Iterable[Rectangle]: ...
+
+    def trace(self, film: DeviceFilm, work: list[Work], due: Callable[[], bool]) -> Steps: ...
+
+    def trace_aovs(self, film: AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps: ...
+
+
+class LocalTracer:
+    """On the device that the scene was prepared for: on all threads, or in one launch on CUDA."""
+
+    def __init__(self, prepared: Prepared) -> None:
+        self.prepared, self.plan, self.device, self.seconds = prepared, prepared.plan, prepared.device, prepared.seconds
+        self.facts, self.tiles = prepared.facts, prepared.tiles
+
+    def trace(self, film: DeviceFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
+        groups = self.prepared.render_arguments(film)
+
+        def trace(job: Work) -> int:
+            for arguments in groups:
+                self.prepared.launch(self.prepared.kernels[0], arguments, job)
+            return job.total
+
+        return self._steps(work, trace, due)
+
+    def trace_aovs(self, film: AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
+        arguments = self.prepared.aov_arguments(film)
+
+        def trace(job: Work) -> int:
+            self.prepared.launch(self.prepared.kernels[1], arguments, job)
+            return job.total
+
+        return self._steps(work, trace, due)
+
+    def _steps(self, work: list[Work], trace: Callable[[Work], int], due: Callable[[], bool]) -> Steps:
+        if self.device.is_cuda:
+            done = sum(trace(job) for job in work)
+            wp.synchronize_device(self.device)
+            yield done, True
+            return
+        with ThreadPoolExecutor(self.prepared.threads) as pool:
+            pending = {pool.submit(trace, job): job for job in work}
+            done = 0
+            try:
+                while pending:
+                    finished, _ = wait(pending, timeout=0.1)
+                    at_rest = due()
+                    waiting = [future for future in pending if future.cancel()] if at_rest else []
+                    if at_rest:
+                        finished = pending.keys() - set(waiting)
+                    done += sum(future.result() for future in finished)
+                    pending = {future: job for future, job in pending.items() if future not in finished}
+                    yield done, at_rest or not pending
+                    if waiting:
+                        pending = {pool.submit(trace, job): job for job in pending.values()}
+            finally:
+                for future in pending:
+                    future.cancel()
+
+
+class Passes:
+    """First sample and number of samples (of each group) of each pass: 1, 1, 2, 4 ..., so that a first picture comes soon.
+
+    A time limit counts from the first pass on: a pass takes no more samples than are likely to be done by then, but for the
+    first of each pixel, which is always taken; nor, with `every`, more than in so many seconds. samples: the fewest and the most
+    that pixels have already; a render that was saved within a pass begins with the pixels that are behind.
+    """
+
+    def __init__(self, film: DeviceFilm, options: Options, spp: int, samples: tuple[int, int], every: float) -> None:
+        self.film, self.options, self.every = film, options, every
+        self.spp = max(1, spp // len(film.groups))
+        self.largest = MAX_PASS // len(film.groups)
+        self.fewest, self.most = samples
+        self.expected_spp, self.timed_out = self.spp, False
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        limit = self.options.time_limit or math.inf
+        first = known = self.fewest  # the speed is that of the samples since `known`, when `since`
+        begin = since = time.perf_counter()
+        count = self.options.pass_size or min(max(first, 1), self.largest)
+        while first < self.spp and (first < self.most or not self._precise_enough(first)):
+            count = min(count, (self.most if first < self.most else self.spp) - first)
+            if self.options.target_error is not None:
+                count = min(count, (1 << first.bit_length()) - first)  # no farther than to the next power of 2
+            if first > 0 and min(limit, self.every) < math.inf:
+                now = time.perf_counter()
+                left = limit - (now - begin)
+                if left <= 0.0:
+                    self.timed_out = True
+                    return
+                likely = min(left, self.every) / (now - since) * (first - known) if first > known else 1.0
+                count = max(1, min(count, int(min(likely, self.spp))))
+            yield first, count
+            first += count
+            if first == self.most:
+                known, since = first, time.perf_counter()
+            count = self.options.pass_size or min(first, self.largest)
+
+    def _precise_enough(self, taken: int) -> bool:
+        """Whether the target error is reached after so many samples of each group; looked at when they are a power of 2."""
+        target = self.options.target_error
+        if target is None or taken == 0 or taken & (taken - 1):
+            return False
+        error = self.film.error()
+        if error > target:  # at worst the variance falls as 1 / n
+            steps = math.ceil(min(2.0 * math.log2(error / target), 24.0))
+            self.expected_spp = min(self.spp, taken << steps)
+        return error <= target
+
+
+class Run:
+    """One picture of a scene that is ready. seed, spp: in place of the options' and the scene's (None)."""
+
+    def __init__(self, tracer: Tracer, checkpoint: Checkpoint | None, seed: int | None = None, spp: int | None = None) -> None:
+        plan = tracer.plan
+        self.tracer, self.plan, self.checkpoint = tracer, plan, checkpoint
+        self.seed = plan.options.seed if seed is None else seed
+        self.arrays = DeviceFilm(plan.scene.settings, plan.crop, tracer.device, self.seed, plan.groups)
+        self.aov: dict[str, np.ndarray] = {}
+        self.seconds, self.seconds_before = dict(tracer.seconds), 0.0
+        self.interrupts: list[int] = []
+        samples, every = (0, 0), math.inf
+        if checkpoint is not None and checkpoint.saved is not None:
+            checkpoint.restore(self.arrays)
+            samples, self.seconds_before = checkpoint.saved.samples, checkpoint.saved.seconds
+        if checkpoint is not None and tracer.device.is_cuda:  # where a launch is the whole picture
+            every = checkpoint.every
+        self.passes = Passes(self.arrays, plan.options, spp or plan.scene.settings.spp, samples, every)
+
+    def film(self) -> Film:
+        """Take the samples, and give the film."""
+        begin = self.begin = time.perf_counter()
+        interrupted = False
+        with held_interrupts() as self.interrupts, self.checkpoint.held() if self.checkpoint else nullcontext():
+            try:
+                if self.plan.options.aov:
+                    self._take_aovs()
+                    self.seconds["aov"] = time.perf_counter() - begin
+                self.begin = time.perf_counter()
+                for first, count in self.passes:
+                    self._take(first, count)
+            except KeyboardInterrupt:  # from _follow, or from a progress callback that wants the end
+                interrupted = True
+            except Exception as error:
+                self._keep(error)
+                raise
+            self.seconds["trace"] = self._elapsed()
+            if self.checkpoint is not None:
+                self.checkpoint.save(self.arrays, self.seconds["trace"])
+                if self.checkpoint.problem:
+                    warnings.warn(self.checkpoint.problem, RuntimeWarning, stacklevel=4)
+            facts = self._facts(interrupted or bool(self.interrupts))
+            return film_of(self.plan, self.arrays, self.seed, self.aov, self.seconds, facts)
+
+    def _facts(self, interrupted: bool) -> dict[str, Any]:
+        """Of the scene, and of how the run ended."""
+        end = {"interrupted": interrupted, "signal": int(self.interrupts[0]) if self.interrupts else None,
+               "timed_out": self.passes.timed_out and not interrupted}
+        return self.tracer.facts() | end | ({} if self.checkpoint is None else self.checkpoint.facts())
+
+    def _keep(self, error: Exception) -> None:
+        """What ends a run leaves a checkpoint, if the film can still be read: not that of a CUDA device that failed."""
+        if self.checkpoint is None or self.tracer.device.is_cuda:
+            return
+        self.checkpoint.save(self.arrays, self._elapsed())
+        if isinstance(error, InputError) and not self.checkpoint.problem:
+            more = InputError(f"{error}; {self.checkpoint.path} has what was done")
+            more.path = error.path
+            raise more from error
+
+    def _elapsed(self) -> float:
+        """Seconds of tracing, with those before the last resume."""
+        return self.seconds_before + time.perf_counter() - self.begin
+
+    def _due(self) -> bool:
+        return self.checkpoint is not None and self.checkpoint.due()
+
+    def _take(self, first: int, count: int) -> None:
+        """Bring every pixel from `first` to `first + count` samples a group, where it has fewer."""
+        work, before = [Work(tile, first, count) for tile in self.tracer.tiles()], first * self.plan.area
+        if first < self.passes.most:  # of a resumed render
+            samples = self.arrays.view(self.arrays.groups[0].samples)
+            work, before = work_left(work, samples, self.plan.crop), int(samples.sum(dtype=np.int64))
+        self._follow(self.tracer.trace(self.arrays, work, self._due), work, lambda done: self._report(before + done))
+
+    def _take_aovs(self) -> None:
+        arrays = AovFilm(self.plan.scene.settings, self.plan.crop, self.tracer.device)
+        work = [Work(tile, 0, 1) for tile in self.tracer.tiles()]
+        self._follow(self.tracer.trace_aovs(arrays, work, self._due), work, lambda done: None)
+        self.aov = {name: arrays.picture(name) for name in self.plan.options.aov}
+
+    def _follow(self, steps: Steps, work: list[Work], report: Callable[[int], None]) -> None:
+        """Save and report while tiles are traced. KeyboardInterrupt where Ctrl-C came: tiles that run come to their end, so that
+        a pixel is never half done."""
+        total = sum(job.total for job in work)
+        with closing(steps):
+            if self.interrupts:
+                raise KeyboardInterrupt
+            for done, at_rest in steps:
+                if self.checkpoint is not None and at_rest and self.checkpoint.due():
+                    self.checkpoint.save(self.arrays, self._elapsed())
+                report(done)
+                if self.interrupts and done < total:
+                    raise KeyboardInterrupt
+
+    def _report(self, done: int) -> None:
+        """done: samples of a group, summed over the pixels."""
+        plan = self.plan
+        if plan.options.progress is None:
+            return
+        total = plan.area * self.passes.expected_spp * plan.groups
+        note = "" if self.checkpoint is None else self.checkpoint.problem
+        plan.options.progress(Progress(done * plan.groups, total, self.arrays.rays, self._elapsed(), note=note,
+                                       picture=lambda: film_so_far(plan, self.arrays)))
