@@ -14,7 +14,7 @@ from tests.data import ROOT
 
 KERNELS = sorted((ROOT / "kernels").glob("*.py"))
 HOST = sorted((ROOT / "wrt").rglob("*.py"))
-ALLOWED = {"warp", "functools", "typing"}
+ALLOWED = {"warp", "functools", "pathlib", "re", "typing"}
 USE_KERNELS = ("accel/", "device.py", "device_film.py", "device_scene.py", "driver.py", "profiler.py",
                "cache_sim.py", "rtcore.py", "bench/")
 

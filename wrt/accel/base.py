@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.batches import launch_stream, stream_kernel
-from wrt.accel.triangle_data import TRIANGLE_DATA
+from wrt.accel.triangle_data import LAYOUTS
 from wrt.core.arrays import check_no_gradients, real_numbers, taken, to_numpy, to_warp
 from wrt.core.device import load_kernel, made_once, records, run_all, start, thread_count, upload
 from wrt.core.errors import InputError
@@ -110,7 +110,7 @@ class Geometry:
             triangle = prim_id[some] < len(self.faces) if units.spheres else slice(None)
             part = out[some][triangle]
             faces = self.faces.take(part["prim_id"], axis=0)
-            TRIANGLE_DATA[units.triangle](part, *(self.vertices.take(faces[:, i], axis=0) for i in range(3)))
+            LAYOUTS[units.triangle_test.layout](part, *(self.vertices.take(faces[:, i], axis=0) for i in range(3)))
             if units.spheres:
                 out[some][triangle] = part
 
