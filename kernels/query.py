@@ -6,6 +6,9 @@ from wrt.kernels.structs import NO_HIT, Ray, Surfaces, kernel
 from wrt.kernels.traverse.common import make_intersect, make_probe, no_hit
 
 LARGEST = wp.constant(3.4028234663852886e38)  # of float32
+# Directions beyond these lengths are scaled by one of these factors: see direction_scale.
+SHORTEST, LONGEST = 2.0**-64, 2.0**64
+LENGTHEN, SHORTEN = 2.0**96, 2.0**-64
 
 
 @wp.struct
@@ -38,8 +41,8 @@ def direction_scale(direction: wp.vec3) -> float:
     longest = wp.abs(direction[0])
     longest = wp.where(wp.abs(direction[1]) > longest, wp.abs(direction[1]), longest)
     longest = wp.where(wp.abs(direction[2]) > longest, wp.abs(direction[2]), longest)
-    short = wp.where(longest < wp.static(2.0**-64), wp.static(2.0**96), 1.0)
-    return wp.where(longest > wp.static(2.0**64), wp.static(2.0**-64), short)
+    short = wp.where(longest < wp.static(SHORTEST), wp.static(LENGTHEN), 1.0)
+    return wp.where(longest > wp.static(LONGEST), wp.static(SHORTEN), short)
 
 
 @wp.func
@@ -49,7 +52,7 @@ def load_ray(rays: RayArrays, i: int) -> Ray:
     The segment ends where t in the caller's units would be beyond float32, so that no traversal finds what cannot be told.
     """
     scale = direction_scale(rays.direction[i])
-    inverse = wp.where(scale > 1.0, wp.static(2.0**-96), wp.where(scale < 1.0, wp.static(2.0**64), 1.0))
+    inverse = wp.where(scale > 1.0, wp.static(1.0 / LENGTHEN), wp.where(scale < 1.0, wp.static(1.0 / SHORTEN), 1.0))
     ray = Ray()
     ray.origin = rays.origin[i]
     ray.direction = scale * rays.direction[i]

@@ -40,7 +40,7 @@ BELOW_KERNELS = {
     "build": {"wide", "traverse", "units", "structs"},
     "study": {"query", "shade", "wide", "build", "traverse", "units", "structs"},
 }
-LIBRARIES_OF_KERNELS = {"warp", "functools", "typing", "collections", "math", "pathlib"}
+LIBRARIES_OF_KERNELS = {"warp", "functools", "re", "typing", "collections", "math", "pathlib"}
 
 
 def module(path: Path) -> str:

@@ -9,8 +9,7 @@ import warp as wp
 
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
-from wrt.kernels.wide.lanes import EMPTY
-from wrt.kernels.wide.traverse import LEAF_RANGE
+from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first, leaf_reference
 
 MAX_WIDTH = wp.constant(8)
 
@@ -43,7 +42,7 @@ class Subtrees:
 
 @wp.struct
 class WideTree:
-    """What comes out. children: `width` a node, references as in kernels.traverse_wide; lo, hi: their boxes, empty where there is
+    """What comes out. children: `width` a node, references as in kernels.wide.references; lo, hi: their boxes, empty where there is
     no child; order: the prim_id of each lane, rows filled up with -1; count: nodes, rows, leaves, depth, and the most entries on
     a traversal's stack. source: room for the children of one node: whose boxes they have, as 2 * (binary node) + side."""
 
@@ -304,7 +303,7 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
                 gather(nodes, order, code / 2, side, out, n_rows * options.width)
                 for i in range(count, rows * options.width):
                     out.order[n_rows * options.width + i] = -1
-                out.children[base + j] = -1 - (n_rows * LEAF_RANGE + count - 1)
+                out.children[base + j] = leaf_reference(n_rows, count)
                 n_rows = n_rows + rows
                 n_leaves = n_leaves + 1
             else:
@@ -340,8 +339,8 @@ def refit(children: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32), w
         a = wp.vec3(wp.inf, wp.inf, wp.inf)
         b = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
         if reference < 0:
-            first = (-1 - reference) / LEAF_RANGE * width
-            for j in range(first, first + (-1 - reference) % LEAF_RANGE + 1):
+            first = leaf_first(reference) * width
+            for j in range(first, first + leaf_count(reference)):
                 prim_id = wp.where(order[j] < 0, none, order[j])
                 a = wp.min(a, low[prim_id])
                 b = wp.max(b, high[prim_id])

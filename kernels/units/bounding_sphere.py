@@ -1,6 +1,6 @@
 """The bounding sphere's unit: does a ray meet a sphere that stands around something?
 
-Not the sphere unit (ray_sphere.py), which finds exact hits: this one only has to let every hit through, as cheaply as it can.
+Not the sphere unit (sphere.py), which finds exact hits: this one only has to let every hit through, as cheaply as it can.
 A sphere is a vec4 (center, radius); a radius below 0 is an empty one.
 """
 
@@ -9,7 +9,7 @@ import warp as wp
 from wrt.kernels.structs import Ray
 
 # In units of 2^-24 of the distance and radius together: 7 for the line's distance from the center, 8 and 4 for where it is
-# nearest and for the ends of the chord, 18 for a hit, which is held to its primitive's padded box by distances that are
+# nearest and for the ends of the chord, 18 for a hit, which is clamped to its primitive's padded box by distances that are
 # rounded themselves (3 errors each, and FAR_PAD). Their sum, 37, is less than 64.
 SPHERE_PAD = wp.constant(2.0**-18)
 # Beyond it squares overflow, and below it they underflow: what is larger is always entered, what is smaller is taken as this.

@@ -5,15 +5,13 @@ for each of its two corners. Planes are tested as (plane - origin) * inv_dir: th
 saves an operation and loses rays by cancellation. RAY_AABB is the table of the tests there are.
 """
 
-from functools import cache
-
 import warp as wp
 
 from wrt.kernels.structs import Ray
 
 # The far distance carries at most 3 rounding errors, and so does the near one of another axis: the interval is widened by
 # twice that (Ize 2013, "Robust BVH Ray Traversal", section 3). The four more on each side cover what the triangle unit's
-# rounding of sheared vertices adds in proportion to the distance; `padded` covers the rest.
+# rounding of sheared vertices adds in proportion to the distance; padded_lo and padded_hi cover the rest.
 FAR_PAD = wp.constant(1.0 + 2.0 * (7.0 * 2.0**-24) / (1.0 - 7.0 * 2.0**-24))
 
 # Powers of two, so that the host computes the same box to the last bit (wrt.accel.geometry.Geometry.bounds).
@@ -48,8 +46,8 @@ def box_pad(lo: wp.vec3, hi: wp.vec3) -> float:
     The triangle unit's signed areas are those of a triangle whose vertices, seen along the ray, are off by up to 3 u of the
     hit's distance (FAR_PAD covers it) and 5 u of the triangle's own extent, which may be far longer than the ray: a ray that
     starts just above a floor 1000 wide. Without it, a ray through the edge of two triangles is given to the one whose box it
-    misses, and is lost. 8 u here, and 4 u of the coordinates in `padded` for the rounding of lo and hi themselves. PAD_SMALLEST
-    is for what underflows in the shear, and changes no pad but those of triangles below 2^-103.
+    misses, and is lost. 8 u here, and 4 u of the coordinates in padded_lo and padded_hi for the rounding of lo and hi themselves.
+    PAD_SMALLEST is for what underflows in the shear, and changes no pad but those of triangles below 2^-103.
     """
     e = hi - lo
     return wp.static(PAD_EXTENT) * wp.max(wp.max(e[0], e[1]), e[2]) + wp.static(PAD_SMALLEST)
@@ -157,31 +155,3 @@ RAY_AABB = {
     "minmax": ray_aabb_minmax,
     "plain": ray_aabb_plain,
 }
-
-
-@cache
-def make_ray_aabb_row(test: str, width: int):
-    """A test of `width` boxes in one call, as a wide node holds them: each of the six planes is a row."""
-    row = wp.types.vector(width, float)
-    unit = RAY_AABB[test]
-
-    @wp.struct
-    class BoxRow:
-        lo_x: row
-        lo_y: row
-        lo_z: row
-        hi_x: row
-        hi_y: row
-        hi_z: row
-
-    @wp.func
-    def ray_aabb_row(ray: BoxRay, boxes: BoxRow, t_max: float) -> row:
-        """The entry distance of each box, inf where it is missed: to the last bit what the test of one box says."""
-        out = row()
-        for i in range(width):
-            lo = wp.vec3(boxes.lo_x[i], boxes.lo_y[i], boxes.lo_z[i])
-            hi = wp.vec3(boxes.hi_x[i], boxes.hi_y[i], boxes.hi_z[i])
-            out[i] = unit(ray, lo, hi, t_max)
-        return out
-
-    return BoxRow, ray_aabb_row

@@ -51,7 +51,7 @@ def kdop_ray(ray: Ray, box: BoxRay, middle: wp.vec3) -> KdopRay:
 def ray_kdop(ray: KdopRay, lo: wp.vec3, hi: wp.vec3, cut_lo: wp.vec4, cut_hi: wp.vec4, t_max: float) -> float:
     """Distance at which the segment [t_min, t_max] enters the box lo .. hi; inf where it misses that, or the line misses the rest.
 
-    Conservative as ray_aabb. The planes askew stand around triangles, not around their boxes, and a hit's t is held to its box
+    Conservative as ray_aabb. The planes askew stand around triangles, not around their boxes, and a hit's t is clamped to its box
     only: where a ray grazes a triangle t may be before they begin. So they may say that the line passes by, but not where.
     """
     interval = slab_interval(ray.box, lo, hi)

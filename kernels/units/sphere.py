@@ -10,7 +10,7 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.units.box import FAR_PAD, BoxRay
-from wrt.kernels.units.triangle import held, padded_interval
+from wrt.kernels.units.triangle import clamped, padded_interval
 
 
 @wp.func
@@ -42,8 +42,8 @@ def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
     interval = padded_interval(box, center - extent, center + extent)
     if not interval[0] <= interval[1] * FAR_PAD:
         return hit
-    t_0 = held(t_0, interval)
-    t_1 = held(t_1, interval)
+    t_0 = clamped(t_0, interval)
+    t_1 = clamped(t_1, interval)
     t = wp.where(t_0 >= ray.t_min, t_0, t_1)
     if t >= ray.t_min and wp.isfinite(t):
         hit.t = t

@@ -13,9 +13,11 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray
 from wrt.kernels.units.box import FAR_PAD, BoxRay, box_pad, padded_hi, padded_lo, slab_interval
 
-# How far holding t to its box may move it through rounding: seven of them (wrt.lab.oracle.bounds), and one step of a denormal t.
-HELD_ROUNDING = wp.constant(7.0 * 2.0**-24)
-HELD_STEP = wp.constant(2.0**-149)
+# How far clamping t to its box may move it through rounding: seven of them (wrt.lab.oracle.bounds), and one step of a denormal t.
+CLAMP_ROUNDING = wp.constant(7.0 * 2.0**-24)
+CLAMP_STEP = wp.constant(2.0**-149)
+# A ray that crosses an axis by less than this part of its way, or of its length, may have a shear that underflowed.
+SLOWEST = wp.constant(2.0**-120)
 
 
 @wp.struct
@@ -60,6 +62,33 @@ def triangle_ray(ray: Ray) -> TriangleRay:
 
 
 @wp.func
+def sheared(v: wp.vec3, shear_x: float, shear_y: float) -> wp.vec3:
+    """A corner, relative to the origin and in the ray's order of axes, moved so that the ray is the z axis."""
+    return wp.vec3(v[0] - shear_x * v[2], v[1] - shear_y * v[2], v[2])
+
+
+@wp.func
+def seen(v: wp.vec3, shear: TriangleRay) -> wp.vec3:
+    """A corner, relative to the origin in world space, as the ray sees it."""
+    turned = wp.vec3(component(v, shear.kx), component(v, shear.ky), component(v, shear.kz))
+    return sheared(turned, shear.shear_x, shear.shear_y)
+
+
+@wp.func
+def edge_areas(a: Any, b: Any, c: Any):
+    """Twice the signed areas of the z axis with each edge: of bc, ca, ab."""
+    return type(a)(c[0] * b[1] - c[1] * b[0], a[0] * c[1] - a[1] * c[0], b[0] * a[1] - b[1] * a[0])
+
+
+@wp.func
+def outside(areas: Any) -> bool:
+    """Whether two of the areas have different signs: the z axis passes the triangle. NaN has no sign."""
+    zero = areas.dtype(0.0)
+    return ((areas[0] < zero or areas[1] < zero or areas[2] < zero)
+            and (areas[0] > zero or areas[1] > zero or areas[2] > zero))
+
+
+@wp.func
 def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> Hit:
     """Both sides count. The hit lies on the whole line: t may be negative. prim_id is 0 on a hit, else NO_HIT.
 
@@ -75,37 +104,22 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
     hit = Hit()
     hit.prim_id = NO_HIT
     hit.t = float(wp.inf)
-    a = v0 - origin
-    b = v1 - origin
-    c = v2 - origin
-    a_z = component(a, shear.kz)
-    b_z = component(b, shear.kz)
-    c_z = component(c, shear.kz)
-    a_x = component(a, shear.kx) - shear.shear_x * a_z
-    a_y = component(a, shear.ky) - shear.shear_y * a_z
-    b_x = component(b, shear.kx) - shear.shear_x * b_z
-    b_y = component(b, shear.ky) - shear.shear_y * b_z
-    c_x = component(c, shear.kx) - shear.shear_x * c_z
-    c_y = component(c, shear.ky) - shear.shear_y * c_z
-
-    area_0 = c_x * b_y - c_y * b_x
-    area_1 = a_x * c_y - a_y * c_x
-    area_2 = b_x * a_y - b_y * a_x
-    if (area_0 < 0.0 or area_1 < 0.0 or area_2 < 0.0) and (area_0 > 0.0 or area_1 > 0.0 or area_2 > 0.0):
+    a = seen(v0 - origin, shear)
+    b = seen(v1 - origin, shear)
+    c = seen(v2 - origin, shear)
+    if outside(edge_areas(a, b, c)):
         return hit
-
-    w_0 = wp.float64(c_x) * wp.float64(b_y) - wp.float64(c_y) * wp.float64(b_x)
-    w_1 = wp.float64(a_x) * wp.float64(c_y) - wp.float64(a_y) * wp.float64(c_x)
-    w_2 = wp.float64(b_x) * wp.float64(a_y) - wp.float64(b_y) * wp.float64(a_x)
+    areas = edge_areas(wp.vec3d(a), wp.vec3d(b), wp.vec3d(c))
+    if outside(areas):
+        return hit
+    area = areas[0] + areas[1] + areas[2]
     zero = wp.float64(0.0)
-    if (w_0 < zero or w_1 < zero or w_2 < zero) and (w_0 > zero or w_1 > zero or w_2 > zero):
-        return hit
-    area = w_0 + w_1 + w_2
     if not (area < zero or area > zero):
         return hit
-    hit.t = float((w_0 * wp.float64(a_z) + w_1 * wp.float64(b_z) + w_2 * wp.float64(c_z)) / area * wp.float64(shear.shear_z))
-    hit.u = float(w_1 / area)
-    hit.v = float(w_2 / area)
+    z = areas[0] * wp.float64(a[2]) + areas[1] * wp.float64(b[2]) + areas[2] * wp.float64(c[2])
+    hit.t = float(z / area * wp.float64(shear.shear_z))
+    hit.u = float(areas[1] / area)
+    hit.v = float(areas[2] / area)
     hit.prim_id = 0
     return hit
 
@@ -129,7 +143,7 @@ def padded_interval(ray: BoxRay, lo: wp.vec3, hi: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def held(t: float, interval: wp.vec2) -> float:
+def clamped(t: float, interval: wp.vec2) -> float:
     """t moved into the interval; its entry where the interval is empty."""
     inside = wp.where(t > interval[1], interval[1], t)
     return wp.where(inside < interval[0], interval[0], inside)
@@ -137,13 +151,13 @@ def held(t: float, interval: wp.vec2) -> float:
 
 @wp.func
 def underflowed(ray: BoxRay, t: float, moved: float) -> bool:
-    """Whether holding t to a box moved it farther than rounding explains, on a ray whose shear may have underflowed.
+    """Whether clamping t to a box moved it farther than rounding explains, on a ray whose shear may have underflowed.
 
     Such a ray crosses some axis by less than 2^-120 on its way to t, or by less than 2^-120 of its length. What underflows puts the
     sheared corners off by 2^-150 (1 + the distance): of any other ray's way that is 2^-29 at most, but divided by such a component
     of the direction, as in the distance to a slab, it is any length.
     """
-    if not wp.abs(moved - t) > HELD_ROUNDING * wp.abs(t) + HELD_STEP:
+    if not wp.abs(moved - t) > CLAMP_ROUNDING * wp.abs(t) + CLAMP_STEP:
         return False
     steep = float(wp.inf)
     grazing = float(0.0)
@@ -151,7 +165,7 @@ def underflowed(ray: BoxRay, t: float, moved: float) -> bool:
         inverse = wp.abs(ray.inv_dir[axis])
         steep = wp.where(inverse < steep, inverse, steep)
         grazing = wp.where(inverse > grazing and inverse < wp.inf, inverse, grazing)
-    least = wp.static(2.0**-120) * grazing
+    least = SLOWEST * grazing
     return steep < least or (wp.abs(t) < least and wp.abs(moved) < least)
 
 
@@ -167,18 +181,18 @@ def within_bounds(ray: BoxRay, t: float, lo: wp.vec3, hi: wp.vec3) -> float:
     never be in the box. It is in the padded box: t is then only moved into the interval of that.
     """
     interval = slab_interval(ray, lo, hi)
-    moved = held(t, interval)
+    moved = clamped(t, interval)
     if not interval[0] <= interval[1] or underflowed(ray, t, moved):
         interval = padded_interval(ray, lo, hi)
         if not interval[0] <= interval[1] * FAR_PAD:
             return float(wp.inf)
-        moved = held(t, interval)
+        moved = clamped(t, interval)
     return moved
 
 
 @wp.func
 def ray_triangle(box: BoxRay, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> Hit:
-    """The default unit: watertight, with t held to the triangle's own box."""
+    """The default unit: watertight, with t clamped to the triangle's own box."""
     hit = watertight(box.origin, shear, v0, v1, v2)
     if hit.prim_id != NO_HIT:
         hit.t = within_bounds(box, hit.t, lower(lower(v0, v1), v2), upper(upper(v0, v1), v2))
@@ -273,19 +287,18 @@ def baldwin_weber(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: PlanePrim
 
 
 class TriangleTest(NamedTuple):
-    """One way to test a triangle: the unit, the record it reads, and whether it needs the watertight test's set-up.
-
-    How corners become records is told by wrt.accel.triangle_data, under the same name.
-    """
+    """One way to test a triangle: the unit, the record that it reads, how corners are written to a record (a name in
+    wrt.accel.triangle_data.LAYOUTS), and whether it needs the watertight test's set-up."""
 
     intersect: Any
     record: Any
+    layout: str
     uses_shear: bool = False
 
 
 RAY_TRIANGLE = {
-    "watertight": TriangleTest(watertight_triangle, Primitive, uses_shear=True),
-    "moeller_trumbore": TriangleTest(moeller_trumbore, Primitive),
-    "baldwin_weber": TriangleTest(baldwin_weber, PlanePrimitive),
-    "plane": TriangleTest(plane_equation, PlanePrimitive),
+    "watertight": TriangleTest(watertight_triangle, Primitive, "corners", uses_shear=True),
+    "moeller_trumbore": TriangleTest(moeller_trumbore, Primitive, "edges"),
+    "baldwin_weber": TriangleTest(baldwin_weber, PlanePrimitive, "transform"),
+    "plane": TriangleTest(plane_equation, PlanePrimitive, "transform"),
 }

@@ -1,34 +1,34 @@
 """The traversal unit of the wide BVHs: nodes of 4 or 8 children, whose boxes are tested as one row, like the triangles of a leaf.
 
 Wald, Benthin and Boulos 2008, "Getting Rid of Packets"; Afra and Ernst 2008 and 2010 for one ray at a time. A row of triangles
-is only sifted: those that the watertight unit would refuse in float32 are left out, and the unit itself decides on the others,
-so that the answers are its own to the last bit. Children are visited from the near to the far: the nearest at once, the others
-by way of the stack, the farthest deepest; what was popped and begins beyond the closest hit is dropped. Any hit asks for no
-order: there the last child comes first, and the builder puts leaves and large boxes last.
+is only culled: those that the watertight unit would refuse in float32 are left out, and the unit itself decides on the others, so
+that the answers are its own to the last bit. Any other triangle test gets every primitive of a leaf. Children are visited from
+the near to the far: the nearest at once, the others by way of the stack, the farthest deepest; what was popped and begins beyond
+the closest hit is dropped. Any hit asks for no order: there the last child comes first, and the builder puts leaves and large
+boxes last.
 """
 
 from functools import cache
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray, Surfaces
+from wrt.kernels.query import LARGEST
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.units.triangle import component
-from wrt.kernels.wide.lanes import EMPTY, LaneRay, make_lanes
-from wrt.kernels.wide.nodes import first_reference, make_box_test, node_size
+from wrt.kernels.wide.lanes import LaneRay, bits, lowest, make_cull, prefetch
+from wrt.kernels.wide.native import source
+from wrt.kernels.wide.nodes import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, far_pad, first_reference, make_nodes, node_size
+from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 
-# The builder lets no walk have more entries than this (kernels.build_wide.collapse).
+# The builder lets no walk have more entries than this (kernels.build.wide.collapse).
 STACK_SIZE = 64
-# A reference is EMPTY, an inner node's index, or -1 - (LEAF_RANGE * (where its primitives begin) + number of primitives - 1).
-LEAF_RANGE = 64
-# Where an endless ray ends for the boxes: one that is entered at infinity is not entered.
-MAX_T = wp.constant(3.4028234663852886e38)
 
 
 @cache
 def make_struct(record):
-    """nodes: as in kernels.wide_nodes, the root first. primitives: rows of as many primitives as a node has children: first the
+    """nodes: as in kernels.wide.nodes, the root first. primitives: rows of as many primitives as a node has children: first the
     first number of `record` of all of them, then the second ... Leaves begin with a row of their own, and their references count
     rows; where nodes are compressed, leaves follow each other without a gap, and references count primitives."""
 
@@ -41,17 +41,22 @@ def make_struct(record):
     return WideBvh
 
 
-stack_type = wp.types.vector(STACK_SIZE, wp.uint64)
-
-# Warp sets every new vector to 0: of these 512 bytes most rays use a few.
-EMPTY_STACK = """
-    alignas(TYPE) char memory[sizeof(TYPE)];
-    return *(TYPE*)memory;
-"""
+def row_size(record, width: int) -> int:
+    """Numbers of a row of primitives."""
+    return record.numpy_dtype()["itemsize"] // 4 * width
 
 
-@wp.func_native(EMPTY_STACK.replace("TYPE", f"wp::vec_t<{STACK_SIZE}, wp::uint64>"))
-def empty_stack() -> stack_type: ...
+@cache
+def make_uninitialized(length: int, dtype):
+    """A vector of whatever memory holds: Warp sets every new one to 0, and of a stack's 512 bytes most rays use a few."""
+
+    @wp.func_native(source("uninitialized.h", TYPE=f"wp::vec_t<{length}, wp::{dtype.__name__}>"))
+    def uninitialized() -> wp.types.vector(length, dtype): ...
+
+    return uninitialized
+
+
+empty_stack = make_uninitialized(STACK_SIZE, wp.uint64)
 
 
 @wp.func
@@ -72,14 +77,14 @@ def t_of(key: wp.uint64) -> float:
 
 @wp.func
 def lane_ray(probe: Probe, pad: float) -> LaneRay:
-    """Set-up, once a ray. pad: what widens the far distances."""
+    """Set-up, once a ray. pad: nodes.far_pad."""
     out = LaneRay()
     out.box = probe.box
     out.box.t_min = probe.box.t_min + 0.0  # not -0: entries are sorted by their bits
     out.far_inv_dir = pad * probe.box.inv_dir
-    out.near_x = wp.where(probe.box.inv_dir[0] < 0.0, 1, 0)
-    out.near_y = wp.where(probe.box.inv_dir[1] < 0.0, 3, 2)
-    out.near_z = wp.where(probe.box.inv_dir[2] < 0.0, 5, 4)
+    out.near_x = wp.where(probe.box.inv_dir[0] < 0.0, HI_X, LO_X)
+    out.near_y = wp.where(probe.box.inv_dir[1] < 0.0, HI_Y, LO_Y)
+    out.near_z = wp.where(probe.box.inv_dir[2] < 0.0, HI_Z, LO_Z)
     out.kx = probe.triangle.kx
     out.ky = probe.triangle.ky
     out.kz = probe.triangle.kz
@@ -92,46 +97,32 @@ def lane_ray(probe: Probe, pad: float) -> LaneRay:
 
 @cache
 def make_gather(record, width):
-    """One lane of a block of rows as a record."""
-    value, bits = make_lanes(width).value, make_lanes(width).bits
+    """gather(rows, i): the record that has its first number at rows[i], the next at rows[i + width] and so on."""
+
+    @wp.func_native(source("gather.h", WIDTH=width))
+    def copy_numbers(rows: wp.array(dtype=wp.float32), i: int, out: wp.ref[record]): ...
 
     @wp.func
-    def gather_corners(rows: wp.array(dtype=wp.float32), i: int) -> Primitive:
-        out = Primitive()
-        out.v0 = wp.vec3(value(rows, i), value(rows, i + width), value(rows, i + 2 * width))
-        out.v1 = wp.vec3(value(rows, i + 3 * width), value(rows, i + 4 * width), value(rows, i + 5 * width))
-        out.v2 = wp.vec3(value(rows, i + 6 * width), value(rows, i + 7 * width), value(rows, i + 8 * width))
-        out.prim_id = bits(rows, i + 9 * width)
+    def gather(rows: wp.array(dtype=wp.float32), i: int) -> record:
+        out = record()
+        copy_numbers(rows, i, out)
         return out
 
-    @wp.func
-    def plane(rows: wp.array(dtype=wp.float32), i: int) -> wp.vec4:
-        return wp.vec4(value(rows, i), value(rows, i + width), value(rows, i + 2 * width), value(rows, i + 3 * width))
-
-    @wp.func
-    def gather_planes(rows: wp.array(dtype=wp.float32), i: int) -> PlanePrimitive:
-        out = PlanePrimitive()
-        out.a = plane(rows, i)
-        out.b = plane(rows, i + 4 * width)
-        out.c = plane(rows, i + 8 * width)
-        out.prim_id = bits(rows, i + 12 * width)
-        return out
-
-    return {Primitive: gather_corners, PlanePrimitive: gather_planes}[record]
+    return gather
 
 
 def make_row_test(units: Units, any_hit, accepts, width):
     """The unit that tests those primitives of a row that are in the mask; its numbers begin at `first`."""
     intersect = make_intersect(units, accepts)
     gather = make_gather(units.triangle_test.record, width)
-    candidates, lowest = make_lanes(width).candidates, make_lanes(width).lowest
-    sifted = units.triangle == "watertight"
+    cull = make_cull(width)
+    culled = units.triangle == "watertight"
 
     @wp.func
     def test_row(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces, probe: Probe, ray: LaneRay,
                  best: Hit) -> Hit:
-        if wp.static(sifted):
-            mask = mask & candidates(rows, first, ray)
+        if wp.static(culled):
+            mask = mask & cull(rows, first, ray)
         while mask != 0:
             best = intersect(probe, surfaces, gather(rows, first + lowest(mask)), best)
             mask = mask & (mask - 1)
@@ -143,28 +134,39 @@ def make_row_test(units: Units, any_hit, accepts, width):
     return test_row
 
 
+@cache
+def make_call_in(record, width: int, compressed: bool, lines: int):
+    """call_in(nodes, primitives, reference): the first cache lines of what a reference leads to, as it is needed soon."""
+    unit = 1 if compressed else width  # of primitives, in which references count
+
+    @wp.func
+    def call_in(nodes: wp.array(dtype=wp.float32), primitives: wp.array(dtype=wp.float32), reference: int):
+        if reference >= 0:
+            prefetch(nodes, reference * wp.static(node_size(width, compressed)), lines)
+        else:
+            prefetch(primitives, leaf_first(reference) * unit / width * wp.static(row_size(record, width)), lines)
+
+    return call_in
+
+
 def make_traversal(units: Units, any_hit: bool, accepts, width: int, compressed: bool):
     """The closest hit, or any (the first that is found), in a tree of nodes of `width` children."""
-    lanes = make_lanes(width)
-    lowest, bits, prefetch = lanes.lowest, lanes.bits, lanes.prefetch
-    entries, entered, pad = make_box_test(units.box, width, compressed)
+    entries, entered = make_nodes(width, compressed, units.box)
     probe_of = make_probe(units)
     test_row = make_row_test(units, any_hit, accepts, width)
-    fetch_node, fetch_primitive, push, finish = make_counters(units, 4 * node_size(width, compressed))
-    struct = make_struct(units.triangle_test.record)
     size_of_node = node_size(width, compressed)
+    fetch_node, fetch_primitive, push, finish = make_counters(units, 4 * size_of_node)
+    record = units.triangle_test.record
+    struct = make_struct(record)
+    call_in = make_call_in(record, width, compressed, 2)
     references = first_reference(width, compressed)
     unit = 1 if compressed else width  # of primitives, in which references count
-    row_size = units.triangle_test.record.numpy_dtype()["itemsize"] // 4 * width
 
     @wp.func
     def child(accel: struct, at: int) -> int:
-        """The reference at `at`; what it refers to is called into the cache, as it is needed soon."""
+        """The reference at `at`."""
         reference = bits(accel.nodes, at)
-        if reference >= 0:
-            prefetch(accel.nodes, reference * wp.static(size_of_node))
-        else:
-            prefetch(accel.primitives, (-1 - reference) / LEAF_RANGE * unit / width * wp.static(row_size))
+        call_in(accel.nodes, accel.primitives, reference)
         return reference
 
     @wp.func
@@ -179,8 +181,8 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int, compressed:
 
     @wp.func
     def test_leaf(accel: struct, surfaces: Surfaces, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
-        begin = (-1 - reference) / LEAF_RANGE * unit
-        end = begin + (-1 - reference) % LEAF_RANGE + 1
+        begin = leaf_first(reference) * unit
+        end = begin + leaf_count(reference)
         while begin < end:
             row = begin / width
             lane = int(0)
@@ -188,7 +190,7 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int, compressed:
                 lane = begin - row * width
             n = wp.min(width - lane, end - begin)
             mask = ((2 << (n - 1)) - 1) << lane
-            best = test_row(accel.primitives, row * wp.static(row_size), mask, surfaces, probe, rows, best)
+            best = test_row(accel.primitives, row * wp.static(row_size(record, width)), mask, surfaces, probe, rows, best)
             if wp.static(any_hit):
                 if best.prim_id != NO_HIT:
                     return best
@@ -198,9 +200,9 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int, compressed:
     @wp.func
     def count_leaf(accel: struct, ray: Ray, counts: Counts, reference: int) -> Counts:
         if wp.static(units.counters):
-            first = (-1 - reference) / LEAF_RANGE * unit
+            first = leaf_first(reference) * unit
             counts.leaves += 1
-            for j in range((-1 - reference) % LEAF_RANGE + 1):
+            for j in range(leaf_count(reference)):
                 counts = fetch_primitive(accel.recorder, ray, counts, first + j)
         return counts
 
@@ -213,9 +215,9 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int, compressed:
     @wp.func
     def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
         probe = probe_of(ray)
-        rows = lane_ray(probe, wp.static(float(pad)))
+        rows = lane_ray(probe, wp.static(far_pad(units.box)))
         best = no_hit(ray)
-        best.t = wp.where(best.t < MAX_T, best.t, MAX_T)
+        best.t = wp.where(best.t < LARGEST, best.t, LARGEST)  # a box that is entered at infinity is not entered
         counts = Counts()
         stack = empty_stack()
         size = int(0)

@@ -8,7 +8,7 @@ from hashlib import sha256
 
 import numpy as np
 
-from wrt.accel.triangle_data import TRIANGLE_DATA
+from wrt.accel.triangle_data import LAYOUTS
 from wrt.core.device import records, run_all
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST
@@ -86,7 +86,7 @@ class Geometry:
             triangle = prim_id[some] < len(self.faces) if units.spheres else slice(None)
             part = out[some][triangle]
             faces = self.faces.take(part["prim_id"], axis=0)
-            TRIANGLE_DATA[units.triangle](part, *(self.vertices.take(faces[:, i], axis=0) for i in range(3)))
+            LAYOUTS[units.triangle_test.layout](part, *(self.vertices.take(faces[:, i], axis=0) for i in range(3)))
             if units.spheres:
                 out[some][triangle] = part
 

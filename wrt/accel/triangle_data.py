@@ -1,4 +1,4 @@
-"""How corners become what a triangle test reads: one layout for each entry of kernels.ray_triangle.RAY_TRIANGLE."""
+"""How corners become what a triangle test reads: LAYOUTS, which rows of kernels.units.triangle.RAY_TRIANGLE name."""
 
 from __future__ import annotations
 
@@ -39,9 +39,8 @@ def transform(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray
             record[name] = np.where(np.isfinite(row).all(axis=1, keepdims=True), row, np.float32(0.0))
 
 
-TRIANGLE_DATA: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]] = {
-    "watertight": corners,
-    "moeller_trumbore": edges,
-    "baldwin_weber": transform,
-    "plane": transform,
+LAYOUTS: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]] = {
+    "corners": corners,
+    "edges": edges,
+    "transform": transform,
 }

@@ -12,7 +12,7 @@ import warp as wp
 
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
-from wrt.accel.triangle_data import TRIANGLE_DATA
+from wrt.accel.triangle_data import LAYOUTS
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, kernel
 from wrt.kernels.units.box import box_ray
 from wrt.kernels.units.triangle import RAY_TRIANGLE, ray_triangle, triangle_ray, watertight
@@ -49,7 +49,7 @@ def run(origin, direction, triangle, which="unit"):
     triangle = np.asarray(triangle, np.float32).reshape(-1, 3, 3)
     n = max(len(origin), len(direction), len(triangle))
     record = np.zeros(len(triangle), dtype=Primitive.numpy_dtype())
-    TRIANGLE_DATA["watertight"](record, *(np.ascontiguousarray(triangle[:, i]) for i in range(3)))
+    LAYOUTS["corners"](record, *(np.ascontiguousarray(triangle[:, i]) for i in range(3)))
     rows = [np.broadcast_to(a, (n, 3)) for a in (origin, direction, record["v0"], record["v1"], record["v2"])]
     line, unit = zeros(n, Hit), zeros(n, Hit)
     launch(triangle_kernel, n, *(vec3s(a) for a in rows), line, unit)
@@ -422,8 +422,8 @@ def closest(test, origin, direction, triangle):
     return build(geometry, "brute_force", triangle=test).closest_hit(origin, direction)
 
 
-def test_every_test_has_its_records():
-    assert set(TRIANGLE_DATA) == set(RAY_TRIANGLE) and next(iter(RAY_TRIANGLE)) == "watertight"
+def test_every_test_names_a_layout():
+    assert {test.layout for test in RAY_TRIANGLE.values()} == set(LAYOUTS) and next(iter(RAY_TRIANGLE)) == "watertight"
 
 
 @pytest.mark.parametrize("test", RAY_TRIANGLE)

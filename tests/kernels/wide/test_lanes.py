@@ -1,4 +1,4 @@
-"""Rows of lanes: the native functions say, bit for bit, what their twins of plain Warp say."""
+"""Rows of lanes: the C++ for the CPU says, bit for bit, what the plain Warp for CUDA says."""
 
 from functools import cache
 
@@ -13,9 +13,8 @@ from wrt.kernels.query import RayArrays, load_ray
 from wrt.kernels.structs import Ray, kernel
 from wrt.kernels.traverse.common import Units, make_probe
 from wrt.kernels.units.box import FAR_PAD, box_ray, ray_aabb
-from wrt.kernels.wide.lanes import LANE_PAD, make_lanes, make_twins, row_type
-from wrt.kernels.wide.nodes import make_nodes, node_size
-from wrt.kernels.wide.nodes import make_twins as node_twins
+from wrt.kernels.wide.lanes import LANE_PAD, lowest, make_native_cull, make_plain_cull, row_type
+from wrt.kernels.wide.nodes import make_native, make_plain, node_size
 from wrt.kernels.wide.traverse import lane_ray
 
 WIDTHS = (4, 8)
@@ -23,8 +22,7 @@ WIDTHS = (4, 8)
 
 @cache
 def both_kernel(width, compressed):
-    """Each function by its native form and by its twin: of node i of `nodes` and block i of `rows` for ray i."""
-    native, twin = make_lanes(width), make_twins(width)
+    """The native form and the plain one: of node i of `nodes` and block i of `rows` for ray i."""
     row = row_type(width)
     probe_of = make_probe(Units())
 
@@ -33,11 +31,8 @@ def both_kernel(width, compressed):
         entries: wp.array(dtype=row)
         entered: wp.array(dtype=wp.int32)
         candidates: wp.array(dtype=wp.int32)
-        lowest: wp.array(dtype=wp.int32)
-        value: wp.array(dtype=wp.float32)
-        bits: wp.array(dtype=wp.int32)
 
-    def make(unit, nodes_unit):
+    def make(cull, nodes_unit):
         entries, entered = nodes_unit
 
         @kernel
@@ -47,19 +42,14 @@ def both_kernel(width, compressed):
             lanes = lane_ray(probe_of(ray), LANE_PAD)
             first = i * wp.static(9 * width)
             node = i * wp.static(node_size(width, compressed))
-            unit.prefetch(rows, first)
             out.entries[i] = entries(nodes, node, lanes)
-            mask = entered(nodes, node, lanes, ray.t_max)
-            out.entered[i] = mask
-            if mask != 0:
-                out.lowest[i] = unit.lowest(mask)
-            out.candidates[i] = unit.candidates(rows, first, lanes)
-            out.value[i] = unit.value(rows, first + 1)
-            out.bits[i] = unit.bits(rows, first + 1)
+            out.entered[i] = entered(nodes, node, lanes, ray.t_max)
+            out.candidates[i] = cull(rows, first, lanes)
 
         return run
 
-    return Out, make(native, make_nodes(width, compressed)), make(twin, node_twins(width, compressed))
+    return (Out, make(make_native_cull(width), make_native(width, compressed)),
+            make(make_plain_cull(width), make_plain(width, compressed)))
 
 
 def results(width, compressed, nodes, rows, rays):
@@ -72,9 +62,7 @@ def results(width, compressed, nodes, rows, rays):
         n = len(origin)
         out = out_type()
         out.entries = zeros(n, row_type(width))
-        for name in ("entered", "candidates", "lowest", "bits"):
-            setattr(out, name, zeros(n, wp.int32))
-        out.value = zeros(n)
+        out.entered, out.candidates = zeros(n, wp.int32), zeros(n, wp.int32)
         launch(run, n, floats(nodes.reshape(-1)), floats(rows.reshape(-1)), arrays, out)
         answers.append({name: getattr(out, name).numpy() for name in out._cls.vars})
     return answers
@@ -99,14 +87,16 @@ def compressed_nodes(rng, n, width, origins):
     return nodes
 
 
-def assert_same(native, twin):
-    for name in native:
-        np.testing.assert_array_equal(native[name].view(np.int32), twin[name].view(np.int32), err_msg=name)
+def assert_same(native, plain, width):
+    for name in ("entered", "candidates"):
+        np.testing.assert_array_equal(native[name], plain[name], err_msg=name)
+    entered = (native["entered"][:, None] >> np.arange(width) & 1).astype(bool)
+    np.testing.assert_array_equal(native["entries"][entered].view(np.int32), plain["entries"][entered].view(np.int32))
 
 
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("width", WIDTHS)
-def test_native_functions_equal_their_twins_on_random_rows(width, compressed):
+def test_both_forms_agree_on_random_rows(width, compressed):
     rng = np.random.default_rng(width)
     n = 20_000
     rows, lo = rng.normal(size=(n, 9, width)), rng.normal(size=(n, width, 3))
@@ -117,15 +107,15 @@ def test_native_functions_equal_their_twins_on_random_rows(width, compressed):
         nodes[:, :-width] = compress(lo.astype(np.float32), hi.astype(np.float32), rng.random((n, width)) < 0.8)
     t_min = np.where(rng.random(n) < 0.5, 0.0, rng.random(n))
     rays = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), t_min, t_min + rng.exponential(3.0, n)
-    native, twin = results(width, compressed, nodes, rows, rays)
-    assert_same(native, twin)
+    native, plain = results(width, compressed, nodes, rows, rays)
+    assert_same(native, plain, width)
     for name in ("entered", "candidates"):
         assert 0.01 < np.unpackbits(native[name].astype(np.uint8)).sum() / (n * width) < 0.98
 
 
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("width", WIDTHS)
-def test_native_functions_equal_their_twins_where_numbers_are_special(width, compressed):
+def test_both_forms_agree_where_numbers_are_special(width, compressed):
     # Planes through the origin, directions with +-0, empty boxes, denormals, overflow, infinities and NaN.
     rng = np.random.default_rng(10 + width)
     n = 40_000
@@ -136,26 +126,22 @@ def test_native_functions_equal_their_twins_where_numbers_are_special(width, com
     direction = rng.choice(special[:5], (n, 3))
     direction[~direction.any(axis=1)] = 1.0
     rays = rng.choice(special[:9], (n, 3)), direction, rng.choice(ends[:4], n), rng.choice(ends, n)
-    native, twin = results(width, compressed, nodes, rng.choice(special, (n, 9, width)), rays)
-    assert_same(native, twin)
+    native, plain = results(width, compressed, nodes, rng.choice(special, (n, 9, width)), rays)
+    assert_same(native, plain, width)
     assert 0 < native["entered"].astype(bool).mean() < 1
 
 
-@pytest.mark.parametrize("width", WIDTHS)
-def test_lowest_is_the_lowest_bit(width):
-    masks = np.arange(1, 1 << width, dtype=np.int32)
-    native, twin = make_lanes(width).lowest, make_twins(width).lowest
+@kernel
+def lowest_bits(mask: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    out[i] = lowest(mask[i])
 
-    @kernel
-    def run(mask: wp.array(dtype=wp.int32), a: wp.array(dtype=wp.int32), b: wp.array(dtype=wp.int32)):
-        i = wp.tid()
-        a[i] = native(mask[i])
-        b[i] = twin(mask[i])
 
-    a, b = zeros(len(masks), wp.int32), zeros(len(masks), wp.int32)
-    launch(run, len(masks), ints(masks), a, b)
-    expected = [bin(mask)[::-1].index("1") for mask in masks]
-    assert a.numpy().tolist() == b.numpy().tolist() == expected
+def test_lowest_is_the_lowest_bit():
+    masks = np.arange(1, 256, dtype=np.int32)
+    out = zeros(len(masks), wp.int32)
+    launch(lowest_bits, len(masks), ints(masks), out)
+    assert out.numpy().tolist() == [bin(mask)[::-1].index("1") for mask in masks]
 
 
 @kernel

@@ -8,17 +8,27 @@ import pytest
 from tests.kernel_tools import floats, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.kernels.query import RayArrays, direction_scale, load_ray
+from wrt.kernels.query import LARGEST, RayArrays, direction_scale, load_ray
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 from wrt.kernels.wide import packets
-from wrt.kernels.wide.lanes import LANE_PAD, make_twins, row_type
-from wrt.kernels.wide.nodes import make_twins as node_twins
-from wrt.kernels.wide.packets import ENTRY, LANES, MET, PACKET_SIZE, ROWS, STACK_WORDS, TO_POP
-from wrt.kernels.wide.stream import COHERENT, PACKETS, SLOTS, WORDS
-from wrt.kernels.wide.traverse import MAX_T, lane_ray
+from wrt.kernels.wide.batch import PACKETS, SLOTS
+from wrt.kernels.wide.lanes import LANE_PAD, make_plain_cull, row_type
+from wrt.kernels.wide.nodes import make_plain
+from wrt.kernels.wide.packets import (
+    CHILD_ENTRY,
+    CHILD_RAYS,
+    COHERENT,
+    LANES,
+    PACKET_SIZE,
+    ROWS,
+    SLOT_SIZE,
+    STACK_WORDS,
+    TO_POP,
+    WIDTH,
+)
+from wrt.kernels.wide.traverse import lane_ray
 
-WIDTH = 8
 NOTHING = wp.constant(99)
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, -1e-40, 3e38, -3e38, np.inf, -np.inf, np.nan], np.float32)
 
@@ -52,19 +62,19 @@ def by_packets(rays: RayArrays, count: int, reach: float, nodes: wp.array(dtype=
         out.children[i] = packets.children(nodes, 64 * i, mask, packet, base)
     for j in range(LANES):
         ray = LANES * i + j
-        slot = ray * WORDS
+        slot = ray * SLOT_SIZE
         bottom = ray * STACK_WORDS
-        packets.begin(nodes, rows, packet, base + j, stacks, bottom, slots, slot)
+        packets.begin(nodes, packet, base + j, stacks, bottom, slots, slot)
         out.begun[ray] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
         slots[slot + 1] = i
         slots[slot + 2] = bottom
-        packets.step(nodes, rows, packet, stacks, slots, slot)
+        packets.step(nodes, packet, stacks, slots, slot)
         out.walk[ray, 0] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
         goes_on = bool(True)
         for k in range(WIDTH):
-            goes_on = goes_on and packets.pop(nodes, rows, reach, stacks, bottom, slots, slot)
+            goes_on = goes_on and packets.pop(nodes, reach, stacks, bottom, slots, slot)
             out.walk[ray, k + 1] = wp.where(goes_on, slots[slot + 1], NOTHING)
-        out.candidates[ray] = packets.sift(rows, 80 * i, 255, packet, base + j)
+        out.candidates[ray] = packets.cull(rows, 80 * i, 255, packet, base + j)
 
 
 @kernel
@@ -79,8 +89,8 @@ def triangles_by_packets(rows: wp.array(dtype=wp.float32), state: wp.array(dtype
 def scalar_kernel():
     row = row_type(WIDTH)
     probe_of, intersect = make_probe(Units()), make_intersect(Units())
-    entries, entered = node_twins(WIDTH, False)
-    candidates = make_twins(WIDTH).candidates
+    entries, entered = make_plain(WIDTH, False)
+    cull = make_plain_cull(WIDTH)
 
     @wp.struct
     class Scalars:
@@ -104,7 +114,7 @@ def scalar_kernel():
         probe = probe_of(ray)
         lanes = lane_ray(probe, LANE_PAD)
         best = no_hit(ray)
-        best.t = wp.where(best.t < MAX_T, best.t, MAX_T)
+        best.t = wp.where(best.t < LARGEST, best.t, LARGEST)
         put(out.rows, i, 0, ray.origin)
         put(out.rows, i, 3, probe.box.inv_dir)
         put(out.rows, i, 6, lanes.far_inv_dir)
@@ -122,7 +132,7 @@ def scalar_kernel():
         first = 80 * (i / LANES)
         out.entries[i] = entries(nodes, node, lanes)
         out.entered[i] = entered(nodes, node, lanes, best.t)
-        out.candidates[i] = candidates(rows, first, lanes)
+        out.candidates[i] = cull(rows, first, lanes)
         for j in range(WIDTH):
             k = first + j
             triangle = Primitive()
@@ -139,7 +149,7 @@ def scalar_kernel():
 class Both:
     """Rays, (16 n, 3) each, with a node and a row of triangles for each packet, through both."""
 
-    def __init__(self, rays, nodes, corners, count=LANES, any_hit=False, reach=MAX_T):
+    def __init__(self, rays, nodes, corners, count=LANES, any_hit=False, reach=LARGEST):
         self.rays = RayArrays()
         self.rays.origin, self.rays.direction, self.rays.t_min, self.rays.t_max = (
             vec3s(rays[0]), vec3s(rays[1]), floats(rays[2]), floats(rays[3]))
@@ -153,7 +163,7 @@ class Both:
                              ("candidates", n * LANES), ("walk", (n * LANES, WIDTH + 1))):
             setattr(lanes, name, zeros(length, wp.int32))
         packet, stacks = zeros(n * PACKET_SIZE), zeros(n * LANES * STACK_WORDS, wp.uint32)
-        launch(by_packets, n, self.rays, count, reach, nodes, rows, packet, stacks, zeros(n * LANES * WORDS, wp.int32), lanes)
+        launch(by_packets, n, self.rays, count, reach, nodes, rows, packet, stacks, zeros(n * LANES * SLOT_SIZE, wp.int32), lanes)
         self.state, self.meets, self.children, self.reaching = (
             getattr(lanes, name).numpy() for name in ("state", "meets", "children", "reaching"))
         self.begun, self.walk, self.candidates = (getattr(lanes, name).numpy() for name in ("begun", "walk", "candidates"))
@@ -276,13 +286,13 @@ def test_a_beam_enters_what_one_of_its_rays_enters(name):
     entered = entered.astype(bool) & both.active[..., None]
     np.testing.assert_array_equal(both.meets[:, None] >> np.arange(LANES) & 1, entered.any(axis=2))
     coherent = both.state >= COHERENT
-    masks = both.set_up[:, MET : MET + WIDTH].view(np.int32)
-    told = (both.children[:, None] >> np.arange(WIDTH) & 1).astype(bool)
+    masks = both.set_up[:, CHILD_RAYS : CHILD_RAYS + WIDTH].view(np.int32)
+    met = (both.children[:, None] >> np.arange(WIDTH) & 1).astype(bool)
     expected = (entered << np.arange(LANES)[:, None]).sum(axis=1)
-    np.testing.assert_array_equal(told[coherent], (expected > 0)[coherent])
-    np.testing.assert_array_equal(np.where(told, masks, 0)[coherent], expected[coherent])
+    np.testing.assert_array_equal(met[coherent], (expected > 0)[coherent])
+    np.testing.assert_array_equal(np.where(met, masks, 0)[coherent], expected[coherent])
     first = np.where(entered, both.scalar.entries.numpy().reshape(-1, LANES, WIDTH), np.inf).min(axis=1)
-    assert (both.set_up[:, ENTRY : ENTRY + WIDTH] <= first)[coherent & told.any(axis=1)][told[coherent & told.any(axis=1)]].all()
+    assert (both.set_up[:, CHILD_ENTRY : CHILD_ENTRY + WIDTH] <= first)[coherent[:, None] & met].all()
 
 
 def walked(both, reach=np.inf):
@@ -325,7 +335,7 @@ def test_rays_begin_with_the_nearest_child_of_the_root(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_sifting_leaves_the_candidates_of_the_rows(name):
+def test_culling_leaves_what_the_rows_leave(name):
     both = case(name)
     np.testing.assert_array_equal(both.candidates, both.scalar.candidates.numpy())
 

@@ -11,14 +11,14 @@ import numpy as np
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BvhOptions, build_binary
-from wrt.accel.bvh.compress import children_there, compress, decompress
-from wrt.accel.bvh.wide_tree import MAX_PLACES, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
+from wrt.accel.bvh.compress import compress, decompress, existing_children
+from wrt.accel.bvh.wide_tree import WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
 from wrt.core.device import empty_aligned, record_dtype, run_all
 from wrt.core.errors import InputError
-from wrt.kernels.wide.lanes import EMPTY
-from wrt.kernels.wide.nodes import first_reference, node_size
-from wrt.kernels.wide.stream import StreamTraversal
-from wrt.kernels.wide.traverse import LEAF_RANGE, WideTraversal
+from wrt.kernels.wide.batch import BatchTraversal
+from wrt.kernels.wide.nodes import PLANES, first_reference, node_size
+from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first
+from wrt.kernels.wide.traverse import WideTraversal
 
 ROWS_PER_JOB = 4096
 
@@ -47,8 +47,8 @@ class WideBvh(Accelerator):
         binary = build_binary(self.geometry, options, self.threads)
         tree = (collapse(binary, self.width, max_leaf, cost_traversal, cost_intersection) if len(binary.order) > 1
                 else small_tree(binary, self.width))
-        if self.compressed and len(binary.order) > MAX_PLACES:
-            raise InputError(f"a {self.name} holds at most {MAX_PLACES} primitives, and there are {len(binary.order)}; take bvh8")
+        if self.compressed and len(binary.order) > MAX_FIRST:
+            raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}; take bvh8")
         built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
         return replace(built, sah_cost=(self._tree(built) if self.compressed else tree).sah_cost(tree.root_area))
 
@@ -66,7 +66,7 @@ class WideBvh(Accelerator):
         return np.ascontiguousarray(self._nodes(built)[:, first : first + self.width]).view(np.int32)
 
     def _arrays(self, tree: WideTree) -> dict[str, np.ndarray]:
-        """The node rows of kernels.wide_nodes."""
+        """The node rows of kernels.wide.nodes."""
         n, size, first = len(tree.children), node_size(self.width, self.compressed), first_reference(self.width, self.compressed)
         nodes = np.zeros((n, size), np.float32)
         nodes[:, first : first + self.width] = tree.children.view(np.float32)
@@ -74,7 +74,7 @@ class WideBvh(Accelerator):
             nodes[:, first : first + self.width] = packed(tree.children, 1).view(np.float32)
             nodes[:, :first] = compress(tree.lo, tree.hi, tree.children != EMPTY)
         else:
-            planes = nodes[:, :first].reshape(n, 6, self.width)
+            planes = nodes[:, :first].reshape(n, len(PLANES), self.width)
             planes[:, 0::2], planes[:, 1::2] = tree.lo.transpose(0, 2, 1), tree.hi.transpose(0, 2, 1)
         return {"nodes": nodes.reshape(-1)}
 
@@ -84,7 +84,7 @@ class WideBvh(Accelerator):
         if self.compressed:
             lo, hi = decompress(head, self.width)
         else:
-            planes = head.reshape(-1, 6, self.width)
+            planes = head.reshape(-1, len(PLANES), self.width)
             lo, hi = (np.ascontiguousarray(planes[:, end::2].transpose(0, 2, 1)) for end in range(2))
         children = packed(self._references(built), self.width)
         return WideTree(lo, hi, children, lanes_of(children, built.order, self.width), built.leaves, built.depth, 0)
@@ -115,7 +115,7 @@ class WideBvh(Accelerator):
             raise InputError("is damaged: its nodes are no whole ones")
         references = self._references(built)
         check_wide(references, len(built.order), self._unit)
-        if self.compressed and (children_there(self._nodes(built), self.width) != (references != EMPTY)).any():
+        if self.compressed and (existing_children(self._nodes(built), self.width) != (references != EMPTY)).any():
             raise InputError("is damaged: a node tells of children that it does not have")
         if not self.compressed:
             planes = self._nodes(built)[:, : first_reference(self.width, False)].reshape(-1, 3, 2, self.width)
@@ -133,9 +133,8 @@ class WideBvh(Accelerator):
 
         tree = self._tree(built)
         leaf = tree.children < 0
-        code = -1 - tree.children.astype(np.int64)
-        first = np.where(leaf, code // LEAF_RANGE * self.width, tree.children)
-        count = np.where(leaf, code % LEAF_RANGE + 1, np.where(tree.children == EMPTY, -1, 0))
+        first = np.where(leaf, leaf_first.func(tree.children.astype(np.int64)) * self.width, tree.children)
+        count = np.where(leaf, leaf_count.func(tree.children), np.where(tree.children == EMPTY, -1, 0))
         return children(tree.lo, tree.hi, first, count, tree.order)
 
 
@@ -152,7 +151,7 @@ class Bvh8(WideBvh):
 
     name = "bvh8"
     width = 8
-    kernels = StreamTraversal()
+    kernels = BatchTraversal()
 
 
 class Bvh8c(WideBvh):

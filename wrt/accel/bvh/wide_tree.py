@@ -13,16 +13,14 @@ from wrt.core.device import load_kernel, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import wide as build_wide
 from wrt.kernels.traverse.bvh2 import Bvh2Node
-from wrt.kernels.wide.lanes import EMPTY
-from wrt.kernels.wide.traverse import LEAF_RANGE, STACK_SIZE
-
-MAX_PLACES = 2**31 // LEAF_RANGE  # of leaves' beginnings: what a reference can tell
+from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first, leaf_reference
+from wrt.kernels.wide.traverse import STACK_SIZE
 
 
 @dataclass(frozen=True, eq=False)
 class WideTree:
     """lo, hi: (N, W, 3) float32, the boxes of each node's children, empty where there is none (these come first); children: (N, W)
-    int32, references as in kernels.traverse_wide; order: (rows, W) int32, the prim_id in each lane of the leaves' rows, -1 where
+    int32, references as in kernels.wide.references; order: (rows, W) int32, the prim_id in each lane of the leaves' rows, -1 where
     there is none; leaves: how many; depth: nodes on the longest way from the root; stack: the most entries a walk has."""
 
     lo: np.ndarray
@@ -48,7 +46,7 @@ class WideTree:
     def sah_cost(self, root: float) -> float:
         """Expected node visits plus primitives tested of a random line that meets a root box with this half of its surface (both
         costing 1)."""
-        count = np.where(self.children < 0, (-1 - self.children) % LEAF_RANGE + 1, 1)
+        count = np.where(self.children < 0, leaf_count.func(self.children), 1)
         if not root > 0.0:
             return float((self.order >= 0).sum())
         return 1.0 + float((self.areas * np.where(self.children == EMPTY, 0, count)).sum() / root)
@@ -77,8 +75,8 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
     out.count = wp.zeros(5, dtype=wp.int32, device=cpu)
     wp.launch(build_wide.collapse, dim=1, device=cpu, inputs=[nodes, order, options, trees, out])
     n_nodes, rows, leaves, depth, stack = out.count.numpy().tolist()
-    if rows > MAX_PLACES:
-        raise InputError(f"a wide BVH holds at most {MAX_PLACES} rows of primitives, and these need {rows}; take accel='bvh2'")
+    if rows > MAX_FIRST:
+        raise InputError(f"a wide BVH holds at most {MAX_FIRST} rows of primitives, and these need {rows}; take accel='bvh2'")
     children, lo, hi = (array.numpy()[: n_nodes * width].reshape(-1, width, *array.numpy().shape[1:]).copy()
                         for array in (out.children, out.lo, out.hi))
     return WideTree(lo, hi, children, out.order.numpy()[: rows * width].reshape(-1, width).copy(), leaves, depth, stack)
@@ -90,7 +88,8 @@ def small_tree(tree: BinaryTree, width: int) -> WideTree:
     lo, hi = np.full((1, width, 3), np.inf, np.float32), np.full((1, width, 3), -np.inf, np.float32)
     children, order = np.full((1, width), EMPTY, np.int32), np.full((n, width), -1, np.int32)
     if n:
-        lo[0, -1], hi[0, -1], children[0, -1], order[0, 0] = tree.nodes["lo_0"][0], tree.nodes["hi_0"][0], -1, tree.order[0]
+        lo[0, -1], hi[0, -1], children[0, -1], order[0, 0] = (
+            tree.nodes["lo_0"][0], tree.nodes["hi_0"][0], leaf_reference.func(0, 1), tree.order[0])
     return WideTree(lo, hi, children, order, n, 1, 0)
 
 
@@ -111,24 +110,25 @@ def refit(tree: WideTree, geometry: Geometry) -> WideTree:
 def packed(children: np.ndarray, unit: int) -> np.ndarray:
     """The same references with leaves one after another in units of so many primitives; kernels count rows, or primitives."""
     leaf = children < 0
-    reference = -1 - children[leaf].astype(np.int64)
-    begin, count = np.divmod(reference, LEAF_RANGE)
-    units = -(-(count + 1) // unit)
-    place = np.empty(len(begin), np.int64)
-    in_order = np.argsort(begin, kind="stable")
+    references = children[leaf].astype(np.int64)
+    count = leaf_count.func(references)
+    units = -(-count // unit)
+    place = np.empty(len(count), np.int64)
+    in_order = np.argsort(leaf_first.func(references), kind="stable")
     place[in_order] = np.cumsum(units[in_order]) - units[in_order]
     out = children.copy()
-    out[leaf] = -1 - (LEAF_RANGE * place + count)
+    out[leaf] = leaf_reference.func(place, count)
     return out
 
 
 def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
     """Which primitive stands in each lane of the leaves' rows: (rows, width), -1 where there is none. children: references in
     units of `width`; order: (R,) the prim_id of every record, leaf after leaf as their rows are."""
-    row, count = np.divmod(-1 - children[children < 0], LEAF_RANGE)
-    rows = int((row + count // width).max(initial=-1)) + 1
+    leaves = children[children < 0]
+    row, count = leaf_first.func(leaves), leaf_count.func(leaves)
+    rows = int((row - (-count // width)).max(initial=0))
     at = np.zeros(rows, np.int64)
-    at[row] = count + 1
+    at[row] = count
     row, count = np.flatnonzero(at), at[at > 0]
     out = np.full(rows * width, -1, np.int32)
     out[np.repeat(row * width - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))] = order
@@ -144,10 +144,10 @@ def check_wide(children: np.ndarray, n_primitives: int, unit: int) -> None:
         raise InputError("is damaged: a node leads out of the tree")
     if (np.bincount(children[inner], minlength=n) != (np.arange(n) > 0)).any():
         raise InputError("is damaged: its nodes are no tree")
-    leaf = np.sort(-1 - children[children < 0].astype(np.int64))
-    count = leaf % LEAF_RANGE + 1
+    leaves = -np.sort(-children[children < 0].astype(np.int64))  # references fall where places rise
+    count = leaf_count.func(leaves)
     units = -(-count // unit)
-    if (leaf // LEAF_RANGE != np.cumsum(units) - units).any() or count.sum() != n_primitives:
+    if (leaf_first.func(leaves) != np.cumsum(units) - units).any() or count.sum() != n_primitives:
         raise InputError("is damaged: a leaf leads to other primitives")
     if stack_need(children) > STACK_SIZE:
         raise InputError(f"is damaged: a walk needs more than {STACK_SIZE} entries")

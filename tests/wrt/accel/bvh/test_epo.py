@@ -12,7 +12,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
-from wrt.kernels.wide.traverse import LEAF_RANGE
+from wrt.kernels.wide.references import leaf_count, leaf_first
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
@@ -39,9 +39,9 @@ def wide_nodes(accel: Accelerator, index: int = 0) -> Iterator[Node]:
         if code == 0:
             continue
         below = list(wide_nodes(accel, code)) if code > 0 else []
-        row, count = divmod(-1 - code, LEAF_RANGE) if code < 0 else (0, 0)
-        own = set(tree.order[row:].reshape(-1)[: count + 1].tolist() if code < 0 else ()).union(*(node[3] for node in below))
-        yield lo, hi, count + 1 if code < 0 else 1, own
+        first, count = (leaf_first.func(code), leaf_count.func(code)) if code < 0 else (0, 1)
+        own = set(tree.order[first:].reshape(-1)[:count].tolist() if code < 0 else ()).union(*(node[3] for node in below))
+        yield lo, hi, count, own
         yield from below
 
 

@@ -18,8 +18,8 @@ from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.query import HitArrays
 from wrt.kernels.traverse.common import Units
-from wrt.kernels.wide.lanes import EMPTY
-from wrt.kernels.wide.traverse import LEAF_RANGE, STACK_SIZE
+from wrt.kernels.wide.references import EMPTY, leaf_reference
+from wrt.kernels.wide.traverse import STACK_SIZE
 from wrt.lab.bench.rays import ray_sets
 from wrt.scene.mesh import Mesh, load_mesh
 from wrt.scene.shapes import icosphere
@@ -147,7 +147,7 @@ def chain(k):
         children[i, 8 - count :] = -1
         children[i, 7] = i + 1 if i + 1 < len(counts) else -1
     n = int((children < 0).sum())
-    children[children < 0] = -1 - LEAF_RANGE * np.arange(n)
+    children[children < 0] = leaf_reference.func(np.arange(n), 1)
     mesh = soup(np.random.default_rng(8).normal(size=(n, 3, 3)))
     nodes = np.zeros((len(counts), 8, 8), np.float32)
     nodes[:, 0:6:2] = np.where(children[:, None] != EMPTY, mesh.vertices.min() - 1.0, np.inf)

@@ -1,0 +1,2 @@
+    #include "packet.h"
+    return RAY_MASK(row(T) >= t_entry);

@@ -1,0 +1,11 @@
+    #include "rows.h"
+    const int first = 0;
+    int* const words = slots.data + (long long)slot;
+    const float* q = packet.data + (long long)ray + ROOT_ENTRIES;
+    Row enter;
+    for (int child = 0; child < WIDTH; ++child) enter[child] = q[LANES * child];
+    const auto met = enter < (Row)(__builtin_inff());
+    words[SLOT_RAY] = ray;
+    words[SLOT_PLACE] = bottom;
+    ((unsigned*)stacks.data)[(long long)bottom] = ~0u;
+    #include "ray_push.h"

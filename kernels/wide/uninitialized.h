@@ -1,0 +1,2 @@
+    alignas(TYPE) char memory[sizeof(TYPE)];
+    return *(TYPE*)memory;
