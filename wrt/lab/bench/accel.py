@@ -7,26 +7,28 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from wrt.accel import ACCELERATORS, Accelerator, Geometry, Hits, build
-from wrt.core.checks import require_known
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.core.html import Rows
 from wrt.lab.bench.peak_memory import peak_bytes
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
+from wrt.lab.bench.report import Part, check_plan, gathered, page
 from wrt.lab.bench.stadium import in_stadium
+from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility import TERRAINS, fit, terrain
 from wrt.scene.mesh import Mesh, as_mesh
 from wrt.scene.shapes import icosphere
 
-YARDSTICK = "bvh2"  # every ray is compared with it, and as many as YARDSTICK_TESTS allow with brute force
+YARDSTICK = "bvh2"  # every ray is compared with it, and as many as BRUTE_FORCE_TESTS allow with brute force
 BRUTE_FORCE_TESTS = 200_000_000
 COUNTED_RAYS = 20_000
+COLUMNS = ("structure", "rays", "build ms", "B/triangle", "peak B", "SAH", "depth", "refs", "nodes", "boxes", "triangles", "Mray/s",
+           "/ first", "differ", "wrong")
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,8 @@ class Plan:
     stadium: bool = False
 
     def __post_init__(self) -> None:
-        for name, low, high in (("rays", 1, 2**28), ("runs", 1, 1000), ("builds", 1, 100), ("max_triangles", 1000, 2**28)):
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"{name} must be {low} to {high}, got {getattr(self, name)}")
-        for what, names, table in (("structure", self.structures, ACCELERATORS), ("kind of ray", self.kinds, RAY_KINDS)):
-            for name in names:
-                require_known(name, table, what)
+        check_plan(self, {"structure": (self.structures, ACCELERATORS), "kind of ray": (self.kinds, RAY_KINDS)},
+                   rays=(1, 2**28), runs=(1, 1000), builds=(1, 100), max_triangles=(1000, 2**28))
         thread_count(self.threads)
 
     @property
@@ -116,15 +114,8 @@ def meshes(plan: Plan) -> Iterator[Mesh]:
 
 def run(plan: Plan, report: Callable[[Row | Refused], None] | None = None) -> Rows[Row | Refused]:
     """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a structure)."""
-    from wrt.lab.bench.accel_report import page
-
-    out: list[Row | Refused] = []
-    for mesh in meshes(plan):
-        for row in _Bench(plan, mesh).rows():
-            out.append(row)
-            if report is not None:
-                report(row)
-    return Rows(out, page)
+    rows = (row for mesh in meshes(plan) for row in _Bench(plan, mesh).rows())
+    return Rows(gathered(rows, report), lambda rows: page(parts(rows)))
 
 
 class _Bench:
@@ -155,32 +146,21 @@ class _Bench:
             truth = answer(self.yardstick, rays, None)
             few = rays.part(slice(None, None, max(len(rays) // self.checked, 1)))
             exact = answer(brute_force, few, None)
-            seconds = self._timed({name: accel for name, (accel, _) in built.items()}, rays)
+            seconds = alternate({name: partial(answer, accel, rays, self.plan.threads) for name, (accel, _) in built.items()},
+                                self.plan.runs)
             for name, (accel, build_seconds) in built.items():
-                row = self._row(name, accel, build_seconds, rays, seconds[name],
-                                differing(answer(accel, rays, None), truth), len(few), differing(answer(accel, few, None), exact))
-                yield replace(row, peak_bytes=peaks[name])
+                answers = (differing(answer(accel, rays, None), truth), len(few), differing(answer(accel, few, None), exact))
+                yield replace(self._row(name, accel, build_seconds, rays, seconds[name], answers), peak_bytes=peaks[name])
 
-    def _timed(self, accels: dict[str, Accelerator], rays: RaySet) -> dict[str, list[float]]:
-        """The runs of all structures alternate, and their order turns: what else the machine does meets all alike."""
-        seconds: dict[str, list[float]] = {name: [] for name in accels}
-        names = list(accels)
-        for i in range(-1, self.plan.runs):  # -1: warm up
-            for name in names[i % len(names):] + names[:i % len(names)]:
-                begin = perf_counter()
-                answer(accels[name], rays, self.plan.threads)
-                if i >= 0:
-                    seconds[name].append(perf_counter() - begin)
-        return seconds
-
-    def _row(self, name: str, accel: Accelerator, build_seconds: tuple[float, ...], rays: RaySet, seconds: list[float],
-             differ: int, checked: int, wrong: int) -> Row:
+    def _row(self, name: str, accel: Accelerator, build_seconds: tuple[float, ...], rays: RaySet, seconds: np.ndarray,
+             answers: tuple[int, int, int]) -> Row:
+        """answers: Row's differ, checked and wrong."""
         counted = rays.part(slice(None, None, max(len(rays) // COUNTED_RAYS, 1)))
         c = accel.closest_hit(counted.origins, counted.directions, 0.0, counted.t_max, counters=True).counters
         assert c is not None
         s, n = accel.stats, len(self.geometry)
         return Row(self.name, n, name, rays.kind, len(rays), build_seconds, s.bytes / n, s.sah_cost, s.depth, s.references,
-                   float(c.nodes.mean()), float(c.boxes.mean()), float(c.primitives.mean()), tuple(seconds), differ, checked, wrong)
+                   float(c.nodes.mean()), float(c.boxes.mean()), float(c.primitives.mean()), tuple(seconds.tolist()), *answers)
 
 
 @cache
@@ -201,6 +181,37 @@ def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
     if isinstance(found, Hits) and isinstance(truth, Hits):
         return int(((found.prim_id != truth.prim_id) | (found.t.view(np.int32) != truth.t.view(np.int32))).sum())
     return int((np.asarray(found) != np.asarray(truth)).sum())
+
+
+def cells(row: Row, first: Row) -> tuple[str, ...]:
+    """One line of the table, as COLUMNS names it."""
+    return (row.structure, row.kind, f"{1e3 * float(np.median(row.build)):.3g}", f"{row.bytes_per_triangle:.0f}",
+            f"{row.peak_bytes / row.triangles:.0f}", f"{row.sah_cost:.3g}", f"{row.depth}",
+            f"{row.references / row.triangles:.2f}", f"{row.nodes:.3g}", f"{row.boxes:.3g}",
+            f"{row.primitives:.3g}", spread(row.mrays), f"{np.median(row.mrays / first.mrays):.2f}", f"{row.differ}",
+            f"{row.wrong} of {row.checked}")
+
+
+def parts(rows: Sequence[Row | Refused]) -> list[Part]:
+    """A table for each mesh, what was refused, and how costs grow."""
+    groups: dict[tuple[str, int], list[Row]] = {}
+    for row in rows:
+        if isinstance(row, Row):
+            groups.setdefault((row.mesh, row.triangles), []).append(row)
+    out = []
+    for (mesh, triangles), group in groups.items():
+        first = {row.kind: row for row in reversed(group)}
+        out.append(Part(f"{mesh}, {triangles} triangles", "", COLUMNS, [cells(row, first[row.kind]) for row in group]))
+    refused = [(row.structure, row.mesh, row.reason) for row in rows if isinstance(row, Refused)]
+    if refused:
+        out.append(Part("Not built", "", ("structure", "mesh", "reason"), refused))
+    grown = growth(rows)
+    if grown:
+        out.append(Part("As triangles grow", "seconds ~ n^exponent (± one standard deviation); times: last over first.",
+                        ("structure", "mesh", "rays", "cost", "triangles", "exponent", "times"), [
+                            (g["structure"], g["mesh"], g["kind"], g["cost"], f"{g['from']} to {g['to']}",
+                             f"{g['exponent']:.3f} ± {g['error']:.3f}", f"{g['times']:.2f}") for g in grown]))
+    return out
 
 
 def growth(rows: Sequence[Row | Refused]) -> list[dict[str, Any]]:

@@ -6,21 +6,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from wrt.accel import ACCELERATORS, Geometry, build
 from wrt.core.device import start, thread_count
-from wrt.core.errors import InputError
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
+from wrt.lab.bench.report import check_plan, gathered
+from wrt.lab.bench.timing import alternate
 from wrt.lab.bench.visibility_check import Agreement, agreement
 from wrt.scene.cameras import Camera
 from wrt.scene.defaults import frame_camera
 from wrt.scene.materials import Material
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh, as_mesh
 from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import icosphere
 
@@ -45,10 +46,8 @@ class Plan:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        for name, low, high in (("size", 1, 16384), ("max_size", MIN_SIDE, 16384), ("max_triangles", 1, 2**30), ("runs", 1, 1000)):
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"{name} must be {low} to {high}, got {getattr(self, name)}")
-        ACCELERATORS.check(self.accel)
+        check_plan(self, {"structure": ([self.accel], ACCELERATORS)}, size=(1, 16384), max_size=(MIN_SIDE, 16384),
+                   max_triangles=(1, 2**30), runs=(1, 1000))
         thread_count(self.threads)
         start(self.device)
 
@@ -122,9 +121,7 @@ class Surface:
 def surfaces(plan: Plan) -> Iterator[Surface]:
     """What to see, up to plan.max_triangles (but its coarsest in any case)."""
     for path in plan.meshes:
-        mesh = load_mesh(path)
-        if not len(mesh.faces):
-            raise InputError("there are no triangles to see", path)
+        mesh = as_mesh(path)
         finer = [replace(mesh, normals=None)]
         while 4 * len(finer[-1].faces) <= plan.max_triangles:
             finer.append(subdivided(finer[-1]))
@@ -142,13 +139,7 @@ def framing(mesh: Mesh) -> Camera:
 
 def run(plan: Plan, report: Callable[[Row], None] | None = None) -> list[Row]:
     """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a device, a structure)."""
-    rows = []
-    for surface in surfaces(plan):
-        for row in _rows(plan, surface):
-            rows.append(row)
-            if report is not None:
-                report(row)
-    return rows
+    return gathered((row for surface in surfaces(plan) for row in _rows(plan, surface)), report)
 
 
 def _rows(plan: Plan, surface: Surface) -> Iterator[Row]:
@@ -173,20 +164,12 @@ class _Bench:
         self.build = tuple(accel.stats.build_seconds for accel in (self.caster.accel, *again))
 
     def measure(self, sweep: str, surface: Surface, side: int) -> Row:
-        """The runs of both kinds alternate, and so does who goes first: what else the machine does meets both alike."""
         camera, size = surface.camera, (side, side)
-        drawers = {"raster": self.rasterizer.draw, "cast": self.caster.draw}
-        seconds: dict[str, list[float]] = {name: [] for name in drawers}
-        for name in drawers:  # warm up
-            drawers[name](camera, size)
-        for i in range(self.plan.runs):
-            for name in sorted(drawers, reverse=i % 2 == 0):
-                begin = perf_counter()
-                drawers[name](camera, size)
-                seconds[name].append(perf_counter() - begin)
+        seconds = alternate({name: partial(drawer.draw, camera, size)
+                             for name, drawer in (("raster", self.rasterizer), ("cast", self.caster))}, self.plan.runs)
+        raster, cast = (tuple(seconds[name].tolist()) for name in ("raster", "cast"))
         checked = agreement(self.rasterizer, self.caster, self.geometry, camera, size)
-        return Row(sweep, surface.name, len(self.geometry.faces), side * side, tuple(seconds["raster"]), tuple(seconds["cast"]),
-                   self.build, checked)
+        return Row(sweep, surface.name, len(self.geometry.faces), side * side, raster, cast, self.build, checked)
 
 
 def fit(n: Sequence[float], seconds: Sequence[float]) -> Fit:

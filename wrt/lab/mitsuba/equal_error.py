@@ -23,8 +23,8 @@ from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench.error import REFERENCE_SEEDS, Reference, finished, make_reference
+from wrt.lab.bench.report import table
 from wrt.lab.bench.timing import Quartiles, quartiles, shown
-from wrt.lab.bench.visibility_report import table
 from wrt.lab.mitsuba.llvm import NotAvailable
 from wrt.lab.mitsuba.process import VARIANTS, Job, MitsubaProcess, environment_of
 from wrt.lab.mitsuba.translate import INTEGRATORS

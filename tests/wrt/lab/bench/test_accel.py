@@ -87,7 +87,7 @@ def test_a_structure_that_refuses_is_named_and_the_others_go_on(box, monkeypatch
     monkeypatch.setitem(bench.ACCELERATORS, "refusing", Refusing)
     rows = run(plan(box, structures=("refusing", "bvh2"), kinds=("random",)))
     assert rows[0] == Refused("box.obj", "refusing", "more than 11 triangles") and rows[1].structure == "bvh2"
-    assert "refusing over box.obj: more than 11 triangles" in report.markdown(rows)
+    assert "| refusing  | box.obj | more than 11 triangles |" in report.text(rows, "")
     assert "<td style=\"text-align:left\">more than 11 triangles</td>" in rows._repr_html_()
 
 
@@ -125,9 +125,9 @@ def test_growth_fits_exponents() -> None:
 
 
 def test_the_tables_hold_what_was_measured() -> None:
-    text = report.markdown([made("a", seconds=(1.0, 1.0)), made("b", seconds=(0.5, 0.5), differ=3)])
+    text = report.text([made("a", seconds=(1.0, 1.0)), made("b", seconds=(0.5, 0.5), differ=3)], "")
     line = next(line for line in text.splitlines() if line.startswith("| b"))
-    named = dict(zip(report.COLUMNS, (cell.strip() for cell in line.strip("|").split("|")), strict=True))
+    named = dict(zip(bench.COLUMNS, (cell.strip() for cell in line.strip("|").split("|")), strict=True))
     assert named["Mray/s"] == "2 [2, 2]" and named["/ first"] == "2.00" and named["differ"] == "3" and named["build ms"] == "500"
 
 

@@ -300,7 +300,7 @@ def test_a_plan_that_cannot_be_run_is_refused(option: str, value: object) -> Non
 
 def test_the_tables_hold_what_was_measured() -> None:
     rows = [row("triangles", 1000, 4096, 0.002, 0.006), row("triangles", 4000, 4096, 0.003, 0.006)]
-    text = visibility_report.markdown(rows)
+    text = visibility_report.text(rows, "")
     lines = [line for line in text.splitlines() if line.startswith("| s ")]
     first = [cell.strip() for cell in lines[0].strip("|").split("|")]
     named = dict(zip(visibility_report.COLUMNS, first, strict=True))
@@ -329,7 +329,7 @@ def test_the_command_prints_tables_and_writes_a_report(folder: Path) -> None:
     assert "## As triangles grow" in result.out and "| cast   | box.obj |" in result.out
     text = Path("report/visibility.md").read_text()
     assert "python -m wrt bench visibility box.obj --size 32 --max-size 64" in text
-    for name in visibility_report.PLOTS.values():
+    for name in visibility_report.PLOTS:
         assert f"]({name})" in text
         picture = np.asarray(Image.open(folder / "report" / name))
         assert picture.ndim == 3 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
