@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel import ACCELERATORS, Geometry, build
+from wrt.core.address_space import require_scipy
 from wrt.core.device import start, thread_count
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
 from wrt.lab.bench.report import check_plan, gathered
@@ -174,14 +175,14 @@ class _Bench:
 
 def fit(n: Sequence[float], seconds: Sequence[float]) -> Fit:
     """The exponent of seconds over n. Raises ValueError for fewer than two points."""
+    require_scipy()
+    from scipy.stats import linregress
+
     x, y = np.log(np.asarray(n, np.float64)), np.log(np.asarray(seconds, np.float64))
     if len(x) < 2:
         raise ValueError("an exponent needs two points")
-    dx = x - x.mean()
-    exponent = float(dx @ y / (dx @ dx))
-    rest = y - y.mean() - exponent * dx
-    error = math.sqrt(float(rest @ rest) / (len(x) - 2) / float(dx @ dx)) if len(x) > 2 else math.nan
-    return Fit(exponent, error, float((y[-1] - y[-2]) / (x[-1] - x[-2])))
+    line = linregress(x, y)
+    return Fit(float(line.slope), float(line.stderr) if len(x) > 2 else math.nan, float((y[-1] - y[-2]) / (x[-1] - x[-2])))
 
 
 def series(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
