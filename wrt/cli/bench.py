@@ -35,9 +35,8 @@ def visibility(how: Telling, **options: Any) -> None:
     MESHES: .obj, .ply or .stl files; without any, a sphere and a terrain.
     """
     from wrt.lab.bench import visibility as study
-    from wrt.lab.bench import visibility_report
 
-    measure(how, study.Plan(**options), study.run, visibility_report)
+    measure(how, study, options)
 
 
 @bench.command()
@@ -82,7 +81,7 @@ def peers(how: Telling, **options: Any) -> None:
     """
     from wrt.lab.bench import peers as study
 
-    measure(how, study.Plan(**options), study.run, study)
+    measure(how, study, options)
 
 
 @bench.command()
@@ -103,9 +102,8 @@ def accel(how: Telling, **options: Any) -> None:
     MESHES: .obj, .ply or .stl files; without any, a terrain that grows from a thousand triangles on.
     """
     from wrt.lab.bench import accel as study
-    from wrt.lab.bench import accel_report
 
-    measure(how, study.Plan(**options), study.run, accel_report)
+    measure(how, study, options)
 
 
 @bench.command()
@@ -121,7 +119,7 @@ def bvh(how: Telling, **options: Any) -> None:
     """Builders of binary BVHs over MESHES: quality, time and memory; and boxes, spheres and 14-DOPs around the same tree."""
     from wrt.lab.bench import bvh as study
 
-    measure(how, study.Plan(**options), study.run, study)
+    measure(how, study, options)
 
 
 @bench.command()

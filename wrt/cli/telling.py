@@ -74,30 +74,30 @@ def telling(report: str | None, *, cluster: bool = False, quiet: str = "No progr
     return decorate
 
 
-def measure(how: Telling, plan: Any, run: Callable[..., list[Any]], report: Any) -> None:
-    """run(plan): each mesh on one worker, where there is a cluster. report: the module that tells of the rows (machine, line, text,
-    data); one with PLOTS writes a folder (write_report), else the text is a Markdown file."""
+def measure(how: Telling, study: Any, options: dict[str, Any]) -> None:
+    """Run a study of wrt.lab.bench, each mesh on one worker where there is a cluster. study: the module, with Plan, run, machine,
+    line, text and data; one with PLOTS writes a folder (write_report), else its text is a Markdown file."""
     from wrt.lab.bench.report import check_folder
     from wrt.lab.bench.sweep import by_mesh
 
-    plots = getattr(report, "PLOTS", None)
+    plan, plots = study.Plan(**options), getattr(study, "PLOTS", None)
     if plots is None:
         how.check_markdown()
     elif how.output is not None:
         check_folder(how.output, plots)
     client = client_of(how.cluster)
-    machine = report.machine(plan)
+    machine = study.machine(plan)
     if client is not None:
         from wrt.renderer.distributed.dask import machines
 
         machine = f"a cluster, each mesh on one worker: {machines(client)}; started from {machine}"
     with warnings_told(how.quiet):
-        rows = by_mesh(run, plan, lambda row: how.progress(report.line(row)), client)
-    text, data, paths = report.text(rows, machine), {"machine": machine, **report.data(rows)}, []
+        rows = by_mesh(study.run, plan, lambda row: how.progress(study.line(row)), client)
+    text, data, paths = study.text(rows, machine), {"machine": machine, **study.data(rows)}, []
     if plots is None:
         how.write(text)
     elif how.output is not None:
-        paths = report.write_report(rows, plan, how.output, machine)
+        paths = study.write_report(rows, plan, how.output, machine)
     if "output" in click.get_current_context().params:
         data["output"] = how.output if plots is None else paths
     how.end(text, data, paths)
