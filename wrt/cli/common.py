@@ -5,8 +5,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import importlib
-import json
-import math
 import re
 import sys
 import time
@@ -252,16 +250,10 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def say_json(value: Any) -> None:
-    """As JSON on stdout, which has no NaN and no infinity: they become null."""
+    """As JSON on stdout."""
+    from wrt.core.json_text import json_text
 
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {str(key): plain(each) for key, each in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(each) for each in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    click.echo(json.dumps(plain(value), default=str, allow_nan=False))
+    click.echo(json_text(value))
 
 
 def say(text: str) -> None:

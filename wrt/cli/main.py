@@ -21,7 +21,7 @@ import click
 
 import wrt
 from wrt.cli.animate import animate
-from wrt.cli.bench import bench, stability
+from wrt.cli.bench import bench
 from wrt.cli.build import build
 from wrt.cli.common import (
     ACCEL,
@@ -42,6 +42,7 @@ from wrt.cli.common import (
     spread_options,
     warnings_told,
 )
+from wrt.cli.measure import stability
 from wrt.cli.profile import profile, whatif
 from wrt.cli.save import check_room, checkpoint_options, save_film
 from wrt.cli.view import view
@@ -58,13 +59,8 @@ def cli() -> None:
     require_modules()  # before a command imports them
 
 
-cli.add_command(stability)
-cli.add_command(bench)
-cli.add_command(build)
-cli.add_command(profile)
-cli.add_command(animate)
-cli.add_command(whatif)
-cli.add_command(view)
+for command in (stability, bench, build, profile, animate, whatif, view):
+    cli.add_command(command)
 
 
 @cli.command(help=f"Render SCENE (.toml, .gltf, .glb, or a mesh: {SUFFIXES}) to a picture.")

@@ -12,17 +12,17 @@ NUMERIC = re.compile(r"[-<±]? ?\d+([.,]\d+)*(e[-+]?\d+)?[%xk]?( |$)")  # how a 
 SHOWN_ROWS = 200  # of one table; more make a notebook slow
 
 
-def html_table(title: str, head: Sequence[Any], rows: Iterable[Sequence[Any]]) -> str:
-    """One HTML table; beyond SHOWN_ROWS rows it says how many are left out. title: above it, "" is none."""
+def html_table(title: str, head: Sequence[Any], rows: Iterable[Sequence[Any]], most: int | None = SHOWN_ROWS) -> str:
+    """One HTML table; beyond `most` rows it says how many are left out. title: above it, "" is none."""
     rows = list(rows)
     out = [f"<b>{html.escape(title)}</b>"] if title else []
     out.append("<table>")
     if head:
         out.append(_row(head, "th", rows[0] if rows else head))
-    out += [_row(row, "td", row) for row in rows[:SHOWN_ROWS]]
+    out += [_row(row, "td", row) for row in rows[:most]]
     out.append("</table>")
-    if len(rows) > SHOWN_ROWS:
-        out.append(f"<p>and {len(rows) - SHOWN_ROWS} more</p>")
+    if most is not None and len(rows) > most:
+        out.append(f"<p>and {len(rows) - most} more</p>")
     return "".join(out)
 
 

@@ -178,9 +178,7 @@ def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER
         out.set_pixels(oiio.ROI(), np.ascontiguousarray(np.clip(image, 0.0, 1.0), dtype=np.float32))
         return out
 
-    pixels: Any = oiio.ImageBufAlgo.FLIP_diff(buffer(b), buffer(a), hdr=0, ppd=pixels_per_degree).get_pixels()
-    difference: np.ndarray = pixels[..., 0]
-    return difference
+    return np.asarray(oiio.ImageBufAlgo.FLIP_diff(buffer(b), buffer(a), hdr=0, ppd=pixels_per_degree).get_pixels())[..., 0]
 
 
 # --- difference image -------------------------------------------------------------------------------------------------

@@ -15,13 +15,14 @@ from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
+from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import make_closest_hit_kernel
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse import bvh2 as traverse_bvh2
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.counters import Counts, Recorder
 from wrt.lab.rtcore.cubin import read_cubin
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})

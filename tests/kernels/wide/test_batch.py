@@ -16,12 +16,13 @@ from wrt.accel.bvh.wide_tree import stack_need
 from wrt.accel.geometry import Geometry
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
+from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import HitArrays
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.wide.references import EMPTY, leaf_reference
 from wrt.kernels.wide.traverse import STACK_SIZE
 from wrt.lab.bench.rays import ray_sets
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 

@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -17,21 +16,37 @@ from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checks import require_known
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.core.html import Rows
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.peak_memory import peak_bytes
+from wrt.lab.bench.plot import LogLogPlot, Series
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
+from wrt.lab.bench.report import Part, check_plan, gathered, markdown, page, write
+from wrt.lab.bench.report import machine as machine_line
 from wrt.lab.bench.stadium import in_stadium
+from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility import TERRAINS, fit, terrain
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
-YARDSTICK = "bvh2"  # every ray is compared with it, and as many as YARDSTICK_TESTS allow with brute force
+YARDSTICK = "bvh2"  # every ray is compared with it, and as many as BRUTE_FORCE_TESTS allow with brute force
 BRUTE_FORCE_TESTS = 200_000_000
 COUNTED_RAYS = 20_000
+COLUMNS = ("structure", "rays", "build ms", "B/triangle", "peak B", "SAH", "depth", "refs", "nodes", "boxes", "triangles", "Mray/s",
+           "/ first", "differ", "wrong")
+REPORT = "accel.md"
+AXES = {"accel-build.png": "microseconds of build a triangle", "accel-memory.png": "bytes a triangle",
+        "accel-growth.png": "triangles"}
+PLOTS = tuple(AXES)
+LEGEND = f"""\
+build: median of the builds, all cores. B/triangle: of the whole structure, triangles included; peak B: what the process grew by
+at the first build, a triangle. SAH: expected nodes and triangles of a random line through the root, costing 1 each. refs:
+primitives in all leaves over triangles. nodes, boxes, triangles: fetched and tested, a ray (closest hit). Mray/s: median of the
+alternating runs, the middle half of them in brackets; / first: over that of the first structure of the table, run by run. differ:
+rays with another prim_id or another bit of t than {YARDSTICK}, of all; wrong: the same against brute force, of as many rays as
+2e8 tests allow. Both must be 0."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +67,8 @@ class Plan:
     stadium: bool = False
 
     def __post_init__(self) -> None:
-        for name, low, high in (("rays", 1, 2**28), ("runs", 1, 1000), ("builds", 1, 100), ("max_triangles", 1000, 2**28)):
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"{name} must be {low} to {high}, got {getattr(self, name)}")
-        for what, names, table in (("structure", self.structures, ACCELERATORS), ("kind of ray", self.kinds, RAY_KINDS)):
-            for name in names:
-                require_known(name, table, what)
+        check_plan(self, {"structure": (self.structures, ACCELERATORS), "kind of ray": (self.kinds, RAY_KINDS)},
+                   rays=(1, 2**28), runs=(1, 1000), builds=(1, 100), max_triangles=(1000, 2**28))
         thread_count(self.threads)
 
     @property
@@ -121,15 +132,8 @@ def meshes(plan: Plan) -> Iterator[Mesh]:
 
 def run(plan: Plan, report: Callable[[Row | Refused], None] | None = None) -> Rows[Row | Refused]:
     """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a structure)."""
-    from wrt.lab.bench.accel_report import page
-
-    out: list[Row | Refused] = []
-    for mesh in meshes(plan):
-        for row in _Bench(plan, mesh).rows():
-            out.append(row)
-            if report is not None:
-                report(row)
-    return Rows(out, page)
+    rows = (row for mesh in meshes(plan) for row in _Bench(plan, mesh).rows())
+    return Rows(gathered(rows, report), lambda rows: page(parts(rows)))
 
 
 class _Bench:
@@ -160,32 +164,21 @@ class _Bench:
             truth = answer(self.yardstick, rays, None)
             few = rays.part(slice(None, None, max(len(rays) // self.checked, 1)))
             exact = answer(brute_force, few, None)
-            seconds = self._timed({name: accel for name, (accel, _) in built.items()}, rays)
+            seconds = alternate({name: partial(answer, accel, rays, self.plan.threads) for name, (accel, _) in built.items()},
+                                self.plan.runs)
             for name, (accel, build_seconds) in built.items():
-                row = self._row(name, accel, build_seconds, rays, seconds[name],
-                                differing(answer(accel, rays, None), truth), len(few), differing(answer(accel, few, None), exact))
-                yield replace(row, peak_bytes=peaks[name])
+                answers = (differing(answer(accel, rays, None), truth), len(few), differing(answer(accel, few, None), exact))
+                yield replace(self._row(name, accel, build_seconds, rays, seconds[name], answers), peak_bytes=peaks[name])
 
-    def _timed(self, accels: dict[str, Accelerator], rays: RaySet) -> dict[str, list[float]]:
-        """The runs of all structures alternate, and their order turns: what else the machine does meets all alike."""
-        seconds: dict[str, list[float]] = {name: [] for name in accels}
-        names = list(accels)
-        for i in range(-1, self.plan.runs):  # -1: warm up
-            for name in names[i % len(names):] + names[:i % len(names)]:
-                begin = perf_counter()
-                answer(accels[name], rays, self.plan.threads)
-                if i >= 0:
-                    seconds[name].append(perf_counter() - begin)
-        return seconds
-
-    def _row(self, name: str, accel: Accelerator, build_seconds: tuple[float, ...], rays: RaySet, seconds: list[float],
-             differ: int, checked: int, wrong: int) -> Row:
+    def _row(self, name: str, accel: Accelerator, build_seconds: tuple[float, ...], rays: RaySet, seconds: np.ndarray,
+             answers: tuple[int, int, int]) -> Row:
+        """answers: Row's differ, checked and wrong."""
         counted = rays.part(slice(None, None, max(len(rays) // COUNTED_RAYS, 1)))
         c = accel.closest_hit(counted.origins, counted.directions, 0.0, counted.t_max, counters=True).counters
         assert c is not None
         s, n = accel.stats, len(self.geometry)
         return Row(self.name, n, name, rays.kind, len(rays), build_seconds, s.bytes / n, s.sah_cost, s.depth, s.references,
-                   float(c.nodes.mean()), float(c.boxes.mean()), float(c.primitives.mean()), tuple(seconds), differ, checked, wrong)
+                   float(c.nodes.mean()), float(c.boxes.mean()), float(c.primitives.mean()), tuple(seconds.tolist()), *answers)
 
 
 @cache
@@ -208,6 +201,37 @@ def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
     return int((np.asarray(found) != np.asarray(truth)).sum())
 
 
+def cells(row: Row, first: Row) -> tuple[str, ...]:
+    """One line of the table, as COLUMNS names it."""
+    return (row.structure, row.kind, f"{1e3 * float(np.median(row.build)):.3g}", f"{row.bytes_per_triangle:.0f}",
+            f"{row.peak_bytes / row.triangles:.0f}", f"{row.sah_cost:.3g}", f"{row.depth}",
+            f"{row.references / row.triangles:.2f}", f"{row.nodes:.3g}", f"{row.boxes:.3g}",
+            f"{row.primitives:.3g}", spread(row.mrays), f"{np.median(row.mrays / first.mrays):.2f}", f"{row.differ}",
+            f"{row.wrong} of {row.checked}")
+
+
+def parts(rows: Sequence[Row | Refused]) -> list[Part]:
+    """A table for each mesh, what was refused, and how costs grow."""
+    groups: dict[tuple[str, int], list[Row]] = {}
+    for row in rows:
+        if isinstance(row, Row):
+            groups.setdefault((row.mesh, row.triangles), []).append(row)
+    out = []
+    for (mesh, triangles), group in groups.items():
+        first = {row.kind: row for row in reversed(group)}
+        out.append(Part(f"{mesh}, {triangles} triangles", "", COLUMNS, [cells(row, first[row.kind]) for row in group]))
+    refused = [(row.structure, row.mesh, row.reason) for row in rows if isinstance(row, Refused)]
+    if refused:
+        out.append(Part("Not built", "", ("structure", "mesh", "reason"), refused))
+    grown = growth(rows)
+    if grown:
+        out.append(Part("As triangles grow", "seconds ~ n^exponent (± one standard deviation); times: last over first.",
+                        ("structure", "mesh", "rays", "cost", "triangles", "exponent", "times"), [
+                            (g["structure"], g["mesh"], g["kind"], g["cost"], f"{g['from']} to {g['to']}",
+                             f"{g['exponent']:.3f} ± {g['error']:.3f}", f"{g['times']:.2f}") for g in grown]))
+    return out
+
+
 def growth(rows: Sequence[Row | Refused]) -> list[dict[str, Any]]:
     """How seconds a ray and seconds of the build grow with the triangles: exponents over meshes of one name, where there are three
     sizes or more."""
@@ -227,3 +251,49 @@ def growth(rows: Sequence[Row | Refused]) -> list[dict[str, Any]]:
             out.append({"mesh": mesh, "structure": structure, "kind": kind, "cost": cost, "from": min(sizes), "to": max(sizes),
                         "times": seconds[-1] / seconds[0], **asdict(found)})
     return out
+
+
+def machine(plan: Plan) -> str:
+    return machine_line(f"{plan.threads} used to search", f"{plan.runs} runs of {plan.rays} rays")
+
+
+def line(row: Row | Refused) -> str:
+    """For the progress."""
+    if isinstance(row, Refused):
+        return f"{row.mesh}: {row.structure}: {row.reason}"
+    return f"{row.mesh}: {row.structure}, {row.kind} rays: {np.median(row.mrays):.3g} Mray/s, {row.differ} differ"
+
+
+def text(rows: Sequence[Row | Refused], machine: str) -> str:
+    """For the terminal."""
+    return f"{machine}\n\n{markdown(parts(rows))}\n{LEGEND}"
+
+
+def data(rows: Sequence[Row | Refused]) -> dict[str, object]:
+    """For JSON."""
+    return {"rows": [row.as_dict() for row in rows if isinstance(row, Row)],
+            "refused": [vars(row) for row in rows if isinstance(row, Refused)], "growth": growth(rows)}
+
+
+def plot(rows: Sequence[Row | Refused], name: str) -> LogLogPlot:
+    """Time to build or memory against time to search (one point a mesh; the last kind of ray that was measured), or the cost of
+    a ray as triangles grow."""
+    kind = next((row.kind for row in reversed(rows) if isinstance(row, Row)), "")
+    series: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        if isinstance(row, Row) and row.kind == kind:
+            search = float(np.median(row.seconds)) / row.rays * 1e6
+            x = (float(np.median(row.build)) / row.triangles * 1e6, row.bytes_per_triangle, float(row.triangles))
+            series.setdefault(row.structure, []).append((x[PLOTS.index(name)], search))
+    lines = [Series(structure, sorted(points) if name == PLOTS[2] else points) for structure, points in series.items()]
+    return LogLogPlot(f"Structures, {kind} rays", AXES[name], "microseconds a ray", lines)
+
+
+def write_report(rows: Sequence[Row | Refused], plan: Plan, folder: Path, machine: str) -> list[Path]:
+    """Markdown and plots; the paths. Raises InputError where the system refuses."""
+    names = [Path(mesh.name if isinstance(mesh, Mesh) else mesh).name for mesh in plan.meshes]
+    command = " ".join(["python -m wrt bench accel", *names, f"--rays {plan.rays}", f"--runs {plan.runs}",
+                        f"--threads {plan.threads}"])
+    text = f"# Structures\n\nMachine: {machine}\n\nTo repeat: `{command}`\n\n{LEGEND}\n\n"
+    return write(folder / REPORT, text + markdown([*parts(rows), *(Part(name, plot=name) for name in PLOTS)]),
+                 {name: plot(rows, name) for name in PLOTS})

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from time import perf_counter, process_time
 
@@ -19,9 +17,9 @@ from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
 from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.geometry import Geometry
-from wrt.core.device import describe_devices, load_kernel, thread_count, upload
+from wrt.core.device import load_kernel, thread_count, upload
 from wrt.core.errors import InputError
-from wrt.io.mesh_file import MESH_FORMATS, load_mesh
+from wrt.io.mesh_file import as_mesh
 from wrt.kernels.query import RayArrays
 from wrt.kernels.study.query_volumes import count_popped, make_enter_kernel
 from wrt.kernels.traverse.bvh2 import box_volumes
@@ -29,7 +27,9 @@ from wrt.kernels.traverse.bvh2_kdop import kdop_volumes
 from wrt.kernels.traverse.bvh2_sphere import sphere_volumes
 from wrt.lab.bench.peak_memory import peak_bytes
 from wrt.lab.bench.rays import RaySet, endless, unit
-from wrt.lab.bench.visibility_report import spread, table
+from wrt.lab.bench.report import Part, check_plan, gathered, load_average, markdown
+from wrt.lab.bench.report import machine as machine_line
+from wrt.lab.bench.timing import alternate, spread
 
 VOLUMES = ("bvh2", "bvh2_sphere", "bvh2_kdop")
 TESTED_RAYS, TESTED_NODES = 1024, 1024
@@ -61,12 +61,8 @@ class Plan:
 
     def __post_init__(self) -> None:
         if not self.meshes:
-            raise InputError(f"name the meshes: {', '.join(MESH_FORMATS)} files")
-        for name in self.builders:
-            BVH_BUILDERS.check(name)
-        for name, high in (("rays", 2**26), ("builds", 100), ("runs", 1000)):
-            if not 1 <= getattr(self, name) <= high:
-                raise InputError(f"{name} must be 1 to {high}, got {getattr(self, name)}")
+            raise InputError("name the meshes")
+        check_plan(self, {BVH_BUILDERS.kind: (self.builders, BVH_BUILDERS)}, rays=(1, 2**26), builds=(1, 100), runs=(1, 1000))
         thread_count(self.threads)
 
 
@@ -92,7 +88,7 @@ class BuilderRow:
 
     def cells(self) -> tuple[str, ...]:
         return (self.builder, f"{self.sah_cost:.2f}", f"{self.cost:.2f}", f"{self.nodes:.2f}", f"{self.leaves:.2f}",
-                f"{self.triangles:.2f}", f"{self.depth}", f"{self.references / self.n_triangles:.2f}", spread(self.seconds, 1.0),
+                f"{self.triangles:.2f}", f"{self.depth}", f"{self.references / self.n_triangles:.2f}", spread(self.seconds),
                 f"{self.cpu_seconds:.3g}", f"{self.peak_bytes / self.n_triangles:.0f}")
 
 
@@ -118,8 +114,8 @@ class VolumeRow:
     def cells(self) -> tuple[str, ...]:
         mrays = self.rays / np.array(self.seconds) / 1e6
         return (self.volume, f"{self.node_bytes}", f"{self.inner_area:.3f}", f"{self.leaf_area:.3f}", f"{self.sah_cost:.2f}",
-                f"{self.nodes:.2f}", f"{self.triangles:.2f}", spread(self.test_seconds, 1e9), spread(self.ratios, 1.0),
-                spread(mrays, 1.0), f"{self.differ}")
+                f"{self.nodes:.2f}", f"{self.triangles:.2f}", spread(self.test_seconds, 1e9), spread(self.ratios),
+                spread(mrays), f"{self.differ}")
 
 
 Rows = list[BuilderRow | VolumeRow]
@@ -127,28 +123,18 @@ Rows = list[BuilderRow | VolumeRow]
 
 def run(plan: Plan, report: Callable[[BuilderRow | VolumeRow], None] | None = None) -> Rows:
     """Measure everything; `report` gets each row as it is done. Raises InputError (a file)."""
-    rows: Rows = []
-    for path in plan.meshes:
-        mesh = load_mesh(path)
-        if not len(mesh.faces):
-            raise InputError("there are no triangles to hit", path)
-        geometry, name = Geometry.of(mesh), Path(path).name
-        rays = inward(geometry, plan.rays, plan.seed)
-        measured: Iterator[BuilderRow | VolumeRow] = chain(builder_rows(plan, name, geometry, rays),
-                                                           volume_rows(plan, name, geometry, rays))
-        for row in measured:
-            rows.append(row)
-            if report is not None:
-                report(row)
-    return rows
+    return gathered((row for path in plan.meshes for row in _mesh_rows(plan, path)), report)
 
 
-def load_average() -> float:
-    return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+def _mesh_rows(plan: Plan, path: str | Path) -> Iterator[BuilderRow | VolumeRow]:
+    geometry, name = Geometry.of(as_mesh(path)), Path(path).name
+    rays = inward(geometry, plan.rays, plan.seed)
+    yield from builder_rows(plan, name, geometry, rays)
+    yield from volume_rows(plan, name, geometry, rays)
 
 
-def machine() -> str:
-    return f"{describe_devices()[0]}, load average {load_average():.1f} at the start"
+def machine(plan: Plan) -> str:
+    return machine_line()
 
 
 def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
@@ -172,7 +158,7 @@ def builder_rows(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet) -> Ite
     small = Geometry(geometry.vertices, geometry.faces[:64], geometry.spheres)
     for name in plan.builders or BVH_BUILDERS:
         build_binary(small, BvhOptions(name), 1)  # the kernels are compiled
-        load = load_average()
+        busy = load_average()
         grow = partial(build_binary, geometry, BvhOptions(name), thread_count(plan.threads))
         _, peak = peak_bytes(grow)
         seconds, cpu_begin = [], process_time()
@@ -186,7 +172,7 @@ def builder_rows(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet) -> Ite
         assert c is not None
         yield BuilderRow(mesh, len(geometry), name, accel.stats.sah_cost, published_cost(accel, rays), float(c.nodes.mean()),
                          float(c.leaves.mean()), float(c.primitives.mean()), accel.stats.depth, accel.stats.references,
-                         tuple(seconds), cpu_seconds, peak, load)
+                         tuple(seconds), cpu_seconds, peak, busy)
 
 
 def device_rays(rays: RaySet, n: int | None = None) -> RayArrays:
@@ -224,17 +210,10 @@ def volume_rows(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet) -> Iter
     nodes = accels["bvh2"].built.arrays["nodes"]
     leaf = np.stack([nodes["count_0"], nodes["count_1"]]) > 0
     tests = {name: tester_of(accel, rays) for name, accel in accels.items()}
-    tested: dict[str, list[float]] = {name: [] for name in VOLUMES}
-    traced: dict[str, list[float]] = {name: [] for name in VOLUMES}
-    for i in range(-1, plan.runs):  # -1: warm up; by turns, so that what else the machine does meets all alike
-        for name in np.roll(VOLUMES, i).tolist():
-            begin = perf_counter()
-            n_tests = tests[name]()
-            middle = perf_counter()
-            accels[name].closest_hit(rays.origins, rays.directions, threads=1)
-            if i >= 0:
-                tested[name].append((middle - begin) / n_tests)
-                traced[name].append(perf_counter() - middle)
+    counts = {name: test() for name, test in tests.items()}
+    trace = {name: partial(accel.closest_hit, rays.origins, rays.directions, threads=1) for name, accel in accels.items()}
+    tested = {name: seconds / counts[name] for name, seconds in alternate(tests, plan.runs).items()}
+    traced = alternate(trace, plan.runs)
     for name, accel in accels.items():
         area = surfaces(accel)
         hits = accel.closest_hit(rays.origins, rays.directions, counters=True)
@@ -243,8 +222,8 @@ def volume_rows(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet) -> Iter
         differ = (hits.prim_id != truth.prim_id) | (hits.t.view(np.int32) != truth.t.view(np.int32))
         yield VolumeRow(mesh, len(geometry), name, accel.built.arrays["nodes"].itemsize,
                         float(area[~leaf].sum() / max(boxes[~leaf].sum(), 1e-300)), float(area[leaf].sum() / boxes[leaf].sum()),
-                        accel.stats.sah_cost, float(c.nodes.mean()), float(c.primitives.mean()), tuple(tested[name]),
-                        tuple(np.array(tested[name]) / np.array(tested["bvh2"])), len(rays), tuple(traced[name]), int(differ.sum()))
+                        accel.stats.sah_cost, float(c.nodes.mean()), float(c.primitives.mean()), tuple(tested[name].tolist()),
+                        tuple((tested[name] / tested["bvh2"]).tolist()), len(rays), tuple(traced[name].tolist()), int(differ.sum()))
 
 
 def tester_of(accel: Accelerator, rays: RaySet) -> Callable[[], int]:
@@ -270,12 +249,24 @@ def tester_of(accel: Accelerator, rays: RaySet) -> Callable[[], int]:
     return test
 
 
-def markdown(rows: Rows) -> str:
-    parts = []
+def line(row: BuilderRow | VolumeRow) -> str:
+    """For the progress."""
+    return f"{row.mesh}: {'  '.join(row.cells())}"
+
+
+def text(rows: Rows, machine: str) -> str:
+    """All tables as Markdown."""
+    parts = [Part("", machine)]
     for mesh in dict.fromkeys(row.mesh for row in rows):
         group = [row for row in rows if row.mesh == mesh]
         for kind, columns in ((BuilderRow, BUILDER_COLUMNS), (VolumeRow, VOLUME_COLUMNS)):
-            parts.append(f"{mesh}, {group[0].n_triangles} triangles\n\n"
-                         + table(columns, [row.cells() for row in group if isinstance(row, kind)]) + "\n")
+            parts.append(Part("", f"{mesh}, {group[0].n_triangles} triangles", columns,
+                              [row.cells() for row in group if isinstance(row, kind)]))
     loads = [row.load for row in rows if isinstance(row, BuilderRow)]
-    return "\n".join(parts) + f"\nLoad average at the builds: {min(loads):.1f} to {max(loads):.1f}.\n"
+    return markdown([*parts, Part("", f"Load average at the builds: {min(loads):.1f} to {max(loads):.1f}."), Part("", LEGEND)])
+
+
+def data(rows: Rows) -> dict[str, object]:
+    """For JSON."""
+    return {"builders": [vars(row) for row in rows if isinstance(row, BuilderRow)],
+            "volumes": [vars(row) for row in rows if isinstance(row, VolumeRow)]}

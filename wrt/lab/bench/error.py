@@ -11,21 +11,20 @@ import platform
 import signal
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 import wrt
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checks import did_you_mean
-from wrt.core.errors import InputError
-from wrt.core.html import html_table
 from wrt.core.interrupts import Interrupted
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench import error_statistics as statistics
-from wrt.lab.bench.error_statistics import UNKNOWN, Estimate
+from wrt.lab.bench.error_rows import Reference, Row, Slope, Sweep, Variant
+from wrt.lab.bench.error_statistics import UNKNOWN
+from wrt.lab.bench.report import check_plan
 from wrt.picture import metrics
 from wrt.picture.film import Film
 from wrt.renderer.features import Features
@@ -38,7 +37,6 @@ from wrt.scene.settings import SAMPLERS
 REFERENCE_SEEDS = 8
 REFERENCE_DEPTH, REFERENCE_THROUGHPUT = 32, 1e-5
 BRUTE_FORCE_LIMIT = 5000  # primitives that it is still put to
-BASE = "as it is"
 
 
 # --- the knobs --------------------------------------------------------------------------------------------------------
@@ -91,20 +89,6 @@ KNOBS = {knob.name: knob for knob in (
 )}
 
 
-@dataclass(frozen=True)
-class Variant:
-    """One knob at one value (knob "" and value None: none is turned), ready to be rendered with."""
-
-    knob: str
-    value: Any
-    scene: Scene
-    options: Options
-
-    @property
-    def label(self) -> str:
-        return f"{self.knob} = {self.value}" if self.knob else BASE
-
-
 def variants(scene: Scene, options: Options, features: Features, knobs: Sequence[str]) -> tuple[list[Variant], list[str]]:
     """The scene as it is, then every value of every knob; and a sentence for each knob that changes nothing."""
     found, left_out = [Variant("", None, scene, options)], []
@@ -125,30 +109,6 @@ def variants(scene: Scene, options: Options, features: Features, knobs: Sequence
 
 
 # --- the reference ----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Reference:
-    """What counts as the truth. pixels: (H, W, 3) float64, the mean over independent seeds; variance: of that mean, averaged
-    over pixels and channels; lost: the share of light that was not followed (a bound on what its own cuts may hide)."""
-
-    pixels: np.ndarray
-    variance: float
-    lost: float
-    seeds: int
-    spp: int
-    max_depth: int
-    min_throughput: float
-    seconds: float
-
-    @property
-    def rmse(self) -> float:
-        return float(np.sqrt(self.variance))
-
-    def as_dict(self) -> dict[str, Any]:
-        return {"rmse": self.rmse, "lost_throughput_per_sample": self.lost, "seeds": self.seeds, "spp_each": self.spp,
-                "max_depth": self.max_depth, "min_throughput": self.min_throughput, "seconds": self.seconds,
-                "mean": float(self.pixels.mean())}
 
 
 def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int], depth: int | None = None) -> Reference:
@@ -183,39 +143,6 @@ def finished(film: Film) -> Film:
 # --- one row ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Row:
-    """One variant at one number of samples.
-
-    products: of the repeats' errors (statistics.gram). rmse: of one picture, the reference's own error taken out; NaN where
-    it is below that. bias, noise: root mean squares over the pixels, rmse^2 = bias^2 + noise^2; bias is NaN where it cannot
-    be told from noise, and `bias_below` bounds it. efficiency: 1 / (mse x seconds). digest: equal where all pixels are.
-    """
-
-    variant: Variant
-    spp: int
-    products: np.ndarray = field(repr=False)
-    seconds: Estimate
-    rmse: Estimate
-    efficiency: Estimate
-    relmse: Estimate
-    flip: Estimate
-    bias: float
-    bias_below: float
-    noise: float
-    build_seconds: float
-    rays_per_sample: float
-    digest: str
-    pareto: bool = False
-
-    def as_dict(self) -> dict[str, Any]:
-        v = self.variant
-        return {"variant": v.label, "knob": v.knob or None, "value": v.value, "spp": self.spp, "bias": self.bias,
-                "bias_below": self.bias_below, "noise": self.noise, "build_seconds": self.build_seconds,
-                "rays_per_sample": self.rays_per_sample, "pareto": self.pareto,
-                **{name: getattr(self, name).as_dict() for name in ("seconds", "rmse", "efficiency", "relmse", "flip")}}
-
-
 def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int], truth: Reference) -> Row:
     """Render with every seed and compare."""
     films = [finished(renderer.run(seed=seed, spp=spp)) for seed in seeds]
@@ -246,29 +173,6 @@ def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int]
         digest=hashlib.sha256(b"".join(film.pixels.tobytes() for film in films)).hexdigest())
 
 
-@dataclass(frozen=True)
-class Slope:
-    """How a variant's log mse, and the log of its variance alone, fall with log spp."""
-
-    variant: Variant
-    mse: Estimate
-    noise: Estimate
-
-    @property
-    def theory(self) -> str:
-        return THEORY[self.variant.scene.settings.sampler]
-
-    def as_dict(self) -> dict[str, Any]:
-        return {"variant": self.variant.label, "mse": self.mse.as_dict(), "noise": self.noise.as_dict(), "theory": self.theory}
-
-
-# Of the variance. Independent samples: -1. Scrambled nets: -3 where the integrand is smooth (Owen 1997, "Scrambled Net Variance
-# for Integrals of Smooth Functions"), -1 - 1/d where an edge crosses d dimensions (He and Wang 2015, "On the Convergence Rate
-# of Randomized Quasi-Monte Carlo for Discontinuous Functions"): -1.5 here. Each pair of dimensions is a net by itself, so that
-# what depends on two pairs at once (pixel and lens, pixel and light) falls as for independent samples.
-THEORY = {"independent": "-1", "sobol": "-1 to -3"}
-
-
 def slope_of(rows: Sequence[Row], known: float) -> Slope:
     """Over the rows of one variant; known: the reference's variance."""
 
@@ -286,44 +190,6 @@ def slope_of(rows: Sequence[Row], known: float) -> Slope:
 
 
 @dataclass
-class Sweep:
-    """Everything that was measured, and what it was measured on. interrupted: the number of the signal that ended it early."""
-
-    scene: str
-    size: tuple[int, int]
-    repeats: int
-    seed: int
-    reference: Reference
-    machine: dict[str, Any]
-    rows: list[Row] = field(default_factory=list)
-    slopes: list[Slope] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
-    interrupted: int | None = None
-
-    @property
-    def same_pixels(self) -> list[str]:
-        """The variants whose pictures are, bit for bit, those of the scene as it is."""
-        base = {row.spp: row.digest for row in self.rows if not row.variant.knob}
-        same: dict[str, bool] = {}
-        for row in self.rows:
-            if row.variant.knob:
-                same[row.variant.label] = same.get(row.variant.label, True) and row.digest == base.get(row.spp)
-        return [label for label, equal in same.items() if equal]
-
-    def _repr_html_(self) -> str:
-        from wrt.lab.bench.error_report import COLUMNS, SLOPE_COLUMNS, cells, slope_cells
-
-        return html_table(f"Speed against error: {self.scene}", COLUMNS, map(cells, self.rows)) + html_table(
-            "How fast the error falls", SLOPE_COLUMNS, map(slope_cells, self.slopes))
-
-    def as_dict(self) -> dict[str, Any]:
-        return {"scene": self.scene, "size": list(self.size), "repeats": self.repeats, "seed": self.seed,
-                "confidence": statistics.CONFIDENCE, "reference": self.reference.as_dict(), "machine": self.machine,
-                "rows": [row.as_dict() for row in self.rows], "slopes": [slope.as_dict() for slope in self.slopes],
-                "same_pixels": self.same_pixels, "left_out": self.left_out, "interrupted": self.interrupted}
-
-
-@dataclass
 class Plan:
     """What to sweep. knobs: names in KNOBS, empty for all; max_spp: the last power of two; reference_spp: samples of each of
     the reference's seeds (None: 8 max_spp); row_seconds: a row that would likely take longer is left out."""
@@ -335,15 +201,9 @@ class Plan:
     row_seconds: float = 120.0
 
     def __post_init__(self) -> None:
-        unknown = sorted(set(self.knobs) - set(KNOBS))
-        if unknown:
-            raise InputError(f"no knob {', '.join(unknown)}; {did_you_mean(unknown[0], KNOBS)}there is {', '.join(KNOBS)}")
-        if not 1 <= self.max_spp <= 1 << 16:
-            raise InputError(f"max_spp must be 1 to 65536, got {self.max_spp}")
-        if not 3 <= self.repeats <= 1000:
-            raise InputError(f"repeats must be 3 to 1000 (fewer seeds have no spread to speak of), got {self.repeats}")
-        if self.reference_spp is not None and not 1 <= self.reference_spp <= 1 << 24:
-            raise InputError(f"reference_spp must be 1 to {1 << 24}, got {self.reference_spp}")
+        check_plan(self, {"knob": (self.knobs, KNOBS)}, max_spp=(1, 1 << 16), repeats=(3, 1000))  # 2 seeds have no spread
+        if self.reference_spp is not None:
+            check_plan(self, {}, reference_spp=(1, 1 << 24))
 
     @property
     def levels(self) -> list[int]:

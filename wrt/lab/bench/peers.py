@@ -3,9 +3,9 @@ turns, on one thread and on all of them."""
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -14,19 +14,19 @@ from typing import Any
 
 import numpy as np
 
-import wrt
 from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checks import require_known
-from wrt.core.device import describe_devices, load_kernel, run_all, thread_count
+from wrt.core.device import load_kernel, run_all, thread_count
 from wrt.core.errors import InputError
-from wrt.io.mesh_file import load_mesh
+from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.accel import warm_up
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
-from wrt.lab.bench.visibility_report import spread, table
+from wrt.lab.bench.report import Part, check_plan, gathered, markdown
+from wrt.lab.bench.report import machine as machine_line
+from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.hard_cases.contestants import PEERS, Embree, Open3D, Peer, WarpMesh
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
@@ -57,13 +57,8 @@ class Plan:
     threads: str = "both"
 
     def __post_init__(self) -> None:
-        for name, low, high in (("rays", 1, 2**28), ("runs", 1, 1000)):
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"{name} must be {low} to {high}, got {getattr(self, name)}")
-        for what, names, known in (("structure", self.structures, ACCELERATORS), ("rival", self.rivals, PEERS),
-                                   ("kind of ray", self.kinds, RAY_KINDS)):
-            for name in names:
-                require_known(name, known, what)
+        check_plan(self, {"structure": (self.structures, ACCELERATORS), "rival": (self.rivals, PEERS),
+                          "kind of ray": (self.kinds, RAY_KINDS)}, rays=(1, 2**28), runs=(1, 1000))
         for name in self.rivals:
             if not PEERS[name].is_installed():
                 raise InputError(f'{name} is not installed: pip install "wrt[peers]"')
@@ -231,53 +226,33 @@ def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
 
 
 def meshes(plan: Plan) -> Iterator[Mesh]:
-    for path in plan.meshes:
-        mesh = load_mesh(path)
-        if not len(mesh.faces):
-            raise InputError("there are no triangles to hit", path)
-        yield mesh
+    yield from map(as_mesh, plan.meshes)
     if not plan.meshes:
         yield icosphere(5)
 
 
 def run(plan: Plan, report: Callable[[Row], None] | None = None) -> list[Row]:
     """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a structure)."""
-    out: list[Row] = []
-    for mesh in meshes(plan):
-        geometry, name = Geometry.of(mesh), Path(mesh.name or "mesh").name
-        own = [Own(structure, geometry) for structure in dict.fromkeys(plan.structures)]
-        everybody: list[Contestant] = [*own, *(Rival(PEERS[rival](), geometry) for rival in plan.chosen)]
-        for kind, rays in ray_sets(own[0].accel, plan.rays, plan.seed).items():
-            if kind not in plan.kinds:
-                continue
-            for threads in plan.counts:
-                for row in _measured((name, len(mesh.faces)), everybody, rays, threads, plan.runs):
-                    out.append(row)
-                    if report is not None:
-                        report(row)
-    return out
+    return gathered((row for mesh in meshes(plan) for row in _mesh_rows(plan, mesh)), report)
+
+
+def _mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
+    geometry, name = Geometry.of(mesh), Path(mesh.name or "mesh").name
+    own = [Own(structure, geometry) for structure in dict.fromkeys(plan.structures)]
+    everybody: list[Contestant] = [*own, *(Rival(PEERS[rival](), geometry) for rival in plan.chosen)]
+    for kind, rays in ray_sets(own[0].accel, plan.rays, plan.seed).items():
+        for threads in plan.counts if kind in plan.kinds else ():
+            yield from _measured((name, len(mesh.faces)), everybody, rays, threads, plan.runs)
 
 
 def _measured(mesh: tuple[str, int], everybody: Sequence[Contestant], rays: RaySet, threads: int, runs: int) -> Iterator[Row]:
     searches = [who.search(rays, threads) for who in everybody]
-    told = [who.told(rays, search()) for who, search in zip(everybody, searches, strict=True)]  # this also warms up
+    told = [who.told(rays, search()) for who, search in zip(everybody, searches, strict=True)]
     hit = float((told[0].prim_id >= 0).mean() if isinstance(told[0], Hits) else np.mean(told[0]))
-    seconds = timed(searches, runs, thread_time if threads == 1 else perf_counter)
+    seconds = alternate(dict(enumerate(searches)), runs, thread_time if threads == 1 else perf_counter)
     for i, who in enumerate(everybody):
-        yield Row(*mesh, rays.kind, len(rays), hit, who.name, who.build, tuple(seconds[i]), differing(told[i], told[0]), threads)
-
-
-def timed(searches: Sequence[Callable[[], Any]], runs: int, clock: Callable[[], float]) -> list[list[float]]:
-    """Seconds of that clock, run by run; the order turns, so that what else the machine does meets all alike."""
-    seconds: list[list[float]] = [[] for _ in searches]
-    n = len(searches)
-    for i in range(runs):
-        for j in range(n):
-            k = (i + j) % n
-            begin = clock()
-            searches[k]()
-            seconds[k].append(max(clock() - begin, 1e-9))
-    return seconds
+        yield Row(*mesh, rays.kind, len(rays), hit, who.name, who.build, tuple(seconds[i].tolist()), differing(told[i], told[0]),
+                  threads)
 
 
 def groups(rows: Sequence[Row]) -> list[list[Row]]:
@@ -305,39 +280,43 @@ def means(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def machine(plan: Plan) -> str:
-    """Device, versions and how busy the machine is: without them no time means anything."""
     from importlib.metadata import PackageNotFoundError, version
 
-    versions = [f"wrt {wrt.__version__}"]
+    versions = []
     for package in ("warp-lang", "embreex", "open3d"):
-        try:
+        with suppress(PackageNotFoundError):
             versions.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            continue
-    load = f"; load average {os.getloadavg()[0]:.1f} at the start" if hasattr(os, "getloadavg") else ""
-    used = " and ".join(map(str, plan.counts))
-    return f"{describe_devices()[0]}, {used} used{load}; {', '.join(versions)}; {plan.runs} runs of {plan.rays} rays by turns"
+    return machine_line(f"{' and '.join(map(str, plan.counts))} used", ", ".join(versions),
+                        f"{plan.runs} runs of {plan.rays} rays by turns")
 
 
 def cells(row: Row, first: Row) -> tuple[str, ...]:
     """One line of the table, as COLUMNS names it."""
-    speed = spread(row.mrays, 1.0), f"{ratio(first, row):.2f}"
-    return row.kind, f"{row.threads}", f"{row.hit:.0%}", row.name, *speed, f"{row.differ}"
+    return (row.kind, f"{row.threads}", f"{row.hit:.0%}", row.name, spread(row.mrays), f"{ratio(first, row):.2f}", f"{row.differ}")
 
 
-def text(rows: Sequence[Row], told: str) -> str:
-    """All tables as Markdown. told: the line of `machine`."""
-    parts = [told + "\n"]
+def line(row: Row) -> str:
+    """For the progress."""
+    return f"{row.mesh}: {'  '.join(cells(row, row))}"
+
+
+def text(rows: Sequence[Row], machine: str) -> str:
+    """All tables as Markdown."""
+    parts = [Part("", machine)]
     by_mesh: dict[tuple[str, int], list[list[Row]]] = {}
     for group in groups(rows):
         by_mesh.setdefault((group[0].mesh, group[0].triangles), []).append(group)
     for (mesh, triangles), parted in by_mesh.items():
         built = ", ".join(f"{row.name} {row.build:.2f} s" for row in parted[0])
-        parts.append(f"## {mesh}, {triangles} triangles\n\nBuilt by the clock: {built}.\n\n"
-                     f"{table(COLUMNS, [cells(row, group[0]) for group in parted for row in group])}\n")
-    found = means(rows)
+        parts.append(Part(f"{mesh}, {triangles} triangles", f"Built by the clock: {built}.", COLUMNS,
+                          [cells(row, group[0]) for group in parted for row in group]))
     kinds = list(dict.fromkeys(row.kind for row in rows))
-    lines = [(name, *(f"{by_kind[kind]:.2f}" for kind in kinds)) for name, by_kind in found.items()]
+    lines = [(name, *(f"{by_kind[kind]:.2f}" for kind in kinds)) for name, by_kind in means(rows).items()]
     if lines:
-        parts.append(f"## Geometric means over {len(by_mesh)} meshes of wrt / it\n\n{table(('who', *kinds), lines)}\n")
-    return "\n".join(parts) + f"\n{LEGEND}\n"
+        parts.append(Part(f"Geometric means over {len(by_mesh)} meshes of wrt / it", "", ("who", *kinds), lines))
+    return markdown([*parts, Part("", LEGEND)])
+
+
+def data(rows: Sequence[Row]) -> dict[str, object]:
+    """For JSON."""
+    return {"rows": [row.as_dict() for row in rows], "means": means(rows)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -11,18 +10,16 @@ from typing import Any
 
 import numpy as np
 
-import wrt
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.device import describe_devices
-from wrt.core.errors import InputError
 from wrt.io.mesh_file import load_mesh
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
+from wrt.lab.bench.report import check_plan, table
+from wrt.lab.bench.report import machine as machine_line
 from wrt.lab.bench.timing import Quartiles, alternate, quartiles, shown
 from wrt.lab.bench.visibility import terrain
-from wrt.lab.bench.visibility_report import table
 from wrt.lab.hard_cases.common import soup, unit_vectors
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere, teapot
@@ -41,9 +38,7 @@ class Plan:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.rays < 1 or self.runs < 1:
-            raise InputError(f"rays and runs must be 1 or more, got {self.rays} and {self.runs}")
-        ACCELERATORS.check(self.accel)
+        check_plan(self, {"structure": ([self.accel], ACCELERATORS)}, rays=(1, 2**28), runs=(1, 1000))
 
 
 @dataclass(frozen=True)
@@ -126,9 +121,7 @@ def _measure(plan: Plan, place: tuple[str, str], geometry: Geometry, units: list
 
 
 def machine() -> str:
-    device = next((line for line in describe_devices() if line.startswith("cpu:")), "cpu")
-    load = f", load average {os.getloadavg()[0]:.1f} at the start" if hasattr(os, "getloadavg") else ""
-    return f"{device}, one used{load}; wrt {wrt.__version__}"
+    return machine_line("one used")
 
 
 def text(rows: list[Price], plan: Plan, told: str) -> str:

@@ -6,8 +6,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,14 @@ import numpy as np
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
+from wrt.core.address_space import require_scipy
 from wrt.core.device import start, thread_count
-from wrt.core.errors import InputError
-from wrt.io.mesh_file import load_mesh
+from wrt.io.mesh_file import as_mesh
+from wrt.lab.bench.plot import LogLogPlot, Series
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
+from wrt.lab.bench.report import Part, check_plan, gathered, markdown, write
+from wrt.lab.bench.report import machine as machine_line
+from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility_check import Agreement, agreement
 from wrt.scene.cameras import Camera
 from wrt.scene.defaults import frame_camera
@@ -31,6 +35,17 @@ MIN_SIDE = 64  # pixels; the sweep over pixels doubles it
 SWEEP_TRIANGLES = 80_000  # about as many in the sweep over pixels
 MAX_BUILDS = 3
 SPHERES, TERRAINS = range(3, 10), [22 * 2**k for k in range(8)]  # subdivisions, cells a side
+REPORT = "visibility.md"
+PLOTS = {"visibility-triangles.png": "triangles", "visibility-pixels.png": "pixels"}
+COLUMNS = ("surface", "triangles", "pixels", "covered", "raster ms", "cast ms", "build ms", "cast / raster", "with build", "differ",
+           "ties", "silhouettes", "unexplained", "depth error", "of bound")
+LEGEND = """\
+covered: pixels with a triangle. raster: a z-buffer, all triangles; cast: one ray a pixel through a structure that is there;
+build: of that structure. Medians of alternating runs, ratios taken run by run; in brackets the middle half of the runs. cast /
+raster above 1: rasterising is cheaper; with build: as if the structure were built for this one picture. differ: pixels with
+another prim_id, of which ties (depths agree within their bound: common edges, coincident triangles), silhouettes (the rays'
+answer is the exact one within a rounding error, some 1e-4 pixels, of the centre), and unexplained (must be 0). depth error: the
+largest relative one where prim_id agrees, and its share of the bound derived for it (must not be above 1)."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +63,8 @@ class Plan:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        for name, low, high in (("size", 1, 16384), ("max_size", MIN_SIDE, 16384), ("max_triangles", 1, 2**30), ("runs", 1, 1000)):
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"{name} must be {low} to {high}, got {getattr(self, name)}")
-        ACCELERATORS.check(self.accel)
+        check_plan(self, {"structure": ([self.accel], ACCELERATORS)}, size=(1, 16384), max_size=(MIN_SIDE, 16384),
+                   max_triangles=(1, 2**30), runs=(1, 1000))
         thread_count(self.threads)
         start(self.device)
 
@@ -125,9 +138,7 @@ class Surface:
 def surfaces(plan: Plan) -> Iterator[Surface]:
     """What to see, up to plan.max_triangles (but its coarsest in any case)."""
     for path in plan.meshes:
-        mesh = load_mesh(path)
-        if not len(mesh.faces):
-            raise InputError("there are no triangles to see", path)
+        mesh = as_mesh(path)
         finer = [replace(mesh, normals=None)]
         while 4 * len(finer[-1].faces) <= plan.max_triangles:
             finer.append(subdivided(finer[-1]))
@@ -145,13 +156,7 @@ def framing(mesh: Mesh) -> Camera:
 
 def run(plan: Plan, report: Callable[[Row], None] | None = None) -> list[Row]:
     """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a device, a structure)."""
-    rows = []
-    for surface in surfaces(plan):
-        for row in _rows(plan, surface):
-            rows.append(row)
-            if report is not None:
-                report(row)
-    return rows
+    return gathered((row for surface in surfaces(plan) for row in _rows(plan, surface)), report)
 
 
 def _rows(plan: Plan, surface: Surface) -> Iterator[Row]:
@@ -176,32 +181,24 @@ class _Bench:
         self.build = tuple(accel.stats.build_seconds for accel in (self.caster.accel, *again))
 
     def measure(self, sweep: str, surface: Surface, side: int) -> Row:
-        """The runs of both kinds alternate, and so does who goes first: what else the machine does meets both alike."""
         camera, size = surface.camera, (side, side)
-        drawers = {"raster": self.rasterizer.draw, "cast": self.caster.draw}
-        seconds: dict[str, list[float]] = {name: [] for name in drawers}
-        for name in drawers:  # warm up
-            drawers[name](camera, size)
-        for i in range(self.plan.runs):
-            for name in sorted(drawers, reverse=i % 2 == 0):
-                begin = perf_counter()
-                drawers[name](camera, size)
-                seconds[name].append(perf_counter() - begin)
+        seconds = alternate({name: partial(drawer.draw, camera, size)
+                             for name, drawer in (("raster", self.rasterizer), ("cast", self.caster))}, self.plan.runs)
+        raster, cast = (tuple(seconds[name].tolist()) for name in ("raster", "cast"))
         checked = agreement(self.rasterizer, self.caster, self.geometry, camera, size)
-        return Row(sweep, surface.name, len(self.geometry.faces), side * side, tuple(seconds["raster"]), tuple(seconds["cast"]),
-                   self.build, checked)
+        return Row(sweep, surface.name, len(self.geometry.faces), side * side, raster, cast, self.build, checked)
 
 
 def fit(n: Sequence[float], seconds: Sequence[float]) -> Fit:
     """The exponent of seconds over n. Raises ValueError for fewer than two points."""
+    require_scipy()
+    from scipy.stats import linregress
+
     x, y = np.log(np.asarray(n, np.float64)), np.log(np.asarray(seconds, np.float64))
     if len(x) < 2:
         raise ValueError("an exponent needs two points")
-    dx = x - x.mean()
-    exponent = float(dx @ y / (dx @ dx))
-    rest = y - y.mean() - exponent * dx
-    error = math.sqrt(float(rest @ rest) / (len(x) - 2) / float(dx @ dx)) if len(x) > 2 else math.nan
-    return Fit(exponent, error, float((y[-1] - y[-2]) / (x[-1] - x[-2])))
+    line = linregress(x, y)
+    return Fit(float(line.slope), float(line.stderr) if len(x) > 2 else math.nan, float((y[-1] - y[-2]) / (x[-1] - x[-2])))
 
 
 def series(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
@@ -241,3 +238,73 @@ def crossings(rows: Sequence[Row]) -> list[dict[str, Any]]:
             found = math.exp(n[i] + (n[i + 1] - n[i]) * ratio[i] / (ratio[i] - ratio[i + 1]))
         out.append({"sweep": sweep, "surface": surface, "n": found, "cheaper": str(cheaper[-1])})
     return out
+
+
+def machine(plan: Plan) -> str:
+    threads = f"{thread_count(plan.threads)} used" if plan.device == "cpu" else ""
+    return machine_line(threads, f"structure {plan.accel}, {plan.runs} runs", device=plan.device)
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """One line of the table, as COLUMNS names it."""
+    a = row.agreement
+    return (Path(row.surface).name, f"{row.triangles}", f"{row.pixels}", f"{a.covered / a.pixels:.1%}",
+            spread(row.raster, 1e3), spread(row.cast, 1e3), f"{1e3 * float(np.median(row.build)):.3g}",
+            spread(row.ratios(False)), f"{np.median(row.ratios(True)):.3g}",
+            f"{a.differ}", f"{a.ties}", f"{a.silhouettes}", f"{a.unexplained}", f"{a.depth_error:.1e}", f"{a.depth_share:.2f}")
+
+
+def line(row: Row) -> str:
+    """For the progress."""
+    return "  ".join(cells(row)[:8])
+
+
+def parts(rows: Sequence[Row], plots: bool = False) -> list[Part]:
+    """All tables; `plots`: with the pictures of PLOTS, which stand beside the file."""
+    out = []
+    for name, sweep in PLOTS.items():
+        lines = [cells(row) for key, group in series(rows).items() if key[0] == sweep for row in group]
+        if lines:
+            out.append(Part(f"As {sweep} grow", "", COLUMNS, lines, name if plots else ""))
+    found = fits(rows)
+    if found:
+        told = "seconds ~ n^exponent over the whole sweep (± one standard deviation), and between its two last points."
+        out.append(Part("Exponents", told, ("cost", "surface", "n", "exponent", "at the end"), [
+            (f["cost"], Path(f["surface"]).name, f["sweep"], f"{f['exponent']:.3f} ± {f['error']:.3f}", f"{f['last']:.3f}")
+            for f in found]))
+    for c in crossings(rows):
+        since = "throughout" if c["n"] is None else f"from about {c['n']:.2g} {c['sweep']} on"
+        out.append(Part("", f"{Path(c['surface']).name}, as {c['sweep']} grow: {c['cheaper']} costs less {since}."))
+    return out
+
+
+def text(rows: Sequence[Row], machine: str) -> str:
+    """For the terminal."""
+    return f"{machine}\n\n{markdown(parts(rows))}\n{LEGEND}"
+
+
+def data(rows: Sequence[Row]) -> dict[str, object]:
+    """For JSON."""
+    return {"rows": [row.as_dict() for row in rows], "exponents": fits(rows), "crossings": crossings(rows)}
+
+
+def plot(rows: Sequence[Row], sweep: str) -> LogLogPlot:
+    """Medians over what grows; on the sweep over triangles also with the build."""
+    costs: dict[str, Callable[[Row], float]] = {
+        "raster": lambda row: float(np.median(row.raster)), "cast": lambda row: float(np.median(row.cast))}
+    if sweep == "triangles":
+        costs["build + cast"] = lambda row: float(np.median(row.cast) + np.median(row.build))
+    lines = [Series(f"{Path(surface).name}: {name}", [(float(getattr(row, sweep)), cost(row)) for row in group])
+             for (which, surface), group in series(rows).items() if which == sweep for name, cost in costs.items()]
+    other = "pixels" if sweep == "triangles" else "triangles"
+    held = sorted({getattr(row, other) for row in rows if row.sweep == sweep})
+    return LogLogPlot(f"Primary visibility, {' or '.join(map(str, held))} {other}", sweep, "seconds a picture", lines)
+
+
+def write_report(rows: Sequence[Row], plan: Plan, folder: Path, machine: str) -> list[Path]:
+    """Markdown and plots; the paths. Raises InputError where the system refuses."""
+    command = " ".join(["python -m wrt bench visibility", *map(str, plan.meshes), f"--size {plan.size}",
+                        f"--max-size {plan.max_size}", f"--max-triangles {plan.max_triangles}", f"--runs {plan.runs}"])
+    text = f"# Rasterising against ray casting\n\nMachine: {machine}\n\nTo repeat: `{command}`\n\n{LEGEND}\n\n"
+    return write(folder / REPORT, text + markdown(parts(rows, plots=True)),
+                 {name: plot(rows, sweep) for name, sweep in PLOTS.items()})

@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from wrt.core.errors import InputError
 from wrt.lab.hard_cases import closed as inside
 from wrt.lab.hard_cases import open as outside
@@ -26,7 +28,7 @@ from wrt.lab.hard_cases.judge import Verdict, check, judge, judge_all_hits, judg
 __all__ = ["ASK", "HARD_CASES", "HIT", "MISS", "HardCase", "Verdict", "check", "chunks", "generate", "judge",
            "judge_all_hits", "judge_next"]
 
-HARD_CASES: dict[str, Callable[[Seed, int], HardCase]] = {
+HARD_CASES: dict[str, Callable[[np.random.Generator, int], HardCase]] = {
     **{f"A_{place}_{aim}": partial(inside.dense_sphere, position=place, aim=aim)
        for place in inside.POSITIONS for aim in AIMS},
     "B_jittered_uniform": partial(inside.jittered_sphere, aim="uniform"),
@@ -69,7 +71,7 @@ def generate(name: str, n: int, seed: Seed = 0) -> HardCase:
         raise InputError(f"no hard case {name!r}; there is {', '.join(HARD_CASES)}")
     make = HARD_CASES[name]
     notes = (make.func if isinstance(make, partial) else make).__doc__ or ""
-    return replace(make(seed, n), name=name, notes=" ".join(notes.split()))
+    return replace(make(np.random.default_rng(seed), n), name=name, notes=" ".join(notes.split()))
 
 
 def chunks(name: str, n: int, seed: int = 0, chunk: int = 2**18) -> Iterator[HardCase]:

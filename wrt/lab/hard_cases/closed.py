@@ -20,7 +20,6 @@ from wrt.accel.geometry import Geometry
 from wrt.lab.hard_cases.common import (
     HIT,
     HardCase,
-    Seed,
     aimed,
     cube,
     hard_case,
@@ -50,29 +49,26 @@ def _dense(position: str) -> Geometry:
     return surface(geometry.vertices, flip_collinear(geometry.vertices, geometry.faces)[0])
 
 
-def dense_sphere(seed: Seed, n: int, *, position: str, aim: str) -> HardCase:
+def dense_sphere(rng: np.random.Generator, n: int, *, position: str, aim: str) -> HardCase:
     """A: a sphere of radius 2 with 159,200 triangles. The origins are in the cube of side 2 around its centre, whose corners
     are 0.26 from the surface; float32 moves a point 2e5 from 0 by 0.012 at most. "far", rounding leaves 2356 faces with their
     corners on a line, which are flipped as every scene's are (wrt.scene.clean.flip_collinear)."""
-    rng = np.random.default_rng(seed)
     center = np.array(POSITIONS[position])
     return inside(_dense(position), center + rng.uniform(-1.0, 1.0, (n, 3)), rng, aim)
 
 
-def jittered_sphere(seed: Seed, n: int, *, aim: str) -> HardCase:
+def jittered_sphere(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
     """B (pbrt-v4, shapes_test, Triangle.Watertight): 16 x 16, each vertex at a radius of 1 + 5 U, the origins in a ball of
     0.5. Corners of a face are at most 26 degrees apart, so that no face comes closer to the centre than cos 26 = 0.89."""
-    rng = np.random.default_rng(seed)
     vertices, faces = lat_long(16, 16, 1.0 + 5.0 * rng.random(2 + 16 * 15))
     return inside(surface(vertices, faces), in_ball(rng, n, 0.5), rng, aim)
 
 
-def needles(seed: Seed, n: int, *, aim: str) -> HardCase:
+def needles(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
     """F: a sphere squeezed by 10^-U(1.5, 4) in two axes, each its own: triangles of aspect 1e3 to 1e8 around the rays.
 
     Coordinates are rounded relative to themselves, which squeezing does not change: origins of half the radius are inside.
     """
-    rng = np.random.default_rng(seed)
     squeeze = np.ones(3)
     axes = rng.permutation(3)
     squeeze[axes[0]] = 10.0 ** -rng.uniform(1.5, 4.0)
@@ -91,9 +87,8 @@ def _sheets() -> Geometry:
     return joined(sphere(64, 32, 1.0), sphere(64, 32, 1.0 + SHEET_GAP))
 
 
-def two_sheets(seed: Seed, n: int, *, aim: str) -> HardCase:
+def two_sheets(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
     """G: glass in glass: two spheres with the same corners but for 4e-5 of the radius; the inner one comes first."""
-    rng = np.random.default_rng(seed)
     return inside(_sheets(), in_ball(rng, n, 0.9), rng, aim)
 
 
@@ -105,9 +100,8 @@ def _coincident() -> Geometry:
     return surface(once.vertices, faces[rng.permutation(len(faces))])
 
 
-def coincident(seed: Seed, n: int, *, aim: str) -> HardCase:
+def coincident(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
     """G: a sphere that is there three times, in a shuffled order: of each tie the lowest prim_id."""
-    rng = np.random.default_rng(seed)
     return inside(_coincident(), in_ball(rng, n, 0.9), rng, aim)
 
 
@@ -122,9 +116,8 @@ def _fan() -> Geometry:
     return surface(np.concatenate([[[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], ring]), np.concatenate([top, bottom]))
 
 
-def shared_vertex(seed: Seed, n: int, *, aim: str) -> HardCase:
+def shared_vertex(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
     """G: a double cone whose apex 10,000 triangles share (as the other apex); "vertices": aimed at the two."""
-    rng = np.random.default_rng(seed)
     geometry = _fan()
     origins = in_ball(rng, n, 0.5).astype(np.float32)
     directions = aimed(geometry, rng, origins, aim)
@@ -133,9 +126,8 @@ def shared_vertex(seed: Seed, n: int, *, aim: str) -> HardCase:
     return replace(hard_case(geometry, origins, directions, HIT, closed=True), asked=20)
 
 
-def scaled(seed: Seed, n: int, *, scale: float, aim: str) -> HardCase:
+def scaled(rng: np.random.Generator, n: int, *, scale: float, aim: str) -> HardCase:
     """H: the same sphere and the same rays, times 1e-6, 1 and 1e6."""
-    rng = np.random.default_rng(seed)
     return inside(sphere(64, 32, scale), in_ball(rng, n, 0.9 * scale), rng, aim)
 
 
@@ -146,9 +138,8 @@ def _stadium() -> tuple[Geometry, Geometry]:
     return pot, joined(pot, sphere(64, 32, 1e5))
 
 
-def stadium(seed: Seed, n: int) -> HardCase:
+def stadium(rng: np.random.Generator, n: int) -> HardCase:
     """H: a teapot in a stadium 1e5 larger; rays from near the pot and from far away, at its corners and past it."""
-    rng = np.random.default_rng(seed)
     pot, both = _stadium()
     origins = (in_ball(rng, n) * np.where(rng.random((n, 1)) < 0.5, 3.0, 5e4)).astype(np.float32)
     at_pot = aimed(pot, rng, origins, "vertices")
@@ -156,17 +147,15 @@ def stadium(seed: Seed, n: int) -> HardCase:
     return hard_case(both, origins, directions, HIT)
 
 
-def lengths(seed: Seed, n: int) -> HardCase:
+def lengths(rng: np.random.Generator, n: int) -> HardCase:
     """I: directions of length 1e-20 to 1e20."""
-    rng = np.random.default_rng(seed)
     case = inside(sphere(32, 16), in_ball(rng, n, 0.9), rng, "uniform")
     directions = case.directions.astype(np.float64) * 10.0 ** rng.uniform(-20.0, 20.0, (n, 1))
     return replace(case, directions=directions.astype(np.float32))
 
 
-def underflowing(seed: Seed, n: int) -> HardCase:
+def underflowing(rng: np.random.Generator, n: int) -> HardCase:
     """I: one or two components of the direction are denormal or underflow to 0 (of either sign)."""
-    rng = np.random.default_rng(seed)
     case = inside(sphere(32, 16), in_ball(rng, n, 0.9), rng, "uniform")
     small = rng.random((n, 3)) < 0.5
     small[np.arange(n), rng.integers(3, size=n)] = False
@@ -174,9 +163,8 @@ def underflowing(seed: Seed, n: int) -> HardCase:
     return replace(case, directions=(case.directions.astype(np.float64) * factor).astype(np.float32))
 
 
-def denormal(seed: Seed, n: int) -> HardCase:
+def denormal(rng: np.random.Generator, n: int) -> HardCase:
     """I: all of the direction is denormal, 1e-41 to 1e-38 long; the sphere is so small that t is at most 4e37."""
-    rng = np.random.default_rng(seed)
     case = inside(sphere(32, 16, 1e-4), in_ball(rng, n, 0.9e-4), rng, "uniform")
     directions = case.directions.astype(np.float64) * 10.0 ** rng.uniform(-41.0, -38.0, (n, 1))
     directions = directions.astype(np.float32)
@@ -190,11 +178,10 @@ def _grid() -> Geometry:
     return joined(*(surface(*cube(cell, cell + 1.0)) for cell in cells))
 
 
-def axis_parallel(seed: Seed, n: int) -> HardCase:
+def axis_parallel(rng: np.random.Generator, n: int) -> HardCase:
     """E: along the axes, both ways, zeros of both signs, through a block of 4 x 4 x 4 unit cubes whose faces coincide: in
     faces, along edges and through corners. They start inside or before the block, so that a face is always ahead; on the
     block's outer faces the weight of the edge there is exactly 0, also in float32: a closed triangle is hit."""
-    rng = np.random.default_rng(seed)
     row, axis = np.arange(n), rng.integers(3, size=n)
     origins = np.where(rng.random((n, 3)) < 0.7, rng.integers(0, 9, (n, 3)) / 2.0,
                        rng.uniform(0.0, 4.0, (n, 3)).astype(np.float32))

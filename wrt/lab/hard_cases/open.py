@@ -13,7 +13,6 @@ from wrt.lab.hard_cases.common import (
     HIT,
     MISS,
     HardCase,
-    Seed,
     cube,
     hard_case,
     in_ball,
@@ -46,20 +45,18 @@ def _towards(geometry: Geometry, rng: np.random.Generator, origins: np.ndarray, 
     return hard_case(geometry, origins, points - origins.astype(np.float64), ASK)
 
 
-def respawned_triangles(seed: Seed, n: int) -> HardCase:
+def respawned_triangles(rng: np.random.Generator, n: int) -> HardCase:
     """C (pbrt-v4, Triangle.Reintersect): 8 triangles with coordinates +-10^U(-8, 8), and rays at them from such places. A
     ray from the hit along next_directions must not hit the same triangle, on whichever side of it it starts."""
-    rng = np.random.default_rng(seed)
     geometry = soup(_signed_powers(rng, (8, 3, 3), -8.0, 8.0))
     case = _towards(geometry, rng, _signed_powers(rng, (n, 3), -8.0, 8.0), _points(geometry, rng, n))
     return replace(case, next_directions=unit_vectors(rng, n).astype(np.float32))
 
 
-def respawned_spheres(seed: Seed, n: int) -> HardCase:
+def respawned_spheres(rng: np.random.Generator, n: int) -> HardCase:
     """C: 8 spheres of radius 10^U(-4, 4), moved by up to 1e4, but by no more than 2^22 radii: one that is smaller than the
     float32 spacing at its centre has no side that a ray could be on. Rays at them from outside and from inside. A ray from
     the hit, turned to the outside of the sphere, must not hit it again."""
-    rng = np.random.default_rng(seed)
     radius = 10.0 ** rng.uniform(-4.0, 4.0, (8, 1))
     moved = np.minimum(10.0 ** rng.uniform(-4.0, 4.0, (8, 1)), 2.0**22 * radius)
     spheres = np.concatenate([unit_vectors(rng, 8) * moved, radius], axis=1)
@@ -90,18 +87,16 @@ def _line_through_zero() -> Geometry:
     return soup(2.0 ** -rng.integers(0, 60, (96, 3, 1)) * step)
 
 
-def without_area(seed: Seed, n: int, *, wide: bool = False) -> HardCase:
+def without_area(rng: np.random.Generator, n: int, *, wide: bool = False) -> HardCase:
     """D: collinear and repeated corners are never hit, whatever rounding says. wide: corners of very different size."""
-    rng = np.random.default_rng(seed)
     geometry = _line_through_zero() if wide else _without_area()
     origins = in_ball(rng, n, 4.0)
     origins[::2] = (origins[::2] * 8.0).round() / 8.0
     return replace(_towards(geometry, rng, origins, _points(geometry, rng, n)), expected=np.full(n, MISS, np.int8))
 
 
-def among_bad(seed: Seed, n: int) -> HardCase:
+def among_bad(rng: np.random.Generator, n: int) -> HardCase:
     """D: a closed sphere with such triangles inside: the sphere must be hit, through them."""
-    rng = np.random.default_rng(seed)
     origins = in_ball(rng, n, 0.5).astype(np.float32)
     directions = _points(_without_area(), rng, n) - origins.astype(np.float64)
     return hard_case(_sphere_with_bad(), origins, directions, HIT, closed=True)
@@ -112,18 +107,16 @@ def _sphere_with_bad() -> Geometry:
     return joined(sphere(32, 16, 8.0), _without_area())
 
 
-def published_bad(seed: Seed, n: int) -> HardCase:
+def published_bad(rng: np.random.Generator, n: int) -> HardCase:
     """D: pbrt's three collinear points. The first ray is the published one; the others start some float32 steps beside it."""
-    rng = np.random.default_rng(seed)
     steps = rng.integers(-8, 9, (2, n, 3)) * 2.0**-24
     steps[:, :1] = 0.0
     origins, directions = (np.array(x) * (1.0 + s) for x, s in zip((BAD_ORIGIN, BAD_DIRECTION), steps, strict=True))
     return hard_case(soup(np.array([BAD_TRIANGLE])), origins, directions, MISS, t_max=BAD_T_MAX)
 
 
-def huge(seed: Seed, n: int) -> HardCase:
+def huge(rng: np.random.Generator, n: int) -> HardCase:
     """D: triangles and origins at 1e30: areas are beyond float32."""
-    rng = np.random.default_rng(seed)
     geometry = soup(1e30 * rng.uniform(-1.0, 1.0, (32, 3, 3)))
     origins = 1e30 * rng.uniform(-1.0, 1.0, (n, 3)) * 10.0 ** (-30.0 * (rng.random((n, 1)) < 0.3))
     case = _towards(geometry, rng, origins, _points(geometry, rng, n))
@@ -132,9 +125,8 @@ def huge(seed: Seed, n: int) -> HardCase:
     return replace(case, directions=shorter.astype(np.float32))
 
 
-def tiny(seed: Seed, n: int) -> HardCase:
+def tiny(rng: np.random.Generator, n: int) -> HardCase:
     """D: triangles of 1e-42 to 1e-36, mostly denormal, from as near and from 1e-30 away."""
-    rng = np.random.default_rng(seed)
     size = 10.0 ** rng.uniform(-42.0, -36.0, (32, 1, 1))
     geometry = soup(size * rng.uniform(-1.0, 1.0, (32, 3, 3)))
     origins = in_ball(rng, n) * 10.0 ** rng.uniform(-42.0, -30.0, (n, 1))
@@ -144,11 +136,10 @@ def tiny(seed: Seed, n: int) -> HardCase:
     return hard_case(geometry, origins, directions / np.where(length > 0.0, length, 1.0), ASK)
 
 
-def tiny_components(seed: Seed, n: int) -> HardCase:
+def tiny_components(rng: np.random.Generator, n: int) -> HardCase:
     """I: triangles of size 1e-20 to 1 with corners on a lattice, and rays of which one or two components of the direction are
     2^-20 to 2^-149 of the longest. In those axes they start exactly at their target's coordinate, which mostly is a face of the
     triangle's box; half of them leave their target behind. Directions are 1e-15 to 1e15 long."""
-    rng = np.random.default_rng(seed)
     corners = rng.integers(-4, 5, (32, 3, 3)) * 10.0 ** rng.uniform(-20.0, 0.0, (32, 1, 1))
     geometry = soup(corners)
     chosen, weights = rng.integers(32, size=n), rng.dirichlet([0.3] * 3, n)
@@ -168,9 +159,8 @@ def tiny_components(seed: Seed, n: int) -> HardCase:
     return hard_case(geometry, origins, directions / np.where(longest > 0.0, longest, 1.0) * length, ASK)
 
 
-def slivers(seed: Seed, n: int) -> HardCase:
+def slivers(rng: np.random.Generator, n: int) -> HardCase:
     """F: single triangles of aspect 1e3 to 1e8, some along the axes, where float32 resolves their width, and some turned."""
-    rng = np.random.default_rng(seed)
     width = 10.0 ** -rng.uniform(3.0, 8.0, 32)
     corners = np.zeros((32, 3, 3))
     corners[:, 0, 0], corners[:, 1, 0], corners[:, 2, 0] = -1.0, 1.0, rng.uniform(-1.0, 1.0, 32)
@@ -182,10 +172,9 @@ def slivers(seed: Seed, n: int) -> HardCase:
     return _towards(geometry, rng, points + unit_vectors(rng, n) * 10.0 ** rng.uniform(-2.0, 2.0, (n, 1)), points)
 
 
-def edge_on(seed: Seed, n: int) -> HardCase:
+def edge_on(rng: np.random.Generator, n: int) -> HardCase:
     """F: rays in the plane of a triangle (half of them exactly: never hit), or out of it by 10^-U(3, 12) rad. All planes are
     parallel, so that a ray in one of them hits none of the others."""
-    rng = np.random.default_rng(seed)
     axis = rng.integers(3)
     corners = rng.uniform(-1.0, 1.0, (24, 3, 3))
     corners[:, :, axis] = rng.integers(-4, 5, (24, 1)) / 4.0
@@ -212,10 +201,9 @@ def _floor(turned: bool) -> Geometry:
     return surface(points @ (np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) if turned else np.eye(3)), faces)
 
 
-def grazing(seed: Seed, n: int, *, turned: bool) -> HardCase:
+def grazing(rng: np.random.Generator, n: int, *, turned: bool) -> HardCase:
     """F: a floor of 2048 triangles, met at 10^U(-7, 0) rad. On the level one, at y = 0, the exact hit is o - d o_y / d_y:
     where that is 1 % inside the border, the ray must hit, because all edges there have a triangle on both sides."""
-    rng = np.random.default_rng(seed)
     points = np.stack([rng.uniform(-90.0, 90.0, n), np.zeros(n), rng.uniform(-90.0, 90.0, n)], axis=1)
     angle, heading = 10.0 ** rng.uniform(-7.0, 0.0, n), rng.uniform(0.0, 2.0 * np.pi, n)
     away = np.stack([np.cos(heading) * np.cos(angle), np.sin(angle), np.sin(heading) * np.cos(angle)], axis=1)
@@ -243,10 +231,9 @@ def _plates() -> Geometry:
     return joined(*(surface(np.stack([i.reshape(-1), j.reshape(-1), np.full(81, z)], axis=1), faces) for z in (1, 2, 4, 8)))
 
 
-def exact_ends(seed: Seed, n: int) -> HardCase:
+def exact_ends(rng: np.random.Generator, n: int) -> HardCase:
     """H: t_min and t_max exactly at the hit, which still counts, and one float32 step past it, which does not. All numbers
     are powers of two and sixteenths: no unit has anything to round."""
-    rng = np.random.default_rng(seed)
     origins = np.concatenate([rng.integers(-15, 16, (n, 2)) / 16.0, np.zeros((n, 1))], axis=1)
     length = 2.0 ** rng.integers(-20, 21, n)
     plate = rng.integers(3, size=n)
@@ -268,9 +255,8 @@ def _cube() -> Geometry:
     return surface(*cube(np.full(3, -1.0), np.full(3, 1.0)))
 
 
-def beside_boxes(seed: Seed, n: int) -> HardCase:
+def beside_boxes(rng: np.random.Generator, n: int) -> HardCase:
     """E: along the axes, one float32 step inside and outside of a cube's faces, and in them."""
-    rng = np.random.default_rng(seed)
     row, axis = np.arange(n), rng.integers(3, size=n)
     side = np.float32(1.0)
     places = np.array([np.nextafter(side, np.float32(2.0)), np.nextafter(side, np.float32(0.0)), 1.0, 0.5])
@@ -282,9 +268,8 @@ def beside_boxes(seed: Seed, n: int) -> HardCase:
     return hard_case(_cube(), origins, directions, ASK, closed=True)
 
 
-def rays_not_finite(seed: Seed, n: int) -> HardCase:
+def rays_not_finite(rng: np.random.Generator, n: int) -> HardCase:
     """I: half of the rays have a NaN or an infinity somewhere; the others must hit all the same."""
-    rng = np.random.default_rng(seed)
     rows = np.concatenate([in_ball(rng, n, 0.9), unit_vectors(rng, n)], axis=1).astype(np.float32)
     bad = rng.random(n) < 0.5
     bad[:1] = True
@@ -302,8 +287,7 @@ def _sphere_not_finite() -> Geometry:
     return joined(good, soup(corners))
 
 
-def mesh_not_finite(seed: Seed, n: int) -> HardCase:
+def mesh_not_finite(rng: np.random.Generator, n: int) -> HardCase:
     """I: a closed sphere, and 30 triangles more with a NaN or an infinity, which are never hit."""
-    rng = np.random.default_rng(seed)
     case = hard_case(_sphere_not_finite(), in_ball(rng, n, 0.9), unit_vectors(rng, n), HIT)
     return replace(case, refused=True)

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-import wrt
-from wrt.core.device import describe_devices, thread_count
+from wrt.core.device import thread_count
 from wrt.core.errors import InputError
-from wrt.core.write_file import replacing
+from wrt.core.html import html_table
 from wrt.lab.bench.plot import LogLogPlot, Series
+from wrt.lab.bench.report import Part, check_folder, table, write
+from wrt.lab.bench.report import machine as machine_line
+from wrt.lab.bench.report import markdown as as_markdown
 from wrt.lab.bench.timing import shown
-from wrt.lab.bench.visibility_report import table
 from wrt.lab.hard_cases.cases import Verdict
-from wrt.lab.hard_cases.stability import ASKED, Plan, Result, Row
-from wrt.picture.image import check_writable, write_codes
+from wrt.lab.hard_cases.stability import ASKED, COLUMNS, Plan, Result, Row, cells
+from wrt.picture.image import encode_png
 
-COLUMNS = ("case", "algorithm", "rays", "judged", "misses", "false hits", "wrong prim", "self-hits", "duplicates", "ties",
-           "near ties", "borderline", "t ulp max", "t ulp 99.9 %", "t / bound")
+PLOTS = {"lost": ("Rays lost or wrong, all hard cases", "rays lost or wrong per million"),
+         "error": ("Error of t, the middle one of the hard cases", "99.9th percentile, float32 ulp")}
 NO_LOSS = 0.3  # where "none" is drawn: as if a third of a ray had been lost
 LEGEND = f"""\
 rays: of which the oracle judged the first ones ("judged", {{sample}} of a case at most); the others have an answer that is known
@@ -33,28 +32,6 @@ bound. Within the bound nothing is wrong, but counted: ties (the same exact t), 
 all hits for the default, of {ASKED} a case for the others) and borderline (the exact ray passes an edge by less than the bound).
 duplicates: one crossing of a surface told twice by an all-hits query. t: error in float32 ulp of the exact distance, and its share
 of the bound."""
-
-
-@dataclass(frozen=True)
-class Part:
-    """A piece of the report: text, a table, or a plot by its file name's ending."""
-
-    title: str = ""
-    text: str = ""
-    head: Sequence[str] = ()
-    lines: Sequence[Sequence[str]] = ()
-    plot: str = ""
-
-
-def cells(row: Row) -> tuple[str, ...]:
-    """A row as text, in the order of COLUMNS."""
-    v = row.verdict
-    if row.refused is not None:
-        return (row.case, row.algorithm, "refused" if row.refused else "ACCEPTED", *[""] * (len(COLUMNS) - 3))
-    counts = (v.rays, row.judged, v.misses, v.false_hits, v.wrong_prim, v.self_hits, v.duplicate_hits, v.ties, v.near_ties,
-              v.borderline_hits + v.borderline_misses)
-    return (row.case, row.algorithm, *map(str, counts), f"{v.t.largest:.3g}", f"{v.t.percentile(99.9):.3g}",
-            f"{v.t.largest_ratio:.2g}")
 
 
 def sums(rows: Sequence[Row]) -> dict[str, Verdict]:
@@ -104,15 +81,16 @@ def _groups(result: Result) -> Part:
     return Part(f"The default ({default}) by group", "", head, lines)
 
 
-def parts(result: Result, plan: Plan) -> list[Part]:
-    """The whole report, in order."""
+def parts(result: Result, plan: Plan, stem: str = "") -> list[Part]:
+    """The whole report, in order; stem: plots are STEM-lost.png and STEM-error.png."""
     command = " ".join(["python -m wrt stability", *plan.cases, f"--rays {plan.rays}", f"--sample {plan.sample}",
                         *(["--peers"] if plan.peers else []), *([f"--seed {plan.seed}"] if plan.seed else [])])
     told = "\n\n".join([f"Machine: {machine(plan)}; {result.seconds:.0f} s in all.", f"To repeat: `{command}`",
                         LEGEND.format(sample=plan.sample), *(f"{line}." for line in _notes(result))])
+    lost, error = (f"{stem}-{which}.png" for which in PLOTS)
     return [Part("Stability of the intersection tests", told), _summary(result),
-            Part("Speed against rays lost or wrong", f"None is drawn at {NO_LOSS} rays: the more rays, the lower.", plot="lost"),
-            Part("Speed against error of t", "", plot="error"), _groups(result),
+            Part("Speed against rays lost or wrong", f"None is drawn at {NO_LOSS} rays: the more rays, the lower.", plot=lost),
+            Part("Speed against error of t", "", plot=error), _groups(result),
             Part("Every case", "", COLUMNS, [cells(row) for row in result.rows])]
 
 
@@ -129,9 +107,7 @@ def _notes(result: Result) -> list[str]:
 
 
 def machine(plan: Plan) -> str:
-    """What it ran on."""
-    device = next((line for line in describe_devices() if line.startswith("cpu:")), "cpu")
-    return f"{device}, {thread_count(plan.threads)} used; wrt {wrt.__version__}"
+    return machine_line(f"{thread_count(plan.threads)} used")
 
 
 def plot(result: Result, which: str) -> LogLogPlot:
@@ -141,51 +117,31 @@ def plot(result: Result, which: str) -> LogLogPlot:
         lost = 1e6 * max(wrong(v), NO_LOSS) / max(v.rays, 1)
         error = lost if which == "lost" else usual_error(result.rows, name)
         series.append(Series(name, [(1e3 / result.speeds[name].mrays[1], error)]))
-    title, label = {"lost": ("Rays lost or wrong, all hard cases", "rays lost or wrong per million"),
-                    "error": ("Error of t, the middle one of the hard cases", "99.9th percentile, float32 ulp")}[which]
+    title, label = PLOTS[which]
     return LogLogPlot(title, "ns a ray, one thread", label, series)
-
-
-def markdown(result: Result, plan: Plan, stem: str = "") -> str:
-    """All of it as Markdown; stem: plots are STEM-lost.png and STEM-error.png, left out where it is empty."""
-    out = []
-    for i, part in enumerate(parts(result, plan)):
-        if part.plot and not stem:
-            continue
-        out.append(f"{'#' if i == 0 else '##'} {part.title}")
-        out += [part.text] if part.text else []
-        out += [f"![{part.title}]({stem}-{part.plot}.png)"] if part.plot else []
-        out += [table(part.head, part.lines)] if part.lines else []
-    return "\n\n".join(out) + "\n"
 
 
 STYLE = """body{font:15px/1.5 sans-serif;max-width:1300px;margin:2em auto;padding:0 1em}
 table{border-collapse:collapse;font-size:13px}td,th{padding:2px 9px;border-bottom:1px solid #ddd;text-align:right}
-td:first-child,th:first-child{text-align:left}img{max-width:100%}"""
+img{max-width:100%}"""
 
 
 def page(result: Result, plan: Plan) -> str:
     """All of it as one HTML file, plots within."""
     out = [f"<!DOCTYPE html><html lang=en><meta charset=utf-8><title>wrt stability</title><style>{STYLE}</style>"]
-    for i, part in enumerate(parts(result, plan)):
-        out.append(f"<h{1 + (i > 0)}>{html.escape(part.title)}</h{1 + (i > 0)}>")
+    for part in parts(result, plan):
+        out.append(f"<h2>{html.escape(part.title)}</h2>")
         out += [f"<p>{html.escape(paragraph)}</p>" for paragraph in part.text.split("\n\n") if paragraph]
         if part.plot:
-            image = base64.b64encode(_png(plot(result, part.plot).draw())).decode()
+            image = base64.b64encode(encode_png(plot(result, _which(part.plot)).draw(), {})).decode()
             out.append(f'<img alt="{html.escape(part.title)}" src="data:image/png;base64,{image}">')
-        if part.lines:
-            rows = ["".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in part.lines]
-            head = "".join(f"<th>{html.escape(cell)}</th>" for cell in part.head)
-            out.append(f"<table><tr>{head}</tr><tr>{'</tr><tr>'.join(rows)}</tr></table>")
+        out += [html_table("", part.head, part.lines, most=None)] if part.lines else []
     return "\n".join(out) + "</html>\n"
 
 
-def _png(pixels: np.ndarray) -> bytes:
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "png")
-    return stream.getvalue()
+def _which(name: str) -> str:
+    """The plot of a file's name."""
+    return name.removesuffix(".png").rsplit("-", 1)[1]
 
 
 def check_report(path: Path) -> None:
@@ -194,21 +150,12 @@ def check_report(path: Path) -> None:
         raise InputError("the report is Markdown or HTML: use .md or .html", path)
     if not path.parent.is_dir():
         raise InputError("no such folder", path.parent)
-    for target in paths(path)[1:]:
-        check_writable(target)
-
-
-def paths(path: Path) -> list[Path]:
-    """The report and what stands beside it."""
-    beside = ("lost", "error") if path.suffix.lower() == ".md" else ()
-    return [path, *(path.with_name(f"{path.stem}-{which}.png") for which in beside)]
+    check_folder(path.parent, [f"{path.stem}-{which}.png" for which in PLOTS if path.suffix.lower() == ".md"])
 
 
 def write_report(result: Result, plan: Plan, path: Path) -> list[Path]:
     """The files; the report is written whole or not at all. Raises InputError where the system refuses."""
-    text = page(result, plan) if path.suffix.lower() == ".html" else markdown(result, plan, path.stem)
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    for target in paths(path)[1:]:
-        write_codes(target, plot(result, target.stem.rsplit("-", 1)[1]).draw())
-    return paths(path)
+    if path.suffix.lower() == ".html":
+        return write(path, page(result, plan), {})
+    told = parts(result, plan, path.stem)
+    return write(path, as_markdown(told), {part.plot: plot(result, _which(part.plot)) for part in told if part.plot})

@@ -39,6 +39,9 @@ ASKED = 2000  # of a rival's claimed hits in one case: is anything nearer? Of th
 CHUNK = 2**18
 COSTLY = {"G_fan": 100}  # 10,000 triangles at one vertex are all tested: so many times fewer rays
 
+COLUMNS = ("case", "algorithm", "rays", "judged", "misses", "false hits", "wrong prim", "self-hits", "duplicates", "ties",
+           "near ties", "borderline", "t ulp max", "t ulp 99.9 %", "t / bound")
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -76,6 +79,17 @@ class Row:
                 "offset_self_hits": self.offset_self_hits, "refused": self.refused, **self.verdict.as_dict()}
 
 
+def cells(row: Row) -> tuple[str, ...]:
+    """A row as text, in the order of COLUMNS."""
+    v = row.verdict
+    if row.refused is not None:
+        return (row.case, row.algorithm, "refused" if row.refused else "ACCEPTED", *[""] * (len(COLUMNS) - 3))
+    counts = (v.rays, row.judged, v.misses, v.false_hits, v.wrong_prim, v.self_hits, v.duplicate_hits, v.ties, v.near_ties,
+              v.borderline_hits + v.borderline_misses)
+    return (row.case, row.algorithm, *map(str, counts), f"{v.t.largest:.3g}", f"{v.t.percentile(99.9):.3g}",
+            f"{v.t.largest_ratio:.2g}")
+
+
 @dataclass(frozen=True)
 class Speed:
     """On one thread, on case A's sphere: Mray/s; its share of the default's, taken run by run; bytes a triangle."""
@@ -101,8 +115,6 @@ class Result:
     undone: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
-        from wrt.lab.hard_cases.report import COLUMNS, cells
-
         return html_table("Stability", COLUMNS, map(cells, self.rows))
 
     def as_dict(self) -> dict[str, Any]:

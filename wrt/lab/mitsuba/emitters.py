@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError
+from wrt.lab.mitsuba.exact import refuse
 from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 
@@ -17,20 +18,20 @@ SPOT_TEXELS = 1024
 WIDEST_SPOT = math.radians(80.0)
 
 
-def light_emitter(mi: Any, light: Light, notes: Any) -> dict[str, Any]:
+def light_emitter(mi: Any, light: Light) -> dict[str, Any]:
     """A point, directional or spot light as a dictionary for `mitsuba.load_dict`."""
     if isinstance(light, PointLight):
         return {"type": "point", "position": list(light.position), "intensity": _rgb(light.intensity)}
     if isinstance(light, DirectionalLight):
         return {"type": "directional", "direction": list(light.direction), "irradiance": _rgb(light.irradiance)}
-    return _spot(mi, light, notes)
+    return _spot(mi, light)
 
 
 def _rgb(color: Any) -> dict[str, Any]:
     return {"type": "rgb", "value": list(color)}
 
 
-def _spot(mi: Any, light: SpotLight, notes: Any) -> dict[str, Any]:
+def _spot(mi: Any, light: SpotLight) -> dict[str, Any]:
     """Mitsuba's falloff is linear in the angle; wrt's is put into the texture that Mitsuba projects from the light."""
     direction = np.array(light.direction)
     up = np.eye(3)[int(np.argmin(np.abs(direction)))]
@@ -43,8 +44,7 @@ def _spot(mi: Any, light: SpotLight, notes: Any) -> dict[str, Any]:
     if light.inner >= light.outer:
         return spot
     if light.outer > WIDEST_SPOT:
-        notes.add("a spot wider than 80 degrees (linear falloff in the angle)", f"light {light.name!r}")
-        return spot | {"cutoff_angle": min(cutoff, 89.9), "beam_width": min(math.degrees(light.inner), 89.8)}
+        refuse("a spot wider than 80 degrees", f"light {light.name!r}")
     x = (2.0 * (np.arange(SPOT_TEXELS) + 0.5) / SPOT_TEXELS - 1.0) * math.tan(light.outer)
     cosine = 1.0 / np.sqrt(1.0 + x[None, :] ** 2 + x[:, None] ** 2)
     ramp = (cosine - math.cos(light.outer)) / (math.cos(light.inner) - math.cos(light.outer))

@@ -19,12 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from wrt.core.checks import as_choice
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench.error import REFERENCE_SEEDS, Reference, finished, make_reference
+from wrt.lab.bench.report import check_plan, table
 from wrt.lab.bench.timing import Quartiles, quartiles, shown
-from wrt.lab.bench.visibility_report import table
 from wrt.lab.mitsuba.llvm import NotAvailable
 from wrt.lab.mitsuba.process import VARIANTS, Job, MitsubaProcess, environment_of
 from wrt.lab.mitsuba.translate import INTEGRATORS
@@ -53,10 +54,8 @@ class Plan:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 1 <= self.spp <= 1 << 16 or not 3 <= self.repeats <= 1000:
-            raise InputError(f"spp must be 1 to 65536 and repeats 3 to 1000, got {self.spp} and {self.repeats}")
-        if self.integrator not in INTEGRATORS:
-            raise InputError(f"integrator must be one of {', '.join(INTEGRATORS)}; got {self.integrator!r}")
+        check_plan(self, {}, spp=(1, 1 << 16), repeats=(3, 1000))
+        as_choice(self.integrator, INTEGRATORS, "integrator")
         if not self.variants or not set(self.variants) <= set(VARIANTS):
             raise InputError(f"variants must be of {', '.join(VARIANTS)}; got {', '.join(self.variants) or 'none'}")
 
@@ -76,8 +75,7 @@ class Side:
     process_seconds: float
 
     def as_dict(self) -> dict[str, Any]:
-        return {"spp": self.spp, "seconds": self.seconds.tolist(), "rmse": self.rmse, "bias": self.bias,
-                "bias_below": self.bias_below, "prepare_seconds": self.prepare_seconds, "process_seconds": self.process_seconds}
+        return vars(self) | {"seconds": self.seconds.tolist()}
 
 
 @dataclass(frozen=True)
@@ -91,8 +89,7 @@ class Rival:
     same_light: bool
 
     def as_dict(self) -> dict[str, Any]:
-        return {**self.side.as_dict(), "ratio": list(self.ratio), "process_ratio": self.process_ratio,
-                "same_light": self.same_light}
+        return {**self.side.as_dict(), **{name: value for name, value in vars(self).items() if name != "side"}}
 
 
 @dataclass(frozen=True)
@@ -109,9 +106,8 @@ class Result:
     reference: Reference
 
     def as_dict(self) -> dict[str, Any]:
-        return {"scene": self.scene, "size": list(self.size), "integrator": self.integrator, "threads": self.threads,
-                "wrt": self.wrt.as_dict(), "mitsuba": {name: rival.as_dict() for name, rival in self.mitsuba.items()},
-                "not_available": self.not_available, "reference": self.reference.as_dict()}
+        return vars(self) | {"wrt": self.wrt.as_dict(), "reference": self.reference.as_dict(),
+                             "mitsuba": {name: rival.as_dict() for name, rival in self.mitsuba.items()}}
 
 
 def matte(scene: Scene) -> Scene:

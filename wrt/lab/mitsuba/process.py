@@ -22,7 +22,7 @@ import numpy as np
 import wrt
 from wrt.core.errors import InputError
 from wrt.lab.mitsuba.llvm import PATH_VARIABLE, NotAvailable, ended, llvm_library
-from wrt.lab.mitsuba.translate import Options, mitsuba, translate
+from wrt.lab.mitsuba.translate import mitsuba, translate
 from wrt.scene.cameras import Camera
 from wrt.scene.model import Scene
 
@@ -129,7 +129,7 @@ def serve() -> None:
         with mitsuba(job.variant) as mi:
             importlib.import_module("drjit").set_thread_count(job.threads)
             begin = time.perf_counter()
-            scene = translate(mi, job.scene, job.camera, Options(integrator=job.integrator)).scene
+            scene = translate(mi, job.scene, job.camera, job.integrator).scene
             answer(time.perf_counter() - begin)
             while True:
                 spp, seed = pickle.load(sys.stdin.buffer)

@@ -8,12 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wrt.lab.mitsuba.bsdfs import bsdf, emission
+from wrt.lab.mitsuba.exact import refuse
 from wrt.scene.materials import Material
-from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Sphere
-
-# The back of a two-sided light is a second mesh, this share of the mesh's extent behind the first.
-BACK_OFFSET = 1e-5
 
 
 class Part(NamedTuple):
@@ -24,19 +21,14 @@ class Part(NamedTuple):
     material: Material
 
 
-class _Triangles(NamedTuple):
+class Triangles(NamedTuple):
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray | None
     uvs: np.ndarray | None
 
 
-def raw_mesh(mi: Any, mesh: Mesh) -> Any:
-    """The mesh as it is, for ray queries: vertices and faces only, in the same order."""
-    return _mesh(mi, "mesh", _Triangles(mesh.vertices, mesh.faces, None, None), {})
-
-
-def object_parts(mi: Any, thing: Object, object_id: int, notes: Any) -> Iterator[tuple[str, Any, Part]]:
+def object_parts(mi: Any, thing: Object, object_id: int) -> Iterator[tuple[str, Any, Part]]:
     """(shape id, `mitsuba.Mesh`, Part) for each material that some face of the object has."""
     world = _to_world(thing)
     of_face = np.zeros(len(world.faces), np.int32) if thing.face_material is None else thing.face_material
@@ -48,28 +40,24 @@ def object_parts(mi: Any, thing: Object, object_id: int, notes: Any) -> Iterator
             triangles = triangles._replace(uvs=np.zeros((len(triangles.vertices), 2), np.float32))
         name = f"object{object_id}_{index}"
         part = Part(object_id, chosen, material)
-        yield name, _mesh(mi, name, triangles, _properties(mi, material, notes)), part
-        if material.is_emissive and material.two_sided:
-            notes.add("two_sided emission (a second mesh close behind emits to the back)", f"material {material.name!r}")
-            back = _mesh(mi, name + "_back", _behind(triangles), _properties(mi, material, notes))
-            yield name + "_back", back, part
+        yield name, make_mesh(mi, name, triangles, _properties(mi, material)), part
 
 
-def sphere_shape(mi: Any, sphere: Sphere, notes: Any) -> Any:
+def sphere_shape(mi: Any, sphere: Sphere) -> Any:
     """Mitsuba's sphere has u around its z from its x, v down from +z: z is turned to +y and x to -x."""
-    if sphere.material.is_emissive and sphere.material.two_sided:
-        notes.add("two_sided emission (the inside does not emit)", f"sphere {sphere.name!r}")
     pose = np.eye(4)
     pose[:3, :3] = sphere.radius * np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
     pose[:3, 3] = sphere.center
-    return {"type": "sphere", "to_world": mi.ScalarTransform4f(pose), **_properties(mi, sphere.material, notes)}
+    return {"type": "sphere", "to_world": mi.ScalarTransform4f(pose), **_properties(mi, sphere.material)}
 
 
-def _properties(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
+def _properties(mi: Any, material: Material) -> dict[str, Any]:
     """A shape's nested plugins: its BSDF, what it emits, the medium inside."""
-    nested: dict[str, Any] = {"bsdf": bsdf(mi, material, notes)}
+    nested: dict[str, Any] = {"bsdf": bsdf(mi, material)}
     if material.is_emissive:
-        nested["emitter"] = emission(mi, material, notes)
+        if material.two_sided:
+            refuse("two_sided emission", f"material {material.name!r}")
+        nested["emitter"] = emission(mi, material)
     if max(material.absorption) > 0.0 and not material.thin:
         strongest = max(material.absorption)  # colours above 1 are refused, hence the scale
         ratio = [value / strongest for value in material.absorption]
@@ -78,13 +66,13 @@ def _properties(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
     return nested
 
 
-def _to_world(thing: Object) -> _Triangles:
+def _to_world(thing: Object) -> Triangles:
     """World-space triangles: float64 arithmetic, rounded to float32 once, as wrt does it."""
     mesh, linear = thing.mesh, thing.transform[:3, :3]
     vertices = mesh.vertices.astype(np.float64) @ linear.T + thing.transform[:3, 3]
     # A mirroring transform turns the winding around; exchanging two corners keeps the outside outside.
     faces = mesh.faces if np.linalg.det(linear) >= 0.0 else mesh.faces[:, [0, 2, 1]]
-    world = _Triangles(vertices.astype(np.float32), faces, None, mesh.uvs)
+    world = Triangles(vertices.astype(np.float32), faces, None, mesh.uvs)
     if mesh.normals is None:
         return world
     normals = mesh.normals.astype(np.float64) @ np.linalg.inv(linear)
@@ -100,23 +88,23 @@ def _to_world(thing: Object) -> _Triangles:
     return corners._replace(normals=np.where(np.any(corners.normals, axis=1, keepdims=True), corners.normals, own))
 
 
-def _select(triangles: _Triangles, chosen: np.ndarray) -> _Triangles:
+def _select(triangles: Triangles, chosen: np.ndarray) -> Triangles:
     """The chosen faces with the vertices that they use."""
     if len(chosen) == len(triangles.faces):
         return triangles
     used, faces = np.unique(triangles.faces[chosen], return_inverse=True)
     pick = lambda array: None if array is None else array[used]
-    return _Triangles(triangles.vertices[used], faces.reshape(-1, 3), pick(triangles.normals), pick(triangles.uvs))
+    return Triangles(triangles.vertices[used], faces.reshape(-1, 3), pick(triangles.normals), pick(triangles.uvs))
 
 
-def _unshared(triangles: _Triangles) -> _Triangles:
+def _unshared(triangles: Triangles) -> Triangles:
     corner = triangles.faces.reshape(-1)
     pick = lambda array: None if array is None else array[corner]
     faces = np.arange(len(corner)).reshape(-1, 3)
-    return _Triangles(triangles.vertices[corner], faces, pick(triangles.normals), pick(triangles.uvs))
+    return Triangles(triangles.vertices[corner], faces, pick(triangles.normals), pick(triangles.uvs))
 
 
-def _face_normals(triangles: _Triangles) -> np.ndarray:
+def _face_normals(triangles: Triangles) -> np.ndarray:
     """(F, 3) float32 unit normals; zero for a triangle without area."""
     a, b, c = (triangles.vertices[triangles.faces[:, corner]].astype(np.float64) for corner in range(3))
     normals = np.cross(b - a, c - a)
@@ -124,16 +112,7 @@ def _face_normals(triangles: _Triangles) -> np.ndarray:
     return (normals / np.where(length > 0.0, length, 1.0)).astype(np.float32)
 
 
-def _behind(triangles: _Triangles) -> _Triangles:
-    """The same triangles seen from the back, moved a little to the back."""
-    corners = _unshared(triangles)
-    extent = float(np.ptp(corners.vertices, axis=0).max())
-    moved = corners.vertices - BACK_OFFSET * extent * np.repeat(_face_normals(corners), 3, axis=0)
-    normals = None if corners.normals is None else -corners.normals
-    return _Triangles(moved.astype(np.float32), corners.faces[:, [0, 2, 1]], normals, corners.uvs)
-
-
-def _mesh(mi: Any, name: str, triangles: _Triangles, nested: dict[str, Any]) -> Any:
+def make_mesh(mi: Any, name: str, triangles: Triangles, nested: dict[str, Any]) -> Any:
     properties = mi.Properties()
     for key, value in nested.items():
         properties[key] = mi.load_dict(value)

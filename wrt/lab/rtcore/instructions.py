@@ -21,7 +21,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.study.unit_probes import make_box_probe, make_triangle_probe
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
-from wrt.lab.bench.visibility_report import table
+from wrt.lab.bench.report import table
 from wrt.lab.rtcore.cubin import CLASSES, INSTRUCTION, KernelCode, read_cubin
 
 ARCH = 75

@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build
+from wrt.accel.bvh.binary import Bvh2
+from wrt.accel.bvh.wide import WideBvh
 from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checks import require_known
-from wrt.core.errors import InputError
-from wrt.core.html import Rows, html_table
+from wrt.core.html import Rows
 from wrt.io.mesh_file import as_mesh
+from wrt.lab.bench import report
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
-from wrt.lab.bench.visibility_report import table
+from wrt.lab.bench.report import Part, check_plan, gathered
 from wrt.lab.rtcore.instructions import Software, box_unit, software, triangle_unit
 from wrt.lab.rtcore.model import Work, simt, trace_rays
 from wrt.lab.rtcore.parameters import GPUS
@@ -41,13 +41,8 @@ class Plan:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        if not 1 <= self.rays <= 2**22:
-            raise InputError(f"rays must be 1 to {2**22}, got {self.rays}")
-        tables: tuple[tuple[str, Sequence[str], Any], ...] = (
-            ("structure", self.structures, ACCELERATORS), ("kind of ray", self.kinds, RAY_KINDS), ("GPU", [self.gpu], GPUS))
-        for what, names, known in tables:
-            for name in names:
-                require_known(name, known, what)
+        check_plan(self, {"structure": (self.structures, ACCELERATORS), "kind of ray": (self.kinds, RAY_KINDS),
+                          "GPU": ([self.gpu], GPUS)}, rays=(1, 2**22))
 
     @property
     def names(self) -> list[str]:
@@ -56,8 +51,8 @@ class Plan:
 
 
 def bvhs() -> list[str]:
-    """Every BVH of the registry by its own name."""
-    return [name for name, cls in ACCELERATORS.items() if name == cls.name and name.startswith("bvh")]
+    """Every BVH of the registry by its own name: what is built from a binary tree."""
+    return [name for name, cls in ACCELERATORS.items() if name == cls.name and issubclass(cls, Bvh2 | WideBvh)]
 
 
 @dataclass(frozen=True)
@@ -69,6 +64,9 @@ class Row:
     structure: str
     bytes: int
     row: ModelRow
+
+    def as_dict(self) -> dict[str, object]:
+        return {**{name: getattr(self, name) for name in ("mesh", "triangles", "structure", "bytes")}, **self.row.as_dict()}
 
 
 def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
@@ -92,12 +90,8 @@ def work_of(accel: Accelerator, rays: RaySet) -> Work:
 
 def run(plan: Plan, tell: Callable[[Row], None] = lambda row: None) -> Rows[Row]:
     """Every row in turn; `tell` gets each when it is there. Raises InputError for a mesh that cannot be read."""
-    rows = []
-    for mesh in map(as_mesh, plan.meshes):
-        for row in _mesh_rows(plan, mesh):
-            tell(row)
-            rows.append(row)
-    return Rows(rows, page)
+    rows = (row for mesh in map(as_mesh, plan.meshes) for row in _mesh_rows(plan, mesh))
+    return Rows(gathered(rows, tell), lambda rows: report.page(parts(rows)))
 
 
 def _mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
@@ -116,22 +110,24 @@ def _mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
 MESH_COLUMNS = ("structure", "kind", "B/triangle", *COLUMNS[1:], "SIMT", "sorted")
 
 
-def by_mesh(rows: Sequence[Row]) -> Iterator[tuple[str, list[tuple[str, ...]]]]:
-    """A title and the lines of a table for each mesh, with the structures' memory."""
+def line(row: Row) -> str:
+    """For the progress."""
+    return "  ".join((row.mesh, row.structure, *cells(row.row)))
+
+
+def parts(rows: Sequence[Row]) -> list[Part]:
+    """A table for each mesh, with the structures' memory."""
+    out = []
     for mesh in dict.fromkeys(row.mesh for row in rows):
         group = [row for row in rows if row.mesh == mesh]
-        yield f"{mesh}, {group[0].triangles} triangles", [
+        out.append(Part(f"{mesh}, {group[0].triangles} triangles", "", MESH_COLUMNS, [
             (row.structure, row.row.name, f"{row.bytes / row.triangles:.0f}", *cells(row.row)[1:],
-             *(f"{row.row.simt[name]:.0%}" for name in ("as they come", "sorted"))) for row in group]
+             *(f"{row.row.simt[name]:.0%}" for name in ("as they come", "sorted"))) for row in group]))
+    return out
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    return "\n".join(f"## {title}\n\n{table(MESH_COLUMNS, lines)}\n" for title, lines in by_mesh(rows))
-
-
-def page(rows: Sequence[Row]) -> str:
-    """The same as HTML."""
-    return "".join(html_table(title, MESH_COLUMNS, lines) for title, lines in by_mesh(rows))
+    return report.markdown(parts(rows))
 
 
 SOFTWARE_TITLE = """\

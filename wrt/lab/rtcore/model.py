@@ -21,7 +21,7 @@ from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.lab.rtcore.caches import LINE, Level1, Misses, Warps, first_level, second_level
 from wrt.lab.rtcore.parameters import BASE, SWEEPS, Core, Gpu
-from wrt.lab.rtcore.warps import WARP, by_coherence, efficiency, longest_of, packed
+from wrt.lab.rtcore.warps import by_coherence, efficiency, longest_of, packed
 
 TERMS = ("box", "triangle", "L1", "L2", "DRAM", "latency")
 
@@ -167,8 +167,3 @@ def trace_rays(accel: Accelerator, name: str, origins: np.ndarray, directions: n
     counters = accel.closest_hit(origins, directions, t_max=t_max, trace=True).counters
     assert counters is not None
     return Work(name, counters, packed(len(origins)) if warp is None else warp)
-
-
-def lanes_busy(work: Work) -> float:
-    """Rays a warp over 32."""
-    return len(work) / (WARP * (int(work.warp[-1]) + 1))

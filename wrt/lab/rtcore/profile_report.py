@@ -8,29 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.errors import InputError
 from wrt.core.html import Rows
-from wrt.lab.bench.histogram import histograms
-from wrt.lab.bench.visibility_report import table
+from wrt.lab.bench.plot import histograms
+from wrt.lab.bench.report import table
 from wrt.lab.rtcore.model import simt
 from wrt.lab.rtcore.parameters import Gpu
 from wrt.lab.rtcore.profile_work import GROUPS, efficiency_rows, warp_order, work_of
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, TITLES, Profile
 from wrt.lab.rtcore.report import LEGEND, ModelRow, model_page, model_row, model_table, simt_table
-from wrt.picture.image import check_writable, write_codes, write_exr
+from wrt.picture.image import write_codes, write_exr
 
 PER_RAY = ("nodes", "boxes", "primitives", "leaves", "stack", "lines")
 LAYERS, HISTOGRAMS, REPORT = "counters.exr", "histograms.png", "profile.md"
-
-
-def check_folder(folder: Path) -> None:
-    """Make the folder if it is not there; InputError where nothing can be written to it."""
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"no folder to write to: {error.strerror}", folder) from error
-    for name in (LAYERS, HISTOGRAMS):
-        check_writable(folder / name)
 
 
 def ray_values(profile: Profile, name: str) -> np.ndarray:
@@ -92,7 +81,6 @@ def summary(profile: Profile, rows: Sequence[ModelRow], gpu: Gpu) -> str:
 
 def write_report(profile: Profile, text: str, folder: Path) -> list[Path]:
     """Everything that there is to see; the paths. Raises InputError where the system refuses."""
-    check_folder(folder)
     paths = []
     for name in PICTURES:
         if profile.maps[name].any():

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from wrt.core.html import html_table
-from wrt.lab.bench.visibility_report import table
+from wrt.lab.bench.report import table
 from wrt.lab.rtcore.model import TERMS, Prediction, Work, predict, sensitivity, span, sweep
 from wrt.lab.rtcore.parameters import PARAMETERS, SWEEPS, Gpu
 

@@ -16,13 +16,11 @@ from wrt.accel.answers import Counters
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
-from wrt.core.checks import require_known
-from wrt.core.errors import InputError
 from wrt.core.html import Rows, html_table
 from wrt.io.mesh_file import as_mesh
 from wrt.kernels.study.bvh2_study import STACK_SIZE, Study
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
-from wrt.lab.bench.visibility_report import table
+from wrt.lab.bench.report import check_plan, gathered, table
 from wrt.lab.rtcore.meshes import bvhs, in_warps
 from wrt.lab.rtcore.model import TERMS, Prediction, Work, predict, simt
 from wrt.lab.rtcore.parameters import BASE, GPUS, SWEEPS, Core, Gpu
@@ -57,12 +55,8 @@ class Plan:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        if not 1 <= self.rays <= 2**22:
-            raise InputError(f"rays must be 1 to {2**22}, got {self.rays}")
-        for what, names, known in (("study", [self.study], STUDIES), ("kind of ray", self.kinds, RAY_KINDS),
-                                   ("GPU", [self.gpu], GPUS)):
-            for name in names:
-                require_known(name, known, what)
+        check_plan(self, {"study": ([self.study], STUDIES), "kind of ray": (self.kinds, RAY_KINDS), "GPU": ([self.gpu], GPUS)},
+                   rays=(1, 2**22))
 
 
 @dataclass(frozen=True)
@@ -164,15 +158,16 @@ STUDIES: dict[str, Callable[[Geometry, RaySet], Iterator[Variant]]] = {
 
 def run(plan: Plan, tell: Callable[[Row], None] = lambda row: None) -> Rows[Row]:
     """All rows of a study; `tell` gets each when it is there. Raises InputError for a mesh that cannot be read."""
+    return Rows(gathered(_rows(plan), tell), lambda rows: html_table(f"What if: {plan.study}", COLUMNS, map(cells, rows)))
+
+
+def _rows(plan: Plan) -> Iterator[Row]:
     geometry, sets = rays_of(plan)
-    rows = []
     for kind in dict.fromkeys(plan.kinds):
         first = None
         for variant in STUDIES[plan.study](geometry, sets[kind]):
             first = first or variant
-            rows.append(row_of(variant, first, kind, GPUS[plan.gpu]))
-            tell(rows[-1])
-    return Rows(rows, lambda rows: html_table(f"What if: {plan.study}", COLUMNS, map(cells, rows)))
+            yield row_of(variant, first, kind, GPUS[plan.gpu])
 
 
 def rays_of(plan: Plan) -> tuple[Geometry, dict[str, RaySet]]:
@@ -217,6 +212,11 @@ class Rate:
     triangles: float
     prediction: Prediction
     doubled: float
+
+    def as_dict(self) -> dict[str, Any]:
+        p = self.prediction
+        return {"structure": self.structure, "kind": self.kind, "boxes": self.boxes, "triangles": self.triangles,
+                "rays_per_second": p.rays_per_second, "limit": p.bottleneck, "clocks": p.terms, "doubled": self.doubled}
 
 
 def rates(plan: Plan, tell: Callable[[str], None] = lambda line: None) -> Rows[Rate]:

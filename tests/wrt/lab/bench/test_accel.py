@@ -14,7 +14,6 @@ from tests.command_line import wrt as command
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.lab.bench import accel as bench
-from wrt.lab.bench import accel_report as report
 from wrt.lab.bench.accel import Plan, Refused, Row, growth, run
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
@@ -87,7 +86,7 @@ def test_a_structure_that_refuses_is_named_and_the_others_go_on(box, monkeypatch
     monkeypatch.setitem(bench.ACCELERATORS, "refusing", Refusing)
     rows = run(plan(box, structures=("refusing", "bvh2"), kinds=("random",)))
     assert rows[0] == Refused("box.obj", "refusing", "more than 11 triangles") and rows[1].structure == "bvh2"
-    assert "refusing over box.obj: more than 11 triangles" in report.markdown(rows)
+    assert "| refusing  | box.obj | more than 11 triangles |" in bench.text(rows, "")
     assert "<td style=\"text-align:left\">more than 11 triangles</td>" in rows._repr_html_()
 
 
@@ -110,7 +109,7 @@ def test_meshes_need_no_file_and_a_notebook_shows_tables(tmp_path) -> None:
     rows = run(Plan((icosphere(1), icosphere(2)), ("bvh2",), ("primary",), rays=100, runs=1))
     page = rows._repr_html_()
     assert [row.triangles for row in rows] == [80, 320] and page.count("<table>") == 2 and "icosphere, 320 triangles" in page
-    assert "bench accel icosphere" in report.write_report(rows, Plan((icosphere(1),)), tmp_path, "")[0].read_text()
+    assert "bench accel icosphere" in bench.write_report(rows, Plan((icosphere(1),)), tmp_path, "")[0].read_text()
     with pytest.raises(InputError, match="mesh must be a Mesh or the path"):
         run(Plan((1,)))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="no triangles"):
@@ -125,9 +124,9 @@ def test_growth_fits_exponents() -> None:
 
 
 def test_the_tables_hold_what_was_measured() -> None:
-    text = report.markdown([made("a", seconds=(1.0, 1.0)), made("b", seconds=(0.5, 0.5), differ=3)])
+    text = bench.text([made("a", seconds=(1.0, 1.0)), made("b", seconds=(0.5, 0.5), differ=3)], "")
     line = next(line for line in text.splitlines() if line.startswith("| b"))
-    named = dict(zip(report.COLUMNS, (cell.strip() for cell in line.strip("|").split("|")), strict=True))
+    named = dict(zip(bench.COLUMNS, (cell.strip() for cell in line.strip("|").split("|")), strict=True))
     assert named["Mray/s"] == "2 [2, 2]" and named["/ first"] == "2.00" and named["differ"] == "3" and named["build ms"] == "500"
 
 
@@ -148,9 +147,9 @@ def test_the_command_prints_json_and_writes_a_report(box, tmp_path) -> None:
     assert out.code == 0 and out.err == ""
     facts = json.loads(out.out)
     assert [row["kind"] for row in facts["rows"]] == ["diffuse", "random"] and facts["refused"] == []
-    for name in (report.REPORT, *report.PLOTS):
+    for name in (bench.REPORT, *bench.PLOTS):
         assert (tmp_path / "report" / name).stat().st_size > 500
-    text = (tmp_path / "report" / report.REPORT).read_text()
+    text = (tmp_path / "report" / bench.REPORT).read_text()
     assert "bench accel box.obj" in text and str(tmp_path) not in text
 
 

@@ -59,5 +59,5 @@ def test_every_unit_has_a_row_on_every_mesh(monkeypatch) -> None:
 def test_bad_plans_are_refused() -> None:
     with pytest.raises(InputError, match="no structure 'sphere'"):
         units.Plan(accel="sphere")
-    with pytest.raises(InputError, match="1 or more"):
+    with pytest.raises(InputError, match="runs must be 1"):
         units.Plan(runs=0)

@@ -18,7 +18,7 @@ from tests.command_line import wrt as command
 from tests.data import data_path
 from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
-from wrt.lab.bench import visibility_report
+from wrt.lab.bench import visibility
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
 from wrt.lab.bench.visibility import Plan, Row, crossings, fit, fits, framing, run, series, subdivided, surfaces, terrain
 from wrt.lab.bench.visibility_check import Agreement, agreement, compare
@@ -300,10 +300,10 @@ def test_a_plan_that_cannot_be_run_is_refused(option: str, value: object) -> Non
 
 def test_the_tables_hold_what_was_measured() -> None:
     rows = [row("triangles", 1000, 4096, 0.002, 0.006), row("triangles", 4000, 4096, 0.003, 0.006)]
-    text = visibility_report.markdown(rows)
+    text = visibility.text(rows, "")
     lines = [line for line in text.splitlines() if line.startswith("| s ")]
     first = [cell.strip() for cell in lines[0].strip("|").split("|")]
-    named = dict(zip(visibility_report.COLUMNS, first, strict=True))
+    named = dict(zip(visibility.COLUMNS, first, strict=True))
     assert named["triangles"] == "1000" and named["covered"] == "50.0%" and named["raster ms"] == "2 [2, 2]"
     assert named["cast / raster"] == "3 [3, 3]" and named["with build"] == "503" and named["build ms"] == "1e+03"
     assert (named["differ"], named["ties"], named["silhouettes"], named["unexplained"]) == ("3", "2", "1", "0")
@@ -329,7 +329,7 @@ def test_the_command_prints_tables_and_writes_a_report(folder: Path) -> None:
     assert "## As triangles grow" in result.out and "| cast   | box.obj |" in result.out
     text = Path("report/visibility.md").read_text()
     assert "python -m wrt bench visibility box.obj --size 32 --max-size 64" in text
-    for name in visibility_report.PLOTS.values():
+    for name in visibility.PLOTS:
         assert f"]({name})" in text
         picture = np.asarray(Image.open(folder / "report" / name))
         assert picture.ndim == 3 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 20

@@ -11,7 +11,7 @@ import pytest
 
 import wrt
 from tests.data import data_path
-from wrt.lab.mitsuba.translate import aov_mitsuba, camera_rays, render_mitsuba
+from tests.mitsuba_oracle import aov_mitsuba, camera_rays, render_mitsuba
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.defaults import frame_camera

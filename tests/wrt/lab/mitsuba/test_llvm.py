@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.mitsuba_oracle import render_mitsuba
 from wrt.core.errors import InputError
 from wrt.lab.mitsuba import llvm
 from wrt.lab.mitsuba import process as mitsuba_process
 from wrt.lab.mitsuba.llvm import NotAvailable, candidates, llvm_library, trial
 from wrt.lab.mitsuba.process import Job, MitsubaProcess
-from wrt.lab.mitsuba.translate import render_mitsuba
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
