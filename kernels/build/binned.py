@@ -17,6 +17,7 @@ from wrt.kernels.build.records import (
     levels,
     low_of,
     lower,
+    parted_at,
     row_of,
 )
 
@@ -142,8 +143,7 @@ def part_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> H
         middle = middle + wp.where(left, 1, 0)
         centers_0 = lower(centers_0, wp.where(left, row, empty))
         centers_1 = lower(centers_1, wp.where(left, empty, row))
-    out = Halves()
-    out.middle = middle
+    out = parted_at(task, middle)
     out.left.box = split.box_0
     out.left.centers = centers_0
     out.right.box = split.box_1

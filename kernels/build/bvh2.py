@@ -163,7 +163,8 @@ def child_of(task: BuildTask, halves: Halves, side: int) -> BuildTask:
     """One side of a split range."""
     child = BuildTask()
     child.begin = wp.where(side == 0, task.begin, halves.middle)
-    child.end = wp.where(side == 0, halves.middle, task.end)
+    child.end = child.begin + wp.where(side == 0, halves.count_0, halves.count_1)
+    child.limit = wp.where(side == 0, halves.middle, task.limit)
     child.slot = wp.where(side == 0, task.slot + 1, task.slot + halves.middle - task.begin)
     child.parent = task.slot
     child.side = side
@@ -180,16 +181,23 @@ def worth_it(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
     """Whether two leaves cost less than one."""
     scale = area_scale(task.measures.box)
     area = half_area(task.measures.box, scale)
-    parts = (half_area(halves.left.box, scale) * rows_of(options, halves.middle - task.begin)
-             + half_area(halves.right.box, scale) * rows_of(options, task.end - halves.middle))
+    parts = (half_area(halves.left.box, scale) * rows_of(options, halves.count_0)
+             + half_area(halves.right.box, scale) * rows_of(options, halves.count_1))
     split_cost = options.cost_traversal * area + options.cost_intersection * parts
     return split_cost < options.cost_intersection * rows_of(options, task.end - task.begin) * area
 
 
+@wp.func
+def mark(left: wp.array(dtype=wp.uint8), begin: int, end: int):
+    """These records are a leaf's: the host drops the others."""
+    for i in range(begin, end):
+        left[i] = wp.uint8(1)
+
+
 @cache
-def make_build_ranges(builder: str):
-    """The kernel of the builder of that name in SPLIT."""
-    split = SPLIT[builder]
+def make_build_ranges(split, place=None):
+    """The kernel of a builder. split(data, task) -> Halves: its records stand in their places, or (spatial splits)
+    place(data, task, halves) -> Halves brings them there once it is known that the range becomes no leaf."""
 
     @kernel
     def build_ranges(data: BuildData, tasks: wp.array(dtype=BuildTask), options: BuildOptions, stop_size: int,
@@ -197,7 +205,7 @@ def make_build_ranges(builder: str):
                      max_depth: wp.array(dtype=wp.int32)):
         """Build the subtree of one task, down to ranges of at most stop_size records, which are listed in left_over.
 
-        Every task has two records or more. Inner nodes of a range of n records have the slots slot .. slot + n - 2 to
+        Every task has two records or more. Inner nodes of a range with room for n have the slots slot .. slot + n - 2 to
         themselves; those that stay free are squeezed out by the host. A whole subtree (stop_size 0) takes the first of them.
         """
         stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=BuildTask)
@@ -218,8 +226,12 @@ def make_build_ranges(builder: str):
             if n <= options.max_leaf and task.parent >= 0:
                 if not worth_it(options, task, halves):
                     tell_parent(data.nodes, task, task.begin, n)
+                    if wp.static(place is not None):
+                        mark(data.left, task.begin, task.end)
                     continue
 
+            if wp.static(place is not None):
+                halves = place(data, task, halves)
             if stop_size == 0:
                 task.slot = slot
                 slot = slot + 1
@@ -232,16 +244,20 @@ def make_build_ranges(builder: str):
             node.lo_1 = low_of(halves.right.box)
             node.hi_1 = high_of(halves.right.box)
             node.first_0 = task.begin
-            node.count_0 = halves.middle - task.begin
+            node.count_0 = halves.count_0
             node.first_1 = halves.middle
-            node.count_1 = task.end - halves.middle
+            node.count_1 = halves.count_1
             data.nodes[task.slot] = node
             # A single record is a leaf; others find out for themselves.
             if node.count_1 > 1:
                 stack[size] = child_of(task, halves, 1)
                 size = size + 1
+            elif wp.static(place is not None):
+                mark(data.left, halves.middle, halves.middle + 1)
             if node.count_0 > 1:
                 stack[size] = child_of(task, halves, 0)
                 size = size + 1
+            elif wp.static(place is not None):
+                mark(data.left, task.begin, task.begin + 1)
 
     return build_ranges

@@ -59,7 +59,12 @@ class BuildOptions:
 @wp.struct
 class BuildData:
     """records: rearranged; codes: Morton codes of the records, ascending (LBVH); of the sweep: boxes: the records as they were,
-    order: for each axis, one after another, the boxes by centroid; area, left, scratch: room, one entry a record."""
+    order: for each axis, one after another, the boxes by centroid; area, left, scratch: room, one entry a record.
+
+    Of spatial splits: boxes: room; left: which records are in leaves; corners: of triangle i from 3 i on (what is no triangle, a
+    sphere, is cut by its box); min_overlap: the least overlap of an object split's sides for a spatial split to be tried, in units
+    of the scene's own size: scale is its area_scale.
+    """
 
     records: wp.array(dtype=BuildRecord)
     nodes: wp.array(dtype=Bvh2Node)
@@ -70,13 +75,18 @@ class BuildData:
     area: wp.array(dtype=wp.float32)
     left: wp.array(dtype=wp.uint8)
     scratch: wp.array(dtype=wp.int32)
+    corners: wp.array(dtype=wp.vec3)
+    scale: float
+    min_overlap: float
 
 
 @wp.struct
 class Halves:
-    """A split range whose records stand in their places: where the right side begins, and what both measure."""
+    """A split range: where the right side begins, how many records both sides have, and what they measure."""
 
     middle: int
+    count_0: int
+    count_1: int
     left: Measures
     right: Measures
 
@@ -164,9 +174,18 @@ def measured(data: BuildData, begin: int, end: int) -> Measures:
 
 
 @wp.func
-def halves_at(data: BuildData, task: BuildTask, middle: int) -> Halves:
+def parted_at(task: BuildTask, middle: int) -> Halves:
+    """Not yet measured."""
     out = Halves()
     out.middle = middle
+    out.count_0 = middle - task.begin
+    out.count_1 = task.end - middle
+    return out
+
+
+@wp.func
+def halves_at(data: BuildData, task: BuildTask, middle: int) -> Halves:
+    out = parted_at(task, middle)
     out.left = measured(data, task.begin, middle)
     out.right = measured(data, middle, task.end)
     return out

@@ -8,12 +8,13 @@ which is shared between its sides in proportion, so that subtrees can be built o
 import warp as wp
 
 from wrt.kernels.build.binned import BIN_COUNT, BINS, Split, bin_of, binned_split, bins_of
+from wrt.kernels.build.clip import Box, empty_box
 from wrt.kernels.build.records import (
     MAX_DEPTH,
     BuildData,
-    BuildOptions,
     BuildRecord,
     BuildTask,
+    Halves,
     area_scale,
     center_of,
     half_area,
@@ -22,37 +23,8 @@ from wrt.kernels.build.records import (
     low_of,
     measured,
     row_of,
-    rows_of,
-    tell_parent,
 )
-from wrt.kernels.structs import kernel
-from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
-
-
-@wp.struct
-class Box:
-    lo: wp.vec3
-    hi: wp.vec3
-
-
-@wp.struct
-class SpatialOptions:
-    """min_overlap: the least overlap of an object split's sides for a spatial split to be tried, in units of the scene's own
-    size: scale is its area_scale; corners: of triangle i from 3 i on; what is no triangle (a sphere) is cut by its box."""
-
-    build: BuildOptions
-    scale: float
-    min_overlap: float
-    corners: wp.array(dtype=wp.vec3)
-
-
-@wp.func
-def empty_box() -> Box:
-    out = Box()
-    out.lo = wp.vec3(wp.inf, wp.inf, wp.inf)
-    out.hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
-    return out
 
 
 @wp.func
@@ -319,120 +291,52 @@ def box_of(records: wp.array(dtype=BuildRecord), begin: int, end: int) -> Box:
 
 
 @wp.func
-def split_references(data: BuildData, task: BuildTask, options: SpatialOptions) -> wp.vec2i:
-    """Both sides of the cheaper of the best object split and, if the sides of that overlap, the best plane: as object_split."""
-    scale = area_scale(task.measures.box)
-    counts = object_split(data, task)
+def sides(data: BuildData, counts: wp.vec2i, task: BuildTask) -> Halves:
+    """What stands in data.boxes, with the boxes of both sides."""
     left = box_of(data.boxes, task.begin, task.begin + counts[0])
     right = box_of(data.boxes, task.limit - counts[1], task.limit)
+    out = Halves()
+    out.count_0 = counts[0]
+    out.count_1 = counts[1]
+    out.left.box = row_of(left.lo, left.hi)
+    out.right.box = row_of(right.lo, right.hi)
+    return out
+
+
+@wp.func
+def split_references(data: BuildData, task: BuildTask) -> Halves:
+    """The cheaper of the best object split and, if the sides of that overlap, the best plane; both sides are in data.boxes."""
+    scale = area_scale(task.measures.box)
+    halves = sides(data, object_split(data, task), task)
     n = task.end - task.begin
-    overlap = half_area(row_of(wp.max(left.lo, right.lo), wp.min(left.hi, right.hi)), options.scale)
-    if task.depth + levels(n) >= MAX_DEPTH or not overlap > options.min_overlap:
-        return counts
+    lo = wp.max(low_of(halves.left.box), low_of(halves.right.box))
+    overlap = half_area(row_of(lo, wp.min(high_of(halves.left.box), high_of(halves.right.box))), data.scale)
+    if task.depth + levels(n) >= MAX_DEPTH or not overlap > data.min_overlap:
+        return halves
     best = Split()
     best.axis = -1
-    best.cost = (box_area(left, scale) * float(counts[0]) + box_area(right, scale) * float(counts[1]))
-    best = spatial_split(data.records, task, options.corners, best)
+    best.cost = (half_area(halves.left.box, scale) * float(halves.count_0)
+                 + half_area(halves.right.box, scale) * float(halves.count_1))
+    best = spatial_split(data.records, task, data.corners, best)
     if best.axis < 0:
-        return counts
-    parted = part_by_plane(data.records, data.boxes, task, best, options.corners)
-    if parted[0] == 0 or parted[1] == 0:
-        return object_split(data, task)
-    return parted
+        return halves
+    counts = part_by_plane(data.records, data.boxes, task, best, data.corners)
+    if counts[0] == 0 or counts[1] == 0:
+        counts = object_split(data, task)
+    return sides(data, counts, task)
 
 
 @wp.func
-def take_room(data: BuildData, task: BuildTask, counts: wp.vec2i) -> int:
-    """Copy both sides back, the free room between them shared in proportion; where the right side begins."""
-    free = task.limit - task.begin - counts[0] - counts[1]
-    share = int(wp.int64(free) * wp.int64(counts[0]) / wp.int64(counts[0] + counts[1]))
-    middle = task.begin + counts[0] + share
-    for i in range(counts[0]):
+def take_room(data: BuildData, task: BuildTask, halves: Halves) -> Halves:
+    """Copy both sides back, the free room between them shared in proportion."""
+    free = task.limit - task.begin - halves.count_0 - halves.count_1
+    share = int(wp.int64(free) * wp.int64(halves.count_0) / wp.int64(halves.count_0 + halves.count_1))
+    middle = task.begin + halves.count_0 + share
+    for i in range(halves.count_0):
         data.records[task.begin + i] = data.boxes[task.begin + i]
-    for i in range(counts[1]):
+    for i in range(halves.count_1):
         data.records[middle + i] = data.boxes[task.limit - 1 - i]
-    return middle
-
-
-@wp.func
-def reference_child(data: BuildData, task: BuildTask, side: int, begin: int, count: int, limit: int) -> BuildTask:
-    child = BuildTask()
-    child.begin = begin
-    child.end = begin + count
-    child.limit = limit
-    child.slot = wp.where(side == 0, task.slot + 1, task.slot + begin - task.begin)
-    child.parent = task.slot
-    child.side = side
-    child.depth = task.depth + 1
-    child.measures = measured(data, child.begin, child.end)
-    return child
-
-
-@wp.func
-def mark(left: wp.array(dtype=wp.uint8), begin: int, end: int):
-    """These records are a leaf's: the host drops the others."""
-    for i in range(begin, end):
-        left[i] = wp.uint8(1)
-
-
-@kernel
-def build_references(data: BuildData, tasks: wp.array(dtype=BuildTask), options: SpatialOptions, stop_size: int,
-                     left_over: wp.array(dtype=BuildTask), n_left_over: wp.array(dtype=wp.int32),
-                     max_depth: wp.array(dtype=wp.int32)):
-    """As kernels.build_bvh2's build_ranges, with references; data.boxes is room, data.left tells which records are in leaves.
-
-    Inner nodes of a range with room for n references take the slots slot .. slot + n - 2.
-    """
-    stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=BuildTask)
-    stack[0] = tasks[0]
-    size = int(1)
-    while size > 0:
-        size = size - 1
-        task = stack[size]
-        n = task.end - task.begin
-        if n <= stop_size and task.parent >= 0:
-            left_over[wp.atomic_add(n_left_over, 0, 1)] = task
-            continue
-        if task.parent < 0:
-            task.measures = measured(data, task.begin, task.end)
-
-        counts = split_references(data, task, options)
-        if n <= options.build.max_leaf and task.parent >= 0:
-            scale = area_scale(task.measures.box)
-            area = half_area(task.measures.box, scale)
-            left_box = box_of(data.boxes, task.begin, task.begin + counts[0])
-            right_box = box_of(data.boxes, task.limit - counts[1], task.limit)
-            parts = (box_area(left_box, scale) * rows_of(options.build, counts[0])
-                     + box_area(right_box, scale) * rows_of(options.build, counts[1]))
-            split_cost = options.build.cost_traversal * area + options.build.cost_intersection * parts
-            if not split_cost < options.build.cost_intersection * rows_of(options.build, n) * area:
-                tell_parent(data.nodes, task, task.begin, n)
-                mark(data.left, task.begin, task.end)
-                continue
-
-        middle = take_room(data, task, counts)
-        left = reference_child(data, task, 0, task.begin, counts[0], middle)
-        right = reference_child(data, task, 1, middle, counts[1], task.limit)
-        max_depth[0] = wp.max(max_depth[0], task.depth)
-        tell_parent(data.nodes, task, task.slot, 0)
-        data.used[task.slot] = wp.uint8(1)
-        node = Bvh2Node()
-        node.lo_0 = low_of(left.measures.box)
-        node.hi_0 = high_of(left.measures.box)
-        node.lo_1 = low_of(right.measures.box)
-        node.hi_1 = high_of(right.measures.box)
-        node.first_0 = left.begin
-        node.count_0 = counts[0]
-        node.first_1 = right.begin
-        node.count_1 = counts[1]
-        data.nodes[task.slot] = node
-        if counts[1] > 1:
-            stack[size] = right
-            size = size + 1
-        else:
-            mark(data.left, right.begin, right.end)
-        if counts[0] > 1:
-            stack[size] = left
-            size = size + 1
-        else:
-            mark(data.left, left.begin, left.end)
+    halves.middle = middle
+    halves.left = measured(data, task.begin, task.begin + halves.count_0)
+    halves.right = measured(data, middle, middle + halves.count_1)
+    return halves

@@ -47,7 +47,8 @@ def decode_png16(data: bytes) -> np.ndarray:
     """A PNG of 16 bits a channel as (H, W, 3) uint16 codes, without its alpha. Raises InputError as decode_rgba8 does.
 
     Pillow keeps only one byte of each channel of a colour picture: the high one, or the low one where it is told that the file has
-    the other order. Grey with alpha has four bytes a pixel: as RGBA, they come all.
+    the other order. Grey with alpha has four bytes a pixel: as RGBA, they come all. (OpenImageIO keeps both, but its
+    libpng writes to stderr what is wrong with a damaged file.)
     """
     with _opened(data, ("PNG",), BYTES_OF_PIXEL16) as picture:
         order = picture.tile[0][3] if picture.tile else ""
@@ -73,6 +74,12 @@ def size_of(data: bytes, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
         return picture.size
 
 
+def texts_of(data: bytes, formats: tuple[str, ...] = FORMATS) -> dict[str, str]:
+    """The texts that stand before an encoded picture's pixels, by keyword. Raises InputError as decode_rgba8 does."""
+    with _opened(data, formats) as picture:
+        return {key: value for key, value in picture.info.items() if isinstance(value, str)}
+
+
 @contextmanager
 def _opened(data: bytes, formats: tuple[str, ...], bytes_of_pixel: float = BYTES_OF_PIXEL) -> Iterator[Any]:
     """The picture, whose pixels are decoded when they are asked for."""
@@ -91,18 +98,3 @@ def _opened(data: bytes, formats: tuple[str, ...], bytes_of_pixel: float = BYTES
         raise InputError(f"cannot be read as an image: it is none of {', '.join(formats)}") from None
     except Exception as error:  # decoders raise nearly anything on a broken file
         raise InputError(f"cannot be read as an image: {' '.join(str(error).split()) or type(error).__name__}") from error
-
-
-def png_texts(data: bytes) -> dict[str, str]:
-    """The uncompressed iTXt entries of a PNG file (as `encode_png` writes them) that stand before its pixels, by keyword."""
-    texts, begin = {}, 8
-    while begin + 8 <= len(data):
-        length, kind = int.from_bytes(data[begin:begin + 4], "big"), data[begin + 4:begin + 8]
-        if kind == b"IDAT":
-            break
-        if kind == b"iTXt":
-            keyword, _, rest = data[begin + 8:begin + 8 + length].partition(b"\0")
-            if rest[:1] == b"\0":  # not compressed; then a method, a language and a translation of the keyword
-                texts[keyword.decode("latin-1")] = rest[2:].split(b"\0", 2)[-1].decode("utf-8", "replace")
-        begin += 12 + length
-    return texts

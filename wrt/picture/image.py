@@ -24,7 +24,7 @@ from wrt.core.files import open_regular, read_file
 from wrt.core.memory import require
 from wrt.core.write_file import replacing
 from wrt.picture.decode import FORMATS as FORMATS_READ
-from wrt.picture.decode import check_size, decode_png16, decode_rgba8, png_texts, size_of
+from wrt.picture.decode import check_size, decode_png16, decode_rgba8, size_of, texts_of
 from wrt.picture.tonemap import decode_srgb, to_codes
 
 PathLike = str | os.PathLike[str]
@@ -227,10 +227,9 @@ def read_image(path: PathLike) -> np.ndarray:
     suffix = Path(path).suffix.lower()
     if suffix in LINEAR_SUFFIXES:
         return _pick_colors(read_channels(path), path)
-    if suffix not in DISPLAY_SUFFIXES:
-        _read(path)
-        raise InputError(f"not an image format that wrt reads ({', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)})", path)
     data = _read(path)
+    if suffix not in DISPLAY_SUFFIXES:
+        raise InputError(f"not an image format that wrt reads ({', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)})", path)
     with _told(path):
         deep = data[:8] == PNG_MAGIC and data[24:25] == b"\x10"
         codes = decode_png16(data) if deep else decode_rgba8(data, _formats(path))[..., :3]
@@ -251,21 +250,8 @@ def picture_size(path: PathLike) -> tuple[int, int]:
             return source.spec().width, source.spec().height
     if Path(path).suffix.lower() not in DISPLAY_SUFFIXES:
         read_image(path)  # says why not
-    data = _read(path)
     with _told(path):
-        return size_of(data, _formats(path))
-
-
-def read_rgba8(source: PathLike | bytes, name: str = "") -> np.ndarray:
-    """A PNG, JPEG, ... file, or its bytes, as (H, W, 4) uint8 codes; alpha is 255 where the file has none.
-
-    16-bit channels keep their high byte. name: what an error calls the file (default: its path). Raises InputError
-    where the file is missing, truncated, too large, or no picture.
-    """
-    name = name or ("image" if isinstance(source, bytes) else os.fspath(source))
-    data = source if isinstance(source, bytes) else _read(source)
-    with _told(name):
-        return decode_rgba8(data, FORMATS_READ if isinstance(source, bytes) else _formats(source))
+        return size_of(read_file(path), _formats(path))
 
 
 def read_channels(path: PathLike) -> dict[str, np.ndarray]:
@@ -288,7 +274,8 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
 def read_metadata(path: PathLike) -> dict[str, str]:
     """What wrt wrote about a picture into its PNG, EXR or HDR file, as text by key; empty where there is nothing."""
     if Path(path).suffix.lower() not in LINEAR_SUFFIXES:
-        pairs = list(png_texts(_read(path)).items())
+        with _told(path):
+            pairs = list(texts_of(read_file(path), _formats(path)).items())
     elif Path(path).suffix.lower() == ".hdr":
         head = _read(path).split(b"\n\n", 1)[0].decode(errors="replace")
         lines = [line[2:].partition("=") for line in head.splitlines() if line.startswith("# ")]
@@ -301,10 +288,8 @@ def read_metadata(path: PathLike) -> dict[str, str]:
 
 
 def _read(path: PathLike) -> bytes:
-    try:
+    with _told(path):
         return read_file(path)
-    except InputError as error:
-        raise error.at(path) from error
 
 
 def _formats(path: PathLike) -> tuple[str, ...]:
@@ -313,23 +298,22 @@ def _formats(path: PathLike) -> tuple[str, ...]:
 
 
 @contextlib.contextmanager
-def _told(name: PathLike) -> Iterator[None]:
+def _told(path: PathLike) -> Iterator[None]:
+    """Errors name the file, once."""
     try:
         yield
     except InputError as error:
-        raise error.at(name) from error.__cause__
+        raise error if error.path is not None else error.at(path) from error
 
 
 @contextlib.contextmanager
 def _opened(path: PathLike) -> Iterator[Any]:
     """An EXR or HDR file in OpenImageIO. Its first bytes are looked at first: it would try all the formats that it knows."""
     try:
-        with open_regular(path) as file:
+        with _told(path), open_regular(path) as file:
             first = file.read(16)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", path) from error
-    except InputError as error:
-        raise error.at(path) from error
     if not first.startswith(_MAGIC[Path(path).suffix.lower()]):
         raise InputError(f"cannot be read as an image: it is no {Path(path).suffix.lower()} file", path)
     import OpenImageIO as oiio

@@ -14,7 +14,8 @@ from PIL import Image
 
 from wrt.core.errors import InputError
 from wrt.picture import image
-from wrt.picture.decode import decode_png16, decode_rgba8, png_texts
+from wrt.picture.decode import decode_rgba8, texts_of
+from wrt.picture.tonemap import to_codes
 
 
 def png(codes: np.ndarray, color_type: int, interlaced: bool = False) -> bytes:
@@ -30,14 +31,16 @@ def png(codes: np.ndarray, color_type: int, interlaced: bool = False) -> bytes:
 
 
 @pytest.mark.parametrize(("channels", "color_type"), [(1, 0), (3, 2), (2, 4), (4, 6)])
-def test_sixteen_bits_come_whole(channels: int, color_type: int) -> None:
+def test_sixteen_bits_come_whole(channels: int, color_type: int, tmp_path: Path) -> None:
     codes = np.random.default_rng(0).integers(0, 65536, (5, 7, channels)).astype(np.uint16)
     expected = codes[..., :3] if channels > 2 else np.repeat(codes[..., :1], 3, axis=2)
     data = png(codes, color_type)
-    assert np.array_equal(decode_png16(data), expected)
+    (tmp_path / "a.png").write_bytes(data)
+    assert np.array_equal(to_codes(image.read_image(tmp_path / "a.png"), bits=16), expected)
     assert np.array_equal(decode_rgba8(data)[..., :3], expected >> 8)
-    with pytest.raises(InputError, match="cannot be read as an image"):
-        decode_png16(data[:-40])
+    (tmp_path / "a.png").write_bytes(data[:-40])
+    with pytest.raises(InputError, match=r"a\.png: cannot be read as an image"):
+        image.read_image(tmp_path / "a.png")
 
 
 def png_header(width: int, height: int) -> bytes:
@@ -99,5 +102,7 @@ def test_no_other_format_is_tried(form: str, tmp_path: Path) -> None:
 
 def test_texts_of_a_png() -> None:
     data = image.encode_png(np.zeros((1, 1, 3), np.uint8), {"a": "ö", "b": "x\0y"})
-    assert png_texts(data) == {"wrt:a": "ö", "wrt:b": "x\0y"}
-    assert png_texts(data[:50]).keys() <= {"wrt:a"} and png_texts(b"") == {}
+    assert texts_of(data) == {"wrt:a": "ö", "wrt:b": "x\0y"}
+    for damaged in (data[:50], b""):
+        with pytest.raises(InputError, match="cannot be read as an image"):
+            texts_of(damaged)

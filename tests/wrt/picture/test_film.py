@@ -8,8 +8,9 @@ import pytest
 from PIL import Image
 
 from wrt.core.errors import InputError
+from wrt.picture.decode import decode_rgba8
 from wrt.picture.film import AOV_VIEWS, Film, aov_path, aov_to_srgb8
-from wrt.picture.image import read_channels, read_image, read_metadata, read_rgba8
+from wrt.picture.image import read_channels, read_image, read_metadata
 from wrt.picture.tonemap import to_codes
 
 H, W = 12, 17
@@ -69,8 +70,8 @@ def test_png_is_shown_as_the_film_says_and_layers_go_beside_it(film: Film, tmp_p
     written = film.save(tmp_path / "a.png", aov=["depth", "prim_id"])
     assert [path.name for path in written] == ["a.png", "a.depth.png", "a.prim_id.png"]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in written)
-    assert np.array_equal(read_rgba8(written[0])[..., :3], to_codes(film.pixels, -1.0, "agx"))
-    assert np.array_equal(read_rgba8(written[1])[..., :3], aov_to_srgb8("depth", film.aov["depth"]))
+    assert np.array_equal(decode_rgba8(written[0].read_bytes())[..., :3], to_codes(film.pixels, -1.0, "agx"))
+    assert np.array_equal(decode_rgba8(written[1].read_bytes())[..., :3], aov_to_srgb8("depth", film.aov["depth"]))
     assert read_metadata(written[0]) == {key: str(value) for key, value in film.metadata.items()}
 
 

@@ -11,7 +11,8 @@ from wrt.accel.geometry import Geometry
 from wrt.core.device import records, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import records as build_records
-from wrt.kernels.build import sbvh as kernels
+from wrt.kernels.build.bvh2 import make_build_ranges
+from wrt.kernels.build.sbvh import split_references, take_room
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 MAX_BUDGET = 8.0
@@ -38,17 +39,15 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
     data.nodes = upload(records(Bvh2Node, room - 1), Bvh2Node, cpu)
     data.used = wp.zeros(room - 1, dtype=wp.uint8, device=cpu)
     data.left = wp.zeros(room, dtype=wp.uint8, device=cpu)
-    settings = kernels.SpatialOptions()
-    settings.build = build_options(options)
     with np.errstate(over="ignore", invalid="ignore"):
         half = 0.5 * (hi.max(axis=0).astype(np.float64) - lo.min(axis=0))
-        settings.scale = 1.0 / max(half.max(), 2.0**-126)
-        x, y, z = half * settings.scale
+        data.scale = 1.0 / max(half.max(), 2.0**-126)
+        x, y, z = half * data.scale
         area = options.split_alpha * (x * y + y * z + z * x)
     # Where a scene has no end there is no split that is worth it.
-    settings.min_overlap = min(area, 3e38) if np.isfinite(area) else 3e38
-    settings.corners = upload(geometry.vertices[geometry.faces].reshape(-1, 3), wp.vec3, cpu)
-    depth = run_tasks(kernels.build_references, data, settings, n, threads, room)
+    data.min_overlap = min(area, 3e38) if np.isfinite(area) else 3e38
+    data.corners = upload(geometry.vertices[geometry.faces].reshape(-1, 3), wp.vec3, cpu)
+    depth = run_tasks(make_build_ranges(split_references, take_room), data, build_options(options), n, threads, room)
     return compact(data, depth)
 
 

@@ -87,7 +87,7 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
     arrays |= {"records": build, "nodes": records(Bvh2Node, n - 1), "used": np.zeros(n - 1, np.uint8)}
     for name, array in arrays.items():
         setattr(data, name, upload(array, data._cls.vars[name].type.dtype, cpu))
-    depth = run_tasks(build_bvh2.make_build_ranges(builder), data, build_options(options), n, threads)
+    depth = run_tasks(build_bvh2.make_build_ranges(build_bvh2.SPLIT[builder]), data, build_options(options), n, threads)
     return BinaryTree(squeeze(data.nodes.numpy(), data.used.numpy() != 0), data.records.numpy()["prim_id"].copy(), depth)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,19 +15,17 @@ from wrt.core.checks import unknown
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
 from wrt.core.memory import Meter
-from wrt.io.mesh_file import load_mesh
+from wrt.io.toml.meshes import Meshes
 from wrt.io.toml.report import raise_all, unknown_materials
+from wrt.io.toml.transforms import transform, turn
 from wrt.scene import shapes
 from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 from wrt.scene.materials import CONDUCTORS, Checkerboard, Material, Texture
-from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
-from wrt.scene.motion import Motion
 from wrt.scene.settings import Settings
 from wrt.scene.values import BLACK, SMALLEST, as_vector, require_count
-from wrt.scene.vertex_normals import smooth
 
 if TYPE_CHECKING:
     from wrt.io.toml import schema as tables
@@ -60,8 +58,8 @@ class _Builder:
         self.materials: dict[str, Material] = {}
         self._images: dict[Path, np.ndarray] = {}
         self._textures: dict[tuple[Any, ...], Texture | Checkerboard] = {}
-        self._meshes: dict[tuple[Any, ...], Mesh] = {}
         self.meter = Meter()
+        self.meshes = Meshes(path.parent, self.meter)
 
     @contextlib.contextmanager
     def at(self, place: str) -> Iterator[None]:
@@ -106,7 +104,7 @@ class _Builder:
                             for m in self.found(box.material)]
         for i, each in enumerate(table.meshes):
             with self.at(f"meshes[{i}]"):
-                objects += self.mesh_object(each, f"meshes[{i}]")
+                objects += self.meshes.objects(each, f"meshes[{i}]", self.materials)
         for i, light in enumerate(table.lights):
             with self.at(f"lights[{i}]"):
                 made = make_light(light, f"lights[{i}]")
@@ -187,7 +185,7 @@ class _Builder:
             if getattr(table, "checkerboard", None) is not None:
                 self._textures[key] = Checkerboard(**table.checkerboard.given())
             else:
-                cosine, sine = _turn(table.rotation)
+                cosine, sine = turn(table.rotation)
                 (u, v), (du, dv) = table.scale, table.offset
                 self._textures[key] = Texture(
                     self.image(self.file(table.file)),
@@ -220,79 +218,6 @@ class _Builder:
             image = read_image(self.file(given.file))
             return EnvironmentBackground(image, given.scale, math.radians(given.rotation), name=given.file)
         return {"constant": ConstantBackground, "gradient": GradientBackground}[given.type](**given.given("type"))
-
-    # --- meshes ---
-
-    def mesh_object(self, table: tables.MeshTable, place: str) -> list[Object]:
-        """The object, or nothing where one of its materials is not known (which is reported elsewhere)."""
-        mesh = self.mesh(table)
-        parts = table.parts or []
-        by_group: Mapping[str, str] = table.materials or {str(i): part.material for i, part in enumerate(parts)}
-        groups = set(mesh.groups)
-        for group in by_group:
-            if group not in groups:
-                raise InputError(f"materials: {unknown(group, 'group of ' + mesh.name, mesh.groups)}")
-        used = np.unique(mesh.face_group).tolist() if mesh.face_group is not None else []
-        wanted = [by_group.get(mesh.groups[group], table.material) for group in used] if by_group else [table.material]
-        for group, name in zip(used, wanted, strict=False):
-            if name is None:
-                raise InputError(f"the triangles of group {mesh.groups[group]!r} have no material; give `material` for "
-                                 "the rest")
-        names = list(dict.fromkeys(str(name) for name in wanted))
-        materials = [material for name in names for material in self.found(name)]
-        if len(materials) < len(names):
-            return []
-        face_material = None
-        if by_group and mesh.face_group is not None:
-            of_group = np.zeros(len(mesh.groups), dtype=np.int32)
-            number = {name: i for i, name in enumerate(names)}
-            of_group[used] = [number[str(name)] for name in wanted]
-            face_material = of_group[mesh.face_group]
-        whole, name = transform(table.transform), table.name or place
-        each = [np.eye(4)] if table.instances is None else [self.placed(one, i) for i, one in enumerate(table.instances)]
-        motion = self.motion(table)
-        return [Object(mesh, tuple(materials), whole @ matrix, face_material, name, motion) for matrix in each]
-
-    def motion(self, table: tables.MeshTable) -> Motion | None:
-        if table.motion is None and table.morph is None:
-            return None
-        keys = None
-        if table.motion is not None:
-            keys = np.array([[key.translate, key.rotate, key.scale] for key in table.motion])
-        target = None
-        if table.morph is not None:
-            from wrt.io.toml import schema as scene_schema
-
-            given = {name: getattr(table.morph, name) for name in ("file", "shape")} | {"smooth": table.smooth}
-            target = self.mesh(scene_schema.MeshTable.model_construct(**given))
-        return Motion(keys, target)
-
-    @staticmethod
-    def placed(table: tables.TransformTable, index: int) -> np.ndarray:
-        try:
-            return transform(table)
-        except InputError as error:
-            raise InputError(f"instances[{index}]: {error}") from None
-
-    def mesh(self, table: tables.MeshTable) -> Mesh:
-        key: tuple[Any, ...]
-        if table.shape is not None:
-            shape, key = table.shape, (table.shape.model_dump_json(),)
-            plain = self._once(key, lambda: shapes.SHAPES[shape.kind](**shape.given("kind")))
-        else:
-            parts = tuple((part.first, part.count) for part in table.parts or [])
-            path = self.file(str(table.file))
-            key = (path, parts)
-            plain = self._once(key, lambda: load_mesh(path, parts))
-        if table.smooth is None:
-            return plain
-        return self._once((*key, table.smooth), lambda: smooth(plain) if table.smooth else replace(plain, normals=None))
-
-    def _once(self, key: tuple[Any, ...], make: Callable[[], Mesh]) -> Mesh:
-        if key not in self._meshes:
-            mesh = self._meshes[key] = make()
-            self.meter.take(32.0 * len(mesh.vertices) + 12.0 * len(mesh.faces), "the meshes")
-        return self._meshes[key]
 
 
 def settings(table: tables.SettingsTable, included: Sequence[Scene]) -> Settings:
@@ -351,42 +276,3 @@ def make_camera(table: tables.CameraTable, name: str) -> Camera:
     if table.matrix is not None:
         return Camera(np.array(table.matrix).reshape(4, 4), **fields)
     return Camera.look_at(table.position, table.target, table.up, **fields)
-
-
-def transform(table: tables.TransformTable | None) -> np.ndarray:
-    """(4, 4) float64: scale, then rotate, then translate; the identity for None.
-
-    Raises InputError where the matrix is singular.
-    """
-    matrix = np.eye(4)
-    if table is None:
-        return matrix
-    if table.matrix is not None:
-        matrix = np.array(table.matrix).reshape(4, 4)
-        if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
-            raise InputError("the transform's matrix is singular")
-        return matrix
-    if table.axis is not None and table.angle is not None:
-        rotation = _about(np.array(table.axis), table.angle)
-    else:
-        x, y, z = (_about(axis, angle) for axis, angle in zip(np.eye(3), table.rotate, strict=True))
-        rotation = z @ y @ x
-    matrix[:3, :3] = rotation * table.scale
-    matrix[:3, 3] = table.translate
-    return matrix
-
-
-def _about(axis: np.ndarray, degrees: float) -> np.ndarray:
-    """(3, 3) rotation about an axis (Rodrigues)."""
-    x, y, z = axis / np.linalg.norm(axis)
-    cosine, sine = _turn(degrees)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
-
-
-def _turn(degrees: float) -> tuple[float, float]:
-    """Cosine and sine, exact for whole quarter turns, so that axis-parallel things stay axis-parallel."""
-    quarters, rest = divmod(degrees, 90.0)
-    if rest == 0.0:
-        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
-    return math.cos(math.radians(degrees)), math.sin(math.radians(degrees))

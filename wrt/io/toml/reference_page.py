@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 from typing import Any
 
 from wrt.io.load import schema
@@ -28,96 +29,7 @@ vectors. Names of files are relative to the scene file. What a scene lacks to be
 
 ## An example
 """
-EXAMPLE = """\
-title = "one of everything that needs no other file"
-
-[settings]
-size = [320, 180]
-spp = 16
-max_depth = 6
-tonemap = "aces"
-
-[cameras.front]
-position = [0, 1.5, 7]
-target = [0, 0.7, 0]
-fov_y = 30
-aperture_radius = 0.02              # without one it is a pinhole
-
-[cameras.portrait]                  # a real lens: 50 mm, f/2, one unit being a metre
-position = [2, 1.2, 4]
-target = [0, 0.7, 0]
-focal_length = 0.05
-sensor_height = 0.024
-f_number = 2
-blades = 7
-
-[background]
-type = "gradient"
-bottom = [0.5, 0.45, 0.4]
-top = [0.4, 0.6, 0.9]
-
-[materials.floor]
-albedo_texture = { checkerboard = { color_a = 0.7, color_b = [0.1, 0.1, 0.12], scale = 8 } }
-
-[materials.clay]
-albedo = [0.7, 0.3, 0.2]
-specular = 0.2                      # a grey
-
-[materials.glass]
-kind = "glass"
-absorption = [0.3, 0.05, 0.1]
-
-[materials.gold]
-kind = "conductor"
-metal = "gold"
-roughness = 0.2
-
-[[quads]]
-corner = [-4, 0, 4]
-edge_u = [8, 0, 0]
-edge_v = [0, 0, -8]
-material = "floor"
-
-[[spheres]]
-center = [-1, 0.6, 0]
-radius = 0.6
-material = "glass"
-
-[[boxes]]
-low = [-0.4, 0, -0.4]
-high = [0.4, 0.8, 0.4]
-material = "clay"
-transform = { translate = [2.2, 0, -1], rotate = [0, 30, 0] }
-
-[[meshes]]
-shape = { kind = "teapot" }
-material = "clay"
-transform = { translate = [0.9, 0, 0], rotate = [0, -20, 0], scale = 0.6 }
-motion = [{ rotate = [0, 0, 0] }, { rotate = [0, 360, 0] }]     # of `wrt animate`
-
-[[meshes]]
-shape = { kind = "torus", radius = 0.25, tube_radius = 0.08 }
-material = "gold"
-instances = [{ translate = [-2, 0.08, 1] }, { translate = [-2.2, 0.24, 1], axis = [0, 0, 1], angle = 15 }]
-
-[[meshes]]
-shape = { kind = "icosphere", subdivisions = 3, radius = 0.2 }
-material = "gold"
-transform = { translate = [0, 0.2, 1.5] }
-morph = { shape = { kind = "icosphere", subdivisions = 3, radius = 0.3 } }
-
-[[lights]]
-type = "directional"
-direction = [-1, -2, -1.5]
-irradiance = 1.5
-
-[[lights]]
-type = "rectangle"
-corner = [-1, 4, -1]
-edge_u = [2, 0, 0]
-edge_v = [0, 0, 2]
-radiance = [4, 3.6, 3]
-"""
+EXAMPLE = Path(__file__).with_name("example.toml").read_text(encoding="utf-8")
 
 
 def scene_format() -> str:

@@ -141,7 +141,7 @@ def test_a_product_that_overflows(tmp_path):
     file = one_triangle()
     file.json["nodes"][0]["scale"] = [1e200] * 3
     file.node(children=[0], scale=[1e200] * 3)
-    with pytest.raises(InputError, match=r"nodes\[0\]: the mesh reaches (inf|nan) units"):
+    with pytest.raises(InputError, match=r"nodes\[0\]: .*(must be a finite 4x4 matrix|reaches inf units)"):
         load(file, tmp_path)
 
 
@@ -149,7 +149,7 @@ def test_a_product_that_overflows(tmp_path):
 def test_a_mesh_out_of_reach(tmp_path, fields):
     file = one_triangle()
     file.json["nodes"][0].update(fields)
-    with pytest.raises(InputError, match=r"nodes\[0\]: the mesh reaches .* units from the origin; at most 1e\+18"):
+    with pytest.raises(InputError, match=r"nodes\[0\]: object .*: reaches .* units from the origin; at most 1e\+18"):
         load(file, tmp_path)
 
 

@@ -1,0 +1,142 @@
+"""The meshes of a glTF file, and the instances of a node.
+
+Source: Khronos, glTF 2.0 specification, section 3.7; EXT_mesh_gpu_instancing, KHR_mesh_quantization.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from wrt.core.errors import InputError
+from wrt.core.memory import Meter
+from wrt.io.gltf.accessors import Accessors
+from wrt.io.gltf.document import Document
+from wrt.io.gltf.nodes import compose
+from wrt.io.gltf.schema import Instancing, at
+from wrt.scene.clean import clean
+from wrt.scene.mesh import Mesh, unit_rows
+from wrt.scene.values import require_count
+
+# Attributes that are read, or named by who wants them (skins, textures), or are the application's own (underscore).
+# TANGENT is named where a normal map would use it: tangents are made from the texture coordinates.
+_NAMED_ELSEWHERE = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_", "JOINTS_", "WEIGHTS_", "_")
+BYTES_OF_VERTEX, BYTES_OF_INDEX = 60.0, 150.0  # of memory, while a mesh is made; an index can be a triangle of its own
+# What a node's instances may set, and what holds where they do not.
+_INSTANCE_ATTRIBUTES: dict[str, tuple[str, tuple[float, ...]]] = {
+    "TRANSLATION": ("VEC3", (0.0, 0.0, 0.0)),
+    "ROTATION": ("VEC4", (0.0, 0.0, 0.0, 1.0)),
+    "SCALE": ("VEC3", (1.0, 1.0, 1.0)),
+}
+
+
+def _list_of_triangles(indices: np.ndarray) -> np.ndarray:
+    return indices[:len(indices) // 3 * 3].reshape(-1, 3)
+
+
+def _strip(indices: np.ndarray) -> np.ndarray:
+    i = np.arange(max(len(indices) - 2, 0), dtype=indices.dtype)
+    odd = i & 1  # every second triangle swaps two corners, so that all face the same way
+    return indices[np.stack([i, i + 1 + odd, i + 2 - odd], axis=1)]
+
+
+def _fan(indices: np.ndarray) -> np.ndarray:
+    i = np.arange(max(len(indices) - 2, 0), dtype=indices.dtype)
+    return indices[np.stack([i + 1, i + 2, np.zeros_like(i)], axis=1)]
+
+
+TRIANGULATE: dict[int, Callable[[np.ndarray], np.ndarray]] = {4: _list_of_triangles, 5: _strip, 6: _fan}
+_NOT_TRIANGLES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
+
+
+class Meshes:
+    """Makes meshes; primitives with the same accessors and mode share one Mesh object."""
+
+    def __init__(self, document: Document) -> None:
+        self._document = document
+        self._accessors = Accessors(document)
+        self._meshes: dict[tuple[Any, ...], Mesh | None] = {}
+        self._meter = Meter()
+        self._instances = 0
+
+    def mesh(self, primitive: Any, name: str, place: str) -> Mesh | None:
+        """The mesh of a primitive, or None where it holds no triangle with an area."""
+        left_out, attributes = self._document.left_out, primitive.attributes
+        if primitive.mode not in TRIANGULATE and primitive.mode not in _NOT_TRIANGLES:
+            raise InputError(f"must be 0 to 6, got {primitive.mode}", None, f"{place}.mode")
+        if primitive.mode in _NOT_TRIANGLES or "POSITION" not in attributes:
+            left_out.add(_NOT_TRIANGLES.get(primitive.mode, "primitives without POSITION"), "mesh", name)
+            return None
+        for attribute in sorted(attributes):
+            if not attribute.startswith(_NAMED_ELSEWHERE):
+                left_out.add(attribute, "mesh", name)
+        if primitive.targets:
+            left_out.add("morph targets", "mesh", name)
+        key = (*(attributes.get(a) for a in ("POSITION", "NORMAL", "TEXCOORD_0")), primitive.indices, primitive.mode)
+        if key not in self._meshes:
+            self._meshes[key] = self._make(primitive, name, place)
+        if self._meshes[key] is None:
+            left_out.add("primitives without a triangle that has an area", "mesh", name)
+        return self._meshes[key]
+
+    def _make(self, primitive: Any, name: str, place: str) -> Mesh | None:
+        positions = self._attribute(primitive, "POSITION", "VEC3", place)
+        normals = self._attribute(primitive, "NORMAL", "VEC3", place)
+        uvs = self._attribute(primitive, "TEXCOORD_0", "VEC2", place)
+        assert positions is not None
+        for attribute, array in (("NORMAL", normals), ("TEXCOORD_0", uvs)):
+            if array is not None and len(array) != len(positions):
+                raise InputError(f"has {len(array)} elements, POSITION has {len(positions)}", None,
+                                 f"{place}.attributes.{attribute}")
+        indices = self._indices(primitive, len(positions), place)
+        with at(place):
+            self._meter.take(BYTES_OF_VERTEX * len(positions) + BYTES_OF_INDEX * len(indices), "the mesh")
+        if primitive.mode == 4 and len(indices) % 3:
+            self._document.left_out.add("incomplete last triangles", "mesh", name)
+        with at(place):
+            cleaned = clean(positions, TRIANGULATE[primitive.mode](indices), normals, uvs)
+            if not len(cleaned.faces):
+                return None
+            normals = None if cleaned.normals is None else unit_rows(cleaned.normals)  # quantised ones are off by a percent
+            return Mesh(cleaned.vertices, cleaned.faces, normals, cleaned.uvs, dropped=cleaned.dropped, name=name)
+
+    def _attribute(self, primitive: Any, attribute: str, kind: str, place: str) -> np.ndarray | None:
+        index = primitive.attributes.get(attribute)
+        if index is None:
+            return None
+        return self._accessors.read(index, kind, f"{place}.attributes.{attribute}").astype(np.float32, copy=False)
+
+    def _indices(self, primitive: Any, count: int, place: str) -> np.ndarray:
+        if primitive.indices is None:
+            return np.arange(count, dtype=np.int32)
+        where = f"{place}.indices"
+        indices = self._accessors.read(primitive.indices, "SCALAR", where)[:, 0]
+        if indices.dtype.kind != "u":
+            raise InputError("must be of an unsigned integer type, not normalised", None, where)
+        if indices.max() >= count:
+            i = int(np.argmax(indices >= count))
+            raise InputError(f"index {i} is {int(indices[i])}, but there are {count} vertices", None, where)
+        return indices.astype(np.int32)  # accessors end at 2^31 - 1
+
+    def instances(self, node: Any, place: str) -> np.ndarray | None:
+        """(N, 4, 4) transforms of a node's instances, relative to the node, or None where it has just itself."""
+        instancing = self._document.extension(node, "EXT_mesh_gpu_instancing", Instancing, place)
+        if instancing is None:
+            return None
+        place = f"{place}.extensions.EXT_mesh_gpu_instancing.attributes"
+        wanted = _INSTANCE_ATTRIBUTES
+        found = {name: self._accessors.read(index, wanted[name][0], f"{place}.{name}").astype(np.float64)
+                 for name, index in instancing.attributes.items() if name in wanted}
+        counts = {len(array) for array in found.values()}
+        if len(counts) != 1:
+            raise InputError(f"must hold accessors of one length, got {sorted(counts) or 'none'}", None, place)
+        if "ROTATION" in found and not found["ROTATION"].any(axis=1).all():
+            raise InputError("must hold unit quaternions, but one is zero", None, f"{place}.ROTATION")
+        count = counts.pop()
+        self._instances += count
+        with at(place):
+            require_count(self._instances, "instances")
+        return compose(*(found.get(name, np.broadcast_to(default, (count, len(default))))
+                         for name, (_, default) in wanted.items()))

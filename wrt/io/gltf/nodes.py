@@ -1,0 +1,105 @@
+"""The node graph of a glTF file, and where its nodes stand. Source: Khronos, glTF 2.0 specification, section 3.5."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from wrt.core.errors import InputError
+from wrt.io.gltf.document import Document
+from wrt.io.gltf.schema import at, exactly
+from wrt.scene.values import as_transform
+
+
+def walk(document: Document) -> Iterator[tuple[int, Any, np.ndarray]]:
+    """Each node of the default scene as (index, node, world matrix (4, 4) float64), parents before children.
+
+    Raises InputError for a node with two parents or that is its own ancestor, anywhere in the file.
+    """
+    _check_forest(document)
+    stack = [(index, place, np.eye(4)) for index, place in reversed(_roots(document))]
+    seen: set[int] = set()
+    while stack:
+        index, place, parent = stack.pop()
+        node = document.item("nodes", index, place)
+        if index in seen:
+            raise InputError(f"nodes[{index}] is in the scene twice", None, place)
+        seen.add(index)
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is reported by whatever stands there
+            world = parent @ local_matrix(node, f"nodes[{index}]")
+        yield index, node, world
+        children = [(child, f"nodes[{index}].children[{i}]", world) for i, child in enumerate(node.children)]
+        stack += reversed(children)
+
+
+def _roots(document: Document) -> list[tuple[int, str]]:
+    gltf = document.gltf
+    if gltf.scene is None and not gltf.scenes:
+        children = {child for node in gltf.nodes for child in node.children}
+        return [(index, "nodes") for index in range(len(gltf.nodes)) if index not in children]
+    number = gltf.scene or 0
+    scene = document.item("scenes", number, "scene")
+    document.left_out.add_extensions(scene.extensions, "scene", scene.name or str(number))
+    roots: dict[int, str] = {}
+    for i, index in enumerate(scene.nodes):
+        place = f"scenes[{number}].nodes[{i}]"
+        if index in roots:
+            raise InputError(f"nodes[{index}] is in the scene twice", None, place)
+        document.item("nodes", index, place)
+        roots[index] = place
+    return list(roots.items())
+
+
+def _check_forest(document: Document) -> None:
+    nodes = document.gltf.nodes
+    parent: dict[int, int] = {}
+    for index, node in enumerate(nodes):
+        for i, child in enumerate(node.children):
+            place = f"nodes[{index}].children[{i}]"
+            document.item("nodes", child, place)
+            if child in parent:
+                raise InputError(f"nodes[{child}] has two parents, the first is nodes[{parent[child]}]", None, place)
+            parent[child] = index
+    # With one parent each, whatever cannot be reached from a root is on a cycle or hangs from one.
+    reached = [index for index in range(len(nodes)) if index not in parent]
+    for index in reached:
+        reached += nodes[index].children
+    if len(reached) < len(nodes):
+        first = min(set(range(len(nodes))) - set(reached))
+        raise InputError("the node graph has a cycle", None, f"nodes[{first}]")
+
+
+def local_matrix(node: Any, place: str) -> np.ndarray:
+    """A node's own transform (4, 4) float64: its matrix, or translation * rotation * scale."""
+    if node.matrix is None and node.translation is None and node.scale is None and node.rotation is None:
+        return np.eye(4)
+    if node.matrix is not None:
+        with at(f"{place}.matrix"):
+            return as_transform(np.array(exactly(node.matrix, 16, "")).reshape(4, 4).T, "it")
+    translation = exactly(node.translation or [0.0] * 3, 3, f"{place}.translation")
+    scale = exactly(node.scale if node.scale is not None else [1.0] * 3, 3, f"{place}.scale")
+    rotation = exactly(node.rotation or [0.0, 0.0, 0.0, 1.0], 4, f"{place}.rotation")
+    if not any(rotation):
+        raise InputError("must be a unit quaternion, got zero", None, f"{place}.rotation")
+    return compose(np.array([translation]), np.array([rotation]), np.array([scale]))[0]
+
+
+def compose(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """(N, 4, 4) matrices translation * rotation * scale from (N, 3), (N, 4) and (N, 3).
+
+    The rotations are quaternions x, y, z, w of any length but 0.
+    """
+    rotation = rotation / np.abs(rotation).max(axis=1, keepdims=True)  # the square of the length must not vanish
+    x, y, z, w = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
+    columns = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w)],
+        [2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)],
+        [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    matrices = np.zeros((len(x), 4, 4))
+    matrices[:, :3, :3] = np.array(columns).transpose(2, 1, 0) * scale[:, None, :]
+    matrices[:, :3, 3] = translation
+    matrices[:, 3, 3] = 1.0
+    return matrices

@@ -1,0 +1,93 @@
+"""The meshes of a scene file: read or made by a formula, with their materials, places and motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wrt.core.checks import unknown
+from wrt.core.errors import InputError
+from wrt.core.memory import Meter
+from wrt.io.mesh_file import load_mesh
+from wrt.io.toml.transforms import transform
+from wrt.scene import shapes
+from wrt.scene.materials import Material
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Object
+from wrt.scene.motion import Motion
+from wrt.scene.vertex_normals import smooth
+
+if TYPE_CHECKING:
+    from wrt.io.toml.schema import MeshTable, MorphTable, TransformTable
+
+
+class Meshes:
+    """Makes the objects of [[meshes]]. A mesh that is asked for twice is one; files are looked for in `folder`."""
+
+    def __init__(self, folder: Path, meter: Meter) -> None:
+        self._folder, self._meter = folder, meter
+        self._meshes: dict[tuple[Any, ...], Mesh] = {}
+
+    def objects(self, table: MeshTable, place: str, materials: Mapping[str, Material]) -> list[Object]:
+        """One for each instance; none where a material is not known (which is reported elsewhere)."""
+        parts = table.parts or []
+        mesh = self._smoothed(table, tuple((part.first, part.count) for part in parts), table.smooth)
+        by_group: Mapping[str, str] = table.materials or {str(i): part.material for i, part in enumerate(parts)}
+        groups = set(mesh.groups)
+        for group in by_group:
+            if group not in groups:
+                raise InputError(f"materials: {unknown(group, 'group of ' + mesh.name, mesh.groups)}")
+        used = np.unique(mesh.face_group).tolist() if mesh.face_group is not None else []
+        wanted = [by_group.get(mesh.groups[group], table.material) for group in used] if by_group else [table.material]
+        for group, name in zip(used, wanted, strict=False):
+            if name is None:
+                raise InputError(f"the triangles of group {mesh.groups[group]!r} have no material; give `material` for the rest")
+        names = list(dict.fromkeys(str(name) for name in wanted))
+        if not materials.keys() >= set(names):
+            return []
+        face_material = None
+        if by_group and mesh.face_group is not None:
+            of_group = np.zeros(len(mesh.groups), dtype=np.int32)
+            number = {name: i for i, name in enumerate(names)}
+            of_group[used] = [number[str(name)] for name in wanted]
+            face_material = of_group[mesh.face_group]
+        each = [np.eye(4)] if table.instances is None else [_placed(one, i) for i, one in enumerate(table.instances)]
+        whole, shown, motion = transform(table.transform), tuple(materials[name] for name in names), self._motion(table)
+        return [Object(mesh, shown, whole @ matrix, face_material, table.name or place, motion) for matrix in each]
+
+    def _motion(self, table: MeshTable) -> Motion | None:
+        if table.motion is None and table.morph is None:
+            return None
+        keys = None if table.motion is None else np.array([[key.translate, key.rotate, key.scale] for key in table.motion])
+        return Motion(keys, None if table.morph is None else self._smoothed(table.morph, (), table.smooth))
+
+    def _smoothed(self, table: MeshTable | MorphTable, parts: tuple[tuple[int, int], ...], wanted: bool | None) -> Mesh:
+        """The table's file or shape, with normals, or without, where one of that is wanted."""
+        shape = table.shape
+        if shape is not None:
+            key: tuple[Any, ...] = (shape.model_dump_json(),)
+            plain = self._once(key, lambda: shapes.SHAPES[shape.kind](**shape.given("kind")))
+        else:
+            path = self._folder / str(table.file)
+            key = (path, parts)
+            plain = self._once(key, lambda: load_mesh(path, parts))
+        if wanted is None:
+            return plain
+        return self._once((*key, wanted), lambda: smooth(plain) if wanted else replace(plain, normals=None))
+
+    def _once(self, key: tuple[Any, ...], make: Callable[[], Mesh]) -> Mesh:
+        if key not in self._meshes:
+            mesh = self._meshes[key] = make()
+            self._meter.take(32.0 * len(mesh.vertices) + 12.0 * len(mesh.faces), "the meshes")
+        return self._meshes[key]
+
+
+def _placed(table: TransformTable, index: int) -> np.ndarray:
+    try:
+        return transform(table)
+    except InputError as error:
+        raise error.at(place=f"instances[{index}]") from error
