@@ -10,20 +10,14 @@ import warp as wp
 
 from wrt.core.device import upload
 from wrt.kernels import structs
-from wrt.kernels.shade.materials import (
-    Scatter,
-    blinn_phong,
-    fresnel_conductor,
-    fresnel_dielectric,
-    fresnel_schlick,
-    fresnel_tint,
-    make_scatter,
-)
+from wrt.kernels.shade import materials
+from wrt.kernels.shade.fresnel import fresnel_conductor, fresnel_dielectric, fresnel_schlick, fresnel_tint
+from wrt.kernels.shade.materials import Scatter, blinn_phong, make_scatter
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import kernel
 from wrt.renderer.features import Features
 from wrt.renderer.upload import TextureTable, material_records
-from wrt.scene.materials import CONDUCTORS, MATERIAL_KINDS, Material
+from wrt.scene.materials import CONDUCTORS, MATERIALS, Material
 
 
 @kernel
@@ -161,8 +155,8 @@ def test_highlight_is_normalised(exponent):
 # --- scatter ----------------------------------------------------------------------------------------------------------
 
 
-EVERYTHING = Features(mirror=True, conductor=True, glass=True, thin_glass=True, metallic_roughness=True, transmission=True,
-                      rough=True, highlight=True, reflection=True, refraction=True)
+EVERYTHING = Features(materials=tuple(MATERIALS), thin_glass=True, transmission=True, rough=True, highlight=True, reflection=True,
+                      refraction=True)
 
 
 @cache
@@ -327,8 +321,5 @@ def test_interpolated_normals_never_send_a_ray_to_the_wrong_side():
         assert (out["refraction"][used, 2] < 0.0).all()
 
 
-def test_every_kind_of_the_scene_has_its_number_on_the_device():
-    from wrt.kernels.shade import materials
-
-    for number, kind in enumerate(MATERIAL_KINDS):
-        assert getattr(materials, kind.upper()) == number
+def test_both_tables_have_the_same_kinds():
+    assert list(materials.MATERIALS) == list(MATERIALS)

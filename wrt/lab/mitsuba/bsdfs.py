@@ -10,16 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from wrt.renderer.features import is_rough
+from wrt.core.errors import InputError
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.values import Color
 
 
 def bsdf(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
-    """The material as a dictionary for `mitsuba.load_dict`."""
+    """The material as a dictionary for `mitsuba.load_dict`. Raises InputError for a kind that is not in BSDFS."""
+    if material.kind not in BSDFS:
+        raise InputError(f"not translatable: material {material.name!r} of kind {material.kind!r}", None, "Mitsuba")
     result = BSDFS[material.kind](mi, material, notes)
     # Glass has two sides by nature; everything else answers light on its back as on its front.
-    transmits = material.kind == "glass" or (material.kind == "metallic_roughness" and material.transmission > 0.0)
+    transmits = material.is_clear
     if material.normal_texture is not None:
         notes.add("normal texture (Mitsuba's own tangents)", f"material {material.name!r}")
         result = {"type": "normalmap", "normalmap": _normal_map(mi, material, notes), "bsdf": result}
@@ -52,7 +54,7 @@ def _mirror(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
 
 def _conductor(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
     result: dict[str, Any] = {"type": "conductor", "eta": _rgb(material.eta), "k": _rgb(material.k)}
-    return result | _ggx("roughconductor", material) if is_rough(material) else result
+    return result | _ggx("roughconductor", material) if material.is_rough else result
 
 
 def _glass(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
@@ -60,10 +62,10 @@ def _glass(mi: Any, material: Material, notes: Any) -> dict[str, Any]:
     result: dict[str, Any] = {"type": "dielectric", "int_ior": material.ior, "ext_ior": 1.0,
                               "specular_transmittance": transmittance}
     if material.thin:
-        if is_rough(material):
+        if material.is_rough:
             notes.add("a thin pane with roughness (smooth)", f"material {material.name!r}")
         return result | {"type": "thindielectric"}
-    return result | _ggx("roughdielectric", material) if is_rough(material) else result
+    return result | _ggx("roughdielectric", material) if material.is_rough else result
 
 
 def _ggx(plugin: str, material: Material) -> dict[str, Any]:

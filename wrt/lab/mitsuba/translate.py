@@ -28,7 +28,6 @@ import numpy as np
 from wrt.core.errors import InputError, SceneWarning
 from wrt.lab.mitsuba.emitters import background_emitter, light_emitter
 from wrt.lab.mitsuba.shapes import Part, object_parts, raw_mesh, sphere_shape
-from wrt.renderer.features import is_rough
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
@@ -175,7 +174,7 @@ def _check_light_transport(scene: Scene, integrator: str, notes: Approximations)
     materials = scene.materials
     if scene.settings.fresnel == "schlick" and any(m.kind == "glass" for m in materials):
         notes.add('fresnel = "schlick" (the exact one)')
-    if scene.lights and any(is_rough(m) for m in materials if m.kind != "metallic_roughness"):
+    if scene.lights and any(m.is_rough for m in materials if m.kind != "metallic_roughness"):
         notes.add("highlights of point lights on rough surfaces (GGX's, where wrt takes Blinn's or none)")
     if integrator == "whitted":
         mixed = [m.name for m in materials if m.kind == "metallic_roughness"]
