@@ -62,7 +62,55 @@ try:
     raise AssertionError
 except wrt.InputError as error:
     assert str(error) == "broken.off: a face has a corner that is none of the 3 vertices"
+
+# Kinds from outside: a beam on a floor of albedo 0.5, half a unit wide; behind the floor's edge the ground; the sky lights it all.
+import beam, horizon
+from wrt.scene.pack import pack, unpack
+
+stage = wrt.load_scene("stage.toml")
+assert isinstance(stage.lights[0], beam.BeamLight) and stage.lights[0].radius == 0.5
+moved = stage.lights[0].moved(np.diag([2.0, 2.0, 2.0, 1.0]))
+assert moved.position == (0.0, 6.0, 0.0) and moved.direction == (0.0, -1.0, 0.0)
+picture = wrt.render(stage, threads=2).pixels[:, :, 1]
+assert np.array_equal(wrt.render(unpack(*pack(stage)), threads=2).pixels[:, :, 1], picture)
+x = 5.0 * np.tan(np.radians(20.0)) * ((2.0 * np.arange(32) + 1.0) / 32.0 - 1.0)
+distance, side = np.hypot(x[:, None], x), np.maximum(np.abs(x[:, None]), np.abs(x))
+for where, expected in ((distance < 0.4, 0.5 + 0.125), ((distance > 0.6) & (side < 1.1), 0.125), (side > 1.3, 1.0)):
+    assert where.sum() > 20 and np.allclose(picture[where], expected, atol=1e-5)
+try:
+    wrt.Scene(lights=beam.BeamLight((0, 1, 0), (0, 0, 0), 1))
+except wrt.InputError as error:
+    assert str(error) == "light: direction must not be zero"
 print("all of it works")
+"""
+
+STAGE = """
+[settings]
+size = [32, 32]
+spp = 4
+filter = "box"
+[cameras.main]
+position = [0, 5, 0]
+target = [0, 0, 0]
+up = [0, 0, -1]
+fov_y = 40
+[background]
+type = "horizon"
+ground = 1
+sky = 0.25
+[materials.floor]
+albedo = 0.5
+[[quads]]
+corner = [-1.2, 0, 1.2]
+edge_u = [2.4, 0, 0]
+edge_v = [0, 0, -2.4]
+material = "floor"
+[[lights]]
+type = "beam"
+position = [0, 3, 0]
+direction = [0, -2, 0]
+irradiance = 3.14159265
+radius = 0.5
 """
 
 SIGN = """
@@ -116,9 +164,10 @@ def python(folder: Path, *arguments: str) -> str:
 
 def test_the_text_can_be_followed(tmp_path: Path) -> None:
     for folder in ("wrt", "kernels"):
-        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     apply(tmp_path)
     (tmp_path / "sign.toml").write_text(SIGN)
+    (tmp_path / "stage.toml").write_text(STAGE)
     assert python(tmp_path, "-c", TRY_IT).endswith("all of it works\n")
     python(tmp_path, "-m", "wrt", "render", "sign.toml", "-q", "--accel", "runs", "-o", "sign.png")
     assert (tmp_path / "sign.png").exists()

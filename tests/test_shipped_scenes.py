@@ -42,15 +42,24 @@ def features(path: Path) -> set[Features]:
 
 @pytest.mark.parametrize("name", Features().switches())
 def test_every_feature_has_a_scene_that_needs_it(name: str) -> None:
-    assert any(getattr(f, name) for path in SCENES for f in features(path)), f"no scene in scenes/ needs {name}"
+    assert any(f.switches()[name] for path in SCENES for f in features(path)), f"no scene in scenes/ needs {name}"
+
+
+def without(features: Features, name: str) -> Features:
+    """With one switch off."""
+    if hasattr(features, name):
+        return replace(features, **{name: False})
+    return replace(features, materials=tuple(kind for kind in features.materials if kind != name),
+                   lights=tuple(kind for kind in features.lights if f"{kind}_lights" != name),
+                   background="constant" if features.background == name else features.background)
 
 
 @pytest.mark.parametrize("name", Features().switches())
 def test_every_feature_changes_the_code_of_a_scene_that_needs_it(name: str) -> None:
     start("cpu")
-    needed = next(f for path in SCENES for f in features(path) if getattr(f, name))
+    needed = next(f for path in SCENES for f in features(path) if f.switches()[name])
     codes = [render_kernel(f, Structure(ACCELERATORS["bvh"], Units(spheres=f.spheres, instances=f.instances))).module.hash_module()
-             for f in (needed, replace(needed, **{name: False}))]
+             for f in (needed, without(needed, name))]
     assert codes[0] != codes[1]
 
 

@@ -1,9 +1,8 @@
-"""Lights: what arrives at a surface directly, and what lies behind everything."""
+"""Light kinds: one sample of what arrives from a light at a surface. One function a kind, and a row in LIGHTS."""
 
 import warp as wp
 
-from wrt.kernels.shade.materials import Scatter, blinn_phong
-from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, hash_pair, make_sample_2d, search_cdf, triangle
+from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, search_cdf, share_of_row, triangle
 from wrt.kernels.shade.surface import (
     Surface,
     make_place_of,
@@ -15,13 +14,7 @@ from wrt.kernels.shade.surface import (
     world_normal,
     world_point,
 )
-from wrt.kernels.structs import Background, Light, Lighting, Ray, Surfaces, gamma, make_ray
-
-LIGHT_POINT = 0
-LIGHT_DIRECTIONAL = 1
-LIGHT_SPOT = 2
-LIGHT_MESH = 3
-LIGHT_SPHERE = 4
+from wrt.kernels.structs import Light, Lighting, Surfaces
 
 
 @wp.struct
@@ -39,96 +32,32 @@ class LightSample:
     area: int
 
 
-@wp.func
-def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
-    """Turned about +y, counter-clockwise seen from above."""
-    c = wp.cos(angle)
-    s = wp.sin(angle)
-    return wp.vec3(c * d[0] + s * d[2], d[1], c * d[2] - s * d[0])
+# --- the kinds --------------------------------------------------------------------------------------------------------
+# Each is (lighting, surfaces, light, surface, xi) -> sample. xi: two numbers in [0, 1) that place the sample; a weight of 0 is no
+# light. Where a ray could hit the light, the sample's `area` is 1.
 
 
 @wp.func
-def environment_pixel(b: Background, column: int, row: int) -> wp.vec3:
-    """Columns go round; rows end at the poles."""
-    x = wp.where(column < 0, column + b.width, wp.where(column >= b.width, column - b.width, column))
-    return b.pixels[wp.clamp(row, 0, b.height - 1) * b.width + x]
+def point_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
+    """Alike in all directions."""
+    sample = LightSample()
+    way = light.position - s.point
+    distance2 = wp.dot(way, way)
+    if distance2 > 0.0:
+        sample.wi = way / wp.sqrt(distance2)
+        sample.end = light.position
+        sample.weight = light.color / distance2
+    return sample
 
 
 @wp.func
-def environment_radiance(b: Background, direction: wp.vec3) -> wp.vec3:
-    """Bilinear look-up in the equirectangular picture; the unit direction is in world space."""
-    d = rotate_y(direction, -b.rotation)
-    x = (0.5 + wp.atan2(d[0], -d[2]) / TWO_PI) * float(b.width) - 0.5
-    y = wp.acos(wp.clamp(d[1], -1.0, 1.0)) / PI * float(b.height) - 0.5
-    column = int(wp.floor(x))
-    row = int(wp.floor(y))
-    fx = x - wp.floor(x)
-    fy = y - wp.floor(y)
-    top = (1.0 - fx) * environment_pixel(b, column, row) + fx * environment_pixel(b, column + 1, row)
-    low = (1.0 - fx) * environment_pixel(b, column, row + 1) + fx * environment_pixel(b, column + 1, row + 1)
-    return b.scale * ((1.0 - fy) * top + fy * low)
-
-
-def make_background(features):
-    """Radiance from beyond all surfaces."""
-
-    @wp.func
-    def background_radiance(b: Background, direction: wp.vec3) -> wp.vec3:
-        """direction: unit length, world space."""
-        if wp.static(features.environment):
-            return environment_radiance(b, direction)
-        if wp.static(features.gradient):
-            return wp.lerp(b.bottom, b.top, 0.5 * (direction[1] + 1.0))
-        return b.bottom
-
-    return background_radiance
-
-
-@wp.func
-def share_of_row(cdf: wp.array(dtype=wp.float32), first: int, i: int) -> float:
-    below = float(0.0)
-    if i > 0:
-        below = cdf[first + i - 1]
-    return cdf[first + i] - below
-
-
-def make_sky_sample(features, background_radiance):
-    """One direction to the background: by its brightness where it is a picture, else by the cosine."""
-
-    @wp.func
-    def by_brightness(b: Background, xi: wp.vec2) -> LightSample:
-        row = search_cdf(b.row_cdf, 0, b.height, xi[0])
-        first = row * b.width
-        column = search_cdf(b.column_cdf, first, b.width, xi[1])
-        p_row = share_of_row(b.row_cdf, 0, row)
-        p_column = share_of_row(b.column_cdf, first, column)
-        # Where in its cell the number fell is uniform again: it places the direction within the pixel.
-        v = 1.0 - (b.row_cdf[row] - xi[0]) / p_row
-        u = 1.0 - (b.column_cdf[first + column] - xi[1]) / p_column
-        theta = PI * (float(row) + wp.clamp(v, 0.0, 1.0)) / float(b.height)
-        phi = TWO_PI * ((float(column) + wp.clamp(u, 0.0, 1.0)) / float(b.width) - 0.5)
-        sin_theta = wp.sin(theta)
-        sample = LightSample()
-        local = wp.vec3(sin_theta * wp.sin(phi), wp.cos(theta), -sin_theta * wp.cos(phi))
-        sample.wi = rotate_y(local, b.rotation)
-        density = p_row * p_column * float(b.width * b.height) / (TWO_PI * PI * wp.max(sin_theta, 1.0e-9))
-        sample.weight = environment_radiance(b, sample.wi) / density
-        return sample
-
-    @wp.func
-    def sky_sample(b: Background, n: wp.vec3, xi: wp.vec2) -> LightSample:
-        sample = LightSample()
-        if wp.static(features.environment):
-            sample = by_brightness(b, xi)
-        else:
-            sample.wi = cosine_hemisphere(xi, n)
-            cosine = wp.max(wp.dot(sample.wi, n), 1.0e-9)
-            sample.weight = background_radiance(b, sample.wi) * (PI / cosine)
-        sample.distant = 1
-        sample.area = 1
-        return sample
-
-    return sky_sample
+def directional_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
+    """From infinity."""
+    sample = LightSample()
+    sample.wi = -light.direction
+    sample.weight = light.color
+    sample.distant = 1
+    return sample
 
 
 @wp.func
@@ -142,12 +71,21 @@ def spot_falloff(light: Light, cos_angle: float) -> float:
     return ramp * ramp
 
 
-def make_mesh_light_sample(features):
+@wp.func
+def spot_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
+    """A point light in a cone."""
+    sample = point_light(lighting, surfaces, light, s, xi)
+    if wp.max(sample.weight) > 0.0:
+        sample.weight = sample.weight * spot_falloff(light, -wp.dot(sample.wi, light.direction))
+    return sample
+
+
+def make_mesh_light(features):
     """A point on the emitters of one light, by power and then uniformly by area."""
     place_of = make_place_of(features.instances)
 
     @wp.func
-    def mesh_light_sample(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
+    def mesh_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
         chosen = search_cdf(lighting.emitter_cdf, light.first, light.count, xi[0])
         emitter = lighting.emitters[light.first + chosen]
         share = share_of_row(lighting.emitter_cdf, light.first, chosen)
@@ -179,7 +117,7 @@ def make_mesh_light_sample(features):
         sample.area = 1
         return sample
 
-    return mesh_light_sample
+    return mesh_light
 
 
 @wp.func
@@ -211,7 +149,7 @@ def sphere_light_from_within(light: Light, s: Surface, way: wp.vec3, xi: wp.vec2
 
 
 @wp.func
-def sphere_light_sample(light: Light, s: Surface, xi: wp.vec2) -> LightSample:
+def sphere_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
     """A direction in the cone that the sphere fills, uniformly (PBR, section 6.2.4); from within, one by the cosine."""
     sample = LightSample()
     way = light.position - s.point
@@ -241,95 +179,41 @@ def sphere_light_sample(light: Light, s: Surface, xi: wp.vec2) -> LightSample:
     return sample
 
 
+# By the name in wrt.scene.lights.LIGHTS (mesh and sphere: the emissive surfaces): from a scene's features to the device function.
+# Light.kind is the place here.
+LIGHTS = {
+    "point": lambda features: point_light,
+    "directional": lambda features: directional_light,
+    "spot": lambda features: spot_light,
+    "mesh": make_mesh_light,
+    "sphere": lambda features: sphere_light,
+}
+
+
+# --- any of them ------------------------------------------------------------------------------------------------------
+
+
 def make_light_sample(features):
-    """One sample of one light, as seen from a surface."""
-    mesh_light_sample = make_mesh_light_sample(features)
-
-    @wp.func
-    def light_sample(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
-        sample = LightSample()
-        if wp.static(features.mesh_lights):
-            if light.kind == wp.static(LIGHT_MESH):
-                return mesh_light_sample(lighting, surfaces, light, s, xi)
-        if wp.static(features.sphere_lights):
-            if light.kind == wp.static(LIGHT_SPHERE):
-                return sphere_light_sample(light, s, xi)
-        if wp.static(features.directional_lights):
-            if light.kind == wp.static(LIGHT_DIRECTIONAL):
-                sample.wi = -light.direction
-                sample.weight = light.color
-                sample.distant = 1
-                return sample
-        if wp.static(features.point_lights or features.spot_lights):
-            way = light.position - s.point
-            distance2 = wp.dot(way, way)
-            if distance2 > 0.0:
-                sample.wi = way / wp.sqrt(distance2)
-                sample.end = light.position
-                sample.weight = light.color / distance2
-                if wp.static(features.spot_lights):
-                    if light.kind == wp.static(LIGHT_SPOT):
-                        sample.weight = sample.weight * spot_falloff(light, -wp.dot(sample.wi, light.direction))
-        return sample
-
+    """The scene's kinds, one `if` after another, as in materials.py."""
+    light_sample = no_light
+    for number, name in reversed(list(enumerate(LIGHTS))):
+        if name in features.lights:
+            light_sample = make_link(number, LIGHTS[name](features), light_sample)
     return light_sample
 
 
 @wp.func
-def shadow_ray(s: Surface, sample: LightSample) -> Ray:
-    """The segment from a surface to a light: t = 1 is the light's end of it.
-
-    A light with an area ends it a little earlier: the rounding of the segment's direction and of t, some 16 steps, grows with
-    the distance, and not with the light's own error bound.
-    """
-    ray = make_ray(spawn_point(s.point, s.error, s.geometric, sample.wi), sample.wi)
-    ray.exclude_plus_one = s.exclude_plus_one
-    if sample.distant == 0:
-        ray.direction = sample.end - ray.origin
-        ray.t_max = wp.where(sample.area != 0, 1.0 - gamma(32.0), 1.0)
-    return ray
+def no_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
+    return LightSample()
 
 
-def make_reflected_light(features):
-    """The light that one sample sends to the eye, before shadows, and which sample that is."""
-    light_sample = make_light_sample(features)
-    sky_sample = make_sky_sample(features, make_background(features))
+def make_link(number, function, others):
+    """`function` for lights of that number, and the others for all other ones."""
 
     @wp.func
-    def choose(lighting: Lighting, surfaces: Surfaces, i: int, s: Surface, xi: wp.vec2) -> LightSample:
-        """Lights are numbered; the background comes after the last one."""
-        sample = LightSample()
-        if wp.static(features.lights):
-            if i < lighting.count:
-                sample = light_sample(lighting, surfaces, lighting.lights[i], s, xi)
-        if wp.static(features.sky_light):
-            if i == lighting.count:
-                sample = sky_sample(lighting.background, s.shading, xi)
-        return sample
+    def light_sample(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
+        if light.kind == wp.static(number):
+            return function(lighting, surfaces, light, s, xi)
+        return others(lighting, surfaces, light, s, xi)
 
-    @wp.func
-    def reflected(sample: LightSample, s: Surface, scatter: Scatter, wo: wp.vec3) -> wp.vec3:
-        cosine = wp.dot(s.shading, sample.wi)
-        if cosine <= 0.0 or wp.dot(s.geometric, sample.wi) <= 0.0:
-            return wp.vec3(0.0, 0.0, 0.0)
-        value = scatter.diffuse / PI
-        if wp.static(features.highlight):
-            # A traced reflection finds lights that have an area by itself; the background is no small light.
-            if sample.area == 0 or (scatter.traced == 0 and sample.distant == 0):
-                if wp.max(scatter.highlight) > 0.0:
-                    value = value + scatter.highlight * blinn_phong(s.shading, sample.wi, wo, scatter.exponent)
-        return cosine * wp.cw_mul(value, sample.weight)
-
-    return choose, reflected
-
-
-def make_light_xi(features):
-    """The numbers that place a sample on a light."""
-    sample_2d = make_sample_2d(features)
-
-    @wp.func
-    def light_xi(key: wp.uint32, index: wp.uint32, i: int) -> wp.vec2:
-        """Two numbers for light i at the path vertex `key`."""
-        return sample_2d(hash_pair(key, wp.static(wp.uint32(0x4C49))), index, i)
-
-    return light_xi
+    return light_sample

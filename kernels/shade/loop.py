@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from wrt.kernels.shade.lights import make_background
-from wrt.kernels.shade.materials import make_shading
+from wrt.kernels.shade.backgrounds import make_background
+from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, make_transmittance
 from wrt.kernels.shade.step import Sample, make_shaded, make_step, mean3
 from wrt.kernels.structs import Lighting, Limits, Ray, Surfaces

@@ -4,8 +4,8 @@ import warp as wp
 
 from wrt.kernels.shade.camera import chief_ray, make_camera_ray
 from wrt.kernels.shade.loop import make_radiance
-from wrt.kernels.shade.materials import make_cutout, make_shading
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
+from wrt.kernels.shade.shading import make_cutout, make_shading
 from wrt.kernels.structs import AovFilm, Camera, Film, Lighting, Limits, Surfaces, Tile, kernel, make_ray
 
 

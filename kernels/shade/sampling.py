@@ -186,3 +186,12 @@ def search_cdf(cdf: wp.array(dtype=wp.float32), first: int, count: int, x: float
         else:
             low = middle + 1
     return low
+
+
+@wp.func
+def share_of_row(cdf: wp.array(dtype=wp.float32), first: int, i: int) -> float:
+    """What entry i adds to the cdf that begins at `first`."""
+    below = float(0.0)
+    if i > 0:
+        below = cdf[first + i - 1]
+    return cdf[first + i] - below

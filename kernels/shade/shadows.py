@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from wrt.kernels.shade.materials import BLEND
+from wrt.kernels.shade.shading import BLEND
 from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Material, Ray, Surfaces
 

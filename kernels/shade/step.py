@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.shade.lights import make_light_xi, make_reflected_light, shadow_ray
-from wrt.kernels.shade.materials import BLEND, Scatter
+from wrt.kernels.shade.direct import make_light_xi, make_reflected_light, shadow_ray
+from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
+from wrt.kernels.shade.shading import BLEND
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT, OUTSIDE, attenuation
 from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Hit, Lighting, Limits, Material, Ray, Surfaces, make_ray

@@ -377,22 +377,23 @@ def damaged_scene(seed: Seed, other: Seed, rng: Random) -> Seed:
 def render_scene(path: Path) -> object:
     """A picture of 8x8 pixels of whatever can be loaded; pixels that are not finite are a defect.
 
-    One kernel with nearly all features for all scenes, one more for those with an environment: a kernel for each mixture would
-    take its time to compile. So each scene has smooth normals, be they zero.
+    One kernel with nearly all features for each kind of background: one for each mixture would take its time to compile. So each
+    scene has smooth normals, be they zero.
     """
+    from dataclasses import fields
     from unittest import mock
 
     from wrt.renderer import plan
     from wrt.renderer.features import STACK_STEP, Features
     from wrt.renderer.render import render
-    from wrt.scene.backgrounds import EnvironmentBackground
+    from wrt.scene.lights import EMISSIVE, LIGHTS
+    from wrt.scene.materials import MATERIALS
 
     scene = load_scene_with_normals(path)
-    environment = isinstance(scene.background, EnvironmentBackground)
-    switches = dict.fromkeys(Features().switches(), True)
-    switches |= {"environment": environment, "gradient": not environment}
+    switches = {each.name: True for each in fields(Features) if each.type == "bool"}
     switches |= dict.fromkeys(("instances", "independent", "schlick"), False)
-    features = Features(**switches, stack_size=9 * STACK_STEP)
+    features = Features(**switches, materials=tuple(MATERIALS), lights=(*LIGHTS, *EMISSIVE), background=scene.background.kind,
+                        stack_size=9 * STACK_STEP)
     with mock.patch.object(plan, "features_of", lambda *arguments: features):
         film = render(scene, size=(8, 8), spp=1, instancing="never", threads=1, aov=("depth", "normal"))
     if not np.isfinite(film.pixels).all() or np.isnan(film.aov["depth"]).any() or not np.isfinite(film.aov["normal"]).all():

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from wrt.renderer.instancing import instanced_meshes
-from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import Camera
-from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
-from wrt.scene.materials import Checkerboard, Material, Texture
+from wrt.scene.lights import EMISSIVE, LIGHTS
+from wrt.scene.materials import MATERIALS, Checkerboard, Texture
 from wrt.scene.model import Scene
 
 STACK_STEP = 16
@@ -24,9 +24,9 @@ class Features:
     """Everything that changes the code of a kernel; what is False leaves no trace in it.
 
     lens, blades, filter: the camera's; independent: the samples are random numbers; instances, spheres, smooth, textures,
-    checkerboards, normal_maps, cutout, blend: the surfaces'; mirror .. rough: the materials'; lights .. tinted_shadows: the
-    lighting; derived: reflection, refraction, transmission, transparent_shadows, sky_light, highlight. stack_size: room for
-    the rays that can be pending, in whole STACK_STEPs, so that neighbouring depths share a kernel.
+    checkerboards, normal_maps, parameter_textures (of roughness and the like), cutout, blend: the surfaces'; materials, lights,
+    background: the kinds there are, by name; derived: reflection, refraction, transmission, transparent_shadows, sky_light,
+    highlight. stack_size: room for the rays that can be pending, in whole STACK_STEPs, so that neighbouring depths share a kernel.
     """
 
     lens: bool = False
@@ -39,27 +39,19 @@ class Features:
     textures: bool = False
     checkerboards: bool = False
     normal_maps: bool = False
+    parameter_textures: bool = False
     cutout: bool = False
     blend: bool = False
-    mirror: bool = False
-    conductor: bool = False
-    glass: bool = False
+    materials: tuple[str, ...] = ()
     thin_glass: bool = False
     absorption: bool = False
-    metallic_roughness: bool = False
     transmission: bool = False
     rough: bool = False
     highlight: bool = False
     schlick: bool = False
     emission: bool = False
-    lights: bool = False
-    point_lights: bool = False
-    directional_lights: bool = False
-    spot_lights: bool = False
-    mesh_lights: bool = False
-    sphere_lights: bool = False
-    gradient: bool = False
-    environment: bool = False
+    lights: tuple[str, ...] = ()
+    background: str = "constant"
     sky_light: bool = False
     ambient: bool = False
     tinted_shadows: bool = False
@@ -69,16 +61,15 @@ class Features:
     stack_size: int = 1
 
     def switches(self) -> dict[str, bool]:
-        """Every on/off feature by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "stack_size"}
+        """Every on/off feature by name, each kind being one."""
+        on_off = {f.name: getattr(self, f.name) for f in fields(self) if f.type == "bool"}
+        return on_off | {f"{name}_lights": name in self.lights for name in (*LIGHTS, *EMISSIVE)} | {
+            name: name in self.materials for name in MATERIALS} | {
+            name: name == self.background for name in BACKGROUNDS if name != Features.background}
 
 
 def mesh_lights(scene: Scene) -> bool:
     return any(m.lights_others for thing in scene.objects for m in thing.materials)
-
-
-def is_rough(material: Material) -> bool:
-    return material.roughness > 0.01 and material.kind in ("conductor", "glass", "metallic_roughness")
 
 
 def features_of(scene: Scene, camera: Camera, meshes: frozenset[int] = frozenset()) -> Features:
@@ -86,25 +77,17 @@ def features_of(scene: Scene, camera: Camera, meshes: frozenset[int] = frozenset
     settings, materials = scene.settings, scene.materials
     textures = [texture for material in materials for texture in material.textures]
     kinds = {material.kind for material in materials}
-    background = scene.background
-    black = isinstance(background, ConstantBackground) and max(background.color) == 0.0
-    black = black or (isinstance(background, GradientBackground) and max(*background.bottom, *background.top) == 0.0)
-    diffuse = bool(kinds & {"diffuse", "metallic_roughness"}) and any(
-        max(m.albedo) > 0.0 for m in materials if m.kind in ("diffuse", "metallic_roughness"))
-    lit = diffuse or any(max(m.specular) > 0.0 for m in materials) or any(is_rough(m) for m in materials)
-    lights = {
-        "point_lights": lit and any(isinstance(light, PointLight) for light in scene.lights),
-        "directional_lights": lit and any(isinstance(light, DirectionalLight) for light in scene.lights),
-        "spot_lights": lit and any(isinstance(light, SpotLight) for light in scene.lights),
-        "mesh_lights": lit and mesh_lights(scene),
-        "sphere_lights": lit and any(s.material.lights_others for s in scene.spheres),
-    }
-    transmission = any(m.kind == "metallic_roughness" and m.transmission > 0.0 for m in materials)
-    glass = "glass" in kinds
-    clear = [m for m in materials if m.kind == "glass" or (m.kind == "metallic_roughness" and m.transmission > 0.0)]
+    diffuse = any(MATERIALS[m.kind].scatters and max(m.albedo) > 0.0 for m in materials)
+    rough = any(m.is_rough for m in materials)
+    highlight = rough or any(max(m.specular) > 0.0 for m in materials)
+    lit = diffuse or highlight
+    lights = {light.kind for light in scene.lights}
+    lights |= {"mesh"} if mesh_lights(scene) else set()
+    lights |= {"sphere"} if any(s.material.lights_others for s in scene.spheres) else set()
+    clear = [m for m in materials if m.is_clear]
     blend = any(m.alpha_mode == "blend" for m in materials)
     tinted = settings.glass_shadows == "tinted" and any(not m.thin for m in clear)
-    reflection = bool(kinds - {"diffuse"})
+    reflection = any(MATERIALS[kind].reflects for kind in kinds)
     refraction = bool(clear)
     children = int(reflection) + int(refraction) + int(blend)
     # The ray at hand is popped before its children are pushed: each level adds one ray less than it has children. What goes
@@ -121,24 +104,21 @@ def features_of(scene: Scene, camera: Camera, meshes: frozenset[int] = frozenset
         textures=any(isinstance(texture, Texture) for texture in textures),
         checkerboards=any(isinstance(texture, Checkerboard) for texture in textures),
         normal_maps=any(m.normal_texture is not None for m in materials),
+        parameter_textures=any(m.uses(name) and getattr(m, name) is not None for m in materials
+                               for name in ("metallic_roughness_texture", "transmission_texture")),
         cutout=any(m.alpha_mode == "mask" for m in materials),
         blend=blend,
-        mirror="mirror" in kinds,
-        conductor="conductor" in kinds,
-        glass=glass,
+        materials=tuple(name for name in MATERIALS if name in kinds),
         thin_glass=any(m.thin for m in clear),
         absorption=any(max(m.absorption) > 0.0 for m in clear),
-        metallic_roughness="metallic_roughness" in kinds,
-        transmission=transmission,
-        rough=any(is_rough(m) for m in materials),
-        highlight=any(max(m.specular) > 0.0 for m in materials) or any(is_rough(m) for m in materials),
-        schlick=settings.fresnel == "schlick" and (refraction or "metallic_roughness" in kinds),
+        transmission=any(m.uses("transmission") for m in clear),
+        rough=rough,
+        highlight=highlight,
+        schlick=settings.fresnel == "schlick" and any(m.uses("ior") for m in materials),
         emission=any(m.is_emissive for m in materials),
-        lights=any(lights.values()),
-        **lights,
-        gradient=isinstance(background, GradientBackground),
-        environment=isinstance(background, EnvironmentBackground),
-        sky_light=lit and not black,
+        lights=tuple(name for name in (*LIGHTS, *EMISSIVE) if lit and name in lights),
+        background=scene.background.kind,
+        sky_light=lit and not scene.background.is_black,
         ambient=max(scene.ambient) > 0.0,
         tinted_shadows=tinted,
         transparent_shadows=lit and (blend or tinted or any(m.thin for m in clear)),

@@ -13,16 +13,15 @@ import warp as wp
 from wrt.core.device import records, upload
 from wrt.core.errors import InputError, SceneWarning
 from wrt.kernels import structs
-from wrt.kernels.shade import lights, textures
+from wrt.kernels.shade import backgrounds, lights, materials, textures
 from wrt.renderer.flatten import Placed, World, world_of
-from wrt.scene.backgrounds import ConstantBackground, GradientBackground
+from wrt.scene.backgrounds import Background
 from wrt.scene.cameras import Camera
-from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
-from wrt.scene.materials import ALPHA_MODES, MATERIAL_KINDS, Checkerboard, Material, Texture
+from wrt.scene.materials import ALPHA_MODES, Checkerboard, Material, Texture, kinds_that_use
 from wrt.scene.model import Scene
 from wrt.scene.size import require_size
+from wrt.scene.values import LUMINANCE
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 # More area lights than this are sampled as one, by power: a shadow ray to each would cost more than it tells.
 MAX_MESH_LIGHTS = 16
 WRAPS = {"repeat": textures.WRAP_REPEAT, "clamp": textures.WRAP_CLAMP, "mirror": textures.WRAP_MIRROR}
@@ -76,16 +75,28 @@ def srgb_table() -> np.ndarray:
     return np.concatenate([linear, code]).astype(np.float32)
 
 
-def material_records(materials: tuple[Material, ...], table: TextureTable) -> np.ndarray:
-    out = records(structs.Material, max(len(materials), 1))
-    for row, material in zip(out, materials, strict=False):
+def number(kind: str, table: dict[str, Any], what: str) -> int:
+    """Where a kind stands in the device's table. Raises InputError where it does not."""
+    if kind not in table:
+        raise InputError(f"{what} {kind!r} has no device function: wrt.kernels.shade has no row for it")
+    return list(table).index(kind)
+
+
+def material_records(used: tuple[Material, ...], table: TextureTable) -> np.ndarray:
+    """What a kind does not use is 0, and no texture. What is clear without `transmission` lets all of it through."""
+    out = records(structs.Material, max(len(used), 1))
+    some_use = kinds_that_use()
+    for row, material in zip(out, used, strict=False):
         for name in out.dtype.names or ():
+            unused = name in some_use and not material.uses(name)
             if name.endswith("_texture"):
-                row[name] = table.index(getattr(material, name))
+                row[name] = -1 if unused else table.index(getattr(material, name))
             elif name == "kind":
-                row[name] = MATERIAL_KINDS.index(material.kind)
+                row[name] = number(material.kind, materials.MATERIALS, "material kind")
             elif name == "alpha_mode":
                 row[name] = ALPHA_MODES.index(material.alpha_mode)
+            elif unused:
+                row[name] = 1.0 if name == "transmission" and material.is_clear else 0.0
             else:
                 row[name] = getattr(material, name)
     return out
@@ -96,16 +107,10 @@ def light_records(scene: Scene, world: World) -> tuple[np.ndarray, np.ndarray, n
     MAX_MESH_LIGHTS all are one together."""
     rows: list[dict[str, Any]] = []
     for light in scene.lights:
-        if isinstance(light, PointLight):
-            rows.append({"kind": lights.LIGHT_POINT, "position": light.position, "color": light.intensity})
-        elif isinstance(light, DirectionalLight):
-            rows.append({"kind": lights.LIGHT_DIRECTIONAL, "direction": light.direction, "color": light.irradiance})
-        elif isinstance(light, SpotLight):
-            rows.append({"kind": lights.LIGHT_SPOT, "position": light.position, "color": light.intensity,
-                         "direction": light.direction, "cos_inner": np.cos(light.inner), "cos_outer": np.cos(light.outer)})
+        rows.append({"kind": number(light.kind, lights.LIGHTS, "light kind"), **light.record()})
     for sphere in scene.spheres:
         if sphere.material.lights_others:
-            rows.append({"kind": lights.LIGHT_SPHERE, "position": sphere.center, "radius": sphere.radius,
+            rows.append({"kind": number("sphere", lights.LIGHTS, "light kind"), "position": sphere.center, "radius": sphere.radius,
                          "color": sphere.material.emission, "two_sided": sphere.material.two_sided})
     groups = _emissive_groups(scene, world)
     if len(groups) > MAX_MESH_LIGHTS:
@@ -116,7 +121,7 @@ def light_records(scene: Scene, world: World) -> tuple[np.ndarray, np.ndarray, n
     for prim_id in groups:
         part, cdf = _emitters(scene, world, prim_id)
         if len(part):
-            rows.append({"kind": lights.LIGHT_MESH, "first": first, "count": len(part)})
+            rows.append({"kind": number("mesh", lights.LIGHTS, "light kind"), "first": first, "count": len(part)})
             parts.append(part)
             cdfs.append(cdf)
             first += len(part)
@@ -163,29 +168,15 @@ def _emitters(scene: Scene, world: World, prim_id: np.ndarray) -> tuple[np.ndarr
     return out, cdf
 
 
-def background_struct(scene: Scene, device: Any) -> Any:
-    """The background, with tables that choose a pixel by its brightness times its solid angle."""
+def background_struct(background: Background, device: Any) -> Any:
     b = structs.Background()
-    background = scene.background
-    if isinstance(background, ConstantBackground):
-        b.bottom = b.top = wp.vec3(*background.color)
-    elif isinstance(background, GradientBackground):
-        b.bottom, b.top = wp.vec3(*background.bottom), wp.vec3(*background.top)
-    else:
-        image = background.image
-        b.height, b.width = image.shape[:2]
-        b.scale, b.rotation = background.scale, background.rotation
-        # Bilinear look-up spreads a pixel into its neighbours: their chance must not be 0. A small share of the mean keeps
-        # dark places in reach of light that rounding leaves there.
-        brightness = image.astype(np.float64) @ LUMINANCE
-        spread = np.maximum(np.maximum(brightness, np.roll(brightness, 1, axis=1)), np.roll(brightness, -1, axis=1))
-        spread = np.maximum(spread, np.maximum(np.vstack([spread[:1], spread[:-1]]), np.vstack([spread[1:], spread[-1:]])))
-        weight = (spread + 1e-3 * spread.mean() + 1e-30) * np.sin(np.pi * (np.arange(b.height) + 0.5) / b.height)[:, None]
-        row = np.cumsum(weight.sum(axis=1))
-        column = np.cumsum(weight, axis=1)
-        b.pixels = upload(image.reshape(-1, 3), wp.vec3, device)
-        b.row_cdf = upload(row / row[-1], wp.float32, device)
-        b.column_cdf = upload((column / column[:, -1:]).ravel(), wp.float32, device)
+    number(background.kind, backgrounds.BACKGROUNDS, "background kind")
+    for name, value in background.record().items():
+        kind = structs.Background.vars[name].type
+        if isinstance(value, np.ndarray):
+            setattr(b, name, upload(value, kind.dtype, device))
+        else:
+            setattr(b, name, wp.vec3(*value) if kind is wp.vec3 else value)
     return b
 
 
@@ -235,7 +226,7 @@ def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()
     tell_left_out(scene)
     world = world_of(scene, meshes)
     table = TextureTable()
-    materials = material_records(scene.materials, table)
+    rows = material_records(scene.materials, table)
     s = structs.Surfaces()
     s.n_triangles = world.geometry.n_triangles
     s.vertices = upload(world.vertices, wp.vec3, device)
@@ -246,7 +237,7 @@ def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()
     if world.placed is not None:
         s.instances = upload(instance_records(world.placed), structs.Instance, device)
     s.prim_material = upload(world.prim_material, wp.int32, device)
-    s.materials = upload(materials, structs.Material, device)
+    s.materials = upload(rows, structs.Material, device)
     s.textures = upload(table.records(), structs.Texture, device)
     s.texels = upload(np.concatenate([np.zeros(1, np.uint32), *table.texels])[1:] if table.texels else np.zeros(1),
                       wp.uint32, device)
@@ -258,7 +249,7 @@ def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()
     lighting.lights = upload(rows, structs.Light, device)
     lighting.emitters = upload(emitters, structs.Emitter, device)
     lighting.emitter_cdf = upload(cdf, wp.float32, device)
-    lighting.background = background_struct(scene, device)
+    lighting.background = background_struct(scene.background, device)
     lighting.ambient = wp.vec3(*scene.ambient)
     return DeviceScene(world, s, lighting)
 

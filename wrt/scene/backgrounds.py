@@ -1,61 +1,90 @@
-"""What rays see that hit nothing: constant, gradient, an equirectangular picture."""
+"""What rays see that hit nothing: one class a kind, and a row in BACKGROUNDS."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from wrt.core.checks import as_array, at_thing
-from wrt.core.errors import InputError
-from wrt.scene.values import BLACK, WHITE, Color, as_number, as_vector
+from wrt.scene.kinds import Kind, given
+from wrt.scene.values import BLACK, LUMINANCE, WHITE, Color
+
+
+class Background(Kind):
+    """What every kind of background is; its device functions stand in kernels/shade/backgrounds.py, under the same name.
+
+    An array in `record` becomes one on the device.
+    """
+
+    what = "background"
+    name = ""
+
+    @property
+    def is_black(self) -> bool:
+        """Whether it lights nothing: then it is not sampled."""
+        return False
 
 
 @dataclass(frozen=True)
-class ConstantBackground:
-    """The same radiance from every direction."""
+class ConstantBackground(Background):
+    """The same radiance from everywhere."""
 
-    color: Color = BLACK
+    kind = "constant"
+    color: Color = field(default=BLACK, metadata=given("color", "from every direction", "radiance"))
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "color", as_vector(self.color, "background color", low=0.0))
+    @property
+    def is_black(self) -> bool:
+        return max(self.color) == 0.0
+
+    def record(self) -> dict[str, Any]:
+        return {"bottom": self.color, "top": self.color}
 
 
 @dataclass(frozen=True)
-class GradientBackground:
-    """From `bottom` (straight down, -y) to `top` (+y), linear in the direction's y."""
+class GradientBackground(Background):
+    """Linear in the direction's y."""
 
-    bottom: Color = WHITE
-    top: Color = (0.5, 0.7, 1.0)
+    kind = "gradient"
+    bottom: Color = field(default=WHITE, metadata=given("color", "from straight below (-y)", "radiance"))
+    top: Color = field(default=(0.5, 0.7, 1.0), metadata=given("color", "from straight above (+y)", "radiance"))
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "bottom", as_vector(self.bottom, "background bottom", low=0.0))
-        object.__setattr__(self, "top", as_vector(self.top, "background top", low=0.0))
+    @property
+    def is_black(self) -> bool:
+        return max(*self.bottom, *self.top) == 0.0
+
+    def record(self) -> dict[str, Any]:
+        return {"bottom": self.bottom, "top": self.top}
 
 
 @dataclass(frozen=True, eq=False)
-class EnvironmentBackground:
-    """An equirectangular picture of the surroundings.
+class EnvironmentBackground(Background):
+    """An equirectangular picture: its middle column is seen along -z, its upper edge is +y.
 
-    image: (H, W, 3) float32 linear radiance, row 0 is straight up (+y); the column at the middle is seen along -z, and
-    columns run to the right of that view (towards +x). rotation: radians about +y, counter-clockwise seen from above.
+    Row 0 of `image` is the upper edge, and columns run to the right of the view along -z (towards +x).
     """
 
-    image: np.ndarray = field(repr=False)
-    scale: float = 1.0
-    rotation: float = 0.0
+    kind = "environment"
+    what = "environment"
+    image: np.ndarray = field(repr=False, metadata=given("image", "image (.exr, .hdr, or sRGB), relative to the scene file"))
+    scale: float = field(default=1.0, metadata=given("number", "multiplies the image", ge=0.0))
+    rotation: float = field(default=0.0, metadata=given("angle", "about +y, counter-clockwise seen from above"))
     name: str = ""
 
-    def __post_init__(self) -> None:
-        at = at_thing("environment", self.name)
-        image = as_array(self.image, np.float32, at + "image")
-        if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-            raise InputError(at + f"image must be (H, W, 3), got {image.shape}")
-        if not np.isfinite(image).all() or (image < 0.0).any():
-            raise InputError(at + "image must be finite and not negative")
-        object.__setattr__(self, "image", image)
-        object.__setattr__(self, "scale", as_number(self.scale, at + "scale", low=0.0))
-        object.__setattr__(self, "rotation", as_number(self.rotation, at + "rotation"))
+    def record(self) -> dict[str, Any]:
+        """With tables that choose a pixel by its brightness times its solid angle."""
+        # Bilinear look-up spreads a pixel into its neighbours: their chance must not be 0. A small share of the mean keeps
+        # dark places in reach of light that rounding leaves there.
+        height, width = self.image.shape[:2]
+        brightness = self.image.astype(np.float64) @ LUMINANCE
+        spread = np.maximum(np.maximum(brightness, np.roll(brightness, 1, axis=1)), np.roll(brightness, -1, axis=1))
+        spread = np.maximum(spread, np.maximum(np.vstack([spread[:1], spread[:-1]]), np.vstack([spread[1:], spread[-1:]])))
+        weight = (spread + 1e-3 * spread.mean() + 1e-30) * np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None]
+        row = np.cumsum(weight.sum(axis=1))
+        column = np.cumsum(weight, axis=1)
+        return {"width": width, "height": height, "scale": self.scale, "rotation": self.rotation,
+                "pixels": self.image.reshape(-1, 3), "row_cdf": row / row[-1], "column_cdf": (column / column[:, -1:]).ravel()}
 
 
-Background = ConstantBackground | GradientBackground | EnvironmentBackground
+BACKGROUNDS: dict[str, type[Background]] = {
+    each.kind: each for each in (ConstantBackground, GradientBackground, EnvironmentBackground)}

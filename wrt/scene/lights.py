@@ -1,60 +1,80 @@
-"""Lights without a surface: point, directional, spot. (What has a surface lights by its material's emission.)"""
+"""Lights without a surface: one class a kind, and a row in LIGHTS. (What has a surface lights by its material's emission.)"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
 
 from wrt.core.checks import at_thing
-from wrt.scene.values import Color, _unit, as_number, as_vector
+from wrt.core.errors import InputError
+from wrt.scene.kinds import Kind, given
+from wrt.scene.values import Color, as_number
+
+
+class Light(Kind):
+    """What every kind of light is; its device function stands in kernels/shade/lights.py, under the same name."""
+
+    what = "light"
 
 
 @dataclass(frozen=True)
-class PointLight:
-    """intensity: radiant intensity (per steradian); irradiance falls with the square of the distance."""
+class PointLight(Light):
+    """A point that shines alike in all directions."""
 
-    position: Color
-    intensity: Color
+    kind = "point"
+    position: Color = field(metadata=given("point", "where it is"))
+    intensity: Color = field(metadata=given(
+        "color", "the same in all directions; irradiance falls with the square of the distance", "radiant intensity"))
     name: str = ""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "position", as_vector(self.position, at_thing("light", self.name) + "position"))
-        object.__setattr__(self, "intensity", as_vector(self.intensity, at_thing("light", self.name) + "intensity", low=0.0))
+    def record(self) -> dict[str, Any]:
+        return {"position": self.position, "color": self.intensity}
 
 
 @dataclass(frozen=True)
-class DirectionalLight:
-    """direction: the way the light travels (any length but 0); irradiance: on a surface that faces it."""
+class DirectionalLight(Light):
+    """A light at infinity."""
 
-    direction: Color
-    irradiance: Color
+    kind = "directional"
+    direction: Color = field(metadata=given("direction", "the way the light travels (any length)"))
+    irradiance: Color = field(metadata=given("color", "on a surface that faces it", "irradiance"))
+    name: str = ""
+
+    def record(self) -> dict[str, Any]:
+        return {"direction": self.direction, "color": self.irradiance}
+
+
+@dataclass(frozen=True)
+class SpotLight(Light):
+    """A point light in a cone.
+
+    Full light within `inner` of its axis, none beyond `outer`, and between them the square of a linear ramp in the cosine, as
+    KHR_lights_punctual recommends.
+    """
+
+    kind = "spot"
+    position: Color = field(metadata=given("point", "where it is"))
+    direction: Color = field(metadata=given("direction", "axis of the cone (any length)"))
+    intensity: Color = field(metadata=given("color", "on the axis", "radiant intensity"))
+    inner: float = field(default=0.0, metadata=given("angle", "half angle of full light", ge=0.0, le=90.0))
+    outer: float = field(default=math.pi / 4, metadata=given("angle", "half angle without light beyond", gt=0.0, le=90.0))
     name: str = ""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         at = at_thing("light", self.name)
-        object.__setattr__(self, "direction", _unit(as_vector(self.direction, at + "direction"), at + "direction"))
-        object.__setattr__(self, "irradiance", as_vector(self.irradiance, at + "irradiance", low=0.0))
+        as_number(self.outer, at + "outer", low=1e-4)
+        if self.inner > self.outer:
+            inner, outer = math.degrees(self.inner), math.degrees(self.outer)
+            raise InputError(at + f"inner ({inner:.6g} degrees) must not be larger than outer ({outer:.6g})")
+
+    def record(self) -> dict[str, Any]:
+        return {"position": self.position, "color": self.intensity, "direction": self.direction,
+                "cos_inner": np.cos(self.inner), "cos_outer": np.cos(self.outer)}
 
 
-@dataclass(frozen=True)
-class SpotLight:
-    """A point light in a cone: full within `inner` of its axis, none beyond `outer` (half angles in radians), and between
-    them the square of a linear ramp in the cosine, as KHR_lights_punctual recommends."""
-
-    position: Color
-    direction: Color
-    intensity: Color
-    inner: float = 0.0
-    outer: float = math.pi / 4
-    name: str = ""
-
-    def __post_init__(self) -> None:
-        at = at_thing("light", self.name)
-        object.__setattr__(self, "position", as_vector(self.position, at + "position"))
-        object.__setattr__(self, "direction", _unit(as_vector(self.direction, at + "direction"), at + "direction"))
-        object.__setattr__(self, "intensity", as_vector(self.intensity, at + "intensity", low=0.0))
-        object.__setattr__(self, "outer", as_number(self.outer, at + "outer", low=1e-4, high=math.pi / 2))
-        object.__setattr__(self, "inner", as_number(self.inner, at + "inner", low=0.0, high=self.outer))
-
-
-Light = PointLight | DirectionalLight | SpotLight
+LIGHTS: dict[str, type[Light]] = {each.kind: each for each in (PointLight, DirectionalLight, SpotLight)}
+EMISSIVE = ("mesh", "sphere")  # the device's kinds that stand for emissive surfaces

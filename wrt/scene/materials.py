@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,7 +57,32 @@ class Checkerboard:
         object.__setattr__(self, "scale", as_number(self.scale, "checkerboard scale", low=1e-6))
 
 
-MATERIAL_KINDS = ("diffuse", "mirror", "conductor", "glass", "metallic_roughness")
+
+class MaterialKind(NamedTuple):
+    """What the host knows of a kind; its device function stands in kernels/shade/materials.py, under the same name.
+
+    about: for the reference of scene files. uses: fields of Material that not every kind reads, and this one does: for a kind
+    that does not use them they are 0 on the device, and a scene file may not give them. scatters: some of `albedo` follows
+    Lambert's law; reflects: sends rays back; clear: lets light through even where it does not use `transmission`.
+    """
+
+    about: str
+    uses: tuple[str, ...] = ()
+    scatters: bool = False
+    reflects: bool = True
+    clear: bool = False
+
+
+MATERIALS: dict[str, MaterialKind] = {
+    "diffuse": MaterialKind("Lambert, with an optional Blinn-Phong highlight", ("specular", "exponent"), scatters=True,
+                            reflects=False),
+    "mirror": MaterialKind("reflects albedo at every angle"),
+    "conductor": MaterialKind("Fresnel reflection of a metal", ("eta", "k", "roughness")),
+    "glass": MaterialKind("reflection and refraction", ("ior", "absorption", "thin", "roughness"), clear=True),
+    "metallic_roughness": MaterialKind(
+        "glTF's", ("ior", "absorption", "thin", "roughness", "metallic", "transmission", "metallic_roughness_texture",
+                   "transmission_texture"), scatters=True),
+}
 ALPHA_MODES = ("opaque", "mask", "blend")
 # Complex index of refraction at 630, 532 and 465 nm, rounded to three digits (optical tables of the pure metals).
 CONDUCTORS: dict[str, tuple[Color, Color]] = {
@@ -117,7 +143,7 @@ class Material:
 
     def __post_init__(self) -> None:
         at = at_thing("material", self.name)
-        as_choice(self.kind, MATERIAL_KINDS, at + "kind")
+        as_choice(self.kind, MATERIALS, at + "kind")
         as_choice(self.alpha_mode, ALPHA_MODES, at + "alpha_mode")
         bounds: dict[str, tuple[float, float]] = {
             "albedo": (0.0, 1.0), "specular": (0.0, 1.0), "eta": (0.0, 1e3), "k": (0.0, 1e3),
@@ -137,6 +163,20 @@ class Material:
                 kinds = (Texture, Checkerboard) if name in ("albedo", "emission") else (Texture,)
                 as_one(getattr(self, slot), kinds, at + slot)
 
+    def uses(self, field: str) -> bool:
+        """Whether its kind reads that field, of those that not every kind reads."""
+        return field in MATERIALS[self.kind].uses
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether light goes through it, alpha aside."""
+        return MATERIALS[self.kind].clear or (self.uses("transmission") and self.transmission > 0.0)
+
+    @property
+    def is_rough(self) -> bool:
+        """Whether its reflection is spread: below a roughness of 0.01 by less than a float32 direction can tell."""
+        return self.uses("roughness") and self.roughness > 0.01
+
     @property
     def is_emissive(self) -> bool:
         """Whether it emits anything, textures aside."""
@@ -155,3 +195,9 @@ class Material:
         slots = (self.albedo_texture, self.metallic_roughness_texture, self.transmission_texture,
                  self.emission_texture, self.normal_texture)
         return tuple(texture for texture in slots if texture is not None)
+
+
+def kinds_that_use() -> dict[str, tuple[str, ...]]:
+    """Of each field that not every kind of material reads, the kinds that do."""
+    used = dict.fromkeys(name for kind in MATERIALS.values() for name in kind.uses)
+    return {name: tuple(kind for kind, row in MATERIALS.items() if name in row.uses) for name in used}

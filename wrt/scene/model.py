@@ -20,9 +20,9 @@ import numpy as np
 from wrt.core.checks import as_array, as_one, as_tuple, at_thing, unknown
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts, html_table
-from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import Camera
-from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
+from wrt.scene.lights import LIGHTS, Light
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.motion import Motion
@@ -103,13 +103,12 @@ class Scene:
     name: str = ""
 
     def __post_init__(self) -> None:
-        kinds: dict[str, Any] = {"objects": Object, "spheres": Sphere, "cameras": Camera,
-                                 "lights": (PointLight, DirectionalLight, SpotLight)}
+        kinds: dict[str, Any] = {"objects": Object, "spheres": Sphere, "cameras": Camera, "lights": tuple(LIGHTS.values())}
         for name, kind in kinds.items():
             object.__setattr__(self, name, as_tuple(getattr(self, name), kind, name))
         for name in ("objects", "spheres", "lights"):
             require_count(len(getattr(self, name)), name)
-        as_one(self.background, (ConstantBackground, GradientBackground, EnvironmentBackground), "background")
+        as_one(self.background, tuple(BACKGROUNDS.values()), "background")
         as_one(self.settings, Settings, "settings")
         object.__setattr__(self, "ambient", as_vector(self.ambient, "ambient", low=0.0))
 

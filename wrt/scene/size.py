@@ -8,7 +8,6 @@ import numpy as np
 
 from wrt.core.checks import at_thing
 from wrt.core.errors import InputError
-from wrt.scene.lights import DirectionalLight
 from wrt.scene.model import Scene
 from wrt.scene.values import SMALLEST
 
@@ -29,9 +28,9 @@ def require_size(scene: Scene) -> None:
 
 
 def _light_with_a_place(scene: Scene) -> str:
-    """What the first light is called whose distance counts: a point or spot light, or a shape that lights others. "" for none."""
+    """What the first light is called whose distance counts: one with a place, or a shape that lights others. "" for none."""
     for light in scene.lights:
-        if not isinstance(light, DirectionalLight):
+        if light.places():
             return at_thing("light", light.name)[:-2]
     for thing in scene.objects:
         if any(material.lights_others for material in thing.materials):
@@ -57,8 +56,8 @@ def _size(scene: Scene, enough: float) -> float:
 def _points(scene: Scene) -> Iterator[np.ndarray]:
     """(N, 3) float64 in world space, a part at a time."""
     for light in scene.lights:
-        if not isinstance(light, DirectionalLight):
-            yield np.array([light.position])
+        if light.places():
+            yield np.array(light.places())
     for sphere in scene.spheres:
         yield np.array(sphere.center) + sphere.radius * np.array([[-1.0], [1.0]])
     for thing in scene.objects:

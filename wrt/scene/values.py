@@ -13,6 +13,7 @@ from wrt.core.errors import InputError
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
 SMALLEST = 1e-30  # of a length that must not be 0
 MAX_OBJECTS = 1 << 20  # and spheres, and lights: a few bytes of a file must not make any number of them
 MAX_REACH = 1e18  # of a shape from the origin, in scene units: the square of a distance must be a float32

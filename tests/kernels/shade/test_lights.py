@@ -10,33 +10,28 @@ from tests.kernel_tools import CPU, directions, launch, rounded, sobol_like, uni
 import warp as wp
 
 from wrt.accel.build import build
-from wrt.kernels.shade.lights import (
-    LightSample,
-    environment_radiance,
-    make_background,
-    make_light_sample,
-    make_sky_sample,
-    shadow_ray,
-)
+from wrt.kernels.shade import backgrounds, lights
+from wrt.kernels.shade.backgrounds import environment, make_sky_sample
+from wrt.kernels.shade.direct import shadow_ray
+from wrt.kernels.shade.lights import LightSample, make_light_sample
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Background, Lighting, Ray, Surfaces, kernel
 from wrt.renderer.features import Features
 from wrt.renderer.upload import upload_scene
-from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground, Object, Scene, Sphere
-from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
+from wrt.scene.backgrounds import BACKGROUNDS, ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.lights import EMISSIVE, LIGHTS, DirectionalLight, PointLight, SpotLight
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
+from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import icosphere, quad
 
-ALL_LIGHTS = Features(lights=True, point_lights=True, directional_lights=True, spot_lights=True, mesh_lights=True,
-                      sphere_lights=True, sky_light=True)
+ALL_LIGHTS = Features(lights=(*LIGHTS, *EMISSIVE), sky_light=True)
 
 
 @cache
 def light_kernel(features):
     light_sample = make_light_sample(features)
-    background = make_background(features)
-    sky_sample = make_sky_sample(features, background)
+    sky_sample = make_sky_sample(features)
 
     @kernel
     def take(lighting: Lighting, surfaces: Surfaces, point: wp.array(dtype=wp.vec3), n: wp.array(dtype=wp.vec3), light: int,
@@ -58,7 +53,7 @@ def light_kernel(features):
 @kernel
 def environment_kernel(b: Background, direction: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.vec3)):
     i = wp.tid()
-    out[i] = environment_radiance(b, direction[i])
+    out[i] = environment(b, direction[i])
 
 
 def take(scene, point=(0.0, 0.0, 0.0), n=(0.0, 1.0, 0.0), light=0, xi=None, features=ALL_LIGHTS):
@@ -89,6 +84,11 @@ def polygon_irradiance(corners, point, n, radiance=1.0):
     cross = np.cross(to, following)
     angle = np.arccos(np.clip((to * following).sum(axis=1), -1.0, 1.0))
     return radiance * 0.5 * abs((angle * (unit(cross) @ n)).sum())
+
+
+def test_both_tables_have_the_same_kinds():
+    assert list(lights.LIGHTS) == [*LIGHTS, *EMISSIVE]
+    assert list(backgrounds.BACKGROUNDS) == list(BACKGROUNDS)
 
 
 # --- lights without area ----------------------------------------------------------------------------------------------
@@ -287,7 +287,7 @@ def test_constant_sky_is_pi_l_without_noise():
 
 def test_gradient_sky():
     scene = Scene(background=GradientBackground((1.0, 0.0, 0.5), (0.0, 2.0, 0.5)))
-    features = replace(ALL_LIGHTS, gradient=True)
+    features = replace(ALL_LIGHTS, background="gradient")
     up, down = (irradiance(scene, n=n, features=features) for n in ((0, 1, 0), (0, -1, 0)))
     # Integral of (y + 1) / 2 times the cosine over the upper hemisphere: pi (2/3 + 1) / 2.
     share = np.pi * (2.0 / 3.0 + 1.0) / 2.0
@@ -296,7 +296,7 @@ def test_gradient_sky():
     assert np.allclose(down, np.pi * top + share * (bottom - top), atol=2e-3)
 
 
-ENVIRONMENT = replace(ALL_LIGHTS, environment=True)
+ENVIRONMENT = replace(ALL_LIGHTS, background="environment")
 
 
 def radiance_of(background, direction):

@@ -9,21 +9,16 @@ from tests.kernel_tools import CPU, floats, launch, rounded, sobol_like, unit, v
 import warp as wp
 
 from wrt.core.device import upload
+from wrt.core.errors import InputError
 from wrt.kernels import structs
-from wrt.kernels.shade.materials import (
-    Scatter,
-    blinn_phong,
-    fresnel_conductor,
-    fresnel_dielectric,
-    fresnel_schlick,
-    fresnel_tint,
-    make_scatter,
-)
+from wrt.kernels.shade import materials
+from wrt.kernels.shade.fresnel import fresnel_conductor, fresnel_dielectric, fresnel_schlick, fresnel_tint
+from wrt.kernels.shade.materials import Scatter, blinn_phong, make_scatter
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import kernel
 from wrt.renderer.features import Features
 from wrt.renderer.upload import TextureTable, material_records
-from wrt.scene.materials import CONDUCTORS, MATERIAL_KINDS, Material
+from wrt.scene.materials import CONDUCTORS, MATERIALS, Material, MaterialKind
 
 
 @kernel
@@ -161,8 +156,8 @@ def test_highlight_is_normalised(exponent):
 # --- scatter ----------------------------------------------------------------------------------------------------------
 
 
-EVERYTHING = Features(mirror=True, conductor=True, glass=True, thin_glass=True, metallic_roughness=True, transmission=True,
-                      rough=True, highlight=True, reflection=True, refraction=True)
+EVERYTHING = Features(materials=tuple(MATERIALS), thin_glass=True, transmission=True, rough=True, highlight=True, reflection=True,
+                      refraction=True)
 
 
 @cache
@@ -327,8 +322,26 @@ def test_interpolated_normals_never_send_a_ray_to_the_wrong_side():
         assert (out["refraction"][used, 2] < 0.0).all()
 
 
-def test_every_kind_of_the_scene_has_its_number_on_the_device():
-    from wrt.kernels.shade import materials
+def test_both_tables_have_the_same_kinds():
+    assert list(materials.MATERIALS) == list(MATERIALS)
 
-    for number, kind in enumerate(MATERIAL_KINDS):
-        assert getattr(materials, kind.upper()) == number
+
+@wp.func
+def half(m: structs.Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> Scatter:
+    result = out
+    result.reflected = 0.5 * m.albedo
+    return result
+
+
+def test_a_kind_from_outside_is_a_row_in_both_tables(monkeypatch):
+    with pytest.raises(InputError, match="kind must be one of"):
+        Material("half")
+    monkeypatch.setitem(MATERIALS, "half", MaterialKind("half a mirror"))
+    half_mirror, whole = Material("half", albedo=(0.8,) * 3, roughness=0.7), Material("mirror", albedo=(0.8,) * 3)
+    with pytest.raises(InputError, match="'half' has no device function"):
+        scatter(half_mirror, slanted(30.0))
+    monkeypatch.setitem(materials.MATERIALS, "half", lambda features: half)
+    features = Features(materials=("mirror", "half"), reflection=True)
+    for material, expected in ((half_mirror, 0.4), (whole, 0.8)):
+        out = scatter(material, slanted(30.0), features=features)
+        assert np.allclose(out["reflected"], expected) and np.allclose(out["reflection"], slanted(-30.0), atol=1e-6)

@@ -566,10 +566,10 @@ def test_defaults_and_choices_are_those_of_the_scene() -> None:
                 value = getattr(table, name)
                 assert (tuple(value) if isinstance(value, list) else value) == getattr(made, name), name
     definitions = schema()["$defs"]
-    from wrt.scene.materials import ALPHA_MODES, CONDUCTORS, MATERIAL_KINDS
+    from wrt.scene.materials import ALPHA_MODES, CONDUCTORS, MATERIALS
     from wrt.scene.settings import FILTERS, TONEMAPS
     material, settings = definitions["MaterialTable"]["properties"], definitions["SettingsTable"]["properties"]
-    assert tuple(material["kind"]["enum"]) == MATERIAL_KINDS
+    assert tuple(material["kind"]["enum"]) == tuple(MATERIALS)
     assert tuple(material["alpha_mode"]["enum"]) == ALPHA_MODES
     assert set(material["metal"]["anyOf"][0]["enum"]) == set(CONDUCTORS)
     assert tuple(settings["filter"]["enum"]) == FILTERS

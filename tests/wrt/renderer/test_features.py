@@ -33,23 +33,26 @@ def scene_of(*materials: Material, mesh: Any = None, spheres: tuple[Material, ..
 
 
 def on(scene: Scene, camera: Camera | None = None) -> set[str]:
-    return {name for name, value in features_of(scene, camera or Camera()).switches().items() if value}
+    """But for "diffuse", which nearly every scene here has."""
+    switches = features_of(scene, camera or Camera()).switches()
+    return {name for name, value in switches.items() if value and name != "diffuse"}
 
 
 def test_a_black_opaque_scene_needs_nothing() -> None:
     assert on(scene_of(BLACK)) == set() and on(scene_of()) == set()
     assert on(scene_of(BLACK, lights=(POINT,), background=SKY)) == set()  # nothing that light could show on
-    assert features_of(scene_of(BLACK), Camera()) == Features()
+    assert features_of(scene_of(BLACK), Camera()) == Features(materials=("diffuse",))
+    assert features_of(scene_of(), Camera()) == Features()
 
 
 @pytest.mark.parametrize(("scene", "expected"), [
     (scene_of(GREY), set()),
-    (scene_of(GREY, lights=(POINT,)), {"lights", "point_lights"}),
-    (scene_of(GREY, lights=(DirectionalLight((0, -1, 0), (1, 1, 1)),)), {"lights", "directional_lights"}),
-    (scene_of(GREY, lights=(SpotLight((0, 1, 0), (0, -1, 0), (1, 1, 1)),)), {"lights", "spot_lights"}),
-    (scene_of(GREY, Material(emission=(1, 1, 1))), {"emission", "lights", "mesh_lights"}),
+    (scene_of(GREY, lights=(POINT,)), {"point_lights"}),
+    (scene_of(GREY, lights=(DirectionalLight((0, -1, 0), (1, 1, 1)),)), {"directional_lights"}),
+    (scene_of(GREY, lights=(SpotLight((0, 1, 0), (0, -1, 0), (1, 1, 1)),)), {"spot_lights"}),
+    (scene_of(GREY, Material(emission=(1, 1, 1))), {"emission", "mesh_lights"}),
     (scene_of(GREY, Material(emission=(1, 1, 1), emits_light=False)), {"emission"}),
-    (scene_of(GREY, spheres=(Material(emission=(1, 1, 1)),)), {"emission", "lights", "sphere_lights", "spheres"}),
+    (scene_of(GREY, spheres=(Material(emission=(1, 1, 1)),)), {"emission", "sphere_lights", "spheres"}),
     (scene_of(GREY, background=SKY), {"sky_light"}),
     (scene_of(GREY, background=GradientBackground()), {"gradient", "sky_light"}),
     (scene_of(GREY, background=GradientBackground((0, 0, 0), (0, 0, 0))), {"gradient"}),
@@ -60,7 +63,7 @@ def test_a_black_opaque_scene_needs_nothing() -> None:
     (scene_of(Material("mirror"), lights=(POINT,), background=SKY), {"mirror", "reflection"}),
     (scene_of(Material("conductor")), {"conductor", "reflection"}),
     (scene_of(Material("conductor", roughness=0.5), lights=(POINT,)),
-     {"conductor", "reflection", "rough", "highlight", "lights", "point_lights"}),
+     {"conductor", "reflection", "rough", "highlight", "point_lights"}),
     (scene_of(Material("glass")), {"glass", "reflection", "refraction"}),
     (scene_of(Material("glass", absorption=(0, 1, 0))), {"glass", "reflection", "refraction", "absorption"}),
     (scene_of(Material("glass", thin=True), GREY),
@@ -74,10 +77,13 @@ def test_a_black_opaque_scene_needs_nothing() -> None:
      {"metallic_roughness", "reflection", "refraction", "transmission"}),
     (scene_of(Material(specular=(0.1, 0, 0))), {"highlight"}),
     (scene_of(Material(alpha_mode="mask")), {"cutout"}),
-    (scene_of(Material(alpha_mode="blend"), lights=(POINT,)), {"blend", "lights", "point_lights", "transparent_shadows"}),
+    (scene_of(Material(alpha_mode="blend"), lights=(POINT,)), {"blend", "point_lights", "transparent_shadows"}),
     (scene_of(BLACK, mesh=icosphere(0)), {"smooth"}),
     (scene_of(Material(albedo_texture=PICTURE)), {"textures"}),
     (scene_of(Material(albedo_texture=Checkerboard())), {"checkerboards"}),
+    (scene_of(Material("metallic_roughness", albedo=(0, 0, 0), metallic_roughness_texture=PICTURE)),
+     {"metallic_roughness", "reflection", "textures", "parameter_textures"}),
+    (scene_of(Material(metallic_roughness_texture=PICTURE)), {"textures"}),  # which its kind does not use
     (scene_of(Material(normal_texture=PICTURE)), {"textures", "normal_maps"}),
     (scene_of(BLACK, settings=Settings(filter="gaussian")), {"filter"}),
     (scene_of(BLACK, settings=Settings(filter="box", sampler="independent")), {"independent"}),

@@ -25,7 +25,7 @@ from wrt.renderer.upload import (
 from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
-from wrt.scene.materials import ALPHA_MODES, MATERIAL_KINDS, Checkerboard, Material, Texture
+from wrt.scene.materials import ALPHA_MODES, MATERIALS, Checkerboard, Material, Texture, kinds_that_use
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import box, icosphere, quad
@@ -116,12 +116,14 @@ def test_material_records_keep_every_value() -> None:
                  metallic_roughness_texture=Texture(picture.image), alpha_cutoff=0.9)
     table = TextureTable()
     out = material_records((a, b), table)
-    assert out["kind"].tolist() == [MATERIAL_KINDS.index("glass"), MATERIAL_KINDS.index("metallic_roughness")]
+    assert [list(MATERIALS)[kind] for kind in out["kind"]] == ["glass", "metallic_roughness"]
     assert out["alpha_mode"].tolist() == [ALPHA_MODES.index("blend"), ALPHA_MODES.index("opaque")]
     for row, material in zip(out, (a, b), strict=True):
         for name in ("albedo", "specular", "exponent", "eta", "k", "ior", "absorption", "thin", "metallic", "roughness",
                      "transmission", "emission", "two_sided", "alpha", "alpha_cutoff", "normal_scale"):
-            assert np.allclose(row[name], getattr(material, name)), name
+            unused = name in kinds_that_use() and not material.uses(name)
+            assert np.allclose(row[name], 0.0 if unused else getattr(material, name)) or name == "transmission", name
+    assert np.allclose(out["transmission"], [1.0, 0.2])  # glass lets through all that it does not reflect
     assert out["albedo_texture"].tolist() == [0, -1] and out["normal_texture"].tolist() == [0, -1]
     assert out["emission_texture"][0] == 1 and out["metallic_roughness_texture"].tolist() == [-1, 2]
     assert len(table.rows) == 3 and table.size == 6  # the picture that two textures share is stored once
@@ -140,7 +142,7 @@ def test_lights_without_area() -> None:
     scene = Scene(lights=(PointLight((1, 2, 3), (4, 5, 6)), DirectionalLight((0, -3, 0), (7, 8, 9)),
                           SpotLight((1, 1, 1), (0, 0, -2), (1, 2, 3), 0.25, 0.5)))
     rows, emitters, _ = light_records(scene, world_mesh(scene))
-    assert rows["kind"].tolist() == [lights.LIGHT_POINT, lights.LIGHT_DIRECTIONAL, lights.LIGHT_SPOT] and len(emitters) == 0
+    assert [list(lights.LIGHTS)[kind] for kind in rows["kind"]] == ["point", "directional", "spot"] and len(emitters) == 0
     assert rows["position"][0].tolist() == [1, 2, 3] and rows["color"][1].tolist() == [7, 8, 9]
     assert np.allclose(rows["direction"][1:], [[0, -1, 0], [0, 0, -1]])
     assert rows["cos_inner"][2] == np.float32(np.cos(0.25)) and rows["cos_outer"][2] == np.float32(np.cos(0.5))
@@ -156,7 +158,7 @@ def lamps(count: int, **rest: float) -> Scene:
 def test_each_glowing_object_is_a_light() -> None:
     scene = lamps(3)
     rows, emitters, cdf = light_records(scene, world_mesh(scene))
-    assert (rows["kind"] == lights.LIGHT_MESH).all()
+    assert (rows["kind"] == list(lights.LIGHTS).index("mesh")).all()
     assert rows["count"].tolist() == [2, 2, 2] and rows["first"].tolist() == [0, 2, 4]
     assert emitters["prim_id"].tolist() == list(range(12, 18))
     assert np.allclose(cdf, [0.5, 1.0] * 3)
@@ -225,7 +227,7 @@ def test_emitters_without_area_or_light_are_never_chosen() -> None:
 def test_glowing_spheres() -> None:
     scene = Scene(spheres=(Sphere((0, 1, 0), 0.5, Material(emission=(1, 2, 3))), Sphere((5, 1, 0), 0.5, GREY)))
     rows, *_ = light_records(scene, world_mesh(scene))
-    assert len(rows) == 1 and rows["kind"][0] == lights.LIGHT_SPHERE and rows["radius"][0] == 0.5
+    assert len(rows) == 1 and rows["kind"][0] == list(lights.LIGHTS).index("sphere") and rows["radius"][0] == 0.5
     assert rows["position"][0].tolist() == [0, 1, 0] and rows["color"][0].tolist() == [1, 2, 3]
 
 

@@ -19,7 +19,7 @@ from wrt.scene.digest import camera_digest, scene_digest
 from wrt.scene.lights import SpotLight
 from wrt.scene.materials import Material, Texture
 from wrt.scene.model import Object, Scene, Sphere
-from wrt.scene.pack import KINDS, pack, unpack
+from wrt.scene.pack import kinds, pack, unpack
 from wrt.scene.shapes import box
 
 SHIPPED = sorted((ROOT / "scenes").glob("*.toml"))
@@ -69,7 +69,7 @@ def test_every_field_of_every_kind_travels() -> None:
                   background=EnvironmentBackground(np.ones((2, 4, 3), np.float32), scale=0.1))
     text, _ = pack(scene)
     for name, content in json.loads(text):
-        assert list(content) == [each.name for each in fields(KINDS[name])]
+        assert list(content) == [each.name for each in fields(kinds()[name])]
     assert sent(scene).lights[0] == scene.lights[0]
 
 

@@ -19,9 +19,9 @@ from wrt.io.toml.meshes import Meshes
 from wrt.io.toml.report import raise_all, unknown_materials
 from wrt.io.toml.transforms import transform, turn
 from wrt.scene import shapes
-from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import Camera
-from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
+from wrt.scene.lights import LIGHTS, Light
 from wrt.scene.materials import CONDUCTORS, Checkerboard, Material, Texture
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import Settings
@@ -107,7 +107,7 @@ class _Builder:
                 objects += self.meshes.objects(each, f"meshes[{i}]", self.materials)
         for i, light in enumerate(table.lights):
             with self.at(f"lights[{i}]"):
-                made = make_light(light, f"lights[{i}]")
+                made = self.light(light, light.name or f"lights[{i}]")
                 if isinstance(made, Object):
                     objects.append(made)
                 else:
@@ -209,15 +209,23 @@ class _Builder:
         return self._images[path]
 
     def background(self, table: tables.SceneTable) -> Background:
+        from wrt.io.toml.kinds import make
         from wrt.picture.image import read_image
 
         given = table.background
         if given is None:
             return ConstantBackground()
-        if given.type == "environment":
-            image = read_image(self.file(given.file))
-            return EnvironmentBackground(image, given.scale, math.radians(given.rotation), name=given.file)
-        return {"constant": ConstantBackground, "gradient": GradientBackground}[given.type](**given.given("type"))
+        return make(BACKGROUNDS[given.type], given, "", lambda name: read_image(self.file(name)))
+
+    def light(self, table: Any, name: str) -> Light | Object:
+        """A light; a rectangle is an object that shines and reflects nothing."""
+        from wrt.io.toml.kinds import make
+        from wrt.picture.image import read_image
+
+        if table.type == "rectangle":
+            material = Material(name=name, albedo=BLACK, emission=as_vector(table.radiance, "radiance"), two_sided=table.two_sided)
+            return Object(shapes.quad(table.corner, table.edge_u, table.edge_v), (material,), name=name)
+        return make(LIGHTS[table.type], table, name, lambda file: read_image(self.file(file)))
 
 
 def settings(table: tables.SettingsTable, included: Sequence[Scene]) -> Settings:
@@ -234,31 +242,9 @@ def moved(scene: Scene, matrix: np.ndarray) -> Scene:
     return replace(
         scene,
         objects=tuple(replace(thing, transform=matrix @ thing.transform) for thing in scene.objects),
-        lights=tuple(_moved_light(light, matrix) for light in scene.lights),
+        lights=tuple(light.moved(matrix) for light in scene.lights),
         cameras=tuple(replace(camera, camera_to_world=matrix @ camera.camera_to_world) for camera in scene.cameras),
     )
-
-
-def _moved_light(light: Light, matrix: np.ndarray) -> Light:
-    changes: dict[str, Any] = {}
-    if not isinstance(light, DirectionalLight):
-        changes["position"] = matrix[:3, :3] @ light.position + matrix[:3, 3]
-    if not isinstance(light, PointLight):
-        changes["direction"] = matrix[:3, :3] @ light.direction
-    return replace(light, **changes)
-
-
-def make_light(table: tables.LightTable, name: str) -> Light | Object:
-    """A light; a rectangle is an object that shines and reflects nothing."""
-    fields = {**table.given("type"), "name": table.name or name}
-    if table.type == "rectangle":
-        material = Material(name=table.name or name, albedo=BLACK, emission=as_vector(table.radiance, "radiance"),
-                            two_sided=table.two_sided)
-        return Object(shapes.quad(table.corner, table.edge_u, table.edge_v), (material,), name=table.name or name)
-    if table.type == "spot":
-        fields |= {"inner": math.radians(table.inner), "outer": math.radians(table.outer)}
-        return SpotLight(**fields)
-    return PointLight(**fields) if table.type == "point" else DirectionalLight(**fields)
 
 
 def make_camera(table: tables.CameraTable, name: str) -> Camera:

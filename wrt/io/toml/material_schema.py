@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, create_model, model_validator
 
-from wrt.scene.materials import WRAPS, Checkerboard, Material
+from wrt.scene.materials import MATERIALS, WRAPS, Checkerboard, Material, kinds_that_use
 
 # --- values -----------------------------------------------------------------------------------------------------------
 
@@ -129,24 +129,12 @@ class ColorTextureTable(_PlacedImage):
 # --- materials --------------------------------------------------------------------------------------------------------
 
 _MATERIAL = Material()
-_KINDS_THAT_USE: dict[str, tuple[str, ...]] = {
-    "specular": ("diffuse",), "exponent": ("diffuse",),
-    "metal": ("conductor",), "eta": ("conductor",), "k": ("conductor",),
-    "ior": ("glass", "metallic_roughness"), "absorption": ("glass", "metallic_roughness"),
-    "thin": ("glass", "metallic_roughness"),
-    "roughness": ("conductor", "glass", "metallic_roughness"),
-    "metallic": ("metallic_roughness",), "transmission": ("metallic_roughness",),
-    "metallic_roughness_texture": ("metallic_roughness",), "transmission_texture": ("metallic_roughness",),
-}
 
 
 class MaterialTable(Table):
     """How a surface answers light."""
 
-    kind: Literal["diffuse", "mirror", "conductor", "glass", "metallic_roughness"] = Field(
-        "diffuse", description="diffuse: Lambert, with an optional Blinn-Phong highlight; mirror: reflects albedo at "
-        "every angle; conductor: Fresnel reflection of a metal; glass: reflection and refraction; metallic_roughness: "
-        "glTF's")
+    kind: str = Field("diffuse")  # a choice of those there are: material_table
     albedo: Share = Field(list(_MATERIAL.albedo), description="share of the light that is scattered or mirrored, or (glass) "
                           "let through by each surface: clear glass has 1, and by default each takes a fifth")
     specular: Share = Field(list(_MATERIAL.specular), description="colour of the highlight (diffuse)")
@@ -185,11 +173,20 @@ class MaterialTable(Table):
 
     @model_validator(mode="after")
     def _check(self) -> MaterialTable:
-        idle = [name for name, kinds in _KINDS_THAT_USE.items()
-                if name in self.model_fields_set and self.kind not in kinds]
+        users = kinds_that_use()
+        users["metal"] = users["eta"]
+        idle = [name for name, kinds in users.items() if name in self.model_fields_set and self.kind not in kinds]
         if idle:
-            uses = "; ".join(f"{name} is used by {' and '.join(_KINDS_THAT_USE[name])}" for name in idle)
+            uses = "; ".join(f"{name} is used by {' and '.join(users[name])}" for name in idle)
             raise ValueError(f"kind {self.kind!r} does not use {', '.join(idle)} ({uses})")
         if self.metal is not None and {"eta", "k"} & self.model_fields_set:
             raise ValueError("give either metal, or eta and k")
         return self
+
+
+def material_table(kinds: tuple[str, ...]) -> type[MaterialTable]:
+    """MaterialTable with a choice between these kinds."""
+    literal: Any = Literal
+    about = "; ".join(f"{name}: {MATERIALS[name].about}" for name in kinds)
+    return create_model("MaterialTable", __base__=MaterialTable, __doc__=MaterialTable.__doc__,
+                        kind=(literal[kinds], Field("diffuse", description=about)))

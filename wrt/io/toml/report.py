@@ -31,11 +31,11 @@ def check(data: dict[str, Any], path: Path) -> SceneTable:
     """The file's tables as models. Raises one InputError that lists everything that is wrong."""
     from pydantic import ValidationError
 
-    from wrt.io.toml.schema import SceneTable
+    from wrt.io.toml.schema import scene_table
 
     known_keys: dict[int, list[str]] = {}
     try:
-        return SceneTable.model_validate(data, context=known_keys)
+        return scene_table().model_validate(data, context=known_keys)
     except ValidationError as error:
         _require_room(error.error_count(), path)
         problems = _lines(error, data, known_keys)

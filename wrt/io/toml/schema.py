@@ -6,10 +6,12 @@ have the scene's own unit; colours are linear Rec. 709. Wherever a colour stands
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from functools import cache
+from typing import Annotated, Any, Literal, Union
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
+from wrt.io.toml.kinds import kind_table
 from wrt.io.toml.material_schema import (
     DEGREES,
     LENGTH,
@@ -28,11 +30,15 @@ from wrt.io.toml.material_schema import (
     Table,
     Unit,
     Vector,
+    material_table,
     require_one,
     unit,
 )
-from wrt.scene.backgrounds import GradientBackground
+from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import Camera
+from wrt.scene.kinds import Kind
+from wrt.scene.lights import LIGHTS
+from wrt.scene.materials import MATERIALS
 from wrt.scene.settings import MAX_DEPTH, Settings
 
 # --- cameras, background, settings ------------------------------------------------------------------------------------
@@ -83,30 +89,6 @@ class CameraTable(Table):
         if problems:
             raise ValueError("; ".join(problems))
         return self
-
-
-class ConstantTable(Table):
-    """The same radiance from everywhere."""
-
-    type: Literal["constant"]
-    color: Annotated[Radiance, RADIANCE] = Field([0.0, 0.0, 0.0], description="from every direction")
-
-
-class GradientTable(Table):
-    """Linear in the direction's y."""
-
-    type: Literal["gradient"]
-    bottom: Annotated[Radiance, RADIANCE] = Field(list(GradientBackground().bottom), description="from straight below (-y)")
-    top: Annotated[Radiance, RADIANCE] = Field(list(GradientBackground().top), description="from straight above (+y)")
-
-
-class EnvironmentTable(Table):
-    """An equirectangular picture: its middle column is seen along -z, its upper edge is +y."""
-
-    type: Literal["environment"]
-    file: str = Field(description="image (.exr, .hdr, or sRGB), relative to the scene file")
-    scale: NotNegative = Field(1.0, description="multiplies the image")
-    rotation: Angle = Field(0.0, description="about +y, counter-clockwise seen from above")
 
 
 class SettingsTable(Table):
@@ -310,43 +292,6 @@ class MeshTable(Table):
 # --- lights -----------------------------------------------------------------------------------------------------------
 
 
-class PointLightTable(Table):
-    """A point that shines alike in all directions."""
-
-    type: Literal["point"]
-    position: Point = Field(description="where it is")
-    intensity: Annotated[Radiance, unit("radiant intensity")] = Field(
-        description="the same in all directions; irradiance falls with the square of the distance")
-    name: str = Field("", description="for messages")
-
-
-class DirectionalLightTable(Table):
-    """A light at infinity."""
-
-    type: Literal["directional"]
-    direction: Vector = Field(description="the way the light travels (any length)")
-    irradiance: Annotated[Radiance, unit("irradiance")] = Field(description="on a surface that faces it")
-    name: str = Field("", description="for messages")
-
-
-class SpotLightTable(Table):
-    """A point light in a cone."""
-
-    type: Literal["spot"]
-    position: Point = Field(description="where it is")
-    direction: Vector = Field(description="axis of the cone (any length)")
-    intensity: Annotated[Radiance, unit("radiant intensity")] = Field(description="on the axis")
-    inner: Angle = Field(0.0, ge=0.0, le=90.0, description="half angle of full light")
-    outer: Angle = Field(45.0, gt=0.0, le=90.0, description="half angle without light beyond")
-    name: str = Field("", description="for messages")
-
-    @model_validator(mode="after")
-    def _check(self) -> SpotLightTable:
-        if self.inner > self.outer:
-            raise ValueError(f"inner ({self.inner:g}) must not be larger than outer ({self.outer:g})")
-        return self
-
-
 class RectangleLightTable(Table):
     """A parallelogram that shines; its front is towards cross(edge_u, edge_v)."""
 
@@ -359,14 +304,10 @@ class RectangleLightTable(Table):
     name: str = Field("", description="for messages")
 
 
-LightTable = Annotated[PointLightTable | DirectionalLightTable | SpotLightTable | RectangleLightTable,
-                       Field(discriminator="type")]
 IncludeEntry = Annotated[
     Annotated[str, Tag("file")] | Annotated[IncludeTable, Tag("table")],
     Discriminator(lambda value: "file" if isinstance(value, str) else "table" if isinstance(value, dict | IncludeTable) else None,
                   custom_error_type="include_type", custom_error_message="a file's name or a table")]
-BackgroundTable = Annotated[ConstantTable | GradientTable | EnvironmentTable, Field(discriminator="type")]
-
 
 class SceneTable(Table):
     """A wrt scene file. Angles are in degrees, lengths in the scene's own unit, colours linear Rec. 709 (one number:
@@ -378,7 +319,7 @@ class SceneTable(Table):
     settings: SettingsTable = Field(default_factory=lambda: SettingsTable.model_validate({}),
                                     description="how the scene wants to be rendered")
     cameras: dict[str, CameraTable] = Field({}, description="by name; the first is the default")
-    background: BackgroundTable | None = Field(None, description="what rays that leave the scene see (default: black)")
+    background: Any = Field(None, description="what rays that leave the scene see (default: black)")
     ambient: Annotated[Radiance, RADIANCE] = Field([0.0, 0.0, 0.0], description="what every diffuse surface receives, unshadowed")
     materials: dict[str, MaterialTable] = Field({}, description="by name")
     override: dict[str, MaterialTable] = Field({}, description="replaces the included material of that name")
@@ -386,4 +327,24 @@ class SceneTable(Table):
     quads: list[QuadTable] = Field([], description="parallelograms")
     boxes: list[BoxTable] = Field([], description="closed boxes")
     meshes: list[MeshTable] = Field([], description="meshes from files or formulas")
-    lights: list[LightTable] = Field([], description="lights")
+    lights: list[Any] = Field([], description="lights")
+
+
+def scene_table() -> type[SceneTable]:
+    """The SceneTable of the kinds of lights, backgrounds and materials that there are: one can be added at any time."""
+    return _scene_table(tuple(LIGHTS.values()), tuple(BACKGROUNDS.values()), tuple(MATERIALS))
+
+
+@cache
+def _scene_table(lights: tuple[type[Kind], ...], backgrounds: tuple[type[Kind], ...], materials: tuple[str, ...]) -> Any:
+    tagged: Any = Annotated
+    one_of: Any = Union
+    by_name: Any = dict
+    many: Any = list
+    material = material_table(materials)
+    light = one_of[(*(kind_table(each, "Light") for each in lights), RectangleLightTable)]
+    background = one_of[tuple(kind_table(each, "") for each in backgrounds)]
+    changes = {"background": tagged[background, Field(discriminator="type")] | None, "materials": by_name[str, material],
+               "override": by_name[str, material], "lights": many[tagged[light, Field(discriminator="type")]]}
+    fields: dict[str, Any] = {name: (kind, SceneTable.model_fields[name]) for name, kind in changes.items()}
+    return create_model("SceneTable", __base__=SceneTable, __doc__=SceneTable.__doc__, **fields)

@@ -60,7 +60,7 @@ def branches(scene: Scene, features: Features) -> bool:
 
 
 def has_dielectric(scene: Scene, features: Features) -> bool:
-    return features.refraction or features.metallic_roughness
+    return any(material.uses("ior") for material in scene.materials)
 
 
 def primitives(scene: Scene) -> int:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from wrt.lab.mitsuba.exact import refuse
-from wrt.renderer.features import is_rough
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.values import Color
 
@@ -50,7 +49,7 @@ def _mirror(mi: Any, material: Material) -> dict[str, Any]:
 
 def _conductor(mi: Any, material: Material) -> dict[str, Any]:
     result: dict[str, Any] = {"type": "conductor", "eta": _rgb(material.eta), "k": _rgb(material.k)}
-    return result | _ggx("roughconductor", material) if is_rough(material) else result
+    return result | _ggx("roughconductor", material) if material.is_rough else result
 
 
 def _glass(mi: Any, material: Material) -> dict[str, Any]:
@@ -58,10 +57,10 @@ def _glass(mi: Any, material: Material) -> dict[str, Any]:
     result: dict[str, Any] = {"type": "dielectric", "int_ior": material.ior, "ext_ior": 1.0,
                               "specular_transmittance": transmittance}
     if material.thin:
-        if is_rough(material):
+        if material.is_rough:
             refuse("a thin pane with roughness", f"material {material.name!r}")
         return result | {"type": "thindielectric"}
-    return result | _ggx("roughdielectric", material) if is_rough(material) else result
+    return result | _ggx("roughdielectric", material) if material.is_rough else result
 
 
 def _ggx(plugin: str, material: Material) -> dict[str, Any]:

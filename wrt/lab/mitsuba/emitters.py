@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,18 @@ WIDEST_SPOT = math.radians(80.0)
 
 
 def light_emitter(mi: Any, light: Light) -> dict[str, Any]:
-    """A point, directional or spot light as a dictionary for `mitsuba.load_dict`."""
-    if isinstance(light, PointLight):
-        return {"type": "point", "position": list(light.position), "intensity": _rgb(light.intensity)}
-    if isinstance(light, DirectionalLight):
-        return {"type": "directional", "direction": list(light.direction), "irradiance": _rgb(light.irradiance)}
-    return _spot(mi, light)
+    """A light as a dictionary for `mitsuba.load_dict`."""
+    if light.kind not in LIGHTS:
+        refuse(f"light {light.name!r} of kind {light.kind!r}")
+    return LIGHTS[light.kind](mi, light)
+
+
+def _point(mi: Any, light: PointLight) -> dict[str, Any]:
+    return {"type": "point", "position": list(light.position), "intensity": _rgb(light.intensity)}
+
+
+def _directional(mi: Any, light: DirectionalLight) -> dict[str, Any]:
+    return {"type": "directional", "direction": list(light.direction), "irradiance": _rgb(light.irradiance)}
 
 
 def _rgb(color: Any) -> dict[str, Any]:
@@ -53,17 +60,29 @@ def _spot(mi: Any, light: SpotLight) -> dict[str, Any]:
     return spot | {"texture": {"type": "bitmap", "data": mi.TensorXf(texels), "raw": True, "wrap_mode": "clamp"}}
 
 
+LIGHTS: dict[str, Callable[[Any, Any], dict[str, Any]]] = {
+    "point": _point, "directional": _directional, "spot": _spot,
+}
+
+
 def background_emitter(mi: Any, background: Background) -> dict[str, Any] | None:
-    """The background as an emitter, None where it is black. Raises InputError for a picture under 3 columns wide."""
-    if isinstance(background, ConstantBackground):
-        return {"type": "constant", "radiance": _rgb(background.color)} if max(background.color) > 0.0 else None
-    if isinstance(background, GradientBackground):
-        height = np.cos(np.linspace(0.0, math.pi, GRADIENT_ROWS))[:, None]
-        share = 0.5 * (height + 1.0)
-        rows = share * np.array(background.top) + (1.0 - share) * np.array(background.bottom)
-        picture = np.repeat(rows[:, None, :], 4, axis=1)
-        return {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(picture, np.float32))}
-    return _environment(mi, background)
+    """The background as an emitter, None where it is a black constant. Raises InputError for a picture under 3 columns wide, and
+    for a kind that is not in BACKGROUNDS."""
+    if background.kind not in BACKGROUNDS:
+        raise InputError(f"not translatable: a background of kind {background.kind!r}", None, "Mitsuba")
+    return BACKGROUNDS[background.kind](mi, background)
+
+
+def _constant(mi: Any, background: ConstantBackground) -> dict[str, Any] | None:
+    return {"type": "constant", "radiance": _rgb(background.color)} if max(background.color) > 0.0 else None
+
+
+def _gradient(mi: Any, background: GradientBackground) -> dict[str, Any]:
+    height = np.cos(np.linspace(0.0, math.pi, GRADIENT_ROWS))[:, None]
+    share = 0.5 * (height + 1.0)
+    rows = share * np.array(background.top) + (1.0 - share) * np.array(background.bottom)
+    picture = np.repeat(rows[:, None, :], 4, axis=1)
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(picture, np.float32))}
 
 
 def _environment(mi: Any, background: EnvironmentBackground) -> dict[str, Any]:
@@ -79,3 +98,8 @@ def _environment(mi: Any, background: EnvironmentBackground) -> dict[str, Any]:
     # Mitsuba's left edge is at -z, wrt's middle: half a turn.
     turn = mi.ScalarTransform4f().rotate([0.0, 1.0, 0.0], math.degrees(background.rotation) + 180.0)
     return {"type": "envmap", "bitmap": mi.Bitmap(rows), "scale": background.scale, "to_world": turn}
+
+
+BACKGROUNDS: dict[str, Callable[[Any, Any], dict[str, Any] | None]] = {
+    "constant": _constant, "gradient": _gradient, "environment": _environment,
+}

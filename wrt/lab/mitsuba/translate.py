@@ -28,7 +28,6 @@ from wrt.core.errors import InputError
 from wrt.lab.mitsuba.emitters import background_emitter, light_emitter
 from wrt.lab.mitsuba.exact import refuse
 from wrt.lab.mitsuba.shapes import Part, object_parts, sphere_shape
-from wrt.renderer.features import is_rough
 from wrt.scene.cameras import Camera
 from wrt.scene.model import Scene
 
@@ -113,7 +112,7 @@ def _check_light_transport(scene: Scene, integrator: str) -> None:
     materials = scene.materials
     if scene.settings.fresnel == "schlick" and any(m.kind == "glass" for m in materials):
         refuse('fresnel = "schlick"')
-    if scene.lights and any(is_rough(m) for m in materials if m.kind != "metallic_roughness"):
+    if scene.lights and any(m.is_rough for m in materials if m.kind != "metallic_roughness"):
         refuse("highlights of point lights on rough surfaces (GGX's, where wrt takes Blinn's or none)")
     if integrator == "whitted":
         mixed = [m.name for m in materials if m.kind == "metallic_roughness"]

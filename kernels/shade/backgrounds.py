@@ -1,0 +1,125 @@
+"""Background kinds: what lies behind everything, and how it is sampled as a light. A function a kind, and a row in BACKGROUNDS."""
+
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from wrt.kernels.shade.lights import LightSample
+from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, search_cdf, share_of_row
+from wrt.kernels.structs import Background
+
+# --- the kinds --------------------------------------------------------------------------------------------------------
+# Each is (background, unit direction in world space) -> radiance.
+
+
+@wp.func
+def constant(b: Background, direction: wp.vec3) -> wp.vec3:
+    return b.bottom
+
+
+@wp.func
+def gradient(b: Background, direction: wp.vec3) -> wp.vec3:
+    """Linear in y."""
+    return wp.lerp(b.bottom, b.top, 0.5 * (direction[1] + 1.0))
+
+
+@wp.func
+def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
+    """Turned about +y, counter-clockwise seen from above."""
+    c = wp.cos(angle)
+    s = wp.sin(angle)
+    return wp.vec3(c * d[0] + s * d[2], d[1], c * d[2] - s * d[0])
+
+
+@wp.func
+def environment_pixel(b: Background, column: int, row: int) -> wp.vec3:
+    """Columns go round; rows end at the poles."""
+    x = wp.where(column < 0, column + b.width, wp.where(column >= b.width, column - b.width, column))
+    return b.pixels[wp.clamp(row, 0, b.height - 1) * b.width + x]
+
+
+@wp.func
+def environment(b: Background, direction: wp.vec3) -> wp.vec3:
+    """Bilinear look-up in the equirectangular picture; the unit direction is in world space."""
+    d = rotate_y(direction, -b.rotation)
+    x = (0.5 + wp.atan2(d[0], -d[2]) / TWO_PI) * float(b.width) - 0.5
+    y = wp.acos(wp.clamp(d[1], -1.0, 1.0)) / PI * float(b.height) - 0.5
+    column = int(wp.floor(x))
+    row = int(wp.floor(y))
+    fx = x - wp.floor(x)
+    fy = y - wp.floor(y)
+    top = (1.0 - fx) * environment_pixel(b, column, row) + fx * environment_pixel(b, column + 1, row)
+    low = (1.0 - fx) * environment_pixel(b, column, row + 1) + fx * environment_pixel(b, column + 1, row + 1)
+    return b.scale * ((1.0 - fy) * top + fy * low)
+
+
+@wp.func
+def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
+    """A direction by the picture's brightness."""
+    row = search_cdf(b.row_cdf, 0, b.height, xi[0])
+    first = row * b.width
+    column = search_cdf(b.column_cdf, first, b.width, xi[1])
+    p_row = share_of_row(b.row_cdf, 0, row)
+    p_column = share_of_row(b.column_cdf, first, column)
+    # Where in its cell the number fell is uniform again: it places the direction within the pixel.
+    v = 1.0 - (b.row_cdf[row] - xi[0]) / p_row
+    u = 1.0 - (b.column_cdf[first + column] - xi[1]) / p_column
+    theta = PI * (float(row) + wp.clamp(v, 0.0, 1.0)) / float(b.height)
+    phi = TWO_PI * ((float(column) + wp.clamp(u, 0.0, 1.0)) / float(b.width) - 0.5)
+    sin_theta = wp.sin(theta)
+    sample = LightSample()
+    local = wp.vec3(sin_theta * wp.sin(phi), wp.cos(theta), -sin_theta * wp.cos(phi))
+    sample.wi = rotate_y(local, b.rotation)
+    density = p_row * p_column * float(b.width * b.height) / (TWO_PI * PI * wp.max(sin_theta, 1.0e-9))
+    sample.weight = environment(b, sample.wi) / density
+    return sample
+
+
+class BackgroundKind(NamedTuple):
+    """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine."""
+
+    radiance: Any
+    sample: Any = None
+
+
+# By the name in wrt.scene.backgrounds.BACKGROUNDS.
+BACKGROUNDS = {
+    "constant": BackgroundKind(constant),
+    "gradient": BackgroundKind(gradient),
+    "environment": BackgroundKind(environment, environment_sample),
+}
+
+
+# --- the scene's ------------------------------------------------------------------------------------------------------
+
+
+def make_background(features):
+    """Radiance from beyond all surfaces: (background, unit direction) -> radiance."""
+    return BACKGROUNDS[features.background].radiance
+
+
+def make_sky_sample(features):
+    """One direction to the background."""
+    radiance, by_kind = BACKGROUNDS[features.background]
+    of_cosine = by_kind is None
+    sample_of_kind = no_sample if of_cosine else by_kind
+
+    @wp.func
+    def sky_sample(b: Background, n: wp.vec3, xi: wp.vec2) -> LightSample:
+        sample = LightSample()
+        if wp.static(of_cosine):
+            sample.wi = cosine_hemisphere(xi, n)
+            cosine = wp.max(wp.dot(sample.wi, n), 1.0e-9)
+            sample.weight = radiance(b, sample.wi) * (PI / cosine)
+        else:
+            sample = sample_of_kind(b, xi)
+        sample.distant = 1
+        sample.area = 1
+        return sample
+
+    return sky_sample
+
+
+@wp.func
+def no_sample(b: Background, xi: wp.vec2) -> LightSample:
+    return LightSample()

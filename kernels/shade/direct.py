@@ -1,0 +1,71 @@
+"""Direct light: one sample of one light, as what it sends to the eye and as the segment to look along."""
+
+import warp as wp
+
+from wrt.kernels.shade.backgrounds import make_sky_sample
+from wrt.kernels.shade.lights import LightSample, make_light_sample
+from wrt.kernels.shade.materials import Scatter, blinn_phong
+from wrt.kernels.shade.sampling import PI, hash_pair, make_sample_2d
+from wrt.kernels.shade.surface import Surface, spawn_point
+from wrt.kernels.structs import Lighting, Ray, Surfaces, gamma, make_ray
+
+
+@wp.func
+def shadow_ray(s: Surface, sample: LightSample) -> Ray:
+    """The segment from a surface to a light: t = 1 is the light's end of it.
+
+    A light with an area ends it a little earlier: the rounding of the segment's direction and of t, some 16 steps, grows with
+    the distance, and not with the light's own error bound.
+    """
+    ray = make_ray(spawn_point(s.point, s.error, s.geometric, sample.wi), sample.wi)
+    ray.exclude_plus_one = s.exclude_plus_one
+    if sample.distant == 0:
+        ray.direction = sample.end - ray.origin
+        ray.t_max = wp.where(sample.area != 0, 1.0 - gamma(32.0), 1.0)
+    return ray
+
+
+def make_reflected_light(features):
+    """The light that one sample sends to the eye, before shadows, and which sample that is."""
+    light_sample = make_light_sample(features)
+    sky_sample = make_sky_sample(features)
+    lights = bool(features.lights)
+
+    @wp.func
+    def choose(lighting: Lighting, surfaces: Surfaces, i: int, s: Surface, xi: wp.vec2) -> LightSample:
+        """Lights are numbered; the background comes after the last one."""
+        sample = LightSample()
+        if wp.static(lights):
+            if i < lighting.count:
+                sample = light_sample(lighting, surfaces, lighting.lights[i], s, xi)
+        if wp.static(features.sky_light):
+            if i == lighting.count:
+                sample = sky_sample(lighting.background, s.shading, xi)
+        return sample
+
+    @wp.func
+    def reflected(sample: LightSample, s: Surface, scatter: Scatter, wo: wp.vec3) -> wp.vec3:
+        cosine = wp.dot(s.shading, sample.wi)
+        if cosine <= 0.0 or wp.dot(s.geometric, sample.wi) <= 0.0:
+            return wp.vec3(0.0, 0.0, 0.0)
+        value = scatter.diffuse / PI
+        if wp.static(features.highlight):
+            # A traced reflection finds lights that have an area by itself; the background is no small light.
+            if sample.area == 0 or (scatter.traced == 0 and sample.distant == 0):
+                if wp.max(scatter.highlight) > 0.0:
+                    value = value + scatter.highlight * blinn_phong(s.shading, sample.wi, wo, scatter.exponent)
+        return cosine * wp.cw_mul(value, sample.weight)
+
+    return choose, reflected
+
+
+def make_light_xi(features):
+    """The numbers that place a sample on a light."""
+    sample_2d = make_sample_2d(features)
+
+    @wp.func
+    def light_xi(key: wp.uint32, index: wp.uint32, i: int) -> wp.vec2:
+        """Two numbers for light i at the path vertex `key`."""
+        return sample_2d(hash_pair(key, wp.static(wp.uint32(0x4C49))), index, i)
+
+    return light_xi
