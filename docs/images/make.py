@@ -1,11 +1,7 @@
-"""Makes the three pictures of README.md with wrt itself: `python docs/images/make.py`."""
+"""Makes the three pictures of README.md with wrt itself: `PYTHONPATH=. python docs/images/make.py`."""
 
-import sys
 import tempfile
 from pathlib import Path
-
-HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parents[1]))
 
 import numpy as np
 
@@ -13,6 +9,7 @@ import wrt
 from tests.gltf_files import GltfFile
 from wrt.scene.shapes import icosphere, lathe
 
+HERE = Path(__file__).resolve().parent
 SIZE = (400, 300)
 ROOM = """
 include = [{ file = "glass.glb" }]
