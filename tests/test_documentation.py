@@ -178,7 +178,7 @@ def test_a_slow_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path
 # --- Python -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/long_renders.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/usage.md", "docs/long_renders.md"])
 def test_python_runs(page: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import wrt
 

@@ -8,8 +8,7 @@ import time
 from abc import ABC, abstractmethod
 from copy import copy
 from dataclasses import asdict, replace
-from inspect import signature
-from typing import Any, ClassVar, get_type_hints
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -21,8 +20,7 @@ from wrt.accel.counting import counted
 from wrt.accel.geometry import Geometry
 from wrt.accel.rays import rays_on, vectors
 from wrt.accel.store import save
-from wrt.accel.structure import Structure, any_hit_kernel, check_units, closest_hit_kernel
-from wrt.core.checks import accepts
+from wrt.accel.structure import Structure, any_hit_kernel, check_options, check_units, closest_hit_kernel
 from wrt.core.device import start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
@@ -49,20 +47,11 @@ class Accelerator(ABC):
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
                  box: str = "conservative", **options: Any) -> None:
         self._begin(geometry, device, threads, triangle, box)
-        self._check_options(options)
+        check_options(self.name, self._build, options)
         require(len(geometry) * self.bytes_to_build, f"a {self.name} over {len(geometry)} primitives")
         begin = time.perf_counter()
         built = self._build(**options)
         self._take(built, begin, built.sah_cost)
-
-    def _check_options(self, options: dict[str, Any]) -> None:
-        """Raise InputError for what _build does not have, or not of that type."""
-        known = {name: kind for name, kind in get_type_hints(self._build).items() if name not in ("options", "return")}
-        for option, value in options.items():
-            if option not in known:
-                raise InputError(f"{self.name} has no option {option!r}; there is {', '.join([*known, 'triangle', 'box'])}")
-            if not accepts(known[option], value):
-                raise InputError(f"{option} must be {signature(self._build).parameters[option].annotation}, got {value!r}")
 
     @classmethod
     def restore(cls, built: Built, geometry: Geometry, device: str = "cpu", threads: int | None = None, *,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, Protocol
+from collections.abc import Callable
+from inspect import signature
+from typing import Any, ClassVar, NamedTuple, Protocol, get_type_hints
 
+from wrt.core.checks import accepts
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
 from wrt.kernels.query import make_any_hit_kernel, make_closest_hit_kernel
@@ -18,6 +21,16 @@ def check_units(triangle: str, box: str) -> None:
     for choice, table, what in ((triangle, RAY_TRIANGLE, "triangle test"), (box, RAY_AABB, "box test")):
         if choice not in table:
             raise InputError(f"no {what} {choice!r}; there is {', '.join(table)}")
+
+
+def check_options(name: str, build: Callable[..., Any], options: dict[str, Any]) -> None:
+    """Raise InputError for options that a builder does not have, or not of that type."""
+    known = {option: kind for option, kind in get_type_hints(build).items() if option not in ("options", "return")}
+    for option, value in options.items():
+        if option not in known:
+            raise InputError(f"{name} has no option {option!r}; there is {', '.join([*known, 'triangle', 'box'])}")
+        if not accepts(known[option], value):
+            raise InputError(f"{option} must be {signature(build).parameters[option].annotation}, got {value!r}")
 
 
 class Kind(Protocol):

@@ -1,0 +1,83 @@
+"""Makes the three pictures of README.md with wrt itself: `PYTHONPATH=. python docs/images/make.py`."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import wrt
+from tests.gltf_files import GltfFile
+from wrt.scene.shapes import icosphere, lathe
+
+HERE = Path(__file__).resolve().parent
+SIZE = (400, 300)
+ROOM = """
+include = [{ file = "glass.glb" }]
+ambient = 0.05
+[settings]
+max_depth = 24
+tonemap = "agx"
+[cameras.main]
+position = [0.3, 2.4, 6.4]
+target = [0.1, 0.95, 0]
+fov_y = 27
+[background]
+type = "gradient"
+bottom = [0.75, 0.72, 0.68]
+top = [0.25, 0.42, 0.75]
+[materials.floor]
+albedo_texture = { checkerboard = { color_a = 0.75, color_b = [0.16, 0.20, 0.27], scale = 24 } }
+[[quads]]
+corner = [-12, 0, 12]
+edge_u = [24, 0, 0]
+edge_v = [0, 0, -24]
+material = "floor"
+[[lights]]
+type = "rectangle"
+corner = [-3.5, 5, 1]
+edge_u = [1.5, 0, 0]
+edge_v = [0, 0, 1.5]
+radiance = 14
+"""
+
+
+def arc(radius: float, height: float, bulge: float, rise: float, way: int) -> list[tuple[float, float]]:
+    """Points of a wall that swells out half way up."""
+    return [(radius + bulge * np.sin(np.pi * s), height + rise * s) for s in np.linspace(0.0, 1.0, 24)[::way]]
+
+
+def glass(folder: Path) -> Path:
+    """A glTF file of its own making: a vase of tinted glass, one ball of metal and one of clay."""
+    gltf = GltfFile()
+    vase = lathe([(0.0, 0.0), (0.42, 0.0), (0.42, 0.0), *arc(0.42, 0.0, 0.38, 1.75, 1), *arc(0.34, 0.16, 0.38, 1.59, -1),
+                  (0.34, 0.16), (0.0, 0.16)], 96)
+    ball = icosphere(5, 0.45)
+    tint = {"transmissionFactor": 1.0}
+    volume = {"thicknessFactor": 0.1, "attenuationColor": [0.25, 0.75, 0.62], "attenuationDistance": 0.35}
+    kinds = [({"metallicFactor": 0.0, "roughnessFactor": 0.0},
+              {"KHR_materials_transmission": tint, "KHR_materials_volume": volume, "KHR_materials_ior": {"ior": 1.5}}),
+             ({"metallicFactor": 1.0, "roughnessFactor": 0.12, "baseColorFactor": [0.95, 0.72, 0.32, 1.0]}, {}),
+             ({"metallicFactor": 0.0, "roughnessFactor": 0.8, "baseColorFactor": [0.55, 0.10, 0.06, 1.0]}, {})]
+    gltf.json["extensionsUsed"] = sorted(kinds[0][1])
+    places = [(vase, [0.0, 0.0, 0.0]), (ball, [-1.15, 0.45, 0.3]), (ball, [0.95, 0.45, -1.1])]
+    for (mesh, place), (surface, extensions) in zip(places, kinds, strict=True):
+        material = gltf.add("materials", {"pbrMetallicRoughness": surface, "extensions": extensions})
+        primitive = gltf.primitive(mesh.vertices, mesh.faces.ravel(), material=material)
+        primitive["attributes"]["NORMAL"] = gltf.accessor(mesh.normals)
+        gltf.node(mesh=gltf.mesh(primitive), translation=place)
+    gltf.write(folder, "glass.glb")
+    room = folder / "room.toml"
+    room.write_text(ROOM, encoding="utf-8")
+    return room
+
+
+def main() -> None:
+    stadium = HERE.parents[1] / "scenes" / "stadium.toml"
+    wrt.render(stadium, spp=64, size=SIZE).save(HERE / "mesh.png")
+    with tempfile.TemporaryDirectory() as folder:
+        wrt.render(glass(Path(folder)), spp=256, size=SIZE).save(HERE / "glass.png")
+    wrt.profile(stadium, spp=4, size=(320, 240)).heatmap("nodes").save(HERE / "nodes.png", optimize=True)
+
+
+if __name__ == "__main__":
+    main()
