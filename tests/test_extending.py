@@ -14,8 +14,13 @@ from tests.data import ROOT
 BLOCK = re.compile(r"^```(python|diff)\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 TRY_IT = """
+<<<<<<< HEAD
 from pathlib import Path
 import numpy as np, wrt
+=======
+import numpy as np, stored_normal, wrt
+from wrt.lab.rtcore.instructions import triangle_unit
+>>>>>>> h/native
 from wrt.scene.shapes import icosphere
 
 ball = icosphere(4)
@@ -36,6 +41,16 @@ both = brute.prim_id == volumes.prim_id
 assert both.mean() > 0.995
 found = both & (brute.prim_id >= 0)
 assert np.quantile(np.abs(volumes.t[found] - brute.t[found]), 0.9) < 1e-4
+
+# A record of its own, in rows of lanes and without: the wide walks for one ray and for many.
+alone = wrt.build(ball, accel="brute_force", triangle="stored_normal").closest_hit(*rays)
+assert (alone.prim_id == brute.prim_id).mean() > 0.995
+for accel in ("bvh", "bvh8c"):
+    own = wrt.build(ball, accel=accel, triangle="stored_normal").closest_hit(*rays)
+    assert np.array_equal(own.prim_id, alone.prim_id) and np.array_equal(own.t, alone.t), accel
+codes = {test: triangle_unit(test).classes for test in ("moeller_trumbore", "signed_volumes", "stored_normal")}
+assert all(20 < code["fp32"] < 100 and code["fp64"] == 0 for code in codes.values()), codes
+assert codes["stored_normal"]["fp32"] < codes["moeller_trumbore"]["fp32"], codes
 
 wrt.build(ball, accel="runs").save("ball.accel")
 again = wrt.load_accel("ball.accel", ball).closest_hit(*rays)

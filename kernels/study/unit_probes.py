@@ -1,12 +1,14 @@
 """Kernels that hold one unit a number of times and little else: what a unit is in machine code is the difference between two."""
 
 from functools import cache
+from pathlib import Path
 
 import warp as wp
 
 from wrt.kernels.structs import Ray, kernel
 from wrt.kernels.units.box import RAY_AABB, BoxRay
 from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay
+from wrt.kernels.wide.native import source
 
 
 @wp.struct
@@ -41,12 +43,29 @@ def make_box_probe(test, count):
     return box_probe
 
 
+def numbers_of(record) -> int:
+    """How many numbers of a record a test reads: all but the prim_id."""
+    return record.numpy_dtype()["itemsize"] // 4 - 1
+
+
+@cache
+def make_add_numbers(record):
+    """add_numbers(total, record): the numbers that a test reads, added to a total."""
+    layout = record.numpy_dtype()
+    prim_id = layout["offsets"][layout["names"].index("prim_id")] // 4
+
+    @wp.func_native(source(Path(__file__).parent / "add_numbers.h", PRIM_ID=prim_id))
+    def add_numbers(total: float, record: record) -> float: ...
+
+    return add_numbers
+
+
 @cache
 def make_triangle_probe(test, count, adding=False):
-    """`count` triangle tests by RAY_TRIANGLE[test], whose t are added up; `adding`: the numbers of the record are instead."""
+    """`count` triangle tests by RAY_TRIANGLE[test], whose t, u and v are added up; `adding`: the numbers of their records are."""
     unit = RAY_TRIANGLE[test].intersect
     record = RAY_TRIANGLE[test].record
-    planes = "a" in record.vars
+    add_numbers = make_add_numbers(record)
 
     @kernel
     def triangle_probe(rays: wp.array(dtype=ProbeRay), primitives: wp.array(dtype=record), out: wp.array(dtype=wp.float32)):
@@ -58,12 +77,8 @@ def make_triangle_probe(test, count, adding=False):
             if wp.static(not adding):
                 hit = wp.static(unit)(ray.box, ray.triangle, ray.ray, p)
                 total += wp.where(hit.prim_id == 0, hit.t + hit.u + hit.v, 0.0)
-            elif wp.static(planes):
-                a = p.a + p.b + p.c
-                total += a[0] + a[1] + a[2] + a[3]
             else:
-                a = p.v0 + p.v1 + p.v2
-                total += a[0] + a[1] + a[2]
+                total = add_numbers(total, p)
         out[i] = total
 
     return triangle_probe

@@ -95,12 +95,14 @@ def make_plain_cull(width: int):
     @wp.func
     def cull(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int:
         mask = int(0)
-        for j in range(width):
+        j = int(0)
+        while j < width:  # `for` would be unrolled, to as many instructions as all the rest of a traversal
             a = corner(rows, first + j, ray)
             b = corner(rows, first + j + 3 * width, ray)
             c = corner(rows, first + j + 6 * width, ray)
             if not outside(edge_areas(a, b, c)):
                 mask = mask | (1 << j)
+            j = j + 1
         return mask
 
     return cull

@@ -1,4 +1,4 @@
-"""C++ for the CPU's lanes: the `.h` files of this folder, each the body of one native function or a part of several.
+"""C++ in `.h` files beside the kernels: each is the body of one native function, or a part of several.
 
 Python defines every number of a layout, and `source` hands it to the C++ under a name. `#include "part.h"` stands for that file's
 text, and a macro ends with its function. Warp hashes the whole text, so a changed file is compiled again.
@@ -11,9 +11,9 @@ INCLUDE = re.compile(r'^ *#include "(\w+\.h)"$', re.MULTILINE)
 MACRO = re.compile(r"^ *#define (\w+)", re.MULTILINE)
 
 
-def text_of(file: str) -> str:
-    """A file with those that it includes."""
-    return INCLUDE.sub(lambda line: text_of(line[1]), (Path(__file__).parent / file).read_text())
+def text_of(file: Path) -> str:
+    """A file with those that it includes, from its own folder."""
+    return INCLUDE.sub(lambda line: text_of(file.parent / line[1]), file.read_text())
 
 
 def literal(value) -> str:
@@ -23,9 +23,10 @@ def literal(value) -> str:
     return value if isinstance(value, str) else f"({int(value)})"
 
 
-def source(file: str, **constants) -> str:
-    """The body of a native function, for wp.func_native: a file, with those constants (int, float, bool, C++) that it names."""
-    body = text_of(file)
+def source(file: str | Path, **constants) -> str:
+    """The body of a native function, for wp.func_native: a file (of this folder, or a path), with those constants (int, float,
+    bool, C++) that it names."""
+    body = text_of(Path(__file__).parent / file)
     named = [name for name in constants if re.search(rf"\b{name}\b", body)]
     before = "".join(f"#define {name} {literal(constants[name])}\n" for name in named)
     after = "".join(f"#undef {name}\n" for name in dict.fromkeys([*named, *MACRO.findall(body)]))

@@ -8,12 +8,11 @@ box. An origin that is NaN says nothing about its axis: no ray is stopped there.
 """
 
 from functools import cache
-from typing import Any, NamedTuple
 
 import warp as wp
 
 from wrt.kernels.units.box import RAY_AABB
-from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, on_cuda, row_type
+from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, on_cuda, row_type, value
 from wrt.kernels.wide.native import source
 
 # The rows of planes. A low plane and the high plane of the same axis differ in the last bit of their numbers.
@@ -28,15 +27,6 @@ MANTISSA_BITS = 23
 
 # By how much far distances are widened for the box tests that have a form in rows.
 ROW_PADS = {"conservative": LANE_PAD, "minmax": 1.0}
-
-
-class Nodes(NamedTuple):
-    """entries(nodes, first, ray) -> row: where the line enters the boxes of the node that begins at `first`, at least t_min; only
-    for the boxes that are entered. entered(nodes, first, ray, t_max) -> mask of the children that the ray enters before it leaves
-    them, and at or before t_max (finite)."""
-
-    entries: Any
-    entered: Any
 
 
 def first_reference(width: int, compressed: bool) -> int:
@@ -54,53 +44,46 @@ def make_plane(width: int, compressed: bool):
     """plane(nodes, first, row, lane): a number of one of PLANES; and exists(nodes, first, lane): whether there is such a child."""
 
     @wp.func
-    def word(nodes: wp.array(dtype=wp.float32), i: int) -> int:
-        return wp.cast(nodes[i], wp.int32)
-
-    @wp.func
     def plane(nodes: wp.array(dtype=wp.float32), first: int, k: int, lane: int) -> float:
         if wp.static(compressed):
-            at = k * width + lane
-            byte = (word(nodes, first + FIRST_BYTES + at / 4) >> (8 * (at % 4))) & 255
-            exponent = (word(nodes, first + WORD) >> (EXPONENT_BITS * (k / 2))) & wp.static((1 << EXPONENT_BITS) - 1)
-            return nodes[first + k / 2] + float(byte) * wp.cast(exponent << MANTISSA_BITS, wp.float32)
-        return nodes[first + k * width + lane]
+            axis = k >> 1
+            at = k * width + lane  # of the bytes, four in a word
+            byte = (bits(nodes, first + FIRST_BYTES + (at >> 2)) >> (8 * (at & 3))) & 255
+            exponent = (bits(nodes, first + WORD) >> (EXPONENT_BITS * axis)) & wp.static((1 << EXPONENT_BITS) - 1)
+            return value(nodes, first + axis) + float(byte) * wp.cast(exponent << MANTISSA_BITS, wp.float32)
+        return value(nodes, first + k * width + lane)
 
     @wp.func
     def exists(nodes: wp.array(dtype=wp.float32), first: int, lane: int) -> bool:
         if wp.static(compressed):
-            return ((word(nodes, first + WORD) >> (EXIST_SHIFT + lane)) & 1) != 0
+            return ((bits(nodes, first + WORD) >> (EXIST_SHIFT + lane)) & 1) != 0
         return True
 
     return plane, exists
 
 
-def lane_by_lane(width: int, compressed: bool, enters) -> Nodes:
-    """Nodes by a function (nodes, first, lane, ray, t_max) that says where the ray enters a child, or inf where it does not."""
+def lane_by_lane(width: int, compressed: bool, enters):
+    """make_children from what is said of one child: enters(nodes, first, lane, ray, t_max) -> distance, inf where it is missed."""
     row = row_type(width)
     _, exists = make_plane(width, compressed)
 
     @wp.func
-    def entries(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row:
-        out = row()
-        for j in range(width):
-            out[j] = enters(nodes, first, j, ray, float(wp.inf))
-        return out
-
-    @wp.func
-    def entered(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int:
+    def children(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float):
+        entries = row()
         mask = int(0)
         for j in range(width):
-            if exists(nodes, first, j) and enters(nodes, first, j, ray, t_max) < wp.inf:
+            entry = enters(nodes, first, j, ray, t_max)
+            entries[j] = entry
+            if exists(nodes, first, j) and entry < wp.inf:
                 mask = mask | (1 << j)
-        return mask
+        return entries, mask
 
-    return Nodes(entries, entered)
+    return children
 
 
 @cache
-def make_scalar(width: int, compressed: bool, box: str) -> Nodes:
-    """By the scalar unit of that name in RAY_AABB, for a box test that has no form in rows."""
+def make_scalar(width: int, compressed: bool, box: str):
+    """make_children by the scalar unit of that name in RAY_AABB, for a box test that has no form in rows."""
     plane, _ = make_plane(width, compressed)
     ray_aabb = RAY_AABB[box]
 
@@ -114,8 +97,8 @@ def make_scalar(width: int, compressed: bool, box: str) -> Nodes:
 
 
 @cache
-def make_plain(width: int, compressed: bool) -> Nodes:
-    """What rows compute, in plain Warp."""
+def make_plain(width: int, compressed: bool):
+    """make_children of rows in plain Warp."""
     plane, _ = make_plane(width, compressed)
 
     @wp.func
@@ -138,44 +121,43 @@ def make_plain(width: int, compressed: bool) -> Nodes:
 
 
 @cache
-def make_native(width: int, compressed: bool) -> Nodes:
-    """C++, for the CPU only."""
+def make_native(width: int, compressed: bool):
+    """make_children of rows in C++, for the CPU only."""
     row = row_type(width)
     layout = {"WIDTH": width, "COMPRESSED": compressed, "WORD": WORD, "FIRST_BYTES": FIRST_BYTES, "EXPONENT_BITS": EXPONENT_BITS,
               "EXIST_SHIFT": EXIST_SHIFT, "MANTISSA_BITS": MANTISSA_BITS}
 
     @wp.func_native(source("row_entries.h", **layout))
-    def entries(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row: ...
+    def row_entries(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row: ...
 
     @wp.func_native(source("row_entered.h", **layout))
-    def entered(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int: ...
+    def row_entered(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int: ...
 
-    return Nodes(entries, entered)
+    @wp.func
+    def children(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float):
+        return row_entries(nodes, first, ray), row_entered(nodes, first, ray, t_max)
+
+    return children
 
 
 @cache
-def make_nodes(width: int, compressed: bool, box: str) -> Nodes:
-    """For a box test of RAY_AABB, in the form that each device runs. The ray's far_inv_dir must be widened by far_pad(box)."""
+def make_children(width: int, compressed: bool, box: str):
+    """children(nodes, first, ray, t_max) -> (row, mask): the mask of the children of the node that begins at `first` which the ray
+    enters before it leaves them, and at or before t_max (finite); the row of where it enters these, at least t_min.
+
+    box: a name in RAY_AABB; the ray's far_inv_dir is widened by far_pad(box). Each device runs its own form.
+    """
     if box not in ROW_PADS:
         return make_scalar(width, compressed, box)
-    row = row_type(width)
     plain, vector = make_plain(width, compressed), make_native(width, compressed)
-    plain_entries, plain_entered = plain
-    vector_entries, vector_entered = vector
 
     @wp.func
-    def entries(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row:
+    def children(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float):
         if on_cuda():
-            return plain_entries(nodes, first, ray)
-        return vector_entries(nodes, first, ray)
+            return plain(nodes, first, ray, t_max)
+        return vector(nodes, first, ray, t_max)
 
-    @wp.func
-    def entered(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int:
-        if on_cuda():
-            return plain_entered(nodes, first, ray, t_max)
-        return vector_entered(nodes, first, ray, t_max)
-
-    return Nodes(entries, entered)
+    return children
 
 
 def far_pad(box: str) -> float:

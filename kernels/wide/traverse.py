@@ -19,7 +19,7 @@ from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.units.triangle import component
 from wrt.kernels.wide.lanes import LaneRay, bits, lowest, make_cull, prefetch
 from wrt.kernels.wide.native import source
-from wrt.kernels.wide.nodes import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, far_pad, first_reference, make_nodes, node_size
+from wrt.kernels.wide.nodes import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, far_pad, first_reference, make_children, node_size
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 
 # The builder lets no walk have more entries than this (kernels.build.wide.collapse).
@@ -151,7 +151,7 @@ def make_call_in(record, width: int, compressed: bool, lines: int):
 
 def make_traversal(units: Units, any_hit: bool, accepts, width: int, compressed: bool):
     """The closest hit, or any (the first that is found), in a tree of nodes of `width` children."""
-    entries, entered = make_nodes(width, compressed, units.box)
+    children = make_children(width, compressed, units.box)
     probe_of = make_probe(units)
     test_row = make_row_test(units, any_hit, accepts, width)
     size_of_node = node_size(width, compressed)
@@ -232,8 +232,7 @@ def make_traversal(units: Units, any_hit: bool, accepts, width: int, compressed:
             else:
                 first = reference * wp.static(size_of_node)
                 counts = count_node(accel, ray, counts, reference)
-                t = entries(accel.nodes, first, rows)
-                mask = entered(accel.nodes, first, rows, best.t)
+                t, mask = children(accel.nodes, first, rows, best.t)
                 if mask != 0:
                     first = first + references
                     lane = lowest(mask)

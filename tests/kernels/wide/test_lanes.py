@@ -32,9 +32,7 @@ def both_kernel(width, compressed):
         entered: wp.array(dtype=wp.int32)
         candidates: wp.array(dtype=wp.int32)
 
-    def make(cull, nodes_unit):
-        entries, entered = nodes_unit
-
+    def make(cull, children):
         @kernel
         def run(nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32), rays: RayArrays, out: Out):
             i = wp.tid()
@@ -42,8 +40,9 @@ def both_kernel(width, compressed):
             lanes = lane_ray(probe_of(ray), LANE_PAD)
             first = i * wp.static(9 * width)
             node = i * wp.static(node_size(width, compressed))
-            out.entries[i] = entries(nodes, node, lanes)
-            out.entered[i] = entered(nodes, node, lanes, ray.t_max)
+            entries, entered = children(nodes, node, lanes, ray.t_max)
+            out.entries[i] = entries
+            out.entered[i] = entered
             out.candidates[i] = cull(rows, first, lanes)
 
         return run

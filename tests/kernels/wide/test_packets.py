@@ -89,7 +89,7 @@ def triangles_by_packets(rows: wp.array(dtype=wp.float32), state: wp.array(dtype
 def scalar_kernel():
     row = row_type(WIDTH)
     probe_of, intersect = make_probe(Units()), make_intersect(Units())
-    entries, entered = make_plain(WIDTH, False)
+    children = make_plain(WIDTH, False)
     cull = make_plain_cull(WIDTH)
 
     @wp.struct
@@ -130,8 +130,9 @@ def scalar_kernel():
         out.rows[i, 20] = direction_scale(rays.direction[i])
         node = 64 * (i / LANES)
         first = 80 * (i / LANES)
-        out.entries[i] = entries(nodes, node, lanes)
-        out.entered[i] = entered(nodes, node, lanes, best.t)
+        entries, entered = children(nodes, node, lanes, best.t)
+        out.entries[i] = entries
+        out.entered[i] = entered
         out.candidates[i] = cull(rows, first, lanes)
         for j in range(WIDTH):
             k = first + j
