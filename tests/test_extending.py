@@ -14,13 +14,9 @@ from tests.data import ROOT
 BLOCK = re.compile(r"^```(python|diff)\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 TRY_IT = """
-<<<<<<< HEAD
 from pathlib import Path
-import numpy as np, wrt
-=======
 import numpy as np, stored_normal, wrt
 from wrt.lab.rtcore.instructions import triangle_unit
->>>>>>> h/native
 from wrt.scene.shapes import icosphere
 
 ball = icosphere(4)
