@@ -21,7 +21,7 @@ class InputError(ValueError):
         super().__init__(": ".join(part for part in parts if part))
 
     def at(self, path: str | os.PathLike[str] | None = None, place: str | None = None) -> InputError:
-        """The same message behind a path and a place, to `raise error.at(path) from error`."""
+        """The same, found in that file or at that place of it."""
         return InputError(str(self), path, place)
 
 

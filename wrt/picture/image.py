@@ -304,7 +304,7 @@ def _read(path: PathLike) -> bytes:
     try:
         return read_file(path)
     except InputError as error:
-        raise error.at(path) from None
+        raise InputError(str(error), path) from None
 
 
 def _formats(path: PathLike) -> tuple[str, ...]:
@@ -317,7 +317,7 @@ def _told(name: PathLike) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise error.at(name) from error.__cause__
+        raise InputError(str(error), name) from error.__cause__
 
 
 @contextlib.contextmanager
@@ -329,7 +329,7 @@ def _opened(path: PathLike) -> Iterator[Any]:
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", path) from error
     except InputError as error:
-        raise error.at(path) from None
+        raise InputError(str(error), path) from None
     if not first.startswith(_MAGIC[Path(path).suffix.lower()]):
         raise InputError(f"cannot be read as an image: it is no {Path(path).suffix.lower()} file", path)
     import OpenImageIO as oiio
