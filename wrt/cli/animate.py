@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import ACCEL, SET, Size, depth_hint, load, naming, say, say_json, settings_of, warnings_told
+from wrt.cli.common import ACCEL, SET, Size, depth_hint, load, naming, say, say_json, settings_of, warnings_reported
 from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
 
@@ -47,7 +47,7 @@ def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: 
     loaded = load(scene, quiet).with_settings(**settings)
     pictures, rows, signal, visibly_cut = [], [], None, 0.0
     begin = time.perf_counter()
-    with warnings_told(quiet), naming(scene):
+    with warnings_reported(quiet), naming(scene):
         for film in animation.animate(loaded, plan, rendering):
             if film.stats["interrupted"]:
                 signal = film.stats["signal"]

@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import ACCEL, Commands, Names, warnings_told
-from wrt.cli.telling import MESHES, Telling, measure, telling
+from wrt.cli.common import ACCEL, Commands, Names, warnings_reported
+from wrt.cli.reporting import MESHES, Reporting, measure, reporting
 
 KINDS = click.option("--kinds", type=Names(), default=("primary", "shadow", "diffuse", "random"), help="Of rays  [default: all]")
 SEED = click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
@@ -28,8 +28,8 @@ def bench() -> None:
 @click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
 @click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
 @click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
-@telling("Folder for a report with plots", cluster=True)
-def visibility(how: Telling, **options: Any) -> None:
+@reporting("Folder for a report with plots", cluster=True)
+def visibility(how: Reporting, **options: Any) -> None:
     """Rasterising against ray casting, as triangles and pixels grow: the cost of both, and where they differ.
 
     MESHES: mesh files; without any, a sphere and a terrain.
@@ -45,8 +45,8 @@ def visibility(how: Telling, **options: Any) -> None:
 @click.option("--runs", type=int, default=9, show_default=True, help="Runs of each unit, by turns")
 @click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
 @SEED
-@telling("Write the table as Markdown (.md)")
-def units(how: Telling, **options: Any) -> None:
+@reporting("Write the table as Markdown (.md)")
+def units(how: Reporting, **options: Any) -> None:
     """The default triangle and box tests beside the others: what they cost, as ratios with their spread, on one thread.
 
     MESHES: mesh files; without any, a sphere, a terrain and a teapot.
@@ -56,7 +56,7 @@ def units(how: Telling, **options: Any) -> None:
     plan = study.Plan(**options)
     how.check_markdown()
     machine = study.machine()
-    with warnings_told(how.quiet):
+    with warnings_reported(how.quiet):
         rows = study.run(plan, how.now_and_then)
     text = study.text(rows, plan, machine)
     how.write(text)
@@ -72,8 +72,8 @@ def units(how: Telling, **options: Any) -> None:
 @click.option("--runs", type=int, default=7, show_default=True, help="Runs of each, by turns")
 @click.option("--threads", default="both", show_default=True, help="one (by its CPU time), all (by the clock) or both")
 @SEED
-@telling("Write the tables as Markdown (.md)", cluster=True)
-def peers(how: Telling, **options: Any) -> None:
+@reporting("Write the tables as Markdown (.md)", cluster=True)
+def peers(how: Reporting, **options: Any) -> None:
     """wrt beside Embree (robust and fast) and Warp's mesh_query_ray: the same rays by turns, on one thread and on all, with ratios
     and answers that differ.
 
@@ -95,8 +95,8 @@ def peers(how: Telling, **options: Any) -> None:
 @click.option("--threads", type=int, default=1, show_default=True, help="Threads to search with (builds use all cores)")
 @click.option("--stadium", is_flag=True, help="Each mesh in a stadium a thousand times its size, with the rays it has alone")
 @SEED
-@telling("Folder for a report with plots", cluster=True)
-def accel(how: Telling, **options: Any) -> None:
+@reporting("Folder for a report with plots", cluster=True)
+def accel(how: Reporting, **options: Any) -> None:
     """Structure against structure: time to build, memory, steps and time to search, and answers that differ (none may).
 
     MESHES: mesh files; without any, a terrain that grows from a thousand triangles on.
@@ -114,8 +114,8 @@ def accel(how: Telling, **options: Any) -> None:
 @click.option("--runs", type=int, default=7, show_default=True, help="Runs of each volume, alternating")
 @click.option("--threads", type=int, help="Threads to build with  [default: all cores]")
 @SEED
-@telling(None, cluster=True)
-def bvh(how: Telling, **options: Any) -> None:
+@reporting(None, cluster=True)
+def bvh(how: Reporting, **options: Any) -> None:
     """Builders of binary BVHs over MESHES: quality, time and memory; and boxes, spheres and 14-DOPs around the same tree."""
     from wrt.lab.bench import bvh as study
 
@@ -131,8 +131,8 @@ def bvh(how: Telling, **options: Any) -> None:
 @SEED
 @click.option("--inside", is_flag=True, help="The camera stands in the middle of the mesh's box, as in a room")
 @click.option("--software", is_flag=True, help="Also what the same rays take in software on a GTX 1080 Ti (compiles for Turing)")
-@telling("Write the tables as Markdown (.md)", cluster=True)
-def rtcore(how: Telling, software: bool, **options: Any) -> None:
+@reporting("Write the tables as Markdown (.md)", cluster=True)
+def rtcore(how: Reporting, software: bool, **options: Any) -> None:
     """The model of the RT core on MESHES: what limits it, rays a second as ranges, and which assumption moves them most."""
     from wrt.cli.common import client_of
     from wrt.lab.bench.sweep import by_mesh
@@ -142,7 +142,7 @@ def rtcore(how: Telling, software: bool, **options: Any) -> None:
 
     plan = study.Plan(**options)
     how.check_markdown()
-    with warnings_told(how.quiet):
+    with warnings_reported(how.quiet):
         rows = by_mesh(study.run, plan, lambda row: how.progress(study.line(row)), client_of(how.cluster))
     text = f"{study.markdown(rows)}\n{LEGEND}\n\n{parameter_table()}"
     in_software = study.in_software(rows) if software else []
@@ -165,7 +165,7 @@ def instructions(structures: tuple[str, ...], as_json: bool) -> None:
         ACCELERATORS.check(name)
     units, codes = study.units(), study.traversals(structures)
     text = f"{study.unit_table(units)}\n\n{study.traversal_table(codes)}\n\n{study.SOFTWARE_LEGEND}"
-    Telling(as_json=as_json).end(text, {
+    Reporting(as_json=as_json).end(text, {
         "units": [{"unit": each.unit, "test": each.test, "instructions": each.instructions, **each.classes} for each in units],
         "traversals": {name: {"registers": code.registers, "stack": code.stack, "code_bytes": len(code.code), **code.classes()}
                        for name, code in codes.items()}})

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import ACCEL, Setting, now_and_then, say, say_json, warnings_told
+from wrt.cli.common import ACCEL, Setting, now_and_then, say, say_json, warnings_reported
 from wrt.core.errors import InputError
 from wrt.io.meshes import SUFFIXES
 
@@ -33,7 +33,7 @@ def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any],
     if reports_progress(accel):
         tell = now_and_then(quiet)
         options["progress"] = lambda done: tell(f"{accel}: {100.0 * done:.0f} % built")
-    with warnings_told(quiet):
+    with warnings_reported(quiet):
         structure = wrt.build(mesh, accel, threads=threads, **options)
     structure.save(output)
     if as_json:

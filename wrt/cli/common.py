@@ -220,7 +220,7 @@ def load(path: Path, quiet: bool, clock: dict[str, float] | None = None) -> Any:
     begin = time.perf_counter()
     from wrt.io.load import load_scene
 
-    with warnings_told(quiet):
+    with warnings_reported(quiet):
         scene = load_scene(path)
     if clock is not None:
         clock["load"] = time.perf_counter() - begin
@@ -228,7 +228,7 @@ def load(path: Path, quiet: bool, clock: dict[str, float] | None = None) -> Any:
 
 
 @contextlib.contextmanager
-def warnings_told(quiet: bool) -> Iterator[None]:
+def warnings_reported(quiet: bool) -> Iterator[None]:
     """Tell the block's warnings on stderr when it is over, a line each; none where it fails: one message is enough."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", SceneWarning)

@@ -40,7 +40,7 @@ from wrt.cli.common import (
     say_json,
     settings_of,
     spread_options,
-    warnings_told,
+    warnings_reported,
 )
 from wrt.cli.measure import stability
 from wrt.cli.profile import profile, whatif
@@ -131,7 +131,7 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
     if checkpoint is not None and options["resume"] and not (os.path.lexists(checkpoint) or quiet):
         say(f"{checkpoint}: no checkpoint yet, rendering from the beginning")
 
-    with warnings_told(quiet):
+    with warnings_reported(quiet):
         with progress_reporter(quiet) as progress, naming(scene):
             film = render_scene(loaded, spp=settings.get("spp"), progress=progress, **options)
         if not film.stats["samples"]:

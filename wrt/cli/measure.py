@@ -9,8 +9,8 @@ from typing import Any
 import click
 
 from wrt.cli.bench import bench
-from wrt.cli.common import SET, Duration, Names, Size, client_of, load, naming, settings_of, warnings_told
-from wrt.cli.telling import Telling, telling
+from wrt.cli.common import SET, Duration, Names, Size, client_of, load, naming, settings_of, warnings_reported
+from wrt.cli.reporting import Reporting, reporting
 
 
 @click.command()
@@ -22,8 +22,8 @@ from wrt.cli.telling import Telling, telling
 @click.option("--peers", is_flag=True, help="Also Embree (robust and fast), Warp's mesh_query_ray and Open3D, where installed")
 @click.option("--threads", type=int, help="Threads for the rays beyond the sample  [default: all cores]")
 @click.option("--runs", type=click.IntRange(min=1), default=7, show_default=True, help="Runs of each for the speed, by turns")
-@telling("Write a report: Markdown with plots beside it (.md), or one page (.html)", cluster=True, quiet="No progress")
-def stability(how: Telling, **options: Any) -> None:
+@reporting("Write a report: Markdown with plots beside it (.md), or one page (.html)", cluster=True, quiet="No progress")
+def stability(how: Reporting, **options: Any) -> None:
     """The hard cases against the intersection tests: rays lost and errors, with the speed beside them.
 
     CASES: names such as E_grid, or the letters of groups; without any, all.
@@ -63,8 +63,8 @@ def stability(how: Telling, **options: Any) -> None:
 @click.option("--seed", type=int, default=0, show_default=True, help="Decides on all seeds")
 @click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
 @click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
-@telling("Folder for a report: Markdown, plot and data")
-def error(how: Telling, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int], **options: Any) -> None:
+@reporting("Folder for a report: Markdown, plot and data")
+def error(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int], **options: Any) -> None:
     """Speed against error of SCENE over the knobs that a render has: each picture against a converged reference."""
     from wrt.lab.bench import error as study
     from wrt.lab.bench import error_report as report
@@ -75,7 +75,7 @@ def error(how: Telling, scene: Path, given: tuple[tuple[str, Any], ...], size: t
     settings = settings_of(given, size="--size", spp="--max-spp")
     paths = {} if how.output is None else report.report_paths(how.output, scene.stem)
     loaded = load(scene, how.quiet).with_settings(size=size, **settings)
-    with warnings_told(how.quiet), naming(scene):
+    with warnings_reported(how.quiet), naming(scene):
         result = study.sweep(loaded, plan, rendering, how.progress)
     if paths:
         report.write_report(result, paths, f"python -m wrt {click.get_current_context().command_path}")
@@ -99,8 +99,8 @@ def error(how: Telling, scene: Path, given: tuple[tuple[str, Any], ...], size: t
 @click.option("--camera", help="A camera's name or number  [default: the first]")
 @SET
 @click.option("--seed", type=int, default=0, show_default=True, help="Decides on all seeds")
-@telling("Write the table as Markdown (.md)")
-def mitsuba(how: Telling, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int], matte: bool,
+@reporting("Write the table as Markdown (.md)")
+def mitsuba(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int], matte: bool,
             camera: str | None, **options: Any) -> None:
     """SCENE by wrt and by Mitsuba 3 (scalar_rgb and llvm_ad_rgb), on all threads: time to equal error, process start included and
     excluded.
@@ -116,7 +116,7 @@ def mitsuba(how: Telling, scene: Path, given: tuple[tuple[str, Any], ...], size:
     how.check_markdown()
     settings = settings_of(given, size="--size", spp="--spp")
     loaded = load(scene, how.quiet).with_settings(size=size, **settings)
-    with tempfile.TemporaryDirectory() as folder, warnings_told(how.quiet), naming(scene):
+    with tempfile.TemporaryDirectory() as folder, warnings_reported(how.quiet), naming(scene):
         command = ["render", str(scene), "--spp", "1", "--size", f"{size[0]}x{size[1]}", "-q", "-o", f"{folder}/start.png"]
         command += [f"--set={name}={value}" for name, value in settings.items()]
         result = equal_error.run(equal_error.matte(loaded) if matte else loaded, plan, Options(camera=camera), command,

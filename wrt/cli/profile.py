@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import ACCEL, SET, Crop, Names, Size, load, naming, settings_of, warnings_told
-from wrt.cli.telling import Telling, telling
+from wrt.cli.common import ACCEL, SET, Crop, Names, Size, load, naming, settings_of, warnings_reported
+from wrt.cli.reporting import Reporting, reporting
 
 
 @click.command()
@@ -23,8 +23,8 @@ from wrt.cli.telling import Telling, telling
 @click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other samples")
 @click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
-@telling("Folder for heat maps, EXR layers, histograms and a report", quiet="No warnings")
-def profile(how: Telling, scene: Path, given: tuple[tuple[str, Any], ...], gpu: str, **options: Any) -> None:
+@reporting("Folder for heat maps, EXR layers, histograms and a report", quiet="No warnings")
+def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu: str, **options: Any) -> None:
     """What every ray of SCENE costs: counters by pixel, kind and depth, and a model of the RT core."""
     from wrt.core.checks import require_known
     from wrt.lab.bench.report import check_folder
@@ -37,7 +37,7 @@ def profile(how: Telling, scene: Path, given: tuple[tuple[str, Any], ...], gpu: 
         check_folder(how.output, (report.LAYERS, report.HISTOGRAMS))
     settings = settings_of(given, {name: options.pop(name) for name in ("size", "max_depth")}, spp="--spp")
     loaded = load(scene, how.quiet).with_settings(**settings)
-    with warnings_told(how.quiet), naming(scene):
+    with warnings_reported(how.quiet), naming(scene):
         found = measure(loaded, **options)
     rows = report.model_rows(found, GPUS[gpu])
     text = report.summary(found, rows, GPUS[gpu])
@@ -57,8 +57,8 @@ STUDIES = ("width", "stack", "planes", "order", "sorting", "rates")
 @click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
 @click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
 @click.option("--inside", is_flag=True, help="The camera stands in the middle of the mesh's box, as in a room")
-@telling("Write the table as Markdown (.md)")
-def whatif(how: Telling, study: str, mesh: Path, **options: Any) -> None:
+@reporting("Write the table as Markdown (.md)")
+def whatif(how: Reporting, study: str, mesh: Path, **options: Any) -> None:
     """Change one thing of the RT core's design, and count the same rays through MESH again.
 
     STUDY: width (node width, format and volume), stack (entries, with restarts), planes (bits of a box plane), order (nearer
@@ -68,7 +68,7 @@ def whatif(how: Telling, study: str, mesh: Path, **options: Any) -> None:
 
     plan = studies.Plan("width" if study == "rates" else study, mesh, **options)
     how.check_markdown()
-    with warnings_told(how.quiet):
+    with warnings_reported(how.quiet):
         if study == "rates":
             rates = studies.rates(plan, how.progress)
             text = studies.rates_markdown(rates)

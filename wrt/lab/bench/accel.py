@@ -295,5 +295,5 @@ def write_report(rows: Sequence[Row | Refused], plan: Plan, folder: Path, machin
     command = " ".join(["python -m wrt bench accel", *names, f"--rays {plan.rays}", f"--runs {plan.runs}",
                         f"--threads {plan.threads}"])
     text = f"# Structures\n\nMachine: {machine}\n\nTo repeat: `{command}`\n\n{LEGEND}\n\n"
-    return write(folder / REPORT, text + markdown([*parts(rows), *(Part(name, plot=name) for name in PLOTS)]),
+    return write(folder / REPORT, text + markdown([*parts(rows), *(Part(plot=name) for name in PLOTS)]),
                  {name: plot(rows, name) for name in PLOTS})

@@ -73,9 +73,8 @@ def has_triangles(scene: Scene, features: Features) -> bool:
 
 def structures(scene: Scene) -> list[str]:
     """One name a structure; brute force where it ends in a lifetime."""
-    by_class = {cls: name for name, cls in reversed(ACCELERATORS.items())}
-    names = [name for name in ACCELERATORS if name in by_class.values()]
-    return [name for name in names if name != "brute_force" or primitives(scene) <= BRUTE_FORCE_LIMIT]
+    first = {cls: name for name, cls in reversed(ACCELERATORS.items())}.values()
+    return [name for name in ACCELERATORS if name in first and (name != "brute_force" or primitives(scene) <= BRUTE_FORCE_LIMIT)]
 
 
 KNOBS = {knob.name: knob for knob in (

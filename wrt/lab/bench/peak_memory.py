@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import math
+import re
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -19,28 +22,14 @@ def peak_bytes(work: Callable[[], T]) -> tuple[T, float]:
     gc.collect()
     with suppress(AttributeError, OSError, TypeError):  # no such library, or (Windows) none without a name
         ctypes.CDLL(None).malloc_trim(0)
-    before = status("VmRSS") if reset_peak() else float("nan")
-    result = work()
-    return result, max(status("VmHWM") - before, 0.0)
-
-
-def reset_peak() -> bool:
-    """Let the peak (VmHWM) be what is used now; whether the system could."""
     try:
-        with open("/proc/self/clear_refs", "w", encoding="ascii") as file:
-            file.write("5")
+        Path("/proc/self/clear_refs").write_text("5")  # the peak is what is used now
     except OSError:
-        return False
-    return True
+        return work(), math.nan
+    before = _peak()
+    return work(), max(_peak() - before, 0.0)
 
 
-def status(name: str) -> float:
-    """A size in /proc/self/status, in bytes; NaN where there is none."""
-    try:
-        with open("/proc/self/status", encoding="ascii") as file:
-            for line in file:
-                if line.startswith(name + ":"):
-                    return 1024.0 * float(line.split()[1])
-    except OSError:
-        pass
-    return float("nan")
+def _peak() -> float:
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    return 1024.0 * float(found[1]) if found else math.nan

@@ -3,7 +3,6 @@ turns, on one thread and on all of them."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -103,22 +102,10 @@ class Row:
         return asdict(self) | {"mrays_median": float(np.median(self.mrays))}
 
 
-class Contestant(ABC):
-    """Somebody who finds hits. search: the work that is timed, with rays and results in arrays of the library's own kind."""
+class Own:
+    """A structure of wrt. search: the work that is timed, as a function of no argument, with rays and results in arrays of the
+    library's own kind; told: its result as hits, or as yes or no for any-hit rays."""
 
-    name: str
-    build: float
-
-    @abstractmethod
-    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
-        """A function of no argument; whatever it takes to convert the rays is done before."""
-
-    @abstractmethod
-    def told(self, rays: RaySet, out: Any) -> Hits | np.ndarray:
-        """The result of `search` as hits, or as yes or no for any-hit rays."""
-
-
-class Own(Contestant):
     def __init__(self, name: str, geometry: Geometry) -> None:
         self.name = f"wrt {ACCELERATORS[name].name}"
         warm_up(name)
@@ -139,8 +126,8 @@ class Own(Contestant):
         return np.asarray(out.numpy()) if rays.any_hit else Hits(*(getattr(out, f).numpy() for f in ("t", "u", "v", "prim_id")))
 
 
-class Rival(Contestant):
-    """A library of wrt.lab.hard_cases.contestants."""
+class Rival:
+    """A library of wrt.lab.hard_cases.contestants; search and told as for Own."""
 
     def __init__(self, peer: Peer, geometry: Geometry) -> None:
         self.peer, self.name = peer, peer.name
@@ -239,13 +226,13 @@ def run(plan: Plan, report: Callable[[Row], None] | None = None) -> list[Row]:
 def _mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
     geometry, name = Geometry.of(mesh), Path(mesh.name or "mesh").name
     own = [Own(structure, geometry) for structure in dict.fromkeys(plan.structures)]
-    everybody: list[Contestant] = [*own, *(Rival(PEERS[rival](), geometry) for rival in plan.chosen)]
+    everybody: list[Own | Rival] = [*own, *(Rival(PEERS[rival](), geometry) for rival in plan.chosen)]
     for kind, rays in ray_sets(own[0].accel, plan.rays, plan.seed).items():
         for threads in plan.counts if kind in plan.kinds else ():
             yield from _measured((name, len(mesh.faces)), everybody, rays, threads, plan.runs)
 
 
-def _measured(mesh: tuple[str, int], everybody: Sequence[Contestant], rays: RaySet, threads: int, runs: int) -> Iterator[Row]:
+def _measured(mesh: tuple[str, int], everybody: Sequence[Own | Rival], rays: RaySet, threads: int, runs: int) -> Iterator[Row]:
     searches = [who.search(rays, threads) for who in everybody]
     told = [who.told(rays, search()) for who, search in zip(everybody, searches, strict=True)]
     hit = float((told[0].prim_id >= 0).mean() if isinstance(told[0], Hits) else np.mean(told[0]))

@@ -19,7 +19,7 @@ from functools import partial
 
 import numpy as np
 
-from wrt.core.errors import InputError
+from wrt.core.checks import require_known
 from wrt.lab.hard_cases import closed as inside
 from wrt.lab.hard_cases import open as outside
 from wrt.lab.hard_cases.common import AIMS, ASK, HIT, MISS, HardCase, Seed
@@ -67,8 +67,7 @@ HARD_CASES: dict[str, Callable[[np.random.Generator, int], HardCase]] = {
 
 def generate(name: str, n: int, seed: Seed = 0) -> HardCase:
     """n rays of one case. Raises InputError for an unknown name."""
-    if name not in HARD_CASES:
-        raise InputError(f"no hard case {name!r}; there is {', '.join(HARD_CASES)}")
+    require_known(name, HARD_CASES, "hard case")
     make = HARD_CASES[name]
     notes = (make.func if isinstance(make, partial) else make).__doc__ or ""
     return replace(make(np.random.default_rng(seed), n), name=name, notes=" ".join(notes.split()))

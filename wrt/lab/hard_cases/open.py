@@ -190,13 +190,18 @@ def edge_on(rng: np.random.Generator, n: int) -> HardCase:
     return replace(case, expected=np.where(flat, MISS, ASK).astype(np.int8))
 
 
+def _square(size: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two coordinates of the corners of cells x cells quads over [-size, size]^2, and their triangles."""
+    x = np.linspace(-size, size, cells + 1)
+    i, j = np.meshgrid(x, x, indexing="ij")
+    first = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).reshape(-1, 1)
+    return i.reshape(-1), j.reshape(-1), np.concatenate([first + [0, cells + 1, cells + 2], first + [0, cells + 2, 1]])
+
+
 @cache
 def _floor(turned: bool) -> Geometry:
-    x = np.linspace(-100.0, 100.0, 33)
-    i, j = np.meshgrid(x, x, indexing="ij")
-    first = (np.arange(32)[:, None] * 33 + np.arange(32)).reshape(-1, 1)
-    faces = np.concatenate([first + [0, 33, 34], first + [0, 34, 1]])
-    points = np.stack([i.reshape(-1), np.zeros(i.size), j.reshape(-1)], axis=1)
+    i, j, faces = _square(100.0, 32)
+    points = np.stack([i, np.zeros(i.size), j], axis=1)
     c, s = np.cos(0.4), np.sin(0.4)
     return surface(points @ (np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) if turned else np.eye(3)), faces)
 
@@ -224,11 +229,8 @@ def grazing(rng: np.random.Generator, n: int, *, turned: bool) -> HardCase:
 @cache
 def _plates() -> Geometry:
     """Four plates of 8 x 8 quads over [-1, 1]^2, at z = 1, 2, 4 and 8."""
-    x = np.linspace(-1.0, 1.0, 9)
-    i, j = np.meshgrid(x, x, indexing="ij")
-    first = (np.arange(8)[:, None] * 9 + np.arange(8)).reshape(-1, 1)
-    faces = np.concatenate([first + [0, 9, 10], first + [0, 10, 1]])
-    return joined(*(surface(np.stack([i.reshape(-1), j.reshape(-1), np.full(81, z)], axis=1), faces) for z in (1, 2, 4, 8)))
+    i, j, faces = _square(1.0, 8)
+    return joined(*(surface(np.stack([i, j, np.full(81, z)], axis=1), faces) for z in (1, 2, 4, 8)))
 
 
 def exact_ends(rng: np.random.Generator, n: int) -> HardCase:

@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.structure import Structure
+from wrt.core.checks import require_known
 from wrt.core.device import load_kernel, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
@@ -210,7 +211,7 @@ def chosen(cases: Sequence[str]) -> list[str]:
     for case in cases or list(HARD_CASES):
         found = [name for name in HARD_CASES if name == case or name.split("_")[0] == case]
         if not found:
-            raise InputError(f"no hard case {case!r}; there is {', '.join(HARD_CASES)}")
+            require_known(case, HARD_CASES, "hard case")
         names += found
     return names
 

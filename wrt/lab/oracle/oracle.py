@@ -31,7 +31,7 @@ from wrt.scene.exact import (
     triangle_crossings,
 )
 
-__all__ = ["AllHits", "Answer", "Bounds", "Crossings", "Place", "Reference", "all_hits", "classify", "closest", "cross",
+__all__ = ["AllHits", "Answer", "Bounds", "Crossings", "Place", "Reference", "all_hits", "closest", "cross",
            "reference_of", "sure", "t_bound"]
 
 WIDTH = 4  # children of a node
@@ -358,11 +358,6 @@ def cross(origins: Any, directions: Any, triangles: Any) -> Crossings:
     """Ray i's line against triangle i: the exact place, and t, u, v of the plane. triangles: (N, 3, 3), taken as float32."""
     rays = _Rays.of(origins, directions, 0.0, np.inf)
     return triangle_crossings(rays.origin, rays.direction, _columns(triangles), all_rows=True)
-
-
-def classify(origins: Any, directions: Any, triangles: Any) -> np.ndarray:
-    """Where ray i's line (t may be negative) meets triangle i, exactly: (N,) int8 of `Place`. triangles: (N, 3, 3)."""
-    return cross(origins, directions, triangles).place
 
 
 def t_bound(origins: Any, directions: Any, triangles: Any) -> np.ndarray:

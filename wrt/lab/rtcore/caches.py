@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -135,11 +135,8 @@ def first_level(warps: Warps, sms: int, slots: int, l1: Cache) -> Level1:
     out.seen, out.seen_at = (wp.zeros(sms * out.seen_size, dtype=wp.int64, device=cpu) for _ in range(2))
     caches = caches_of(l1, sms)
     load_kernel(replay_warps, cpu)
-
-    def run(sm: int) -> Callable[[], None]:
-        return lambda: wp.launch(replay_warps, dim=1, inputs=[trace, caches, out, sm], device=cpu)
-
-    run_all([run(sm) for sm in range(sms)], thread_count(None))
+    run_all([partial(wp.launch, replay_warps, dim=1, inputs=[trace, caches, out, sm], device=cpu) for sm in range(sms)],
+            thread_count(None))
     used = np.concatenate([np.arange(a, a + n) for a, n in zip(room, out.misses.numpy(), strict=False)])
     return Level1(int(out.accesses.numpy().sum()), int(out.wanted.numpy().sum()), out.line.numpy()[used],
                   out.time.numpy()[used], out.lanes.numpy()[used])

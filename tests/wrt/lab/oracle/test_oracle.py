@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from wrt.lab.oracle.bounds import triangle_bounds
-from wrt.lab.oracle.oracle import Place, Reference, all_hits, classify, closest, cross, reference_of, sure, t_bound
+from wrt.lab.oracle.oracle import Place, Reference, all_hits, closest, cross, reference_of, sure, t_bound
 from wrt.scene.exact import sphere_crossings, triangle_crossings
 
 Row = list[Fraction]
@@ -116,9 +116,9 @@ def test_a_point_of_the_plane_that_no_float_tells_from_the_edge() -> None:
     # The ray passes the edge by 2^-60 of its length: float64 cannot see it, and the answer must not be EDGE.
     triangle = np.array([[[0, 0, 1], [1, 0, 1], [0, 1, 1]]] * 2, np.float32)
     origin = np.array([[0.25, 2.0**-60, 0], [0.25, -(2.0**-60), 0]], np.float32)
-    assert classify(origin, np.array([[0, 0, 1]] * 2), triangle).tolist() == [Place.INSIDE, Place.OUTSIDE]
+    assert cross(origin, np.array([[0, 0, 1]] * 2), triangle).place.tolist() == [Place.INSIDE, Place.OUTSIDE]
     origin[:, 1] = 0.0
-    assert classify(origin, np.array([[0, 0, 1]] * 2), triangle).tolist() == [Place.EDGE] * 2
+    assert cross(origin, np.array([[0, 0, 1]] * 2), triangle).place.tolist() == [Place.EDGE] * 2
 
 
 # --- many triangles -------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import CLUSTER, client_of, now_and_then, say, say_json, warnings_told
+from wrt.cli.common import CLUSTER, client_of, now_and_then, say, say_json, warnings_reported
 from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
 
@@ -18,7 +18,7 @@ MESHES = click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
 
 
 @dataclass(frozen=True)
-class Telling:
+class Reporting:
     """output: a report's file or folder (None: none); cluster: a Dask scheduler's address; quiet: no progress; as_json: JSON, not
     text."""
 
@@ -56,7 +56,7 @@ class Telling:
             raise SystemExit(exit_code(interrupted))
 
 
-def telling(report: str | None, *, cluster: bool = False, quiet: str = "No progress, no warnings") -> Callable[[Any], Any]:
+def reporting(report: str | None, *, cluster: bool = False, quiet: str = "No progress, no warnings") -> Callable[[Any], Any]:
     """A command with these options, which it gets as one argument, `how`. report: help of -o (None: no such option)."""
     options = [click.option("--json", "as_json", is_flag=True, help="Print as JSON"),
                click.option("-q", "--quiet", is_flag=True, help=quiet)]
@@ -65,16 +65,16 @@ def telling(report: str | None, *, cluster: bool = False, quiet: str = "No progr
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
-        def told(**given: Any) -> None:
+        def reported(**given: Any) -> None:
             how = {name: given.pop(name) for name in ("output", "cluster", "quiet", "as_json") if name in given}
-            command(how=Telling(**how), **given)
+            command(how=Reporting(**how), **given)
 
-        return functools.reduce(lambda wrapped, option: option(wrapped), options, told)
+        return functools.reduce(lambda wrapped, option: option(wrapped), options, reported)
 
     return decorate
 
 
-def measure(how: Telling, study: Any, options: dict[str, Any]) -> None:
+def measure(how: Reporting, study: Any, options: dict[str, Any]) -> None:
     """Run a study of wrt.lab.bench, each mesh on one worker where there is a cluster. study: the module, with Plan, run, machine,
     line, text and data; one with PLOTS writes a folder (write_report), else its text is a Markdown file."""
     from wrt.lab.bench.report import check_folder
@@ -91,7 +91,7 @@ def measure(how: Telling, study: Any, options: dict[str, Any]) -> None:
         from wrt.renderer.distributed.dask import machines
 
         machine = f"a cluster, each mesh on one worker: {machines(client)}; started from {machine}"
-    with warnings_told(how.quiet):
+    with warnings_reported(how.quiet):
         rows = by_mesh(study.run, plan, lambda row: how.progress(study.line(row)), client)
     text, data, paths = study.text(rows, machine), {"machine": machine, **study.data(rows)}, []
     if plots is None:
