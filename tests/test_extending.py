@@ -14,7 +14,6 @@ from tests.data import ROOT
 BLOCK = re.compile(r"^```(python|diff)\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 TRY_IT = """
-from pathlib import Path
 import numpy as np, stored_normal, wrt
 from wrt.lab.rtcore.instructions import triangle_unit
 from wrt.scene.shapes import icosphere
@@ -56,23 +55,6 @@ assert np.array_equal(again.prim_id, brute.prim_id)
 sign = wrt.render("sign.toml", threads=2).pixels[:, 16, 0]
 slope = np.tan(np.radians(20.0)) * (1.0 - (2.0 * np.arange(32) + 1.0) / 32.0)
 assert np.allclose(sign, 0.5 * 0.5 * (1.0 - slope / np.sqrt(1.0 + slope**2)), atol=1e-3)
-
-# A pyramid, whose base is a polygon of four corners.
-Path("house.off").write_text("OFF\\n5 5 0\\n0 0 0\\n1 0 0\\n1 1 0\\n0 1 0\\n.5 .5 1\\n"
-                             "4 0 3 2 1\\n3 0 1 4\\n3 1 2 4\\n3 2 3 4\\n3 3 0 4\\n")
-Path("broken.off").write_text("OFF\\n3 1 0\\n0 0 0\\n1 0 0\\n0 1 0\\n3 0 1 7\\n")
-from wrt.io.mesh_file import MESH_FORMATS, load_mesh, register_mesh_format
-register_mesh_format(".offtoo", lambda path: MESH_FORMATS[".off"](path))
-Path("house.offtoo").write_bytes(Path("house.off").read_bytes())
-for name in ("house.off", "house.offtoo"):
-    house = load_mesh(name)
-    assert len(house.vertices) == 5 and len(house.faces) == 6
-    assert len(wrt.load_scene(name).objects) == 1
-try:
-    load_mesh("broken.off")
-    raise AssertionError
-except wrt.InputError as error:
-    assert str(error) == "broken.off: a face has a corner that is none of the 3 vertices"
 
 # Kinds from outside: a beam on a floor of albedo 0.5, half a unit wide; behind the floor's edge the ground; the sky lights it all.
 import beam, horizon
@@ -182,4 +164,39 @@ def test_the_text_can_be_followed(tmp_path: Path) -> None:
     assert python(tmp_path, "-c", TRY_IT).endswith("all of it works\n")
     python(tmp_path, "-m", "wrt", "render", "sign.toml", "-q", "--accel", "runs", "-o", "sign.png")
     assert (tmp_path / "sign.png").exists()
-    assert ".off, .ply" in python(tmp_path, "-m", "wrt", "render", "--help")
+
+
+PYRAMID = "OFF\n5 5 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n.5 .5 1\n4 0 3 2 1\n3 0 1 4\n3 1 2 4\n3 2 3 4\n3 3 0 4\n"
+READ_IT = """
+import wrt
+from wrt.io.mesh_file import MESH_FORMATS, load_mesh, register_mesh_format
+
+register_mesh_format(".pyramid", lambda path: MESH_FORMATS[".off"](path))
+for name in ("a.off", "a.pyramid"):
+    mesh = load_mesh(name)
+    assert len(mesh.vertices) == 5 and len(mesh.faces) == 6
+    assert len(wrt.load_scene(name).objects) == 1
+try:
+    load_mesh("broken.off")
+    raise AssertionError("it was read")
+except wrt.InputError as error:
+    assert str(error) == "broken.off: a face has a corner that is none of the 5 vertices"
+try:
+    load_mesh("a.obj2")
+    raise AssertionError("it was read")
+except wrt.InputError as error:
+    assert "known are .obj, .off, .ply, .stl, .pyramid" in str(error)
+print("all of it works")
+"""
+
+
+def test_a_mesh_format_is_one_file(tmp_path: Path) -> None:
+    name = "wrt/io/meshes/off.py"
+    for folder in ("wrt", "kernels"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / name).write_text(next(body for _, path, body in BLOCK.findall((ROOT / "docs" / "extending.md").read_text())
+                                      if path == name))
+    for file, text in (("a.off", PYRAMID), ("a.pyramid", PYRAMID), ("broken.off", PYRAMID.replace("3 3 0 4", "3 3 0 7"))):
+        (tmp_path / file).write_text(text)
+    assert python(tmp_path, "-W", "ignore", "-c", READ_IT).endswith("all of it works\n")
+    assert "or a mesh: .obj, .off, .ply, .stl" in " ".join(python(tmp_path, "-m", "wrt", "render", "--help").split())
