@@ -32,15 +32,15 @@ from wrt.core.interrupts import exit_code
 @click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
 @click.option("--json", "as_json", is_flag=True, help="Print what each frame took as JSON")
-def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: float, rebuild_at: float,
-            given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool, **options: Any) -> None:
+def animate(scene: Path, output: Path, fps: float, given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool,
+            **options: Any) -> None:
     """A turntable of SCENE, or its motion (`motion` and `morph` of TOML scenes), frame by frame."""
     from wrt.renderer import animate as animation
     from wrt.renderer.options import Options
 
     if not 0.1 <= fps <= 100.0:
         raise InputError(f"fps must be 0.1 to 100, got {fps:g}")
-    plan = animation.Animation(frames, degrees, rebuild_at)
+    plan = animation.Animation(*(options.pop(name) for name in ("frames", "degrees", "rebuild_at")))
     settings = settings_of(given, {name: options.pop(name) for name in ("spp", "size")})
     rendering = Options(**options)
     target = animation.check_output(output)
@@ -56,11 +56,11 @@ def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: 
             rows.append(row)
             visibly_cut = max(visibly_cut, film.stats["visibly_cut"])
             if target.is_dir():
-                film.save(animation.frame_path(target, row["number"], frames))
+                film.save(animation.frame_path(target, row["number"], plan.frames))
             else:
                 pictures.append(film.to_srgb8())
             if not quiet:
-                say(f"frame {row['number'] + 1} of {frames}: {row['structure']} in {row['seconds']:.3f} s,"
+                say(f"frame {row['number'] + 1} of {plan.frames}: {row['structure']} in {row['seconds']:.3f} s,"
                     f" traced in {row['trace']:.2f} s")
     if pictures:
         animation.save_movie(target, pictures, fps)
@@ -71,6 +71,6 @@ def animate(scene: Path, output: Path, frames: int, degrees: float | None, fps: 
     hint = depth_hint(visibly_cut, loaded.settings.max_depth, "--set max_depth")
     if hint and not quiet:
         say(hint)
-    if len(rows) < frames:
-        say(f"interrupted after {len(rows)} of {frames} frames")
+    if len(rows) < plan.frames:
+        say(f"interrupted after {len(rows)} of {plan.frames} frames")
         raise SystemExit(exit_code(signal))
