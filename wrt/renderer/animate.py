@@ -55,7 +55,7 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
     if moves(scene):
         options = replace(options, instancing="never")
     renderer = Renderer(scene_at(scene, 0.0), options)
-    start, middle = renderer.camera, np.mean(scene.bounds(), axis=0)
+    start, middle = renderer.prepared.plan.camera, np.mean(scene.bounds(), axis=0)
     done = {"structure": "built", "seconds": renderer.accel.stats.build_seconds, "growth": 1.0}
     for frame in range(animation.frames):
         time = frame / animation.frames

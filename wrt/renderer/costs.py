@@ -66,8 +66,7 @@ class CostCounter:
         data.recorder = recorder
         accel = self.prepared.plan.structure.struct()
         accel.accel, accel.log = data, log
-        (arguments,) = self.prepared.render_arguments(film, accel)
-        self.prepared.launch(self.prepared.kernels[0], arguments, Work(rectangle, 0, self.prepared.plan.scene.settings.spp))
+        self.prepared.launch(film, accel)(Work(rectangle, 0, self.prepared.plan.scene.settings.spp))
 
     def zeros(self, n: int, dtype: Any) -> Any:
         return wp.zeros(n, dtype=dtype, device=self.prepared.device)

@@ -66,19 +66,25 @@ class Prepared:
         side = max(x1 - x0, y1 - y0) if self.device.is_cuda else self.plan.options.tile_size or TILE_SIZE
         return tiles(self.plan.crop, side)
 
-    def render_arguments(self, film: DeviceFilm, accel: Any = None) -> list[list[Any]]:
-        """Of the render kernel, for each group of the film; accel: the structure's record, where it is not the structure's own."""
-        world = [self.accel.data if accel is None else accel, self.arrays.surfaces, self.arrays.lighting, self.camera]
-        return [[*world, self.plan.limits(seed), group] for seed, group in zip(film.seeds, film.groups, strict=True)]
+    def launch(self, film: DeviceFilm | AovFilm, accel: Any = None) -> Callable[[Work], int]:
+        """A function that traces some work into the film, and gives its samples. accel: a record in place of the structure's."""
+        accel = self.accel.data if accel is None else accel
+        if isinstance(film, AovFilm):
+            kernel, groups = self.kernels[1], [[accel, self.arrays.surfaces, self.camera, film.struct]]
+        else:
+            world = [accel, self.arrays.surfaces, self.arrays.lighting, self.camera]
+            kernel, groups = self.kernels[0], [[*world, self.plan.limits(seed), group]
+                                               for seed, group in zip(film.seeds, film.groups, strict=True)]
 
-    def aov_arguments(self, film: AovFilm) -> list[Any]:
-        return [self.accel.data, self.arrays.surfaces, self.camera, film.struct]
+        def trace(work: Work) -> int:
+            tile = structs.Tile()
+            tile.x, tile.y, tile.width, height = work.rectangle
+            tile.first_sample, tile.n_samples = work.first, work.n
+            for arguments in groups:
+                wp.launch(kernel, dim=tile.width * height, inputs=[*arguments, tile], device=self.device)
+            return work.total
 
-    def launch(self, kernel: Any, arguments: list[Any], work: Work) -> None:
-        tile = structs.Tile()
-        tile.x, tile.y, tile.width, height = work.rectangle
-        tile.first_sample, tile.n_samples = work.first, work.n
-        wp.launch(kernel, dim=tile.width * height, inputs=[*arguments, tile], device=self.device)
+        return trace
 
     # --- what a worker is asked for (wrt.renderer.distributed) ---
 
@@ -92,14 +98,13 @@ class Prepared:
         film = DeviceFilm(self.plan.scene.settings, corners(work.rectangle), self.device, seed, self.plan.groups)
         for (_, array), values in zip(film.arrays(), state or (), strict=False):
             film.put(array, values)
-        for arguments in self.render_arguments(film):
-            self.launch(self.kernels[0], arguments, work)
+        self.launch(film)(work)
         return [film.picture(array) for _, array in film.arrays()]
 
-    def aov_tile(self, rectangle: Rectangle) -> list[np.ndarray]:
+    def aov_tile(self, work: Work) -> list[np.ndarray]:
         """The AOVs that were asked for, in their order, of a rectangle."""
-        film = AovFilm(self.plan.scene.settings, corners(rectangle), self.device)
-        self.launch(self.kernels[1], self.aov_arguments(film), Work(rectangle, 0, 1))
+        film = AovFilm(self.plan.scene.settings, corners(work.rectangle), self.device)
+        self.launch(film)(work)
         return [film.picture(name) for name in self.plan.options.aov]
 
 

@@ -38,14 +38,6 @@ class Renderer:
         self.prepared = prepare(plan, device)
 
     @property
-    def scene(self) -> Scene:
-        return self.prepared.plan.scene
-
-    @property
-    def camera(self) -> Camera:
-        return self.prepared.plan.camera
-
-    @property
     def accel(self) -> Accelerator:
         return self.prepared.accel
 

@@ -32,29 +32,25 @@ Steps = Generator[tuple[int, bool], None, None]
 class Tracer(Protocol):
     """Who traces the tiles of a run: threads of this process, or others (wrt.renderer.distributed).
 
-    seconds: of making the scene ready. `trace` and `trace_aovs` give a step every tenth of a second or so, and one in the end;
-    where `due()` is true, one in which no tile runs. Closed early, they end the tiles that run and begin no others.
+    device: of the film; seconds: of making the scene ready; facts: counts of it and its structure. `trace` gives a step every
+    tenth of a second or so, and one in the end; where `due()` is true, one in which no tile runs. Closed early, it lets the tiles
+    that run end and begins no others.
     """
 
     @property
     def plan(self) -> Plan: ...
 
     @property
-    def device(self) -> Any:
-        """Of the film."""
+    def device(self) -> Any: ...
 
     @property
     def seconds(self) -> Mapping[str, float]: ...
 
-    def facts(self) -> dict[str, Any]:
-        """Counts of the scene and its structure."""
-        ...
+    def facts(self) -> dict[str, Any]: ...
 
     def tiles(self) -> Iterable[Rectangle]: ...
 
-    def trace(self, film: DeviceFilm, work: list[Work], due: Callable[[], bool]) -> Steps: ...
-
-    def trace_aovs(self, film: AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps: ...
+    def trace(self, film: DeviceFilm | AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps: ...
 
 
 class LocalTracer:
@@ -64,26 +60,8 @@ class LocalTracer:
         self.prepared, self.plan, self.device, self.seconds = prepared, prepared.plan, prepared.device, prepared.seconds
         self.facts, self.tiles = prepared.facts, prepared.tiles
 
-    def trace(self, film: DeviceFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
-        groups = self.prepared.render_arguments(film)
-
-        def trace(job: Work) -> int:
-            for arguments in groups:
-                self.prepared.launch(self.prepared.kernels[0], arguments, job)
-            return job.total
-
-        return self._steps(work, trace, due)
-
-    def trace_aovs(self, film: AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
-        arguments = self.prepared.aov_arguments(film)
-
-        def trace(job: Work) -> int:
-            self.prepared.launch(self.prepared.kernels[1], arguments, job)
-            return job.total
-
-        return self._steps(work, trace, due)
-
-    def _steps(self, work: list[Work], trace: Callable[[Work], int], due: Callable[[], bool]) -> Steps:
+    def trace(self, film: DeviceFilm | AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
+        trace = self.prepared.launch(film)
         if self.device.is_cuda:
             done = sum(trace(job) for job in work)
             wp.synchronize_device(self.device)
@@ -232,21 +210,21 @@ class Run:
         if first < self.passes.most:  # of a resumed render
             samples = self.arrays.view(self.arrays.groups[0].samples)
             work, before = work_left(work, samples, self.plan.crop), int(samples.sum(dtype=np.int64))
-        self._follow(self.tracer.trace(self.arrays, work, self._due), work, lambda done: self._report(before + done))
+        self._follow(self.arrays, work, lambda done: self._report(before + done))
 
     def _take_aovs(self) -> None:
         arrays = AovFilm(self.plan.scene.settings, self.plan.crop, self.tracer.device)
         work = [Work(tile, 0, 1) for tile in self.tracer.tiles()]
-        self._follow(self.tracer.trace_aovs(arrays, work, self._due), work, lambda done: None)
+        self._follow(arrays, work, lambda done: None)
         self.aov = {name: arrays.picture(name) for name in self.plan.options.aov}
 
-    def _follow(self, steps: Steps, work: list[Work], report: Callable[[int], None]) -> None:
-        """Save and report while tiles are traced. KeyboardInterrupt where Ctrl-C came: tiles that run come to their end, so that
+    def _follow(self, film: DeviceFilm | AovFilm, work: list[Work], report: Callable[[int], None]) -> None:
+        """Trace, save and report. KeyboardInterrupt where Ctrl-C came: tiles that run come to their end, so that
         a pixel is never half done."""
         total = sum(job.total for job in work)
-        with closing(steps):
-            if self.interrupts:
-                raise KeyboardInterrupt
+        if self.interrupts:
+            raise KeyboardInterrupt
+        with closing(self.tracer.trace(film, work, self._due)) as steps:
             for done, at_rest in steps:
                 if self.checkpoint is not None and at_rest and self.checkpoint.due():
                     self.checkpoint.save(self.arrays, self._elapsed())

@@ -85,7 +85,7 @@ def files(path: Path) -> list[str]:
 ], ids=str)
 def test_a_resumed_render_is_that_of_one_go(first: dict[str, Any], then: dict[str, Any], path: Path, whole: Film,
                                             monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(LocalTracer, "_steps", slowly(LocalTracer._steps))
+    monkeypatch.setattr(LocalTracer, "trace", slowly(LocalTracer.trace))
     part = render(SCENE, checkpoint=path, progress=stop_at(0.3), aov="depth", **first)
     assert part.stats["interrupted"] and part.stats["checkpoint"] == str(path) and part.stats["resumed"] is None
     assert 0 < part.stats["samples"] < whole.stats["samples"] and files(path) == [path.name]
@@ -98,20 +98,20 @@ def test_a_resumed_render_is_that_of_one_go(first: dict[str, Any], then: dict[st
     assert again.stats["seconds"]["trace"] > saved.seconds and read(path).samples == (24, 24)
 
 
-def slowly(steps: Any) -> Any:
-    """LocalTracer._steps with a step after a tile or two, not after tenths of a second: an interruption falls within a pass."""
+def slowly(trace: Any) -> Any:
+    """LocalTracer.trace with a step after a tile or two, not after tenths of a second: an interruption falls within a pass."""
 
-    def traced(self: LocalTracer, work: list[Any], trace: Any, due: Any) -> Steps:
+    def traced(self: LocalTracer, film: Any, work: list[Any], due: Any) -> Steps:
         done = 0
         for i in range(0, len(work), 3):
-            yield from ((done + n, at_rest) for n, at_rest in steps(self, work[i : i + 3], trace, due))
+            yield from ((done + n, at_rest) for n, at_rest in trace(self, film, work[i : i + 3], due))
             done += sum(job.total for job in work[i : i + 3])
 
     return traced
 
 
 def test_an_interruption_within_a_pass_leaves_differing_pixels(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(LocalTracer, "_steps", slowly(LocalTracer._steps))  # what the test above rests on
+    monkeypatch.setattr(LocalTracer, "trace", slowly(LocalTracer.trace))  # what the test above rests on
     part = render(SCENE, checkpoint=path, progress=stop_at(0.3), pass_size=24, tile_size=4)
     assert set(np.unique(part.samples)) == {0, 24} and read(path).samples == (0, 24)
 
@@ -125,7 +125,7 @@ def test_many_resumes_with_a_target_error(path: Path, monkeypatch: pytest.Monkey
     options: dict[str, Any] = {"target_error": 0.012, "tile_size": 8}
     expected = render(SCENE, **options)
     assert expected.stats["target_reached"] and expected.metadata["spp"] > 8
-    monkeypatch.setattr(LocalTracer, "_steps", slowly(LocalTracer._steps))
+    monkeypatch.setattr(LocalTracer, "trace", slowly(LocalTracer.trace))
     shares = iter((0.05, 0.1, 0.4))
     film = render(SCENE, checkpoint=path, progress=stop_at(next(shares)), **options)
     while film.stats["interrupted"]:
@@ -329,7 +329,7 @@ def test_a_disk_that_fills_up_costs_neither_the_render_nor_the_last_checkpoint(p
             raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(module.os, "fsync", sometimes)
-    monkeypatch.setattr(LocalTracer, "_steps", slowly(LocalTracer._steps))
+    monkeypatch.setattr(LocalTracer, "trace", slowly(LocalTracer.trace))
     film = render(SCENE, checkpoint=path, checkpoint_every=1e-9, aov="depth", progress=told.append)
     notes = {progress.note for progress in told}
     assert same(film, whole) and notes == {"", f"{path}: the checkpoint cannot be written: No space left on device"}

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from typing import Any
@@ -75,40 +75,29 @@ class DistributedRenderer:
         side = math.ceil(math.sqrt(self.plan.area / (TILES_EACH * self.workers.slots())))
         return tiles(self.plan.crop, self.plan.options.tile_size or min(max(side, low), high))
 
-    def trace(self, film: DeviceFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
-        views = [film.view(array) for _, array in film.arrays()]
-        jobs = (("trace_tile", job, film.seed, [view[self._place(job.rectangle)] for view in views] if job.first else None)
-                for job in work)
-
-        def put(job: Job, arrays: Any) -> int:
-            for view, array in zip(views, arrays, strict=True):
-                view[self._place(job[1].rectangle)] = array
-            return int(job[1].total)
-
-        return self._steps(jobs, put)
-
-    def trace_aovs(self, film: AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
-        def put(job: Job, arrays: Any) -> int:
-            for name, array in zip(self.plan.options.aov, arrays, strict=True):
-                film.view(name)[self._place(job[1])] = array
-            return int(job[1][2] * job[1][3])
-
-        return self._steps((("aov_tile", job.rectangle) for job in work), put)
-
-    def _steps(self, jobs: Iterable[Job], put: Callable[[Job, Any], int]) -> Steps:
-        """No pixel of the film is ever half done: `put` writes whole tiles, here. Closed early, tiles that run are given up."""
-        total, due = 0, 0.0
-        running: Generator[tuple[Job, Reply] | None, None, None] = self.workers.run(jobs)
-        with closing(running):
+    def trace(self, film: DeviceFilm | AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
+        """No pixel of the film is ever half done: whole tiles are written to it, here. Closed early, it gives up tiles that run."""
+        jobs: Iterable[Job]
+        if isinstance(film, AovFilm):
+            views = [film.view(name) for name in self.plan.options.aov]
+            jobs = (("aov_tile", part) for part in work)
+        else:
+            views = [film.view(array) for _, array in film.arrays()]
+            jobs = (("trace_tile", part, film.seed, [view[self._place(part.rectangle)] for view in views] if part.first else None)
+                    for part in work)
+        total, next_step = 0, 0.0
+        with closing(self.workers.run(jobs)) as running:
             for done in running:
                 if done is not None:
-                    job, reply = done
+                    (_, part, *_), reply = done
                     _check_kind(reply, self.kind)  # a worker may have come later
                     self.tiles_by[reply[0]] += 1
-                    total += put(job, reply[2])
-                if time.monotonic() >= due:
+                    total += part.total
+                    for view, array in zip(views, reply[2], strict=True):
+                        view[self._place(part.rectangle)] = array
+                if time.monotonic() >= next_step:
                     yield total, True
-                    due = time.monotonic() + STEP_SECONDS
+                    next_step = time.monotonic() + STEP_SECONDS
             yield total, True
 
     def _place(self, rectangle: Rectangle) -> tuple[slice, slice]:
