@@ -19,11 +19,7 @@ def build(mesh: Mesh | structures.Geometry | str | os.PathLike[str], accel: str 
     mesh: a Mesh, a Geometry, or the path of a mesh file. accel: a name in ACCELERATORS. options: `triangle` and
     `box`, the intersection tests, and the structure's own (see its class). Raises InputError that names the argument.
     """
-    if isinstance(mesh, str | os.PathLike):
-        mesh = load_mesh(mesh)
-    if not isinstance(mesh, Mesh | structures.Geometry):
-        raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(mesh)}")
-    return structures.build(mesh, as_one(accel, str, "accel"), as_one(device, str, "device"), threads, **options)
+    return structures.build(_read(mesh), as_one(accel, str, "accel"), as_one(device, str, "device"), threads, **options)
 
 
 def load_accel(path: str | os.PathLike[str], mesh: Mesh | structures.Geometry | str | os.PathLike[str], device: str = "cpu",
@@ -32,8 +28,12 @@ def load_accel(path: str | os.PathLike[str], mesh: Mesh | structures.Geometry | 
 
     Raises InputError for a file that is missing, foreign, damaged, of another version or over another mesh.
     """
+    return structures.load_accel(path, _read(mesh), as_one(device, str, "device"), threads)
+
+
+def _read(mesh: Mesh | structures.Geometry | str | os.PathLike[str]) -> Mesh | structures.Geometry:
     if isinstance(mesh, str | os.PathLike):
-        mesh = load_mesh(mesh)
+        return load_mesh(mesh)
     if not isinstance(mesh, Mesh | structures.Geometry):
         raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(mesh)}")
-    return structures.load_accel(path, mesh, as_one(device, str, "device"), threads)
+    return mesh
