@@ -150,7 +150,7 @@ def damaged_mesh(seed: Seed, other: Seed, rng: Random) -> Seed:
 
 
 def read_mesh(path: Path) -> object:
-    from wrt.scene.mesh import load_mesh
+    from wrt.io.mesh_file import load_mesh
 
     return load_mesh(path)
 
