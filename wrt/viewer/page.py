@@ -174,7 +174,7 @@ class Page:
             toml = gui.add_button("camera as TOML", hint="A table for a scene file")
         png.on_click(self._safe(lambda event: self._save(event.client, ".png")))
         self.exr.on_click(self._safe(lambda event: self._save(event.client, ".exr")))
-        toml.on_click(self._safe(lambda event: self._give_camera(event.client)))
+        toml.on_click(self._safe(lambda event: give_camera(event.client, self.viewer.view.camera)))
 
     def _lens_folder(self, camera: Camera) -> None:
         gui, unit = self.server.gui, self.unit
@@ -234,11 +234,7 @@ class Page:
         self.viewer.change(camera=lambda camera: replace(camera, **fields))
 
     def _clicked(self, event: Any) -> None:
-        if self.by_click.value:
-            self._focus_at(*event.screen_pos)
-
-    def _focus_at(self, x: float, y: float) -> None:
-        distance = self.viewer.focus_at(x, y)
+        distance = self.viewer.focus_at(*event.screen_pos) if self.by_click.value else None
         if distance is not None:
             self.focus.value = distance
             self._set_lens(focus_distance=distance)
@@ -255,16 +251,18 @@ class Page:
         finally:
             self._saving.release()
 
-    def _give_camera(self, client: Any) -> None:
-        if client is None:
-            return
-        text = camera_toml(self.viewer.view.camera)
-        with client.gui.add_modal("Camera") as modal:
-            client.gui.add_markdown(f"```toml\n{text}```")
-            save = client.gui.add_button("save as a file")
-            close = client.gui.add_button("close")
-        save.on_click(lambda event: client.send_file_download("camera.toml", text.encode(), save_immediately=True))
-        close.on_click(lambda event: modal.close())
+
+def give_camera(client: Any, camera: Camera) -> None:
+    """Show a camera to a browser as a table of a scene file."""
+    if client is None:
+        return
+    text = camera_toml(camera)
+    with client.gui.add_modal("Camera") as modal:
+        client.gui.add_markdown(f"```toml\n{text}```")
+        save = client.gui.add_button("save as a file")
+        close = client.gui.add_button("close")
+    save.on_click(lambda event: client.send_file_download("camera.toml", text.encode(), save_immediately=True))
+    close.on_click(lambda event: modal.close())
 
 
 def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
