@@ -12,13 +12,14 @@ from tests.data import data_path
 from tests.kernel_tools import rounded
 from tests.rewalk import PRIMITIVE_BYTES, REWALK, rays
 from wrt.accel import ACCELERATORS, Geometry, Structure, build
+from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import make_closest_hit_kernel
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse import bvh2 as traverse_bvh2
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.counters import Counts, Recorder
 from wrt.lab.rtcore.cubin import read_cubin
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})

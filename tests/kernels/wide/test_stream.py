@@ -13,12 +13,13 @@ from wrt.accel import batches as streams
 from wrt.accel.base import Built, Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.batches import rays_per_launch, stream_kernel
 from wrt.accel.bvh.wide_tree import stack_need
+from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import HitArrays
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.wide.lanes import EMPTY
 from wrt.kernels.wide.traverse import LEAF_RANGE, STACK_SIZE
 from wrt.lab.bench.rays import ray_sets
-from wrt.scene.mesh import Mesh, load_mesh
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 
