@@ -14,6 +14,7 @@ from wrt.accel.build import build
 from wrt.accel.built import Built
 from wrt.accel.bvh.wide_tree import stack_need
 from wrt.accel.geometry import Geometry
+from wrt.accel.rays import rays_on
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.io.mesh_file import load_mesh
@@ -28,13 +29,13 @@ from wrt.scene.shapes import icosphere
 
 def one_by_one(accel, o, d, t_min, t_max):
     """Closest hits and any hits by the kernel for one ray."""
-    rays, _ = accel._rays(np.ascontiguousarray(o, np.float32), np.ascontiguousarray(d, np.float32), t_min, t_max)
+    rays, _ = rays_on(accel.device, np.ascontiguousarray(o, np.float32), np.ascontiguousarray(d, np.float32), t_min, t_max)
     n = len(o)
     hits = HitArrays()
     hits.t, hits.u, hits.v, hits.prim_id = zeros(n), zeros(n), zeros(n), zeros(n, wp.int32)
-    accel._launch(closest_hit_kernel(accel.structure), [accel.data, accel._surfaces, rays, hits], n, 1)
+    streams.launch(closest_hit_kernel(accel.structure), [accel.data, accel._surfaces, rays, hits], n, accel.device, 1)
     dark = zeros(n, wp.bool)
-    accel._launch(any_hit_kernel(accel.structure), [accel.data, accel._surfaces, rays, dark], n, 1)
+    streams.launch(any_hit_kernel(accel.structure), [accel.data, accel._surfaces, rays, dark], n, accel.device, 1)
     return {name: getattr(hits, name).numpy() for name in ("t", "u", "v", "prim_id")}, dark.numpy()
 
 
