@@ -22,6 +22,7 @@ from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.renderer.features import Features, features_of
 from wrt.renderer.renderer import aov_kernel, render_kernel
+from wrt.scene.cameras import CAMERAS
 from wrt.scene.model import Scene
 
 SCENES = sorted((ROOT / "scenes").glob("*.toml"))
@@ -42,6 +43,11 @@ def features(path: Path) -> set[Features]:
 @pytest.mark.parametrize("name", Features().switches())
 def test_every_feature_has_a_scene_that_needs_it(name: str) -> None:
     assert any(getattr(f, name) for path in SCENES for f in features(path)), f"no scene in scenes/ needs {name}"
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_every_kind_of_camera_has_a_scene(kind: str) -> None:
+    assert any(isinstance(camera, CAMERAS[kind]) for path in SCENES for camera in load(path).cameras)
 
 
 @pytest.mark.parametrize("name", Features().switches())

@@ -61,10 +61,10 @@ def as_scene(value: Scene | Mesh | str | os.PathLike[str]) -> Scene:
 
 def schema() -> dict[str, Any]:
     """The JSON Schema (draft 2020-12) of TOML scene files."""
-    from wrt.io.toml.schema import SceneTable
+    from wrt.io.toml.schema import scene_table
 
     dialect = "https://json-schema.org/draft/2020-12/schema"
-    return {"$schema": dialect, **SceneTable.model_json_schema(), "title": "wrt scene"}
+    return {"$schema": dialect, **scene_table().model_json_schema(), "title": "wrt scene"}
 
 
 def _load_toml(path: Path) -> Scene:

@@ -21,7 +21,7 @@ from wrt.picture.film import Film
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
 from wrt.renderer.upload import upload_scene
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.motion import moves, scene_at
 from wrt.scene.values import as_number
@@ -76,7 +76,7 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
             return
 
 
-def orbited(camera: Camera, middle: np.ndarray, degrees: float) -> Camera:
+def orbited(camera: CameraKind, middle: np.ndarray, degrees: float) -> CameraKind:
     """The camera turned about the vertical axis (+y) through the point of its line of view that is nearest to `middle` (3,)."""
     if degrees == 0.0:
         return camera

@@ -11,7 +11,7 @@ import numpy as np
 
 from wrt.renderer.instancing import instanced_meshes
 from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.model import Scene
@@ -23,12 +23,14 @@ STACK_STEP = 16
 class Features:
     """Everything that changes the code of a kernel; what is False leaves no trace in it.
 
-    lens, blades, filter: the camera's; independent: the samples are random numbers; instances, spheres, smooth, textures,
-    checkerboards, normal_maps, cutout, blend: the surfaces'; mirror .. rough: the materials'; lights .. tinted_shadows: the
-    lighting; derived: reflection, refraction, transmission, transparent_shadows, sky_light, highlight. stack_size: room for
-    the rays that can be pending, in whole STACK_STEPs, so that neighbouring depths share a kernel.
+    camera: the module of its device function; lens, blades, filter: the camera's; independent: the samples are random
+    numbers; instances, spheres, smooth, textures, checkerboards, normal_maps, cutout, blend: the surfaces'; mirror .. rough:
+    the materials'; lights .. tinted_shadows: the lighting; derived: reflection, refraction, transmission,
+    transparent_shadows, sky_light, highlight. stack_size: room for the rays that can be pending, in whole STACK_STEPs, so that
+    neighbouring depths share a kernel.
     """
 
+    camera: str = Camera.device
     lens: bool = False
     blades: bool = False
     filter: bool = False
@@ -70,7 +72,7 @@ class Features:
 
     def switches(self) -> dict[str, bool]:
         """Every on/off feature by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "stack_size"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if isinstance(f.default, bool)}
 
 
 def mesh_lights(scene: Scene) -> bool:
@@ -81,7 +83,7 @@ def is_rough(material: Material) -> bool:
     return material.roughness > 0.01 and material.kind in ("conductor", "glass", "metallic_roughness")
 
 
-def features_of(scene: Scene, camera: Camera, instancing: str = "auto") -> Features:
+def features_of(scene: Scene, camera: CameraKind, instancing: str = "auto") -> Features:
     """The features that this scene needs through this camera, with its settings."""
     settings, materials = scene.settings, scene.materials
     textures = [texture for material in materials for texture in material.textures]
@@ -111,8 +113,8 @@ def features_of(scene: Scene, camera: Camera, instancing: str = "auto") -> Featu
     # straight on through a blended surface takes no level: it waits below its siblings, until they are done.
     pending = (children - 1) * (settings.max_depth + 1) + 1
     return Features(
-        lens=camera.aperture_radius > 0.0,
-        blades=camera.aperture_radius > 0.0 and camera.blades > 0,
+        camera=camera.device,
+        **camera.switches(),
         filter=settings.filter != "box",
         independent=settings.sampler == "independent",
         instances=bool(instanced_meshes(scene, instancing)),
@@ -183,7 +185,7 @@ def describe(scene: Scene, camera: str | int | None = None) -> dict[str, Any]:
         "lights": [f"{light.name or i} ({type(light).__name__})" for i, light in enumerate(scene.lights)],
         "emissive_objects": sum(any(m.lights_others for m in o.materials) for o in scene.objects),
         "background": type(scene.background).__name__,
-        "cameras": [c.name or str(i) for i, c in enumerate(scene.cameras)],
+        "cameras": [f"{c.name or i} ({c.kind})" for i, c in enumerate(scene.cameras)],
         "size": "{}x{}".format(*scene.settings.size),
         "spp": scene.settings.spp,
         "bounds_low": low,

@@ -38,8 +38,8 @@ from wrt.renderer.memory_estimate import bytes_of_scene
 from wrt.renderer.options import AOVS as AOVS
 from wrt.renderer.options import OPTIONS, Options, Progress
 from wrt.renderer.tiles import Rectangle, Work, corners, tiles, work_left
-from wrt.renderer.upload import camera_struct, upload_scene
-from wrt.scene.cameras import Camera
+from wrt.renderer.upload import camera_kind, camera_struct, upload_scene
+from wrt.scene.cameras import CameraKind
 from wrt.scene.digest import camera_digest, scene_digest
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
@@ -92,12 +92,12 @@ def renderer_of(scene: Scene, options: Options) -> Renderer:
 
 @made_once
 def render_kernel(features: Features, structure: Structure) -> Any:
-    return kernels.make_render_kernel(features, structure)
+    return kernels.make_render_kernel(features, structure, camera_kind(features.camera))
 
 
 @made_once
 def aov_kernel(features: Features, structure: Structure) -> Any:
-    return kernels.make_aov_kernel(features, structure)
+    return kernels.make_aov_kernel(features, structure, camera_kind(features.camera))
 
 
 def kernel_hash(kernel: Any, device: str) -> str:
@@ -116,7 +116,7 @@ class Renderer:
         self.interrupts: list[int] = []
         self.fraction_built = 0.0
         self.device = self._film_device()
-        self.camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
+        self.camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
         self.features = features_of(scene, self.camera, options.instancing)
         self.deepest = scene.settings.max_depth
         self.groups = 1 if options.target_error is None else GROUPS
@@ -219,15 +219,16 @@ class Renderer:
         self.accel = build(self.device_scene.world.geometry, self.options.accel, self.options.device, self.threads, **options)
         self.spans = {"upload": [(begin, uploaded)], "build": [(uploaded, time.perf_counter())]}
 
-    def aim(self, camera: Camera, **settings: Any) -> None:
+    def aim(self, camera: CameraKind, **settings: Any) -> None:
         """Another camera and other settings (of AIMED) for the next `run`, with the same kernel and structure.
 
-        Raises InputError for what the kernel was not made for: an aperture where there was a pinhole, more bounces.
+        Raises InputError for what the kernel was not made for: another kind of camera, a lens where there
+        was a pinhole, more bounces.
         """
         scene = self.scene.with_settings(**settings)
         lacks = [name for name, needed, there in (
-            ("an aperture", camera.aperture_radius > 0.0, self.features.lens),
-            ("an aperture with blades", camera.aperture_radius > 0.0 and camera.blades > 0, self.features.blades),
+            (f"a camera of the kind {camera.kind}", camera.device != self.features.camera, False),
+            *((f"a camera's {name}", needed, getattr(self.features, name)) for name, needed in camera.switches().items()),
             ("so many bounces", scene.settings.max_depth > self.deepest, False),
             ("other settings than " + ", ".join(AIMED), bool(settings.keys() - AIMED), False),
             ("a checkpoint", self.checkpoint is not None, False)) if needed and not there]

@@ -11,7 +11,7 @@ import numpy as np
 from wrt.core.errors import InputError
 from wrt.scene import model as scenes
 from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CAMERAS
 from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.mesh import Mesh
@@ -19,7 +19,7 @@ from wrt.scene.model import Object, Scene
 from wrt.scene.settings import Settings
 
 KINDS = {kind.__name__: kind for kind in (
-    Scene, Settings, Camera, Object, Mesh, scenes.Sphere, Material, Texture, Checkerboard,
+    Scene, Settings, Object, Mesh, scenes.Sphere, Material, Texture, Checkerboard,
     PointLight, DirectionalLight, SpotLight, ConstantBackground, GradientBackground,
     EnvironmentBackground)}
 LEFT_OUT: dict[type, tuple[str, ...]] = {Object: ("motion",)}  # a picture shows the object without
@@ -36,6 +36,7 @@ def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
     """The scene, bit for bit, with what was shared shared again; its arrays are those given. Raises InputError where the text
     is not of `pack`. Values are not checked again: a camera's pose would be rounded once more."""
     things: list[Any] = []
+    kinds = KINDS | {kind.__name__: kind for kind in CAMERAS.values()}
 
     def value(plain: Any) -> Any:
         if not isinstance(plain, dict):
@@ -47,8 +48,9 @@ def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
 
     try:
         for name, content in json.loads(text):
-            thing = object.__new__(KINDS[name])
-            for each in fields(KINDS[name]):
+            kind = kinds[name]
+            thing = object.__new__(kind)
+            for each in fields(kind):
                 object.__setattr__(thing, each.name, value(content[each.name]))
             things.append(thing)
         if not isinstance(things[-1], Scene):

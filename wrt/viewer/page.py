@@ -21,7 +21,7 @@ from wrt.picture.film import Film
 from wrt.picture.heatmap import colors, short
 from wrt.picture.image import encode_png
 from wrt.renderer.options import Options
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import TONEMAPS
 from wrt.viewer.access import access_for
@@ -102,12 +102,12 @@ class Page:
 
     # --- the viewport -------------------------------------------------------------------------------------------------
 
-    def _place_camera(self, camera: Camera, target: np.ndarray) -> None:
+    def _place_camera(self, camera: CameraKind, target: np.ndarray) -> None:
         self.server.scene.set_up_direction(tuple(up_of(camera)))
         start = self.server.initial_camera
         start.position = tuple(camera.camera_to_world[:3, 3] / self.unit)
         start.look_at = tuple(target / self.unit)
-        start.fov = camera.fov_y
+        start.fov = (camera if isinstance(camera, Camera) else Camera()).fov_y
 
     async def _connected(self, client: Any) -> None:
         client.camera.on_update(self._moved)
@@ -155,11 +155,12 @@ class Page:
 
     # --- the panel ----------------------------------------------------------------------------------------------------
 
-    def _panel(self, camera: Camera) -> None:
+    def _panel(self, camera: CameraKind) -> None:
         gui = self.server.gui
         self.status = gui.add_markdown("waiting for the first picture")
         self.doing = gui.add_markdown("", visible=False)
-        self._lens_folder(camera)
+        if isinstance(camera, Camera):
+            self._lens_folder(camera)
         with gui.add_folder("Light"):
             depth = gui.add_slider("bounces", 0, self.viewer.deepest, 1, self.viewer.view.max_depth, hint="After the first hit")
             accel = gui.add_dropdown("structure", tuple(ACCELERATORS), initial_value=self.viewer.view.accel,

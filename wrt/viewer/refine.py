@@ -20,10 +20,11 @@ from wrt.picture.film import Film
 from wrt.picture.heatmap import colored, top_of
 from wrt.picture.tonemap import to_codes
 from wrt.renderer.options import Options, Progress
+from wrt.renderer.pixel_rays import film_rays
 from wrt.renderer.progress import COMPILING
 from wrt.renderer.renderer import Renderer
 from wrt.renderer.upload import camera_struct
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 from wrt.scene.digest import camera_digest
 from wrt.scene.model import Scene
 
@@ -41,7 +42,7 @@ class View:
     """What is asked for. size: (width, height) in pixels when it is fine; accel: a name in ACCELERATORS; cost: "" for the
     picture, or a counter of COUNTERS, of which a heat map is made."""
 
-    camera: Camera
+    camera: CameraKind
     size: tuple[int, int]
     max_depth: int
     accel: str
@@ -93,7 +94,7 @@ class Viewer:
                  tell: Callable[[str], None] = lambda text: None, spp: int = 1024) -> None:
         self.scene, self.options, self.show, self.tell, self.spp = scene, options, show, tell, spp
         settings = scene.settings
-        camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
+        camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
         self.deepest = max(settings.max_depth, DEEPEST)
         self.view = View(camera, settings.size, settings.max_depth, options.accel)
         self.exposure, self.tonemap = settings.exposure, settings.tonemap
@@ -159,15 +160,13 @@ class Viewer:
     def focus_at(self, x: float, y: float) -> float | None:
         """The distance, along the axis, of what stands at a place of the picture (0 to 1 from its top left corner): what a
         camera must focus on to see it sharp. None where there is nothing, or nothing was built yet."""
-        camera, (width, height) = self.view.camera, self.view.size
+        camera, size = self.view.camera, self.view.size
         renderer = self._renderers.get(self.view.accel)
         if renderer is None:
             return None
-        tangent = np.tan(0.5 * camera.fov_y)
-        toward = np.array([(2.0 * x - 1.0) * tangent * width / height, (1.0 - 2.0 * y) * tangent, -1.0])
-        pose = camera.camera_to_world
-        hits = renderer.accel.closest_hit(pose[None, :3, 3].astype(np.float32), (pose[:3, :3] @ toward)[None].astype(np.float32))
-        return float(hits.t[0]) if hits.prim_id[0] >= 0 else None
+        origins, directions = film_rays(camera, size, np.array([[x, y]]))
+        hits = renderer.accel.closest_hit(origins, directions)
+        return float(hits.t[0] * (directions[0] @ -camera.camera_to_world[:3, 2])) if hits.prim_id[0] >= 0 else None
 
     def structure(self, accel: str) -> str:
         """A structure in a few words."""
@@ -230,9 +229,9 @@ class Viewer:
         """Make the renderer that the view needs, if there is none; whether there is one then."""
         try:
             if view.accel not in self._renderers:
-                camera = replace(view.camera, aperture_radius=view.camera.aperture_radius or 1.0)  # compiles the lens
                 scene = self.scene.with_settings(max_depth=self.deepest)
-                options = replace(self.options, accel=view.accel, camera=camera, tile_size=TILE_SIZE, progress=self._report)
+                options = replace(self.options, accel=view.accel, camera=view.camera.opened(), tile_size=TILE_SIZE,
+                                  progress=self._report)
                 self._renderers[view.accel] = Renderer(scene, options)
             if view.cost and view.accel not in self._counters:
                 self._counters[view.accel] = CostCounter(self._renderers[view.accel])

@@ -51,6 +51,13 @@ sensor_height = 0.024
 f_number = 2
 blades = 7
 
+[cameras.plan]
+type = "orthographic"
+position = [0, 9, 0]
+target = [0, 0, 0]
+up = [0, 0, -1]
+height = 8
+
 [background]
 type = "gradient"
 bottom = [0.5, 0.45, 0.4]

@@ -31,11 +31,11 @@ def check(data: dict[str, Any], path: Path) -> SceneTable:
     """The file's tables as models. Raises one InputError that lists everything that is wrong."""
     from pydantic import ValidationError
 
-    from wrt.io.toml.schema import SceneTable
+    from wrt.io.toml.schema import scene_table
 
     known_keys: dict[int, list[str]] = {}
     try:
-        return SceneTable.model_validate(data, context=known_keys)
+        return scene_table().model_validate(data, context=known_keys)
     except ValidationError as error:
         _require_room(error.error_count(), path)
         problems = _lines(error, data, known_keys)
@@ -130,7 +130,7 @@ def _line(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) ->
     if kind == "value_error":
         return f"{place or 'file'}: {context['error']}"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
-        tag = context["discriminator"].strip("'")
+        tag = "type" if context["discriminator"].endswith("()") else context["discriminator"].strip("'")
         if kind == "union_tag_not_found":
             return f"{place}.{tag}: is missing"
         choices = [name.strip("'") for name in context["expected_tags"].split(", ")]

@@ -29,7 +29,7 @@ from wrt.core.errors import InputError, SceneWarning
 from wrt.lab.mitsuba.emitters import background_emitter, light_emitter
 from wrt.lab.mitsuba.shapes import Part, object_parts, raw_mesh, sphere_shape
 from wrt.renderer.features import is_rough
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
@@ -117,7 +117,7 @@ class Translation(NamedTuple):
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 
-def to_mitsuba(scene: Scene, camera: Camera | str | int | None = None, **options: Any) -> Any:
+def to_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, **options: Any) -> Any:
     """The scene as a `mitsuba.Scene` of variant scalar_rgb, with sensor, film, sampler and integrator set.
 
     options: the fields of `Options`. Raises InputError for what cannot be translated, and where Mitsuba is missing.
@@ -126,11 +126,11 @@ def to_mitsuba(scene: Scene, camera: Camera | str | int | None = None, **options
         return translate(mi, scene, camera, Options(**options)).scene
 
 
-def _camera(scene: Scene, camera: Camera | str | int | None) -> Camera:
-    return camera if isinstance(camera, Camera) else scene.camera(camera)
+def _camera(scene: Scene, camera: CameraKind | str | int | None) -> CameraKind:
+    return camera if isinstance(camera, CameraKind) else scene.camera(camera)
 
 
-def translate(mi: Any, scene: Scene, camera: Camera | str | int | None, options: Options) -> Translation:
+def translate(mi: Any, scene: Scene, camera: CameraKind | str | int | None, options: Options) -> Translation:
     """As `to_mitsuba`, for the module `mitsuba` with the variant that it has set."""
     notes = Approximations(options.approximate)
     contents: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True}
@@ -212,31 +212,43 @@ def _integrator(mi: Any, name: str, scene: Scene, options: Options, lit: bool, p
 # --- camera and film --------------------------------------------------------------------------------------------------
 
 
-def _sensor(mi: Any, scene: Scene, camera: Camera, options: Options, notes: Approximations) -> dict[str, Any]:
-    if camera.aperture_radius > 0.0 and camera.blades:
-        notes.add("aperture blades (a round aperture of the same radius)", f"camera {camera.name!r}")
+def _sensor(mi: Any, scene: Scene, camera: CameraKind, options: Options, notes: Approximations) -> dict[str, Any]:
     far = _farthest(scene, camera)
     # Mitsuba's camera looks along +z with +x to the left: half a turn about y away from glTF's.
     pose = camera.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
     sensor: dict[str, Any] = {
-        "type": "perspective", "fov_axis": "y", "fov": math.degrees(camera.fov_y), "near_clip": 1e-5 * far,
-        "far_clip": 4.0 * far, "to_world": mi.ScalarTransform4f(pose), "film": _film(scene, options),
+        "near_clip": 1e-5 * far, "far_clip": 4.0 * far, "film": _film(scene, options),
         "sampler": {"type": "independent", "sample_count": options.spp or scene.settings.spp},
     }
-    if camera.aperture_radius > 0.0:
-        sensor |= {"type": "thinlens", "aperture_radius": camera.aperture_radius,
-                   "focus_distance": camera.focus_distance}
-    return sensor
+    if isinstance(camera, OrthographicCamera):
+        width, height = options.size or scene.settings.size
+        half_width = 0.5 * camera.height * width / height
+        pose = pose @ np.diag([half_width, half_width, 1.0, 1.0])
+        sensor |= {"type": "orthographic"}
+    elif isinstance(camera, Camera):
+        sensor |= {"type": "perspective", "fov_axis": "y", "fov": math.degrees(camera.fov_y)}
+        if camera.aperture_radius > 0.0:
+            sensor |= {"type": "thinlens", "aperture_radius": camera.aperture_radius,
+                       "focus_distance": camera.focus_distance}
+            if camera.blades:
+                notes.add("aperture blades (a round aperture of the same radius)", f"camera {camera.name!r}")
+    else:
+        raise InputError(f"Mitsuba has no {camera.kind} camera (camera {camera.name!r})")
+    return sensor | {"to_world": mi.ScalarTransform4f(pose)}
 
 
-def _farthest(scene: Scene, camera: Camera) -> float:
+def _farthest(scene: Scene, camera: CameraKind) -> float:
     """An upper bound of the distance from the camera to any shape."""
     if not scene.objects and not scene.spheres:
-        return camera.focus_distance
+        return _focus(camera)
     low, high = scene.bounds()
     position = camera.camera_to_world[:3, 3]
     reach = np.linalg.norm(np.maximum(np.abs(low - position), np.abs(high - position)))
-    return max(float(reach), camera.focus_distance if camera.aperture_radius > 0.0 else 0.0)
+    return max(float(reach), _focus(camera) if camera.switches().get("lens") else 0.0)
+
+
+def _focus(camera: CameraKind) -> float:
+    return camera.focus_distance if isinstance(camera, Camera) else 1.0
 
 
 def _film(scene: Scene, options: Options) -> dict[str, Any]:
@@ -264,7 +276,7 @@ class Rendering(NamedTuple):
     spp: int
 
 
-def render_mitsuba(scene: Scene, camera: Camera | str | int | None = None, **options: Any) -> Rendering:
+def render_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, **options: Any) -> Rendering:
     """Render with Mitsuba; options are the fields of `Options`.
 
     The variance of the mean is estimated from passes with different seeds (32 or more where spp allows). It is None for
@@ -342,30 +354,20 @@ class Aovs(NamedTuple):
     prim_id: np.ndarray
 
 
-def camera_rays(camera: Camera, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Origin (3,) and unit directions (H, W, 3), float64, through the centres of the pixels and of the lens."""
-    width, height = size
-    top = math.tan(0.5 * camera.fov_y)
-    x = (2.0 * (np.arange(width) + 0.5) / width - 1.0) * top * width / height
-    y = (1.0 - 2.0 * (np.arange(height) + 0.5) / height) * top
-    local = np.stack(np.broadcast_arrays(x[None, :], y[:, None], -1.0), axis=-1)
-    directions = local @ camera.camera_to_world[:3, :3].T
-    return camera.camera_to_world[:3, 3].copy(), directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-
-
-def aov_mitsuba(scene: Scene, camera: Camera | str | int | None = None, size: tuple[int, int] | None = None) -> Aovs:
-    """Depth, normals and ids at the pixel centres, from rays that are made here (Mitsuba's own camera is not used).
+def aov_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, size: tuple[int, int] | None = None) -> Aovs:
+    """Depth, normals and ids at the pixel centres, from wrt.camera_rays (Mitsuba's own camera is not used).
 
     Materials and lights play no part, so that any scene will do. Raises InputError where Mitsuba is missing.
     """
+    from wrt.renderer.pixel_rays import camera_rays  # late: it starts Warp, which a process of Mitsuba's can do without
+
     plain = Material()
     shapes_only = Scene(
         objects=tuple(replace(thing, materials=(plain,), face_material=None) for thing in scene.objects),
         spheres=tuple(replace(sphere, material=plain) for sphere in scene.spheres),
-        cameras=(_camera(scene, camera),),
     )
     width, height = size or scene.settings.size
-    origin, directions = camera_rays(shapes_only.cameras[0], (width, height))
+    rays = camera_rays(_camera(scene, camera), (width, height))
     count = height * width
     position, geometric, shading = np.zeros((3, count, 3), np.float32)
     out = Aovs(np.full(count, np.inf, np.float32), position, geometric, shading, np.zeros((count, 2), np.float32),
@@ -373,10 +375,11 @@ def aov_mitsuba(scene: Scene, camera: Camera | str | int | None = None, size: tu
     sizes = [len(thing.mesh.faces) for thing in shapes_only.objects] + [1] * len(shapes_only.spheres)
     first_prim = np.concatenate([[0], np.cumsum(sizes)])
     with mitsuba() as mi:
-        translated = translate(mi, shapes_only, shapes_only.cameras[0], Options(integrator="path"))
-        start = origin.tolist()
-        for index, direction in enumerate(directions.reshape(-1, 3).tolist()):
-            hit = translated.scene.ray_intersect(mi.Ray3f(start, direction))
+        translated = translate(mi, shapes_only, Camera(), Options(integrator="path"))
+        for index, (origin, direction) in enumerate(zip(*(array.tolist() for array in rays), strict=True)):
+            if not any(direction):
+                continue
+            hit = translated.scene.ray_intersect(mi.Ray3f(origin, direction))
             if not hit.is_valid():
                 continue
             part = translated.parts[hit.shape.id()]
