@@ -185,7 +185,7 @@ def describe(scene: Scene, camera: str | int | None = None) -> dict[str, Any]:
         "lights": [f"{light.name or i} ({type(light).__name__})" for i, light in enumerate(scene.lights)],
         "emissive_objects": sum(any(m.lights_others for m in o.materials) for o in scene.objects),
         "background": type(scene.background).__name__,
-        "cameras": [f"{c.name or i} ({c.kind})" for i, c in enumerate(scene.cameras)],
+        "cameras": [c.name or str(i) for i, c in enumerate(scene.cameras)],
         "size": "{}x{}".format(*scene.settings.size),
         "spp": scene.settings.spp,
         "bounds_low": low,
