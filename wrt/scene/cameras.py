@@ -123,15 +123,18 @@ class Camera(CameraKind):
             raise InputError(at_thing("camera", self.name) + f"blades must be 0 (round) or 3 to 64, got {self.blades}")
 
     def record(self, size: tuple[int, int]) -> dict[str, Any]:
+        """Tangents of half the angles of view, and the lens."""
         tan_y = float(np.tan(0.5 * self.fov_y))
         return {"tan_y": tan_y, "tan_x": tan_y * size[0] / size[1], "focus_distance": self.focus_distance,
                 "aperture_radius": self.aperture_radius, "blades": self.blades, "blade_rotation": self.blade_rotation}
 
     def switches(self) -> dict[str, bool]:
+        """A lens where there is an aperture, and blades where it has some."""
         lens = self.aperture_radius > 0.0
         return {"lens": lens, "blades": lens and self.blades > 0}
 
     def opened(self) -> Self:
+        """With an aperture, where it has none."""
         return replace(self, aperture_radius=self.aperture_radius or 1.0)
 
     @staticmethod
@@ -168,6 +171,7 @@ class OrthographicCamera(CameraKind):
     height: float = parameter(2.0, "of what the picture shows, from its lower to its upper edge", SMALLEST, unit=LENGTH)
 
     def record(self, size: tuple[int, int]) -> dict[str, Any]:
+        """Half the sides of what the picture shows."""
         return {"half_width": 0.5 * self.height * size[0] / size[1], "half_height": 0.5 * self.height}
 
 
@@ -185,6 +189,7 @@ class FisheyeCamera(CameraKind):
                            0.0006, 360.0, DEGREES)
 
     def record(self, size: tuple[int, int]) -> dict[str, Any]:
+        """Half the angle of view, and half the picture's sides in radii of the image circle."""
         return {"half_angle": 0.5 * self.fov, "half_width": size[0] / min(size), "half_height": size[1] / min(size)}
 
 
