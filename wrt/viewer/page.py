@@ -21,7 +21,7 @@ from wrt.picture.film import Film
 from wrt.picture.heatmap import colors, short
 from wrt.picture.image import encode_png
 from wrt.renderer.options import Options
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import TONEMAPS
 from wrt.viewer.access import access_for
@@ -103,12 +103,12 @@ class Page:
 
     # --- the viewport -------------------------------------------------------------------------------------------------
 
-    def _place_camera(self, camera: Camera, target: np.ndarray) -> None:
+    def _place_camera(self, camera: CameraKind, target: np.ndarray) -> None:
         self.server.scene.set_up_direction(tuple(up_of(camera)))
         start = self.server.initial_camera
         start.position = tuple(camera.camera_to_world[:3, 3] / self.unit)
         start.look_at = tuple(target / self.unit)
-        start.fov = camera.fov_y
+        start.fov = (camera if isinstance(camera, Camera) else Camera()).fov_y
 
     async def _connected(self, client: Any) -> None:
         client.camera.on_update(self._moved)
@@ -156,11 +156,12 @@ class Page:
 
     # --- the panel ----------------------------------------------------------------------------------------------------
 
-    def _panel(self, camera: Camera) -> None:
+    def _panel(self, camera: CameraKind) -> None:
         gui = self.server.gui
         self.status = gui.add_markdown("waiting for the first picture")
         self.doing = gui.add_markdown("", visible=False)
-        self._lens_folder(camera)
+        if isinstance(camera, Camera):
+            self._lens_folder(camera)
         with gui.add_folder("Light"):
             depth = gui.add_slider("bounces", 0, self.viewer.deepest, 1, self.viewer.view.max_depth, hint="After the first hit")
             accel = gui.add_dropdown("structure", tuple(ACCELERATORS), initial_value=self.viewer.view.accel,
@@ -174,7 +175,7 @@ class Page:
             toml = gui.add_button("camera as TOML", hint="A table for a scene file")
         png.on_click(self._safe(lambda event: self._save(event.client, ".png")))
         self.exr.on_click(self._safe(lambda event: self._save(event.client, ".exr")))
-        toml.on_click(self._safe(lambda event: self._give_camera(event.client)))
+        toml.on_click(self._safe(lambda event: event.client and give_camera(event.client, camera_toml(self.viewer.view.camera))))
 
     def _lens_folder(self, camera: Camera) -> None:
         gui, unit = self.server.gui, self.unit
@@ -255,16 +256,15 @@ class Page:
         finally:
             self._saving.release()
 
-    def _give_camera(self, client: Any) -> None:
-        if client is None:
-            return
-        text = camera_toml(self.viewer.view.camera)
-        with client.gui.add_modal("Camera") as modal:
-            client.gui.add_markdown(f"```toml\n{text}```")
-            save = client.gui.add_button("save as a file")
-            close = client.gui.add_button("close")
-        save.on_click(lambda event: client.send_file_download("camera.toml", text.encode(), save_immediately=True))
-        close.on_click(lambda event: modal.close())
+
+def give_camera(client: Any, text: str) -> None:
+    """Show a browser the camera as TOML, to copy or to save."""
+    with client.gui.add_modal("Camera") as modal:
+        client.gui.add_markdown(f"```toml\n{text}```")
+        save = client.gui.add_button("save as a file")
+        close = client.gui.add_button("close")
+    save.on_click(lambda event: client.send_file_download("camera.toml", text.encode(), save_immediately=True))
+    close.on_click(lambda event: modal.close())
 
 
 def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
