@@ -74,7 +74,7 @@ class Page:
         except BaseException:
             listening.close()
             raise
-        self._place_camera(start, orbited_point(scene, start))
+        place_camera(self.server, start, orbited_point(scene, start), self.unit)
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True)
         self._panel(start)
         self.server.on_client_connect(self._connected)
@@ -102,13 +102,6 @@ class Page:
             self.server.stop()
 
     # --- the viewport -------------------------------------------------------------------------------------------------
-
-    def _place_camera(self, camera: CameraKind, target: np.ndarray) -> None:
-        self.server.scene.set_up_direction(tuple(up_of(camera)))
-        start = self.server.initial_camera
-        start.position = tuple(camera.camera_to_world[:3, 3] / self.unit)
-        start.look_at = tuple(target / self.unit)
-        start.fov = (camera if isinstance(camera, Camera) else Camera()).fov_y
 
     async def _connected(self, client: Any) -> None:
         client.camera.on_update(self._moved)
@@ -255,6 +248,15 @@ class Page:
             client.send_file_download(f"{self.name}{suffix}", encoded(picture, suffix), save_immediately=True)
         finally:
             self._saving.release()
+
+
+def place_camera(server: Any, camera: CameraKind, target: np.ndarray, unit: float) -> None:
+    """Where browsers begin: at the camera, which looks at `target`; unit: the length of one of the viewport's."""
+    server.scene.set_up_direction(tuple(up_of(camera)))
+    start = server.initial_camera
+    start.position = tuple(camera.camera_to_world[:3, 3] / unit)
+    start.look_at = tuple(target / unit)
+    start.fov = (camera if isinstance(camera, Camera) else Camera()).fov_y
 
 
 def give_camera(client: Any, text: str) -> None:
