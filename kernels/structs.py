@@ -104,22 +104,6 @@ class PlanePrimitive:
 
 
 @wp.struct
-class Camera:
-    """right, up, forward: an orthonormal frame; the picture spans forward +- tan_x right +- tan_y up."""
-
-    origin: wp.vec3
-    right: wp.vec3
-    up: wp.vec3
-    forward: wp.vec3
-    tan_x: float
-    tan_y: float
-    focus_distance: float
-    aperture_radius: float
-    blades: int
-    blade_rotation: float
-
-
-@wp.struct
 class Texture:
     """A picture in the shared array of texels (from `first`, rows of `width`), or a checkerboard (width = 0)."""
 

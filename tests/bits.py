@@ -6,6 +6,7 @@ first line is a digest of these functions: where it differs, the pixels below it
 
 from __future__ import annotations
 
+import math
 from hashlib import sha256
 from pathlib import Path
 
@@ -62,10 +63,20 @@ def hits(accel: str) -> str:
     structure = wrt.build(mesh, accel)
     hit = structure.closest_hit(origins, directions)
     assert (hit.prim_id >= 0).mean() > 0.3
-    camera = wrt.Camera.look_at((0.0, 2.0, 4.0), (0.0, 0.0, 0.0), fov_y=0.6)
-    seen = structure.closest_hit(*wrt.camera_rays(camera, "160x90"))
+    seen = structure.closest_hit(*primary_rays(160, 90))
     occluded = structure.any_hit(origins, directions, t_max=0.9)
     return digest(hit.t, hit.u, hit.v, hit.prim_id, seen.t, seen.u, seen.v, seen.prim_id, occluded)
+
+
+def primary_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of a pinhole, rounded once from float64: wrt.camera_rays gives what the device makes of them."""
+    pose = wrt.Camera.look_at((0.0, 2.0, 4.0), (0.0, 0.0, 0.0)).camera_to_world
+    tan_y = math.tan(0.5 * 0.6)
+    x = (2.0 * (np.arange(width) + 0.5) / width - 1.0) * tan_y * width / height
+    y = (1.0 - 2.0 * (np.arange(height) + 0.5) / height) * tan_y
+    directions = x[None, :, None] * pose[:3, 0] + y[:, None, None] * pose[:3, 1] - pose[:3, 2]
+    directions = (directions / np.linalg.norm(directions, axis=2, keepdims=True)).reshape(-1, 3).astype(np.float32)
+    return np.tile(pose[:3, 3].astype(np.float32), (len(directions), 1)), directions
 
 
 def stored() -> dict[str, str]:

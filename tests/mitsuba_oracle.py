@@ -10,13 +10,14 @@ import numpy as np
 
 from wrt.lab.mitsuba.shapes import Triangles, make_mesh
 from wrt.lab.mitsuba.translate import mitsuba, translate
-from wrt.scene.cameras import Camera
+from wrt.renderer.pixel_rays import camera_rays
+from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 
 
-def to_mitsuba(scene: Scene, camera: Camera | str | int | None = None, integrator: str = "auto") -> Any:
+def to_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, integrator: str = "auto") -> Any:
     """The scene as a `mitsuba.Scene` of variant scalar_rgb."""
     with mitsuba() as mi:
         return translate(mi, scene, camera, integrator).scene
@@ -30,7 +31,7 @@ class Rendering(NamedTuple):
     spp: int
 
 
-def render_mitsuba(scene: Scene, camera: Camera | str | int | None = None, *, seed: int = 0, integrator: str = "auto",
+def render_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, *, seed: int = 0, integrator: str = "auto",
                    **settings: Any) -> Rendering:
     """Render with Mitsuba; settings: those of the scene to change. spp is rounded up to whole passes.
 
@@ -97,19 +98,8 @@ class Aovs(NamedTuple):
     prim_id: np.ndarray
 
 
-def camera_rays(camera: Camera, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Origin (3,) and unit directions (H, W, 3), float64, through the centres of the pixels and of the lens."""
-    width, height = size
-    top = math.tan(0.5 * camera.fov_y)
-    x = (2.0 * (np.arange(width) + 0.5) / width - 1.0) * top * width / height
-    y = (1.0 - 2.0 * (np.arange(height) + 0.5) / height) * top
-    local = np.stack(np.broadcast_arrays(x[None, :], y[:, None], -1.0), axis=-1)
-    directions = local @ camera.camera_to_world[:3, :3].T
-    return camera.camera_to_world[:3, 3].copy(), directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-
-
-def aov_mitsuba(scene: Scene, camera: Camera | str | int | None = None, size: tuple[int, int] | None = None) -> Aovs:
-    """Depth, normals and ids at the pixel centres, from rays that are made here (Mitsuba's own camera is not used).
+def aov_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, size: tuple[int, int] | None = None) -> Aovs:
+    """Depth, normals and ids at the pixel centres, from wrt.camera_rays (Mitsuba's own camera is not used).
 
     Materials and lights play no part, so that any scene will do.
     """
@@ -117,10 +107,9 @@ def aov_mitsuba(scene: Scene, camera: Camera | str | int | None = None, size: tu
     shapes_only = Scene(
         objects=tuple(replace(thing, materials=(plain,), face_material=None) for thing in scene.objects),
         spheres=tuple(replace(sphere, material=plain) for sphere in scene.spheres),
-        cameras=(camera if isinstance(camera, Camera) else scene.camera(camera),),
     )
     width, height = size or scene.settings.size
-    origin, directions = camera_rays(shapes_only.cameras[0], (width, height))
+    rays = camera_rays(camera if isinstance(camera, CameraKind) else scene.camera(camera), (width, height))
     count = height * width
     position, geometric, shading = np.zeros((3, count, 3), np.float32)
     out = Aovs(np.full(count, np.inf, np.float32), position, geometric, shading, np.zeros((count, 2), np.float32),
@@ -128,10 +117,11 @@ def aov_mitsuba(scene: Scene, camera: Camera | str | int | None = None, size: tu
     sizes = [len(thing.mesh.faces) for thing in shapes_only.objects] + [1] * len(shapes_only.spheres)
     first_prim = np.concatenate([[0], np.cumsum(sizes)])
     with mitsuba() as mi:
-        translated = translate(mi, shapes_only, shapes_only.cameras[0], "path")
-        start = origin.tolist()
-        for index, direction in enumerate(directions.reshape(-1, 3).tolist()):
-            hit = translated.scene.ray_intersect(mi.Ray3f(start, direction))
+        translated = translate(mi, shapes_only, Camera(), "path")
+        for index, (origin, direction) in enumerate(zip(*(array.tolist() for array in rays), strict=True)):
+            if not any(direction):
+                continue
+            hit = translated.scene.ray_intersect(mi.Ray3f(origin, direction))
             if not hit.is_valid():
                 continue
             part = translated.parts[hit.shape.id()]

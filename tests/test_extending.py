@@ -129,6 +129,52 @@ material = "sign"
 """
 
 
+A_CAMERA = """
+import numpy as np, wrt
+import cylinder
+
+scene = wrt.load_scene("cylinder.toml")
+(camera,) = scene.cameras
+assert isinstance(camera, cylinder.CylinderCamera) and np.isclose(camera.fov_x, np.radians(200.0))
+film = wrt.render(scene, aov=("depth",), threads=2)
+angle = np.radians(200.0) * ((np.arange(40) + 0.5) / 40.0 - 0.5)
+height = np.radians(200.0) * 0.5 * (0.5 - (np.arange(20) + 0.5) / 20.0)
+x, z = np.sin(angle), -np.cos(angle)
+expected = np.stack(np.broadcast_arrays(x[None], height[:, None], z[None]), axis=-1) / np.sqrt(1.0 + height**2)[:, None, None]
+directions = wrt.camera_rays(camera, (40, 20))[1].reshape(20, 40, 3)
+assert np.allclose(directions, expected, atol=1e-6)
+assert np.allclose(film.aov["depth"], 3.0, rtol=1e-6)  # from the middle of a sphere
+assert np.allclose(film.pixels[..., 0], 0.25, atol=1e-5)
+
+from wrt.io.toml.reference_page import scene_format
+from wrt.scene.digest import camera_digest
+from wrt.scene.pack import pack, unpack
+
+(back,) = unpack(*pack(scene)).cameras
+assert camera_digest(back) == camera_digest(camera)
+assert "### Cylinder camera" in scene_format()
+print("all of it works")
+"""
+
+CYLINDER = """
+[settings]
+size = [40, 20]
+spp = 4
+[cameras.main]
+type = "cylinder"
+matrix = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+fov_x = 200
+[materials.glow]
+albedo = 0
+emission = 0.25
+two_sided = true
+[[spheres]]
+center = [0, 0, 0]
+radius = 3
+material = "glow"
+"""
+
+
 def apply(copy: Path) -> None:
     """Follow the text. An edit's old lines stand exactly once in its file."""
     text = (ROOT / "docs" / "extending.md").read_text()
@@ -148,8 +194,8 @@ def apply(copy: Path) -> None:
             path.write_text(before.replace("\n" + old, "\n" + new))
 
 
-def python(folder: Path, *arguments: str) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(folder)}
+def python(folder: Path, *arguments: str, wrt: Path | None = None) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(wrt or folder)}
     done = subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
@@ -200,3 +246,10 @@ def test_a_mesh_format_is_one_file(tmp_path: Path) -> None:
         (tmp_path / file).write_text(text)
     assert python(tmp_path, "-W", "ignore", "-c", READ_IT).endswith("all of it works\n")
     assert "or a mesh: .obj, .off, .ply, .stl" in " ".join(python(tmp_path, "-m", "wrt", "render", "--help").split())
+
+
+def test_a_camera_of_ones_own_needs_no_copy_of_the_project(tmp_path: Path) -> None:
+    blocks = {name: body for _, name, body in BLOCK.findall((ROOT / "docs" / "extending.md").read_text())}
+    (tmp_path / "cylinder.py").write_text(blocks["cylinder.py"])
+    (tmp_path / "cylinder.toml").write_text(CYLINDER)
+    assert python(tmp_path, "-c", A_CAMERA, wrt=ROOT).endswith("all of it works\n")

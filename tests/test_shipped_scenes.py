@@ -23,6 +23,7 @@ from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.renderer.features import Features, features_of
 from wrt.renderer.instancing import instanced_meshes
 from wrt.renderer.plan import aov_kernel, render_kernel
+from wrt.scene.cameras import CAMERAS
 from wrt.scene.model import Scene
 
 SCENES = sorted((ROOT / "scenes").glob("*.toml"))
@@ -52,6 +53,11 @@ def without(features: Features, name: str) -> Features:
     return replace(features, materials=tuple(kind for kind in features.materials if kind != name),
                    lights=tuple(kind for kind in features.lights if f"{kind}_lights" != name),
                    background="constant" if features.background == name else features.background)
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_every_kind_of_camera_has_a_scene(kind: str) -> None:
+    assert any(isinstance(camera, CAMERAS[kind]) for path in SCENES for camera in load(path).cameras)
 
 
 @pytest.mark.parametrize("name", Features().switches())

@@ -2,8 +2,9 @@
 
 Rays by themselves: load_mesh, Mesh, build, ACCELERATORS, load_accel, camera_rays.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
-Scenes in Python: Scene, Settings, Camera, Object, Sphere, Material, Texture, Checkerboard, Motion; PointLight,
-DirectionalLight, SpotLight; ConstantBackground, GradientBackground, EnvironmentBackground.
+Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
+FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; ConstantBackground, GradientBackground,
+EnvironmentBackground.
 What a picture costs: profile. What goes wrong: InputError, SceneWarning.
 """
 
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
     from wrt.scene.backgrounds import EnvironmentBackground as EnvironmentBackground
     from wrt.scene.backgrounds import GradientBackground as GradientBackground
     from wrt.scene.cameras import Camera as Camera
+    from wrt.scene.cameras import FisheyeCamera as FisheyeCamera
+    from wrt.scene.cameras import OrthographicCamera as OrthographicCamera
+    from wrt.scene.cameras import PanoramaCamera as PanoramaCamera
     from wrt.scene.lights import DirectionalLight as DirectionalLight
     from wrt.scene.lights import PointLight as PointLight
     from wrt.scene.lights import SpotLight as SpotLight
@@ -64,7 +68,7 @@ _PUBLIC = {
     "wrt.renderer.pixel_rays": ("camera_rays",),
     "wrt.renderer.render": ("render",),
     "wrt.scene.backgrounds": ("ConstantBackground", "EnvironmentBackground", "GradientBackground"),
-    "wrt.scene.cameras": ("Camera",),
+    "wrt.scene.cameras": ("Camera", "FisheyeCamera", "OrthographicCamera", "PanoramaCamera"),
     "wrt.scene.lights": ("DirectionalLight", "PointLight", "SpotLight"),
     "wrt.scene.materials": ("Checkerboard", "Material", "Texture"),
     "wrt.scene.mesh": ("Mesh",),

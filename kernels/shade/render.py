@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from wrt.kernels.shade.camera import chief_ray, make_camera_ray
 from wrt.kernels.shade.loop import make_radiance
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
 from wrt.kernels.shade.shading import make_cutout, make_shading
-from wrt.kernels.structs import AovFilm, Camera, Film, Lighting, Limits, Surfaces, Tile, kernel, make_ray
+from wrt.kernels.shade.step import Sample
+from wrt.kernels.structs import AovFilm, Film, Lighting, Limits, Surfaces, Tile, kernel
 
 
 @wp.func
@@ -23,15 +23,17 @@ def make_traversals(features, structure):
     return structure.traversal(any_hit=False, accepts=accepts), structure.traversal(any_hit=True, accepts=accepts)
 
 
-def make_render_kernel(features, structure):
+def make_render_kernel(features, structure, camera_kind):
     """A kernel that adds samples to the pixels of a tile; it holds only the code that `features` asks for.
 
+    camera_kind: a module as wrt.kernels.shade.cameras says.
     Where the structure's units count, it must be a wrt.kernels.study.ray_log one, and every ray is logged.
     """
     accel_struct = structure.struct
     closest_hit, any_hit = make_traversals(features, structure)
     sample_2d = make_sample_2d(features)
-    camera_ray = make_camera_ray(features.lens, features.blades)
+    camera_struct = camera_kind.Camera
+    camera_ray = camera_kind.make_camera_ray(features)
     counting = structure.units.counters
     radiance = make_radiance(features, accel_struct, closest_hit, any_hit, counting)
 
@@ -40,7 +42,7 @@ def make_render_kernel(features, structure):
         accel: accel_struct,
         surfaces: Surfaces,
         lighting: Lighting,
-        camera: Camera,
+        camera: camera_struct,
         limits: Limits,
         film: Film,
         tile: Tile,
@@ -69,7 +71,9 @@ def make_render_kernel(features, structure):
             if wp.static(features.lens):
                 lens_xi = sample_2d(key, index, 1)
             ray = camera_ray(camera, position, lens_xi)
-            sample = radiance(accel, surfaces, lighting, limits, ray, key, index)
+            sample = Sample()
+            if ray.t_max > 0.0:  # else the film gets no light here
+                sample = radiance(accel, surfaces, lighting, limits, ray, key, index)
             color = sample.radiance
             if not wp.isfinite(color[0] + color[1] + color[2]):
                 film.not_finite[pixel] += 1
@@ -89,24 +93,30 @@ def make_render_kernel(features, structure):
     return render
 
 
-def make_aov_kernel(features, structure):
+def make_aov_kernel(features, structure, camera_kind):
     """What the ray through each pixel's centre (and the lens' centre) meets first."""
+    camera_struct = camera_kind.Camera
+    camera_ray = camera_kind.make_camera_ray()
     accel_struct = structure.struct
     closest_hit, _ = make_traversals(features, structure)
     surface_at, resolve, shading_normal, _, _ = make_shading(features)
 
     @kernel
-    def aovs(accel: accel_struct, surfaces: Surfaces, camera: Camera, film: AovFilm, tile: Tile):
+    def aovs(accel: accel_struct, surfaces: Surfaces, camera: camera_struct, film: AovFilm, tile: Tile):
         tid = wp.tid()
         x = tile.x + tid % tile.width
         y = tile.y + tid / tile.width
         pixel = (y - film.y) * film.columns + x - film.x
         position = wp.vec2((float(x) + 0.5) / float(film.width), (float(y) + 0.5) / float(film.height))
-        ray = make_ray(camera.origin, wp.normalize(chief_ray(camera, position)))
+        ray = camera_ray(camera, position, wp.vec2(0.5, 0.5))
+        film.depth[pixel] = float(wp.inf)
+        film.prim_id[pixel] = -1
+        film.material_id[pixel] = -1
+        if ray.t_max < 0.0:
+            return
         hit = closest_hit(accel, surfaces, ray)
         film.depth[pixel] = hit.t
         film.prim_id[pixel] = hit.prim_id
-        film.material_id[pixel] = -1
         if hit.prim_id >= 0:
             s = surface_at(surfaces, ray, hit)
             m = resolve(surfaces, s)

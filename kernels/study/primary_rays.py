@@ -2,12 +2,13 @@
 
 import warp as wp
 
-from wrt.kernels.shade.camera import chief_ray
-from wrt.kernels.structs import Camera, Surfaces, Tile, kernel, make_ray
+from wrt.kernels.shade.cameras.perspective import Camera, make_camera_ray
+from wrt.kernels.structs import Surfaces, Tile, kernel
 
 
 def make_primary_rays_kernel(accel_struct, closest_hit):
-    """A kernel over the pixels of a tile; a miss has depth = inf and prim_id = -1."""
+    """A kernel over the pixels of a tile, for a perspective camera; a miss has depth = inf and prim_id = -1."""
+    camera_ray = make_camera_ray()
 
     @kernel
     def primary_rays(
@@ -24,7 +25,7 @@ def make_primary_rays_kernel(accel_struct, closest_hit):
         x = tile.x + tid % tile.width
         y = tile.y + tid / tile.width
         position = wp.vec2((float(x) + 0.5) / float(width), (float(y) + 0.5) / float(height))
-        ray = make_ray(camera.origin, wp.normalize(chief_ray(camera, position)))
+        ray = camera_ray(camera, position, wp.vec2(0.5, 0.5))
         hit = closest_hit(accel, surfaces, ray)
         depth[y * width + x] = hit.t
         prim_id[y * width + x] = hit.prim_id

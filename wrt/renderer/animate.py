@@ -16,7 +16,7 @@ from wrt.core.write_file import check_writable, replacing
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.moving import moves, scene_at
 from wrt.scene.values import as_number
@@ -71,7 +71,7 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
             return
 
 
-def orbited(camera: Camera, middle: np.ndarray, degrees: float) -> Camera:
+def orbited(camera: CameraKind, middle: np.ndarray, degrees: float) -> CameraKind:
     """The camera turned about the vertical axis (+y) through the point of its line of view that is nearest to `middle` (3,)."""
     if degrees == 0.0:
         return camera

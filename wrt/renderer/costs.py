@@ -19,7 +19,7 @@ from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.plan import Plan
 from wrt.renderer.prepare import Prepared, prepare
 from wrt.renderer.tiles import Rectangle, Work
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 
 COUNTERS = tuple(Counts.vars)
 
@@ -48,7 +48,7 @@ class CostCounter:
         counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
         self.prepared = prepare(replace(plan, structure=LoggedStructure(counting)), device, built)
 
-    def aim(self, camera: Camera, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
+    def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
         """As Prepared.aimed."""
         self.prepared = self.prepared.aimed(camera, angles_of, **settings)
 

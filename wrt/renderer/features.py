@@ -11,7 +11,7 @@ import numpy as np
 
 from wrt.renderer.instancing import instanced_meshes
 from wrt.scene.backgrounds import BACKGROUNDS
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.lights import EMISSIVE, LIGHTS
 from wrt.scene.materials import MATERIALS, Checkerboard, Texture
 from wrt.scene.model import Scene
@@ -23,12 +23,14 @@ STACK_STEP = 16
 class Features:
     """Everything that changes the code of a kernel; what is False leaves no trace in it.
 
-    lens, blades, filter: the camera's; independent: the samples are random numbers; instances, spheres, smooth, textures,
-    checkerboards, normal_maps, parameter_textures (of roughness and the like), cutout, blend: the surfaces'; materials, lights,
-    background: the kinds there are, by name; derived: reflection, refraction, transmission, transparent_shadows, sky_light,
-    highlight. stack_size: room for the rays that can be pending, in whole STACK_STEPs, so that neighbouring depths share a kernel.
+    camera: the module of its device function; lens, blades, filter: the camera's; independent: the samples are random numbers;
+    instances, spheres, smooth, textures, checkerboards, normal_maps, parameter_textures (of roughness and the like), cutout,
+    blend: the surfaces'; materials, lights, background: the kinds there are, by name; derived: reflection, refraction,
+    transmission, transparent_shadows, sky_light, highlight. stack_size: room for the rays that can be pending, in whole
+    STACK_STEPs, so that neighbouring depths share a kernel.
     """
 
+    camera: str = Camera.device
     lens: bool = False
     blades: bool = False
     filter: bool = False
@@ -72,7 +74,7 @@ def mesh_lights(scene: Scene) -> bool:
     return any(m.lights_others for thing in scene.objects for m in thing.materials)
 
 
-def features_of(scene: Scene, camera: Camera, meshes: frozenset[int] = frozenset()) -> Features:
+def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = frozenset()) -> Features:
     """The features that this scene needs through this camera, with its settings. meshes: those kept once (instancing.py)."""
     settings, materials = scene.settings, scene.materials
     textures = [texture for material in materials for texture in material.textures]
@@ -94,8 +96,8 @@ def features_of(scene: Scene, camera: Camera, meshes: frozenset[int] = frozenset
     # straight on through a blended surface takes no level: it waits below its siblings, until they are done.
     pending = (children - 1) * (settings.max_depth + 1) + 1
     return Features(
-        lens=camera.aperture_radius > 0.0,
-        blades=camera.aperture_radius > 0.0 and camera.blades > 0,
+        camera=camera.device,
+        **camera.switches(),
         filter=settings.filter != "box",
         independent=settings.sampler == "independent",
         instances=bool(meshes),

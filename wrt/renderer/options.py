@@ -18,7 +18,7 @@ from wrt.core.device import start, thread_count
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.renderer.instancing import INSTANCING
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 
@@ -77,7 +77,7 @@ class Options:
     device: str = "cpu"
     accel: str = "bvh"
     threads: int | None = None
-    camera: str | int | Camera | None = None
+    camera: str | int | CameraKind | None = None
     crop: tuple[int, int, int, int] | None = None
     aov: Sequence[str] = ()
     time_limit: float | None = None
@@ -124,7 +124,7 @@ class Options:
             raise InputError(f"crop must be x0, y0, x1, y1 in pixels, got {self.crop!r}")
         if not (self.progress is None or callable(self.progress)):
             raise InputError(f"progress must be a function of a Progress, got {shown(self.progress)}")
-        as_one(self.camera, (str, int, np.integer, Camera, type(None)), "camera")
+        as_one(self.camera, (str, int, np.integer, CameraKind, type(None)), "camera")
         as_one(self.accel_options, dict, "accel_options")
         as_one(self.threads, (int, np.integer, type(None)), "threads")
         thread_count(self.threads)

@@ -2,25 +2,43 @@
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 import numpy as np
+import warp as wp
 
 from wrt.core.checks import as_one, as_size
-from wrt.scene.cameras import Camera
+from wrt.core.device import load_kernel, made_once, start, upload
+from wrt.kernels.shade.camera_rays import make_camera_rays_kernel
+from wrt.renderer.upload import camera_kind, camera_struct
+from wrt.scene.cameras import CameraKind
 
 
-def camera_rays(camera: Camera, size: tuple[int, int] | str) -> tuple[np.ndarray, np.ndarray]:
-    """One ray a pixel, through the middle of the lens and the pixel's centre: those of a Film's AOVs, but for rounding.
+def camera_rays(camera: CameraKind, size: tuple[int, int] | str) -> tuple[np.ndarray, np.ndarray]:
+    """One ray a pixel, through the middle of the lens and the pixel's centre: those of a Film's AOVs.
 
     size: width and height, or "640x360". Returns origins and directions, (width * height, 3) float32 each, in world space, row
-    by row from the top left; directions have unit length, so that a hit's t is the AOV "depth". Raises InputError.
+    by row from the top left; directions have unit length, so that a hit's t is the AOV "depth". Where a camera has no ray,
+    beyond a fisheye's image circle, they are 0: `directions.any(axis=1)` are the rays that there are. Raises InputError.
     """
     width, height = as_size(size)
-    pose = as_one(camera, Camera, "camera").camera_to_world
-    tan_y = math.tan(0.5 * camera.fov_y)
-    x = (2.0 * (np.arange(width) + 0.5) / width - 1.0) * tan_y * width / height
-    y = (1.0 - 2.0 * (np.arange(height) + 0.5) / height) * tan_y
-    directions = x[None, :, None] * pose[:3, 0] + y[:, None, None] * pose[:3, 1] - pose[:3, 2]
-    directions = (directions / np.linalg.norm(directions, axis=2, keepdims=True)).reshape(-1, 3).astype(np.float32)
-    return np.tile(pose[:3, 3].astype(np.float32), (len(directions), 1)), directions
+    x = (np.arange(width, dtype=np.float32) + np.float32(0.5)) / np.float32(width)
+    y = (np.arange(height, dtype=np.float32) + np.float32(0.5)) / np.float32(height)
+    film = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1)
+    return film_rays(camera, (width, height), film.reshape(-1, 2))
+
+
+def film_rays(camera: CameraKind, size: tuple[int, int], film: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `camera_rays`, through points (N, 2) of a picture of `size` pixels: (0, 0) is its top left corner, (1, 1) the bottom
+    right one."""
+    device = start("cpu")
+    kernel = _kernel(camera_kind(as_one(camera, CameraKind, "camera").device))
+    load_kernel(kernel, device)
+    origins, directions = (wp.empty(len(film), dtype=wp.vec3, device=device) for _ in range(2))
+    wp.launch(kernel, len(film), [camera_struct(camera, size), upload(film, wp.vec2, device)], [origins, directions], device=device)
+    return origins.numpy(), directions.numpy()
+
+
+@made_once
+def _kernel(kind: Any) -> Any:
+    return make_camera_rays_kernel(kind)

@@ -16,7 +16,8 @@ from wrt.renderer.features import Features, features_of
 from wrt.renderer.film_arrays import GROUPS
 from wrt.renderer.instancing import instanced_meshes
 from wrt.renderer.options import Options
-from wrt.scene.cameras import Camera
+from wrt.renderer.upload import camera_kind
+from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import Settings
 
@@ -25,12 +26,12 @@ AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  #
 
 @made_once
 def render_kernel(features: Features, structure: Any) -> Any:
-    return kernels.make_render_kernel(features, structure)
+    return kernels.make_render_kernel(features, structure, camera_kind(features.camera))
 
 
 @made_once
 def aov_kernel(features: Features, structure: Any) -> Any:
-    return kernels.make_aov_kernel(features, structure)
+    return kernels.make_aov_kernel(features, structure, camera_kind(features.camera))
 
 
 def kernel_hash(kernel: Any, device: str) -> str:
@@ -46,7 +47,7 @@ class Plan:
 
     scene: Scene
     options: Options
-    camera: Camera
+    camera: CameraKind
     meshes: frozenset[int]
     features: Features
     structure: Any
@@ -80,13 +81,13 @@ class Plan:
         limits.seed = seed
         return limits
 
-    def aimed(self, camera: Camera, **settings: Any) -> Plan:
+    def aimed(self, camera: CameraKind, **settings: Any) -> Plan:
         """Another camera and other settings (of AIMED), for the same kernels. Raises InputError for what they were not made for:
-        an aperture where there was a pinhole, more bounces."""
+        another kind of camera, a lens where there was a pinhole, more bounces."""
         scene = self.scene.with_settings(**settings)
         lacks = [name for name, needed, has in (
-            ("an aperture", camera.aperture_radius > 0.0, self.features.lens),
-            ("an aperture with blades", camera.aperture_radius > 0.0 and camera.blades > 0, self.features.blades),
+            (f"a camera of the kind {camera.kind}", camera.device != self.features.camera, False),
+            *((f"a camera's {name}", needed, getattr(self.features, name)) for name, needed in camera.switches().items()),
             ("so many bounces", scene.settings.max_depth > self.deepest, False),
             ("other settings than " + ", ".join(AIMED), bool(settings.keys() - AIMED), False)) if needed and not has]
         if lacks:
@@ -100,7 +101,7 @@ class Plan:
 
 def plan_of(scene: Scene, options: Options) -> Plan:
     """Raises InputError for a camera or a crop that there is not."""
-    camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
+    camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
     meshes = instanced_meshes(scene, options.instancing)
     features = features_of(scene, camera, meshes)
     units = Units(options.triangle, options.box, features.spheres, instances=features.instances)

@@ -22,7 +22,7 @@ from wrt.renderer.options import Progress
 from wrt.renderer.plan import Plan
 from wrt.renderer.tiles import Rectangle, Work, corners, tiles
 from wrt.renderer.upload import DeviceScene, camera_struct, upload_scene
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 
 TILE_SIZE = 32
 PREPARING = "wrt prepares"  # what the threads that compile and build are called
@@ -43,7 +43,7 @@ class Prepared:
     camera: Any
     seconds: dict[str, float]
 
-    def aimed(self, camera: Camera, angles_of: tuple[int, int] | None = None, **settings: Any) -> Prepared:
+    def aimed(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> Prepared:
         """For another camera and other settings: as Plan.aimed. angles_of: a size with the picture's shape, where the picture's
         own is rounded: that would change the angle of view."""
         plan = self.plan.aimed(camera, **settings)

@@ -21,7 +21,7 @@ from wrt.renderer.plan import plan_of
 from wrt.renderer.prepare import kind_of, prepare
 from wrt.renderer.schedule import LocalTracer, Run
 from wrt.renderer.upload import upload_scene
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 
 
@@ -41,7 +41,7 @@ class Renderer:
     def accel(self) -> Accelerator:
         return self.prepared.accel
 
-    def aim(self, camera: Camera, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
+    def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
         """Another camera and other settings for the next `run`, with the same kernels and structure: as Prepared.aimed."""
         if self.checkpoint is not None:
             raise InputError("this renderer was not made for a checkpoint")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from wrt.kernels import structs
 from wrt.kernels.shade import backgrounds, lights, materials, textures
 from wrt.renderer.flatten import Placed, World, world_of
 from wrt.scene.backgrounds import Background
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 from wrt.scene.materials import ALPHA_MODES, Checkerboard, Material, Texture, kinds_that_use
 from wrt.scene.model import Scene
 from wrt.scene.size import require_size
@@ -254,14 +255,17 @@ def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()
     return DeviceScene(world, s, lighting)
 
 
-def camera_struct(camera: Camera, size: tuple[int, int]) -> Any:
+def camera_kind(device: str) -> Any:
+    """The device's side of a kind of camera: the module of that name (wrt.kernels.shade.cameras)."""
+    return import_module(device)
+
+
+def camera_struct(camera: CameraKind, size: tuple[int, int]) -> Any:
     """The camera for a picture of so many pixels."""
-    c = structs.Camera()
+    c = camera_kind(camera.device).Camera()
     pose = camera.camera_to_world
     c.origin = wp.vec3(*pose[:3, 3])
     c.right, c.up, c.forward = wp.vec3(*pose[:3, 0]), wp.vec3(*pose[:3, 1]), wp.vec3(*(-pose[:3, 2]))
-    c.tan_y = float(np.tan(0.5 * camera.fov_y))
-    c.tan_x = c.tan_y * size[0] / size[1]
-    c.focus_distance, c.aperture_radius = camera.focus_distance, camera.aperture_radius
-    c.blades, c.blade_rotation = camera.blades, camera.blade_rotation
+    for name, value in camera.record(size).items():
+        setattr(c, name, value)
     return c

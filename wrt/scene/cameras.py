@@ -1,10 +1,10 @@
-"""Where a picture is taken from, and with which lens."""
+"""Where a picture is taken from, and how its points become rays: one class and one row of CAMERAS a kind."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -12,24 +12,31 @@ from wrt.core.checks import as_integer, at_thing
 from wrt.core.errors import InputError
 from wrt.scene.values import SMALLEST, as_number, as_transform, as_vector
 
+DEGREES, LENGTH = "degrees", "length"
+
+
+def parameter(default: float, description: str, low: float, high: float = math.inf, unit: str = "") -> Any:
+    """A field of a camera's class, which a scene file has under the same name; a whole number where the default is one.
+
+    unit: "", LENGTH or DEGREES: then default, low and high are in degrees here, as in files, and the field is in radians.
+    """
+    about = {"default": default, "description": description, "low": low, "high": high, "unit": unit}
+    return field(default=math.radians(default) if unit == DEGREES else default, metadata=about)
+
 
 @dataclass(frozen=True, eq=False)
-class Camera:
-    """A pinhole, or a thin lens where `aperture_radius` > 0.
+class CameraKind:
+    """What all cameras have: a pose, and a name.
 
-    camera_to_world: (4, 4), rotation and translation; it looks along its own -z, +y is up. fov_y: full vertical angle of
-    view (radians). focus_distance: along the axis, from the lens to the plane that is sharp. blades: 0 for a round
-    aperture, else the number of its straight sides (3 or more), turned by `blade_rotation` radians.
-    `lens` gives fov_y, aperture_radius and focus_distance for a focal length, an f-number and a sensor height.
+    camera_to_world: (4, 4), rotation and translation; it looks along its own -z, +y is up. A kind adds its parameters as
+    fields, and says where its device function is.
     """
 
+    kind: ClassVar[str]  # what scene files call it
+    device: ClassVar[str]  # the module that wrt.kernels.shade.cameras describes
+
     camera_to_world: np.ndarray = field(default_factory=lambda: np.eye(4))
-    fov_y: float = math.radians(45.0)
-    aperture_radius: float = 0.0
-    focus_distance: float = 1.0
-    blades: int = 0
-    blade_rotation: float = 0.0
-    name: str = ""
+    name: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
         at = at_thing("camera", self.name)
@@ -43,16 +50,27 @@ class Camera:
         x = x / np.linalg.norm(x)
         matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = x, np.cross(z, x), z
         object.__setattr__(self, "camera_to_world", matrix)
-        object.__setattr__(self, "fov_y", as_number(self.fov_y, at + "fov_y", low=1e-5, high=math.pi - 1e-3))
-        object.__setattr__(self, "aperture_radius", as_number(self.aperture_radius, at + "aperture_radius", low=0.0))
-        object.__setattr__(self, "focus_distance", as_number(self.focus_distance, at + "focus_distance", low=SMALLEST))
-        object.__setattr__(self, "blade_rotation", as_number(self.blade_rotation, at + "blade_rotation"))
-        as_integer(self.blades, at + "blades", 0, 64)
-        if self.blades in (1, 2):
-            raise InputError(at + f"blades must be 0 (round) or 3 to 64, got {self.blades}")
+        for key, about in self.parameters().items():
+            low, high, value = about["low"], about["high"], getattr(self, key)
+            if isinstance(about["default"], int):
+                as_integer(value, at + key, low, high)
+                continue
+            if about["unit"] == DEGREES:
+                low, high = math.radians(low), math.radians(high)
+            object.__setattr__(self, key, as_number(value, at + key, low=low, high=high))
 
-    @staticmethod
-    def look_at(position: Any, target: Any, up: Any = (0.0, 1.0, 0.0), **rest: Any) -> Camera:
+    @classmethod
+    def parameters(cls) -> dict[str, dict[str, Any]]:
+        """The fields made by `parameter`, with what it was told of each."""
+        return {each.name: dict(each.metadata) for each in fields(cls) if each.metadata}
+
+    def as_in_files(self) -> dict[str, float]:
+        """The parameters in the units of scene files."""
+        values = {key: (getattr(self, key), about["unit"]) for key, about in self.parameters().items()}
+        return {key: math.degrees(value) if unit == DEGREES else value for key, (value, unit) in values.items()}
+
+    @classmethod
+    def look_at(cls, position: Any, target: Any, up: Any = (0.0, 1.0, 0.0), **rest: Any) -> Self:
         """A camera at `position` that looks at `target`; `rest` are the other fields."""
         origin, aim, upward = (np.array(as_vector(v, n)) for v, n in ((position, "position"), (target, "target"), (up, "up")))
         z = origin - aim
@@ -65,7 +83,59 @@ class Camera:
         x /= np.linalg.norm(x)
         matrix = np.eye(4)
         matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = x, np.cross(z, x), z, origin
-        return Camera(camera_to_world=matrix, **rest)
+        return cls(camera_to_world=matrix, **rest)
+
+    def record(self, size: tuple[int, int]) -> dict[str, Any]:
+        """What the device's struct holds beside the pose, for a picture of so many pixels."""
+        return {}
+
+    def switches(self) -> dict[str, bool]:
+        """The switches of wrt.renderer.features.Features that this camera decides: `lens`, where rays need a sample of a lens."""
+        return {}
+
+    def opened(self) -> Self:
+        """This camera with every switch on: a renderer made for it can show all that a viewer may set."""
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Camera(CameraKind):
+    """A pinhole, or a thin lens where it has an aperture.
+
+    fov_y: full vertical angle of view (radians). focus_distance: along the axis, from the lens to the plane that is sharp. blades:
+    0 for a round aperture, else the number of its straight sides (3 or more), turned by `blade_rotation` radians.
+    `lens` gives fov_y, aperture_radius and focus_distance for a focal length, an f-number and a sensor height.
+    """
+
+    kind = "perspective"
+    device = "wrt.kernels.shade.cameras.perspective"
+
+    fov_y: float = parameter(45.0, "full vertical angle of view", 0.0006, 179.9, DEGREES)
+    aperture_radius: float = parameter(0.0, "0 is a pinhole", 0.0, unit=LENGTH)
+    focus_distance: float = parameter(1.0, "along the axis to what is sharp (beside a target: by default as far as that)",
+                                      SMALLEST, unit=LENGTH)
+    blades: int = parameter(0, "0: a round aperture; from 3 on its number of sides", 0, 64)
+    blade_rotation: float = parameter(0.0, "turns the aperture", -math.inf, unit=DEGREES)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.blades in (1, 2):
+            raise InputError(at_thing("camera", self.name) + f"blades must be 0 (round) or 3 to 64, got {self.blades}")
+
+    def record(self, size: tuple[int, int]) -> dict[str, Any]:
+        """Tangents of half the angles of view, and the lens."""
+        tan_y = float(np.tan(0.5 * self.fov_y))
+        return {"tan_y": tan_y, "tan_x": tan_y * size[0] / size[1], "focus_distance": self.focus_distance,
+                "aperture_radius": self.aperture_radius, "blades": self.blades, "blade_rotation": self.blade_rotation}
+
+    def switches(self) -> dict[str, bool]:
+        """A lens where there is an aperture, and blades where it has some."""
+        lens = self.aperture_radius > 0.0
+        return {"lens": lens, "blades": lens and self.blades > 0}
+
+    def opened(self) -> Self:
+        """With an aperture, where it has none."""
+        return replace(self, aperture_radius=self.aperture_radius or 1.0)
 
     @staticmethod
     def lens(focal_length: float, focus_distance: float, sensor_height: float, *, f_number: float | None = None,
@@ -86,3 +156,54 @@ class Camera:
         image_distance = f * s / (s - f)
         return {"fov_y": 2.0 * math.atan(0.5 * h / image_distance), "focus_distance": s,
                 "aperture_radius": as_number(radius, "aperture_radius", low=0.0)}
+
+
+@dataclass(frozen=True, eq=False)
+class OrthographicCamera(CameraKind):
+    """Parallel rays, from the plane through the camera on.
+
+    height: of what the picture shows, from its lower to its upper edge (scene units); its width follows from the picture's size.
+    """
+
+    kind = "orthographic"
+    device = "wrt.kernels.shade.cameras.orthographic"
+
+    height: float = parameter(2.0, "of what the picture shows, from its lower to its upper edge", SMALLEST, unit=LENGTH)
+
+    def record(self, size: tuple[int, int]) -> dict[str, Any]:
+        """Half the sides of what the picture shows."""
+        return {"half_width": 0.5 * self.height * size[0] / size[1], "half_height": 0.5 * self.height}
+
+
+@dataclass(frozen=True, eq=False)
+class FisheyeCamera(CameraKind):
+    """An equidistant fisheye: angles to the axis are proportional to distances from the picture's middle; black beyond the circle.
+
+    fov: full angle of view across the image circle (radians), whose diameter is the picture's shorter side.
+    """
+
+    kind = "fisheye"
+    device = "wrt.kernels.shade.cameras.fisheye"
+
+    fov: float = parameter(180.0, "full angle of view across the image circle, which is as wide as the picture's shorter side",
+                           0.0006, 360.0, DEGREES)
+
+    def record(self, size: tuple[int, int]) -> dict[str, Any]:
+        """Half the angle of view, and half the picture's sides in radii of the image circle."""
+        return {"half_angle": 0.5 * self.fov, "half_width": size[0] / min(size), "half_height": size[1] / min(size)}
+
+
+@dataclass(frozen=True, eq=False)
+class PanoramaCamera(CameraKind):
+    """All directions around a point, equirectangular: the camera looks at its middle; its edges are behind, above and below.
+
+    A picture twice as wide as high is an environment as backgrounds take it.
+    """
+
+    kind = "panorama"
+    device = "wrt.kernels.shade.cameras.panorama"
+
+
+# A kind of one's own is one more: CAMERAS[Mine.kind] = Mine.
+CAMERAS: dict[str, type[CameraKind]] = {each.kind: each for each in (Camera, OrthographicCamera, FisheyeCamera, PanoramaCamera)}
+

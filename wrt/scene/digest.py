@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
@@ -22,7 +22,7 @@ def scene_digest(scene: Scene) -> str:
     return _digest(scene, {}).hex()
 
 
-def camera_digest(camera: Camera) -> str:
+def camera_digest(camera: CameraKind) -> str:
     return _digest(camera, {}).hex()
 
 

@@ -8,7 +8,6 @@ scene's own unit; colours are linear Rec. 709 (`(3,)` floats); angles are radian
 from __future__ import annotations
 
 import contextlib
-import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
@@ -21,7 +20,7 @@ from wrt.core.checks import as_array, as_one, as_tuple, at_thing, unknown
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts, html_table
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 from wrt.scene.lights import LIGHTS, Light
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
@@ -96,14 +95,14 @@ class Scene:
     objects: tuple[Object, ...] = ()
     spheres: tuple[Sphere, ...] = ()
     lights: tuple[Light, ...] = ()
-    cameras: tuple[Camera, ...] = ()
+    cameras: tuple[CameraKind, ...] = ()
     background: Background = field(default_factory=ConstantBackground)
     ambient: Color = BLACK
     settings: Settings = field(default_factory=Settings)
     name: str = ""
 
     def __post_init__(self) -> None:
-        kinds: dict[str, Any] = {"objects": Object, "spheres": Sphere, "cameras": Camera, "lights": tuple(LIGHTS.values())}
+        kinds: dict[str, Any] = {"objects": Object, "spheres": Sphere, "cameras": CameraKind, "lights": tuple(LIGHTS.values())}
         for name, kind in kinds.items():
             object.__setattr__(self, name, as_tuple(getattr(self, name), kind, name))
         for name in ("objects", "spheres", "lights"):
@@ -129,11 +128,12 @@ class Scene:
         lights = [(light.name, type(light).__name__) for light in self.lights]
         lights += [(m.name, "emissive material") for m in self.materials if m.lights_others]
         lights.append(("", type(self.background).__name__))
-        cameras = [(each.name, f"{math.degrees(each.fov_y):.4g} degrees high", each.aperture_radius) for each in self.cameras]
+        cameras = [(each.name, each.kind, ", ".join(f"{key} {value:.4g}" for key, value in each.as_in_files().items()))
+                   for each in self.cameras]
         settings = {each.name: getattr(self.settings, each.name) for each in fields(Settings)}
         settings["size"] = f"{self.settings.size[0]}x{self.settings.size[1]}"
         return html_table(repr(self), ("shape", "kind", "primitives", "materials"), things) + html_table(
-            "", ("light", "kind"), lights) + html_table("", ("camera", "angle of view", "aperture radius"), cameras) + html_facts(
+            "", ("light", "kind"), lights) + html_table("", ("camera", "kind", "parameters"), cameras) + html_facts(
             "Settings", settings)
 
     @property
@@ -147,7 +147,7 @@ class Scene:
             used.setdefault(id(sphere.material), sphere.material)
         return tuple(used.values())
 
-    def camera(self, name: str | int | None = None) -> Camera:
+    def camera(self, name: str | int | None = None) -> CameraKind:
         """The camera of that name or number (None: the first). Raises InputError that lists the names there are."""
         if not self.cameras:
             raise InputError("the scene has no camera")

@@ -11,7 +11,7 @@ import numpy as np
 from wrt.core.errors import InputError
 from wrt.scene import model as scenes
 from wrt.scene.backgrounds import BACKGROUNDS
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CAMERAS
 from wrt.scene.lights import LIGHTS
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.mesh import Mesh
@@ -22,8 +22,8 @@ from wrt.scene.settings import Settings
 def kinds() -> dict[str, type[Any]]:
     """What travels, by the names of the classes."""
     return {kind.__name__: kind for kind in (
-        Scene, Settings, Camera, Object, Mesh, scenes.Sphere, Material, Texture, Checkerboard, *LIGHTS.values(),
-        *BACKGROUNDS.values())}
+        Scene, Settings, Object, Mesh, scenes.Sphere, Material, Texture, Checkerboard, *CAMERAS.values(),
+        *LIGHTS.values(), *BACKGROUNDS.values())}
 
 
 LEFT_OUT: dict[type, tuple[str, ...]] = {Object: ("motion",)}  # a picture shows the object without

@@ -21,7 +21,7 @@ from wrt.picture.film import Film
 from wrt.picture.heatmap import colors, short
 from wrt.picture.image import encode_png
 from wrt.renderer.options import Options
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import TONEMAPS
 from wrt.viewer.access import access_for
@@ -74,7 +74,7 @@ class Page:
         except BaseException:
             listening.close()
             raise
-        self._place_camera(start, orbited_point(scene, start))
+        place_camera(self.server, start, orbited_point(scene, start), self.unit)
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True)
         self._panel(start)
         self.server.on_client_connect(self._connected)
@@ -102,13 +102,6 @@ class Page:
             self.server.stop()
 
     # --- the viewport -------------------------------------------------------------------------------------------------
-
-    def _place_camera(self, camera: Camera, target: np.ndarray) -> None:
-        self.server.scene.set_up_direction(tuple(up_of(camera)))
-        start = self.server.initial_camera
-        start.position = tuple(camera.camera_to_world[:3, 3] / self.unit)
-        start.look_at = tuple(target / self.unit)
-        start.fov = camera.fov_y
 
     async def _connected(self, client: Any) -> None:
         client.camera.on_update(self._moved)
@@ -156,11 +149,12 @@ class Page:
 
     # --- the panel ----------------------------------------------------------------------------------------------------
 
-    def _panel(self, camera: Camera) -> None:
+    def _panel(self, camera: CameraKind) -> None:
         gui = self.server.gui
         self.status = gui.add_markdown("waiting for the first picture")
         self.doing = gui.add_markdown("", visible=False)
-        self._lens_folder(camera)
+        if isinstance(camera, Camera):
+            self._lens_folder(camera)
         with gui.add_folder("Light"):
             depth = gui.add_slider("bounces", 0, self.viewer.deepest, 1, self.viewer.view.max_depth, hint="After the first hit")
             accel = gui.add_dropdown("structure", tuple(ACCELERATORS), initial_value=self.viewer.view.accel,
@@ -252,7 +246,16 @@ class Page:
             self._saving.release()
 
 
-def give_camera(client: Any, camera: Camera) -> None:
+def place_camera(server: Any, camera: CameraKind, target: np.ndarray, unit: float) -> None:
+    """Where browsers begin: at the camera, which looks at `target`; unit: the length of one of the viewport's."""
+    server.scene.set_up_direction(tuple(up_of(camera)))
+    start = server.initial_camera
+    start.position = tuple(camera.camera_to_world[:3, 3] / unit)
+    start.look_at = tuple(target / unit)
+    start.fov = (camera if isinstance(camera, Camera) else Camera()).fov_y
+
+
+def give_camera(client: Any, camera: CameraKind) -> None:
     """Show a camera to a browser as a table of a scene file."""
     if client is None:
         return

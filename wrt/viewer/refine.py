@@ -21,7 +21,7 @@ from wrt.picture.tonemap import to_codes
 from wrt.renderer.costs import COUNTERS
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.progress import COMPILING
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.viewer.renderers import Renderers
 from wrt.viewer.view import Shown, View
@@ -76,7 +76,7 @@ class Viewer:
                  report: Callable[[str], None] = lambda text: None, spp: int = 1024) -> None:
         self.scene, self.show, self.report, self.spp = scene, show, report, spp
         settings = scene.settings
-        camera = options.camera if isinstance(options.camera, Camera) else scene.camera(options.camera)
+        camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
         self.deepest = max(settings.max_depth, DEEPEST)
         self.view = View(camera, settings.size, settings.max_depth, options.accel)
         self.exposure, self.tonemap = settings.exposure, settings.tonemap

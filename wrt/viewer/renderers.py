@@ -11,6 +11,7 @@ import numpy as np
 from wrt.picture.film import Film
 from wrt.renderer.costs import CostCounter
 from wrt.renderer.options import Options, Progress
+from wrt.renderer.pixel_rays import film_rays
 from wrt.renderer.renderer import Renderer
 from wrt.scene.model import Scene
 from wrt.viewer.view import View
@@ -29,8 +30,8 @@ class Renderers:
     def prepare(self, view: View) -> None:
         """Make what the view needs, if it is not there."""
         if view.accel not in self.by_accel:
-            camera = replace(view.camera, aperture_radius=view.camera.aperture_radius or 1.0)  # compiles the lens
-            options = replace(self.options, accel=view.accel, camera=camera, tile_size=TILE_SIZE, progress=self.progress)
+            options = replace(self.options, accel=view.accel, camera=view.camera.opened(), tile_size=TILE_SIZE,
+                              progress=self.progress)
             self.by_accel[view.accel] = Renderer(self.scene, options)
         if view.cost and view.accel not in self.counters:
             prepared = self.by_accel[view.accel].prepared
@@ -53,13 +54,10 @@ class Renderers:
         there is nothing, or nothing was built yet."""
         if view.accel not in self.by_accel:
             return None
-        camera, (width, height) = view.camera, view.size
-        tangent = np.tan(0.5 * camera.fov_y)
-        toward = np.array([(2.0 * x - 1.0) * tangent * width / height, (1.0 - 2.0 * y) * tangent, -1.0])
-        pose = camera.camera_to_world
-        hits = self.by_accel[view.accel].accel.closest_hit(pose[None, :3, 3].astype(np.float32),
-                                                          (pose[:3, :3] @ toward)[None].astype(np.float32))
-        return float(hits.t[0]) if hits.prim_id[0] >= 0 else None
+        origins, directions = film_rays(view.camera, view.size, np.array([[x, y]]))
+        hits = self.by_accel[view.accel].accel.closest_hit(origins, directions)
+        along = float(directions[0] @ -view.camera.camera_to_world[:3, 2])
+        return float(hits.t[0]) * along if hits.prim_id[0] >= 0 else None
 
     def describe(self, accel: str) -> str:
         """A structure in a few words."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 from wrt.scene.digest import camera_digest
 
 
@@ -15,7 +15,7 @@ class View:
     """What is asked for. size: (width, height) in pixels when it is fine; accel: a name in ACCELERATORS; cost: "" for the
     picture, or a counter of wrt.renderer.costs.COUNTERS, of which a heat map is made."""
 
-    camera: Camera
+    camera: CameraKind
     size: tuple[int, int]
     max_depth: int
     accel: str

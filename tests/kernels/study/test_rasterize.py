@@ -9,11 +9,12 @@ import pytest
 
 from tests.kernel_tools import CPU, launch, zeros  # before warp: it silences Warp's banner
 from wrt.accel.geometry import Geometry
+from wrt.core.errors import InputError
 from wrt.kernels.structs import kernel
 from wrt.kernels.study import rasterize as kernels
 from wrt.lab.bench.rasterizer import NOTHING, Rasterizer, directions_from_pixels, primary_rays_kernel, view_struct
 from wrt.renderer.upload import camera_struct
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, FisheyeCamera
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import box, icosphere
 
@@ -334,3 +335,10 @@ def test_kernels_compile_for_turing_and_hopper(tmp_path: Path) -> None:
     for each in (kernels.project, kernels.bound, kernels.rasterize, cast):
         binaries = wp.compile_aot_module(each.module, arch=[75, 90], module_dir=tmp_path)
         assert [Path(binary).stat().st_size > 5_000 for binary in binaries] == [True, True]
+
+
+def test_only_a_perspective_camera_can_be_rasterized():
+    mesh = icosphere(1)
+    ball = Geometry(mesh.vertices, mesh.faces, np.zeros((0, 4), np.float32))
+    with pytest.raises(InputError, match="perspective camera; camera 'sky' is fisheye"):
+        Rasterizer(ball).draw(FisheyeCamera(name="sky"), (8, 8))

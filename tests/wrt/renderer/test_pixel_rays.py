@@ -8,6 +8,7 @@ import pytest
 import wrt
 from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.core.errors import InputError
+from wrt.scene.cameras import CAMERAS, CameraKind
 from wrt.scene.shapes import box
 
 
@@ -19,9 +20,38 @@ def test_they_hit_what_the_picture_shows() -> None:
     origins, directions = wrt.camera_rays(camera, "48x27")
     assert origins.shape == directions.shape == (48 * 27, 3) and origins.dtype == directions.dtype == np.float32
     hits = wrt.build(mesh).closest_hit(origins, directions)
-    same = hits.prim_id.reshape(27, 48) == film.aov["prim_id"]
-    assert (~same).sum() <= 2 and (hits.prim_id >= 0).sum() > 100  # but where an edge passes through a pixel's centre
-    np.testing.assert_allclose(hits.t.reshape(27, 48)[same], film.aov["depth"][same], rtol=1e-5)
+    np.testing.assert_array_equal(hits.prim_id.reshape(27, 48), film.aov["prim_id"])
+    np.testing.assert_array_equal(hits.t.reshape(27, 48), film.aov["depth"])
+    assert (hits.prim_id >= 0).sum() > 100
+
+
+@pytest.mark.parametrize("kind", CAMERAS.values(), ids=list(CAMERAS))
+def test_pictures_and_aovs_of_a_sphere_are_those_of_the_rays(kind: type[CameraKind]) -> None:
+    center, radius = np.array([0.3, -0.1, 0.2]), 1.6
+    camera = kind.look_at((1.5, 2.0, 2.5), (0.1, 0.0, 0.0))
+    ball = wrt.Material(albedo=(0.0, 0.0, 0.0), emission=(1.0, 1.0, 1.0))
+    scene = wrt.Scene(spheres=(wrt.Sphere(tuple(center), radius, ball),), cameras=(camera,),
+                      background=wrt.GradientBackground((0.0, 0.0, 0.0), (0.2, 0.2, 0.2)))
+    film = wrt.render(scene, size=(48, 30), spp=4, filter="box", aov=("depth", "prim_id", "material_id"))
+    origins, directions = (array.reshape(30, 48, 3).astype(np.float64) for array in wrt.camera_rays(camera, (48, 30)))
+    lit = directions.any(axis=2)
+    assert lit.all() == (kind.kind != "fisheye")
+    along = ((center - origins) * directions).sum(axis=2)
+    across = radius**2 - ((center - origins) ** 2).sum(axis=2) + along**2
+    sure = np.abs(across) > 1e-4
+    hit = lit & (across > 0.0) & (along > 0.0)
+    assert hit.sum() > 20 and (film.aov["prim_id"] >= 0)[sure].tolist() == hit[sure].tolist()
+    assert np.array_equal(film.aov["prim_id"] >= 0, film.aov["material_id"] >= 0)
+    np.testing.assert_allclose(film.aov["depth"][hit & sure], (along - np.sqrt(np.abs(across)))[hit & sure], rtol=1e-5)
+    assert np.isinf(film.aov["depth"][~hit & sure]).all()
+    # A pixel shows what its centre sees, where its neighbours see the same. The sky is linear in the direction's y.
+    value = np.where(hit, 1.0, np.where(lit, 0.2 * 0.5 * (1.0 + directions[..., 1]), 0.0))
+    padded = np.pad(np.where(lit, value, -1.0), 1, constant_values=-1.0)
+    near = np.stack([padded[i : i + 30, j : j + 48] for i in range(3) for j in range(3)])
+    flat = np.ptp(near, axis=0) < 0.05
+    assert flat.mean() > 0.6
+    np.testing.assert_allclose(film.pixels[..., 0][flat], value[flat], atol=0.02)
+    assert film.pixels[~lit & flat].max(initial=0.0) == 0.0
 
 
 def test_the_corners_are_where_the_angle_of_view_ends() -> None:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tests.wrt.viewer.test_refine import CAMERA, SCENE
 from wrt.core.errors import SceneWarning
 from wrt.io.load import load_scene
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind, FisheyeCamera, OrthographicCamera, PanoramaCamera
 from wrt.scene.model import Scene
 from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
 
@@ -56,6 +56,17 @@ def test_a_scene_file_has_the_camera_that_was_written(tmp_path: Path, seed: int,
     for name in ("fov_y", "aperture_radius", "focus_distance", "blades"):
         assert getattr(found, name) == pytest.approx(getattr(camera, name), rel=1e-14)
     assert not camera.blades or math.isclose(found.blade_rotation, camera.blade_rotation, rel_tol=1e-14)
+
+
+@pytest.mark.parametrize("camera", [OrthographicCamera(height=3.25), FisheyeCamera(fov=3.0), PanoramaCamera()])
+def test_other_kinds_turn_and_are_written_too(tmp_path: Path, camera: CameraKind) -> None:
+    turned = from_viewport(camera, SimpleNamespace(wxyz=(0.6, 0.0, 0.8, 0.0), position=np.array([1.0, 2.0, 3.0]), fov=0.9), 2.0)
+    assert turned.camera_to_world[:3, 3].tolist() == [2.0, 4.0, 6.0] and turned.as_in_files() == camera.as_in_files()
+    path = tmp_path / "scene.toml"
+    path.write_text('[background]\ntype = "gradient"\n' + camera_toml(turned, "seen"))
+    found = load_scene(path).camera("seen")
+    assert type(found) is type(camera) and found.as_in_files() == pytest.approx(camera.as_in_files(), rel=1e-14)
+    np.testing.assert_allclose(found.camera_to_world, turned.camera_to_world, atol=1e-11)
 
 
 def test_what_is_up() -> None:

@@ -20,7 +20,7 @@ from wrt.picture.film import Film
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
 from wrt.scene.backgrounds import GradientBackground
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, FisheyeCamera
 from wrt.scene.lights import DirectionalLight
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene
@@ -282,7 +282,8 @@ def test_a_renderer_aims_elsewhere_with_what_it_has() -> None:
     renderer.aim(other, size=(20, 31), spp=2, max_depth=1)
     expected = wrt.render(PINHOLE, camera=other, size=(20, 31), spp=2, max_depth=1)
     np.testing.assert_array_equal(renderer.run().pixels, expected.pixels)
-    for camera, settings, message in ((replace(other, aperture_radius=0.1), {}, "an aperture"),
+    for camera, settings, message in ((replace(other, aperture_radius=0.1), {}, "a camera's lens"),
+                                      (FisheyeCamera(), {}, "a camera of the kind fisheye"),
                                       (other, {"max_depth": 9}, "so many bounces"), (other, {"filter": "box"}, "other settings")):
         with pytest.raises(InputError, match=f"not made for {message}"):
             renderer.aim(camera, **settings)

@@ -24,7 +24,7 @@ from wrt.io.gltf.materials import Materials
 from wrt.io.gltf.meshes import Meshes
 from wrt.io.gltf.nodes import walk
 from wrt.io.gltf.schema import PunctualLightOfNode, PunctualLights, SpotCone, at, exactly
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.scene.defaults import stage
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 from wrt.scene.materials import Material
@@ -92,7 +92,7 @@ class _Reader:
     document: Document
     objects: list[Object] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
-    cameras: list[Camera] = field(default_factory=list)
+    cameras: list[CameraKind] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._meshes = Meshes(self.document)
@@ -165,14 +165,13 @@ class _Reader:
         source = self.document.item("cameras", node.camera, f"{place}.camera")
         name = node.name or source.name or f"camera {node.camera}"
         self.document.left_out.add_extensions(source.extensions, "camera", name)
-        if source.type == "orthographic":
-            self.document.left_out.add("orthographic projection", "camera", name)
-        elif source.type != "perspective" or source.perspective is None:
+        lens = getattr(source, source.type) if source.type in ("perspective", "orthographic") else None
+        if lens is None:
             raise InputError("must be 'perspective' or 'orthographic', with the object of that name", None,
                              f"cameras[{node.camera}].type")
-        else:
-            with at(f"{place}.camera"):
-                self.cameras.append(Camera(camera_to_world=world, fov_y=source.perspective.yfov, name=name))
+        with at(f"{place}.camera"):
+            self.cameras.append(Camera(world, lens.yfov, name=name) if source.type == "perspective" else
+                                OrthographicCamera(world, 2.0 * lens.ymag, name=name))
 
     def _add_light(self, node: Any, world: np.ndarray, place: str) -> None:
         link = self.document.extension(node, "KHR_lights_punctual", PunctualLightOfNode, place)

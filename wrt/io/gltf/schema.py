@@ -118,6 +118,7 @@ _REQUIRED = {
     "Accessor": ("componentType", "count", "type"), "Sparse": ("count", "indices", "values"),
     "AccessorSparseIndices": ("bufferView", "componentType"), "AccessorSparseValues": ("bufferView",),
     "BufferView": ("buffer", "byteLength"), "Buffer": ("byteLength",), "Camera": ("type",), "Perspective": ("yfov",),
+    "Orthographic": ("xmag", "ymag"),
     "Primitive": ("attributes",), "TextureInfo": ("index",), "NormalMaterialTexture": ("index",), "Asset": ("version",),
     "GLTF2": ("asset",),
 }

@@ -20,7 +20,7 @@ from wrt.io.toml.report import raise_all, unknown_materials
 from wrt.io.toml.transforms import transform, turn
 from wrt.scene import shapes
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CAMERAS, DEGREES, Camera, CameraKind
 from wrt.scene.lights import LIGHTS, Light
 from wrt.scene.materials import CONDUCTORS, Checkerboard, Material, Texture
 from wrt.scene.model import Object, Scene, Sphere
@@ -29,6 +29,7 @@ from wrt.scene.values import BLACK, SMALLEST, as_vector, require_count
 
 if TYPE_CHECKING:
     from wrt.io.toml import schema as tables
+    from wrt.io.toml.camera_schema import PoseTable
     from wrt.io.toml.material_schema import MaterialTable
 
 _COLOR_SLOTS = ("albedo_texture", "emission_texture")
@@ -91,7 +92,7 @@ class _Builder:
         objects: list[Object] = []
         spheres: list[Sphere] = []
         lights: list[Light] = []
-        cameras: list[Camera] = []
+        cameras: list[CameraKind] = []
         for i, sphere in enumerate(table.spheres):
             with self.at(f"spheres[{i}]"):
                 spheres += [Sphere(**{**sphere.given(), "material": m}) for m in self.found(sphere.material)]
@@ -253,18 +254,20 @@ def moved(scene: Scene, matrix: np.ndarray) -> Scene:
     )
 
 
-def make_camera(table: tables.CameraTable, name: str) -> Camera:
-    """A camera from where it stands and looks, or from its matrix; from its angle of view, or from a real lens."""
-    focus = table.focus_distance
-    if focus is None and table.position is not None and table.target is not None:
-        focus = max(math.dist(table.position, table.target), SMALLEST)
-    fields: dict[str, Any] = {"blades": table.blades, "blade_rotation": math.radians(table.blade_rotation), "name": name}
-    if table.focal_length is not None and table.sensor_height is not None:
-        fields |= Camera.lens(table.focal_length, focus or 1.0, table.sensor_height, f_number=table.f_number,
-                              aperture_radius=table.aperture_radius)
-    else:
-        fields |= {"fov_y": math.radians(45.0 if table.fov_y is None else table.fov_y), "focus_distance": focus or 1.0,
-                   "aperture_radius": table.aperture_radius or 0.0}
+def make_camera(table: PoseTable, name: str) -> CameraKind:
+    """A camera from where it stands and looks, or from its matrix; a perspective one by its angle of view, or by a real lens."""
+    kind = CAMERAS[table.type]
+    values: dict[str, Any] = {}
+    for key, about in kind.parameters().items():
+        if key in table.model_fields_set:
+            value = getattr(table, key)
+            values[key] = math.radians(value) if about["unit"] == DEGREES else value
+        elif key == "focus_distance" and table.position is not None and table.target is not None:
+            values[key] = max(math.dist(table.position, table.target), SMALLEST)
+    focal_length, sensor_height = (getattr(table, key, None) for key in ("focal_length", "sensor_height"))
+    if focal_length is not None and sensor_height is not None:
+        values |= Camera.lens(focal_length, values.get("focus_distance", 1.0), sensor_height,
+                              f_number=getattr(table, "f_number", None), aperture_radius=values.get("aperture_radius"))
     if table.matrix is not None:
-        return Camera(np.array(table.matrix).reshape(4, 4), **fields)
-    return Camera.look_at(table.position, table.target, table.up, **fields)
+        return kind(np.array(table.matrix).reshape(4, 4), name=name, **values)
+    return kind.look_at(table.position, table.target, table.up, name=name, **values)

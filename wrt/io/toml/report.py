@@ -130,7 +130,7 @@ def _line(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) ->
     if kind == "value_error":
         return f"{place or 'file'}: {context['error']}"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
-        tag = context["discriminator"].strip("'")
+        tag = "type" if context["discriminator"].endswith("()") else context["discriminator"].strip("'")
         if kind == "union_tag_not_found":
             return f"{place}.{tag}: is missing"
         choices = [name.strip("'") for name in context["expected_tags"].split(", ")]

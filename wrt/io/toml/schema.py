@@ -11,18 +11,16 @@ from typing import Annotated, Any, Literal, Union
 
 from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
+from wrt.io.toml.camera_schema import any_camera
 from wrt.io.toml.kinds import kind_table
 from wrt.io.toml.material_schema import (
-    DEGREES,
     LENGTH,
     Angle,
     Angles,
     Length,
     MaterialTable,
     Matrix,
-    NotNegative,
     Point,
-    Positive,
     Radiance,
     Scale3,
     Segments,
@@ -35,60 +33,18 @@ from wrt.io.toml.material_schema import (
     unit,
 )
 from wrt.scene.backgrounds import BACKGROUNDS
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CAMERAS, CameraKind
 from wrt.scene.kinds import Kind
 from wrt.scene.lights import LIGHTS
 from wrt.scene.materials import MATERIALS
 from wrt.scene.settings import MAX_DEPTH, Settings
 
-# --- cameras, background, settings ------------------------------------------------------------------------------------
+# --- background, settings ---------------------------------------------------------------------------------------------
 
-_CAMERA = Camera()
 _SETTINGS = Settings()
 RADIANCE = unit("radiance")
 
 
-class CameraTable(Table):
-    """A pinhole, or a thin lens where it has an aperture. Give position and target, or matrix; fov_y, or
-    focal_length."""
-
-    position: Point | None = Field(None, description="where the camera stands")
-    target: Point | None = Field(None, description="the point in the middle of the picture")
-    up: Vector = Field([0.0, 1.0, 0.0], description="what is up in the picture")
-    matrix: Matrix | None = Field(None, description="camera to world, row by row; the camera looks along -z, +y is up")
-    fov_y: Annotated[float, Field(gt=0.0, lt=179.9), DEGREES] | None = Field(
-        None, description="full vertical angle of view (default: 45)")
-    focal_length: Length | None = Field(None, description="of a real lens, in place of fov_y")
-    sensor_height: Length | None = Field(None, description="of a real lens")
-    f_number: Positive | None = Field(
-        None, description="of a real lens: the aperture's radius is focal_length / (2 f_number)")
-    aperture_radius: Annotated[NotNegative, LENGTH] | None = Field(None, description="0 is a pinhole (default: 0)")
-    focus_distance: Length | None = Field(
-        None, description="along the axis to what is sharp (default: the distance to target, else 1)")
-    blades: int = Field(_CAMERA.blades, ge=0, le=64, description="0: a round aperture; from 3 on its number of sides")
-    blade_rotation: Angle = Field(0.0, description="turns the aperture")
-
-    @model_validator(mode="after")
-    def _check(self) -> CameraTable:
-        problems = []
-        if (self.matrix is None) == (self.position is None and self.target is None):
-            problems.append("give either position and target, or matrix")
-        elif self.matrix is None and (self.position is None or self.target is None):
-            problems.append("needs both position and target")
-        if self.focal_length is None and (self.sensor_height is not None or self.f_number is not None):
-            problems.append("sensor_height and f_number belong to a focal_length")
-        if self.focal_length is not None:
-            if self.fov_y is not None:
-                problems.append("give either fov_y or focal_length")
-            if self.sensor_height is None:
-                problems.append("focal_length needs a sensor_height")
-            if (self.f_number is None) == (self.aperture_radius is None):
-                problems.append("focal_length needs either f_number or aperture_radius")
-        if self.blades in (1, 2):
-            problems.append(f"blades must be 0 (round) or 3 to 64, not {self.blades}")
-        if problems:
-            raise ValueError("; ".join(problems))
-        return self
 
 
 class SettingsTable(Table):
@@ -318,7 +274,7 @@ class SceneTable(Table):
         [], description="glTF files, or tables with a transform; their shapes, cameras and lights come behind this file's")
     settings: SettingsTable = Field(default_factory=lambda: SettingsTable.model_validate({}),
                                     description="how the scene wants to be rendered")
-    cameras: dict[str, CameraTable] = Field({}, description="by name; the first is the default")
+    cameras: dict[str, Any] = Field({}, description="by name; the first is the default")
     background: Any = Field(None, description="what rays that leave the scene see (default: black)")
     ambient: Annotated[Radiance, RADIANCE] = Field([0.0, 0.0, 0.0], description="what every diffuse surface receives, unshadowed")
     materials: dict[str, MaterialTable] = Field({}, description="by name")
@@ -331,12 +287,13 @@ class SceneTable(Table):
 
 
 def scene_table() -> type[SceneTable]:
-    """The SceneTable of the kinds of lights, backgrounds and materials that there are: one can be added at any time."""
-    return _scene_table(tuple(LIGHTS.values()), tuple(BACKGROUNDS.values()), tuple(MATERIALS))
+    """The SceneTable of the kinds of cameras, lights, backgrounds and materials that there are: one can be added at any time."""
+    return _scene_table(tuple(CAMERAS.values()), tuple(LIGHTS.values()), tuple(BACKGROUNDS.values()), tuple(MATERIALS))
 
 
 @cache
-def _scene_table(lights: tuple[type[Kind], ...], backgrounds: tuple[type[Kind], ...], materials: tuple[str, ...]) -> Any:
+def _scene_table(cameras: tuple[type[CameraKind], ...], lights: tuple[type[Kind], ...], backgrounds: tuple[type[Kind], ...],
+                 materials: tuple[str, ...]) -> Any:
     tagged: Any = Annotated
     one_of: Any = Union
     by_name: Any = dict
@@ -344,7 +301,8 @@ def _scene_table(lights: tuple[type[Kind], ...], backgrounds: tuple[type[Kind], 
     material = material_table(materials)
     light = one_of[(*(kind_table(each, "Light") for each in lights), RectangleLightTable)]
     background = one_of[tuple(kind_table(each, "") for each in backgrounds)]
-    changes = {"background": tagged[background, Field(discriminator="type")] | None, "materials": by_name[str, material],
-               "override": by_name[str, material], "lights": many[tagged[light, Field(discriminator="type")]]}
+    changes = {"cameras": by_name[str, any_camera(cameras)], "background": tagged[background, Field(discriminator="type")] | None,
+               "materials": by_name[str, material], "override": by_name[str, material],
+               "lights": many[tagged[light, Field(discriminator="type")]]}
     fields: dict[str, Any] = {name: (kind, SceneTable.model_fields[name]) for name, kind in changes.items()}
     return create_model("SceneTable", __base__=SceneTable, __doc__=SceneTable.__doc__, **fields)

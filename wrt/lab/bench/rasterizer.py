@@ -22,7 +22,7 @@ from wrt.kernels.structs import Surfaces, Tile
 from wrt.kernels.study import rasterize as kernels
 from wrt.kernels.study.primary_rays import make_primary_rays_kernel
 from wrt.renderer.upload import camera_struct
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind
 
 NOTHING = np.uint64(0x7F800000_FFFFFFFF)  # depth inf, prim_id -1
 TRIANGLES_PER_LAUNCH = 65536
@@ -31,19 +31,26 @@ ROWS_ON_CUDA = 16  # a band: one thread draws a triangle's part of it
 TILE_SIZE = 32
 
 
-def directions_from_pixels(camera: Camera, size: tuple[int, int]) -> np.ndarray:
+def as_perspective(camera: CameraKind) -> Camera:
+    """Raise InputError for another camera: straight edges must stay straight."""
+    if not isinstance(camera, Camera):
+        raise InputError(f"z-buffer and rays are compared through a perspective camera; camera {camera.name!r} is {camera.kind}")
+    return camera
+
+
+def directions_from_pixels(camera: CameraKind, size: tuple[int, int]) -> np.ndarray:
     """(3, 3) float64 that takes (x, y, 1), in pixels from the top left corner, to the direction through that point.
 
     From the float32 numbers that the ray units get: it is the exact value of what they compute (not yet of unit length).
     """
-    c = camera_struct(camera, size)
+    c = camera_struct(as_perspective(camera), size)
     right, up, forward = (np.array(list(v), np.float64) for v in (c.right, c.up, c.forward))
     tan_x, tan_y = (float(np.float32(value)) for value in (c.tan_x, c.tan_y))  # the struct still holds what it was given
     across, down = 2.0 * tan_x / size[0] * right, -2.0 * tan_y / size[1] * up
     return np.column_stack([across, down, forward - tan_x * right + tan_y * up])
 
 
-def view_struct(camera: Camera, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> Any:
+def view_struct(camera: CameraKind, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> Any:
     """kernels.rasterize.View of a camera. shift: in pixels, of all centres, to the right and down."""
     from_pixels = directions_from_pixels(camera, size) @ np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
     view = kernels.View()
@@ -74,7 +81,7 @@ class Rasterizer:
         for kernel in (kernels.project, kernels.bound, kernels.rasterize):
             load_kernel(kernel, self.device)
 
-    def draw(self, camera: Camera, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> None:
+    def draw(self, camera: CameraKind, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> None:
         """Draw all triangles into a picture of `size` pixels, seen from the middle of the camera's lens.
 
         shift: sample so far, in pixels, right and down of the pixels' centres.
@@ -157,14 +164,14 @@ class RayCaster:
         load_kernel(self.kernel, self.device)
         self.size = (0, 0)
 
-    def draw(self, camera: Camera, size: tuple[int, int]) -> None:
+    def draw(self, camera: CameraKind, size: tuple[int, int]) -> None:
         """Cast the ray through every pixel's centre, from the middle of the camera's lens."""
         width, height = size
         if self.size != size:
             self.size = size
             self._depth = wp.empty(width * height, dtype=wp.float32, device=self.device)
             self._prim_id = wp.empty(width * height, dtype=wp.int32, device=self.device)
-        c = camera_struct(camera, size)
+        c = camera_struct(as_perspective(camera), size)
         step = max(size) if self.device.is_cuda else TILE_SIZE
 
         def job(x: int, y: int) -> Any:

@@ -31,6 +31,7 @@ from wrt.lab.mitsuba.process import VARIANTS, Job, MitsubaProcess, environment_o
 from wrt.lab.mitsuba.translate import INTEGRATORS
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
+from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.model import Scene
 
@@ -117,7 +118,7 @@ def matte(scene: Scene) -> Scene:
                                emission=m.emission if m.lights_others else (0.0, 0.0, 0.0)) for m in scene.materials}
     objects = tuple(replace(thing, materials=tuple(changed[id(m)] for m in thing.materials)) for thing in scene.objects)
     spheres = tuple(replace(sphere, material=changed[id(sphere.material)]) for sphere in scene.spheres)
-    cameras = tuple(replace(camera, blades=0) for camera in scene.cameras)
+    cameras = tuple(replace(each, blades=0) if isinstance(each, Camera) else each for each in scene.cameras)
     return replace(scene, objects=objects, spheres=spheres, cameras=cameras, ambient=(0.0, 0.0, 0.0))
 
 

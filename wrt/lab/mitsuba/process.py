@@ -23,7 +23,7 @@ import wrt
 from wrt.core.errors import InputError
 from wrt.lab.mitsuba.llvm import PATH_VARIABLE, NotAvailable, ended, llvm_library
 from wrt.lab.mitsuba.translate import mitsuba, translate
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 
 VARIANTS = ("scalar_rgb", "llvm_ad_rgb")
@@ -36,7 +36,7 @@ class Job(NamedTuple):
 
     variant: str
     scene: Scene
-    camera: Camera | str | int | None
+    camera: CameraKind | str | int | None
     integrator: str
     threads: int
 

@@ -28,7 +28,7 @@ from wrt.core.errors import InputError
 from wrt.lab.mitsuba.emitters import background_emitter, light_emitter
 from wrt.lab.mitsuba.exact import refuse
 from wrt.lab.mitsuba.shapes import Part, object_parts, sphere_shape
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.scene.model import Scene
 
 VARIANT = "scalar_rgb"
@@ -64,7 +64,7 @@ class Translation(NamedTuple):
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 
-def translate(mi: Any, scene: Scene, camera: Camera | str | int | None = None, integrator: str = "auto") -> Translation:
+def translate(mi: Any, scene: Scene, camera: CameraKind | str | int | None = None, integrator: str = "auto") -> Translation:
     """The scene for the module `mitsuba` with the variant that it has set, with sensor, film, sampler and integrator.
 
     camera: a camera, or that of the scene by name or number. integrator: one of INTEGRATORS; "auto" is "volpath" where something
@@ -93,7 +93,7 @@ def translate(mi: Any, scene: Scene, camera: Camera | str | int | None = None, i
     _check_light_transport(scene, integrator)
 
     contents["integrator"] = _integrator(mi, integrator, scene, lit, parts)
-    contents["sensor"] = _sensor(mi, scene, camera if isinstance(camera, Camera) else scene.camera(camera))
+    contents["sensor"] = _sensor(mi, scene, camera if isinstance(camera, CameraKind) else scene.camera(camera))
     try:
         return Translation(mi.load_dict(contents), parts)
     except RuntimeError as error:
@@ -149,31 +149,43 @@ def _integrator(mi: Any, name: str, scene: Scene, lit: bool, parts: dict[str, Pa
 # --- camera and film --------------------------------------------------------------------------------------------------
 
 
-def _sensor(mi: Any, scene: Scene, camera: Camera) -> dict[str, Any]:
-    if camera.aperture_radius > 0.0 and camera.blades:
-        refuse("aperture blades", f"camera {camera.name!r}")
+def _sensor(mi: Any, scene: Scene, camera: CameraKind) -> dict[str, Any]:
     far = _farthest(scene, camera)
     # Mitsuba's camera looks along +z with +x to the left: half a turn about y away from glTF's.
     pose = camera.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
     sensor: dict[str, Any] = {
-        "type": "perspective", "fov_axis": "y", "fov": math.degrees(camera.fov_y), "near_clip": 1e-5 * far,
-        "far_clip": 4.0 * far, "to_world": mi.ScalarTransform4f(pose), "film": _film(scene),
+        "near_clip": 1e-5 * far, "far_clip": 4.0 * far, "film": _film(scene),
         "sampler": {"type": "independent", "sample_count": scene.settings.spp},
     }
-    if camera.aperture_radius > 0.0:
-        sensor |= {"type": "thinlens", "aperture_radius": camera.aperture_radius,
-                   "focus_distance": camera.focus_distance}
-    return sensor
+    if isinstance(camera, OrthographicCamera):
+        width, height = scene.settings.size
+        half_width = 0.5 * camera.height * width / height
+        pose = pose @ np.diag([half_width, half_width, 1.0, 1.0])
+        sensor |= {"type": "orthographic"}
+    elif isinstance(camera, Camera):
+        sensor |= {"type": "perspective", "fov_axis": "y", "fov": math.degrees(camera.fov_y)}
+        if camera.aperture_radius > 0.0:
+            sensor |= {"type": "thinlens", "aperture_radius": camera.aperture_radius,
+                       "focus_distance": camera.focus_distance}
+            if camera.blades:
+                refuse("aperture blades", f"camera {camera.name!r}")
+    else:
+        refuse(f"a {camera.kind} camera", f"camera {camera.name!r}")
+    return sensor | {"to_world": mi.ScalarTransform4f(pose)}
 
 
-def _farthest(scene: Scene, camera: Camera) -> float:
+def _farthest(scene: Scene, camera: CameraKind) -> float:
     """An upper bound of the distance from the camera to any shape."""
     if not scene.objects and not scene.spheres:
-        return camera.focus_distance
+        return _focus(camera)
     low, high = scene.bounds()
     position = camera.camera_to_world[:3, 3]
     reach = np.linalg.norm(np.maximum(np.abs(low - position), np.abs(high - position)))
-    return max(float(reach), camera.focus_distance if camera.aperture_radius > 0.0 else 0.0)
+    return max(float(reach), _focus(camera) if camera.switches().get("lens") else 0.0)
+
+
+def _focus(camera: CameraKind) -> float:
+    return camera.focus_distance if isinstance(camera, Camera) else 1.0
 
 
 def _film(scene: Scene) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests.gltf_files import TRIANGLE, GltfFile, load_warned, one_triangle, with_light
 from wrt.core.errors import InputError
 from wrt.io.gltf.reader import load_gltf
+from wrt.scene.cameras import OrthographicCamera
 from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
 from wrt.scene.model import Scene
 
@@ -370,13 +371,13 @@ def test_cameras_have_the_pose_of_their_node(tmp_path):
     assert right.camera_to_world @ [0, 0, -9, 1] == pytest.approx([0, 0, 0, 1])  # it looks along -z
 
 
-def test_orthographic_cameras_are_named_and_replaced(tmp_path):
+def test_an_orthographic_camera_is_as_high_as_its_ymag_says(tmp_path):
     file = one_triangle()
-    plan = file.add("cameras", {"type": "orthographic", "orthographic": {"xmag": 1, "ymag": 1, "zfar": 9, "znear": 0}})
-    file.node(camera=plan, name="plan")
-    scene, messages = load_warned(file.write(tmp_path))
-    assert [camera.name for camera in scene.cameras] == ["framing"] and len(messages) == 1
-    assert "orthographic projection (camera 'plan')" in messages[0] and "no camera" in messages[0]
+    plan = file.add("cameras", {"type": "orthographic", "orthographic": {"xmag": 3, "ymag": 1.5, "zfar": 9, "znear": 0}})
+    file.node(camera=plan, name="plan", translation=[0, 0, 4])
+    (camera,) = load(file, tmp_path).cameras
+    assert isinstance(camera, OrthographicCamera) and (camera.name, camera.height) == ("plan", 3.0)
+    assert camera.camera_to_world[:3, 3].tolist() == [0, 0, 4]
 
 
 @pytest.mark.parametrize("camera, message", [
@@ -384,6 +385,8 @@ def test_orthographic_cameras_are_named_and_replaced(tmp_path):
     ({"type": "fisheye"}, r"cameras\[0\].type: must be 'perspective' or"),
     ({}, r"cameras\[0\].type: is required"),
     ({"type": "perspective", "perspective": {}}, r"cameras\[0\].perspective.yfov: is required"),
+    ({"type": "orthographic", "orthographic": {"ymag": 1}}, r"cameras\[0\].orthographic.xmag: is required"),
+    ({"type": "orthographic", "orthographic": {"xmag": 1, "ymag": 0}}, r"nodes\[1\].camera: .*height must be"),
     ({"type": "perspective", "perspective": {"yfov": 4}}, r"nodes\[1\].camera: .*fov_y must be"),
     ({"type": "perspective", "perspective": {"yfov": "wide"}}, r"perspective.yfov: must be a number"),
 ])

@@ -11,7 +11,7 @@ import pytest
 
 import wrt
 from tests.data import data_path
-from tests.mitsuba_oracle import aov_mitsuba, camera_rays, render_mitsuba
+from tests.mitsuba_oracle import aov_mitsuba, render_mitsuba
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.defaults import frame_camera
@@ -42,7 +42,7 @@ def first_hits(name: str):
     camera = frame_camera(scene) if pose is None else Camera.look_at(*pose, fov_y=math.radians(70))
     scene = replace(scene, cameras=(camera,))
     film = wrt.render(scene, size=SIZE, spp=1, max_depth=0, aov=("depth", "normal", "prim_id"))
-    return film.aov, aov_mitsuba(scene, size=SIZE), camera_rays(camera, SIZE)[1]
+    return film.aov, aov_mitsuba(scene, size=SIZE), wrt.camera_rays(camera, SIZE)[1].reshape(*SIZE[::-1], 3)
 
 
 def silhouettes(depth: np.ndarray) -> np.ndarray:

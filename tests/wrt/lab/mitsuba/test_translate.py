@@ -1,4 +1,4 @@
-"""The translation to Mitsuba against closed forms and float64 NumPy: wrt's own kernels play no part here."""
+"""The translation to Mitsuba against closed forms and float64 NumPy: wrt's own kernels make no more here than the rays of AOVs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from wrt.core.errors import InputError
 from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, FisheyeCamera, OrthographicCamera
 from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.mesh import Mesh
@@ -20,7 +20,7 @@ from wrt.scene.settings import Settings
 
 pytest.importorskip("mitsuba", reason='needs Mitsuba 3 (pip install "wrt[peers]")')
 
-from tests.mitsuba_oracle import aov_mitsuba, camera_rays, render_mitsuba, to_mitsuba, trace_mitsuba
+from tests.mitsuba_oracle import aov_mitsuba, render_mitsuba, to_mitsuba, trace_mitsuba
 from wrt.lab.mitsuba.translate import mitsuba
 
 CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
@@ -49,6 +49,16 @@ def rotation(axis: int, angle: float) -> np.ndarray:
     matrix[i, i] = matrix[j, j] = math.cos(angle)
     matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
     return matrix
+
+
+def camera_rays(camera: Camera, size) -> tuple[np.ndarray, np.ndarray]:
+    """Origin (3,) and unit directions (H, W, 3), float64."""
+    width, height = size
+    top = math.tan(0.5 * camera.fov_y)
+    x = (2.0 * (np.arange(width) + 0.5) / width - 1.0) * top * width / height
+    y = (1.0 - 2.0 * (np.arange(height) + 0.5) / height) * top
+    directions = np.stack(np.broadcast_arrays(x[None, :], y[:, None], -1.0), axis=-1) @ camera.camera_to_world[:3, :3].T
+    return camera.camera_to_world[:3, 3].copy(), directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
 def plane_hit(camera: Camera, size) -> np.ndarray:
@@ -112,6 +122,30 @@ def test_pixels_lie_where_the_camera_says():
     assert (~border).sum() > 0.6 * border.size and (expected[..., 2] > 0).any()
     np.testing.assert_array_equal(pixels[~border], blocks.mean(axis=(1, 3))[~border].astype(np.float32))
     assert abs(pixels - blocks.mean(axis=(1, 3))).mean() < 0.03
+
+
+def test_an_orthographic_camera_shows_a_ball_where_it_is_and_as_large_as_it_is():
+    camera = OrthographicCamera.look_at((1.0, 0.7, 9.5), (0.2, 0.1, 0.0), height=4.0)
+    right, up = camera.camera_to_world[:3, :2].T
+    center = np.array([0.2, 0.1, 0.0]) + 0.75 * right - 0.5 * up
+    glow = Material(albedo=(0, 0, 0), emission=(1, 1, 1))
+    scene = Scene(spheres=(Sphere(tuple(center), 0.6, glow),), cameras=(camera,))
+    pixels = render_mitsuba(scene, size=(48, 32), spp=64, integrator="path").pixels[..., 0]
+    x = ((np.arange(48) + 0.5) / 48 - 0.5) * 6.0
+    y = (0.5 - (np.arange(32) + 0.5) / 32) * 4.0
+    assert pixels.sum() * (4.0 / 32) ** 2 == pytest.approx(np.pi * 0.6**2, rel=0.01)
+    found = [(pixels * x).sum() / pixels.sum(), (pixels.T * y).sum() / pixels.sum()]
+    assert found == pytest.approx([0.75, -0.5], abs=0.01)
+    aov = aov_mitsuba(scene, size=(48, 32))
+    assert np.isfinite(aov.depth).sum() * (4.0 / 32) ** 2 == pytest.approx(np.pi * 0.6**2, rel=0.05)
+
+
+def test_a_camera_that_mitsuba_has_not_is_refused_but_its_rays_can_be_traced():
+    scene = Scene(spheres=(Sphere((0, 0, -5), 1.0, Material()),), cameras=(FisheyeCamera(fov=1.0, name="eye"),))
+    with pytest.raises(InputError, match="'eye': not translatable exactly: a fisheye camera"):
+        render_mitsuba(scene, size=(8, 8), spp=1)
+    depth = aov_mitsuba(scene, size=(33, 33)).depth
+    assert depth[16, 16] == pytest.approx(4.0) and np.isinf(depth[0, 0])
 
 
 def test_thin_lens_blurs_as_the_equation_says():

@@ -1,24 +1,38 @@
-"""Cameras: from a point of the picture, and one of the lens, to a ray."""
+"""A pinhole, or a thin lens with a round or polygonal aperture."""
 
 import warp as wp
 
 from wrt.kernels.shade.sampling import disk, polygon
-from wrt.kernels.structs import Camera, Ray, lift, make_ray
+from wrt.kernels.structs import Ray, lift, make_ray
+
+
+@wp.struct
+class Camera:
+    """The picture spans forward +- tan_x right +- tan_y up."""
+
+    origin: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    forward: wp.vec3
+    tan_x: float
+    tan_y: float
+    focus_distance: float
+    aperture_radius: float
+    blades: int
+    blade_rotation: float
 
 
 @wp.func
 def chief_ray(camera: Camera, film: wp.vec2) -> wp.vec3:
-    """The direction through the lens' centre, which no lens bends; its part along `forward` is 1.
-
-    film: (0, 0) is the picture's top left corner, (1, 1) the bottom right one.
-    """
+    """The direction through the lens' centre, which no lens bends; its part along `forward` is 1."""
     x = (2.0 * film[0] - 1.0) * camera.tan_x
     y = (1.0 - 2.0 * film[1]) * camera.tan_y
     return camera.forward + x * camera.right + y * camera.up
 
 
-def make_camera_ray(lens: bool, blades: bool):
-    """Pinhole, or thin lens with a round or polygonal aperture; direction of unit length, world space."""
+def make_camera_ray(features=None):
+    lens = features is not None and features.lens
+    blades = lens and features.blades
 
     @wp.func
     def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:

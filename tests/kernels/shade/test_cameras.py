@@ -1,4 +1,5 @@
-"""Camera rays against the lecture's construction in float64: chief ray, parallel ray, and the point S where they meet."""
+"""Camera rays against closed forms in float64; of a lens, the lecture's construction: chief ray, parallel ray, and the point S
+where they meet."""
 
 from functools import cache
 
@@ -8,19 +9,19 @@ import pytest
 from tests.kernel_tools import launch, unit, vec2s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.kernels.shade.camera import make_camera_ray
-from wrt.kernels.structs import Camera as DeviceCamera
 from wrt.kernels.structs import Ray, kernel
-from wrt.renderer.upload import camera_struct
-from wrt.scene.cameras import Camera
+from wrt.renderer.features import Features
+from wrt.renderer.upload import camera_kind, camera_struct
+from wrt.scene.cameras import Camera, FisheyeCamera, OrthographicCamera, PanoramaCamera
 
 
 @cache
-def camera_kernel(lens, blades):
-    camera_ray = make_camera_ray(lens, blades)
+def camera_kernel(device, features):
+    kind = camera_kind(device)
+    camera_struct, camera_ray = kind.Camera, kind.make_camera_ray(features)
 
     @kernel
-    def trace(camera: DeviceCamera, film: wp.array(dtype=wp.vec2), xi: wp.array(dtype=wp.vec2), out: wp.array(dtype=Ray)):
+    def trace(camera: camera_struct, film: wp.array(dtype=wp.vec2), xi: wp.array(dtype=wp.vec2), out: wp.array(dtype=Ray)):
         i = wp.tid()
         out[i] = camera_ray(camera, film[i], xi[i])
 
@@ -31,9 +32,9 @@ def rays(camera, size, film, xi=None):
     """origins, directions (N, 3) float64 of a camera's rays at film points, with lens samples xi."""
     film = np.asarray(film, float).reshape(-1, 2)
     xi = np.zeros_like(film) if xi is None else xi
-    lens, blades = camera.aperture_radius > 0.0, camera.aperture_radius > 0.0 and camera.blades > 0
+    kernel = camera_kernel(camera.device, Features(**camera.switches()))
     out = zeros(len(film), Ray)
-    launch(camera_kernel(lens, blades), len(film), camera_struct(camera, size), vec2s(film), vec2s(xi), out)
+    launch(kernel, len(film), camera_struct(camera, size), vec2s(film), vec2s(xi), out)
     out = out.numpy()
     assert (out["t_min"] == 0.0).all() and np.isinf(out["t_max"]).all() and (out["exclude_plus_one"] == 0).all()
     origin, direction = out["origin"].astype(np.float64), out["direction"].astype(np.float64)
@@ -139,3 +140,52 @@ def test_a_closed_aperture_is_a_pinhole():
     pinhole = rays(Camera.look_at(**POSE), (16, 9), film)
     stopped = rays(Camera.look_at(**POSE, aperture_radius=1e-9, focus_distance=3.0), (16, 9), film)
     assert np.allclose(pinhole[1], stopped[1], atol=1e-6)
+
+
+FILM = np.random.default_rng(5).random((200, 2))
+
+
+@pytest.mark.parametrize("size", [(640, 360), (100, 300)])
+def test_orthographic_rays_are_parallel_and_start_where_their_pixels_are(size):
+    camera = OrthographicCamera.look_at(**POSE, height=3.0)
+    right, up, forward, eye = frame(camera)
+    origin, direction = rays(camera, size, FILM)
+    x, y = (FILM[:, 0] - 0.5) * 3.0 * size[0] / size[1], (0.5 - FILM[:, 1]) * 3.0
+    assert np.allclose(origin, eye + x[:, None] * right + y[:, None] * up, atol=2e-6)
+    assert np.allclose(direction, forward, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(640, 360), (100, 300), (64, 64)])
+@pytest.mark.parametrize("fov", [0.5, np.pi, 2.0 * np.pi])
+def test_a_fisheyes_angles_are_proportional_to_the_radius(size, fov):
+    camera = FisheyeCamera.look_at(**POSE, fov=fov)
+    right, up, forward, eye = frame(camera)
+    x, y = (2.0 * FILM - 1.0).T * (np.array(size) / min(size))[:, None] * [[1.0], [-1.0]]
+    radius = np.hypot(x, y)
+    inside = radius < 1.0 - 1e-6
+    origin, direction = rays(camera, size, FILM[inside])
+    angle = np.arccos(np.clip(direction @ forward, -1.0, 1.0))
+    assert np.allclose(angle, 0.5 * fov * radius[inside], atol=2e-3)  # arccos doubles the digits that are lost beside the axis
+    assert np.allclose(np.sin(0.5 * fov * radius[inside])[:, None] * np.stack([x, y], axis=1)[inside] / radius[inside, None],
+                       np.stack([direction @ right, direction @ up], axis=1), atol=2e-6)
+    assert np.allclose(origin, eye, atol=1e-6)
+    assert np.allclose(rays(camera, size, [(0.5, 0.5)])[1], forward, atol=1e-6)
+
+
+def test_a_fisheye_has_no_ray_beyond_its_circle():
+    camera, size = FisheyeCamera(), (64, 36)
+    film = np.array([(0.5 + 0.5 * 36 / 64 + 1e-3, 0.5), (0.0, 0.0), (0.5, -0.01), (1.0, 0.5)])
+    out = zeros(len(film), Ray)
+    launch(camera_kernel(camera.device, Features()), len(film), camera_struct(camera, size), vec2s(film), vec2s(film), out)
+    assert (out.numpy()["t_max"] < 0.0).all() and not out.numpy()["direction"].any()
+
+
+def test_a_panoramas_columns_are_longitudes_and_its_rows_latitudes():
+    camera = PanoramaCamera.look_at(**POSE)
+    right, up, forward, eye = frame(camera)
+    origin, direction = rays(camera, (64, 32), FILM)
+    assert np.allclose(origin, eye, atol=1e-6)
+    assert np.allclose(np.arctan2(direction @ right, direction @ forward), 2.0 * np.pi * (FILM[:, 0] - 0.5), atol=2e-5)
+    assert np.allclose(np.arcsin(direction @ up), np.pi * (0.5 - FILM[:, 1]), atol=2e-3)
+    corners = rays(camera, (64, 32), [(0.5, 0.5), (0.75, 0.5), (0.25, 0.5), (0.0, 0.5), (1.0, 0.5), (0.3, 0.0), (0.3, 1.0)])[1]
+    assert np.allclose(corners, [forward, right, -right, -forward, -forward, up, -up], atol=1e-6)

@@ -1,0 +1,34 @@
+"""The rays of a camera by themselves, and the ray that there is not."""
+
+import warp as wp
+
+from wrt.kernels.structs import Ray, kernel, make_ray
+
+
+@wp.func
+def no_ray() -> Ray:
+    """Where the film gets no light: t_max < 0, and no direction."""
+    ray = make_ray(wp.vec3(0.0, 0.0, 0.0), wp.vec3(0.0, 0.0, 0.0))
+    ray.t_max = -1.0
+    return ray
+
+
+def make_camera_rays_kernel(camera_kind):
+    """camera_kind: a module as wrt.kernels.shade.cameras says. Through the middle of the lens; the direction is 0 where there is no
+    ray."""
+    camera_struct = camera_kind.Camera
+    camera_ray = camera_kind.make_camera_ray()
+
+    @kernel
+    def camera_rays(
+        camera: camera_struct,
+        film: wp.array(dtype=wp.vec2),
+        origins: wp.array(dtype=wp.vec3),
+        directions: wp.array(dtype=wp.vec3),
+    ):
+        tid = wp.tid()
+        ray = camera_ray(camera, film[tid], wp.vec2(0.5, 0.5))
+        origins[tid] = ray.origin
+        directions[tid] = ray.direction
+
+    return camera_rays

@@ -1,0 +1,40 @@
+"""An equidistant fisheye: the angle to the axis grows in proportion to the distance from the picture's centre."""
+
+import warp as wp
+
+from wrt.kernels.shade.camera_rays import no_ray
+from wrt.kernels.structs import Ray, make_ray
+
+
+@wp.struct
+class Camera:
+    """half_angle: between the axis and the rays of the image circle's edge; half_width, half_height: of the picture, the circle's
+    radius being 1."""
+
+    origin: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    forward: wp.vec3
+    half_angle: float
+    half_width: float
+    half_height: float
+
+
+@wp.func
+def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
+    """No ray beyond the image circle."""
+    x = (2.0 * film[0] - 1.0) * camera.half_width
+    y = (1.0 - 2.0 * film[1]) * camera.half_height
+    radius = wp.sqrt(x * x + y * y)
+    if radius > 1.0:
+        return no_ray()
+    angle = radius * camera.half_angle
+    aside = 0.0
+    if radius > 0.0:
+        aside = wp.sin(angle) / radius
+    direction = wp.cos(angle) * camera.forward + aside * (x * camera.right + y * camera.up)
+    return make_ray(camera.origin, wp.normalize(direction))
+
+
+def make_camera_ray(features=None):
+    return camera_ray

@@ -1,0 +1,27 @@
+"""Everything around one point, equirectangular: columns are longitudes, rows are latitudes."""
+
+import warp as wp
+
+from wrt.kernels.structs import Ray, make_ray
+
+
+@wp.struct
+class Camera:
+    origin: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    forward: wp.vec3
+
+
+@wp.func
+def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
+    """The middle column looks along `forward`, the right half to the right; the upper edge is `up`. An environment background of
+    the same picture is seen in the same directions."""
+    longitude = wp.TAU * (film[0] - 0.5)
+    colatitude = wp.PI * film[1]
+    level = wp.sin(longitude) * camera.right + wp.cos(longitude) * camera.forward
+    return make_ray(camera.origin, wp.normalize(wp.sin(colatitude) * level + wp.cos(colatitude) * camera.up))
+
+
+def make_camera_ray(features=None):
+    return camera_ray
