@@ -196,7 +196,7 @@ class Surfaces:
 
 @wp.struct
 class Light:
-    """kind: one of the LIGHT_ constants of lights.py.
+    """kind: its place among the kinds of lights that the kernel is made for.
 
     Point, spot: position, color = radiant intensity; directional: direction of travel, color = irradiance; sphere:
     position, radius, color = radiance, two_sided: inwards too; mesh: emitters first .. first + count - 1.

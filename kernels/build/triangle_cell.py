@@ -34,7 +34,7 @@ class TriangleCell:
 @wp.func
 def triangle_cell(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, lo: wp.vec3, hi: wp.vec3) -> TriangleCell:
     """lo, hi: the triangle's padded box. Grown by the same pads, the triangle holds every point that its unit may call a hit,
-    but for what is proportional to the hit's distance, which the ray's side widens (kernels.cell_ray)."""
+    but for what is proportional to the hit's distance, which the ray's side widens (kernels.traverse.cell_ray)."""
     out = TriangleCell()
     out.v0 = wp.vec3d(v0)
     out.v1 = wp.vec3d(v1)

@@ -1,7 +1,7 @@
 """What a ray must allow for in a structure that lists a triangle only in the cells that the triangle itself meets.
 
 The point at the t of the triangle unit is on the triangle, but for its pad and a few roundings of t: it is in a cell that lists
-the triangle. Only then is t moved into the interval of the triangle's box (kernels.ray_triangle.within_bounds), by up to the
+the triangle. Only then is t moved into the interval of the triangle's box (kernels.units.triangle.within_bounds), by up to the
 pad across the direction, which on a grazing ray is a long way along it. So a hit may be told to lie up to `cell_slack` before
 or behind the cells that list it, and a walk goes on so far behind its best hit, and begins so far before t_min.
 """
@@ -13,7 +13,7 @@ from wrt.kernels.units.box import FAR_PAD, BoxRay
 
 @wp.func
 def later(t: float) -> float:
-    """t, not smaller for any rounding of plane distances (kernels.ray_aabb.FAR_PAD), whatever its sign. Monotone; NaN stays."""
+    """t, not smaller for any rounding of plane distances (kernels.units.box.FAR_PAD), whatever its sign. Monotone; NaN stays."""
     return wp.max(t * FAR_PAD, t * wp.static(2.0 - float(FAR_PAD)))
 
 

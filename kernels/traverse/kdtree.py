@@ -6,7 +6,7 @@ so that the first one with a hit inside is the last one to visit.
 
 No hit is lost to rounding: both parts are widened by what the plane's distance and the hit's own may be off by, in proportion
 to the distance; what is off in proportion to the triangle is in the leaves, whose triangles are clipped to larger cells
-(kernels.build_clip). A ray in the splitting plane has the distance 0 * inf = NaN there: comparisons that are false for NaN
+(kernels.build.clip). A ray in the splitting plane has the distance 0 * inf = NaN there: comparisons that are false for NaN
 send it to both sides, whole.
 """
 

@@ -46,8 +46,9 @@ class Refit:
 
 @dataclass(frozen=True, eq=False)
 class Counters:
-    """What each ray cost, (N,) each, as in kernels.counters.Counts; trace: the fetches of all rays one after another, those of
-    ray i from first[i] to first[i + 1]: address (int64, bytes; primitives from PRIMITIVE_SPACE on) and size (int64, bytes)."""
+    """What each ray cost, (N,) each, as in kernels.traverse.counters.Counts; trace: the fetches of all rays one after another,
+    those of ray i from first[i] to first[i + 1]: address (int64, bytes; primitives from PRIMITIVE_SPACE on) and size (int64,
+    bytes)."""
 
     counts: np.ndarray
     first: np.ndarray

@@ -141,7 +141,7 @@ class Accelerator(ABC):
             return Refit(beside.stats.build_seconds, growth, rebuilt)
 
     def _children(self, built: Built) -> Any:
-        """A hierarchy of boxes as kernels.end_point_overlap.Children."""
+        """A hierarchy of boxes as kernels.build.end_point_overlap.Children."""
         raise InputError(f"a {self.name} has no end-point overlap: it is no hierarchy of boxes")
 
     def epo(self) -> float:

@@ -57,7 +57,7 @@ class Geometry:
     def write_bounds(self, lo: np.ndarray, hi: np.ndarray, threads: int = 1) -> None:
         """The same into arrays that there are, (N, 3) float32.
 
-        To the last bit what the units take (kernels.ray_triangle.within_bounds): a hit is never outside its box.
+        To the last bit what the units take (kernels.units.triangle.within_bounds): a hit is never outside its box.
         """
         def fill(first: int) -> None:
             some, n = slice(first, first + RECORDS_PER_JOB), len(self.faces)

@@ -25,7 +25,7 @@ from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.units.box import PAD_COORDINATE
 
 ROUNDOFF = 2.0**-24
-SLACK = 32.0 * ROUNDOFF  # see kernels.traverse_instances.enter
+SLACK = 32.0 * ROUNDOFF  # see kernels.traverse.instances.enter
 BOXES = 1 << 22  # box transforms that finding the instances' own boxes may take
 ALIGNMENT = 64  # bytes, between the addresses of structures
 
@@ -150,7 +150,7 @@ class Instances(Accelerator):
 
 
 def slack(geometry: InstancedGeometry) -> float:
-    """The part of the distance by which boxes are widened: see kernels.traverse_instances.enter."""
+    """The part of the distance by which boxes are widened: see kernels.traverse.instances.enter."""
     spread = np.abs(geometry.to_world[:, :, :3]) @ np.abs(geometry.to_local[:, :, :3])
     return float(np.float32(SLACK * spread.sum(axis=2).max(initial=1.0)))
 

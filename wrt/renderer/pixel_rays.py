@@ -9,7 +9,7 @@ import warp as wp
 
 from wrt.core.checks import as_one, as_size
 from wrt.core.device import load_kernel, made_once, start, upload
-from wrt.kernels.shade.camera_rays import make_camera_rays_kernel
+from wrt.kernels.shade.pixel_rays import make_camera_rays_kernel
 from wrt.renderer.upload import camera_kind, camera_struct
 from wrt.scene.cameras import CameraKind
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from wrt.kernels.shade.camera_rays import no_ray
+from wrt.kernels.shade.pixel_rays import no_ray
 from wrt.kernels.structs import Ray, make_ray
 
 

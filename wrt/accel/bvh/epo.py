@@ -16,7 +16,7 @@ TRIANGLES_PER_LAUNCH = 16384
 
 
 def end_point_overlap(tree: Any, geometry: Geometry, threads: int) -> float:
-    """The metric EPO of a hierarchy (kernels.end_point_overlap.Children on the CPU) with both costs 1; 0 without any area.
+    """The metric EPO of a hierarchy (kernels.build.end_point_overlap.Children on the CPU) with both costs 1; 0 without any area.
 
     Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies", equation 2: the sum, over all nodes, of
     the node's cost times the share of the whole surface that is in its box and not below it. Only triangles have surface here;

@@ -78,7 +78,7 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
 
 
 def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: int, **arrays: np.ndarray) -> BinaryTree:
-    """Run a builder of kernels.build_bvh2 over BuildRecords; arrays: the other fields of BuildData that it reads."""
+    """Run a builder of kernels.build.bvh2 over BuildRecords; arrays: the other fields of BuildData that it reads."""
     cpu = start("cpu")
     n = len(build)
     if n <= 1:

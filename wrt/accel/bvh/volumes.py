@@ -159,7 +159,7 @@ def cuts(geometry: Geometry, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def project(v: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 -> (N, 4), as kernels.ray_kdop.project."""
+    """(N, 3) float32 -> (N, 4), as kernels.units.kdop.project."""
     x, y, z = v[:, 0], v[:, 1], v[:, 2]
     return np.stack([x + y + z, y - x + z, x - y + z, x + y - z], axis=1)
 

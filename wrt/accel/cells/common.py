@@ -36,7 +36,7 @@ def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
 
 
 def check_numbers(arrays: dict[str, np.ndarray]) -> None:
-    """Raise InputError unless pad and extent are what kernels.cell_ray.cell_slack may be given."""
+    """Raise InputError unless pad and extent are what kernels.traverse.cell_ray.cell_slack may be given."""
     if not (arrays["pad"] >= 0.0 and arrays["extent"] >= 0.0):
         raise InputError("is damaged: its numbers are out of range")
 
@@ -51,7 +51,7 @@ def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: in
 
 
 def triangle_reach(geometry: Geometry, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For kernels.cell_ray.cell_slack: the largest pad and the largest extent of all triangles' padded boxes."""
+    """For kernels.traverse.cell_ray.cell_slack: the largest pad and the largest extent of all triangles' padded boxes."""
     n = len(geometry.faces)
     if not n:
         return np.zeros((), np.float32), np.zeros((), np.float32)

@@ -99,7 +99,7 @@ def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> KdTreeDa
 
 
 def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) -> tuple[Any, float]:
-    """The primitives for kernels.build_clip, and the largest extent of those that it clips."""
+    """The primitives for kernels.build.clip, and the largest extent of those that it clips."""
     cpu = start("cpu")
     with np.errstate(over="ignore"):
         extent = (hi - lo).max(axis=1)

@@ -155,7 +155,7 @@ def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) ->
 
 
 class _Splitter:
-    """The kernels of kernels.build_octree over one geometry."""
+    """The kernels of kernels.build.octree over one geometry."""
 
     def __init__(self, geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: Any, threads: int) -> None:
         self.cpu, self.layout, self.threads = start("cpu"), layout, threads

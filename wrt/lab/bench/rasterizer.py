@@ -51,7 +51,7 @@ def directions_from_pixels(camera: CameraKind, size: tuple[int, int]) -> np.ndar
 
 
 def view_struct(camera: CameraKind, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> Any:
-    """kernels.rasterize.View of a camera. shift: in pixels, of all centres, to the right and down."""
+    """kernels.study.rasterize.View of a camera. shift: in pixels, of all centres, to the right and down."""
     from_pixels = directions_from_pixels(camera, size) @ np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
     view = kernels.View()
     view.origin = wp.vec3d(*list(camera_struct(camera, size).origin))

@@ -17,7 +17,7 @@ point P = sum l_i v_i *of the triangle* passes the ray at (x, y) with |x| <= del
   The sum itself carries three errors (Z, 1 / d_z, the result), and holding t to the triangle's box, whose slabs carry three
   and whose planes P can only leave by errors of its own, moves it by at most 7 more: gamma(10) T, where T = |t_P| if
   all Z have one sign and max |Z| / |d_z| if not. Of those errors eta is divided by d_x, which may be tiny: where |d_x t| and S
-  are above 2^-120 it moves t by less than 2^-28 T, and elsewhere the unit lets no eta move t (kernels.ray_triangle.underflowed).
+  are above 2^-120 it moves t by less than 2^-28 T, and elsewhere the unit lets no eta move t (kernels.units.triangle.underflowed).
   Very short and very long directions are scaled by powers of two before and t after: that is exact, but for what underflows.
 
 *The sphere test* is taken in float64 and rounded once; the box it is held to contains the sphere, so that only the slabs' own

@@ -154,7 +154,7 @@ def sensitivity(work: Work, gpu: Gpu, core: Core = BASE) -> dict[str, float]:
 
 def simt(counts: np.ndarray, warp: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> dict[str, float]:
     """SIMT efficiency, a ray costing its box operations and triangle tests: of the warps as they are, of the same rays packed
-    without gaps, and packed after sorting them by coherence. counts: as kernels.counters.Counts, one row a ray."""
+    without gaps, and packed after sorting them by coherence. counts: as kernels.traverse.counters.Counts, one row a ray."""
     cost = counts["box_operations"].astype(np.float64) + counts["primitives"]
     order = by_coherence(origins, directions)
     return {"as they come": efficiency(cost, warp), "packed": efficiency(cost, packed(len(cost))),

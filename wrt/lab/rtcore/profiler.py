@@ -47,9 +47,9 @@ TRACE_LIMIT = 4_000_000  # fetches that are kept
 class Rays:
     """Every ray of a picture, (N,) each, tile by tile and pixel by pixel, in the order in which each pixel traced them.
 
-    rays: as kernels.ray_log.LoggedRay; counts: as kernels.counters.Counts; pixel: row * width + column; kind: index in KINDS
-    ("straight": goes on unbent through a blended surface); depth: bounces behind it (a shadow ray's: of the ray whose hit it
-    starts from); lines: distinct cache lines. trace_rows: the rays whose fetches were kept, trace_first: where each one's
+    rays: as kernels.study.ray_log.LoggedRay; counts: as kernels.traverse.counters.Counts; pixel: row * width + column; kind: index
+    in KINDS ("straight": goes on unbent through a blended surface); depth: bounces behind it (a shadow ray's: of the ray whose hit
+    it starts from); lines: distinct cache lines. trace_rows: the rays whose fetches were kept, trace_first: where each one's
     begin; address, size: of each fetch, in bytes, as in wrt.accel.answers.Counters.
     """
 
