@@ -168,7 +168,7 @@ class Page:
             toml = gui.add_button("camera as TOML", hint="A table for a scene file")
         png.on_click(self._safe(lambda event: self._save(event.client, ".png")))
         self.exr.on_click(self._safe(lambda event: self._save(event.client, ".exr")))
-        toml.on_click(self._safe(lambda event: event.client and give_camera(event.client, camera_toml(self.viewer.view.camera))))
+        toml.on_click(self._safe(lambda event: give_camera(event.client, camera_toml(self.viewer.view.camera))))
 
     def _lens_folder(self, camera: Camera) -> None:
         gui, unit = self.server.gui, self.unit
@@ -260,7 +260,9 @@ def place_camera(server: Any, camera: CameraKind, target: np.ndarray, unit: floa
 
 
 def give_camera(client: Any, text: str) -> None:
-    """Show a browser the camera as TOML, to copy or to save."""
+    """Show a browser the camera as TOML, to copy or to save; nobody, where it has left."""
+    if client is None:
+        return
     with client.gui.add_modal("Camera") as modal:
         client.gui.add_markdown(f"```toml\n{text}```")
         save = client.gui.add_button("save as a file")
