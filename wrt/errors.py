@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-LONGEST = 5000  # characters of a line of a message, which may quote what stands in a file
+LONGEST, END = 5000, 1000  # characters of a line of a message, which may quote what stands in a file; those kept of its end
 
 
 class InputError(ValueError):
@@ -15,7 +15,8 @@ class InputError(ValueError):
 
     def __init__(self, message: str, path: str | os.PathLike[str] | None = None, place: str | None = None) -> None:
         self.path = path
-        message = "\n".join(line if len(line) <= LONGEST else line[:LONGEST - 3] + "..." for line in message.split("\n"))
+        message = "\n".join(line if len(line) <= LONGEST else f"{line[:LONGEST - END - 3]}...{line[-END:]}"
+                            for line in message.split("\n"))
         parts = [os.fspath(path) if path is not None else None, place, message]
         super().__init__(": ".join(part for part in parts if part))
 
