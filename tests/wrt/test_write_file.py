@@ -293,10 +293,13 @@ def test_the_part_of_a_killed_render_is_removed_by_others(every: float, tmp_path
     """By whoever writes there, whatever its own name: nobody may ever resume it."""
     with running(SAVING, tmp_path / "a", every) as killed, running(SAVING, tmp_path / "b", every) as other:
         assert told(killed) == told(other) == "runs"
+        deadline = time.monotonic() + 60.0
+        while not {".a.part", ".b.part"} <= names(tmp_path):  # who compiles tells it from a thread of its own, maybe before
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
         killed.kill()
         killed.wait()
         before = names(tmp_path)
-        assert {".a.part", ".b.part"} <= before
         write_codes(tmp_path / "c.png", np.zeros((2, 2, 3), np.uint8))
         assert names(tmp_path) == before - {".a.part"} | {"c.png"}
     write_file._cleaned.discard(tmp_path)
