@@ -73,6 +73,8 @@ class _Builder:
         self.path = path
         self.problems: list[str] = []
         self.materials: dict[str, Material] = {}
+        self._included: dict[Path, Scene] = {}  # a file that is named again is read once
+        self._included_objects = 0
         self._images: dict[Path, np.ndarray] = {}
         self._textures: dict[tuple[Any, ...], Texture | Checkerboard] = {}
         self._meshes: dict[tuple[Any, ...], Mesh] = {}
@@ -96,7 +98,7 @@ class _Builder:
             self.materials |= self.material(material, name, f"materials.{name}")
         included: list[Scene] = []
         for i, entry in enumerate(table.include):
-            included += self.included(entry, f"include[{i}]", sum(len(scene.objects) for scene in included))
+            included += self.included(entry, f"include[{i}]")
         included = self.overridden(included, table)
         known = {m.name: m for scene in included for m in scene.materials} | self.materials
         # A material that is itself wrong is known all the same: one mistake gives one line.
@@ -154,15 +156,19 @@ class _Builder:
 
     # --- included files ---
 
-    def included(self, entry: str | tables.IncludeTable, place: str, before: int) -> list[Scene]:
+    def included(self, entry: str | tables.IncludeTable, place: str) -> list[Scene]:
         from wrt.gltf import load_gltf
 
         name, to_world = (entry, None) if isinstance(entry, str) else (entry.file, entry.transform)
         with self.at(place):
             if not name.lower().endswith((".gltf", ".glb")):
                 raise InputError(f"{name!r} is no .gltf or .glb file; a mesh file belongs into [[meshes]]")
-            scene = load_gltf(self.file(name), staged=False)
-            require_count(before + len(scene.objects), "objects")
+            path = self.file(name)
+            if path not in self._included:
+                self._included[path] = load_gltf(path, staged=False)
+            scene = self._included[path]
+            self._included_objects += len(scene.objects)
+            require_count(self._included_objects, "objects")
             return [moved(scene, transform(to_world))]
         return []
 
