@@ -22,6 +22,7 @@ from tests.grown import GROWN, png_chunk
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not os.access("/proc/self/clear_refs", os.W_OK),
                                                    reason="needs /proc to measure a peak")]
 MOST = 400  # MiB, as WRT_MEMORY
+NO_PICTURE = ("image: PNG frames", "image: HDR header", "image: HDR settings")  # to what reads pictures; all others are read
 ADDRESSES = 6 << 30  # that a child may have at most, be it in the wrong
 
 CHILD = """
@@ -68,7 +69,8 @@ def test_a_file_that_repeats_one_thing(name: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{seed.suffix}"
     path.write_bytes(seed.data)
     if seed.suffix in (".png", ".hdr"):
-        assert kept("compare", path, path)["code"] == 0
+        told = kept("compare", path, path)
+        assert "cannot be read as an image" in told["err"] if name in NO_PICTURE else told["code"] == 0
     else:
         kept("validate", as_scene(path))
 
