@@ -110,7 +110,7 @@ class Camera(CameraKind):
     kind = "perspective"
     device = "wrt.kernels.shade.cameras.perspective"
 
-    fov_y: float = parameter(45.0, "full vertical angle of view", 0.0006, 179.9, DEGREES)
+    fov_y: float = parameter(45.0, "full vertical angle of view", 0.0005, 179.94, DEGREES)
     aperture_radius: float = parameter(0.0, "0 is a pinhole", 0.0, unit=LENGTH)
     focus_distance: float = parameter(1.0, "along the axis to what is sharp (beside a target: by default as far as that)",
                                       SMALLEST, unit=LENGTH)
@@ -186,7 +186,7 @@ class FisheyeCamera(CameraKind):
     device = "wrt.kernels.shade.cameras.fisheye"
 
     fov: float = parameter(180.0, "full angle of view across the image circle, which is as wide as the picture's shorter side",
-                           0.0006, 360.0, DEGREES)
+                           0.0005, 360.0, DEGREES)
 
     def record(self, size: tuple[int, int]) -> dict[str, Any]:
         """Half the angle of view, and half the picture's sides in radii of the image circle."""

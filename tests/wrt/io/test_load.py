@@ -434,7 +434,7 @@ position = [0, 0, 0]
     ('materials = 5', "materials", "expected a table"),
     ('spheres = 5', "spheres", "expected an array"),
     ("[cameras.a]\nposition = [0, 0, 0]", "cameras.a", "needs both position and target"),
-    ("[cameras.a]\nfov_y = 180\nposition = [0, 0, 0]\ntarget = [0, 0, 1]", "cameras.a.fov_y", "<= 179.9"),
+    ("[cameras.a]\nfov_y = 180\nposition = [0, 0, 0]\ntarget = [0, 0, 1]", "cameras.a.fov_y", "<= 179.94"),
     ("[cameras.a]\nposition = [0, 0, 0]\ntarget = [0, 0, 0]", "cameras.a", "the same point"),
     ("[cameras.a]\nposition = [0, 0, 0]\ntarget = [0, 1, 0]", "cameras.a", "parallel"),
     ("[cameras.a]\nposition = [0, 0, 0]\ntarget = [0, 0, 1]\nfocal_length = 2", "cameras.a", "needs a sensor_height"),

@@ -59,7 +59,7 @@ def test_every_number_has_a_unit_or_is_known_to_have_none() -> None:
 
 @pytest.mark.parametrize(("section", "row"), [
     ("Settings", '| `size` | 2 whole numbers | pixels | `[640, 360]` | 1 to 32768 | width and height |'),
-    ("Camera", "| `fov_y` | number | degrees | `45.0` | 0.0006 to 179.9 | full vertical angle of view |"),
+    ("Camera", "| `fov_y` | number | degrees | `45.0` | 0.0005 to 179.94 | full vertical angle of view |"),
     ("Sphere", "| `radius` | number | length | required | > 0 | its radius |"),
     ("Tube", "| `radius` | number or list of numbers | length | `0.1` | > 0 | one, or one for each point |"),
     ("Mesh", "| `instances` | list of [Transform](#transform) |  |  | 1 or more | the mesh once for each, placed so before"
