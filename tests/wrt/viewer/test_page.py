@@ -162,6 +162,8 @@ def browser_page(page: Any) -> Iterator[Any]:
         view.on("console", lambda message: view.mistakes.append(message.text) if message.type == "error" else None)
         view.on("pageerror", lambda error: view.mistakes.append(str(error)))
         view.goto(f"{page.url}&fixedDpr=1")  # else viser draws coarser where the machine is slow
+        # A slow browser begins with viser's own camera, and moves to the scene's.
+        until(lambda: np.allclose(page.viewer.view.camera.camera_to_world, CAMERA.camera_to_world), view)
         yield view
         browser.close()
 
