@@ -85,7 +85,7 @@ class Judge:
         """What is wrong where a file of `size` bytes took so much, and that is to be in proportion."""
         if self.form.pace and seconds > SECONDS + self.form.pace * size:
             return f"more time than a file of that size may take\n{size} bytes, {seconds:.2f} s"
-        if self.form.pace and taken > BYTES + BYTES_OF_BYTE * size:
+        if self.form.pace and not self.form.compressed and taken > BYTES + BYTES_OF_BYTE * size:
             return f"more memory than a file of that size may take\n{size} bytes, {taken / 2**20:.0f} MiB"
         return ""
 
