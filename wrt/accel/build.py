@@ -15,10 +15,10 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.instances import InstancedGeometry, Instances
 from wrt.accel.store import check_target, read
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checks import as_one, shown
+from wrt.core.checks import as_one
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
-from wrt.io.mesh_file import load_mesh
+from wrt.io.mesh_file import mesh_of
 from wrt.scene.mesh import Mesh
 
 
@@ -76,10 +76,4 @@ def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: s
 
 def geometry_of(mesh: Mesh | Geometry | str | os.PathLike[str]) -> Geometry:
     """Raises InputError for what is no mesh, and for a file that cannot be read."""
-    if isinstance(mesh, Geometry):
-        return mesh
-    if isinstance(mesh, str | os.PathLike):
-        mesh = load_mesh(mesh)
-    if not isinstance(mesh, Mesh):
-        raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(mesh)}")
-    return Geometry.of(mesh)
+    return mesh if isinstance(mesh, Geometry) else Geometry.of(mesh_of(mesh))

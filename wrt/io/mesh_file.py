@@ -91,11 +91,16 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
     )
 
 
-def as_mesh(value: Mesh | str | os.PathLike[str]) -> Mesh:
-    """A Mesh as it is; the mesh of a file by its path (load_mesh). Raises InputError for anything else, or no triangles."""
+def mesh_of(value: Mesh | str | os.PathLike[str]) -> Mesh:
+    """A Mesh as it is; the mesh of a file by its path (load_mesh). Raises InputError for anything else."""
     if not isinstance(value, Mesh | str | os.PathLike):
         raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(value)}")
-    mesh = value if isinstance(value, Mesh) else load_mesh(value)
+    return value if isinstance(value, Mesh) else load_mesh(value)
+
+
+def as_mesh(value: Mesh | str | os.PathLike[str]) -> Mesh:
+    """As mesh_of. Raises InputError where there are no triangles, too."""
+    mesh = mesh_of(value)
     if not len(mesh.faces):
         raise InputError("there are no triangles to hit", None if isinstance(value, Mesh) else value)
     return mesh
