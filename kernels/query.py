@@ -1,9 +1,11 @@
 """Kernels for rays by themselves: arrays of rays in, hits out."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Ray, Surfaces, kernel
-from wrt.kernels.traverse.common import make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 
 LARGEST = wp.constant(3.4028234663852886e38)  # of float32
 # Directions beyond these lengths are scaled by one of these factors: see direction_scale.
@@ -62,7 +64,7 @@ def load_ray(rays: RayArrays, i: int) -> Ray:
     return ray
 
 
-def make_closest_hit_kernel(accel_struct, traverse):
+def make_closest_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
     """rays first .. first + dim - 1 against the structure. A hit whose t is beyond float32 is a miss."""
 
     @kernel
@@ -78,7 +80,7 @@ def make_closest_hit_kernel(accel_struct, traverse):
     return closest_hit
 
 
-def make_any_hit_kernel(accel_struct, traverse):
+def make_any_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
     """As closest_hit, but only whether there is one."""
 
     @kernel
@@ -100,7 +102,7 @@ class HitList:
     t: wp.array(dtype=wp.float32)
 
 
-def make_all_hits_kernel(units):
+def make_all_hits_kernel(units: Units) -> Any:
     """Every primitive that each ray hits in its segment, by testing all of them: what the units say, without a structure."""
     probe_of = make_probe(units)
     intersect = make_intersect(units)

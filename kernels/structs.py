@@ -4,6 +4,8 @@ Rays and hits are in world space. Every kernel of the project is made by `kernel
 the same options.
 """
 
+from typing import TYPE_CHECKING, Any
+
 import warp as wp
 
 NO_HIT = wp.constant(0x7FFFFFFF)  # prim_id while nothing is hit: larger than any other, so that ties go to a real one
@@ -15,9 +17,17 @@ EPSILON = wp.constant(2.0**-24)  # the unit roundoff of float32
 MODULE_OPTIONS = {"fuse_fp": False, "enable_backward": False}
 
 
-def kernel(function):
-    """A Warp kernel in a module of its own, without fused multiply-add and without the code for gradients."""
-    return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+if TYPE_CHECKING:  # device code is not for type checkers: its annotations are Warp's
+    from typing import no_type_check as kernel
+else:
+    def kernel(function):
+        """A Warp kernel in a module of its own, without fused multiply-add and without the code for gradients."""
+        return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+
+
+def size_of(struct: Any) -> int:
+    """Bytes of a record."""
+    return int(struct.numpy_dtype()["itemsize"])
 
 
 @wp.func

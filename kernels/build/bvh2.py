@@ -5,6 +5,7 @@ over, on all cores. What differs between builders is how a range is split: SPLIT
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -142,7 +143,7 @@ def choose_sweep(data: BuildData, task: BuildTask) -> int:
     return best
 
 
-def split_at(choose):
+def split_at(choose: Any) -> Any:
     @wp.func
     def split(data: BuildData, task: BuildTask) -> Halves:
         return halves_at(data, task, choose(data, task))
@@ -195,7 +196,7 @@ def mark(left: wp.array(dtype=wp.uint8), begin: int, end: int):
 
 
 @cache
-def make_build_ranges(split, place=None):
+def make_build_ranges(split: Any, place: Any = None) -> Any:
     """The kernel of a builder. split(data, task) -> Halves: its records stand in their places, or (spatial splits)
     place(data, task, halves) -> Halves brings them there once it is known that the range becomes no leaf."""
 

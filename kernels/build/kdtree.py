@@ -1,14 +1,14 @@
 """The builder's inner loop: a subtree of the k-d tree by the surface area heuristic with perfect splits, on the CPU backend.
 
-Wald and Havran 2006, "On building fast kd-Trees for Ray Tracing, and on doing that in O(N log N)": every face of every
-reference's box is a candidate plane. The faces are events, sorted once for the subtree; a sweep over them finds the best plane,
-and a split keeps their order: those of references on one side only are handed down, those of references that straddle the
-plane are clipped to both cells, sorted by themselves and merged in. The host launches this once a subtree, on all cores.
+Wald and Havran 2006 (kernels.build.kdtree_split). The faces are events, sorted once for the subtree; a sweep over them finds the
+best plane, and a split keeps their order: those of references on one side only are handed down, those of references that straddle
+the plane are clipped to both cells, sorted by themselves and merged in. The host launches this once a subtree, on all cores.
 """
 
 import warp as wp
 
 from wrt.kernels.build.clip import Clippable, clip_to_cell
+from wrt.kernels.build.kdtree_split import KdEvent, KdOptions, KdSplit, KdTask, KdWork, cheapest_split, half_area
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 
@@ -16,58 +16,6 @@ BOTH = wp.constant(wp.uint8(0))
 LEFT = wp.constant(wp.uint8(1))
 RIGHT = wp.constant(wp.uint8(2))
 RUN = wp.constant(8)  # so many events are sorted by insertion before the runs are merged
-
-
-@wp.struct
-class KdEvent:
-    """A face of a reference's box. code = 8 * (number of the reference) + 2 * axis + (1 where the box begins, 0: ends)."""
-
-    position: float
-    code: int
-
-
-@wp.struct
-class KdOptions:
-    """A cell becomes a leaf with max_leaf references, at max_depth, or (by_cost) where no split costs less. empty_bonus: part
-    of its cost that a split is let off which cuts off empty space."""
-
-    max_leaf: int
-    max_depth: int
-    by_cost: int
-    cost_traversal: wp.float64
-    cost_intersection: wp.float64
-    empty_bonus: wp.float64
-
-
-@wp.struct
-class KdTask:
-    """A cell to build. first, count: its events; budget: leaves' references (an empty leaf counts as one) that it may come to
-    in the end; slot: its node."""
-
-    lo: wp.vec3
-    hi: wp.vec3
-    first: int
-    count: int
-    budget: int
-    depth: int
-    slot: int
-
-
-@wp.struct
-class KdWork:
-    """Memory of one subtree of n references. prim_id (n), side (n): of each; lo, hi (n): their boxes in the root's cell; events
-    (6 budget): a stack of the lists of all cells that wait; kept_*, fresh_*, scratch (6 n each): the lists of one split."""
-
-    prim_id: wp.array(dtype=wp.int32)
-    lo: wp.array(dtype=wp.vec3)
-    hi: wp.array(dtype=wp.vec3)
-    side: wp.array(dtype=wp.uint8)
-    events: wp.array(dtype=KdEvent)
-    kept_left: wp.array(dtype=KdEvent)
-    kept_right: wp.array(dtype=KdEvent)
-    fresh_left: wp.array(dtype=KdEvent)
-    fresh_right: wp.array(dtype=KdEvent)
-    scratch: wp.array(dtype=KdEvent)
 
 
 @wp.struct
@@ -88,17 +36,6 @@ class KdOutput:
     nodes: wp.array(dtype=KdNode)
     references: wp.array(dtype=wp.int32)
     totals: wp.array(dtype=KdTotals)
-
-
-@wp.struct
-class KdSplit:
-    """axis < 0: none. n_left, n_right: references on each side, those that straddle the plane on both."""
-
-    axis: int
-    position: float
-    cost: wp.float64
-    n_left: int
-    n_right: int
 
 
 @wp.func
@@ -165,60 +102,6 @@ def add_events(events: wp.array(dtype=KdEvent), count: int, lo: wp.vec3, hi: wp.
         event.code = reference * 8 + 2 * axis + 1
         events[count + 2 * axis + 1] = event
     return count + 6
-
-
-@wp.func
-def half_area(e: wp.vec3d) -> wp.float64:
-    return e[0] * e[1] + e[1] * e[2] + e[2] * e[0]
-
-
-@wp.func
-def cheapest_split(work: KdWork, task: KdTask, options: KdOptions) -> KdSplit:
-    """The plane of least expected cost, if (by_cost) it is below the cost of a leaf and the references are in the budget."""
-    best = KdSplit()
-    best.axis = -1
-    n = task.count / 6
-    best.cost = wp.where(options.by_cost != 0, options.cost_intersection * wp.float64(n), wp.float64(wp.inf))
-    e = wp.vec3d(task.hi) - wp.vec3d(task.lo)
-    scale = options.cost_intersection / half_area(e)
-    n_left = wp.vec3i(0, 0, 0)
-    n_right = wp.vec3i(n, n, n)
-    end = task.first + task.count
-    i = int(task.first)
-    while i < end:
-        event = work.events[i]
-        position = event.position
-        axis = (event.code & 7) >> 1
-        starts = int(0)
-        ends = int(0)
-        same = bool(True)
-        while same:  # all faces in this plane
-            starts = starts + (event.code & 1)
-            ends = ends + 1 - (event.code & 1)
-            i = i + 1
-            same = i < end
-            if same:
-                event = work.events[i]
-                same = event.position == position and (event.code & 7) >> 1 == axis
-        right = n_right[axis] - ends
-        n_right[axis] = right
-        left = n_left[axis]
-        n_left[axis] = left + starts
-        if position > task.lo[axis] and position < task.hi[axis] and wp.max(left, 1) + wp.max(right, 1) <= task.budget:
-            e_1 = e[(axis + 1) % 3]
-            e_2 = e[(axis + 2) % 3]
-            area_left = (wp.float64(position) - wp.float64(task.lo[axis])) * (e_1 + e_2) + e_1 * e_2
-            area_right = (wp.float64(task.hi[axis]) - wp.float64(position)) * (e_1 + e_2) + e_1 * e_2
-            cost = options.cost_traversal + scale * (area_left * wp.float64(left) + area_right * wp.float64(right))
-            if left == 0 or right == 0:
-                cost = cost * (wp.float64(1.0) - options.empty_bonus)
-            if cost < best.cost:
-                best.axis = axis
-                best.position = position
-                best.cost = cost
-                best.n_left = left
-                best.n_right = right
-    return best
 
 
 @wp.func

@@ -6,11 +6,11 @@ level: which levels are done but for their last child (Laine 2010, "Restart Trai
 al. 2019, "Wide BVH Traversal with a Short Stack").
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node, box_volumes, make_binary_traversal, make_struct
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, make_counters
@@ -28,22 +28,22 @@ class Study(NamedTuple):
     ordered: bool = True
     early: bool = True
 
-    def make_struct(self, record):
+    def make_struct(self, record: Any) -> Any:
         return make_struct(record)
 
-    def make_traversal(self, units: Units, any_hit: bool, accepts=None):
+    def make_traversal(self, units: Units, any_hit: bool, accepts: Any = None) -> Any:
         if self.entries < STACK_SIZE:
             return make_short_stack(units, self.entries, any_hit, accepts)
         volumes = box_volumes(units.triangle_test.record, units.box_test)
         return make_binary_traversal(units, volumes, any_hit, accepts, self.ordered, self.early)
 
 
-def make_short_stack(units: Units, entries: int, any_hit: bool, accepts=None):
+def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any, with so many entries (0: none, each pop starts again at the root). The tree has LEVELS at most."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
     ray_aabb = units.box_test
-    fetch_node, fetch_primitive, push, finish = make_counters(units, Bvh2Node.numpy_dtype()["itemsize"])
+    fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(Bvh2Node))
     struct = make_struct(units.triangle_test.record)
     room = max(entries, 1)
 

@@ -1,12 +1,14 @@
 """Visibility by rays alone: what the ray through each pixel's centre hits, with no shading."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.shade.cameras.perspective import Camera, make_camera_ray
 from wrt.kernels.structs import Surfaces, Tile, kernel
 
 
-def make_primary_rays_kernel(accel_struct, closest_hit):
+def make_primary_rays_kernel(accel_struct: Any, closest_hit: Any) -> Any:
     """A kernel over the pixels of a tile, for a perspective camera; a miss has depth = inf and prim_id = -1."""
     camera_ray = make_camera_ray()
 

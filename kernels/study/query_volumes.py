@@ -1,6 +1,7 @@
 """What bounding volumes cost: tests by themselves, and walks that are counted as others publish them."""
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -12,7 +13,7 @@ from wrt.kernels.units.box import box_ray, ray_aabb
 
 
 @cache
-def make_enter_kernel(volumes: Volumes):
+def make_enter_kernel(volumes: Volumes) -> Any:
     """The kernel that tests each ray against both children of every node of `accel`, whatever the walk would do."""
     struct, set_up, enter = volumes.struct, volumes.set_up, volumes.enter
     probe_of = make_probe(Units())

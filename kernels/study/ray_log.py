@@ -5,6 +5,7 @@ counters, and hands it on. Only kernels that profile are compiled with it.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -36,7 +37,7 @@ class RayLog:
 
 
 @cache
-def make_struct(accel_struct):
+def make_struct(accel_struct: Any) -> Any:
     """row: the pixel of this thread, counted from the tile's first; each thread sets it in its own copy."""
 
     @wp.struct
@@ -48,7 +49,7 @@ def make_struct(accel_struct):
     return Logged
 
 
-def make_traversal(accel_struct, traverse, any_hit):
+def make_traversal(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
     """`traverse`, with the ray in the log. Its counters go to the ray's own row, or without rows to the pixel's."""
     struct = make_struct(accel_struct)
 

@@ -1,5 +1,7 @@
 """Rays that go on from where others hit, as the integrator's do: does one meet the surface that it leaves?"""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.query import RayArrays, load_ray
@@ -17,7 +19,7 @@ class Respawn:
     next_prim_id: wp.array(dtype=wp.int32)
 
 
-def make_respawn_kernel(accel_struct, traverse, surface_at):
+def make_respawn_kernel(accel_struct: Any, traverse: Any, surface_at: Any) -> Any:
     """The hit of each ray, and the hit of a second one that leaves from there as the integrator's do; -1 on a miss.
 
     On a sphere the second direction is turned to the outside: towards the inside it would hit the far wall, rightly.

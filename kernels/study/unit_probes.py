@@ -2,10 +2,11 @@
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import Ray, kernel
+from wrt.kernels.structs import Ray, kernel, size_of
 from wrt.kernels.units.box import RAY_AABB, BoxRay
 from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay
 from wrt.kernels.wide.native import source
@@ -21,7 +22,7 @@ class ProbeRay:
 
 
 @cache
-def make_box_probe(test, count):
+def make_box_probe(test: str | None, count: int) -> Any:
     """`count` box tests by RAY_AABB[test], whose results are added up; without a test (None), the six planes are."""
     unit = RAY_AABB[test] if test is not None else None
 
@@ -43,13 +44,13 @@ def make_box_probe(test, count):
     return box_probe
 
 
-def numbers_of(record) -> int:
+def numbers_of(record: Any) -> int:
     """How many numbers of a record a test reads: all but the prim_id."""
-    return record.numpy_dtype()["itemsize"] // 4 - 1
+    return size_of(record) // 4 - 1
 
 
 @cache
-def make_add_numbers(record):
+def make_add_numbers(record: Any) -> Any:
     """add_numbers(total, record): the numbers that a test reads, added to a total."""
     layout = record.numpy_dtype()
     prim_id = layout["offsets"][layout["names"].index("prim_id")] // 4
@@ -61,7 +62,7 @@ def make_add_numbers(record):
 
 
 @cache
-def make_triangle_probe(test, count, adding=False):
+def make_triangle_probe(test: str, count: int, adding: bool = False) -> Any:
     """`count` triangle tests by RAY_TRIANGLE[test], whose t, u and v are added up; `adding`: the numbers of their records are."""
     unit = RAY_TRIANGLE[test].intersect
     record = RAY_TRIANGLE[test].record

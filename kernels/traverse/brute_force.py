@@ -1,6 +1,7 @@
 """The traversal unit without a structure: every primitive is tested. The yardstick for all others."""
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -10,7 +11,7 @@ from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 
 
 @cache
-def make_struct(record):
+def make_struct(record: Any) -> Any:
     """The structure over records of this kind: all primitives, in the order of prim_id."""
 
     @wp.struct
@@ -21,7 +22,7 @@ def make_struct(record):
     return BruteForce
 
 
-def make_traversal(units: Units, any_hit: bool, accepts=None):
+def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found), among all primitives."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)

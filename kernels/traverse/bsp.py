@@ -26,10 +26,11 @@ divides by 0 or nearly so: the distances are then beyond the interval, or say no
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.units.box import BoxRay, slab_interval
@@ -92,7 +93,7 @@ def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3, exte
 
 
 @cache
-def make_struct(record):
+def make_struct(record: Any) -> Any:
     """lo, hi: the root box; extent: the longest side of a primitive's padded box; the root itself is the child (first, count),
     as in a node."""
 
@@ -110,11 +111,11 @@ def make_struct(record):
     return Bsp
 
 
-def make_traversal(units: Units, any_hit: bool, accepts=None):
+def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found). The box test has no say: only the root has a box."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
-    fetch_node, fetch_primitive, push, finish = make_counters(units, BspNode.numpy_dtype()["itemsize"])
+    fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(BspNode))
     struct = make_struct(units.triangle_test.record)
 
     @wp.func

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.units.box import BoxRay
@@ -37,7 +37,7 @@ class Bvh2Node:
 
 
 @cache
-def make_struct(record):
+def make_struct(record: Any) -> Any:
     """The structure over records of this kind: nodes[0] is the root; primitives are in the order of the leaves."""
 
     @wp.struct
@@ -61,7 +61,7 @@ class Volumes(NamedTuple):
 
 
 @cache
-def box_volumes(record, box_test) -> Volumes:
+def box_volumes(record: Any, box_test: Any) -> Volumes:
     struct = make_struct(record)
 
     @wp.func
@@ -75,18 +75,19 @@ def box_volumes(record, box_test) -> Volumes:
     return Volumes(struct, Bvh2Node, set_up, enter)
 
 
-def make_traversal(units: Units, any_hit: bool, accepts=None):
+def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found)."""
     return make_binary_traversal(units, box_volumes(units.triangle_test.record, units.box_test), any_hit, accepts)
 
 
-def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts=None, ordered: bool = True, early: bool = True):
+def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts: Any = None, ordered: bool = True,
+                          early: bool = True) -> Any:
     """As make_traversal, over a tree with volumes of another kind. ordered: the nearer child first; early: nodes beyond the best
     hit are dropped (what either is worth is for studies to tell)."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
     struct, set_up, enter = volumes.struct, volumes.set_up, volumes.enter
-    fetch_node, fetch_primitive, push, finish = make_counters(units, volumes.node.numpy_dtype()["itemsize"])
+    fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(volumes.node))
 
     @wp.func
     def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:

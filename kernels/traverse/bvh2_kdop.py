@@ -1,6 +1,7 @@
 """The traversal unit of the binary BVH whose volumes are 14-DOPs: boxes with their corners cut off, 56 bytes each."""
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -29,7 +30,7 @@ class KdopNode:
 
 
 @cache
-def make_struct(record):
+def make_struct(record: Any) -> Any:
     """middle: what the planes askew are relative to."""
 
     @wp.struct
@@ -43,7 +44,7 @@ def make_struct(record):
 
 
 @cache
-def kdop_volumes(record) -> Volumes:
+def kdop_volumes(record: Any) -> Volumes:
     struct = make_struct(record)
 
     @wp.func
@@ -58,6 +59,6 @@ def kdop_volumes(record) -> Volumes:
     return Volumes(struct, KdopNode, set_up, enter)
 
 
-def make_traversal(units: Units, any_hit: bool, accepts=None):
+def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found). The box test of `units` is for primitives only."""
     return make_binary_traversal(units, kdop_volumes(units.triangle_test.record), any_hit, accepts)

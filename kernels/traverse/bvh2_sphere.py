@@ -1,6 +1,7 @@
 """The traversal unit of the binary BVH whose volumes are spheres: 16 bytes instead of a box's 24, and no corner to fit."""
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -23,7 +24,7 @@ class SphereNode:
 
 
 @cache
-def make_struct(record):
+def make_struct(record: Any) -> Any:
     @wp.struct
     class Bvh2Sphere:
         nodes: wp.array(dtype=SphereNode)
@@ -34,7 +35,7 @@ def make_struct(record):
 
 
 @cache
-def sphere_volumes(record) -> Volumes:
+def sphere_volumes(record: Any) -> Volumes:
     struct = make_struct(record)
 
     @wp.func
@@ -48,6 +49,6 @@ def sphere_volumes(record) -> Volumes:
     return Volumes(struct, SphereNode, set_up, enter)
 
 
-def make_traversal(units: Units, any_hit: bool, accepts=None):
+def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found). The box test of `units` is for primitives only."""
     return make_binary_traversal(units, sphere_volumes(units.triangle_test.record), any_hit, accepts)

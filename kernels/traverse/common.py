@@ -52,7 +52,7 @@ def no_hit(ray: Ray) -> Hit:
     return best
 
 
-def make_probe(units: Units):
+def make_probe(units: Units) -> Any:
     """The set-up of both units, once a ray."""
 
     @wp.func
@@ -67,7 +67,7 @@ def make_probe(units: Units):
     return probe_of
 
 
-def make_intersect(units: Units, accepts=None):
+def make_intersect(units: Units, accepts: Any = None) -> Any:
     """The unit that tests one primitive and keeps the better hit.
 
     accepts(surfaces, prim_id, u, v) -> bool may refuse a hit (cut-outs); None takes all.

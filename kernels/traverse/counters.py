@@ -4,9 +4,12 @@ Compiled in only where `Units.counters` asks for it: without, every function her
 nothing of it. A traversal unit counts into a local `Counts` and hands it to the structure's `Recorder` when it ends.
 """
 
+from typing import Any
+
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray
+from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
+from wrt.kernels.traverse.common import Units
 
 # Nodes and primitives have address spaces of their own; an entry of the trace is address * 2^12 + size in bytes.
 PRIMITIVE_SPACE = wp.constant(wp.int64(1 << 40))
@@ -71,11 +74,11 @@ def add_counts(recorder: Recorder, slot: int, counts: Counts):
     recorder.counts[slot] = total
 
 
-def make_counters(units, node_bytes):
+def make_counters(units: Units, node_bytes: int) -> Any:
     """fetch_node, fetch_primitive, push: each gives the counts that it got, one step on; and finish. node_bytes: of one node."""
     on = units.counters
     node_size = int(node_bytes)
-    primitive_size = int(units.triangle_test.record.numpy_dtype()["itemsize"])
+    primitive_size = size_of(units.triangle_test.record)
 
     @wp.func
     def fetch_node(recorder: Recorder, ray: Ray, counts: Counts, index: int, boxes: int) -> Counts:

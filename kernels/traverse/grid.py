@@ -7,10 +7,11 @@ enter, each once. Mailboxing: Amanatides and Woo, section 3, with a few slots by
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
 from wrt.kernels.traverse.cell_ray import cell_slack, earlier, later, parallel
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
@@ -87,7 +88,7 @@ def slabs_left(layout: GridLayout, ray: BoxRay, axis: int, slab: int, limit: flo
 
 
 @cache
-def make_struct(record):
+def make_struct(record: Any) -> Any:
     """The structure over records of this kind, in the order of prim_id. lo, hi, size, n: the GridLayout; pad, extent: the largest
     of any triangle's box; mailbox: 1 to remember what was tested; cells: x first, then y, then z; references: indices of
     primitives."""
@@ -109,11 +110,11 @@ def make_struct(record):
     return Grid
 
 
-def make_traversal(units: Units, any_hit: bool, accepts=None):
+def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found). The box test is the walk's own, whatever `units` says."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
-    fetch_node, fetch_primitive, _, finish = make_counters(units, GridCell.numpy_dtype()["itemsize"])
+    fetch_node, fetch_primitive, _, finish = make_counters(units, size_of(GridCell))
     struct = make_struct(units.triangle_test.record)
 
     @wp.func

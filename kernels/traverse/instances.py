@@ -6,10 +6,11 @@ is left for this level is never to pass by a structure in which a hit would have
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 from wrt.kernels.traverse.common import Units, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, add_counts, make_counters
@@ -29,7 +30,7 @@ class Placement:
 
 
 @cache
-def make_struct(bottom):
+def make_struct(bottom: Any) -> Any:
     """Two levels over structures of this kind: nodes[0] is the root, whose leaves are rows of `placements`. slack: see `enter`;
     bases: where each structure begins in the space of addresses."""
 
@@ -110,9 +111,9 @@ def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
     return out
 
 
-def make_traversal(units: Units, any_hit: bool, bottom, bottom_struct):
+def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any) -> Any:
     """The closest hit, or any, among all placed structures. bottom: the lower level's traversal, made with these units."""
-    fetch_node, _, push, finish = make_counters(units._replace(instances=False), Bvh2Node.numpy_dtype()["itemsize"])
+    fetch_node, _, push, finish = make_counters(units._replace(instances=False), size_of(Bvh2Node))
     struct = make_struct(bottom_struct)
 
     @wp.func

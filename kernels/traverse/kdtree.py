@@ -11,10 +11,11 @@ send it to both sides, whole.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
 from wrt.kernels.traverse.cell_ray import earlier, later
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
@@ -40,7 +41,7 @@ class KdNode:
 
 
 @cache
-def make_struct(record):
+def make_struct(record: Any) -> Any:
     """The structure over records of this kind: nodes[0] is the root, lo and hi its cell; primitives are in the order of the
     leaves, once in each that they reach into. reach: the largest extent of a triangle that was clipped."""
 
@@ -73,12 +74,12 @@ def held_distance(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
     return reach * wp.min(HELD_GRAZING * steepest, 1.01 / longest)
 
 
-def make_traversal(units: Units, any_hit: bool, accepts=None):
+def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found)."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
     ray_aabb = units.box_test
-    fetch_node, fetch_primitive, push, finish = make_counters(units, KdNode.numpy_dtype()["itemsize"])
+    fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(KdNode))
     struct = make_struct(units.triangle_test.record)
 
     @wp.func

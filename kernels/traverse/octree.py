@@ -7,10 +7,11 @@ without primitives have no record and are never looked at.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
 from wrt.kernels.traverse.cell_ray import cell_slack, earlier, later
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
@@ -111,7 +112,7 @@ def octants_met(occupied: int, enter: float, middle: wp.vec3, leave: float) -> i
 
 
 @cache
-def make_struct(record):
+def make_struct(record: Any) -> Any:
     """The structure over records of this kind, in the order of prim_id. nodes[0] is the root; lo, hi, size, levels: the
     OctreeLayout; pad, extent: the largest of any triangle's box; mailbox: 1 to remember what was tested; references: indices of
     primitives."""
@@ -133,11 +134,11 @@ def make_struct(record):
     return Octree
 
 
-def make_traversal(units: Units, any_hit: bool, accepts=None):
+def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found). The box test is the walk's own, whatever `units` says."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
-    fetch_node, fetch_primitive, push, finish = make_counters(units, OctreeNode.numpy_dtype()["itemsize"])
+    fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(OctreeNode))
     struct = make_struct(units.triangle_test.record)
 
     @wp.func

@@ -16,14 +16,14 @@ def text_of(file: Path) -> str:
     return INCLUDE.sub(lambda line: text_of(file.parent / line[1]), file.read_text())
 
 
-def literal(value) -> str:
+def literal(value: float | str) -> str:
     """As C++ writes it; text is C++ already."""
     if isinstance(value, float):
         return f"({value.hex()}f)"
     return value if isinstance(value, str) else f"({int(value)})"
 
 
-def source(file: str | Path, **constants) -> str:
+def source(file: str | Path, **constants: float | str) -> str:
     """The body of a native function, for wp.func_native: a file (of this folder, or a path), with those constants (int, float,
     bool, C++) that it names."""
     body = text_of(Path(__file__).parent / file)

@@ -7,7 +7,7 @@ bit: a test holds the two together. This file has the layouts that they work on;
 import warp as wp
 
 from wrt.kernels.query import LARGEST, LENGTHEN, LONGEST, SHORTEN, SHORTEST, HitArrays, RayArrays
-from wrt.kernels.structs import NO_HIT, Primitive
+from wrt.kernels.structs import NO_HIT, Primitive, size_of
 from wrt.kernels.units.box import FAR_PAD, PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST
 from wrt.kernels.units.triangle import CLAMP_ROUNDING, CLAMP_STEP, SLOWEST
 from wrt.kernels.wide.native import source
@@ -61,7 +61,7 @@ LAYOUT = {
     "CHILD_ENTRY": CHILD_ENTRY, "CHILD_RAYS": CHILD_RAYS, "ROOT_ENTRIES": ROOT_ENTRIES, "LEVEL": LEVEL,
     "LEVEL_REFERENCES": LEVEL_REFERENCES, "LEVEL_BELOW": LEVEL_BELOW, "KEY_MASK": KEY_MASK, "TO_POP": TO_POP,
     "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
-    "PRIM_ID_ROW": Primitive.numpy_dtype()["offsets"][-1] // 4, "NO_HIT": NO_HIT,
+    "PRIM_ID_ROW": size_of(Primitive) // 4 - 1, "NO_HIT": NO_HIT,
     "LARGEST": LARGEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
     "FAR_PAD": FAR_PAD, "PAD_EXTENT": PAD_EXTENT, "PAD_COORDINATE": PAD_COORDINATE, "PAD_SMALLEST": PAD_SMALLEST,
     "CLAMP_ROUNDING": CLAMP_ROUNDING, "CLAMP_STEP": CLAMP_STEP, "SLOWEST": SLOWEST,

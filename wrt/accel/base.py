@@ -41,7 +41,7 @@ class Accelerator(ABC):
     """
 
     name: ClassVar[str]
-    kernels: ClassVar[Any]
+    kernels: Any
     bytes_to_build: ClassVar[float] = 200.0  # of memory for each primitive, at the peak; measured, rounded up
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",

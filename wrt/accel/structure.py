@@ -37,7 +37,7 @@ class Kind(Protocol):
     """What is asked of an Accelerator class: its traversal's module."""
 
     name: ClassVar[str]
-    kernels: ClassVar[Any]
+    kernels: Any
 
 
 class Structure(NamedTuple):

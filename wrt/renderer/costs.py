@@ -12,7 +12,7 @@ import warp as wp
 
 from wrt.accel.counting import copied
 from wrt.accel.structure import Structure
-from wrt.core.device import run_all
+from wrt.core.device import record_dtype, run_all
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import Counts, Recorder
 from wrt.renderer.film_arrays import DeviceFilm
@@ -21,7 +21,7 @@ from wrt.renderer.prepare import Prepared, prepare
 from wrt.renderer.tiles import Rectangle, Work
 from wrt.scene.cameras import CameraKind
 
-COUNTERS = tuple(Counts.vars)
+COUNTERS = record_dtype(Counts).names or ()
 
 
 class LoggedStructure(NamedTuple):

@@ -170,10 +170,10 @@ def _emitters(scene: Scene, world: World, prim_id: np.ndarray) -> tuple[np.ndarr
 
 
 def background_struct(background: Background, device: Any) -> Any:
-    b = structs.Background()
+    b: Any = structs.Background()
     number(background.kind, backgrounds.BACKGROUNDS, "background kind")
     for name, value in background.record().items():
-        kind = structs.Background.vars[name].type
+        kind = b._cls.vars[name].type
         if isinstance(value, np.ndarray):
             setattr(b, name, upload(value, kind.dtype, device))
         else:

@@ -83,7 +83,7 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
     n = len(build)
     if n <= 1:
         return small_tree(build["lo"], build["hi"])
-    data = build_records.BuildData()
+    data: Any = build_records.BuildData()
     arrays |= {"records": build, "nodes": records(Bvh2Node, n - 1), "used": np.zeros(n - 1, np.uint8)}
     for name, array in arrays.items():
         setattr(data, name, upload(array, data._cls.vars[name].type.dtype, cpu))

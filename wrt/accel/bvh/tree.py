@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wrt.core.device import records
 from wrt.core.errors import InputError
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 MAX_LEAF = 64
-NODE_DTYPE = np.dtype(Bvh2Node.numpy_dtype())
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class BinaryTree:
 
 def small_tree(lo: np.ndarray, hi: np.ndarray) -> BinaryTree:
     """The tree over no box or one: a root with nothing to split. lo, hi: (0 or 1, 3) float32."""
-    nodes = np.zeros(1, NODE_DTYPE)
+    nodes = records(Bvh2Node, 1)
     nodes["lo_0"], nodes["hi_0"], nodes["lo_1"], nodes["hi_1"] = np.inf, -np.inf, np.inf, -np.inf
     if len(lo):
         nodes["lo_0"], nodes["hi_0"], nodes["count_0"] = lo, hi, 1

@@ -13,7 +13,7 @@ from wrt.accel.built import Built
 from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.refit import refit_nodes
-from wrt.accel.bvh.tree import NODE_DTYPE, root_area
+from wrt.accel.bvh.tree import root_area
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import check_links
 from wrt.core.device import load_kernel, records, run_all, start, upload
@@ -76,7 +76,7 @@ class Bvh2Kdop(Bvh2):
 
 def boxes_around(built: Built, there: list[np.ndarray], geometry: Geometry) -> np.ndarray:
     """Bvh2Node records with the links of other nodes, and boxes that fit the geometry; there: which children exist."""
-    nodes = np.zeros(len(built.arrays["nodes"]), NODE_DTYPE)
+    nodes = records(Bvh2Node, len(built.arrays["nodes"]))
     for name in LINKS:
         nodes[name] = built.arrays["nodes"][name]
     for side, exists in zip("01", there, strict=True):

@@ -13,6 +13,7 @@ from wrt.core.device import load_kernel, records, run_all, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import kdtree as kernels
 from wrt.kernels.build.clip import Clippable, clip_references
+from wrt.kernels.build.kdtree_split import half_area
 from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 
 BINS = 64
@@ -20,6 +21,7 @@ BINS = 64
 CLIP_SIZES = (1e-30, 1e30)
 MAX_IN_LEAF = 1 << 24  # the node holds the number as a float32
 MAX_INDEX = 1 << 29  # a node's word has 29 bits for it
+Part = tuple[np.ndarray, np.ndarray, Any]  # nodes, order and totals of a subtree
 
 
 @dataclass(frozen=True)
@@ -112,10 +114,6 @@ def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) ->
     return shapes, float(extent[exact].max(initial=0.0))
 
 
-def half_area(e: np.ndarray) -> Any:
-    return e[..., 0] * e[..., 1] + e[..., 1] * e[..., 2] + e[..., 2] * e[..., 0]
-
-
 def split_top(root: Cell, shapes: Any, options: KdOptions) -> tuple[list[tuple[float, int]], list[Cell], float]:
     """Nodes (split, word) of the top of the tree, the cells that are left to do, and the half areas of the nodes together."""
     max_depth = options.depth(len(root.prim_id))
@@ -131,7 +129,7 @@ def split_top(root: Cell, shapes: Any, options: KdOptions) -> tuple[list[tuple[f
             tasks.append(cell)
             continue
         nodes[cell.slot] = (float(plane[1]), 4 * len(nodes) + plane[0])
-        area += float(half_area(cell.cell_hi.astype(np.float64) - cell.cell_lo))
+        area += float(half_area.func(cell.cell_hi.astype(np.float64) - cell.cell_lo))
         todo += reversed(divide(cell, plane, shapes, len(nodes)))
         nodes += [(0.0, 0), (0.0, 0)]
     return nodes, tasks, area
@@ -158,7 +156,7 @@ def binned_split(cell: Cell, options: KdOptions) -> tuple[int, np.float32] | Non
         caps, sides = e[axis - 2] * e[axis - 1], e[axis - 2] + e[axis - 1]
         share = planes.astype(np.float64) - low
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            cost = options.cost_traversal + options.cost_intersection / half_area(e) * (
+            cost = options.cost_traversal + options.cost_intersection / half_area.func(e) * (
                 (share * sides + caps) * left + ((width - share) * sides + caps) * right)
         cost = np.where((left == 0) | (right == 0), (1.0 - options.empty_bonus) * cost, cost)
         inside = (planes > cell.cell_lo[axis]) & (planes < cell.cell_hi[axis])
@@ -201,7 +199,7 @@ def clipped(shapes: Any, prim_id: np.ndarray, cell_lo: np.ndarray, cell_hi: np.n
     return lo.numpy(), hi.numpy()
 
 
-def build_subtrees(tasks: list[Cell], shapes: Any, options: KdOptions, threads: int) -> list[tuple]:
+def build_subtrees(tasks: list[Cell], shapes: Any, options: KdOptions, threads: int) -> list[Part]:
     """nodes, order and totals of each task."""
     chosen = kernels.KdOptions()
     chosen.max_leaf, chosen.by_cost, chosen.empty_bonus = options.max_leaf, options.by_cost, options.empty_bonus
@@ -243,7 +241,7 @@ def build_subtree(cell: Cell, shapes: Any, options: Any) -> tuple[np.ndarray, np
     return out.nodes.numpy()[: totals["nodes"]].copy(), out.references.numpy()[: totals["references"]].copy(), totals
 
 
-def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[tuple], root: Cell, area: float,
+def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[Part], root: Cell, area: float,
            reach: float) -> KdTreeData:
     """One tree of the top and the subtrees: each root goes to its slot, the other nodes and the references behind all before."""
     n_nodes = len(top) + sum(len(nodes) - 1 for nodes, _, _ in parts)
@@ -265,6 +263,6 @@ def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[tuple], 
         next_node += len(subtree) - 1
         next_reference += len(references)
     totals = [totals for _, _, totals in parts]
-    cost = (area + sum(float(t["cost"]) for t in totals)) / float(half_area(root.cell_hi.astype(np.float64) - root.cell_lo))
+    cost = (area + sum(float(t["cost"]) for t in totals)) / float(half_area.func(root.cell_hi.astype(np.float64) - root.cell_lo))
     return KdTreeData(nodes, order, root.cell_lo, root.cell_hi, sum(int(t["leaves"]) for t in totals),
                       max(int(t["depth"]) for t in totals), cost, reach)
