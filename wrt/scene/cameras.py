@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from wrt.core.checks import as_integer, at_thing
+from wrt.core.checks import at_thing
 from wrt.core.errors import InputError
+from wrt.scene.kinds import check_fields, forms, given
 from wrt.scene.values import SMALLEST, as_number, as_transform, as_vector
-
-DEGREES, LENGTH = "degrees", "length"
-
-
-def parameter(default: float, description: str, low: float, high: float = math.inf, unit: str = "") -> Any:
-    """A field of a camera's class, which a scene file has under the same name; a whole number where the default is one.
-
-    unit: "", LENGTH or DEGREES: then default, low and high are in degrees here, as in files, and the field is in radians.
-    """
-    about = {"default": default, "description": description, "low": low, "high": high, "unit": unit}
-    return field(default=math.radians(default) if unit == DEGREES else default, metadata=about)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +19,7 @@ class CameraKind:
     """What all cameras have: a pose, and a name.
 
     camera_to_world: (4, 4), rotation and translation; it looks along its own -z, +y is up. A kind adds its parameters as
-    fields, and says where its device function is.
+    fields that are each `field(metadata=given(...))`, and says where its device function is.
     """
 
     kind: ClassVar[str]  # what scene files call it
@@ -50,24 +40,12 @@ class CameraKind:
         x = x / np.linalg.norm(x)
         matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = x, np.cross(z, x), z
         object.__setattr__(self, "camera_to_world", matrix)
-        for key, about in self.parameters().items():
-            low, high, value = about["low"], about["high"], getattr(self, key)
-            if isinstance(about["default"], int):
-                as_integer(value, at + key, low, high)
-                continue
-            if about["unit"] == DEGREES:
-                low, high = math.radians(low), math.radians(high)
-            object.__setattr__(self, key, as_number(value, at + key, low=low, high=high))
-
-    @classmethod
-    def parameters(cls) -> dict[str, dict[str, Any]]:
-        """The fields made by `parameter`, with what it was told of each."""
-        return {each.name: dict(each.metadata) for each in fields(cls) if each.metadata}
+        check_fields(self, at)
 
     def as_in_files(self) -> dict[str, float]:
         """The parameters in the units of scene files."""
-        values = {key: (getattr(self, key), about["unit"]) for key, about in self.parameters().items()}
-        return {key: math.degrees(value) if unit == DEGREES else value for key, (value, unit) in values.items()}
+        values = {key: (getattr(self, key), each.metadata["form"]) for key, each in forms(type(self)).items()}
+        return {key: math.degrees(value) if form == "angle" else value for key, (value, form) in values.items()}
 
     @classmethod
     def look_at(cls, position: Any, target: Any, up: Any = (0.0, 1.0, 0.0), **rest: Any) -> Self:
@@ -110,12 +88,12 @@ class Camera(CameraKind):
     kind = "perspective"
     device = "wrt.kernels.shade.cameras.perspective"
 
-    fov_y: float = parameter(45.0, "full vertical angle of view", 0.0005, 179.94, DEGREES)
-    aperture_radius: float = parameter(0.0, "0 is a pinhole", 0.0, unit=LENGTH)
-    focus_distance: float = parameter(1.0, "along the axis to what is sharp (beside a target: by default as far as that)",
-                                      SMALLEST, unit=LENGTH)
-    blades: int = parameter(0, "0: a round aperture; from 3 on its number of sides", 0, 64)
-    blade_rotation: float = parameter(0.0, "turns the aperture", -math.inf, unit=DEGREES)
+    fov_y: float = field(default=math.pi / 4.0, metadata=given("angle", "full vertical angle of view", ge=0.0005, le=179.94))
+    aperture_radius: float = field(default=0.0, metadata=given("number", "0 is a pinhole", "length", ge=0.0))
+    focus_distance: float = field(default=1.0, metadata=given(
+        "number", "along the axis to what is sharp (beside a target: by default as far as that)", "length", ge=SMALLEST))
+    blades: int = field(default=0, metadata=given("whole", "0: a round aperture; from 3 on its number of sides", ge=0, le=64))
+    blade_rotation: float = field(default=0.0, metadata=given("angle", "turns the aperture"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -168,7 +146,8 @@ class OrthographicCamera(CameraKind):
     kind = "orthographic"
     device = "wrt.kernels.shade.cameras.orthographic"
 
-    height: float = parameter(2.0, "of what the picture shows, from its lower to its upper edge", SMALLEST, unit=LENGTH)
+    height: float = field(default=2.0, metadata=given(
+        "number", "of what the picture shows, from its lower to its upper edge", "length", ge=SMALLEST))
 
     def record(self, size: tuple[int, int]) -> dict[str, Any]:
         """Half the sides of what the picture shows."""
@@ -185,8 +164,8 @@ class FisheyeCamera(CameraKind):
     kind = "fisheye"
     device = "wrt.kernels.shade.cameras.fisheye"
 
-    fov: float = parameter(180.0, "full angle of view across the image circle, which is as wide as the picture's shorter side",
-                           0.0005, 360.0, DEGREES)
+    fov: float = field(default=math.pi, metadata=given(
+        "angle", "full angle of view across the image circle, which is as wide as the picture's shorter side", ge=0.0005, le=360.0))
 
     def record(self, size: tuple[int, int]) -> dict[str, Any]:
         """Half the angle of view, and half the picture's sides in radii of the image circle."""

@@ -1,4 +1,5 @@
-"""Kinds of lights and backgrounds: each says once what it is, for scenes in Python, for scene files and for the device."""
+"""Fields that say what they are, once for scenes in Python, scene files and the reference of these; and what lights and backgrounds
+have in common."""
 
 from __future__ import annotations
 
@@ -9,18 +10,17 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from wrt.core.checks import as_array, at_thing
+from wrt.core.checks import as_array, as_choice, as_integer, as_one, as_size, at_thing
 from wrt.core.errors import InputError
 from wrt.scene.values import Color, _unit, as_number, as_vector
 
 K = TypeVar("K", bound="Kind")
-
-
-Limits = dict[str, float]
+Limits = dict[str, Any]
 
 
 def _number(value: Any, what: str, limits: Limits, unit: float = 1.0) -> float:
-    low, high = limits.get("ge", limits.get("gt", -math.inf)), limits.get("le", limits.get("lt", math.inf))
+    low: float = limits.get("ge", limits.get("gt", -math.inf))
+    high: float = limits.get("le", limits.get("lt", math.inf))
     return as_number(value, what, low=low * unit, high=high * unit)
 
 
@@ -33,26 +33,38 @@ def _image(value: Any, what: str, limits: Limits) -> np.ndarray:
     return image
 
 
-# What a field of a kind can be, and how it is checked.
+# What a field can be, and how it is checked.
 FORMS: dict[str, Callable[[Any, str, Limits], Any]] = {
     "point": lambda value, what, limits: as_vector(value, what),  # in world space; it moves with the scene
     "direction": lambda value, what, limits: _unit(as_vector(value, what), what),  # of any length, kept at 1; it turns
-    "color": lambda value, what, limits: as_vector(value, what, low=0.0),
+    "color": lambda value, what, limits: as_vector(value, what, low=0.0, high=limits.get("le", math.inf)),
     "number": _number,
     "angle": lambda value, what, limits: _number(value, what, limits, math.pi / 180.0),  # radians here, degrees in files and limits
+    "whole": lambda value, what, limits: as_integer(value, what, limits["ge"], limits["le"]),
+    "flag": lambda value, what, limits: value,
+    "choice": lambda value, what, limits: as_choice(value, limits["among"], what),
+    "size": lambda value, what, limits: as_size(value, what),
     "image": _image,  # (H, W, 3) float32 linear radiance; in a file the name of an image file
+    "texture": lambda value, what, limits: value if value is None else as_one(value, limits["among"], what),
 }
 
 
-def given(form: str, about: str, unit: str = "", **limits: float) -> dict[str, Any]:
+def given(form: str, about: str, unit: str = "", **limits: Any) -> dict[str, Any]:
     """A field's `metadata`: one of FORMS, what it is (for the reference of scene files), its unit where the form says none, and
-    for numbers and angles their limits (ge, gt, le, lt)."""
+    its limits: of numbers, angles and colours (ge, gt, le, lt), or what it is one of (among)."""
     return {"form": form, "about": about, "unit": unit, "limits": limits}
 
 
-def forms(kind: type[Kind]) -> dict[str, Field[Any]]:
-    """The fields that describe the thing, by name; `name` itself is none."""
-    return {each.name: each for each in fields(kind) if "form" in each.metadata}  # type: ignore[arg-type]
+def forms(kind: type[Any]) -> dict[str, Field[Any]]:
+    """The fields that `given` describes, by name."""
+    return {each.name: each for each in fields(kind) if "form" in each.metadata}
+
+
+def check_fields(thing: Any, at: str) -> None:
+    """Bring each of them to its form. Raises InputError, which begins with `at`, for a value that has not that form."""
+    for name, each in forms(type(thing)).items():
+        check = FORMS[each.metadata["form"]]
+        object.__setattr__(thing, name, check(getattr(thing, name), at + name, each.metadata["limits"]))
 
 
 class Kind:
@@ -66,10 +78,7 @@ class Kind:
     name: str
 
     def __post_init__(self) -> None:
-        at = at_thing(self.what, self.name)
-        for name, each in forms(type(self)).items():
-            check = FORMS[each.metadata["form"]]
-            object.__setattr__(self, name, check(getattr(self, name), at + name, each.metadata["limits"]))
+        check_fields(self, at_thing(self.what, self.name))
 
     def record(self) -> dict[str, Any]:
         """What the device function reads: values by their names in the struct of kernels/structs.py."""

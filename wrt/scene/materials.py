@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from wrt.core.checks import LARGEST, as_array, as_choice, as_one, at_thing
+from wrt.core.checks import LARGEST, as_array, as_choice, at_thing
 from wrt.core.errors import InputError
-from wrt.scene.values import BLACK, Color, as_number, as_vector
+from wrt.scene.kinds import check_fields, forms, given
+from wrt.scene.values import BLACK, Color
 
 WRAPS = ("repeat", "clamp", "mirror")
 
@@ -47,15 +47,12 @@ class Texture:
 class Checkerboard:
     """Two colours in turn; `scale` squares to one unit of u and of v."""
 
-    color_a: Color = (0.8, 0.8, 0.8)
-    color_b: Color = (0.2, 0.2, 0.2)
-    scale: float = 1.0
+    color_a: Color = field(default=(0.8, 0.8, 0.8), metadata=given("color", "colour of the square at (u, v) = (0, 0)"))
+    color_b: Color = field(default=(0.2, 0.2, 0.2), metadata=given("color", "colour of its neighbours"))
+    scale: float = field(default=1.0, metadata=given("number", "squares to one unit of u and of v", ge=1e-6))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "color_a", as_vector(self.color_a, "checkerboard color_a", low=0.0))
-        object.__setattr__(self, "color_b", as_vector(self.color_b, "checkerboard color_b", low=0.0))
-        object.__setattr__(self, "scale", as_number(self.scale, "checkerboard scale", low=1e-6))
-
+        check_fields(self, "checkerboard ")
 
 
 class MaterialKind(NamedTuple):
@@ -117,51 +114,51 @@ class Material:
 
     kind: str = "diffuse"
     name: str = ""
-    albedo: Color = (0.8, 0.8, 0.8)
-    specular: Color = BLACK
-    exponent: float = 50.0
-    eta: Color = CONDUCTORS["silver"][0]
-    k: Color = CONDUCTORS["silver"][1]
-    ior: float = 1.5
-    absorption: Color = BLACK
-    thin: bool = False
-    metallic: float = 0.0
-    roughness: float = 0.0
-    transmission: float = 0.0
-    emission: Color = BLACK
-    two_sided: bool = False
-    emits_light: bool = True
-    alpha: float = 1.0
-    alpha_mode: str = "opaque"
-    alpha_cutoff: float = 0.5
-    normal_scale: float = 1.0
-    albedo_texture: Texture | Checkerboard | None = None
-    metallic_roughness_texture: Texture | None = None
-    transmission_texture: Texture | None = None
-    emission_texture: Texture | Checkerboard | None = None
-    normal_texture: Texture | None = None
+    albedo: Color = field(default=(0.8, 0.8, 0.8), metadata=given(
+        "color", "share of the light that is scattered or mirrored, or (glass) let through by each surface: clear glass has 1, and"
+        " by default each takes a fifth", le=1.0))
+    specular: Color = field(default=BLACK, metadata=given("color", "colour of the highlight (diffuse)", le=1.0))
+    exponent: float = field(default=50.0, metadata=given("number", "Blinn-Phong exponent (diffuse)", ge=0.0, le=1e6))
+    eta: Color = field(default=CONDUCTORS["silver"][0], metadata=given(
+        "color", "real part of the index of refraction at red, green, blue (conductor)", le=1e3))
+    k: Color = field(default=CONDUCTORS["silver"][1], metadata=given(
+        "color", "imaginary part of the index of refraction (conductor)", le=1e3))
+    ior: float = field(default=1.5, metadata=given("number", "index of refraction (glass, metallic_roughness)", ge=1.0, le=10.0))
+    absorption: Color = field(default=BLACK, metadata=given(
+        "color", "per unit length inside: what is left after a length d is exp(-absorption d) (glass, metallic_roughness)",
+        "1 / length"))
+    thin: bool = field(default=False, metadata=given(
+        "flag", "an infinitely thin pane: nothing is bent (glass, metallic_roughness)"))
+    metallic: float = field(default=0.0, metadata=given("number", "0 dielectric, 1 metal (metallic_roughness)", ge=0.0, le=1.0))
+    roughness: float = field(default=0.0, metadata=given(
+        "number", "perceptual roughness, the GGX alpha is its square; 0 is a perfect mirror (conductor, glass, metallic_roughness)",
+        ge=0.0, le=1.0))
+    transmission: float = field(default=0.0, metadata=given(
+        "number", "share that is transmitted (metallic_roughness)", ge=0.0, le=1.0))
+    emission: Color = field(default=BLACK, metadata=given("color", "of the front side", "radiance"))
+    two_sided: bool = field(default=False, metadata=given("flag", "both sides emit"))
+    emits_light: bool = field(default=True, metadata=given(
+        "flag", "the emission lights other surfaces (false: it is only seen)"))
+    alpha: float = field(default=1.0, metadata=given("number", "opacity", ge=0.0, le=1.0))
+    alpha_mode: str = field(default="opaque", metadata=given(
+        "choice", "opaque: alpha is not used; mask: nothing where alpha < alpha_cutoff; blend: 1 - alpha of the light goes straight"
+        " through", among=ALPHA_MODES))
+    alpha_cutoff: float = field(default=0.5, metadata=given("number", "threshold of alpha_mode mask", ge=0.0, le=1.0))
+    normal_scale: float = field(default=1.0, metadata=given("number", "strength of the normal map", ge=-1e3, le=1e3))
+    albedo_texture: Texture | Checkerboard | None = field(default=None, metadata=given(
+        "texture", "multiplies albedo; its alpha multiplies alpha", among=(Texture, Checkerboard)))
+    metallic_roughness_texture: Texture | None = field(default=None, metadata=given(
+        "texture", "green multiplies roughness, blue metallic", among=(Texture,)))
+    transmission_texture: Texture | None = field(default=None, metadata=given(
+        "texture", "red multiplies transmission", among=(Texture,)))
+    emission_texture: Texture | Checkerboard | None = field(default=None, metadata=given(
+        "texture", "multiplies emission", among=(Texture, Checkerboard)))
+    normal_texture: Texture | None = field(default=None, metadata=given("texture", "tangent-space normal map", among=(Texture,)))
 
     def __post_init__(self) -> None:
         at = at_thing("material", self.name)
         as_choice(self.kind, MATERIALS, at + "kind")
-        as_choice(self.alpha_mode, ALPHA_MODES, at + "alpha_mode")
-        bounds: dict[str, tuple[float, float]] = {
-            "albedo": (0.0, 1.0), "specular": (0.0, 1.0), "eta": (0.0, 1e3), "k": (0.0, 1e3),
-            "absorption": (0.0, math.inf), "emission": (0.0, math.inf),
-        }
-        for name, (low, high) in bounds.items():
-            object.__setattr__(self, name, as_vector(getattr(self, name), at + name, low=low, high=high))
-        scalars: dict[str, tuple[float, float]] = {
-            "exponent": (0.0, 1e6), "ior": (1.0, 10.0), "metallic": (0.0, 1.0), "roughness": (0.0, 1.0),
-            "transmission": (0.0, 1.0), "alpha": (0.0, 1.0), "alpha_cutoff": (0.0, 1.0), "normal_scale": (-1e3, 1e3),
-        }
-        for name, (low, high) in scalars.items():
-            object.__setattr__(self, name, as_number(getattr(self, name), at + name, low=low, high=high))
-        for name in ("albedo", "emission", "metallic_roughness", "transmission", "normal"):
-            slot = f"{name}_texture"
-            if getattr(self, slot) is not None:
-                kinds = (Texture, Checkerboard) if name in ("albedo", "emission") else (Texture,)
-                as_one(getattr(self, slot), kinds, at + slot)
+        check_fields(self, at)
 
     def uses(self, field: str) -> bool:
         """Whether its kind reads that field, of those that not every kind reads."""
@@ -192,9 +189,13 @@ class Material:
     @property
     def textures(self) -> tuple[Texture | Checkerboard, ...]:
         """Those that it has, in no order to rely on."""
-        slots = (self.albedo_texture, self.metallic_roughness_texture, self.transmission_texture,
-                 self.emission_texture, self.normal_texture)
+        slots = (getattr(self, name) for name in SLOTS)
         return tuple(texture for texture in slots if texture is not None)
+
+
+# Its textures; True: of a colour.
+SLOTS = {name: Checkerboard in each.metadata["limits"]["among"] for name, each in forms(Material).items()
+         if each.metadata["form"] == "texture"}
 
 
 def kinds_that_use() -> dict[str, tuple[str, ...]]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
-from wrt.core.checks import as_choice, as_integer, as_size
-from wrt.scene.values import as_number
+from wrt.scene.kinds import check_fields, given
 
 FILTERS = ("box", "gaussian", "blackman-harris")
 SAMPLERS = ("sobol", "independent")
@@ -26,28 +25,22 @@ class Settings:
     spread), or "independent" random numbers, whose noise falls more slowly. exposure in stops.
     """
 
-    size: tuple[int, int] = (640, 360)
-    spp: int = 64
-    max_depth: int = 8
-    min_throughput: float = 1e-3
-    filter: str = "blackman-harris"
-    fresnel: str = "exact"
-    glass_shadows: str = "opaque"
-    sampler: str = "sobol"
-    exposure: float = 0.0
-    tonemap: str = "none"
+    size: tuple[int, int] = field(default=(640, 360), metadata=given("size", "width and height", "pixels"))
+    spp: int = field(default=64, metadata=given("whole", "samples per pixel", ge=1, le=1 << 24))
+    max_depth: int = field(default=8, metadata=given("whole", "bounces after the first hit", ge=0, le=MAX_DEPTH))
+    min_throughput: float = field(default=1e-3, metadata=given("number", "a ray that carries less is cut", ge=0.0, le=1.0))
+    filter: str = field(default="blackman-harris", metadata=given("choice", "pixel filter", among=FILTERS))
+    fresnel: str = field(default="exact", metadata=given("choice", "of dielectrics", among=FRESNELS))
+    glass_shadows: str = field(default="opaque", metadata=given(
+        "choice", "tinted: shadow rays go straight through solid glass (default: tinted where an included glTF file has solid"
+        " glass, else opaque)", among=GLASS_SHADOWS))
+    sampler: str = field(default="sobol", metadata=given(
+        "choice", "how a pixel's samples are spread: evenly, or by independent random numbers", among=SAMPLERS))
+    exposure: float = field(default=0.0, metadata=given("number", "doubles what is shown with each", "stops", ge=-100.0, le=100.0))
+    tonemap: str = field(default="none", metadata=given("choice", "curve from linear to display", among=TONEMAPS))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "size", as_size(self.size))
-        object.__setattr__(self, "spp", as_integer(self.spp, "spp", 1, 1 << 24))
-        object.__setattr__(self, "max_depth", as_integer(self.max_depth, "max_depth", 0, MAX_DEPTH))
-        as_number(self.min_throughput, "min_throughput", low=0.0, high=1.0)
-        as_number(self.exposure, "exposure", low=-100.0, high=100.0)
-        as_choice(self.filter, FILTERS, "filter")
-        as_choice(self.fresnel, FRESNELS, "fresnel")
-        as_choice(self.glass_shadows, GLASS_SHADOWS, "glass_shadows")
-        as_choice(self.sampler, SAMPLERS, "sampler")
-        as_choice(self.tonemap, TONEMAPS, "tonemap")
+        check_fields(self, "")
 
 
 SETTINGS = tuple(each.name for each in fields(Settings))

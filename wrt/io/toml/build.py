@@ -15,14 +15,16 @@ from wrt.core.checks import unknown
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
 from wrt.core.memory import Meter
+from wrt.io.toml.kinds import make, taken
 from wrt.io.toml.meshes import Meshes
 from wrt.io.toml.report import raise_all, unknown_materials
 from wrt.io.toml.transforms import transform, turn
 from wrt.scene import shapes
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
-from wrt.scene.cameras import CAMERAS, DEGREES, Camera, CameraKind
+from wrt.scene.cameras import CAMERAS, Camera, CameraKind
+from wrt.scene.kinds import forms
 from wrt.scene.lights import LIGHTS, Light
-from wrt.scene.materials import CONDUCTORS, Checkerboard, Material, Texture
+from wrt.scene.materials import CONDUCTORS, SLOTS, Checkerboard, Material, Texture
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import Settings
 from wrt.scene.values import BLACK, SMALLEST, as_vector, require_count
@@ -31,9 +33,8 @@ if TYPE_CHECKING:
     from wrt.io.toml import schema as tables
     from wrt.io.toml.camera_schema import PoseTable
     from wrt.io.toml.material_schema import MaterialTable
+    from wrt.io.toml.values import Table
 
-_COLOR_SLOTS = ("albedo_texture", "emission_texture")
-_DATA_SLOTS = ("metallic_roughness_texture", "transmission_texture", "normal_texture")
 
 
 def build(table: tables.SceneTable, path: Path) -> Scene:
@@ -173,14 +174,14 @@ class _Builder:
 
     def material(self, table: MaterialTable, name: str, place: str) -> dict[str, Material]:
         """The material by its name, or nothing where it is wrong."""
-        fields = table.given("metal", *_COLOR_SLOTS, *_DATA_SLOTS)
+        fields = table.given("metal", *SLOTS)
         if table.metal is not None:
             fields["eta"], fields["k"] = CONDUCTORS[table.metal]
-        for slot in (*_COLOR_SLOTS, *_DATA_SLOTS):
+        for slot, is_color in SLOTS.items():
             texture = getattr(table, slot)
             if texture is not None:
                 with self.at(f"{place}.{slot}"):
-                    fields[slot] = self.texture(texture, slot in _COLOR_SLOTS)
+                    fields[slot] = self.texture(texture, is_color)
         with self.at(place):
             return {name: Material(name=name, **fields)}
         return {}
@@ -216,7 +217,6 @@ class _Builder:
         return self._images[path]
 
     def background(self, table: tables.SceneTable) -> Background:
-        from wrt.io.toml.kinds import make
         from wrt.picture.image import read_image
 
         given = table.background
@@ -226,7 +226,6 @@ class _Builder:
 
     def light(self, table: Any, name: str) -> Light | Object:
         """A light; a rectangle is an object that shines and reflects nothing."""
-        from wrt.io.toml.kinds import make
         from wrt.picture.image import read_image
 
         if table.type == "rectangle":
@@ -235,11 +234,11 @@ class _Builder:
         return make(LIGHTS[table.type], table, name, lambda file: read_image(self.file(file)))
 
 
-def settings(table: tables.SettingsTable, included: Sequence[Scene]) -> Settings:
+def settings(table: Table, included: Sequence[Scene]) -> Settings:
     """What the file says; where it does not say how glass casts shadows, the included files decide: tinted if one needs that."""
     tinted = any(scene.settings.glass_shadows == "tinted" for scene in included)
     needed = {"glass_shadows": "tinted"} if tinted else {}
-    return Settings(**{**needed, **table.given(), "size": tuple(table.size)})
+    return Settings(**{**needed, **table.given()})
 
 
 def moved(scene: Scene, matrix: np.ndarray) -> Scene:
@@ -258,12 +257,9 @@ def make_camera(table: PoseTable, name: str) -> CameraKind:
     """A camera from where it stands and looks, or from its matrix; a perspective one by its angle of view, or by a real lens."""
     kind = CAMERAS[table.type]
     values: dict[str, Any] = {}
-    for key, about in kind.parameters().items():
-        if key in table.model_fields_set:
-            value = getattr(table, key)
-            values[key] = math.radians(value) if about["unit"] == DEGREES else value
-        elif key == "focus_distance" and table.position is not None and table.target is not None:
-            values[key] = max(math.dist(table.position, table.target), SMALLEST)
+    if "focus_distance" in forms(kind) and table.position is not None and table.target is not None:
+        values["focus_distance"] = max(math.dist(table.position, table.target), SMALLEST)
+    values |= taken(kind, table)
     focal_length, sensor_height = (getattr(table, key, None) for key in ("focal_length", "sensor_height"))
     if focal_length is not None and sensor_height is not None:
         values |= Camera.lens(focal_length, values.get("focus_distance", 1.0), sensor_height,

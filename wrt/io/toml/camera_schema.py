@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from functools import reduce
 from operator import or_
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
-from wrt.io.toml.material_schema import Length, Matrix, Point, Positive, Table, Vector
+from wrt.io.toml.kinds import described
+from wrt.io.toml.values import Length, Matrix, Point, Positive, Table, Vector
 from wrt.scene.cameras import Camera, CameraKind
-from wrt.scene.values import SMALLEST
 
 
 class PoseTable(Table):
@@ -63,13 +62,8 @@ def camera_table(kind: type[CameraKind]) -> Any:
     """The table of a kind of camera: its pose, and the parameters of its class."""
     base = LensTable if issubclass(kind, Camera) else PoseTable
     keys: dict[str, Any] = {"type": (Literal[kind.kind], Camera.kind if kind is Camera else Field())}
-    for key, about in kind.parameters().items():
-        limits = {"gt": 0.0} if about["low"] == SMALLEST else {"ge": about["low"]} if math.isfinite(about["low"]) else {}
-        limits |= {"le": about["high"]} if math.isfinite(about["high"]) else {}
-        keys[key] = (type(about["default"]), Field(about["default"], description=about["description"], **limits,
-                                                   json_schema_extra={"unit": about["unit"]} if about["unit"] else None))
     about_kind = (kind.__doc__ or "").split("\n\n")[0]
-    return create_model(f"{kind.__name__}Table", __base__=base, __doc__=f"{about_kind} {base.__doc__}", **keys)
+    return create_model(f"{kind.__name__}Table", __base__=base, __doc__=f"{about_kind} {base.__doc__}", **keys, **described(kind))
 
 
 def _type_of_camera(table: Any) -> str:

@@ -1,4 +1,4 @@
-"""Lights and backgrounds of a TOML scene file: each kind's table, from what its fields say of themselves, and the thing itself."""
+"""Tables of a TOML scene file from what the fields of a class say of themselves, and lights and backgrounds from such tables."""
 
 from __future__ import annotations
 
@@ -9,22 +9,40 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, create_model
 
-from wrt.io.toml.material_schema import Angle, Point, Radiance, Table, Vector, unit
-from wrt.scene.kinds import Kind, forms
+from wrt.io.toml.values import Angle, Point, Radiance, Share, Size, Table, Vector, unit
+from wrt.scene.kinds import Kind, Limits, forms
+from wrt.scene.values import SMALLEST
 
 K = TypeVar("K", bound=Kind)
-TYPES: dict[str, Any] = {"point": Point, "direction": Vector, "color": Radiance, "number": float, "angle": Angle, "image": str}
+_literal: Any = Literal
+TYPES: dict[str, Callable[[Limits], Any]] = {
+    "point": lambda limits: Point, "direction": lambda limits: Vector, "angle": lambda limits: Angle,
+    "color": lambda limits: Share if limits.get("le") == 1.0 else Radiance,
+    "number": lambda limits: float, "whole": lambda limits: int, "flag": lambda limits: bool, "size": lambda limits: Size,
+    "choice": lambda limits: _literal[limits["among"]], "image": lambda limits: str,
+}
+BOUNDED = ("number", "whole", "angle")  # the other types have their bounds
+
+
+def described(kind: type[Any], types: dict[str, Callable[[Limits], Any]] = TYPES) -> dict[str, Any]:
+    """The keys of a table for a class: the fields that `given` describes, with angles in degrees and an image by its file."""
+    found: dict[str, Any] = {}
+    for key, each in forms(kind).items():
+        form, limits = each.metadata["form"], each.metadata["limits"]
+        bounds = limits if form in BOUNDED else {}
+        if bounds.get("ge") == SMALLEST:
+            bounds = {**bounds, "ge": None, "gt": 0.0}
+        value: Any = types[form](limits)
+        if each.metadata["unit"]:
+            value = Annotated[value, unit(each.metadata["unit"])]
+        default = ... if each.default is MISSING else _written(form, each.default)
+        found["file" if form == "image" else key] = (value, Field(default, description=each.metadata["about"], **bounds))
+    return found
 
 
 def kind_table(kind: type[Kind], what: str) -> type[Table]:
-    """The table of that kind (PointLightTable, say, where `what` is Light), with angles in degrees and an image by its file."""
-    literal: Any = Literal
-    found: dict[str, Any] = {"type": (literal[kind.kind], ...)}
-    for key, each in forms(kind).items():
-        form, limits = each.metadata["form"], each.metadata["limits"]
-        value: Any = TYPES[form] if not each.metadata["unit"] else Annotated[TYPES[form], unit(each.metadata["unit"])]
-        default = ... if each.default is MISSING else _written(form, each.default)
-        found["file" if form == "image" else key] = (value, Field(default, description=each.metadata["about"], **limits))
+    """The table of that kind: PointLightTable, say, where `what` is Light."""
+    found = {"type": (_literal[kind.kind], ...), **described(kind)}
     if "file" not in found and _has_name(kind):
         found["name"] = (str, Field("", description="for messages"))
     summary = (kind.__doc__ or kind.__name__).split("\n\n")[0]
@@ -43,15 +61,22 @@ def _written(form: str, value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
+def taken(kind: type[Any], table: Any) -> dict[str, Any]:
+    """What a checked table gives of those keys, by the class's fields; an image by its file."""
+    values: dict[str, Any] = {}
+    for key, each in forms(kind).items():
+        form = each.metadata["form"]
+        written = "file" if form == "image" else key
+        if written in table.model_fields_set:
+            value = getattr(table, written)
+            values[key] = math.radians(value) if form == "angle" else value
+    return values
+
+
 def make(kind: type[K], table: Any, name: str, read: Callable[[str], Any]) -> K:
     """The light or background of a checked table; `read` is given the name of an image file."""
-    values: dict[str, Any] = {"name": name} if _has_name(kind) else {}
+    values: dict[str, Any] = ({"name": name} if _has_name(kind) else {}) | taken(kind, table)
     for key, each in forms(kind).items():
-        written = "file" if each.metadata["form"] == "image" else key
-        if written not in table.model_fields_set:
-            continue
-        value = getattr(table, written)
         if each.metadata["form"] == "image":
-            value, values["name"] = read(value), value
-        values[key] = math.radians(value) if each.metadata["form"] == "angle" else value
+            values |= {key: read(values[key]), "name": values[key]}
     return kind(**values)

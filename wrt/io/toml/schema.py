@@ -12,13 +12,13 @@ from typing import Annotated, Any, Literal, Union
 from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
 from wrt.io.toml.camera_schema import any_camera
-from wrt.io.toml.kinds import kind_table
-from wrt.io.toml.material_schema import (
+from wrt.io.toml.kinds import described, kind_table
+from wrt.io.toml.material_schema import MaterialTable, material_table
+from wrt.io.toml.values import (
     LENGTH,
     Angle,
     Angles,
     Length,
-    MaterialTable,
     Matrix,
     Point,
     Radiance,
@@ -26,9 +26,7 @@ from wrt.io.toml.material_schema import (
     Segments,
     Subdivisions,
     Table,
-    Unit,
     Vector,
-    material_table,
     require_one,
     unit,
 )
@@ -37,35 +35,12 @@ from wrt.scene.cameras import CAMERAS, CameraKind
 from wrt.scene.kinds import Kind
 from wrt.scene.lights import LIGHTS
 from wrt.scene.materials import MATERIALS
-from wrt.scene.settings import MAX_DEPTH, Settings
+from wrt.scene.settings import Settings
 
-# --- background, settings ---------------------------------------------------------------------------------------------
-
-_SETTINGS = Settings()
 RADIANCE = unit("radiance")
-
-
-
-
-class SettingsTable(Table):
-    """How the scene wants to be rendered; the command line can override all of it."""
-
-    size: Annotated[list[Annotated[int, Field(ge=1, le=32768)]], Field(min_length=2, max_length=2)] = Field(
-        list(_SETTINGS.size), json_schema_extra={"unit": "pixels"}, description="width and height")
-    spp: int = Field(_SETTINGS.spp, ge=1, le=1 << 24, description="samples per pixel")
-    max_depth: int = Field(_SETTINGS.max_depth, ge=0, le=MAX_DEPTH, description="bounces after the first hit")
-    min_throughput: Unit = Field(_SETTINGS.min_throughput, description="a ray that carries less is cut")
-    filter: Literal["box", "gaussian", "blackman-harris"] = Field("blackman-harris", description="pixel filter")
-    fresnel: Literal["exact", "schlick"] = Field("exact", description="of dielectrics")
-    glass_shadows: Literal["opaque", "tinted"] = Field(
-        "opaque", description="tinted: shadow rays go straight through solid glass (default: tinted where an included glTF file has"
-                              " solid glass, else opaque)")
-    sampler: Literal["sobol", "independent"] = Field(
-        "sobol", description="how a pixel's samples are spread: evenly, or by independent random numbers")
-    exposure: float = Field(_SETTINGS.exposure, ge=-100.0, le=100.0, json_schema_extra={"unit": "stops"},
-                            description="doubles what is shown with each")
-    tonemap: Literal["none", "reinhard", "aces", "agx"] = Field("none", description="curve from linear to display")
-
+SettingsTable: Any = create_model(
+    "SettingsTable", __base__=Table, __doc__="How the scene wants to be rendered; the command line can override all of it.",
+    **described(Settings))
 
 # --- shapes -----------------------------------------------------------------------------------------------------------
 
@@ -272,8 +247,7 @@ class SceneTable(Table):
     title: str = Field("", description="what the picture shows")
     include: list[IncludeEntry] = Field(
         [], description="glTF files, or tables with a transform; their shapes, cameras and lights come behind this file's")
-    settings: SettingsTable = Field(default_factory=lambda: SettingsTable.model_validate({}),
-                                    description="how the scene wants to be rendered")
+    settings: Any = Field(default_factory=SettingsTable, description="how the scene wants to be rendered")
     cameras: dict[str, Any] = Field({}, description="by name; the first is the default")
     background: Any = Field(None, description="what rays that leave the scene see (default: black)")
     ambient: Annotated[Radiance, RADIANCE] = Field([0.0, 0.0, 0.0], description="what every diffuse surface receives, unshadowed")
@@ -301,7 +275,8 @@ def _scene_table(cameras: tuple[type[CameraKind], ...], lights: tuple[type[Kind]
     material = material_table(materials)
     light = one_of[(*(kind_table(each, "Light") for each in lights), RectangleLightTable)]
     background = one_of[tuple(kind_table(each, "") for each in backgrounds)]
-    changes = {"cameras": by_name[str, any_camera(cameras)], "background": tagged[background, Field(discriminator="type")] | None,
+    changes = {"settings": SettingsTable, "cameras": by_name[str, any_camera(cameras)],
+               "background": tagged[background, Field(discriminator="type")] | None,
                "materials": by_name[str, material], "override": by_name[str, material],
                "lights": many[tagged[light, Field(discriminator="type")]]}
     fields: dict[str, Any] = {name: (kind, SceneTable.model_fields[name]) for name, kind in changes.items()}

@@ -1,0 +1,82 @@
+"""Values of a TOML scene file as pydantic types, and the tables that they stand in.
+
+Wherever a colour stands, one number is a grey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, model_validator
+
+from wrt.scene.materials import WRAPS
+
+
+def _repeated(count: int) -> Callable[[Any], Any]:
+    """A single value (but no bool and no text) stands for `count` of it."""
+    return lambda value: [value] * count if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+def _or_one(values: dict[str, Any], count: int) -> WithJsonSchema:
+    array = {"type": "array", "items": values, "minItems": count, "maxItems": count}
+    return WithJsonSchema({"anyOf": [values, array]})
+
+
+def unit(name: str) -> Any:
+    """Says in the schema what a number is measured in."""
+    return Field(json_schema_extra={"unit": name})
+
+
+LENGTH, DEGREES = unit("length"), unit("degrees")
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Matrix = Annotated[list[float], Field(min_length=16, max_length=16)]
+Positive = Annotated[float, Field(gt=0.0)]
+Point = Annotated[list[float], Field(min_length=3, max_length=3), LENGTH]
+Length = Annotated[float, Field(gt=0.0), LENGTH]
+Angle = Annotated[float, DEGREES]
+Angles = Annotated[list[float], Field(min_length=3, max_length=3), DEGREES]
+Share = Annotated[  # a colour that reflects or transmits
+    list[Unit], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
+    _or_one({"type": "number", "minimum": 0, "maximum": 1}, 3)]
+Radiance = Annotated[  # a colour without an upper bound
+    list[NotNegative], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
+    _or_one({"type": "number", "minimum": 0}, 3)]
+Scale3 = Annotated[list[float], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
+                   _or_one({"type": "number"}, 3)]
+Scale2 = Annotated[list[float], Field(min_length=2, max_length=2), BeforeValidator(_repeated(2)),
+                   _or_one({"type": "number"}, 2)]
+WrapMode = Literal["repeat", "clamp", "mirror"]
+Wraps = Annotated[list[WrapMode], Field(min_length=2, max_length=2),
+                  BeforeValidator(lambda value: [value] * 2 if isinstance(value, str) else value),
+                  _or_one({"type": "string", "enum": list(WRAPS)}, 2)]
+Subdivisions = Annotated[int, Field(ge=0, le=9)]
+Segments = Annotated[int, Field(ge=3, le=4096)]
+Size = Annotated[list[Annotated[int, Field(ge=1, le=32768)]], Field(min_length=2, max_length=2)]
+
+
+class Table(BaseModel):
+    """A table of the file: unknown keys, wrong types, NaN and infinity are errors."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _note_keys(cls, data: Any, info: ValidationInfo) -> Any:
+        """Leave the known keys where the report of an unknown one finds them."""
+        if isinstance(info.context, dict) and isinstance(data, dict):
+            info.context[id(data)] = list(cls.model_fields)
+        return data
+
+    def given(self, *leave_out: str) -> dict[str, Any]:
+        """The fields that the file gives, as plain values."""
+        return self.model_dump(exclude_unset=True, exclude=set(leave_out))
+
+
+def require_one(table: Table, *choices: tuple[str, ...]) -> None:
+    """Raise ValueError unless exactly one of the groups of fields is given."""
+    given = [names for names in choices if any(getattr(table, name) is not None for name in names)]
+    if len(given) != 1:
+        raise ValueError("give exactly one of " + ", or ".join(" and ".join(names) for names in choices))
