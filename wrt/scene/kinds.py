@@ -19,8 +19,8 @@ Limits = dict[str, Any]
 
 
 def _number(value: Any, what: str, limits: Limits, unit: float = 1.0) -> float:
-    low: float = limits.get("ge", limits.get("gt", -math.inf))
-    high: float = limits.get("le", limits.get("lt", math.inf))
+    low = max(limits.get(each, -math.inf) for each in ("ge", "gt"))
+    high = min(limits.get(each, math.inf) for each in ("le", "lt"))
     return as_number(value, what, low=low * unit, high=high * unit)
 
 
