@@ -12,7 +12,7 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.counters import Counts, Recorder, add_counts, make_counters
 from wrt.kernels.units.box import BoxRay
 
 # Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
@@ -81,9 +81,10 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
 
 
 def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts: Any = None, ordered: bool = True,
-                          early: bool = True) -> Any:
+                          early: bool = True, visit: Any = None) -> Any:
     """As make_traversal, over a tree with volumes of another kind. ordered: the nearer child first; early: nodes beyond the best
-    hit are dropped (what either is worth is for studies to tell)."""
+    hit are dropped (what either is worth is for studies to tell). visit(accel, surfaces, ray, index, best) -> Hit: in place of
+    the triangle test, where a leaf holds structures, which count for themselves."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
     struct, set_up, enter = volumes.struct, volumes.set_up, volumes.enter
@@ -105,9 +106,15 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
         while True:
             if count > 0:
                 counts.leaves += 1
+                if wp.static(visit is not None and units.counters):
+                    add_counts(accel.recorder, ray.slot, counts)
+                    counts = Counts()
                 for i in range(first, first + count):
-                    best = intersect(probe, surfaces, accel.primitives[i], best)
-                    counts = fetch_primitive(accel.recorder, ray, counts, i)
+                    if wp.static(visit is not None):
+                        best = visit(accel, surfaces, ray, i, best)
+                    else:
+                        best = intersect(probe, surfaces, accel.primitives[i], best)
+                        counts = fetch_primitive(accel.recorder, ray, counts, i)
                     if wp.static(any_hit):
                         if best.prim_id != NO_HIT:
                             return finish(accel.recorder, ray, counts, best)

@@ -10,11 +10,11 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
-from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
-from wrt.kernels.traverse.common import Units, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, add_counts, make_counters
-from wrt.kernels.units.box import FAR_PAD, BoxRay, box_ray, slab_interval
+from wrt.kernels.structs import Hit, Ray, Surfaces
+from wrt.kernels.traverse.bvh2 import Bvh2Node, Volumes, make_binary_traversal
+from wrt.kernels.traverse.common import Probe, Units
+from wrt.kernels.traverse.counters import Recorder
+from wrt.kernels.units.box import FAR_PAD, BoxRay, slab_interval
 
 
 @wp.struct
@@ -44,6 +44,14 @@ def make_struct(bottom: Any) -> Any:
         recorder: Recorder
 
     return Instances
+
+
+@wp.struct
+class WidenedRay:
+    """What `enter` needs of a ray."""
+
+    box: BoxRay
+    slack: float
 
 
 @wp.func
@@ -113,7 +121,6 @@ def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
 
 def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any) -> Any:
     """The closest hit, or any, among all placed structures. bottom: the lower level's traversal, made with these units."""
-    fetch_node, _, push, finish = make_counters(units._replace(instances=False), size_of(Bvh2Node))
     struct = make_struct(bottom_struct)
 
     @wp.func
@@ -134,62 +141,16 @@ def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any)
         return hit
 
     @wp.func
-    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
-        box = box_ray(ray)
-        best = no_hit(ray)
-        counts = Counts()
-        stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
-        stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
-        stack_t = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
-        size = int(0)
-        first = int(0)
-        count = int(0)
-        while True:
-            if count > 0:
-                counts.leaves += 1
-                if wp.static(units.counters):
-                    add_counts(accel.recorder, ray.slot, counts)
-                    counts = Counts()
-                for i in range(first, first + count):
-                    best = visit(accel, surfaces, ray, i, best)
-                    if wp.static(any_hit):
-                        if best.prim_id != NO_HIT:
-                            return finish(accel.recorder, ray, counts, best)
-            else:
-                node = accel.nodes[first]
-                counts = fetch_node(accel.recorder, ray, counts, first, 2)
-                t_0 = enter(box, node.lo_0, node.hi_0, accel.slack, best.t)
-                t_1 = enter(box, node.lo_1, node.hi_1, accel.slack, best.t)
-                hit_0 = t_0 < wp.inf
-                hit_1 = t_1 < wp.inf
-                if hit_0 and hit_1:
-                    swap = t_1 < t_0
-                    stack_first[size] = wp.where(swap, node.first_0, node.first_1)
-                    stack_count[size] = wp.where(swap, node.count_0, node.count_1)
-                    stack_t[size] = wp.where(swap, t_0, t_1)
-                    size = size + 1
-                    counts = push(counts, size)
-                    first = wp.where(swap, node.first_1, node.first_0)
-                    count = wp.where(swap, node.count_1, node.count_0)
-                    continue
-                if hit_0:
-                    first = node.first_0
-                    count = node.count_0
-                    continue
-                if hit_1:
-                    first = node.first_1
-                    count = node.count_1
-                    continue
-            found = bool(False)
-            while size > 0 and not found:
-                size = size - 1
-                counts.pops += 1
-                if stack_t[size] <= best.t:
-                    first = stack_first[size]
-                    count = stack_count[size]
-                    found = True
-            if not found:
-                break
-        return finish(accel.recorder, ray, counts, best)
+    def set_up(accel: struct, probe: Probe) -> WidenedRay:
+        out = WidenedRay()
+        out.box = probe.box
+        out.slack = accel.slack
+        return out
 
-    return traverse
+    @wp.func
+    def enter_both(ray: WidenedRay, node: Bvh2Node, t_max: float) -> wp.vec2:
+        return wp.vec2(enter(ray.box, node.lo_0, node.hi_0, ray.slack, t_max),
+                       enter(ray.box, node.lo_1, node.hi_1, ray.slack, t_max))
+
+    volumes = Volumes(struct, Bvh2Node, set_up, enter_both)
+    return make_binary_traversal(units._replace(instances=False), volumes, any_hit, visit=visit)
