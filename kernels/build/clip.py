@@ -55,6 +55,32 @@ def within_cell(lo: wp.vec3, hi: wp.vec3, cell_lo: wp.vec3, cell_hi: wp.vec3) ->
 
 
 @wp.func
+def cut_by_plane(polygon: wp.array(dtype=wp.vec3d), n: int, clipped: wp.array(dtype=wp.vec3d), axis: int, sign: wp.float64,
+                 wall: wp.float64) -> int:
+    """The part of a polygon of n corners on one side of a plane across an axis (sign 1: above), in `polygon`; how many corners that
+    has, MAX_CORNERS at most. clipped: room."""
+    m = int(0)
+    last = polygon[n - 1]
+    last_inside = sign * (last[axis] - wall)
+    for i in range(n):
+        corner = polygon[i]
+        inside = sign * (corner[axis] - wall)
+        if (inside < wp.float64(0.0)) != (last_inside < wp.float64(0.0)) and m < wp.static(MAX_CORNERS):
+            cut = last + (last_inside / (last_inside - inside)) * (corner - last)
+            cut[axis] = wall
+            clipped[m] = cut
+            m = m + 1
+        if inside >= wp.float64(0.0) and m < wp.static(MAX_CORNERS):
+            clipped[m] = corner
+            m = m + 1
+        last = corner
+        last_inside = inside
+    for i in range(m):
+        polygon[i] = clipped[i]
+    return m
+
+
+@wp.func
 def clip_to_cell(shapes: Clippable, prim_id: int, cell_lo: wp.vec3, cell_hi: wp.vec3) -> Box:
     """The box of what of the primitive is in the cell, larger by its margin and within the cell; or an empty box."""
     if shapes.exact[prim_id] == wp.uint8(0):
@@ -77,33 +103,16 @@ def clip_to_cell(shapes: Clippable, prim_id: int, cell_lo: wp.vec3, cell_hi: wp.
         wall = wall - sign * (pad + CLIP_COORDINATE * wp.abs(wall))
         outside = wp.where(plane % 2 == 0, lo[axis] < wall, hi[axis] > wall)
         if outside:
-            m = int(0)
-            last = polygon[n - 1]
-            last_inside = sign * (last[axis] - wall)
-            for i in range(n):
-                if m > wp.static(MAX_CORNERS - 2):
-                    return within_cell(shapes.lo[prim_id], shapes.hi[prim_id], cell_lo, cell_hi)
-                corner = polygon[i]
-                inside = sign * (corner[axis] - wall)
-                if (inside < wp.float64(0.0)) != (last_inside < wp.float64(0.0)):
-                    cut = last + (last_inside / (last_inside - inside)) * (corner - last)
-                    cut[axis] = wall
-                    clipped[m] = cut
-                    m = m + 1
-                if inside >= wp.float64(0.0):
-                    clipped[m] = corner
-                    m = m + 1
-                last = corner
-                last_inside = inside
-            if m == 0:
+            n = cut_by_plane(polygon, n, clipped, axis, sign, wall)
+            if n == 0:
                 return empty_box()
-            n = m
-            lo = clipped[0]
-            hi = clipped[0]
+            if n == wp.static(MAX_CORNERS):  # there may have been more
+                return within_cell(shapes.lo[prim_id], shapes.hi[prim_id], cell_lo, cell_hi)
+            lo = polygon[0]
+            hi = polygon[0]
             for i in range(n):
-                polygon[i] = clipped[i]
-                lo = wp.min(lo, clipped[i])
-                hi = wp.max(hi, clipped[i])
+                lo = wp.min(lo, polygon[i])
+                hi = wp.max(hi, polygon[i])
     margin = wp.vec3d(pad, pad, pad)
     lo = lo - margin - CLIP_COORDINATE * wp.vec3d(wp.abs(lo[0]), wp.abs(lo[1]), wp.abs(lo[2]))
     hi = hi + margin + CLIP_COORDINATE * wp.vec3d(wp.abs(hi[0]), wp.abs(hi[1]), wp.abs(hi[2]))

@@ -2,15 +2,14 @@
 
 Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies": a ray that ends at a point of the surface visits
 every node whose box holds the point, for nothing where the point's triangle is not below. How much of each triangle lies in such
-boxes is found by clipping it to them (Sutherland and Hodgman 1974), in float64.
+boxes is found by clipping it to them, in float64.
 """
 
 import warp as wp
 
+from wrt.kernels.build.clip import MAX_CORNERS, cut_by_plane
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import STACK_SIZE
-
-MAX_CORNERS = 12  # a triangle, and one more for each of the six planes; rounding may add some
 
 
 @wp.struct
@@ -53,27 +52,9 @@ def area_inside(triangle: Corners, lo: wp.vec3d, hi: wp.vec3d) -> wp.float64:
         sign = wp.where(plane % 2 == 0, wp.float64(1.0), wp.float64(-1.0))
         wall = wp.where(plane % 2 == 0, lo[axis], hi[axis])
         if wp.where(plane % 2 == 0, low[axis] < wall, high[axis] > wall):
-            m = int(0)
-            last = polygon[n - 1]
-            last_inside = sign * (last[axis] - wall)
-            for i in range(n):
-                corner = polygon[i]
-                inside = sign * (corner[axis] - wall)
-                if (inside < wp.float64(0.0)) != (last_inside < wp.float64(0.0)) and m < wp.static(MAX_CORNERS):
-                    cut = last + (last_inside / (last_inside - inside)) * (corner - last)
-                    cut[axis] = wall
-                    clipped[m] = cut
-                    m = m + 1
-                if inside >= wp.float64(0.0) and m < wp.static(MAX_CORNERS):
-                    clipped[m] = corner
-                    m = m + 1
-                last = corner
-                last_inside = inside
-            if m == 0:
+            n = cut_by_plane(polygon, n, clipped, axis, sign, wall)
+            if n == 0:
                 return wp.float64(-1.0)
-            n = m
-            for i in range(n):
-                polygon[i] = clipped[i]
     doubled = wp.vec3d()
     for i in range(1, n - 1):
         doubled = doubled + wp.cross(polygon[i] - polygon[0], polygon[i + 1] - polygon[0])

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from math import prod
 from pathlib import Path
 from typing import Any, TypeVar
@@ -230,6 +230,18 @@ def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
     with ThreadPoolExecutor(threads) as pool:
         for future in [pool.submit(job) for job in jobs]:
             future.result()
+
+
+def launch(kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -> None:
+    """Launch a kernel over n on the CPU; with a step over ranges of so many, on that many threads: the first of each is the input
+    that is None."""
+    cpu = start("cpu")
+    load_kernel(kernel, cpu)
+
+    def job(first: int) -> None:
+        wp.launch(kernel, dim=min(step or n, n - first), device=cpu, inputs=[first if each is None else each for each in inputs])
+
+    run_all([partial(job, first) for first in range(0, n, step or max(n, 1))], threads)
 
 
 def run_growing(begin: Callable[[Any], tuple[Callable[[], Any], Callable[[], Iterable[Any]]]], tasks: Iterable[Any],

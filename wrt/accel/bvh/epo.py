@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, run_all, start, upload
+from wrt.core.device import launch, start, upload
 from wrt.kernels.build import end_point_overlap as kernels
 
 TRIANGLES_PER_LAUNCH = 16384
@@ -30,13 +29,7 @@ def end_point_overlap(tree: Any, geometry: Geometry, threads: int) -> float:
         return 0.0
     vertices, faces = upload(geometry.vertices, wp.vec3, cpu), upload(geometry.faces, wp.vec3i, cpu)
     out = wp.zeros(n, dtype=wp.float64, device=cpu)
-    load_kernel(kernels.end_point_overlap, cpu)
-
-    def job(first: int) -> None:
-        wp.launch(kernels.end_point_overlap, dim=min(TRIANGLES_PER_LAUNCH, n - first), device=cpu,
-                  inputs=[tree, vertices, faces, first, out])
-
-    run_all([partial(job, first) for first in range(0, n, TRIANGLES_PER_LAUNCH)], threads)
+    launch(kernels.end_point_overlap, n, tree, vertices, faces, None, out, threads=threads, step=TRIANGLES_PER_LAUNCH)
     return float(out.numpy().sum() / surface)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, start, upload
+from wrt.core.device import launch, start, upload
 from wrt.kernels.build.refit import refit
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
@@ -17,7 +17,5 @@ def refit_nodes(nodes: np.ndarray, order: np.ndarray, geometry: Geometry) -> np.
     cpu = start("cpu")
     lo, hi = geometry.bounds()
     device_nodes = upload(nodes.copy(), Bvh2Node, cpu)
-    load_kernel(refit, cpu)
-    wp.launch(refit, dim=1, device=cpu, inputs=[device_nodes, upload(order.copy(), wp.int32, cpu), upload(lo, wp.vec3, cpu),
-                                                upload(hi, wp.vec3, cpu)])
+    launch(refit, 1, device_nodes, upload(order.copy(), wp.int32, cpu), upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu))
     return np.asarray(device_nodes.numpy()).copy()

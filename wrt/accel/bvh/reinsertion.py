@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import warp as wp
 from wrt.accel.bvh.top_down import build_binned, build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.core.device import launch, records, start, upload
 from wrt.kernels.build import reinsertion as kernels
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
@@ -55,8 +54,6 @@ def half_areas(links: np.ndarray, scale: np.float32) -> np.ndarray:
 def optimize(tree: BinaryTree, options: BvhOptions, threads: int) -> BinaryTree:
     """The tree (one record a leaf, three or more of them) with less area in its boxes, and leaves as the options want them."""
     cpu = start("cpu")
-    for kernel in (kernels.find_moves, kernels.make_moves, kernels.walk_down, kernels.weigh, kernels.write_nodes):
-        load_kernel(kernel, cpu)
     links = upload(links_of(tree), kernels.Link, cpu)
     view = links.numpy()
     with np.errstate(over="ignore"):
@@ -83,19 +80,14 @@ def move_once(links: Any, view: np.ndarray, scale: np.float32, threads: int) -> 
     moves = records(kernels.Move, len(nodes))
     moves["node"] = nodes
     device_moves = upload(moves, kernels.Move, cpu)
-
-    def search(first: int) -> None:
-        count = min(NODES_PER_LAUNCH, len(nodes) - first)
-        wp.launch(kernels.find_moves, dim=count, device=cpu, inputs=[links, device_moves, first, scale])
-
-    run_all([partial(search, first) for first in range(0, len(nodes), NODES_PER_LAUNCH)], threads)
+    launch(kernels.find_moves, len(nodes), links, device_moves, None, scale, threads=threads, step=NODES_PER_LAUNCH)
     moves = device_moves.numpy()
     moves = moves[moves["gain"] > 0.0]
     if not len(moves):
         return
     moves = moves[np.argsort(-moves["gain"], kind="stable")]
     touched = wp.zeros(len(view), dtype=wp.uint8, device=cpu)
-    wp.launch(kernels.make_moves, dim=1, device=cpu, inputs=[links, upload(moves, kernels.Move, cpu), touched])
+    launch(kernels.make_moves, 1, links, upload(moves, kernels.Move, cpu), touched)
 
 
 def walk_down(links: Any) -> Any:
@@ -105,7 +97,7 @@ def walk_down(links: Any) -> Any:
         setattr(walk, name, wp.empty(len(links), dtype=wp.int32, device=cpu))
     walk.cost = wp.empty(len(links), dtype=wp.float32, device=cpu)
     walk.depth = wp.zeros(1, dtype=wp.int32, device=cpu)
-    wp.launch(kernels.walk_down, dim=1, device=cpu, inputs=[links, walk])
+    launch(kernels.walk_down, 1, links, walk)
     return walk
 
 
@@ -114,12 +106,11 @@ def collapse(tree: BinaryTree, links: Any, options: BvhOptions, scale: np.float3
     cpu = start("cpu")
     n_inner = len(tree.nodes)
     walk = walk_down(links)
-    wp.launch(kernels.weigh, dim=1, device=cpu, inputs=[links, walk, build_options(options), scale])
+    launch(kernels.weigh, 1, links, walk, build_options(options), scale)
     order = wp.empty(len(tree.order), dtype=wp.int32, device=cpu)
     nodes = wp.empty(n_inner, dtype=Bvh2Node, device=cpu)
     count = wp.zeros(1, dtype=wp.int32, device=cpu)
-    wp.launch(kernels.write_nodes, dim=1, device=cpu, inputs=[
-        links, walk, n_inner, upload(tree.order, wp.int32, cpu), order, nodes, count])
+    launch(kernels.write_nodes, 1, links, walk, n_inner, upload(tree.order, wp.int32, cpu), order, nodes, count)
     inner = (walk.index.numpy()[:n_inner] >= 0) & (links.numpy()["left"][:n_inner] >= 0)
     depth = int(walk.level.numpy()[:n_inner][inner].max())
     return BinaryTree(nodes.numpy()[: int(count.numpy()[0])].copy(), order.numpy(), depth)

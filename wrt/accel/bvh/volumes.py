@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from wrt.accel.bvh.refit import refit_nodes
 from wrt.accel.bvh.tree import root_area
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import check_links
-from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.core.device import launch, records, start, upload
 from wrt.kernels.build import volumes as fits
 from wrt.kernels.traverse import bvh2_kdop as traverse_bvh2_kdop
 from wrt.kernels.traverse import bvh2_sphere as traverse_bvh2_sphere
@@ -101,8 +100,7 @@ def spans_of(nodes: np.ndarray) -> Any:
     spans = fits.Spans()
     spans.begin = wp.empty(2 * len(nodes), dtype=wp.int32, device=cpu)
     spans.end = wp.empty(2 * len(nodes), dtype=wp.int32, device=cpu)
-    load_kernel(fits.find_spans, cpu)
-    wp.launch(fits.find_spans, dim=1, device=cpu, inputs=[upload(nodes, Bvh2Node, cpu), spans])
+    launch(fits.find_spans, 1, upload(nodes, Bvh2Node, cpu), spans)
     return spans
 
 
@@ -120,15 +118,8 @@ def fit_spheres(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, thread
     cpu = start("cpu")
     lo, hi = geometry.bounds()
     out = upload(with_links(traverse_bvh2_sphere.SphereNode, nodes), traverse_bvh2_sphere.SphereNode, cpu)
-    inputs = [upload(nodes, Bvh2Node, cpu), spans_of(nodes), upload(order.copy(), wp.int32, cpu), upload(lo, wp.vec3, cpu),
-              upload(hi, wp.vec3, cpu), out]
-    load_kernel(fits.fit_spheres, cpu)
-
-    def fit(first: int) -> None:
-        count = min(NODES_PER_LAUNCH, len(nodes) - first)
-        wp.launch(fits.fit_spheres, dim=count, device=cpu, inputs=[*inputs, first])
-
-    run_all([partial(fit, first) for first in range(0, len(nodes), NODES_PER_LAUNCH)], threads)
+    launch(fits.fit_spheres, len(nodes), upload(nodes, Bvh2Node, cpu), spans_of(nodes), upload(order.copy(), wp.int32, cpu),
+           upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu), out, None, threads=threads, step=NODES_PER_LAUNCH)
     return np.asarray(out.numpy())
 
 
@@ -169,7 +160,6 @@ def fit_kdops(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, middle: 
     cpu = start("cpu")
     cut_lo, cut_hi = cuts(geometry, middle)
     out = upload(with_links(traverse_bvh2_kdop.KdopNode, nodes), traverse_bvh2_kdop.KdopNode, cpu)
-    load_kernel(fits.fit_kdops, cpu)
-    wp.launch(fits.fit_kdops, dim=1, device=cpu, inputs=[spans_of(nodes), upload(order.copy(), wp.int32, cpu),
-                                                         upload(cut_lo, wp.vec4, cpu), upload(cut_hi, wp.vec4, cpu), out])
+    launch(fits.fit_kdops, 1, spans_of(nodes), upload(order.copy(), wp.int32, cpu), upload(cut_lo, wp.vec4, cpu),
+           upload(cut_hi, wp.vec4, cpu), out)
     return np.asarray(out.numpy())

@@ -9,7 +9,7 @@ import warp as wp
 
 from wrt.accel.bvh.tree import BinaryTree
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, start, upload
+from wrt.core.device import launch, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import wide as build_wide
 from wrt.kernels.traverse.bvh2 import Bvh2Node
@@ -64,16 +64,14 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
     trees.size, trees.height = (wp.zeros(n, dtype=wp.int32, device=cpu) for _ in range(2))
     trees.cost = wp.zeros(build_wide.MAX_WIDTH * n, dtype=wp.float32, device=cpu)
     trees.choice = wp.zeros(build_wide.MAX_WIDTH * n, dtype=wp.uint8, device=cpu)
-    load_kernel(build_wide.subtree_costs, cpu)
-    load_kernel(build_wide.collapse, cpu)
-    wp.launch(build_wide.subtree_costs, dim=1, device=cpu, inputs=[nodes, options, trees])
+    launch(build_wide.subtree_costs, 1, nodes, options, trees)
     out = build_wide.WideTree()
     out.children = wp.empty(n * width, dtype=wp.int32, device=cpu)
     out.lo, out.hi = (wp.empty(n * width, dtype=wp.vec3, device=cpu) for _ in range(2))
     out.source = wp.empty(width, dtype=wp.int32, device=cpu)
     out.order = wp.empty(len(tree.order) * width, dtype=wp.int32, device=cpu)
     out.count = wp.zeros(5, dtype=wp.int32, device=cpu)
-    wp.launch(build_wide.collapse, dim=1, device=cpu, inputs=[nodes, order, options, trees, out])
+    launch(build_wide.collapse, 1, nodes, order, options, trees, out)
     n_nodes, rows, leaves, depth, stack = out.count.numpy().tolist()
     if rows > MAX_FIRST:
         raise InputError(f"a wide BVH holds at most {MAX_FIRST} rows of primitives, and these need {rows}; take accel='bvh2'")
@@ -100,10 +98,8 @@ def refit(tree: WideTree, geometry: Geometry) -> WideTree:
     low, high = (upload(np.append(box, [[end] * 3], axis=0), wp.vec3, cpu)  # lane -1: an empty box
                  for box, end in zip(geometry.bounds(), (np.inf, -np.inf), strict=True))
     lo, hi = (wp.empty(tree.children.size, dtype=wp.vec3, device=cpu) for _ in range(2))
-    load_kernel(build_wide.refit, cpu)
-    wp.launch(build_wide.refit, dim=1, device=cpu, inputs=[
-        upload(tree.children.reshape(-1).copy(), wp.int32, cpu), upload(tree.order.reshape(-1).copy(), wp.int32, cpu), width,
-        low, high, lo, hi])
+    launch(build_wide.refit, 1, upload(tree.children.reshape(-1).copy(), wp.int32, cpu),
+           upload(tree.order.reshape(-1).copy(), wp.int32, cpu), width, low, high, lo, hi)
     return replace(tree, lo=lo.numpy().reshape(-1, width, 3), hi=hi.numpy().reshape(-1, width, 3))
 
 

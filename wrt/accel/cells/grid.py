@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
 from wrt.accel.cells.common import cell_source, check_numbers, check_references, one_row, triangle_reach
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.core.device import launch, records, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import grid as build_grid
 from wrt.kernels.traverse import grid as kernels
@@ -125,15 +124,9 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
     source = cell_source(geometry, bounds)
     n = len(geometry)
     count = wp.zeros(n, dtype=wp.int32, device=cpu)
-    for kernel in (build_grid.list_cells, build_grid.sort_by_cell):
-        load_kernel(kernel, cpu)
-
-    def launch(begin: Any, cells: Any, first: int) -> None:
-        wp.launch(build_grid.list_cells, dim=min(PRIMITIVES_PER_LAUNCH, n - first), device=cpu,
-                  inputs=[source, layout, first, begin, count, cells])
 
     def run(begin: Any, cells: Any) -> None:
-        run_all([partial(launch, begin, cells, first) for first in range(0, n, PRIMITIVES_PER_LAUNCH)], threads)
+        launch(build_grid.list_cells, n, source, layout, None, begin, count, cells, threads=threads, step=PRIMITIVES_PER_LAUNCH)
 
     run(wp.zeros(0, dtype=wp.int64, device=cpu), wp.zeros(0, dtype=wp.int32, device=cpu))
     begin = np.zeros(n + 1, np.int64)
@@ -147,7 +140,7 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
         run(device_begin, cell_of)
     cells = upload(records(kernels.GridCell, int(np.prod(layout.n))), kernels.GridCell, cpu)
     references = wp.zeros(total, dtype=wp.int32, device=cpu)
-    wp.launch(build_grid.sort_by_cell, dim=1, inputs=[device_begin, cell_of, cells, references], device=cpu)
+    launch(build_grid.sort_by_cell, 1, device_begin, cell_of, cells, references)
     return cells.numpy(), references.numpy()
 
 

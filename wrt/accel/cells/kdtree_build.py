@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.core.device import launch, load_kernel, records, run_all, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import kdtree as kernels
 from wrt.kernels.build.clip import Clippable, clip_references
@@ -194,8 +195,7 @@ def clipped(shapes: Any, prim_id: np.ndarray, cell_lo: np.ndarray, cell_hi: np.n
     """The boxes of what of each primitive is in a cell."""
     cpu = start("cpu")
     lo, hi = (wp.zeros(len(prim_id), dtype=wp.vec3, device=cpu) for _ in range(2))
-    wp.launch(clip_references, dim=len(prim_id), device=cpu, inputs=[
-        shapes, upload(prim_id, wp.int32, cpu), wp.vec3(*cell_lo), wp.vec3(*cell_hi), lo, hi])
+    launch(clip_references, len(prim_id), shapes, upload(prim_id, wp.int32, cpu), wp.vec3(*cell_lo), wp.vec3(*cell_hi), lo, hi)
     return lo.numpy(), hi.numpy()
 
 
@@ -208,13 +208,11 @@ def build_subtrees(tasks: list[Cell], shapes: Any, options: KdOptions, threads: 
     load_kernel(kernels.build_subtree, start("cpu"))
     parts: list[Any] = [None] * len(tasks)
 
-    def job(i: int) -> Any:
-        def run() -> None:
-            parts[i] = build_subtree(tasks[i], shapes, chosen)
-        return run
+    def job(i: int) -> None:
+        parts[i] = build_subtree(tasks[i], shapes, chosen)
 
     # Largest first, so that no thread is left with a big one at the end.
-    run_all([job(i) for i in sorted(range(len(tasks)), key=lambda i: -len(tasks[i].prim_id))], threads)
+    run_all([partial(job, i) for i in sorted(range(len(tasks)), key=lambda i: -len(tasks[i].prim_id))], threads)
     return parts
 
 
@@ -236,7 +234,7 @@ def build_subtree(cell: Cell, shapes: Any, options: Any) -> tuple[np.ndarray, np
     root = kernels.KdTask()
     root.lo, root.hi = wp.vec3(*cell.cell_lo), wp.vec3(*cell.cell_hi)
     root.budget, root.depth = cell.budget, cell.depth
-    wp.launch(kernels.build_subtree, dim=1, device=cpu, inputs=[shapes, work, root, options, out])
+    launch(kernels.build_subtree, 1, shapes, work, root, options, out)
     totals = out.totals.numpy()[0].copy()
     return out.nodes.numpy()[: totals["nodes"]].copy(), out.references.numpy()[: totals["references"]].copy(), totals
 

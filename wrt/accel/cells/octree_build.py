@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import warp as wp
 
 from wrt.accel.cells.common import cell_source
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.core.device import launch, records, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import octree as build_octree
 from wrt.kernels.traverse.octree import MAX_LEVELS, OctreeLayout, OctreeNode
@@ -160,15 +159,6 @@ class _Splitter:
     def __init__(self, geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: Any, threads: int) -> None:
         self.cpu, self.layout, self.threads = start("cpu"), layout, threads
         self.source = cell_source(geometry, bounds)
-        for kernel in (build_octree.find_octants, build_octree.count_octants, build_octree.fill_octants):
-            load_kernel(kernel, self.cpu)
-
-    def _launch(self, kernel: Any, n: int, step: int, *inputs: Any) -> None:
-        """Over ranges of `step`; `first` is the input that is None."""
-        def job(first: int) -> None:
-            wp.launch(kernel, dim=min(step, n - first), device=self.cpu, inputs=[first if x is None else x for x in inputs])
-
-        run_all([partial(job, first) for first in range(0, n, step)], self.threads)
 
     def _int32(self, array: np.ndarray) -> Any:
         return upload(np.ascontiguousarray(array, np.int32), wp.int32, self.cpu)
@@ -181,9 +171,9 @@ class _Splitter:
         count = wp.zeros((m, 8), dtype=wp.int32, device=self.cpu)
         cell_of = self._int32(np.repeat(np.arange(m), cells.count))
         corner = upload(np.ascontiguousarray(cells.corner, np.int32), wp.vec3i, self.cpu)
-        self._launch(build_octree.find_octants, n, REFERENCES_PER_LAUNCH, self.source, self.layout, None, half, corner, cell_of,
-                     self.references, self.masks)
-        self._launch(build_octree.count_octants, m, CELLS_PER_LAUNCH, None, self.begin, self.masks, count)
+        launch(build_octree.find_octants, n, self.source, self.layout, None, half, corner, cell_of, self.references, self.masks,
+               threads=self.threads, step=REFERENCES_PER_LAUNCH)
+        launch(build_octree.count_octants, m, None, self.begin, self.masks, count, threads=self.threads, step=CELLS_PER_LAUNCH)
         return count.numpy()
 
     def fill(self, cells: Cells, corner: np.ndarray, count: np.ndarray, growth: np.ndarray) -> Cells:
@@ -191,8 +181,9 @@ class _Splitter:
         begin = np.concatenate([[0], np.cumsum(count.ravel())])
         room = np.where(count.any(axis=1, keepdims=True), begin[:-1].reshape(-1, 8), -1)
         out = wp.zeros(int(begin[-1]), dtype=wp.int32, device=self.cpu)
-        self._launch(build_octree.fill_octants, len(cells.corner), CELLS_PER_LAUNCH, None, self.begin, self.masks, self.references,
-                     upload(np.ascontiguousarray(room, np.int32).reshape(-1, 8), wp.int32, self.cpu), out)
+        launch(build_octree.fill_octants, len(cells.corner), None, self.begin, self.masks, self.references,
+               upload(np.ascontiguousarray(room, np.int32).reshape(-1, 8), wp.int32, self.cpu), out,
+               threads=self.threads, step=CELLS_PER_LAUNCH)
         has = count > 0
         return Cells(corner[has].astype(np.int32), np.concatenate([begin[:-1][has.ravel()], begin[-1:]]).astype(np.int32),
                      out.numpy(), np.repeat(growth, has.sum(axis=1)))
