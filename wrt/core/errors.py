@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 LONGEST, END = 5000, 1000  # characters of a line of a message, which may quote what stands in a file; those kept of its end
 
@@ -23,6 +25,15 @@ class InputError(ValueError):
     def at(self, path: str | os.PathLike[str] | None = None, place: str | None = None) -> InputError:
         """The same, found in that file or at that place of it."""
         return InputError(str(self), path, place)
+
+
+@contextmanager
+def at(place: str | None = None, path: str | os.PathLike[str] | None = None) -> Iterator[None]:
+    """Put a file, or a place such as "nodes[3].scale", in front of any InputError raised inside."""
+    try:
+        yield
+    except InputError as error:
+        raise error.at(path, place) from error
 
 
 class SceneWarning(UserWarning):

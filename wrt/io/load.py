@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from wrt.core.checks import as_path, shown
-from wrt.core.errors import InputError, SceneWarning
+from wrt.core.errors import InputError, SceneWarning, at
 from wrt.core.files import read_file, require_file
 from wrt.core.memory import require
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh
@@ -142,10 +142,8 @@ def _require_sound(data: dict[str, Any]) -> None:
 
 def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = ()) -> Scene:
     """The scene with a camera and light where it lacks them; what was added is told, after `notes`."""
-    try:
+    with at(path=path):
         scene, added = stage(scene)
-    except InputError as error:
-        raise error.at(path) from error
     if notes or added:
         warnings.warn(f"{os.fspath(path)}: {'; '.join([*notes, *added])}", SceneWarning, stacklevel=4)
     return scene

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from wrt.core.checks import as_path, shown
-from wrt.core.errors import InputError, SceneWarning
+from wrt.core.errors import InputError, SceneWarning, at
 from wrt.core.files import require_file
 from wrt.core.memory import require
 from wrt.core.registry import Registry
@@ -67,13 +67,11 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
     if path.suffix.lower() not in MESH_FORMATS:
         raise InputError(f"is no mesh file: known are {', '.join(MESH_FORMATS)}", path)
     require_file(path)
-    try:
+    with at(path=path):
         raw = MESH_FORMATS[path.suffix.lower()](path)
         if len(raw.faces) == 0:
             raise InputError(f"holds no triangles ({raw.positions} positions, {raw.incomplete} faces of fewer than 3 corners)")
         groups, face_group = _part_groups(parts, len(raw.faces)) if parts else (raw.groups, raw.face_group)
-    except InputError as error:
-        raise error.at(path) from error
     require(BYTES_OF_FACE * len(raw.faces) + BYTES_OF_VERTEX * len(raw.vertices), "the mesh")
     cleaned = clean(raw.vertices, raw.faces, raw.normals, raw.uvs, face_group)
     if len(cleaned.faces) == 0:

@@ -72,23 +72,23 @@ def squeeze(nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def half_areas(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """Half the surfaces of boxes, (N,) float64; 0 for empty ones."""
+    """Half the surfaces of boxes lo, hi (..., 3), (...) float64; 0 for empty ones."""
     e = np.clip(hi.astype(np.float64) - lo.astype(np.float64), 0.0, 1e39)
-    return np.asarray(e[:, 0] * e[:, 1] + e[:, 1] * e[:, 2] + e[:, 2] * e[:, 0])
+    return np.asarray(e[..., 0] * e[..., 1] + e[..., 1] * e[..., 2] + e[..., 2] * e[..., 0])
 
 
 def root_area(nodes: np.ndarray) -> float:
     """Half the surface of the box around the whole tree."""
-    return float(half_areas(np.minimum(nodes["lo_0"][:1], nodes["lo_1"][:1]), np.maximum(nodes["hi_0"][:1], nodes["hi_1"][:1]))[0])
+    return float(half_areas(np.minimum(nodes["lo_0"][0], nodes["lo_1"][0]), np.maximum(nodes["hi_0"][0], nodes["hi_1"][0])))
+
+
+def expected_cost(root: float, areas: np.ndarray, counts: np.ndarray) -> float:
+    """Expected node visits plus primitives tested (both costing 1) of a random line that meets a root box of this surface. areas,
+    counts: of all children, in the same units; count 0: an inner node. The root itself is visited."""
+    return 1.0 + float((areas * np.maximum(counts, 1)).sum() / root) if root > 0.0 else float(counts.sum())
 
 
 def sah_cost(nodes: np.ndarray) -> float:
-    """Expected node visits plus triangle tests of a random line that meets the root box (both costing 1)."""
-    root = root_area(nodes)
-    if not root > 0.0:
-        return float(nodes["count_0"].sum() + nodes["count_1"].sum())
-    total = root  # the root itself is visited
-    for side in ("0", "1"):
-        areas = half_areas(nodes["lo_" + side], nodes["hi_" + side])
-        total += float((areas * np.where(nodes["count_" + side] > 0, nodes["count_" + side], 1.0)).sum())
-    return total / root
+    """Of Bvh2Node records."""
+    areas = np.stack([half_areas(nodes["lo_" + side], nodes["hi_" + side]) for side in "01"])
+    return expected_cost(root_area(nodes), areas, np.stack([nodes["count_0"], nodes["count_1"]]))

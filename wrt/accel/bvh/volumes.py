@@ -12,7 +12,7 @@ from wrt.accel.built import Built
 from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.refit import refit_nodes
-from wrt.accel.bvh.tree import root_area
+from wrt.accel.bvh.tree import expected_cost, root_area
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import check_links
 from wrt.core.device import launch, records, start, upload
@@ -87,11 +87,7 @@ def boxes_around(built: Built, there: list[np.ndarray], geometry: Geometry) -> n
 def cost_of(nodes: np.ndarray, areas: np.ndarray) -> float:
     """As wrt.accel.bvh.tree.sah_cost, of lines that meet the root's box, for volumes with these surfaces, (2, N). Where volumes
     stick out of the root's box, lines that pass it by count too."""
-    root = 2.0 * root_area(nodes)
-    weight = np.stack([np.maximum(nodes["count_0"], 1), np.maximum(nodes["count_1"], 1)])
-    if not root > 0.0:
-        return float(nodes["count_0"].sum() + nodes["count_1"].sum())
-    return 1.0 + float((areas * weight).sum() / root)
+    return expected_cost(2.0 * root_area(nodes), areas, np.stack([nodes["count_0"], nodes["count_1"]]))
 
 
 def spans_of(nodes: np.ndarray) -> Any:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from wrt.accel.bvh.tree import BinaryTree
+from wrt.accel.bvh.tree import BinaryTree, expected_cost, half_areas
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, start, upload
 from wrt.core.errors import InputError
@@ -34,22 +34,16 @@ class WideTree:
     @property
     def areas(self) -> np.ndarray:
         """(N, W): half the surface of each child's box in float64, 0 where there is none."""
-        e = np.clip(self.hi.astype(np.float64) - self.lo, 0.0, 1e39)
-        return e[..., 0] * e[..., 1] + e[..., 1] * e[..., 2] + e[..., 2] * e[..., 0]
+        return half_areas(self.lo, self.hi)
 
     @property
     def root_area(self) -> float:
         """Half the surface of the box around all."""
-        e = np.clip(self.hi[0].max(axis=0).astype(np.float64) - self.lo[0].min(axis=0), 0.0, 1e39)
-        return float(e[0] * e[1] + e[1] * e[2] + e[2] * e[0])
+        return float(half_areas(self.lo[0].min(axis=0), self.hi[0].max(axis=0)))
 
     def sah_cost(self, root: float) -> float:
-        """Expected node visits plus primitives tested of a random line that meets a root box with this half of its surface (both
-        costing 1)."""
-        count = np.where(self.children < 0, leaf_count.func(self.children), 1)
-        if not root > 0.0:
-            return float((self.order >= 0).sum())
-        return 1.0 + float((self.areas * np.where(self.children == EMPTY, 0, count)).sum() / root)
+        """As wrt.accel.bvh.tree.expected_cost, for a root box with this half of its surface."""
+        return expected_cost(root, self.areas, np.where(self.children < 0, leaf_count.func(self.children), 0))
 
 
 def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float, cost_intersection: float) -> WideTree:

@@ -10,6 +10,7 @@ import warp as wp
 
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
+from wrt.accel.bvh.tree import half_areas
 from wrt.accel.cells.common import cell_source, check_numbers, check_references, one_row, triangle_reach
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, records, start, upload
@@ -146,9 +147,6 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
 
 def sah_cost(layout: Any, visits: int) -> float:
     """Expected cells and primitives of a random line through the grid's box: `visits` cells and references, all of one size."""
-    extent = np.clip(np.array(layout.hi, np.float64) - np.array(layout.lo, np.float64), 0.0, 1e39)
-    def area(e: np.ndarray) -> float:
-        return float(e[0] * e[1] + e[1] * e[2] + e[2] * e[0])
-
-    whole = area(extent)
-    return visits * area(extent / np.array(layout.n, np.float64)) / whole if whole > 0.0 else float(visits)
+    extent = np.array(layout.hi, np.float64) - np.array(layout.lo, np.float64)
+    whole, cell = (float(half_areas(np.zeros(3), e)) for e in (extent, extent / np.array(layout.n, np.float64)))
+    return visits * cell / whole if whole > 0.0 else float(visits)

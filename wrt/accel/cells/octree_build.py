@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from wrt.accel.bvh.tree import half_areas
 from wrt.accel.cells.common import cell_source
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, records, start, upload
@@ -100,8 +101,7 @@ def planes(layout: Any, corner: np.ndarray) -> np.ndarray:
 
 def areas(layout: Any, corner: np.ndarray, size: int) -> np.ndarray:
     """Half the surface of the cells (..., 3) of this size."""
-    e = planes(layout, corner + size) - planes(layout, corner)
-    return e[..., 0] * e[..., 1] + e[..., 1] * e[..., 2] + e[..., 2] * e[..., 0]
+    return half_areas(planes(layout, corner), planes(layout, corner + size))
 
 
 def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Tree:

@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, at
 from wrt.core.memory import Meter
 from wrt.io.gltf.document import Document
-from wrt.io.gltf.schema import at
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}

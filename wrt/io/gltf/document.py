@@ -19,10 +19,10 @@ from urllib.parse import unquote_to_bytes
 import numpy as np
 
 from wrt.core.checks import short
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, at
 from wrt.core.files import read_file
 from wrt.core.memory import require
-from wrt.io.gltf.schema import at, read_as
+from wrt.io.gltf.schema import read_as
 
 GLB_MAGIC = b"glTF"
 # Of memory, at most, measured: of a byte of JSON in ASCII, of one where a character can take four bytes, and of each of these

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, at
 from wrt.core.memory import Meter
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.schema import (
@@ -24,7 +24,6 @@ from wrt.io.gltf.schema import (
     Transmission,
     Unlit,
     Volume,
-    at,
     exactly,
 )
 from wrt.picture.decode import decode_rgba8

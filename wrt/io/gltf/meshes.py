@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, at
 from wrt.core.memory import Meter
 from wrt.io.gltf.accessors import Accessors
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.nodes import compose
-from wrt.io.gltf.schema import Instancing, at
+from wrt.io.gltf.schema import Instancing
 from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.values import require_count

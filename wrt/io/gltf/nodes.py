@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, at
 from wrt.io.gltf.document import Document
-from wrt.io.gltf.schema import at, exactly
+from wrt.io.gltf.schema import exactly
 from wrt.scene.values import as_transform
 
 

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.errors import InputError, SceneWarning
+from wrt.core.errors import InputError, SceneWarning, at
 from wrt.core.memory import Meter
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.materials import Materials
 from wrt.io.gltf.meshes import Meshes
 from wrt.io.gltf.nodes import walk
-from wrt.io.gltf.schema import PunctualLightOfNode, PunctualLights, SpotCone, at, exactly
+from wrt.io.gltf.schema import PunctualLightOfNode, PunctualLights, SpotCone, exactly
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.scene.defaults import stage
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
@@ -45,15 +45,13 @@ def load_gltf(path: str | os.PathLike[str], *, staged: bool = True) -> Scene:
     The scene's settings are the defaults, but for glass_shadows = "tinted" where the file has solid glass (KHR_materials_volume).
     Raises InputError that names the file and the place in its JSON.
     """
-    try:
+    with at(path=path):
         document = Document(path)
         scene = _Reader(document).scene()
         left_out = [f"not supported and left out: {left_out}" for left_out in [document.left_out.sentence()] if left_out]
         if not scene.objects and (staged or not (scene.lights or scene.cameras)):
             raise InputError("; ".join(["the scene has no triangles", *left_out]))
         scene, added = stage(scene) if staged else (scene, [])
-    except InputError as error:
-        raise error.at(path) from error
     if left_out or added:
         warnings.warn(f"{os.fspath(path)}: {'; '.join(left_out + added)}", SceneWarning, stacklevel=2)
     return scene

@@ -11,23 +11,11 @@ import functools
 import math
 import types
 import typing
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 from wrt.core.checks import short
 from wrt.core.errors import InputError
-
-
-@contextmanager
-def at(place: str) -> Iterator[None]:
-    """Put `place` (such as "nodes[3].scale") in front of any InputError raised inside."""
-    try:
-        yield
-    except InputError as error:
-        raise error.at(place=place) from error
-
 
 # --- the extensions that wrt reads ------------------------------------------------------------------------------------
 

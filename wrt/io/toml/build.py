@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wrt.core.checks import unknown
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, at
 from wrt.core.files import read_file
 from wrt.core.memory import Meter
 from wrt.io.toml.kinds import make, taken
@@ -44,10 +44,8 @@ def build(table: tables.SceneTable, path: Path) -> Scene:
     every name that is not known, every file that cannot be used, and every value that the scene refuses.
     """
     builder = _Builder(path)
-    try:
+    with at(path=path):
         scene = builder.scene(table)
-    except InputError as error:
-        raise error.at(path) from error
     raise_all(builder.problems, path)
     assert scene is not None
     return scene
@@ -209,11 +207,9 @@ class _Builder:
         from wrt.picture.decode import decode_rgba8
 
         if path not in self._images:
-            try:
+            with at(path=path):
                 self._images[path] = decode_rgba8(read_file(path))
                 self.meter.take(self._images[path].nbytes, "the images")
-            except InputError as error:
-                raise error.at(path) from error
         return self._images[path]
 
     def background(self, table: tables.SceneTable) -> Background:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wrt.core.checks import unknown
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, at
 from wrt.core.memory import Meter
 from wrt.io.mesh_file import load_mesh
 from wrt.io.toml.transforms import transform
@@ -22,7 +22,7 @@ from wrt.scene.motion import Motion
 from wrt.scene.vertex_normals import smooth
 
 if TYPE_CHECKING:
-    from wrt.io.toml.schema import MeshTable, MorphTable, TransformTable
+    from wrt.io.toml.schema import MeshTable, MorphTable
 
 
 class Meshes:
@@ -55,7 +55,10 @@ class Meshes:
             number = {name: i for i, name in enumerate(names)}
             of_group[used] = [number[str(name)] for name in wanted]
             face_material = of_group[mesh.face_group]
-        each = [np.eye(4)] if table.instances is None else [_placed(one, i) for i, one in enumerate(table.instances)]
+        each = [] if table.instances else [np.eye(4)]
+        for i, one in enumerate(table.instances or ()):
+            with at(f"instances[{i}]"):
+                each.append(transform(one))
         whole, shown, motion = transform(table.transform), tuple(materials[name] for name in names), self._motion(table)
         return [Object(mesh, shown, whole @ matrix, face_material, table.name or place, motion) for matrix in each]
 
@@ -84,10 +87,3 @@ class Meshes:
             mesh = self._meshes[key] = make()
             self._meter.take(32.0 * len(mesh.vertices) + 12.0 * len(mesh.faces), "the meshes")
         return self._meshes[key]
-
-
-def _placed(table: TransformTable, index: int) -> np.ndarray:
-    try:
-        return transform(table)
-    except InputError as error:
-        raise error.at(place=f"instances[{index}]") from error

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wrt.core.checks import short, unknown
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, at
 from wrt.core.memory import require
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ def check(data: dict[str, Any], path: Path) -> SceneTable:
     try:
         return scene_table().model_validate(data, context=known_keys)
     except ValidationError as error:
-        _require_room(error.error_count(), path)
+        with at(path=path):
+            require(BYTES_OF_PROBLEM * error.error_count(), f"a list of {error.error_count()} errors")
         problems = _lines(error, data, known_keys)
     if not data.get("include"):
         materials = data.get("materials")
@@ -65,13 +66,6 @@ def setting_choices(name: str) -> tuple[str, ...]:
     from wrt.io.toml.schema import SettingsTable
 
     return tuple(SettingsTable.model_json_schema()["properties"].get(name, {}).get("enum", ()))
-
-
-def _require_room(count: int, path: Path) -> None:
-    try:
-        require(BYTES_OF_PROBLEM * count, f"a list of {count} errors")
-    except InputError as error:
-        raise error.at(path) from error
 
 
 def _lines(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> list[str]:
