@@ -12,6 +12,7 @@ import warp as wp
 
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
+from wrt.accel.cells.common import check_tree, require_between
 from wrt.accel.geometry import Geometry
 from wrt.core.device import load_kernel, records, run_all, start, upload
 from wrt.core.errors import InputError
@@ -50,12 +51,7 @@ class Bsp(Accelerator):
         for name, value in (("cost_intersection", cost_intersection), ("cost_axis", cost_axis), ("cost_plane", cost_plane)):
             if not 0.0 < value < math.inf:
                 raise InputError(f"{name} must be above 0 and finite, got {value}")
-        if samples < 0:
-            raise InputError(f"samples must be 0 or more, got {samples}")
-        if not 0 <= max_depth <= MAX_DEPTH:
-            raise InputError(f"max_depth must be 0 to {MAX_DEPTH}, got {max_depth}")
-        if not 1.0 <= max_growth <= 1000.0:
-            raise InputError(f"max_growth must be 1 to 1000, got {max_growth}")
+        require_between(samples=(samples, 0, 1 << 30), max_depth=(max_depth, 0, MAX_DEPTH), max_growth=(max_growth, 1.0, 1000.0))
         if progress is not None and not callable(progress):
             raise InputError(f"progress must be a function of one number, got {progress!r}")
         if n > max_triangles:
@@ -233,22 +229,14 @@ def check_planes(built: Built) -> None:
         raise InputError("is damaged: a tree has one root")
     nodes, root_first, root_count = (built.arrays[name] for name in ("nodes", "first", "count"))
     n = len(nodes)
-    parents, children = np.zeros(n + 1, np.int64), []
-    for parent, first, count in ((np.array([-1]), root_first.reshape(1), root_count.reshape(1)),
-                                 *((np.arange(n), nodes[f"first_{side}"], nodes[f"count_{side}"]) for side in "01")):
-        first, inner = first.astype(np.int64), count == kernels.INNER
-        # A child stands behind its parent: no walk returns to where it was.
-        if ((count < 0) & ~inner).any() or (inner & ((first <= parent) | (first >= n))).any() or (
-                (count > 0) & ((first < 0) | (first + count > len(built.order)))).any():
-            raise InputError("is damaged: a node leads out of the tree")
-        parents += np.bincount(first[inner], minlength=n + 1)
-        children.append(np.where(inner, first, -1))
-    if (parents[:n] != 1).any() or ((nodes["axis"] < 0) | (nodes["axis"] > kernels.PLANE)).any():
+    parent = np.repeat(np.arange(-1, n), [1, *[2] * n])
+    first, count = (np.concatenate([root.reshape(1), np.stack([nodes[f"{what}_0"], nodes[f"{what}_1"]], axis=1).reshape(-1)])
+                    for what, root in (("first", root_first), ("count", root_count)))
+    first, inner = first.astype(np.int64), count == kernels.INNER
+    if ((count < 0) & ~inner).any() or (inner & ((first <= parent) | (first >= n))).any() or (
+            (count > 0) & ((first < 0) | (first + count > len(built.order)))).any():
+        raise InputError("is damaged: a node leads out of the tree")
+    if ((nodes["axis"] < 0) | (nodes["axis"] > kernels.PLANE)).any():
         raise InputError("is damaged: its nodes are no tree")
-    level, depth = children[0][children[0] >= 0], 0
-    while len(level):
-        depth += 1
-        if depth > kernels.STACK_SIZE:
-            raise InputError(f"is damaged: deeper than {kernels.STACK_SIZE}")
-        level = np.concatenate([child[level] for child in children[1:]])
-        level = level[level >= 0]
+    # The link to the root is node 0, before the others.
+    check_tree(n + 1, parent[inner] + 1, first[inner] + 1, kernels.STACK_SIZE)

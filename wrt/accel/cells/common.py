@@ -50,6 +50,27 @@ def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: in
         raise InputError("is damaged: a reference leads out of the primitives")
 
 
+def check_tree(n: int, parent: np.ndarray, child: np.ndarray, max_depth: int) -> None:
+    """Raise InputError unless n nodes are a tree from node 0 on, of at most max_depth levels below it, where each child stands
+    behind its parent: no walk returns to where it was."""
+    sound = n > 0 and bool((child > parent).all()) and np.array_equal(np.sort(child), np.arange(1, n))
+    if sound:
+        above, at = np.zeros(n, np.int64), np.arange(n)
+        above[child] = parent
+        for _ in range(max_depth):
+            at = above[at]
+        sound = not at.any()
+    if not sound:
+        raise InputError(f"is damaged: its nodes are no tree of at most {max_depth} levels below the root")
+
+
+def require_between(**options: tuple[float, float, float]) -> None:
+    """Raise InputError for an option (value, low, high) that is not between its limits, these included."""
+    for name, (value, low, high) in options.items():
+        if not low <= value <= high:
+            raise InputError(f"{name} must be {low:.10g} to {high:.10g}, got {value}")
+
+
 def triangle_reach(geometry: Geometry, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For kernels.traverse.cell_ray.cell_slack: the largest pad and the largest extent of all triangles' padded boxes."""
     n = len(geometry.faces)

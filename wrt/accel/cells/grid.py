@@ -11,7 +11,7 @@ import warp as wp
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
 from wrt.accel.bvh.tree import half_areas
-from wrt.accel.cells.common import cell_source, check_numbers, check_references, one_row, triangle_reach
+from wrt.accel.cells.common import cell_source, check_numbers, check_references, one_row, require_between, triangle_reach
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, records, start, upload
 from wrt.core.errors import InputError
@@ -37,8 +37,7 @@ class Grid(Accelerator):
     kernels = kernels
 
     def _build(self, density: float = 2.0, mailbox: bool = True) -> Built:
-        if not 1e-3 <= density <= 1e3:
-            raise InputError(f"density must be 1e-3 to 1e3 cells a primitive, got {density}")
+        require_between(density=(density, 1e-3, 1e3))
         lo, hi = self.geometry.bounds()
         layout = resolution(lo, hi, density)
         cells, references = list_references(self.geometry, (lo, hi), layout, self.threads)

@@ -8,6 +8,7 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
+from wrt.accel.cells.common import check_tree
 from wrt.accel.cells.kdtree_build import KdOptions, build_tree
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import kdtree as kernels
@@ -37,24 +38,9 @@ class KdTree(Accelerator):
         nodes = built.arrays["nodes"]
         if any(built.arrays[name].size != size for name, size in (("lo", 3), ("hi", 3), ("reach", 1))):
             raise InputError("is damaged: a tree has one cell")
-        if not is_tree(nodes, kernels.STACK_SIZE):
-            raise InputError(f"is damaged: its nodes are no tree of at most {kernels.STACK_SIZE} levels below the root")
-        leaf = (nodes["word"] & 3) == kernels.LEAF
-        first, count = (nodes["word"][leaf] >> 2).astype(np.int64), nodes["split"][leaf].astype(np.float64)
+        leaf, first = (nodes["word"] & 3) == kernels.LEAF, (nodes["word"] >> 2).astype(np.int64)
+        check_tree(len(nodes), np.tile(np.flatnonzero(~leaf), 2), np.concatenate([first[~leaf], first[~leaf] + 1]),
+                   kernels.STACK_SIZE)
+        first, count = first[leaf], nodes["split"][leaf].astype(np.float64)
         if not ((first >= 0) & (count >= 0.0) & (first + count <= len(built.order))).all():
             raise InputError("is damaged: a leaf has primitives that are not there")
-
-
-def is_tree(nodes: np.ndarray, max_depth: int) -> bool:
-    """Whether each node but the root is the child of one that stands before it, and none is deeper than max_depth."""
-    inner = np.nonzero((nodes["word"] & 3) != kernels.LEAF)[0]
-    left = (nodes["word"][inner] >> 2).astype(np.int64)
-    children = np.sort(np.concatenate([left, left + 1]))
-    if not (left > inner).all() or not np.array_equal(children, np.arange(1, len(nodes))):
-        return False
-    parent = np.zeros(len(nodes), np.int64)
-    parent[left] = parent[left + 1] = inner
-    at = np.arange(len(nodes))
-    for _ in range(max_depth):
-        at = parent[at]
-    return len(nodes) > 0 and not at.any()

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, load_kernel, records, run_all, start, upload
 from wrt.core.errors import InputError
@@ -42,12 +43,10 @@ class KdOptions:
     def __post_init__(self) -> None:
         if self.max_depth is not None and (isinstance(self.max_depth, bool) or not isinstance(self.max_depth, int)):
             raise InputError(f"max_depth must be int or None, got {self.max_depth!r}")
-        for name, low, high in (("max_leaf", 1, MAX_IN_LEAF), ("max_depth", 0, STACK_SIZE), ("perfect_below", 1024, 1 << 27),
-                                ("cost_traversal", 0.0, 1e6), ("cost_intersection", 0.0, 1e6), ("empty_bonus", 0.0, 1.0),
-                                ("max_growth", 1.0, 1e4)):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise InputError(f"{name} must be {low:g} to {high:g}, got {value}")
+        require_between(max_leaf=(self.max_leaf, 1, MAX_IN_LEAF), max_depth=(self.max_depth or 0, 0, STACK_SIZE),
+                        perfect_below=(self.perfect_below, 1024, 1 << 27), cost_traversal=(self.cost_traversal, 0.0, 1e6),
+                        cost_intersection=(self.cost_intersection, 0.0, 1e6), empty_bonus=(self.empty_bonus, 0.0, 1.0),
+                        max_growth=(self.max_growth, 1.0, 1e4))
 
     def depth(self, n: int) -> int:
         """As given, or 8 + 1.3 log2 n (Havran 2000; Pharr et al., "Physically Based Rendering", section 4.4)."""

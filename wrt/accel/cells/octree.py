@@ -6,7 +6,7 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
-from wrt.accel.cells.common import check_numbers, check_references, one_row, triangle_reach
+from wrt.accel.cells.common import check_numbers, check_references, check_tree, one_row, triangle_reach
 from wrt.accel.cells.octree_build import OctreeOptions, build_tree
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import octree as kernels
@@ -41,27 +41,11 @@ class Octree(Accelerator):
         levels, lo, hi = int(arrays["levels"]), arrays["lo"], arrays["hi"]
         if not 0 <= levels <= kernels.MAX_LEVELS or (levels and not (lo + np.float32(1 << levels) * arrays["size"] >= hi).all()):
             raise InputError("is damaged: its cells are not in order")
-        if arrays["mailbox"] not in (0, 1):
+        if arrays["mailbox"] not in (0, 1) or (arrays["nodes"]["count"] < -0xFF).any():
             raise InputError("is damaged: its numbers are out of range")
         nodes = arrays["nodes"]
-        if not is_tree(nodes, levels):
-            raise InputError(f"is damaged: its nodes are no tree of at most {levels} levels below the root")
+        inner = np.flatnonzero(nodes["count"] < 0)
+        octants = np.bitwise_count(-nodes["count"][inner].astype(np.int64)).astype(np.int64)
+        child = np.repeat(nodes["first"][inner] - (np.cumsum(octants) - octants), octants) + np.arange(octants.sum())
+        check_tree(len(nodes), np.repeat(inner, octants), child, levels)
         check_references(nodes[nodes["count"] >= 0], arrays["references"], len(built.order))
-
-
-def is_tree(nodes: np.ndarray, max_depth: int) -> bool:
-    """Whether each node but the root is the octant of one that stands before it, and none is deeper than max_depth."""
-    inner = np.nonzero(nodes["count"] < 0)[0]
-    mask, first = -nodes["count"][inner].astype(np.int64), nodes["first"][inner].astype(np.int64)
-    if not len(nodes) or (mask > 0xFF).any() or (first <= inner).any():
-        return False
-    n = np.bitwise_count(mask).astype(np.int64)
-    child = np.repeat(first - (np.cumsum(n) - n), n) + np.arange(n.sum())
-    if not np.array_equal(np.sort(child), np.arange(1, len(nodes))):
-        return False
-    parent = np.zeros(len(nodes), np.int64)
-    parent[child] = np.repeat(inner, n)
-    at = np.arange(len(nodes))
-    for _ in range(max_depth):
-        at = parent[at]
-    return not at.any()

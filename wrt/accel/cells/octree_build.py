@@ -9,10 +9,9 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.bvh.tree import half_areas
-from wrt.accel.cells.common import cell_source
+from wrt.accel.cells.common import cell_source, require_between
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, records, start, upload
-from wrt.core.errors import InputError
 from wrt.kernels.build import octree as build_octree
 from wrt.kernels.traverse.octree import MAX_LEVELS, OctreeLayout, OctreeNode
 from wrt.kernels.units.box import PAD_EXTENT
@@ -33,12 +32,8 @@ class OctreeOptions:
     max_growth: float
 
     def __post_init__(self) -> None:
-        if not 1 <= self.max_leaf <= 1 << 20:
-            raise InputError(f"max_leaf must be 1 to {1 << 20}, got {self.max_leaf}")
-        if not 0 <= self.max_depth <= MAX_LEVELS:
-            raise InputError(f"max_depth must be 0 to {MAX_LEVELS}, got {self.max_depth}")
-        if not 1.0 <= self.max_growth <= 1e4:
-            raise InputError(f"max_growth must be 1 to 1e4 references a primitive, got {self.max_growth}")
+        require_between(max_leaf=(self.max_leaf, 1, 1 << 20), max_depth=(self.max_depth, 0, MAX_LEVELS),
+                        max_growth=(self.max_growth, 1.0, 1e4))
 
 
 @dataclass
