@@ -8,36 +8,25 @@ which is shared between its sides in proportion, so that subtrees can be built o
 import warp as wp
 
 from wrt.kernels.build.binned import BIN_COUNT, BINS, Split, bin_of, binned_split, bins_of
-from wrt.kernels.build.clip import Box, empty_box
 from wrt.kernels.build.records import (
     MAX_DEPTH,
     BuildData,
     BuildRecord,
     BuildTask,
     Halves,
+    Row,
     area_scale,
     center_of,
+    empty_row,
     half_area,
     high_of,
     levels,
     low_of,
+    lower,
     measured,
     row_of,
 )
 from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
-
-
-@wp.func
-def joined(a: Box, lo: wp.vec3, hi: wp.vec3) -> Box:
-    out = Box()
-    out.lo = wp.min(a.lo, lo)
-    out.hi = wp.max(a.hi, hi)
-    return out
-
-
-@wp.func
-def box_area(box: Box, scale: float) -> float:
-    return half_area(row_of(box.lo, box.hi), scale)
 
 
 @wp.func
@@ -49,17 +38,15 @@ def crossing(a: wp.vec3, b: wp.vec3, axis: int, plane: float) -> wp.vec3:
 
 
 @wp.func
-def cut(record: BuildRecord, axis: int, low: float, high: float, corners: wp.array(dtype=wp.vec3)) -> Box:
-    """The box of a reference between two planes; lo > hi where nothing of it is there.
+def cut(record: BuildRecord, axis: int, low: float, high: float, corners: wp.array(dtype=wp.vec3)) -> BuildRecord:
+    """A reference between two planes; lo > hi where nothing of it is there.
 
     Conservative: the triangle's part between the planes, each moved out by the pads of the triangle's own box, is padded as
     that box is, and kept within the reference's box. A hit is within these pads of the triangle, and so of a part of it. But
     a hit's t is held to the triangle's own box, and a ray that grazes a triangle in an axis plane moves far on the way there:
     of such a triangle, whose box is no thicker than its pads, the box is cut, not the triangle.
     """
-    out = Box()
-    out.lo = record.lo
-    out.hi = record.hi
+    out = record
     out.lo[axis] = wp.max(record.lo[axis], low)
     out.hi[axis] = wp.min(record.hi[axis], high)
     first = 3 * record.prim_id
@@ -75,27 +62,27 @@ def cut(record: BuildRecord, axis: int, low: float, high: float, corners: wp.arr
     margin = 2.0 * pad + 2.0**-20.0 * wp.max(wp.max(wp.abs(lo)), wp.max(wp.abs(hi)))
     if not wp.min(e) > margin or not wp.isfinite(margin):
         return out
-    part = empty_box()
+    part = empty_row()
     from_plane = low - margin
     to_plane = high + margin
     for k in range(3):
         p = wp.where(k == 0, a, wp.where(k == 1, b, c))
         q = wp.where(k == 0, b, wp.where(k == 1, c, a))
         if p[axis] >= from_plane and p[axis] <= to_plane:
-            part = joined(part, p, p)
+            part = lower(part, row_of(p, p))
         if (p[axis] < from_plane) != (q[axis] < from_plane):
             x = crossing(p, q, axis, from_plane)
-            part = joined(part, x, x)
+            part = lower(part, row_of(x, x))
         if (p[axis] > to_plane) != (q[axis] > to_plane):
             x = crossing(p, q, axis, to_plane)
-            part = joined(part, x, x)
-    out.lo = wp.max(out.lo, padded_lo(part.lo, pad))
-    out.hi = wp.min(out.hi, padded_hi(part.hi, pad))
+            part = lower(part, row_of(x, x))
+    out.lo = wp.max(out.lo, padded_lo(low_of(part), pad))
+    out.hi = wp.min(out.hi, padded_hi(high_of(part), pad))
     return out
 
 
 @wp.func
-def is_empty(box: Box) -> bool:
+def is_empty(box: BuildRecord) -> bool:
     return box.lo[0] > box.hi[0] or box.lo[1] > box.hi[1] or box.lo[2] > box.hi[2]
 
 
@@ -132,13 +119,11 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
         if extent > 0.0 and wp.isfinite(extent):
             enter = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.int32)
             leave = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.int32)
-            lo = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.vec3)
-            hi = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.vec3)
+            box = wp.zeros(shape=wp.static(BIN_COUNT), dtype=Row)
             right_cost = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.float32)
             right_count = wp.zeros(shape=wp.static(BIN_COUNT), dtype=wp.int32)
             for b in range(BINS):
-                lo[b] = wp.vec3(wp.inf, wp.inf, wp.inf)
-                hi[b] = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+                box[b] = empty_row()
             for i in range(task.begin, task.end):
                 record = records[i]
                 first = spatial_bin(low, high, record.lo[axis])
@@ -146,28 +131,25 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
                 enter[first] = enter[first] + 1
                 leave[last] = leave[last] + 1
                 for b in range(first, last + 1):
-                    part = Box()
-                    part.lo = record.lo
-                    part.hi = record.hi
+                    part = record
                     if first < last:
                         part = cut(record, axis, plane_of(low, high, b), plane_of(low, high, b + 1), corners)
                     if not is_empty(part):
-                        lo[b] = wp.min(lo[b], part.lo)
-                        hi[b] = wp.max(hi[b], part.hi)
-            side = empty_box()
+                        box[b] = lower(box[b], row_of(part.lo, part.hi))
+            side = empty_row()
             count = int(0)
             for k in range(BINS - 1):
                 b = BINS - 1 - k
-                side = joined(side, lo[b], hi[b])
+                side = lower(side, box[b])
                 count = count + leave[b]
-                right_cost[b] = box_area(side, scale) * float(count)
+                right_cost[b] = half_area(side, scale) * float(count)
                 right_count[b] = count
-            side = empty_box()
+            side = empty_row()
             count = int(0)
             for b in range(1, BINS):
-                side = joined(side, lo[b - 1], hi[b - 1])
+                side = lower(side, box[b - 1])
                 count = count + enter[b - 1]
-                cost = box_area(side, scale) * float(count) + right_cost[b]
+                cost = half_area(side, scale) * float(count) + right_cost[b]
                 fits = count > 0 and count < n and right_count[b] > 0 and right_count[b] < n
                 if fits and count + right_count[b] <= task.limit - task.begin and cost < best.cost:
                     best.axis = axis
@@ -185,26 +167,26 @@ def part_by_plane(data_records: wp.array(dtype=BuildRecord), room: wp.array(dtyp
     """
     scale = area_scale(task.measures.box)
     plane = plane_of(task.measures.box[split.axis], -task.measures.box[3 + split.axis], split.bin)
-    left = empty_box()
-    right = empty_box()
+    left = empty_row()
+    right = empty_row()
     n_left = int(0)
     n_right = int(0)
     for i in range(task.begin, task.end):  # what is surely on one side, and the parts of what is not
         record = data_records[i]
         if record.hi[split.axis] < plane:
-            left = joined(left, record.lo, record.hi)
+            left = lower(left, row_of(record.lo, record.hi))
             n_left = n_left + 1
         elif record.lo[split.axis] >= plane:
-            right = joined(right, record.lo, record.hi)
+            right = lower(right, row_of(record.lo, record.hi))
             n_right = n_right + 1
         else:
             part = cut(record, split.axis, -wp.inf, plane, corners)
             if not is_empty(part):
-                left = joined(left, part.lo, part.hi)
+                left = lower(left, row_of(part.lo, part.hi))
                 n_left = n_left + 1
             part = cut(record, split.axis, plane, wp.inf, corners)
             if not is_empty(part):
-                right = joined(right, part.lo, part.hi)
+                right = lower(right, row_of(part.lo, part.hi))
                 n_right = n_right + 1
 
     done_0 = int(0)
@@ -219,13 +201,13 @@ def part_by_plane(data_records: wp.array(dtype=BuildRecord), room: wp.array(dtyp
             to_left = is_empty(part_1)
             to_right = is_empty(part_0) and not to_left
             if not to_left and not to_right:
-                area_0 = box_area(left, scale)
-                area_1 = box_area(right, scale)
-                wide_0 = joined(left, record.lo, record.hi)
-                wide_1 = joined(right, record.lo, record.hi)
+                area_0 = half_area(left, scale)
+                area_1 = half_area(right, scale)
+                wide_0 = lower(left, row_of(record.lo, record.hi))
+                wide_1 = lower(right, row_of(record.lo, record.hi))
                 both = area_0 * float(n_left) + area_1 * float(n_right)
-                only_0 = box_area(wide_0, scale) * float(n_left) + area_1 * float(n_right - 1)
-                only_1 = area_0 * float(n_left - 1) + box_area(wide_1, scale) * float(n_right)
+                only_0 = half_area(wide_0, scale) * float(n_left) + area_1 * float(n_right - 1)
+                only_1 = area_0 * float(n_left - 1) + half_area(wide_1, scale) * float(n_right)
                 if only_0 < both and only_0 <= only_1:
                     to_left = bool(True)
                     left = wide_0
@@ -235,15 +217,10 @@ def part_by_plane(data_records: wp.array(dtype=BuildRecord), room: wp.array(dtyp
                     right = wide_1
                     n_left = n_left - 1
                 elif done_0 + done_1 + 1 + task.end - i <= task.limit - task.begin:
-                    half = record
-                    half.lo = part_0.lo
-                    half.hi = part_0.hi
-                    room[task.begin + done_0] = half
+                    room[task.begin + done_0] = part_0
                     done_0 = done_0 + 1
-                    half.lo = part_1.lo
-                    half.hi = part_1.hi
                     done_1 = done_1 + 1
-                    room[task.limit - done_1] = half
+                    room[task.limit - done_1] = part_1
                 else:
                     to_left = bool(True)
         if to_left:
@@ -283,23 +260,21 @@ def object_split(data: BuildData, task: BuildTask) -> wp.vec2i:
 
 
 @wp.func
-def box_of(records: wp.array(dtype=BuildRecord), begin: int, end: int) -> Box:
-    out = empty_box()
+def box_of(records: wp.array(dtype=BuildRecord), begin: int, end: int) -> Row:
+    out = empty_row()
     for i in range(begin, end):
-        out = joined(out, records[i].lo, records[i].hi)
+        out = lower(out, row_of(records[i].lo, records[i].hi))
     return out
 
 
 @wp.func
 def sides(data: BuildData, counts: wp.vec2i, task: BuildTask) -> Halves:
     """What stands in data.boxes, with the boxes of both sides."""
-    left = box_of(data.boxes, task.begin, task.begin + counts[0])
-    right = box_of(data.boxes, task.limit - counts[1], task.limit)
     out = Halves()
     out.count_0 = counts[0]
     out.count_1 = counts[1]
-    out.left.box = row_of(left.lo, left.hi)
-    out.right.box = row_of(right.lo, right.hi)
+    out.left.box = box_of(data.boxes, task.begin, task.begin + counts[0])
+    out.right.box = box_of(data.boxes, task.limit - counts[1], task.limit)
     return out
 
 
