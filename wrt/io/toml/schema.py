@@ -6,8 +6,10 @@ have the scene's own unit; colours are linear Rec. 709. Wherever a colour stands
 
 from __future__ import annotations
 
-from functools import cache
-from typing import Annotated, Any, Literal, Union
+from functools import cache, reduce
+from inspect import Parameter, signature
+from operator import or_
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
@@ -15,12 +17,12 @@ from wrt.io.toml.camera_schema import any_camera
 from wrt.io.toml.kinds import described, kind_table
 from wrt.io.toml.material_schema import MaterialTable, material_table
 from wrt.io.toml.values import (
-    LENGTH,
     Angle,
     Angles,
     Length,
     Matrix,
     Point,
+    Profile,
     Radiance,
     Scale3,
     Segments,
@@ -36,6 +38,7 @@ from wrt.scene.kinds import Kind
 from wrt.scene.lights import LIGHTS
 from wrt.scene.materials import MATERIALS
 from wrt.scene.settings import Settings
+from wrt.scene.shapes import SHAPES
 
 RADIANCE = unit("radiance")
 SettingsTable: Any = create_model(
@@ -107,60 +110,37 @@ class BoxTable(Table):
     name: str = Field("", description="for messages")
 
 
-class IcosphereShape(Table):
-    """A ball of 20 * 4^subdivisions triangles around the origin."""
-
-    kind: Literal["icosphere"]
-    subdivisions: Subdivisions = Field(3, description="each makes four triangles of one")
-    radius: Length = Field(1.0, description="of the ball")
-
-
-class TorusShape(Table):
-    """A ring around the y axis."""
-
-    kind: Literal["torus"]
-    radius: Length = Field(1.0, description="from the axis to the middle of the tube")
-    tube_radius: Length = Field(0.35, description="of the tube")
-    segments: Segments = Field(64, description="around the axis")
-    tube_segments: Segments = Field(32, description="around the tube")
+# The parameters of each of SHAPES, by its names: what they are, and what the reference says of them.
+SHAPE_KEYS: dict[str, dict[str, tuple[Any, str]]] = {
+    "icosphere": {"subdivisions": (Subdivisions, "each makes four triangles of one"), "radius": (Length, "of the ball")},
+    "torus": {"radius": (Length, "from the axis to the middle of the tube"), "tube_radius": (Length, "of the tube"),
+              "segments": (Segments, "around the axis"), "tube_segments": (Segments, "around the tube")},
+    "lathe": {"profile": (Profile, "points (radius, height), from the bottom up; one given twice makes a sharp edge"),
+              "segments": (Segments, "around the axis")},
+    "prism": {"sides": (Segments, "of the polygon"), "radius": (Length, "of the circle through its corners"),
+              "length": (Length, "along z")},
+    "tube": {"points": (Annotated[list[Point], Field(min_length=2)], "the line"),
+             "radius": (Length | list[Length], "one, or one for each point"), "segments": (Segments, "around the tube")},
+    "teapot": {"segments": (Segments, "around its axis")},
+}
 
 
-class LatheShape(Table):
-    """A profile turned around the y axis."""
-
-    kind: Literal["lathe"]
-    profile: Annotated[list[Annotated[list[float], Field(min_length=2, max_length=2), LENGTH]], Field(min_length=2)] = Field(
-        description="points (radius, height), from the bottom up; one given twice makes a sharp edge")
-    segments: Segments = Field(64, description="around the axis")
-
-
-class PrismShape(Table):
-    """A regular polygon in the x-y plane, drawn out along z."""
-
-    kind: Literal["prism"]
-    sides: Segments = Field(3, description="of the polygon")
-    radius: Length = Field(1.0, description="of the circle through its corners")
-    length: Length = Field(2.0, description="along z")
+def shape_table(kind: str) -> type[Table]:
+    """The table of a shape, with the defaults of its function."""
+    literal: Any = Literal
+    parameters = signature(SHAPES[kind]).parameters
+    keys: dict[str, Any] = {"kind": (literal[kind], ...)}
+    for name, (value, about) in SHAPE_KEYS[kind].items():
+        default = parameters[name].default
+        keys[name] = (value, Field(... if default is Parameter.empty else default, description=about))
+    summary = (SHAPES[kind].__doc__ or "").split("\n\n")[0]
+    return create_model(f"{kind.capitalize()}Shape", __base__=Table, __doc__=summary, **keys)
 
 
-class TubeShape(Table):
-    """A round tube along a line of points, with flat ends."""
-
-    kind: Literal["tube"]
-    points: Annotated[list[Point], Field(min_length=2)] = Field(description="the line")
-    radius: Length | list[Length] = Field(0.1, description="one, or one for each point")
-    segments: Segments = Field(24, description="around the tube")
-
-
-class TeapotShape(Table):
-    """A pot with lid, spout and handle, about 2 wide and 1 high, standing on y = 0."""
-
-    kind: Literal["teapot"]
-    segments: Segments = Field(64, description="around its axis")
-
-
-Shape = Annotated[IcosphereShape | TorusShape | LatheShape | PrismShape | TubeShape | TeapotShape,
-                  Field(discriminator="kind")]
+if TYPE_CHECKING:
+    Shape = Any
+else:
+    Shape = Annotated[reduce(or_, map(shape_table, SHAPE_KEYS)), Field(discriminator="kind")]
 
 
 class PartTable(Table):

@@ -36,6 +36,7 @@ Matrix = Annotated[list[float], Field(min_length=16, max_length=16)]
 Positive = Annotated[float, Field(gt=0.0)]
 Point = Annotated[list[float], Field(min_length=3, max_length=3), LENGTH]
 Length = Annotated[float, Field(gt=0.0), LENGTH]
+Profile = Annotated[list[Annotated[list[float], Field(min_length=2, max_length=2), LENGTH]], Field(min_length=2)]
 Angle = Annotated[float, DEGREES]
 Angles = Annotated[list[float], Field(min_length=3, max_length=3), DEGREES]
 Share = Annotated[  # a colour that reflects or transmits
