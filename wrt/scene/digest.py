@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from hashlib import sha256
 from typing import Any
@@ -40,19 +39,10 @@ def _digest(value: Any, known: dict[int, bytes]) -> bytes:
     elif isinstance(value, tuple | list):
         for each in value:
             out.update(_digest(each, known))
+    elif isinstance(value, np.ndarray):
+        out.update(f"{value.shape}{value.dtype.str}".encode() + np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, bool | int | float | str | np.number | None):
+        out.update(repr(value).encode())
     else:
-        out.update(_leaf(value))
+        raise TypeError(f"no digest of {type(value).__name__}")
     return out.digest()
-
-
-def _leaf(value: Any) -> bytes:
-    for kinds, as_bytes in LEAVES:
-        if isinstance(value, kinds):
-            return as_bytes(value)
-    raise TypeError(f"no digest of {type(value).__name__}")
-
-
-LEAVES: list[tuple[Any, Callable[[Any], bytes]]] = [
-    (np.ndarray, lambda array: f"{array.shape}{array.dtype.str}".encode() + np.ascontiguousarray(array).tobytes()),
-    ((bool, int, float, str, np.number, type(None)), lambda value: repr(value).encode()),
-]

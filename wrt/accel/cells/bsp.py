@@ -64,18 +64,13 @@ class Bsp(Accelerator):
         lo, hi = (bound.astype(np.float64) for bound in self.geometry.bounds())
         options = BspOptions()
         options.cost_intersection, options.cost_axis, options.cost_plane = cost_intersection, cost_axis, cost_plane
-        options.samples, options.max_depth = samples, max_depth or automatic_depth(n)
+        options.samples, options.max_depth = samples, max_depth or min(MAX_DEPTH, 16 + 2 * math.ceil(math.log2(n)))
         options.lo, options.hi = wp.vec3d(lo.min(axis=0)), wp.vec3d(hi.max(axis=0))
         builder = Builder(self.geometry, options, self.threads, int(max_growth * n), progress or (lambda done: None))
         return builder.build()
 
     def _check(self, built: Built) -> None:
         check_planes(built)
-
-
-def automatic_depth(n: int) -> int:
-    """The depth at which cells of n primitives are split no more, whatever the heuristic would like."""
-    return min(MAX_DEPTH, 16 + 2 * math.ceil(math.log2(n)))
 
 
 class Launch:

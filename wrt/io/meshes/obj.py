@@ -170,9 +170,6 @@ class _Text:
         """(N, 2 or 3) float64 of all `key` lines."""
         return np.frombuffer(self.numbers[key], np.float64).reshape(-1, _KEEP[key])
 
-    def line_of_corner(self, corner: int) -> int:
-        return self.face_lines[int(np.searchsorted(np.cumsum(self.counts), corner, side="right"))]
-
     def triples(self) -> tuple[np.ndarray, np.ndarray]:
         """(U, 3) int64: every different corner as zero-based v, vt, vn (-1: not given); (C,) int32 which one each corner is.
 
@@ -197,7 +194,8 @@ class _Text:
         return different[order] - 1, rank[index]
 
     def _first_line(self, index: np.ndarray, corner: int) -> int:
-        return self.line_of_corner(int(np.argmax(index == corner)))
+        face = np.searchsorted(np.cumsum(self.counts), np.argmax(index == corner), side="right")
+        return self.face_lines[int(face)]
 
     def groups(self) -> tuple[tuple[str, ...], np.ndarray | None]:
         """Names of the parts and the part of each polygon: by material, else by group, else by object; () where

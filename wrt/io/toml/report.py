@@ -133,15 +133,12 @@ def _line(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) ->
         choices = re.findall("'([^']*)'", context["expected"])
         return f"{place}: {unknown(_text(error['input']), 'value', choices)}"
     expected = _EXPECTED[kind].format(**context) if kind in _EXPECTED else error["msg"]
-    return f"{place}: got {_shown(error['input'])}, expected {expected}"
+    value = error["input"]
+    return f"{place}: got {str(value).lower() if isinstance(value, bool) else short(value)}, expected {expected}"
 
 
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else short(value)
-
-
-def _shown(value: Any) -> str:
-    return {True: "true", False: "false"}[value] if isinstance(value, bool) else short(value)
 
 
 def _place(location: Sequence[str | int], data: Any, missing: bool) -> tuple[str, Any]:
