@@ -17,8 +17,7 @@ from wrt.picture.film import Film
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
 from wrt.scene.cameras import CameraKind
-from wrt.scene.model import Scene
-from wrt.scene.moving import moves, scene_at
+from wrt.scene.model import Scene, moves, scene_at
 from wrt.scene.values import as_number
 
 REBUILD_AT = 1.5  # growth of the SAH cost by refits (docs/acceleration.md, "Moving meshes")

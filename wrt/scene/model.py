@@ -199,3 +199,14 @@ class Scene:
             if name not in SETTINGS:
                 raise InputError(unknown(name, "setting", SETTINGS))
         return replace(self, settings=replace(self.settings, **{k: v for k, v in changes.items() if v is not None}))
+
+
+def moves(scene: Scene) -> bool:
+    return any(thing.motion is not None for thing in scene.objects)
+
+
+def scene_at(scene: Scene, time: float) -> Scene:
+    """The scene at a time in [0, 1] of its period: the same objects, faces and materials, in other places."""
+    return replace(scene, objects=tuple(
+        replace(thing, mesh=thing.motion.mesh(thing.mesh, time), transform=thing.transform @ thing.motion.transform(time),
+                motion=None) if thing.motion else thing for thing in scene.objects))

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from wrt.core.checks import as_integer
 from wrt.core.errors import InputError
 from wrt.core.memory import require
 from wrt.scene.clean import clean
@@ -64,8 +65,7 @@ _BOX_FACES.flags.writeable = _BOX_UVS.flags.writeable = False  # all boxes share
 
 def icosphere(subdivisions: int = 3, radius: float = 1.0) -> Mesh:
     """A ball of 20 * 4^subdivisions nearly equal triangles around the origin, with exact normals and no uvs."""
-    if not 0 <= subdivisions <= 9:
-        raise InputError(f"icosphere: subdivisions must be 0 to 9, got {subdivisions}")
+    subdivisions = as_integer(subdivisions, "icosphere: subdivisions", 0, 9)
     require(BYTES_OF_FACE * 20 * 4**subdivisions, f"an icosphere of {20 * 4**subdivisions} triangles")
     radius = as_number(radius, "icosphere radius", low=1e-30)
     golden = 0.5 + math.sqrt(1.25)
@@ -145,8 +145,7 @@ def prism(sides: int = 3, radius: float = 1.0, length: float = 2.0) -> Mesh:
 
     radius: of the circle through the corners.
     """
-    if not 3 <= sides <= 4096:
-        raise InputError(f"prism: sides must be 3 to 4096, got {sides}")
+    sides = as_integer(sides, "prism: sides", 3, 4096)
     radius, length = as_number(radius, "prism radius", low=1e-30), as_number(length, "prism length", low=1e-30)
     angle = np.pi / 2.0 + np.arange(sides) * (2.0 * np.pi / sides)
     ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -252,8 +251,7 @@ def _grid(points: np.ndarray, normals: np.ndarray, name: str) -> Mesh:
 def _require_segments(shape: str, *segments: int, rows: int = 1) -> None:
     """Raise InputError unless each number of segments is in range, and all of them times `rows` of quads are not too many."""
     for count in segments:
-        if not 3 <= count <= 4096:
-            raise InputError(f"{shape}: segments must be 3 to 4096, got {count}")
+        as_integer(count, f"{shape}: segments", 3, 4096)
     faces = 2 * rows * math.prod(segments)
     if faces > MAX_FACES:
         raise InputError(f"{shape}: {faces} triangles; at most {MAX_FACES} are made")

@@ -18,9 +18,8 @@ from wrt.renderer.options import Options
 from wrt.scene.backgrounds import GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
-from wrt.scene.model import Object, Scene
+from wrt.scene.model import Object, Scene, scene_at
 from wrt.scene.motion import Motion
-from wrt.scene.moving import scene_at
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import icosphere, quad, torus
 

@@ -12,9 +12,8 @@ from wrt.core.errors import InputError
 from wrt.scene.digest import scene_digest
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Object, Scene
+from wrt.scene.model import Object, Scene, moves, scene_at
 from wrt.scene.motion import Motion
-from wrt.scene.moving import moves, scene_at
 from wrt.scene.shapes import icosphere, torus
 
 GREY = Material()

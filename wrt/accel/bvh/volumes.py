@@ -46,8 +46,8 @@ class Bvh2Sphere(Bvh2):
         check_links(nodes, empty, len(built.order), self.kernels.STACK_SIZE)
 
     def _refit(self, built: Built) -> Built:
-        return self._around(boxes_around(built, [built.arrays["nodes"][f"sphere_{side}"][:, 3] >= 0.0 for side in "01"],
-                                         self.geometry), built.order, built.leaves, built.depth)
+        there = [built.arrays["nodes"][f"sphere_{side}"][:, 3] >= 0.0 for side in "01"]
+        return self._around(boxes_around(built, there, self.geometry), built.order, built.leaves, built.depth)
 
 
 class Bvh2Kdop(Bvh2):
