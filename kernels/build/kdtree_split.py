@@ -77,6 +77,17 @@ def half_area(e: wp.vec3d) -> wp.float64:
 
 
 @wp.func
+def split_cost(options: KdOptions, scale: wp.float64, caps: wp.float64, rim: wp.float64, below: wp.float64, above: wp.float64,
+               left: wp.float64, right: wp.float64) -> wp.float64:
+    """Of a plane across an axis with so many references on each side, `below` and `above` it so far to the cell's ends; caps: area
+    of the cell across the axis; rim: half of the length around that; scale: the cost of a reference over the cell's half area.
+
+    The host takes it too, of arrays: `split_cost.func`.
+    """
+    return options.cost_traversal + scale * ((below * rim + caps) * left + (above * rim + caps) * right)
+
+
+@wp.func
 def cheapest_split(work: KdWork, task: KdTask, options: KdOptions) -> KdSplit:
     """The plane of least expected cost, if (by_cost) it is below the cost of a leaf and the references are in the budget."""
     best = KdSplit()
@@ -111,9 +122,9 @@ def cheapest_split(work: KdWork, task: KdTask, options: KdOptions) -> KdSplit:
         if position > task.lo[axis] and position < task.hi[axis] and wp.max(left, 1) + wp.max(right, 1) <= task.budget:
             e_1 = e[(axis + 1) % 3]
             e_2 = e[(axis + 2) % 3]
-            area_left = (wp.float64(position) - wp.float64(task.lo[axis])) * (e_1 + e_2) + e_1 * e_2
-            area_right = (wp.float64(task.hi[axis]) - wp.float64(position)) * (e_1 + e_2) + e_1 * e_2
-            cost = options.cost_traversal + scale * (area_left * wp.float64(left) + area_right * wp.float64(right))
+            below = wp.float64(position) - wp.float64(task.lo[axis])
+            above = wp.float64(task.hi[axis]) - wp.float64(position)
+            cost = split_cost(options, scale, e_1 * e_2, e_1 + e_2, below, above, wp.float64(left), wp.float64(right))
             if left == 0 or right == 0:
                 cost = cost * (wp.float64(1.0) - options.empty_bonus)
             if cost < best.cost:
