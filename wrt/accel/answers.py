@@ -7,9 +7,14 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from wrt.core.arrays import to_numpy, to_warp
+from wrt.core.checks import shown
+from wrt.core.errors import InputError
 from wrt.core.html import html_facts, html_table
+
+HIT_TYPES = {"t": np.float32, "u": np.float32, "v": np.float32, "prim_id": np.int32}
 
 
 @dataclass(frozen=True)
@@ -106,4 +111,32 @@ class Hits:
         return self._each(to_warp)
 
     def _each(self, convert: Callable[[Any], Any]) -> Hits:
-        return replace(self, **{name: convert(getattr(self, name)) for name in ("t", "u", "v", "prim_id")})
+        return replace(self, **{name: convert(getattr(self, name)) for name in HIT_TYPES})
+
+
+def hit_arrays(out: Hits | None, n: int, device: Any) -> list[Any]:
+    """Where n hits go, by HIT_TYPES: the arrays of `out`, or new ones; of Warp on a device, or of NumPy (None). Raises InputError
+    for those that do not fit."""
+    if out is None:
+        return [new_array(n, dtype, device) for dtype in HIT_TYPES.values()]
+    if not isinstance(out, Hits):
+        raise InputError(f"out must be Hits, got {shown(out)}")
+    return [fitting(getattr(out, name), f"out.{name}", n, dtype, device) for name, dtype in HIT_TYPES.items()]
+
+
+def new_array(n: int, dtype: Any, device: Any) -> Any:
+    return np.empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
+
+
+def fitting(array: Any, name: str, n: int, dtype: Any, device: Any) -> Any:
+    """The array, which is looked at as in hit_arrays."""
+    if device is None:
+        fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray
+        wanted = f"a NumPy array ({n},) of {np.dtype(dtype)}, without gaps and writeable"
+    else:
+        fits = (isinstance(array, wp.array) and array.dtype == wp.dtype_from_numpy(dtype) and array.device == device
+                and (array.is_contiguous or n == 0))
+        wanted = f"a Warp array ({n},) of {np.dtype(dtype)} on {device}, without gaps"
+    if not (fits and array.shape == (n,)):
+        raise InputError(f"{name} must be {wanted}, got {shown(array)}")
+    return array

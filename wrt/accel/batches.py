@@ -6,16 +6,23 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import numpy as np
 import warp as wp
+from warp._src.types import array_t  # what a kernel gets for an array; a Warp array takes ten times as long to make
 
-from wrt.accel.structure import Structure
+from wrt.accel.answers import HIT_TYPES
+from wrt.accel.rays import Rays
+from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.core.device import empty_aligned, load_kernel, made_once, run_all, upload
+from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.structs import Surfaces
 from wrt.kernels.wide.packets import Scratch
 
-# Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Fewer than
-# FEWEST in all are not divided.
-FEWEST, SOME, MOST = 8192, 32768, 131072
+# Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Up to FEWEST
+# are not divided. A thread takes one part after another, about PARTS of them, so that all threads end at about the same time.
+FEWEST, MOST, PARTS = 8192, 131072, 8
 RAYS_PER_LAUNCH = 16384  # one at a time
+SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
 
 
 @made_once
@@ -25,51 +32,113 @@ def stream_kernel(structure: Structure, any_hit: bool) -> Any:
     return make(structure.units, any_hit) if make else None
 
 
-_free: list[Scratch] = []  # a new one costs as much as a thousand rays
-
-
-def borrow(sizes: tuple[int, int, int]) -> Scratch:
-    """What one launch works in; to be put back into _free. One size serves all: there is one kind of stream."""
-    try:
-        return _free.pop()
-    except IndexError:
-        out = Scratch()
-        # Rows of lanes would else lie in two cache lines each.
-        out.packets, out.stacks, out.slots = (upload(empty_aligned((size,), wp.dtype_to_numpy(dtype)), dtype, wp.get_device("cpu"))
-                                              for size, dtype in zip(sizes, (wp.float32, wp.uint32, wp.int32), strict=True))
-        return out
-
-
 def rays_per_launch(n: int, threads: int, block: int) -> int:
-    """A multiple of `block`, so that all threads have as many launches."""
-    if threads == 1 or n <= FEWEST:
-        return MOST
-    launches = threads * max(round(n / (threads * SOME)), 1)
-    return -(-n // (launches * block)) * block
+    """A multiple of `block`."""
+    part = MOST if threads == 1 else max(FEWEST, min(n // (threads * PARTS), MOST))
+    return -(-part // block) * block
 
 
-def launch_stream(structure: Structure, kernel: Any, inputs: list[Any], n: int, threads: int) -> None:
-    """Trace rays 0 .. n - 1 with a kernel of stream_kernel. inputs: its first ones, up to `out`."""
-    module = structure.accel.kernels
-    load_kernel(kernel, wp.get_device("cpu"))
-    part = rays_per_launch(n, threads, module.stream_block)
-    firsts = range(0, n, part)
-    # One for each job that runs at a time; other calls, on other threads, borrow others.
-    mine = [borrow(module.stream_sizes) for _ in range(min(threads, len(firsts)))]
+class Tracer:
+    """What answers queries on the CPU: a kernel for a structure, and workers that are kept from call to call."""
 
-    def job(first: int) -> None:
-        end = min(first + part, n)
-        scratch = mine.pop()
-        wp.launch(kernel, dim=-(-(end - first) // module.stream_block), inputs=[*inputs, scratch, first, end], device="cpu",
-                  record_tape=False)
-        mine.append(scratch)
+    def __init__(self, structure: Structure, any_hit: bool) -> None:
+        self.structure, self.any_hit = structure, any_hit
+        self.stream = stream_kernel(structure, any_hit)
+        self.kernel = self.stream or (any_hit_kernel if any_hit else closest_hit_kernel)(structure)
+        self.block = structure.accel.kernels.stream_block if self.stream else 1
+        self.free: list[Worker] = []
 
-    run_all([partial(job, first) for first in firsts], threads)
-    _free.extend(mine)  # not after an error: a thread may still be at work in one
+    def trace(self, data: Any, surfaces: Surfaces, rays: Rays, out: list[Any], threads: int) -> None:
+        """Answers to arrays without gaps, in the order of HIT_TYPES. Raises InputError for rays that are refused; they have been
+        traced then, and the answers are nothing to go by."""
+        load_kernel(self.kernel, wp.get_device("cpu"))
+        if not self.stream:  # which says itself whether it met such
+            rays = rays.checked()
+        given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in out]
+        n = len(given[0])
+        packed = pack(given, answers) if n > SMALL and all(map(readable, given)) else None
+        part = FEWEST if not packed else rays_per_launch(n, threads, self.block) if self.stream else RAYS_PER_LAUNCH
+        refused: list[bool] = []
+
+        def job(first: int) -> None:
+            worker, end = self.borrow(), min(first + part, n)
+            if packed:
+                worker.launch(data, surfaces, packed, first, end)
+            else:
+                copy(given, slice(first, end), worker.given, slice(end - first))
+                worker.launch(data, surfaces, worker.packed, 0, end - first)
+                copy(worker.answers, slice(end - first), answers, slice(first, end))
+            refused.append(bool(worker.slots[-1]))
+            self.free.append(worker)  # not after an error: a thread may still be at work in it
+
+        run_all([partial(job, first) for first in range(0, n, part)], threads)
+        if any(refused):
+            rays.checked()
+
+    def borrow(self) -> Worker:
+        """For one launch."""
+        try:
+            return self.free.pop()
+        except IndexError:
+            return Worker(self)
+
+
+tracer = made_once(Tracer)
+
+
+class Worker:
+    """A launch that is recorded once, what it works in, and arrays for rays and answers that cannot be used where they are. For one
+    thread at a time."""
+
+    def __init__(self, tracer: Tracer) -> None:
+        self.given = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
+        self.answers: list[Any] = [np.empty(FEWEST, dtype) for dtype in ([np.bool_] if tracer.any_hit else HIT_TYPES.values())]
+        self.packed = pack(self.given, self.answers)
+        self.block, self.scratch, self.slots = tracer.block, [], np.zeros(1, np.int32)
+        if tracer.stream:
+            scratch = Scratch()
+            # Rows of lanes would else lie in two cache lines each.
+            scratch.packets, scratch.stacks, scratch.slots = (
+                upload(empty_aligned((size,), wp.dtype_to_numpy(dtype)), dtype, wp.get_device("cpu")) for size, dtype in
+                zip(tracer.structure.accel.kernels.stream_sizes, (wp.float32, wp.uint32, wp.int32), strict=True))
+            self.scratch, self.slots = [scratch], scratch.slots.numpy()
+        inputs = [tracer.structure.struct(), Surfaces(), RayArrays(), None if tracer.any_hit else HitArrays(), *self.scratch]
+        numbers = [0, 0] if tracer.stream else [0]
+        self.command = wp.launch(tracer.kernel, dim=1, inputs=inputs + numbers, device="cpu", record_cmd=True)
+        self.places = range(len(inputs + numbers))
+
+    def launch(self, data: Any, surfaces: Any, packed: tuple[Any, Any], first: int, end: int) -> None:
+        """Trace rays first .. end - 1. The last of `slots` tells whether the kernel met one that is refused."""
+        inputs = [data.__ctype__(), surfaces.__ctype__(), *packed, *(scratch.__ctype__() for scratch in self.scratch), first, end]
+        for i, value in zip(self.places, inputs, strict=False):  # the kernel for one ray has no `end`
+            self.command.set_param_at_index_from_ctype(i, value)
+        self.command.set_dim(-(-(end - first) // self.block))
+        self.command.launch()
+
+
+def readable(array: np.ndarray) -> bool:
+    """Whether a kernel can read it where it is."""
+    return array.dtype == np.float32 and array.flags.aligned and (array.flags.c_contiguous or array.strides == (0,))
+
+
+def pack(given: list[np.ndarray], answers: list[np.ndarray]) -> tuple[Any, Any]:
+    """Rays and answers as kernels get them: RayArrays, and HitArrays or an array of bool. Nothing keeps the memory."""
+    rays, hits = RayArrays().__ctype__(), HitArrays().__ctype__()
+    for struct, names, arrays in ((rays, RayArrays.vars, given), (hits, HitArrays.vars, answers)):
+        for name, array in zip(names, arrays, strict=False):
+            setattr(struct, name, array_t(array.ctypes.data, ndim=1, shape=array.shape, strides=array.strides))
+    return rays, hits if len(answers) > 1 else hits.t
+
+
+def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: slice) -> None:
+    """Copy rows of arrays; what is beyond float32 becomes infinite."""
+    with np.errstate(over="ignore"):
+        for source, target in zip(sources, targets, strict=True):
+            target[to] = source[rows]
 
 
 def launch(kernel: Any, inputs: list[Any], n: int, device: Any, threads: int) -> None:
-    """Trace rays 0 .. n - 1, one at a time. inputs: the kernel's first ones, up to where the hits go."""
+    """Trace rays 0 .. n - 1, one at a time. inputs: Warp arrays on the device, the kernel's first ones up to where hits go."""
     if device.is_cuda:
         wp.launch(kernel, dim=n, inputs=[*inputs, 0], device=device, record_tape=False)
         return

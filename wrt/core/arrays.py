@@ -32,20 +32,23 @@ def to_warp(array: Any, dtype: Any = None) -> Any:
 
 
 def real_numbers(value: Any, name: str, shape: str) -> np.ndarray:
-    """A contiguous float32 array of what somebody gives as real numbers: arrays of integers or floats of any size, lists, scalars;
-    what is beyond float32 becomes infinite. Raises InputError that calls it `name`, and says that `shape` was expected."""
+    """An array of what somebody gives as real numbers: arrays of integers or floats of any size as they are, lists, scalars;
+    objects as float32. Raises InputError that calls it `name`, and says that `shape` was expected."""
     if isinstance(value, np.ma.MaskedArray):
         raise InputError(f"{name} must not be a masked array: its mask would be ignored; leave masked rows out, or fill them")
     try:
         array = np.asarray(value)
-        if array.dtype == np.float32:
-            return np.asarray(array, order="C")
         if array.dtype.kind in REAL:
-            with np.errstate(over="ignore"):
-                return np.asarray(array, dtype=np.float32, order="C")
+            return float32(array) if array.dtype.kind == "O" else array
     except (TypeError, ValueError, OverflowError):
         pass
     raise InputError(f"{name} must be {shape} of real numbers, got {shown(value)}")
+
+
+def float32(array: np.ndarray) -> np.ndarray:
+    """Without gaps, the same array if it is so; what is beyond float32 becomes infinite."""
+    with np.errstate(over="ignore"):
+        return np.asarray(array, dtype=np.float32, order="C")
 
 
 def check_no_gradients(**arrays: Any) -> None:
