@@ -114,14 +114,14 @@ class Hits:
         return replace(self, **{name: convert(getattr(self, name)) for name in HIT_TYPES})
 
 
-def hit_arrays(out: Hits | None, n: int, device: Any) -> list[Any]:
-    """Where n hits go, by HIT_TYPES: the arrays of `out`, or new ones; of Warp on a device, or of NumPy (None). Raises InputError
-    for those that do not fit."""
+def room_for_hits(out: Hits | None, n: int, device: Any) -> Hits:
+    """Where n hits go: the arrays of `out`, or new ones; of Warp on a device, or of NumPy (None). Raises InputError for those that
+    do not fit."""
     if out is None:
-        return [new_array(n, dtype, device) for dtype in HIT_TYPES.values()]
+        return Hits(*(new_array(n, dtype, device) for dtype in HIT_TYPES.values()))
     if not isinstance(out, Hits):
         raise InputError(f"out must be Hits, got {shown(out)}")
-    return [fitting(getattr(out, name), f"out.{name}", n, dtype, device) for name, dtype in HIT_TYPES.items()]
+    return Hits(*(fitting(getattr(out, name), f"out.{name}", n, dtype, device) for name, dtype in HIT_TYPES.items()))
 
 
 def new_array(n: int, dtype: Any, device: Any) -> Any:
@@ -129,7 +129,7 @@ def new_array(n: int, dtype: Any, device: Any) -> Any:
 
 
 def fitting(array: Any, name: str, n: int, dtype: Any, device: Any) -> Any:
-    """The array, which is looked at as in hit_arrays."""
+    """The array, which is looked at as in room_for_hits."""
     if device is None:
         fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray
         wanted = f"a NumPy array ({n},) of {np.dtype(dtype)}, without gaps and writeable"

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from wrt.accel.answers import HIT_TYPES, AccelStats, Counters, Hits, Refit, fitting, hit_arrays, new_array
+from wrt.accel.answers import HIT_TYPES, AccelStats, Counters, Hits, Refit, fitting, new_array, room_for_hits
 from wrt.accel.batches import launch, tracer
 from wrt.accel.built import Built, State
 from wrt.accel.counting import counted
@@ -201,9 +201,10 @@ class Accelerator(ABC):
         what `out` holds is lost then.
         """
         threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
-        arrays = hit_arrays(out, len(rays.origins), self.device if rays.as_warp else None)
-        cost = self._answer(rays, arrays, threads, any_hit=False, counting=trace if counters or trace else None)
-        return Hits(*arrays, counters=cost)
+        hits = room_for_hits(out, len(rays.origins), self.device if rays.as_warp else None)
+        arrays = [hits.t, hits.u, hits.v, hits.prim_id]
+        cost = _answer(self, rays, arrays, threads, any_hit=False, counting=trace if counters or trace else None)
+        return hits if cost is None else replace(hits, counters=cost)
 
     def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                 threads: int | None = None, *, out: Any = None) -> Any:
@@ -212,27 +213,29 @@ class Accelerator(ABC):
         threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
         n, device = len(rays.origins), self.device if rays.as_warp else None
         occluded = new_array(n, np.bool_, device) if out is None else fitting(out, "out", n, np.bool_, device)
-        self._answer(rays, [occluded], threads, any_hit=True)
+        _answer(self, rays, [occluded], threads, any_hit=True)
         return occluded
 
-    def _answer(self, rays: Rays, out: list[Any], threads: int, any_hit: bool, counting: bool | None = None) -> Counters | None:
-        """Write answers to the arrays of `out`. counting: with a trace or without; None: not at all."""
-        data = self.data  # once: a refit may replace it meanwhile
-        if counting is None and not self.device.is_cuda:
-            tracer(self.structure, any_hit).trace(data, self._surfaces, rays, out, threads)
-            return None
-        there = [array if isinstance(array, wp.array) else new_array(len(array), array.dtype, self.device) for array in out]
-        hits = HitArrays()
-        for name, array in zip(HIT_TYPES, () if any_hit else there, strict=False):
-            setattr(hits, name, array)
-        inputs, n = [data, self._surfaces, rays_on(self.device, rays), there[0] if any_hit else hits], len(out[0])
-        if counting is None:
-            launch((any_hit_kernel if any_hit else closest_hit_kernel)(self.structure), inputs, n, self.device, threads)
-        cost = None if counting is None else counted(closest_hit_kernel, self.structure, inputs, n, counting, threads)
-        for array, found in zip(out, there, strict=True):
-            if array is not found:
-                array[:] = found.numpy()
-        return cost
+
+def _answer(accel: Accelerator, rays: Rays, out: list[Any], threads: int, any_hit: bool,
+            counting: bool | None = None) -> Counters | None:
+    """Write answers to the arrays of `out`. counting: with a trace or without; None: not at all."""
+    data = accel.data  # once: a refit may replace it meanwhile
+    if counting is None and not accel.device.is_cuda:
+        tracer(accel.structure, any_hit).trace(data, accel._surfaces, rays, out, threads)
+        return None
+    there = [array if isinstance(array, wp.array) else new_array(len(array), array.dtype, accel.device) for array in out]
+    hits = HitArrays()
+    for name, array in zip(HIT_TYPES, () if any_hit else there, strict=False):
+        setattr(hits, name, array)
+    inputs, n = [data, accel._surfaces, rays_on(accel.device, rays), there[0] if any_hit else hits], len(out[0])
+    if counting is None:
+        launch((any_hit_kernel if any_hit else closest_hit_kernel)(accel.structure), inputs, n, accel.device, threads)
+    cost = None if counting is None else counted(closest_hit_kernel, accel.structure, inputs, n, counting, threads)
+    for array, found in zip(out, there, strict=True):
+        if array is not found:
+            array[:] = found.numpy()
+    return cost
 
 
 def array_bytes(data: Any) -> int:
