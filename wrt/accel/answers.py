@@ -132,11 +132,10 @@ def fitting(array: Any, name: str, n: int, dtype: Any, device: Any) -> Any:
     """The array, which is looked at as in room_for_hits."""
     if device is None:
         fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray
-        wanted = f"a NumPy array ({n},) of {np.dtype(dtype)}, without gaps and writeable"
     else:
         fits = (isinstance(array, wp.array) and array.dtype == wp.dtype_from_numpy(dtype) and array.device == device
                 and (array.is_contiguous or n == 0))
-        wanted = f"a Warp array ({n},) of {np.dtype(dtype)} on {device}, without gaps"
     if not (fits and array.shape == (n,)):
-        raise InputError(f"{name} must be {wanted}, got {shown(array)}")
+        kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device},")
+        raise InputError(f"{name} must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} without gaps, got {shown(array)}")
     return array

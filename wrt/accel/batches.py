@@ -13,6 +13,7 @@ from warp._src.types import array_t  # what a kernel gets for an array; a Warp a
 from wrt.accel.answers import HIT_TYPES
 from wrt.accel.rays import Rays
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
+from wrt.core.arrays import float32
 from wrt.core.device import empty_aligned, load_kernel, made_once, run_all, upload
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Surfaces
@@ -112,7 +113,9 @@ class Worker:
         inputs = [data.__ctype__(), surfaces.__ctype__(), *packed, *(scratch.__ctype__() for scratch in self.scratch), first, end]
         for i, value in zip(self.places, inputs, strict=False):  # the kernel for one ray has no `end`
             self.command.set_param_at_index_from_ctype(i, value)
-        self.command.set_dim(-(-(end - first) // self.block))
+        threads = -(-(end - first) // self.block)
+        if threads != self.command.bounds.size:
+            self.command.set_dim(threads)
         self.command.launch()
 
 
@@ -131,10 +134,9 @@ def pack(given: list[np.ndarray], answers: list[np.ndarray]) -> tuple[Any, Any]:
 
 
 def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: slice) -> None:
-    """Copy rows of arrays; what is beyond float32 becomes infinite."""
-    with np.errstate(over="ignore"):
-        for source, target in zip(sources, targets, strict=True):
-            target[to] = source[rows]
+    """Copy rows of arrays, to float32 where they are of another type."""
+    for source, target in zip(sources, targets, strict=True):
+        target[to] = source[rows] if source.dtype == target.dtype else float32(source[rows])
 
 
 def launch(kernel: Any, inputs: list[Any], n: int, device: Any, threads: int) -> None:

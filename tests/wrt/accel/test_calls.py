@@ -116,7 +116,7 @@ def test_answers_go_where_the_caller_says(ball: Accelerator, n: int, as_warp: bo
 
 
 @pytest.mark.parametrize(("field", "array", "message"), [
-    ("t", np.zeros(4, np.float32), r"out.t must be a NumPy array \(3,\) of float32, without gaps and writeable, got an array"),
+    ("t", np.zeros(4, np.float32), r"out.t must be a NumPy array \(3,\) of float32, writeable and without gaps, got an array"),
     ("t", np.zeros(3), "out.t must be .* of float32.*, got .* of float64"),
     ("u", np.zeros((3, 1), np.float32), r"out.u must be .* \(3,\)"), ("v", np.zeros(6, np.float32)[::2], "out.v must be .*gaps"),
     ("v", frozen(np.zeros(3, np.float32)), "out.v must be .*writeable"), ("prim_id", np.zeros(3, np.int64), "out.prim_id .* int32"),
@@ -138,7 +138,7 @@ def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
         ball.closest_hit(*rays, out=np.zeros(3))  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"out must be a NumPy array \(3,\) of bool.*, got an array \(3,\) of float32"):
         ball.any_hit(*rays, out=np.zeros(3, np.float32))
-    with pytest.raises(InputError, match=r"out must be a Warp array \(3,\) of bool on cpu, without gaps, got an array"):
+    with pytest.raises(InputError, match=r"out must be a Warp array \(3,\) of bool, on cpu, without gaps, got an array"):
         ball.any_hit(*on_warp, out=np.zeros(3, bool))
     for wrong in (wp.zeros(4, dtype=wp.bool, device="cpu"), wp.zeros(3, dtype=wp.int32, device="cpu"),
                   wp.zeros(6, dtype=wp.bool, device="cpu")[::2]):
