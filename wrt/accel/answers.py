@@ -125,6 +125,7 @@ def room_for_hits(out: Hits | None, n: int, device: Any) -> Hits:
 
 
 def new_array(n: int, dtype: Any, device: Any) -> Any:
+    """(n,), of Warp on a device, or of NumPy (None); what is in it is anything."""
     return np.empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
 
 

@@ -37,7 +37,8 @@ class Accelerator(ABC):
     Several threads may ask one structure at a time, and one of them may refit it: docs/acceleration.md, "Several threads".
 
     kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts); for the CPU it may have
-    make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.batches), with stream_block and stream_sizes.
+    make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.batches), with stream_block and stream_sizes;
+    the last of its slots tells whether it met a ray that a query refuses.
     """
 
     name: ClassVar[str]

@@ -13,7 +13,6 @@ from warp._src.types import array_t  # what a kernel gets for an array; a Warp a
 from wrt.accel.answers import HIT_TYPES
 from wrt.accel.rays import Rays
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
-from wrt.core.arrays import float32
 from wrt.core.device import empty_aligned, load_kernel, made_once, run_all, upload
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Surfaces
@@ -24,6 +23,7 @@ from wrt.kernels.wide.packets import Scratch
 FEWEST, MOST, PARTS = 8192, 131072, 8
 RAYS_PER_LAUNCH = 16384  # one at a time
 SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
+MOST_IN_PLACE = 1 << 31  # a kernel's numbers of rays are int32
 
 
 @made_once
@@ -57,7 +57,7 @@ class Tracer:
             rays = rays.checked()
         given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in out]
         n = len(given[0])
-        packed = pack(given, answers) if n > SMALL and all(map(readable, given)) else None
+        packed = pack(given, answers) if SMALL < n < MOST_IN_PLACE and all(map(readable, given)) else None
         part = FEWEST if not packed else rays_per_launch(n, threads, self.block) if self.stream else RAYS_PER_LAUNCH
         refused: list[bool] = []
 
@@ -106,13 +106,16 @@ class Worker:
         inputs = [tracer.structure.struct(), Surfaces(), RayArrays(), None if tracer.any_hit else HitArrays(), *self.scratch]
         numbers = [0, 0] if tracer.stream else [0]
         self.command = wp.launch(tracer.kernel, dim=1, inputs=inputs + numbers, device="cpu", record_cmd=True)
-        self.places = range(len(inputs + numbers))
+        self.inputs = [None] * len(inputs + numbers)  # as they were last
+        self.own = [scratch.__ctype__() for scratch in self.scratch]
 
     def launch(self, data: Any, surfaces: Any, packed: tuple[Any, Any], first: int, end: int) -> None:
         """Trace rays first .. end - 1. The last of `slots` tells whether the kernel met one that is refused."""
-        inputs = [data.__ctype__(), surfaces.__ctype__(), *packed, *(scratch.__ctype__() for scratch in self.scratch), first, end]
-        for i, value in zip(self.places, inputs, strict=False):  # the kernel for one ray has no `end`
-            self.command.set_param_at_index_from_ctype(i, value)
+        inputs = [data.__ctype__(), surfaces.__ctype__(), *packed, *self.own, first, end]
+        for i, last in enumerate(self.inputs):  # the kernel for one ray has no `end`
+            if inputs[i] is not last:
+                self.command.set_param_at_index_from_ctype(i, inputs[i])
+                self.inputs[i] = inputs[i]
         threads = -(-(end - first) // self.block)
         if threads != self.command.bounds.size:
             self.command.set_dim(threads)
@@ -134,9 +137,13 @@ def pack(given: list[np.ndarray], answers: list[np.ndarray]) -> tuple[Any, Any]:
 
 
 def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: slice) -> None:
-    """Copy rows of arrays, to float32 where they are of another type."""
+    """Copy rows of arrays; what is beyond float32 becomes infinite."""
     for source, target in zip(sources, targets, strict=True):
-        target[to] = source[rows] if source.dtype == target.dtype else float32(source[rows])
+        if source.dtype == target.dtype:
+            target[to] = source[rows]
+        else:
+            with np.errstate(over="ignore"):
+                target[to] = source[rows]
 
 
 def launch(kernel: Any, inputs: list[Any], n: int, device: Any, threads: int) -> None:

@@ -53,8 +53,8 @@ def float32(array: np.ndarray) -> np.ndarray:
 
 def check_no_gradients(**arrays: Any) -> None:
     """Raise InputError that names the Warp array of which a tape would wait for gradients: there are none."""
-    for name, array in arrays.items():
-        if isinstance(array, wp.array) and array.requires_grad and context.runtime.tape is not None:
+    for name, array in arrays.items() if context.runtime.tape is not None else ():
+        if isinstance(array, wp.array) and array.requires_grad:
             raise InputError(f"{name} requires gradients and a wp.Tape is recording, but wrt has no gradients: ask outside of the"
                              f" tape, or give wp.clone({name}, requires_grad=False)")
 
