@@ -14,7 +14,8 @@ from wrt.core.checks import shown
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts, html_table
 
-HIT_TYPES = {"t": np.float32, "u": np.float32, "v": np.float32, "prim_id": np.int32}
+HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
+ANY_HIT_TYPES = {"out": np.bool_}
 
 
 @dataclass(frozen=True)
@@ -111,32 +112,22 @@ class Hits:
         return self._each(to_warp)
 
     def _each(self, convert: Callable[[Any], Any]) -> Hits:
-        return replace(self, **{name: convert(getattr(self, name)) for name in HIT_TYPES})
+        return replace(self, **{name: convert(getattr(self, name)) for name in ("t", "u", "v", "prim_id")})
 
 
-def room_for_hits(out: Hits | None, n: int, device: Any) -> Hits:
-    """Where n hits go: the arrays of `out`, or new ones; of Warp on a device, or of NumPy (None). Raises InputError for those that
-    do not fit."""
-    if out is None:
-        return Hits(*(new_array(n, dtype, device) for dtype in HIT_TYPES.values()))
-    if not isinstance(out, Hits):
-        raise InputError(f"out must be Hits, got {shown(out)}")
-    return Hits(*(fitting(getattr(out, name), f"out.{name}", n, dtype, device) for name, dtype in HIT_TYPES.items()))
-
-
-def new_array(n: int, dtype: Any, device: Any) -> Any:
-    """(n,), of Warp on a device, or of NumPy (None); what is in it is anything."""
-    return np.empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
-
-
-def fitting(array: Any, name: str, n: int, dtype: Any, device: Any) -> Any:
-    """The array, which is looked at as in room_for_hits."""
-    if device is None:
-        fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray
-    else:
-        fits = (isinstance(array, wp.array) and array.dtype == wp.dtype_from_numpy(dtype) and array.device == device
-                and (array.is_contiguous or n == 0))
-    if not (fits and array.shape == (n,)):
-        kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device},")
-        raise InputError(f"{name} must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} without gaps, got {shown(array)}")
-    return array
+def room_for(types: dict[str, Any], given: list[Any] | None, n: int, device: Any) -> list[Any]:
+    """Where n answers go: an array of each type, of Warp on a device, or of NumPy (None); those that are given, if there are some.
+    Raises InputError that calls one by its name in `types` where it does not fit."""
+    if given is None:
+        return [np.empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
+                for dtype in types.values()]
+    for (name, dtype), array in zip(types.items(), given, strict=True):
+        if device is None:
+            fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray
+        else:
+            fits = (isinstance(array, wp.array) and array.dtype == wp.dtype_from_numpy(dtype) and array.device == device
+                    and (array.is_contiguous or n == 0))
+        if not (fits and array.shape == (n,)):
+            kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device},")
+            raise InputError(f"{name} must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} without gaps, got {shown(array)}")
+    return given

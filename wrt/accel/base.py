@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from wrt.accel.answers import HIT_TYPES, AccelStats, Counters, Hits, Refit, fitting, new_array, room_for_hits
+from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES, AccelStats, Counters, Hits, Refit, room_for
 from wrt.accel.batches import launch, tracer
 from wrt.accel.built import Built, State
 from wrt.accel.counting import counted
@@ -21,6 +21,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.rays import Rays, rays_of, rays_on, vectors
 from wrt.accel.store import save
 from wrt.accel.structure import Structure, any_hit_kernel, check_options, check_units, closest_hit_kernel
+from wrt.core.checks import shown
 from wrt.core.device import start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
@@ -202,40 +203,39 @@ class Accelerator(ABC):
         what `out` holds is lost then.
         """
         threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
-        hits = room_for_hits(out, len(rays.origins), self.device if rays.as_warp else None)
-        arrays = [hits.t, hits.u, hits.v, hits.prim_id]
-        cost = _answer(self, rays, arrays, threads, any_hit=False, counting=trace if counters or trace else None)
-        return hits if cost is None else replace(hits, counters=cost)
+        if not (out is None or isinstance(out, Hits)):
+            raise InputError(f"out must be Hits, got {shown(out)}")
+        given = None if out is None else [out.t, out.u, out.v, out.prim_id]
+        t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
+        return Hits(t, u, v, prim_id, _answer(self, rays, arrays, threads, trace if counters or trace else None))
 
     def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                 threads: int | None = None, *, out: Any = None) -> Any:
         """Whether each ray hits anything in its segment: (N,) bool, True where closest_hit finds a hit and nowhere else. Arguments
         as in closest_hit; out: an array that takes the answer."""
         threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
-        n, device = len(rays.origins), self.device if rays.as_warp else None
-        occluded = new_array(n, np.bool_, device) if out is None else fitting(out, "out", n, np.bool_, device)
-        _answer(self, rays, [occluded], threads, any_hit=True)
-        return occluded
+        given = None if out is None else [out]
+        arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
+        _answer(self, rays, arrays, threads)
+        return arrays[0]
 
 
-def _answer(accel: Accelerator, rays: Rays, out: list[Any], threads: int, any_hit: bool,
-            counting: bool | None = None) -> Counters | None:
-    """Write answers to the arrays of `out`. counting: with a trace or without; None: not at all."""
-    data = accel.data  # once: a refit may replace it meanwhile
+def _answer(accel: Accelerator, rays: Rays, out: list[Any], threads: int, counting: bool | None = None) -> Counters | None:
+    """Write the answers to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a trace or without; None: not at all."""
+    data, n, any_hit = accel.data, len(out[0]), len(out) == 1  # data once: a refit may replace it meanwhile
     if counting is None and not accel.device.is_cuda:
         tracer(accel.structure, any_hit).trace(data, accel._surfaces, rays, out, threads)
         return None
-    there = [array if isinstance(array, wp.array) else new_array(len(array), array.dtype, accel.device) for array in out]
+    there = out if rays.as_warp else room_for(ANY_HIT_TYPES if any_hit else HIT_TYPES, None, n, accel.device)
     hits = HitArrays()
-    for name, array in zip(HIT_TYPES, () if any_hit else there, strict=False):
+    for name, array in zip(HitArrays.vars, there, strict=False) if not any_hit else ():
         setattr(hits, name, array)
-    inputs, n = [data, accel._surfaces, rays_on(accel.device, rays), there[0] if any_hit else hits], len(out[0])
+    inputs = [data, accel._surfaces, rays_on(accel.device, rays), there[0] if any_hit else hits]
     if counting is None:
         launch((any_hit_kernel if any_hit else closest_hit_kernel)(accel.structure), inputs, n, accel.device, threads)
     cost = None if counting is None else counted(closest_hit_kernel, accel.structure, inputs, n, counting, threads)
-    for array, found in zip(out, there, strict=True):
-        if array is not found:
-            array[:] = found.numpy()
+    for array, found in zip(out, there, strict=True) if not rays.as_warp else ():
+        array[:] = found.numpy()
     return cost
 
 

@@ -10,10 +10,11 @@ import numpy as np
 import warp as wp
 from warp._src.types import array_t  # what a kernel gets for an array; a Warp array takes ten times as long to make
 
-from wrt.accel.answers import HIT_TYPES
+from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES
 from wrt.accel.rays import Rays
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
-from wrt.core.device import empty_aligned, load_kernel, made_once, run_all, upload
+from wrt.core.arrays import to_warp
+from wrt.core.device import empty_aligned, load_kernel, made_once, run_all
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.wide.packets import Scratch
@@ -23,14 +24,6 @@ from wrt.kernels.wide.packets import Scratch
 FEWEST, MOST, PARTS = 8192, 131072, 8
 RAYS_PER_LAUNCH = 16384  # one at a time
 SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
-MOST_IN_PLACE = 1 << 31  # a kernel's numbers of rays are int32
-
-
-@made_once
-def stream_kernel(structure: Structure, any_hit: bool) -> Any:
-    """The kernel for a structure, or None where it has no other than the one for one ray."""
-    make = getattr(structure.accel.kernels, "make_stream", None)
-    return make(structure.units, any_hit) if make else None
 
 
 def rays_per_launch(n: int, threads: int, block: int) -> int:
@@ -40,24 +33,28 @@ def rays_per_launch(n: int, threads: int, block: int) -> int:
 
 
 class Tracer:
-    """What answers queries on the CPU: a kernel for a structure, and workers that are kept from call to call."""
+    """What answers queries on the CPU: the kernel for a structure, and workers that are kept from call to call."""
 
     def __init__(self, structure: Structure, any_hit: bool) -> None:
-        self.structure, self.any_hit = structure, any_hit
-        self.stream = stream_kernel(structure, any_hit)
+        kernels = structure.accel.kernels
+        # A kernel for many rays at a time, or None where there is but the one for one ray.
+        self.stream = kernels.make_stream(structure.units, any_hit) if hasattr(kernels, "make_stream") else None
         self.kernel = self.stream or (any_hit_kernel if any_hit else closest_hit_kernel)(structure)
-        self.block = structure.accel.kernels.stream_block if self.stream else 1
+        self.block = kernels.stream_block if self.stream else 1
+        self.sizes = kernels.stream_sizes if self.stream else ()
+        self.types = ANY_HIT_TYPES if any_hit else HIT_TYPES
+        self.inputs = structure.struct(), Surfaces(), RayArrays(), None if any_hit else HitArrays()
         self.free: list[Worker] = []
 
-    def trace(self, data: Any, surfaces: Surfaces, rays: Rays, out: list[Any], threads: int) -> None:
-        """Answers to arrays without gaps, in the order of HIT_TYPES. Raises InputError for rays that are refused; they have been
-        traced then, and the answers are nothing to go by."""
+    def trace(self, data: Any, surfaces: Any, rays: Rays, out: list[Any], threads: int) -> None:
+        """Write the answers to arrays without gaps. Raises InputError for rays that are refused; by then they have been traced, and
+        the answers are nothing to go by."""
         load_kernel(self.kernel, wp.get_device("cpu"))
         if not self.stream:  # which says itself whether it met such
             rays = rays.checked()
         given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in out]
         n = len(given[0])
-        packed = pack(given, answers) if SMALL < n < MOST_IN_PLACE and all(map(readable, given)) else None
+        packed = pack(given, answers) if SMALL < n < 1 << 31 and all(map(readable, given)) else None  # a kernel counts in int32
         part = FEWEST if not packed else rays_per_launch(n, threads, self.block) if self.stream else RAYS_PER_LAUNCH
         refused: list[bool] = []
 
@@ -93,21 +90,19 @@ class Worker:
 
     def __init__(self, tracer: Tracer) -> None:
         self.given = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
-        self.answers: list[Any] = [np.empty(FEWEST, dtype) for dtype in ([np.bool_] if tracer.any_hit else HIT_TYPES.values())]
+        self.answers = [np.empty(FEWEST, dtype) for dtype in tracer.types.values()]
         self.packed = pack(self.given, self.answers)
-        self.block, self.scratch, self.slots = tracer.block, [], np.zeros(1, np.int32)
-        if tracer.stream:
-            scratch = Scratch()
-            # Rows of lanes would else lie in two cache lines each.
-            scratch.packets, scratch.stacks, scratch.slots = (
-                upload(empty_aligned((size,), wp.dtype_to_numpy(dtype)), dtype, wp.get_device("cpu")) for size, dtype in
-                zip(tracer.structure.accel.kernels.stream_sizes, (wp.float32, wp.uint32, wp.int32), strict=True))
-            self.scratch, self.slots = [scratch], scratch.slots.numpy()
-        inputs = [tracer.structure.struct(), Surfaces(), RayArrays(), None if tracer.any_hit else HitArrays(), *self.scratch]
-        numbers = [0, 0] if tracer.stream else [0]
-        self.command = wp.launch(tracer.kernel, dim=1, inputs=inputs + numbers, device="cpu", record_cmd=True)
-        self.inputs = [None] * len(inputs + numbers)  # as they were last
-        self.own = [scratch.__ctype__() for scratch in self.scratch]
+        self.block, self.scratch = tracer.block, Scratch()
+        # Aligned: rows of lanes would else lie in two cache lines each.
+        types = np.float32, np.uint32, np.int32
+        memory = [empty_aligned((size,), dtype) for size, dtype in zip(tracer.sizes, types, strict=False)]
+        for name, array in zip(Scratch.vars, memory, strict=False):
+            setattr(self.scratch, name, to_warp(array))
+        self.slots = memory[-1] if memory else np.zeros(1, np.int32)
+        own = [self.scratch, 0] if tracer.stream else []
+        self.command = wp.launch(tracer.kernel, dim=1, inputs=[*tracer.inputs, *own, 0], device="cpu", record_cmd=True)
+        self.inputs: list[Any] = [None] * (len(own) + 5)  # as they were last
+        self.own = [self.scratch.__ctype__()] if tracer.stream else []
 
     def launch(self, data: Any, surfaces: Any, packed: tuple[Any, Any], first: int, end: int) -> None:
         """Trace rays first .. end - 1. The last of `slots` tells whether the kernel met one that is refused."""

@@ -81,12 +81,13 @@ def _segment_ends(value: Any, n: int, name: str) -> Any:
 
 
 def _checked_ends(array: Any, name: str) -> Any:
-    if not isinstance(array, wp.array):
-        array = array if array.strides == (0,) else float32(array)
-    elif not array.is_contiguous:
-        array = array.contiguous()
-    if not (isinstance(array, wp.array) and array.device.is_cuda):
-        _check_ends(np.asarray(array).min(initial=np.inf), name)
+    if isinstance(array, wp.array):
+        array = array if array.is_contiguous else array.contiguous()
+        if array.device.is_cuda:
+            return array
+    elif array.strides != (0,):
+        array = float32(array)
+    _check_ends(np.asarray(array).min(initial=np.inf), name)
     return array
 
 

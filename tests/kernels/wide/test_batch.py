@@ -9,7 +9,7 @@ from tests.kernel_tools import CPU, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel import batches as streams
-from wrt.accel.batches import FEWEST, MOST, rays_per_launch, stream_kernel, tracer
+from wrt.accel.batches import FEWEST, MOST, rays_per_launch, tracer
 from wrt.accel.build import build
 from wrt.accel.built import Built
 from wrt.accel.bvh.wide_tree import stack_need
@@ -39,7 +39,7 @@ def one_by_one(accel, o, d, t_min, t_max):
 
 
 def assert_same(accel, o, d, t_min=0.0, t_max=np.inf, threads=1):
-    assert stream_kernel(accel.structure, False) is not None
+    assert tracer(accel.structure, False).stream is not None
     expected, dark = one_by_one(accel, o, d, t_min, t_max)
     found = accel.closest_hit(o, d, t_min, t_max, threads=threads)
     for name, values in expected.items():
@@ -80,7 +80,7 @@ def test_more_rays_than_a_launch(sphere, threads):
     for _ in range(3):
         assert_same(sphere, o, d, threads=threads)
     assert 1 <= len(free) <= threads  # what the jobs work in is lent again
-    assert all(array.ptr % 64 == 0 for worker in free for array in (worker.scratch[0].packets, worker.scratch[0].stacks))
+    assert all(array.ptr % 64 == 0 for worker in free for array in (worker.scratch.packets, worker.scratch.stacks))
 
 
 @pytest.mark.parametrize("threads", [2, 3, 16])
@@ -206,9 +206,9 @@ def test_packets_are_given_up_where_they_fall_apart():
 def test_units_without_lanes_have_no_stream():
     bvh8 = ACCELERATORS["bvh8"]
     for units in (Units(triangle="moeller_trumbore"), Units(box="plain"), Units(spheres=True), Units(counters=True)):
-        assert stream_kernel(Structure(bvh8, units), False) is None
-    assert stream_kernel(Structure(ACCELERATORS["bvh2"]), False) is None
-    assert stream_kernel(Structure(bvh8, Units(box="minmax")), True) is not None
+        assert tracer(Structure(bvh8, units), False).stream is None
+    assert tracer(Structure(ACCELERATORS["bvh2"]), False).stream is None
+    assert tracer(Structure(bvh8, Units(box="minmax")), True).stream is not None
 
 
 @pytest.mark.slow
