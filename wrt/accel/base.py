@@ -14,20 +14,19 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES, AccelStats, Counters, Hits, Refit, room_for
-from wrt.accel.batches import launch, tracer
+from wrt.accel.batches import trace_on_gpu, tracer
 from wrt.accel.built import Built, State
 from wrt.accel.counting import counted
 from wrt.accel.geometry import Geometry
-from wrt.accel.rays import Rays, rays_of, rays_on, vectors
+from wrt.accel.rays import Rays, rays_of, vectors
 from wrt.accel.store import save
-from wrt.accel.structure import Structure, any_hit_kernel, check_options, check_units, closest_hit_kernel
+from wrt.accel.structure import Structure, check_options, check_units
 from wrt.core.checks import shown
 from wrt.core.device import start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
 from wrt.core.memory import require
 from wrt.core.seconds import seconds_without_loads
-from wrt.kernels.query import HitArrays
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 
@@ -222,21 +221,18 @@ class Accelerator(ABC):
 
 def _answer(accel: Accelerator, rays: Rays, out: list[Any], threads: int, counting: bool | None = None) -> Counters | None:
     """Write the answers to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a trace or without; None: not at all."""
-    data, n, any_hit = accel.data, len(out[0]), len(out) == 1  # data once: a refit may replace it meanwhile
-    if counting is None and not accel.device.is_cuda:
-        tracer(accel.structure, any_hit).trace(data, accel._surfaces, rays, out, threads)
-        return None
-    there = out if rays.as_warp else room_for(ANY_HIT_TYPES if any_hit else HIT_TYPES, None, n, accel.device)
-    hits = HitArrays()
-    for name, array in zip(HitArrays.vars, there, strict=False) if not any_hit else ():
-        setattr(hits, name, array)
-    inputs = [data, accel._surfaces, rays_on(accel.device, rays), there[0] if any_hit else hits]
+
+    def trace(structure: Structure, data: Any) -> None:
+        if accel.device.is_cuda:
+            trace_on_gpu(structure, data, accel._surfaces, rays, out, accel.device)
+        else:
+            tracer(structure, len(out) == 1).trace(data, accel._surfaces, rays, out, threads)
+
+    data = accel.data  # once: a refit may replace it meanwhile
     if counting is None:
-        launch((any_hit_kernel if any_hit else closest_hit_kernel)(accel.structure), inputs, n, accel.device, threads)
-    cost = None if counting is None else counted(closest_hit_kernel, accel.structure, inputs, n, counting, threads)
-    for array, found in zip(out, there, strict=True) if not rays.as_warp else ():
-        array[:] = found.numpy()
-    return cost
+        trace(accel.structure, data)
+        return None
+    return counted(trace, accel.structure, data, len(out[0]), accel.device, counting)
 
 
 def array_bytes(data: Any) -> int:

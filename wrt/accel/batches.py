@@ -11,7 +11,7 @@ import warp as wp
 from warp._src.types import array_t  # what a kernel gets for an array; a Warp array takes ten times as long to make
 
 from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES
-from wrt.accel.rays import Rays
+from wrt.accel.rays import Rays, rays_on
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, load_kernel, made_once, run_all
@@ -141,14 +141,16 @@ def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: 
                 target[to] = source[rows]
 
 
-def launch(kernel: Any, inputs: list[Any], n: int, device: Any, threads: int) -> None:
-    """Trace rays 0 .. n - 1, one at a time. inputs: Warp arrays on the device, the kernel's first ones up to where hits go."""
-    if device.is_cuda:
-        wp.launch(kernel, dim=n, inputs=[*inputs, 0], device=device, record_tape=False)
-        return
-    load_kernel(kernel, device)
-
-    def job(first: int) -> None:
-        wp.launch(kernel, dim=min(RAYS_PER_LAUNCH, n - first), inputs=[*inputs, first], device=device, record_tape=False)
-
-    run_all([partial(job, first) for first in range(0, n, RAYS_PER_LAUNCH)], threads)
+def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out: list[Any], device: Any) -> None:
+    """As Tracer.trace."""
+    there = [array if isinstance(array, wp.array) else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device)
+             for array in out]
+    hits = HitArrays()
+    for name, array in zip(HitArrays.vars, there, strict=False) if len(out) > 1 else ():
+        setattr(hits, name, array)
+    kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
+    inputs = [data, surfaces, rays_on(device, rays), hits if len(out) > 1 else there[0], 0]
+    wp.launch(kernel, dim=len(out[0]), inputs=inputs, device=device, record_tape=False)
+    for array, found in zip(out, there, strict=True):
+        if array is not found:
+            array[:] = found.numpy()

@@ -46,9 +46,9 @@ def real_numbers(value: Any, name: str, shape: str) -> np.ndarray:
 
 
 def float32(array: np.ndarray) -> np.ndarray:
-    """Without gaps, the same array if it is so; what is beyond float32 becomes infinite."""
+    """Aligned and without gaps, the same array if it is so; what is beyond float32 becomes infinite."""
     with np.errstate(over="ignore"):
-        return np.asarray(array, dtype=np.float32, order="C")
+        return np.require(array, np.float32, ["C", "A"])
 
 
 def check_no_gradients(**arrays: Any) -> None:

@@ -5,10 +5,9 @@ import pytest
 
 from tests.data import data_path
 
-from tests.kernel_tools import CPU, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import CPU, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel import batches as streams
 from wrt.accel.batches import FEWEST, MOST, rays_per_launch, tracer
 from wrt.accel.build import build
 from wrt.accel.built import Built
@@ -32,9 +31,9 @@ def one_by_one(accel, o, d, t_min, t_max):
     rays, n = rays_on(accel.device, rays_of(o, d, t_min, t_max)), len(o)
     hits = HitArrays()
     hits.t, hits.u, hits.v, hits.prim_id = zeros(n), zeros(n), zeros(n), zeros(n, wp.int32)
-    streams.launch(closest_hit_kernel(accel.structure), [accel.data, accel._surfaces, rays, hits], n, accel.device, 1)
+    launch(closest_hit_kernel(accel.structure), n, accel.data, accel._surfaces, rays, hits, 0)
     dark = zeros(n, wp.bool)
-    streams.launch(any_hit_kernel(accel.structure), [accel.data, accel._surfaces, rays, dark], n, accel.device, 1)
+    launch(any_hit_kernel(accel.structure), n, accel.data, accel._surfaces, rays, dark, 0)
     return {name: getattr(hits, name).numpy() for name in ("t", "u", "v", "prim_id")}, dark.numpy()
 
 

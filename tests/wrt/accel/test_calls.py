@@ -81,6 +81,16 @@ def test_arrays_of_any_form_give_the_same_bits(ball: Accelerator, form: str, n: 
     assert bits(ball.closest_hit(origins, given[1], t_min, given[3])) == bits(expected)  # mixed
 
 
+@pytest.mark.parametrize("form", ["float64", "fortran", "unaligned"])
+def test_counters_are_those_of_the_same_ray(ball: Accelerator, form: str) -> None:
+    rays = some_rays(MANY)
+    expected = ball.closest_hit(*rays, trace=True).counters
+    found = ball.closest_hit(*map(FORMS[form], rays), trace=True, threads=2).counters
+    for name in ("counts", "first", "address", "size"):
+        assert np.array_equal(getattr(found, name), getattr(expected, name))
+    assert len(np.unique(expected.counts["nodes"])) > 1  # type: ignore[union-attr]
+
+
 @pytest.mark.parametrize("n", [5, MANY])
 def test_one_number_for_all_segments_is_as_an_array_of_it(ball: Accelerator, n: int) -> None:
     origins, directions = some_rays(n)

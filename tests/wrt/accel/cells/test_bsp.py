@@ -245,8 +245,12 @@ def test_random_lines_cost_what_the_heuristic_says(kind: str, options: dict[str,
     hits = HitArrays()
     hits.t, hits.u, hits.v = (wp.zeros(len(rays.t_min), dtype=wp.float32, device="cpu") for _ in range(3))
     hits.prim_id = wp.zeros(len(rays.t_min), dtype=wp.int32, device="cpu")
-    inputs = [tree.data, tree._surfaces, rays, hits]
-    counts = counted(lambda structure: refusing_kernel(), tree.structure, inputs, len(rays.t_min), trace=False, threads=1).counts
+    n, refusing = len(rays.t_min), refusing_kernel()
+
+    def trace(structure, data):
+        wp.launch(refusing, dim=n, inputs=[data, tree._surfaces, rays, hits, 0], device="cpu")
+
+    counts = counted(trace, tree.structure, tree.data, n, tree.device, False).counts
     steps = counts["nodes"] + counts["primitives"]
     assert abs(steps.mean() - tree.stats.sah_cost) < 3.0 * steps.std() / np.sqrt(len(steps))
 
