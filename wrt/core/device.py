@@ -232,7 +232,12 @@ def _helpers(process: int) -> ThreadPoolExecutor:
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
     """Run all tasks on so many threads, this one among them; after the first error none is begun, and it is raised when those
     that run have ended."""
-    left = deque(enumerate(tasks))
+    jobs = list(tasks)
+    if threads == 1 or len(jobs) <= 1:
+        for job in jobs:
+            job()
+        return
+    left = deque(enumerate(jobs))
     errors: dict[int, BaseException] = {}
 
     def work() -> None:
@@ -249,7 +254,7 @@ def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
 
     helpers: list[Future[None]] = []
     try:
-        for _ in range(min(threads, len(left)) - 1):
+        for _ in range(min(threads, len(jobs)) - 1):
             helpers.append(_helpers(os.getpid()).submit(work))
         work()
     finally:
