@@ -8,6 +8,7 @@ from wrt.kernels.structs import NO_HIT, Ray, Surfaces, kernel
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 
 LARGEST = wp.constant(3.4028234663852886e38)  # of float32
+FARTHEST = 1e37  # of an origin's coordinates that arrays of NumPy may have: differences of such are finite
 # Directions beyond these lengths are scaled by one of these factors: see direction_scale.
 SHORTEST, LONGEST = 2.0**-64, 2.0**64
 LENGTHEN, SHORTEN = 2.0**96, 2.0**-64
@@ -15,7 +16,7 @@ LENGTHEN, SHORTEN = 2.0**96, 2.0**-64
 
 @wp.struct
 class RayArrays:
-    """One ray a row."""
+    """One ray a row. t_min and t_max may have a stride of 0: one number for all."""
 
     origin: wp.array(dtype=wp.vec3)
     direction: wp.array(dtype=wp.vec3)

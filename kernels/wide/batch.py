@@ -23,6 +23,7 @@ from wrt.kernels.wide.packets import (
     COHERENT,
     LANES,
     PACKET_SIZE,
+    REFUSED,
     ROW,
     SLOT,
     SLOT_SIZE,
@@ -72,6 +73,7 @@ LINES = 4  # cache lines that are called in of what is next
 IN_A_ROW, PAUSE = 4, 32
 FAILED = SLOT_SIZE * SLOTS  # where Scratch.slots counts the packets in a row that fell apart
 PAUSED = FAILED + 1  # and those that are left until one is tried again
+ANY_REFUSED = PAUSED + 1  # where it says whether a query refuses one of the rays: the last number of `slots`
 
 # A packet leaves as many entries as a ray alone, but the nearest child is on the stack as well, before it is taken from there.
 ENTRIES = STACK_SIZE + 1
@@ -305,12 +307,15 @@ def make_kernel(units: Units, any_hit: bool):
         if wp.tid() == 0:
             put_slot(scratch.slots, FAILED, 0)
             put_slot(scratch.slots, PAUSED, 0)
+            put_slot(scratch.slots, ANY_REFUSED, 0)
         alone = wp.uint64(0)
         for p in range(PACKETS):
             count = wp.min(end - block - LANES * p, LANES)
             if count > 0:
                 base = PACKET_SIZE * p
                 active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch.packets, base)
+                if bits(scratch.packets, base + REFUSED) != 0:
+                    put_slot(scratch.slots, ANY_REFUSED, 1)
                 paused = slot_at(scratch.slots, PAUSED)
                 if active >= COHERENT and paused == 0:
                     worth = walk_packet(accel, surfaces, scratch.packets, base, active - COHERENT)
@@ -337,7 +342,7 @@ class BatchTraversal(WideTraversal):
     """Plain nodes of 8, for which there is a kernel for many rays at a time."""
 
     stream_block = PACKETS * LANES
-    stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, PAUSED + 1  # lengths of a Scratch's arrays
+    stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, ANY_REFUSED + 1  # lengths of a Scratch's arrays
 
     def __init__(self) -> None:
         super().__init__(WIDTH)

@@ -10,8 +10,8 @@
         #define Y(v) __builtin_shufflevector(TWO(v, 1), THIRD(v), 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30)
         #define Z(v) __builtin_shufflevector(TWO(v, 2), THIRD(v), 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31)
         o_x = X(a); o_y = Y(a); o_z = Z(a); d_x = X(b); d_y = Y(b); d_z = Z(b);
-        t_min = *(const Rays*)(rays.t_min.data + first);
-        t_max = *(const Rays*)(rays.t_max.data + first);
+        t_min = rays.t_min.strides[0] ? *(const Rays*)(rays.t_min.data + first) : (Rays)(rays.t_min.data[0]);
+        t_max = rays.t_max.strides[0] ? *(const Rays*)(rays.t_max.data + first) : (Rays)(rays.t_max.data[0]);
     } else {
         float copy[8][LANES];
         for (int j = 0; j < LANES; ++j) {
@@ -20,8 +20,8 @@
                 copy[k][j] = rays.origin.data[i][k];
                 copy[3 + k][j] = rays.direction.data[i][k];
             }
-            copy[6][j] = rays.t_min.data[i];
-            copy[7][j] = rays.t_max.data[i];
+            copy[6][j] = rays.t_min.data[rays.t_min.strides[0] ? i : 0];
+            copy[7][j] = rays.t_max.data[rays.t_max.strides[0] ? i : 0];
         }
         auto copied = [&](int k) { return *(Rays*)copy[k]; };
         o_x = copied(0); o_y = copied(1); o_z = copied(2); d_x = copied(3); d_y = copied(4); d_z = copied(5);

@@ -5,6 +5,11 @@
     Rays size_x = __builtin_elementwise_abs(d_x), size_y = __builtin_elementwise_abs(d_y), size_z = __builtin_elementwise_abs(d_z);
     Rays longest = size_y > size_x ? size_y : size_x;
     longest = size_z > longest ? size_z : longest;
+    #define WITHIN(x, most) (__builtin_elementwise_abs(x) <= most)
+    const Rays farthest = FARTHEST;
+    const auto near = WITHIN(o_x, farthest) & WITHIN(o_y, farthest) & WITHIN(o_z, farthest);
+    const auto finite = WITHIN(d_x, largest) & WITHIN(d_y, largest) & WITHIN(d_z, largest);
+    ((int*)q)[REFUSED] = RAY_MASK(~(near & finite & (longest > 0.0f) & (t_min >= 0.0f) & (t_max == t_max)));
     const Rays lengthen = LENGTHEN, lengthen_inverse = 1.0f / LENGTHEN, shorten = SHORTEN, shorten_inverse = 1.0f / SHORTEN;
     const Rays scale = longest > LONGEST ? shorten : (longest < SHORTEST ? lengthen : one);
     const Rays inverse = longest > LONGEST ? shorten_inverse : (longest < SHORTEST ? lengthen_inverse : one);

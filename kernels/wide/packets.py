@@ -6,7 +6,7 @@ bit: a test holds the two together. This file has the layouts that they work on;
 
 import warp as wp
 
-from wrt.kernels.query import LARGEST, LENGTHEN, LONGEST, SHORTEN, SHORTEST, HitArrays, RayArrays
+from wrt.kernels.query import FARTHEST, LARGEST, LENGTHEN, LONGEST, SHORTEN, SHORTEST, HitArrays, RayArrays
 from wrt.kernels.structs import NO_HIT, Primitive, size_of
 from wrt.kernels.units.box import FAR_PAD, PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST
 from wrt.kernels.units.triangle import CLAMP_ROUNDING, CLAMP_STEP, SLOWEST
@@ -28,9 +28,11 @@ AXIS_BITS = 2
 
 # Then the beam: intervals that hold the origins and the reciprocals of all its rays. Each word is there for x, y and z: the origin
 # that is closest to the near planes, and to the far planes; the reciprocal of the largest magnitude, and of the smallest; the same
-# two for far planes; and which plane of a node is near (as a float). One word more: the lowest t_min.
+# two for far planes; and which plane of a node is near (as a float). One word more: the lowest t_min. And one that is not the
+# beam's, REFUSED: the mask of rays whose numbers a query refuses (wrt.accel.rays).
 BEAM_WORDS = ("near_origin", "far_origin", "largest", "smallest", "far_largest", "far_smallest", "near_row", "t_min")
 BEAM = {name: LANES * len(ROWS) + 3 * i for i, name in enumerate(BEAM_WORDS)}
+REFUSED = BEAM["t_min"] + 1
 
 # Then what `children` and `meets` find. CHILD_ENTRY: where the beam enters each child; CHILD_RAYS: the mask (int32) of the rays
 # that meet each; ROOT_ENTRIES: for each child a row of where the rays enter it, inf where they do not.
@@ -58,11 +60,11 @@ TO_POP = 1 << WIDTH
 
 LAYOUT = {
     "WIDTH": WIDTH, "LANES": LANES, "COHERENT": COHERENT, "AXIS_BITS": AXIS_BITS, "AXIS_MASK": (1 << AXIS_BITS) - 1,
-    "CHILD_ENTRY": CHILD_ENTRY, "CHILD_RAYS": CHILD_RAYS, "ROOT_ENTRIES": ROOT_ENTRIES, "LEVEL": LEVEL,
+    "REFUSED": REFUSED, "CHILD_ENTRY": CHILD_ENTRY, "CHILD_RAYS": CHILD_RAYS, "ROOT_ENTRIES": ROOT_ENTRIES, "LEVEL": LEVEL,
     "LEVEL_REFERENCES": LEVEL_REFERENCES, "LEVEL_BELOW": LEVEL_BELOW, "KEY_MASK": KEY_MASK, "TO_POP": TO_POP,
     "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
     "PRIM_ID_ROW": size_of(Primitive) // 4 - 1, "NO_HIT": NO_HIT,
-    "LARGEST": LARGEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
+    "LARGEST": LARGEST, "FARTHEST": FARTHEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
     "FAR_PAD": FAR_PAD, "PAD_EXTENT": PAD_EXTENT, "PAD_COORDINATE": PAD_COORDINATE, "PAD_SMALLEST": PAD_SMALLEST,
     "CLAMP_ROUNDING": CLAMP_ROUNDING, "CLAMP_STEP": CLAMP_STEP, "SLOWEST": SLOWEST,
     **{name.upper(): first for name, first in ROW.items()},
@@ -74,8 +76,8 @@ LAYOUT = {
 
 @wp.struct
 class Scratch:
-    """What one thread works in. packets: PACKET_SIZE each; stacks: STACK_WORDS a slot; slots: SLOT_SIZE each, then two counts of
-    batch.make_kernel."""
+    """What one thread works in. packets: PACKET_SIZE each; stacks: STACK_WORDS a slot; slots: SLOT_SIZE each, then three numbers
+    of batch.make_kernel."""
 
     packets: wp.array(dtype=wp.float32)
     stacks: wp.array(dtype=wp.uint32)

@@ -7,9 +7,15 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from wrt.core.arrays import to_numpy, to_warp
+from wrt.core.checks import shown
+from wrt.core.errors import InputError
 from wrt.core.html import html_facts, html_table
+
+HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
+ANY_HIT_TYPES = {"out": np.bool_}
 
 
 @dataclass(frozen=True)
@@ -107,3 +113,21 @@ class Hits:
 
     def _each(self, convert: Callable[[Any], Any]) -> Hits:
         return replace(self, **{name: convert(getattr(self, name)) for name in ("t", "u", "v", "prim_id")})
+
+
+def room_for(types: dict[str, Any], given: list[Any] | None, n: int, device: Any) -> list[Any]:
+    """Where n answers go: an array of each type, of Warp on a device, or of NumPy (None); those that are given, if there are some.
+    Raises InputError that calls one by its name in `types` where it does not fit."""
+    if given is None:
+        return [np.empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
+                for dtype in types.values()]
+    for (name, dtype), array in zip(types.items(), given, strict=True):
+        if device is None:
+            fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray
+        else:
+            fits = (isinstance(array, wp.array) and array.dtype == wp.dtype_from_numpy(dtype) and array.device == device
+                    and (array.is_contiguous or n == 0))
+        if not (fits and array.shape == (n,)):
+            kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device},")
+            raise InputError(f"{name} must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} without gaps, got {shown(array)}")
+    return given

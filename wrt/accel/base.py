@@ -13,20 +13,20 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from wrt.accel.answers import AccelStats, Hits, Refit
-from wrt.accel.batches import launch, launch_stream, stream_kernel
+from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES, AccelStats, Counters, Hits, Refit, room_for
+from wrt.accel.batches import trace_on_gpu, tracer
 from wrt.accel.built import Built, State
 from wrt.accel.counting import counted
 from wrt.accel.geometry import Geometry
-from wrt.accel.rays import rays_on, vectors
+from wrt.accel.rays import Rays, rays_of, vectors
 from wrt.accel.store import save
-from wrt.accel.structure import Structure, any_hit_kernel, check_options, check_units, closest_hit_kernel
+from wrt.accel.structure import Structure, check_options, check_units
+from wrt.core.checks import shown
 from wrt.core.device import start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
 from wrt.core.memory import require
 from wrt.core.seconds import seconds_without_loads
-from wrt.kernels.query import HitArrays
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 
@@ -37,7 +37,8 @@ class Accelerator(ABC):
     Several threads may ask one structure at a time, and one of them may refit it: docs/acceleration.md, "Several threads".
 
     kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts); for the CPU it may have
-    make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.batches), with stream_block and stream_sizes.
+    make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.batches), with stream_block and stream_sizes;
+    the last of its slots tells whether it met a ray that a query refuses.
     """
 
     name: ClassVar[str]
@@ -185,49 +186,53 @@ class Accelerator(ABC):
                                                 "box test": units.box, "device": str(self.device), **asdict(self.stats)})
 
     def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-                    threads: int | None = None, *, counters: bool = False, trace: bool = False) -> Hits:
+                    threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits | None = None) -> Hits:
         """The closest hit of each ray in the closed segment [t_min, t_max]; at equal t the lowest prim_id.
 
         Closed means that a surface through the origin is hit at t_min = 0; a t_min above 0 leaves it out. origins,
         directions: (N, 3) real numbers, taken as float32; origins up to 1e37, so that differences are finite; directions finite,
         not zero and of any length (where t would be beyond float32, there is no hit); t_min (>= 0), t_max: scalars or (N,).
-        Warp arrays are (N,) vec3, and of their values only t_min and t_max are looked at, on the CPU. threads: 1 or more, or one
-        a core. counters: count what each ray costs (hits.counters); trace: also record what it fetches, which takes a second run.
+        float32 without gaps is read where it is, all else is copied part by part. Warp arrays are (N,) vec3, and of their values
+        only t_min and t_max are looked at, on the CPU. threads: 1 or more, or one a core. counters: count what each ray costs
+        (hits.counters); trace: also record what it fetches, which takes a second run. out: hits of as many rays, whose arrays take
+        the new ones (NumPy's, or Warp's if the rays are; they must not overlap with the rays' own).
 
         Several threads may ask at a time, with or without counters, while another refits. There are no gradients: Warp arrays
-        that require them are refused while a wp.Tape records. Raises InputError that names the argument and what was expected.
+        that require them are refused while a wp.Tape records. Raises InputError that names the argument and what was expected;
+        what `out` holds is lost then.
         """
-        data, threads = self.data, thread_count(threads)  # data once: a refit may replace it meanwhile
-        rays, as_warp = rays_on(self.device, origins, directions, t_min, t_max)
-        n = len(rays.t_min)
-        hits = HitArrays()
-        for field, dtype in (("t", wp.float32), ("u", wp.float32), ("v", wp.float32), ("prim_id", wp.int32)):
-            setattr(hits, field, wp.empty(n, dtype=dtype, device=self.device))
-        inputs, cost = [data, self._surfaces, rays, hits], None
-        if counters or trace:
-            cost = counted(closest_hit_kernel, self.structure, inputs, n, trace, threads)
-        else:
-            self._trace(inputs, n, threads, any_hit=False)
-        t, u, v, prim_id = (array if as_warp else array.numpy() for array in (hits.t, hits.u, hits.v, hits.prim_id))
-        return Hits(t, u, v, prim_id, cost)
+        threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
+        if not (out is None or isinstance(out, Hits)):
+            raise InputError(f"out must be Hits, got {shown(out)}")
+        given = None if out is None else [out.t, out.u, out.v, out.prim_id]
+        t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
+        return Hits(t, u, v, prim_id, _answer(self, rays, arrays, threads, trace if counters or trace else None))
 
     def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-                threads: int | None = None) -> Any:
+                threads: int | None = None, *, out: Any = None) -> Any:
         """Whether each ray hits anything in its segment: (N,) bool, True where closest_hit finds a hit and nowhere else. Arguments
-        as in closest_hit."""
-        data, threads = self.data, thread_count(threads)
-        rays, as_warp = rays_on(self.device, origins, directions, t_min, t_max)
-        occluded = wp.empty(len(rays.t_min), dtype=wp.bool, device=self.device)
-        self._trace([data, self._surfaces, rays, occluded], len(occluded), threads, any_hit=True)
-        return occluded if as_warp else occluded.numpy()
+        as in closest_hit; out: an array that takes the answer."""
+        threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
+        given = None if out is None else [out]
+        arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
+        _answer(self, rays, arrays, threads)
+        return arrays[0]
 
-    def _trace(self, inputs: list[Any], n: int, threads: int, any_hit: bool) -> None:
-        """By the kernel for many rays at a time where there is one."""
-        stream = None if self.device.is_cuda else stream_kernel(self.structure, any_hit)
-        if stream is None:
-            launch((any_hit_kernel if any_hit else closest_hit_kernel)(self.structure), inputs, n, self.device, threads)
+
+def _answer(accel: Accelerator, rays: Rays, out: list[Any], threads: int, counting: bool | None = None) -> Counters | None:
+    """Write the answers to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a trace or without; None: not at all."""
+
+    def trace(structure: Structure, data: Any) -> None:
+        if accel.device.is_cuda:
+            trace_on_gpu(structure, data, accel._surfaces, rays, out, accel.device)
         else:
-            launch_stream(self.structure, stream, inputs, n, threads)
+            tracer(structure, len(out) == 1).trace(data, accel._surfaces, rays, out, threads)
+
+    data = accel.data  # once: a refit may replace it meanwhile
+    if counting is None:
+        trace(accel.structure, data)
+        return None
+    return counted(trace, accel.structure, data, len(out[0]), accel.device, counting)
 
 
 def array_bytes(data: Any) -> int:

@@ -6,76 +6,151 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import numpy as np
 import warp as wp
+from warp._src.types import array_t  # what a kernel gets for an array; a Warp array takes ten times as long to make
 
-from wrt.accel.structure import Structure
-from wrt.core.device import empty_aligned, load_kernel, made_once, run_all, upload
+from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES
+from wrt.accel.rays import Rays, rays_on
+from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
+from wrt.core.arrays import to_warp
+from wrt.core.device import empty_aligned, load_kernel, made_once, run_all
+from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.structs import Surfaces
 from wrt.kernels.wide.packets import Scratch
 
-# Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Fewer than
-# FEWEST in all are not divided.
-FEWEST, SOME, MOST = 8192, 32768, 131072
+# Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Up to FEWEST
+# are not divided. A thread takes one part after another, about PARTS of them, so that all threads end at about the same time.
+FEWEST, MOST, PARTS = 8192, 131072, 8
 RAYS_PER_LAUNCH = 16384  # one at a time
-
-
-@made_once
-def stream_kernel(structure: Structure, any_hit: bool) -> Any:
-    """The kernel for a structure, or None where it has no other than the one for one ray."""
-    make = getattr(structure.accel.kernels, "make_stream", None)
-    return make(structure.units, any_hit) if make else None
-
-
-_free: list[Scratch] = []  # a new one costs as much as a thousand rays
-
-
-def borrow(sizes: tuple[int, int, int]) -> Scratch:
-    """What one launch works in; to be put back into _free. One size serves all: there is one kind of stream."""
-    try:
-        return _free.pop()
-    except IndexError:
-        out = Scratch()
-        # Rows of lanes would else lie in two cache lines each.
-        out.packets, out.stacks, out.slots = (upload(empty_aligned((size,), wp.dtype_to_numpy(dtype)), dtype, wp.get_device("cpu"))
-                                              for size, dtype in zip(sizes, (wp.float32, wp.uint32, wp.int32), strict=True))
-        return out
+SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
 
 
 def rays_per_launch(n: int, threads: int, block: int) -> int:
-    """A multiple of `block`, so that all threads have as many launches."""
-    if threads == 1 or n <= FEWEST:
-        return MOST
-    launches = threads * max(round(n / (threads * SOME)), 1)
-    return -(-n // (launches * block)) * block
+    """A multiple of `block`."""
+    part = MOST if threads == 1 else max(FEWEST, min(n // (threads * PARTS), MOST))
+    return -(-part // block) * block
 
 
-def launch_stream(structure: Structure, kernel: Any, inputs: list[Any], n: int, threads: int) -> None:
-    """Trace rays 0 .. n - 1 with a kernel of stream_kernel. inputs: its first ones, up to `out`."""
-    module = structure.accel.kernels
-    load_kernel(kernel, wp.get_device("cpu"))
-    part = rays_per_launch(n, threads, module.stream_block)
-    firsts = range(0, n, part)
-    # One for each job that runs at a time; other calls, on other threads, borrow others.
-    mine = [borrow(module.stream_sizes) for _ in range(min(threads, len(firsts)))]
+class Tracer:
+    """What answers queries on the CPU: the kernel for a structure, and workers that are kept from call to call."""
 
-    def job(first: int) -> None:
-        end = min(first + part, n)
-        scratch = mine.pop()
-        wp.launch(kernel, dim=-(-(end - first) // module.stream_block), inputs=[*inputs, scratch, first, end], device="cpu",
-                  record_tape=False)
-        mine.append(scratch)
+    def __init__(self, structure: Structure, any_hit: bool) -> None:
+        kernels = structure.accel.kernels
+        # A kernel for many rays at a time, or None where there is but the one for one ray.
+        self.stream = kernels.make_stream(structure.units, any_hit) if hasattr(kernels, "make_stream") else None
+        self.kernel = self.stream or (any_hit_kernel if any_hit else closest_hit_kernel)(structure)
+        self.block = kernels.stream_block if self.stream else 1
+        self.sizes = kernels.stream_sizes if self.stream else ()
+        self.types = ANY_HIT_TYPES if any_hit else HIT_TYPES
+        self.inputs = structure.struct(), Surfaces(), RayArrays(), None if any_hit else HitArrays()
+        self.free: list[Worker] = []
 
-    run_all([partial(job, first) for first in firsts], threads)
-    _free.extend(mine)  # not after an error: a thread may still be at work in one
+    def trace(self, data: Any, surfaces: Any, rays: Rays, out: list[Any], threads: int) -> None:
+        """Write the answers to arrays without gaps. Raises InputError for rays that are refused; by then they have been traced, and
+        the answers are nothing to go by."""
+        load_kernel(self.kernel, wp.get_device("cpu"))
+        if not self.stream:  # which says itself whether it met such
+            rays = rays.checked()
+        given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in out]
+        n = len(given[0])
+        packed = pack(given, answers) if SMALL < n < 1 << 31 and all(map(readable, given)) else None  # a kernel counts in int32
+        part = FEWEST if not packed else rays_per_launch(n, threads, self.block) if self.stream else RAYS_PER_LAUNCH
+        refused: list[bool] = []
+
+        def job(first: int) -> None:
+            worker, end = self.borrow(), min(first + part, n)
+            if packed:
+                worker.launch(data, surfaces, packed, first, end)
+            else:
+                copy(given, slice(first, end), worker.given, slice(end - first))
+                worker.launch(data, surfaces, worker.packed, 0, end - first)
+                copy(worker.answers, slice(end - first), answers, slice(first, end))
+            refused.append(bool(worker.slots[-1]))
+            self.free.append(worker)  # not after an error: a thread may still be at work in it
+
+        run_all([partial(job, first) for first in range(0, n, part)], threads)
+        if any(refused):
+            rays.checked()
+
+    def borrow(self) -> Worker:
+        """For one launch."""
+        try:
+            return self.free.pop()
+        except IndexError:
+            return Worker(self)
 
 
-def launch(kernel: Any, inputs: list[Any], n: int, device: Any, threads: int) -> None:
-    """Trace rays 0 .. n - 1, one at a time. inputs: the kernel's first ones, up to where the hits go."""
-    if device.is_cuda:
-        wp.launch(kernel, dim=n, inputs=[*inputs, 0], device=device, record_tape=False)
-        return
-    load_kernel(kernel, device)
+tracer = made_once(Tracer)
 
-    def job(first: int) -> None:
-        wp.launch(kernel, dim=min(RAYS_PER_LAUNCH, n - first), inputs=[*inputs, first], device=device, record_tape=False)
 
-    run_all([partial(job, first) for first in range(0, n, RAYS_PER_LAUNCH)], threads)
+class Worker:
+    """A launch that is recorded once, what it works in, and arrays for rays and answers that cannot be used where they are. For one
+    thread at a time."""
+
+    def __init__(self, tracer: Tracer) -> None:
+        self.given = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
+        self.answers = [np.empty(FEWEST, dtype) for dtype in tracer.types.values()]
+        self.packed = pack(self.given, self.answers)
+        self.block, self.scratch = tracer.block, Scratch()
+        # Aligned: rows of lanes would else lie in two cache lines each.
+        types = np.float32, np.uint32, np.int32
+        memory = [empty_aligned((size,), dtype) for size, dtype in zip(tracer.sizes, types, strict=False)]
+        for name, array in zip(Scratch.vars, memory, strict=False):
+            setattr(self.scratch, name, to_warp(array))
+        self.slots = memory[-1] if memory else np.zeros(1, np.int32)
+        own = [self.scratch, 0] if tracer.stream else []
+        self.command = wp.launch(tracer.kernel, dim=1, inputs=[*tracer.inputs, *own, 0], device="cpu", record_cmd=True)
+        self.inputs: list[Any] = [None] * (len(own) + 5)  # as they were last
+        self.own = [self.scratch.__ctype__()] if tracer.stream else []
+
+    def launch(self, data: Any, surfaces: Any, packed: tuple[Any, Any], first: int, end: int) -> None:
+        """Trace rays first .. end - 1. The last of `slots` tells whether the kernel met one that is refused."""
+        inputs = [data.__ctype__(), surfaces.__ctype__(), *packed, *self.own, first, end]
+        for i, last in enumerate(self.inputs):  # the kernel for one ray has no `end`
+            if inputs[i] is not last:
+                self.command.set_param_at_index_from_ctype(i, inputs[i])
+                self.inputs[i] = inputs[i]
+        threads = -(-(end - first) // self.block)
+        if threads != self.command.bounds.size:
+            self.command.set_dim(threads)
+        self.command.launch()
+
+
+def readable(array: np.ndarray) -> bool:
+    """Whether a kernel can read it where it is."""
+    return array.dtype == np.float32 and array.flags.aligned and (array.flags.c_contiguous or array.strides == (0,))
+
+
+def pack(given: list[np.ndarray], answers: list[np.ndarray]) -> tuple[Any, Any]:
+    """Rays and answers as kernels get them: RayArrays, and HitArrays or an array of bool. Nothing keeps the memory."""
+    rays, hits = RayArrays().__ctype__(), HitArrays().__ctype__()
+    for struct, names, arrays in ((rays, RayArrays.vars, given), (hits, HitArrays.vars, answers)):
+        for name, array in zip(names, arrays, strict=False):
+            setattr(struct, name, array_t(array.ctypes.data, ndim=1, shape=array.shape, strides=array.strides))
+    return rays, hits if len(answers) > 1 else hits.t
+
+
+def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: slice) -> None:
+    """Copy rows of arrays; what is beyond float32 becomes infinite."""
+    for source, target in zip(sources, targets, strict=True):
+        if source.dtype == target.dtype:
+            target[to] = source[rows]
+        else:
+            with np.errstate(over="ignore"):
+                target[to] = source[rows]
+
+
+def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out: list[Any], device: Any) -> None:
+    """As Tracer.trace."""
+    there = [array if isinstance(array, wp.array) else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device)
+             for array in out]
+    hits = HitArrays()
+    for name, array in zip(HitArrays.vars, there, strict=False) if len(out) > 1 else ():
+        setattr(hits, name, array)
+    kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
+    inputs = [data, surfaces, rays_on(device, rays), hits if len(out) > 1 else there[0], 0]
+    wp.launch(kernel, dim=len(out[0]), inputs=inputs, device=device, record_tape=False)
+    for array, found in zip(out, there, strict=True):
+        if array is not found:
+            array[:] = found.numpy()

@@ -9,18 +9,16 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.answers import Counters
-from wrt.accel.batches import launch
 from wrt.accel.structure import Structure
 from wrt.core.device import upload
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts
 
 
-def counted(make_kernel: Callable[[Structure], Any], structure: Structure, inputs: list[Any], n: int, trace: bool,
-            threads: int) -> Counters:
-    """Trace rays 0 .. n - 1 and count. make_kernel: of the kernel for a structure; inputs: as of `launch`, the structure's data
-    first. With a trace it runs twice: only then is it known how long the trace of each ray is."""
-    data, device = inputs[0], inputs[2].t_min.device
-    kernel = make_kernel(structure._replace(units=structure.units._replace(counters=True)))
+def counted(trace: Callable[[Structure, Any], None], structure: Structure, data: Any, n: int, device: Any,
+            fetches_too: bool) -> Counters:
+    """Trace n rays and count. trace: does so with the kernel for a structure, and its data; it is called twice where fetches are
+    asked for: only then is it known how many each ray has."""
+    counting = structure._replace(units=structure.units._replace(counters=True))
 
     def run(first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # The struct of the counting kernel is the same, but what it records is this call's alone.
@@ -28,12 +26,12 @@ def counted(make_kernel: Callable[[Structure], Any], structure: Structure, input
         own.recorder.counts = wp.zeros(n, dtype=Counts, device=device)
         own.recorder.first = upload(first, wp.int64, device)
         own.recorder.fetches = wp.zeros(int(first[-1]) if len(first) else 0, dtype=wp.int64, device=device)
-        launch(kernel, [own, *inputs[1:]], n, device, threads)
+        trace(counting, own)
         return own.recorder.counts.numpy(), own.recorder.fetches.numpy()
 
     counts, fetches = run(np.zeros(0, np.int64))
     first = np.zeros(n + 1, np.int64)
-    if trace:
+    if fetches_too:
         np.cumsum(counts["nodes"].astype(np.int64) + counts["primitives"], out=first[1:])
         counts, fetches = run(first)
     return Counters(counts, first, fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))

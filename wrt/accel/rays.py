@@ -1,69 +1,112 @@
-"""Rays of a query: checked, on the device, in the form that kernels take."""
+"""Rays of a query: what somebody gives, and what of it is refused."""
 
 from __future__ import annotations
 
-from typing import Any
+from ctypes import c_float
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
-from wrt.core.arrays import check_no_gradients, real_numbers, taken
+from wrt.core.arrays import check_no_gradients, float32, real_numbers, taken
 from wrt.core.device import upload
 from wrt.core.errors import InputError
-from wrt.kernels.query import RayArrays
+from wrt.kernels.query import FARTHEST, RayArrays
 
-FARTHEST = 1e37  # of an origin's coordinates: differences of such are finite
+LOWEST = {"t_min": 0.0, "t_max": -np.inf}
 
 
-def rays_on(device: Any, origins: Any, directions: Any, t_min: Any, t_max: Any) -> tuple[RayArrays, bool]:
-    """The arguments of Accelerator.closest_hit as arrays on a device, and whether they were Warp arrays. Raises InputError that
-    names the argument."""
+class Rays(NamedTuple):
+    """What somebody gives as rays: NumPy arrays of any real numbers and with any gaps, (N, 3) and (N,) (a stride of 0: one number
+    for all), or Warp's of vec3 and float32. Their shapes are right, their numbers anything."""
+
+    origins: Any
+    directions: Any
+    t_min: Any
+    t_max: Any
+
+    @property
+    def as_warp(self) -> bool:
+        return isinstance(self.origins, wp.array)
+
+    def checked(self) -> Rays:
+        """The same as float32 without gaps. Raises InputError that names the first that kernels must not get; of Warp arrays, only
+        t_min and t_max on the CPU are looked at."""
+        if self.as_warp:
+            origins, directions = (a if a.is_contiguous else a.contiguous() for a in (self.origins, self.directions))
+        else:
+            origins, directions = vectors(self.origins, "origins", FARTHEST), vectors(self.directions, "directions")
+            _check_not_zero(directions)
+        return Rays(origins, directions, _checked_ends(self.t_min, "t_min"), _checked_ends(self.t_max, "t_max"))
+
+
+def rays_of(origins: Any, directions: Any, t_min: Any, t_max: Any) -> Rays:
+    """The arguments of Accelerator.closest_hit, whose shapes and kinds are checked. Raises InputError that names the argument."""
     check_no_gradients(origins=origins, directions=directions, t_min=t_min, t_max=t_max)
     origins, directions = taken(origins, "origins"), taken(directions, "directions")
-    as_warp = isinstance(origins, wp.array) or isinstance(directions, wp.array)
-    rays = RayArrays()
-    if as_warp:
+    if isinstance(origins, wp.array) or isinstance(directions, wp.array):
         if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in (origins, directions)):
             raise InputError("origins and directions must both be Warp arrays of vec3, or both NumPy arrays")
-        n = len(origins)
-        rays.origin, rays.direction = (a if a.is_contiguous else a.contiguous() for a in (origins, directions))
     else:
-        origins, directions = vectors(origins, "origins", FARTHEST), vectors(directions, "directions")
-        n = len(origins)
-        _check_not_zero(directions)
-        rays.origin = upload(origins, wp.vec3, device)
-        rays.direction = upload(directions, wp.vec3, device)
+        origins, directions = _rows(origins, "origins"), _rows(directions, "directions")
+    n = len(origins)
     if len(directions) != n:
         raise InputError(f"directions must have as many rows as origins ({n}), got {len(directions)}")
-    rays.t_min = _segment_end(device, t_min, n, "t_min", low=0.0)
-    rays.t_max = _segment_end(device, t_max, n, "t_max", low=-np.inf)
-    return rays, as_warp
+    return Rays(origins, directions, _segment_ends(t_min, n, "t_min"), _segment_ends(t_max, n, "t_max"))
 
 
-def _segment_end(device: Any, value: Any, n: int, name: str, low: float) -> Any:
+def rays_on(device: Any, rays: Rays) -> RayArrays:
+    """Checked, as Warp arrays on a device."""
+    out = RayArrays()
+    for name, array, dtype in zip(RayArrays.vars, rays.checked(), (wp.vec3, wp.vec3, wp.float32, wp.float32), strict=True):
+        setattr(out, name, array if isinstance(array, wp.array) else upload(array, dtype, device))
+    return out
+
+
+def _segment_ends(value: Any, n: int, name: str) -> Any:
     if isinstance(value, wp.array):
         if value.dtype != wp.float32 or value.shape != (n,):
             raise InputError(f"{name} must be ({n},) float32, got {value.shape} {value.dtype.__name__}")
-        if value.device.is_cpu:
-            _check_ends(value.numpy(), name, low)
-        return value if value.is_contiguous else value.contiguous()
-    array = real_numbers(value, name, f"a number or ({n},)")
-    if array.ndim > 1 or (array.ndim == 1 and len(array) != n):
-        raise InputError(f"{name} must be a number or ({n},), got {array.shape}")
-    _check_ends(array, name, low)
-    return upload(np.broadcast_to(array, (n,)).copy(), wp.float32, device)
+        return value
+    if type(value) is not float:  # most are
+        array = real_numbers(value, name, f"a number or ({n},)")
+        if array.ndim > 1 or (array.ndim == 1 and len(array) != n):
+            raise InputError(f"{name} must be a number or ({n},), got {array.shape}")
+        if array.ndim == 1:
+            return array
+        value = float(float32(array))
+    number = c_float(value)
+    _check_ends(number.value, name)
+    return np.ndarray((n,), np.float32, number, strides=(0,))  # type: ignore[arg-type]
 
 
-def _check_ends(array: np.ndarray, name: str, low: float) -> None:
-    if not array.min(initial=np.inf) >= low:  # the least of what has a NaN is NaN
-        raise InputError(f"{name} must not be NaN" + (f" or below {low:g}" if low > -np.inf else ""))
+def _checked_ends(array: Any, name: str) -> Any:
+    if isinstance(array, wp.array):
+        array = array if array.is_contiguous else array.contiguous()
+        if array.device.is_cuda:
+            return array
+    elif array.strides != (0,):
+        array = float32(array)
+    _check_ends(np.asarray(array).min(initial=np.inf), name)
+    return array
+
+
+def _check_ends(least: Any, name: str) -> None:
+    """least: of all numbers; NaN where there is one."""
+    if not least >= LOWEST[name]:
+        raise InputError(f"{name} must not be NaN" + (" or below 0" if name == "t_min" else ""))
+
+
+def _rows(value: Any, name: str) -> np.ndarray:
+    array = real_numbers(value, name, "(N, 3)")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"{name} must be (N, 3), got {array.shape}")
+    return array
 
 
 def vectors(value: Any, name: str, most: float = float(np.finfo(np.float32).max)) -> np.ndarray:
     """(N, 3) float32, no component beyond `most`."""
-    array = real_numbers(value, name, "(N, 3)")
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{name} must be (N, 3), got {array.shape}")
+    array = float32(_rows(value, name))
     numbers = array.reshape(-1)
     if not (numbers.min(initial=0.0) >= -most and numbers.max(initial=0.0) <= most):  # False for NaN
         for good, what in ((np.isfinite(array), "finite"), (np.abs(array) <= most, f"within {most:g}")):

@@ -32,26 +32,29 @@ def to_warp(array: Any, dtype: Any = None) -> Any:
 
 
 def real_numbers(value: Any, name: str, shape: str) -> np.ndarray:
-    """A contiguous float32 array of what somebody gives as real numbers: arrays of integers or floats of any size, lists, scalars;
-    what is beyond float32 becomes infinite. Raises InputError that calls it `name`, and says that `shape` was expected."""
+    """An array of what somebody gives as real numbers: arrays of integers or floats of any size as they are, lists, scalars;
+    objects as float32. Raises InputError that calls it `name`, and says that `shape` was expected."""
     if isinstance(value, np.ma.MaskedArray):
         raise InputError(f"{name} must not be a masked array: its mask would be ignored; leave masked rows out, or fill them")
     try:
         array = np.asarray(value)
-        if array.dtype == np.float32:
-            return np.asarray(array, order="C")
         if array.dtype.kind in REAL:
-            with np.errstate(over="ignore"):
-                return np.asarray(array, dtype=np.float32, order="C")
+            return float32(array) if array.dtype.kind == "O" else array
     except (TypeError, ValueError, OverflowError):
         pass
     raise InputError(f"{name} must be {shape} of real numbers, got {shown(value)}")
 
 
+def float32(array: np.ndarray) -> np.ndarray:
+    """Aligned and without gaps, the same array if it is so; what is beyond float32 becomes infinite."""
+    with np.errstate(over="ignore"):
+        return np.require(array, np.float32, ["C", "A"])
+
+
 def check_no_gradients(**arrays: Any) -> None:
     """Raise InputError that names the Warp array of which a tape would wait for gradients: there are none."""
-    for name, array in arrays.items():
-        if isinstance(array, wp.array) and array.requires_grad and context.runtime.tape is not None:
+    for name, array in arrays.items() if context.runtime.tape is not None else ():
+        if isinstance(array, wp.array) and array.requires_grad:
             raise InputError(f"{name} requires gradients and a wp.Tape is recording, but wrt has no gradients: ask outside of the"
                              f" tape, or give wp.clone({name}, requires_grad=False)")
 

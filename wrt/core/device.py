@@ -10,6 +10,7 @@ import shutil
 import sys
 import tempfile
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -29,6 +30,7 @@ from wrt.core.memory import available
 from wrt.core.seconds import loading
 from wrt.core.write_file import compiling
 
+MOST_HELPERS = 1 << 10
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
 
 wp.config.log_level = wp.LOG_WARNING if hasattr(wp, "LOG_WARNING") else 30
@@ -220,16 +222,46 @@ def thread_count(threads: int | None) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
+@cache
+def _helpers(process: int) -> ThreadPoolExecutor:
+    """Threads that wait for the next call of run_all: to start one takes as long as to trace thousands of rays. A process that was
+    forked has none of its parent's."""
+    return ThreadPoolExecutor(MOST_HELPERS, "wrt")
+
+
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
-    """Run all tasks on so many threads; the first error is raised after those that run have ended."""
+    """Run all tasks on so many threads, this one among them; after the first error none is begun, and it is raised when those
+    that run have ended."""
     jobs = list(tasks)
     if threads == 1 or len(jobs) <= 1:
         for job in jobs:
             job()
         return
-    with ThreadPoolExecutor(threads) as pool:
-        for future in [pool.submit(job) for job in jobs]:
-            future.result()
+    left = deque(enumerate(jobs))
+    errors: dict[int, BaseException] = {}
+
+    def work() -> None:
+        while True:
+            try:
+                i, job = left.popleft()
+            except IndexError:
+                return
+            try:
+                job()
+            except BaseException as error:
+                errors[i] = error
+                left.clear()
+
+    helpers: list[Future[None]] = []
+    try:
+        for _ in range(min(threads, len(jobs)) - 1):
+            helpers.append(_helpers(os.getpid()).submit(work))
+        work()
+    finally:
+        left.clear()
+        wait([helper for helper in helpers if not helper.cancel()])  # one that has not begun is not needed any more
+    if errors:
+        raise errors.pop(min(errors))
 
 
 def launch(kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -> None:

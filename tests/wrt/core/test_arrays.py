@@ -10,7 +10,7 @@ import warp as wp
 
 import wrt
 from wrt.accel.answers import Hits
-from wrt.accel.rays import rays_on
+from wrt.accel.rays import rays_of, rays_on
 from wrt.core.arrays import to_numpy, to_warp
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
@@ -88,7 +88,7 @@ def test_rays_are_not_copied() -> None:
     accel = wrt.build(box())
     for origins, directions in ((ORIGINS, DIRECTIONS), (Tensor(ORIGINS), Tensor(DIRECTIONS)),
                                 (to_warp(ORIGINS, wp.vec3), to_warp(DIRECTIONS, wp.vec3))):
-        rays, _ = rays_on(accel.device, origins, directions, 0.0, np.inf)
+        rays = rays_on(accel.device, rays_of(origins, directions, 0.0, np.inf))
         assert (address(rays.origin), address(rays.direction)) == (address(ORIGINS), address(DIRECTIONS))
 
 

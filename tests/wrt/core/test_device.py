@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -85,6 +86,49 @@ def test_run_all_runs_each_task_once_and_raises_the_first_error(threads: int) ->
     with pytest.raises(RuntimeError, match="task 5"):
         run_all([lambda i=i: task(i) for i in range(5, 10)], threads)
     run_all([], threads)
+
+
+def test_run_all_takes_part_and_begins_nothing_after_an_error() -> None:
+    begun: list[int] = []
+    seen: set[int] = set()
+    both = threading.Barrier(2)
+
+    def task(i: int) -> None:
+        begun.append(i)
+        seen.add(threading.get_ident())
+        if i < 2:
+            both.wait(60.0)
+            raise KeyError(i)
+        time.sleep(0.01)
+
+    with pytest.raises(KeyError, match="0"):
+        run_all([lambda i=i: task(i) for i in range(1000)], 2)
+    assert len(begun) < 10 and threading.get_ident() in seen and len(seen) == 2
+
+
+def test_run_all_within_run_all() -> None:
+    done: list[int] = []
+    for _ in range(3):
+        run_all([lambda: run_all([lambda: done.append(1)] * 5, 3)] * 20, 4)
+    assert len(done) == 300
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_run_all_has_threads_of_its_own_after_a_fork() -> None:
+    code = """if True:
+        import os, threading
+        from wrt.core.device import run_all
+        def threads():
+            seen, both = set(), threading.Barrier(2)
+            run_all([lambda: (both.wait(60.0), seen.add(threading.get_ident()))] * 2, 2)
+            return len(seen)
+        assert threads() == 2
+        child = os.fork()
+        if child == 0:
+            os._exit(threads())
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 2
+    """
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
 
 
 @pytest.mark.parametrize(("array", "dtype", "shape"), [

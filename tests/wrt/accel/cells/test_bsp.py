@@ -18,7 +18,7 @@ from wrt.accel.build import build, build_cached
 from wrt.accel.cells.bsp import Bsp
 from wrt.accel.counting import counted
 from wrt.accel.geometry import Geometry
-from wrt.accel.rays import rays_on
+from wrt.accel.rays import rays_of, rays_on
 from wrt.core.errors import InputError
 from wrt.kernels.query import HitArrays, make_closest_hit_kernel
 from wrt.kernels.structs import Surfaces
@@ -241,12 +241,16 @@ def test_random_lines_cost_what_the_heuristic_says(kind: str, options: dict[str,
     rng = np.random.default_rng(5)
     tree = build(HARD[kind](rng), "bsp", **options)
     lo, hi = (np.array(tree.built.arrays[name], np.float64) for name in ("lo", "hi"))
-    rays, _ = rays_on(tree.device, *lines_through(lo, hi, rng, 40_000), 0.0, np.inf)
+    rays = rays_on(tree.device, rays_of(*lines_through(lo, hi, rng, 40_000), 0.0, np.inf))
     hits = HitArrays()
     hits.t, hits.u, hits.v = (wp.zeros(len(rays.t_min), dtype=wp.float32, device="cpu") for _ in range(3))
     hits.prim_id = wp.zeros(len(rays.t_min), dtype=wp.int32, device="cpu")
-    inputs = [tree.data, tree._surfaces, rays, hits]
-    counts = counted(lambda structure: refusing_kernel(), tree.structure, inputs, len(rays.t_min), trace=False, threads=1).counts
+    n, refusing = len(rays.t_min), refusing_kernel()
+
+    def trace(structure, data):
+        wp.launch(refusing, dim=n, inputs=[data, tree._surfaces, rays, hits, 0], device="cpu")
+
+    counts = counted(trace, tree.structure, tree.data, n, tree.device, False).counts
     steps = counts["nodes"] + counts["primitives"]
     assert abs(steps.mean() - tree.stats.sah_cost) < 3.0 * steps.std() / np.sqrt(len(steps))
 

@@ -1,0 +1,291 @@
+"""Calls with NumPy arrays: what is read in place, what is converted, where the answers go, and what a call costs beside tracing."""
+
+from __future__ import annotations
+
+import threading
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from wrt.accel.answers import Hits
+from wrt.accel.base import Accelerator
+from wrt.accel.batches import FEWEST
+from wrt.accel.build import build
+from wrt.core.arrays import to_warp
+from wrt.core.errors import InputError
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import icosphere
+
+NAMES = "bvh8", "bvh2"  # with and without a kernel for many rays at a time
+MANY = 2 * FEWEST + 77
+FIELDS = "t", "u", "v", "prim_id"
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def ball(request: pytest.FixtureRequest) -> Accelerator:
+    return build(icosphere(3), request.param)
+
+
+def some_rays(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    origins = (2.0 * rng.normal(size=(n, 3))).astype(np.float32)
+    return origins, (0.5 * rng.normal(size=(n, 3)) - origins).astype(np.float32)
+
+
+def bits(hits: Hits) -> list[bytes]:
+    return [np.asarray(getattr(hits, name)).tobytes() for name in FIELDS]
+
+
+def unaligned(a: np.ndarray) -> np.ndarray:
+    memory = np.zeros(a.nbytes + 1, np.uint8)
+    memory[1:] = np.frombuffer(a.tobytes(), np.uint8)
+    return memory[1:].view(a.dtype).reshape(a.shape)
+
+
+def frozen(a: np.ndarray) -> np.ndarray:
+    a = a.copy()
+    a.flags.writeable = False
+    return a
+
+
+FORMS = {
+    "float64": lambda a: a.astype(np.float64), "big-endian": lambda a: a.astype(">f4"), "fortran": np.asfortranarray,
+    "strided": lambda a: np.repeat(a, 2, axis=0)[::2], "reversed": lambda a: a[::-1].copy()[::-1], "unaligned": unaligned,
+    "columns": lambda a: np.concatenate([a, a], axis=-1)[..., : a.shape[-1]], "frozen": frozen, "list": lambda a: a.tolist(),
+}
+
+
+@pytest.mark.parametrize("n", [3, FEWEST, MANY])
+@pytest.mark.parametrize("form", FORMS)
+def test_arrays_of_any_form_give_the_same_bits(ball: Accelerator, form: str, n: int) -> None:
+    origins, directions = some_rays(n)
+    t_min, t_max = np.float32(0.05 * np.arange(n) / n), np.float32(0.2 + np.arange(n) % 3)
+    expected, occluded = ball.closest_hit(origins, directions, t_min, t_max), ball.any_hit(origins, directions, t_min, t_max)
+    assert 0 < (expected.prim_id >= 0).sum() < n and np.array_equal(occluded, expected.prim_id >= 0)
+    given = [FORMS[form](array) for array in (origins, directions, t_min, t_max)]
+    for threads in (1, 2):
+        assert bits(ball.closest_hit(*given, threads=threads)) == bits(expected)
+        assert np.array_equal(ball.any_hit(*given, threads=threads), occluded)
+    assert bits(ball.closest_hit(origins, given[1], t_min, given[3])) == bits(expected)  # mixed
+
+
+@pytest.mark.parametrize("form", ["float64", "fortran", "unaligned"])
+def test_counters_are_those_of_the_same_ray(ball: Accelerator, form: str) -> None:
+    rays = some_rays(MANY)
+    expected = ball.closest_hit(*rays, trace=True).counters
+    found = ball.closest_hit(*map(FORMS[form], rays), trace=True, threads=2).counters
+    for name in ("counts", "first", "address", "size"):
+        assert np.array_equal(getattr(found, name), getattr(expected, name))
+    assert len(np.unique(expected.counts["nodes"])) > 1  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("n", [5, MANY])
+def test_one_number_for_all_segments_is_as_an_array_of_it(ball: Accelerator, n: int) -> None:
+    origins, directions = some_rays(n)
+    for t_min, t_max in ((0.0, np.inf), (0.25, 1.0), (np.float32(0.5), 2), (0, np.float64(1e300)), (-1e-60, -1.0)):
+        ends = [np.full(n, end, np.float64) for end in (t_min, t_max)]
+        with np.errstate(over="ignore"):
+            asked = ball.closest_hit(origins, directions, *ends)
+        assert bits(ball.closest_hit(origins, directions, t_min, t_max)) == bits(asked)
+        on_warp = ball.closest_hit(to_warp(origins, wp.vec3), to_warp(directions, wp.vec3), t_min, t_max)
+        assert isinstance(on_warp.t, wp.array) and bits(on_warp) == bits(asked)
+
+
+# --- where the answers go ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("as_warp", [False, True])
+@pytest.mark.parametrize("n", [0, 1, 1000, MANY])
+def test_answers_go_where_the_caller_says(ball: Accelerator, n: int, as_warp: bool) -> None:
+    rays: tuple[Any, ...] = some_rays(n)
+    expected, dark = ball.closest_hit(*rays, threads=1), ball.any_hit(*rays)
+    room: list[Any] = [np.full(n, 7, np.int32 if name == "prim_id" else np.float32) for name in FIELDS] + [np.ones(n, bool)]
+    if as_warp:
+        rays, room = tuple(to_warp(a, wp.vec3) for a in rays), [to_warp(a) for a in room]
+    out = Hits(*room[:4])
+    for threads in (1, 2):
+        hits = ball.closest_hit(*rays, threads=threads, out=out)
+        assert all(getattr(hits, name) is array for name, array in zip(FIELDS, room, strict=False))
+        assert bits(hits) == bits(expected)
+        assert ball.any_hit(*rays, threads=threads, out=room[4]) is room[4] and np.array_equal(np.asarray(room[4]), dark)
+    counted = ball.closest_hit(*rays, counters=True, out=out)
+    assert bits(counted) == bits(expected) and counted.t is room[0] and len(counted.counters.counts) == n  # type: ignore[union-attr]
+    assert out.counters is None
+
+
+@pytest.mark.parametrize(("field", "array", "message"), [
+    ("t", np.zeros(4, np.float32), r"out.t must be a NumPy array \(3,\) of float32, writeable and without gaps, got an array"),
+    ("t", np.zeros(3), "out.t must be .* of float32.*, got .* of float64"),
+    ("u", np.zeros((3, 1), np.float32), r"out.u must be .* \(3,\)"), ("v", np.zeros(6, np.float32)[::2], "out.v must be .*gaps"),
+    ("v", frozen(np.zeros(3, np.float32)), "out.v must be .*writeable"), ("prim_id", np.zeros(3, np.int64), "out.prim_id .* int32"),
+    ("prim_id", [0, 0, 0], "out.prim_id must be a NumPy array"), ("t", None, "out.t must be a NumPy array"),
+    ("t", "warp", r"out.t must be a NumPy array \(3,\) of float32.*, got"),
+])
+def test_room_that_does_not_fit_is_named(ball: Accelerator, field: str, array: Any, message: str) -> None:
+    rays = some_rays(3)
+    room = {name: np.zeros(3, np.int32 if name == "prim_id" else np.float32) for name in FIELDS}
+    room[field] = wp.zeros(3, dtype=wp.float32, device="cpu") if isinstance(array, str) else array  # type: ignore[assignment]
+    with pytest.raises(InputError, match=message):
+        ball.closest_hit(*rays, out=Hits(**room))
+
+
+def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
+    rays = some_rays(3)
+    on_warp = tuple(to_warp(a, wp.vec3) for a in rays)
+    with pytest.raises(InputError, match="out must be Hits, got an array"):
+        ball.closest_hit(*rays, out=np.zeros(3))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"out must be a NumPy array \(3,\) of bool.*, got an array \(3,\) of float32"):
+        ball.any_hit(*rays, out=np.zeros(3, np.float32))
+    with pytest.raises(InputError, match=r"out must be a Warp array \(3,\) of bool, on cpu, without gaps, got an array"):
+        ball.any_hit(*on_warp, out=np.zeros(3, bool))
+    for wrong in (wp.zeros(4, dtype=wp.bool, device="cpu"), wp.zeros(3, dtype=wp.int32, device="cpu"),
+                  wp.zeros(6, dtype=wp.bool, device="cpu")[::2]):
+        with pytest.raises(InputError, match=r"out must be a Warp array \(3,\) of bool"):
+            ball.any_hit(*on_warp, out=wrong)
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("form", ["as it is", "float64", "fortran"])
+@pytest.mark.parametrize("n", [100, MANY])
+def test_the_first_row_that_is_wrong_is_named(ball: Accelerator, n: int, form: str) -> None:
+    good = *some_rays(n), np.zeros(n, np.float32), np.ones(n, np.float32)
+    last = n - 1
+    for which, value, rows, message in (
+            (0, np.nan, (last,), f"origins must be finite; row {last} is"), (0, -np.inf, (n // 2, last), f"row {n // 2} is"),
+            (0, 1.1e37, (last, 7), r"origins must be within 1e\+37; row 7 is"),
+            (1, np.inf, (0, last), "directions must be finite; row 0 is"),
+            (1, 0.0, (n - 2, last), f"directions must not be zero; row {n - 2} is"),
+            (2, np.nan, (last,), "t_min must not be NaN or below 0"), (2, -1e-30, (last,), "t_min must not be NaN or below 0"),
+            (3, np.nan, (last,), "t_max must not be NaN")):
+        arrays = [array.copy() for array in good]
+        arrays[which][list(rows)] = value
+        if form != "as it is":
+            arrays = [FORMS[form](array) for array in arrays]
+        for threads in (1, 2):
+            for query in (ball.closest_hit, ball.any_hit):
+                with pytest.raises(InputError, match=message):
+                    query(*arrays, threads=threads)  # type: ignore[operator]
+    arrays = [array.copy() for array in good]
+    arrays[3][::2] = -np.inf  # an empty segment is no error
+    assert (ball.closest_hit(*arrays).prim_id[::2] == -1).all()
+
+
+def test_origins_are_named_before_what_follows(ball: Accelerator) -> None:
+    origins, directions = some_rays(MANY)
+    origins[-1], directions[0], directions[1] = np.nan, 0.0, np.inf
+    with pytest.raises(InputError, match=f"origins must be finite; row {MANY - 1} is"):
+        ball.closest_hit(origins, directions, np.full(MANY, -1.0), threads=2)
+    with pytest.raises(InputError, match="directions must be finite; row 1 is"):
+        ball.closest_hit(origins[:-1], directions[:-1], threads=2)
+
+
+def test_numbers_of_warp_arrays_are_not_looked_at_but_for_segments(ball: Accelerator) -> None:
+    origins, directions = some_rays(MANY)
+    expected = ball.closest_hit(origins, directions).prim_id
+    origins[5], directions[6], directions[7] = np.nan, 0.0, np.inf
+    on_warp = to_warp(origins, wp.vec3), to_warp(directions, wp.vec3)
+    found = ball.closest_hit(*on_warp).numpy().prim_id
+    np.testing.assert_array_equal(np.delete(found, [5, 6, 7]), np.delete(expected, [5, 6, 7]))
+    ends = np.ones(MANY, np.float32)
+    ends[-1] = np.nan
+    with pytest.raises(InputError, match="t_max must not be NaN"):
+        ball.closest_hit(*on_warp, t_max=to_warp(ends))
+
+
+def test_a_structure_answers_after_an_error(ball: Accelerator) -> None:
+    origins, directions = some_rays(MANY)
+    expected = bits(ball.closest_hit(origins, directions))
+    wrong = origins.copy()
+    wrong[3] = np.nan
+    for _ in range(3):
+        with pytest.raises(InputError, match="row 3"):
+            ball.closest_hit(wrong, directions, threads=2)
+        assert bits(ball.closest_hit(origins, directions, threads=2)) == expected
+
+
+# --- several structures and threads -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_structures_that_take_turns_answer_for_themselves(name: str) -> None:
+    sphere = icosphere(2)
+    small, large = (build(Mesh(np.float32(size) * sphere.vertices, sphere.faces), name) for size in (0.5, 2.0))
+    origins, directions = np.float32([[0, 0, 5]]), np.float32([[0.01, 0.02, -1]])
+    expected = [accel.closest_hit(origins, directions).t.item() for accel in (small, large)]
+    assert expected[0] > 4.4 > 3.2 > expected[1]
+    for i in (0, 1, 1, 0, 0, 1):
+        assert (small, large)[i].closest_hit(origins, directions).t.item() == expected[i]
+
+
+def test_calls_of_all_sizes_on_several_threads(ball: Accelerator) -> None:
+    asked = [some_rays(n, n) for n in (1, 40, 300, FEWEST + 1, MANY)]
+    asked = [(o.astype(np.float64 if i % 2 else np.float32), d) for i, (o, d) in enumerate(asked)]
+    alone = [bits(ball.closest_hit(*rays, threads=1)) for rays in asked]
+    dark = [ball.any_hit(*rays, threads=1).tobytes() for rays in asked]
+
+    def ask(i: int) -> None:
+        for k in range(i, i + 15):
+            k = k % len(asked)
+            assert bits(ball.closest_hit(*asked[k], threads=1 + i % 3)) == alone[k]
+            assert ball.any_hit(*asked[k]).tobytes() == dark[k]
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(ask, range(8)))
+
+
+# --- what a call costs ------------------------------------------------------------------------------------------------
+
+
+def test_rays_in_place_need_no_memory_of_their_size() -> None:
+    accel = build(icosphere(1), "bvh8")
+    n = 20 * FEWEST
+    origins, directions = some_rays(n)
+    out, dark = accel.closest_hit(origins, directions), accel.any_hit(origins, directions)
+
+    def peak(*arguments: Any, **options: Any) -> float:
+        """Bytes a ray."""
+        accel.closest_hit(*arguments, threads=1, **options)
+        tracemalloc.start()
+        try:
+            accel.closest_hit(*arguments, threads=1, **options)
+            return tracemalloc.get_traced_memory()[1] / n
+        finally:
+            tracemalloc.stop()
+
+    assert peak(origins, directions, 0.0, 5.0, out=out) < 1.0
+    assert 16.0 <= peak(origins, directions) < 17.0  # the answers
+    assert peak(origins.astype(np.float64), np.asfortranarray(directions), np.zeros(n), 5.0, out=out) < 1.0
+    assert dark.nbytes == n
+
+
+def test_a_small_call_wakes_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    accel = build(icosphere(1), "bvh8")
+    rays = some_rays(FEWEST)
+    seen: set[int] = set()
+    launch = wp.Launch.launch
+    monkeypatch.setattr(wp.Launch, "launch", lambda self, *a: (seen.add(threading.get_ident()), launch(self, *a))[1])
+    for form in (np.asarray, np.float64):
+        accel.closest_hit(form(rays[0]), rays[1], threads=8)  # type: ignore[operator]
+        accel.any_hit(form(rays[0]), rays[1])  # type: ignore[operator]
+    assert seen == {threading.get_ident()}
+
+
+def test_a_call_packs_no_launch_and_makes_no_warp_array(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Each costs as much as the rest of a call of one ray.
+    accel = build(icosphere(1), "bvh8")
+    asked = [some_rays(n) for n in (1, 5000)]
+    expected = [(bits(accel.closest_hit(*rays)), accel.any_hit(*rays).tobytes()) for rays in asked]
+
+    def refuse(*arguments: Any, **options: Any) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(wp, "launch", refuse)
+    monkeypatch.setattr(wp.array, "__init__", refuse)
+    assert [(bits(accel.closest_hit(*rays)), accel.any_hit(*rays).tobytes()) for rays in asked] == expected
