@@ -25,6 +25,17 @@ class RayArrays:
 
 
 @wp.struct
+class Queue:
+    """Rays of a picture, one a row, whose directions are taken as they are; exclude: as Ray.exclude_plus_one."""
+
+    origin: wp.array(dtype=wp.vec3)
+    direction: wp.array(dtype=wp.vec3)
+    t_min: wp.array(dtype=wp.float32)
+    t_max: wp.array(dtype=wp.float32)
+    exclude: wp.array(dtype=wp.int32)
+
+
+@wp.struct
 class HitArrays:
     """One hit a row; a miss has t = inf and prim_id = -1."""
 
@@ -91,6 +102,36 @@ def make_any_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
         dark[i] = hit.prim_id >= 0
 
     return any_hit
+
+
+@wp.func
+def queued_ray(queue: Queue, i: int) -> Ray:
+    ray = Ray()
+    ray.origin = queue.origin[i]
+    ray.direction = queue.direction[i]
+    ray.t_min = queue.t_min[i]
+    ray.t_max = queue.t_max[i]
+    ray.exclude_plus_one = queue.exclude[i]
+    return ray
+
+
+def make_queue_kernel(accel_struct, traverse, any_hit):
+    """Rays first .. end - 1 of a picture's queue, one at a time. out: HitArrays, or for any hit an array of bool."""
+    out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
+
+    @kernel
+    def trace_queue(accel: accel_struct, surfaces: Surfaces, queue: Queue, out: out_type, first: int, end: int):
+        i = first + wp.tid()
+        hit = traverse(accel, surfaces, queued_ray(queue, i))
+        if wp.static(any_hit):
+            out[i] = hit.prim_id >= 0
+        else:
+            out.t[i] = hit.t
+            out.u[i] = hit.u
+            out.v[i] = hit.v
+            out.prim_id[i] = hit.prim_id
+
+    return trace_queue
 
 
 @wp.struct

@@ -31,14 +31,15 @@ BELOW_WRT = {
 }
 # The folders of kernels/, and from which others each may import; `structs` is below all of them.
 BELOW_KERNELS = {
+    "native": set(),
     "structs": set(),
     "units": {"structs"},
     "traverse": {"units", "structs"},
-    "wide": {"query", "traverse", "units", "structs"},
-    "shade": {"traverse", "units", "structs"},
     "query": {"traverse", "units", "structs"},
+    "wide": {"native", "query", "traverse", "units", "structs"},
+    "shade": {"native", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
-    "study": {"query", "shade", "wide", "build", "traverse", "units", "structs"},
+    "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }
 LIBRARIES_OF_KERNELS = {"warp", "functools", "re", "typing", "collections", "math", "pathlib"}
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from wrt.kernels.shade.backgrounds import make_sky_sample
-from wrt.kernels.shade.lights import LightSample, make_light_sample
+from wrt.kernels.shade.lights import LIGHTS, WITHOUT_AREA, LightSample, make_light_sample
 from wrt.kernels.shade.materials import Scatter, blinn_phong
 from wrt.kernels.shade.sampling import PI, hash_pair, make_sample_2d
 from wrt.kernels.shade.surface import Surface, spawn_point
@@ -62,10 +62,16 @@ def make_reflected_light(features):
 def make_light_xi(features):
     """The numbers that place a sample on a light."""
     sample_2d = make_sample_2d(features)
+    single = {number for number, name in enumerate(LIGHTS) if name in features.lights and name in WITHOUT_AREA}
+    is_single = wp.types.vector(len(LIGHTS), int)(*(int(number in single) for number in range(len(LIGHTS))))
 
     @wp.func
-    def light_xi(key: wp.uint32, index: wp.uint32, i: int) -> wp.vec2:
+    def light_xi(lighting: Lighting, key: wp.uint32, index: wp.uint32, i: int) -> wp.vec2:
         """Two numbers for light i at the path vertex `key`."""
+        if wp.static(bool(single)):
+            if i < lighting.count:
+                if is_single[lighting.lights[i].kind] != 0:
+                    return wp.vec2(0.0, 0.0)
         return sample_2d(hash_pair(key, wp.static(wp.uint32(0x4C49))), index, i)
 
     return light_xi

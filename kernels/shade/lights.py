@@ -190,6 +190,10 @@ LIGHTS = {
 }
 
 
+# Those that have one sample alone, for which no xi is drawn.
+WITHOUT_AREA = ("point", "directional", "spot")
+
+
 # --- any of them ------------------------------------------------------------------------------------------------------
 
 

@@ -5,7 +5,7 @@ import warp as wp
 from wrt.kernels.shade.backgrounds import make_background
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, make_transmittance
-from wrt.kernels.shade.step import Sample, make_shaded, make_step, mean3
+from wrt.kernels.shade.step import Lit, Sample, add_up, counted, is_lit, lit_by, make_shaded, make_step
 from wrt.kernels.structs import Lighting, Limits, Ray, Surfaces
 
 
@@ -16,18 +16,12 @@ def make_direct_light(features, accel_struct, transmittance, step, counting=Fals
 
     @wp.func
     def direct_light(accel: accel_struct, surfaces: Surfaces, lighting: Lighting, shaded: Shaded, index: wp.uint32) -> Shadow:
-        """In `transmittance`: the radiance towards the eye. cut: shadow rays that were, and lost: the light they were worth in
-        a room of radiance 1."""
+        """As `add_up` takes it. cut: shadow rays that were, and lost: the light they were worth in a room of radiance 1."""
         out = Shadow()
         for i in range(lighting.count + wp.static(extra_lights)):
             request = shadow_request(surfaces, lighting, shaded, i, index)
             if wp.max(request.value) > 0.0:
-                shadow = transmittance(accel, surfaces, request.ray, request.end)
-                out.transmittance += wp.cw_mul(request.value, shadow.transmittance)
-                out.rays += shadow.rays
-                if wp.static(features.transparent_shadows):
-                    out.cut += shadow.cut
-                    out.lost += wp.cw_mul(shaded.scatter.diffuse + shaded.scatter.highlight, shadow.lost)
+                out = lit_by(out, request.value, shaded.scatter, transmittance(accel, surfaces, request.ray, request.end))
         return out
 
     return direct_light
@@ -37,11 +31,11 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
     """The whole tree of rays behind one camera ray. `features`: wrt.renderer.features.Features; counting: rays carry a label."""
     shading = make_shading(features)
     step = make_step(features, shading, counting)
-    Path, first_path, ray_of, shade, _, _, keep, tally = step
+    Path, first_path, ray_of, shade, _, _, keep, worth = step
     background_radiance = make_background(features)
     transmittance = make_transmittance(features, shading, accel_struct, closest_hit, any_hit)
     direct_light = make_direct_light(features, accel_struct, transmittance, step, counting)
-    lit = bool(features.lights) or features.sky_light
+    lit_at_all = bool(features.lights) or features.sky_light
 
     @wp.func
     def radiance(
@@ -64,34 +58,35 @@ def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
                 out.radiance += wp.cw_mul(path.throughput, background_radiance(lighting.background, path.direction))
                 continue
             shaded = shade(surfaces, lighting, path, ray, hit, index)
+            lit = Lit()
+            lit.light = shaded.light
+            lit.throughput = shaded.throughput
             if wp.static(features.blend):
                 verdict = keep(shaded.onward, limits, traced)
                 if verdict == 1:
                     stack[size] = shaded.onward
                     size = size + 1
-                out = tally(out, surfaces, shaded.onward, verdict)
-            light = shaded.light
-            if wp.static(lit):
-                if wp.max(shaded.scatter.diffuse) > 0.0 or wp.max(shaded.scatter.highlight) > 0.0:
-                    direct = direct_light(accel, surfaces, lighting, shaded, index)
-                    light += direct.transmittance
-                    out.rays += direct.rays
-                    if wp.static(features.transparent_shadows):
-                        out.cut_depth += direct.cut
-                        out.lost += mean3(wp.cw_mul(shaded.throughput, direct.lost))
-            out.radiance += wp.cw_mul(shaded.throughput, light)
+                out = counted(out, verdict)
+                out.lost += worth(surfaces, shaded.onward, verdict)
             if wp.static(features.reflection):
                 verdict = keep(shaded.reflected, limits, traced)
                 if verdict == 1:
                     stack[size] = shaded.reflected
                     size = size + 1
-                out = tally(out, surfaces, shaded.reflected, verdict)
+                out = counted(out, verdict)
+                lit.reflected = worth(surfaces, shaded.reflected, verdict)
             if wp.static(features.refraction):
                 verdict = keep(shaded.refracted, limits, traced)
                 if verdict == 1:
                     stack[size] = shaded.refracted
                     size = size + 1
-                out = tally(out, surfaces, shaded.refracted, verdict)
+                out = counted(out, verdict)
+                lit.refracted = worth(surfaces, shaded.refracted, verdict)
+            direct = Shadow()
+            if wp.static(lit_at_all):
+                if is_lit(shaded.scatter):
+                    direct = direct_light(accel, surfaces, lighting, shaded, index)
+            out = add_up(out, lit, direct)
         return out
 
     return radiance

@@ -8,6 +8,15 @@ constants of Vegdahl 2021 ("Building a Better LK Hash"). Independent random numb
 
 import warp as wp
 
+from wrt.kernels.native import source
+
+# The constants of the hash, of the scramble, and what makes the seeds of a point's two numbers differ.
+HASH_1, HASH_2 = 0x21F0AAAD, 0xD35A2D97
+LK_1, LK_2, LK_3 = 0x3D20ADEA, 0x05526C56, 0x53A22864
+SEED_X, SEED_Y = 0xA511E9B3, 0x63D83595
+# Every second bit, pair, four and eight bits; and what a number of 24 bits is multiplied by.
+BITS_1, BITS_2, BITS_4, BITS_8 = 0x55555555, 0x33333333, 0x0F0F0F0F, 0x00FF00FF
+UNIT = wp.constant(2.0**-24)
 TWO_PI = wp.constant(6.283185307179586)
 PI = wp.constant(3.141592653589793)
 
@@ -16,9 +25,9 @@ PI = wp.constant(3.141592653589793)
 def hash_u32(x: wp.uint32) -> wp.uint32:
     """A bijection of 32 bits without visible pattern (two rounds of xor-shift and multiplication; Wellons 2018)."""
     x = x ^ (x >> wp.uint32(16))
-    x = x * wp.static(wp.uint32(0x21F0AAAD))
+    x = x * wp.static(wp.uint32(HASH_1))
     x = x ^ (x >> wp.uint32(15))
-    x = x * wp.static(wp.uint32(0xD35A2D97))
+    x = x * wp.static(wp.uint32(HASH_2))
     return x ^ (x >> wp.uint32(15))
 
 
@@ -30,21 +39,21 @@ def hash_pair(a: wp.uint32, b: wp.uint32) -> wp.uint32:
 
 @wp.func
 def reverse_bits(x: wp.uint32) -> wp.uint32:
-    x = ((x >> wp.uint32(1)) & wp.static(wp.uint32(0x55555555))) | ((x & wp.static(wp.uint32(0x55555555))) << wp.uint32(1))
-    x = ((x >> wp.uint32(2)) & wp.static(wp.uint32(0x33333333))) | ((x & wp.static(wp.uint32(0x33333333))) << wp.uint32(2))
-    x = ((x >> wp.uint32(4)) & wp.static(wp.uint32(0x0F0F0F0F))) | ((x & wp.static(wp.uint32(0x0F0F0F0F))) << wp.uint32(4))
-    x = ((x >> wp.uint32(8)) & wp.static(wp.uint32(0x00FF00FF))) | ((x & wp.static(wp.uint32(0x00FF00FF))) << wp.uint32(8))
+    x = ((x >> wp.uint32(1)) & wp.static(wp.uint32(BITS_1))) | ((x & wp.static(wp.uint32(BITS_1))) << wp.uint32(1))
+    x = ((x >> wp.uint32(2)) & wp.static(wp.uint32(BITS_2))) | ((x & wp.static(wp.uint32(BITS_2))) << wp.uint32(2))
+    x = ((x >> wp.uint32(4)) & wp.static(wp.uint32(BITS_4))) | ((x & wp.static(wp.uint32(BITS_4))) << wp.uint32(4))
+    x = ((x >> wp.uint32(8)) & wp.static(wp.uint32(BITS_8))) | ((x & wp.static(wp.uint32(BITS_8))) << wp.uint32(8))
     return (x >> wp.uint32(16)) | (x << wp.uint32(16))
 
 
 @wp.func
 def laine_karras(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
     """A permutation in which each bit depends only on itself and lower ones: on reversed bits, a nested scramble."""
-    x = x ^ (x * wp.static(wp.uint32(0x3D20ADEA)))
+    x = x ^ (x * wp.static(wp.uint32(LK_1)))
     x = x + seed
     x = x * ((seed >> wp.uint32(16)) | wp.uint32(1))
-    x = x ^ (x * wp.static(wp.uint32(0x05526C56)))
-    return x ^ (x * wp.static(wp.uint32(0x53A22864)))
+    x = x ^ (x * wp.static(wp.uint32(LK_2)))
+    return x ^ (x * wp.static(wp.uint32(LK_3)))
 
 
 @wp.func
@@ -54,17 +63,17 @@ def sobol_second(index: wp.uint32) -> wp.uint32:
     Entry (i, j) is odd exactly where j's bits are among i's (Lucas), so that the product is five folds.
     """
     x = index
-    x = x ^ ((x >> wp.uint32(1)) & wp.static(wp.uint32(0x55555555)))
-    x = x ^ ((x >> wp.uint32(2)) & wp.static(wp.uint32(0x33333333)))
-    x = x ^ ((x >> wp.uint32(4)) & wp.static(wp.uint32(0x0F0F0F0F)))
-    x = x ^ ((x >> wp.uint32(8)) & wp.static(wp.uint32(0x00FF00FF)))
+    x = x ^ ((x >> wp.uint32(1)) & wp.static(wp.uint32(BITS_1)))
+    x = x ^ ((x >> wp.uint32(2)) & wp.static(wp.uint32(BITS_2)))
+    x = x ^ ((x >> wp.uint32(4)) & wp.static(wp.uint32(BITS_4)))
+    x = x ^ ((x >> wp.uint32(8)) & wp.static(wp.uint32(BITS_8)))
     return x ^ (x >> wp.uint32(16))
 
 
 @wp.func
 def unit_float(x: wp.uint32) -> float:
     """The upper 24 bits as a number in [0, 1)."""
-    return float(x >> wp.uint32(8)) * wp.static(2.0**-24)
+    return float(x >> wp.uint32(8)) * UNIT
 
 
 @wp.func
@@ -72,8 +81,8 @@ def sample_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
     """Point `index` of the sequence that belongs to (key, dimension); any 2^k-aligned block of 2^k is a (0, k, 2)-net."""
     seed = hash_pair(key, wp.uint32(dimension))
     i = reverse_bits(laine_karras(reverse_bits(index), seed))
-    x = reverse_bits(laine_karras(i, hash_u32(seed ^ wp.static(wp.uint32(0xA511E9B3)))))
-    y = reverse_bits(laine_karras(sobol_second(i), hash_u32(seed ^ wp.static(wp.uint32(0x63D83595)))))
+    x = reverse_bits(laine_karras(i, hash_u32(seed ^ wp.static(wp.uint32(SEED_X)))))
+    y = reverse_bits(laine_karras(sobol_second(i), hash_u32(seed ^ wp.static(wp.uint32(SEED_Y)))))
     return wp.vec2(unit_float(x), unit_float(y))
 
 
@@ -82,8 +91,30 @@ def independent_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
     """As sample_2d, but each point is drawn by itself: the plain Monte Carlo that an even sequence is measured against."""
     seed = hash_pair(key, wp.uint32(dimension))
     x = hash_pair(seed, index)
-    y = hash_pair(seed ^ wp.static(wp.uint32(0x63D83595)), index)
+    y = hash_pair(seed ^ wp.static(wp.uint32(SEED_Y)), index)
     return wp.vec2(unit_float(x), unit_float(y))
+
+
+@wp.func_native(source("shade/sample_points.h", HASH_1=HASH_1, HASH_2=HASH_2, LK_1=LK_1, LK_2=LK_2, LK_3=LK_3, SEED_X=SEED_X,
+                       SEED_Y=SEED_Y, BITS_1=BITS_1, BITS_2=BITS_2, BITS_4=BITS_4, BITS_8=BITS_8, UNIT=UNIT))
+def sample_points(seed: wp.uint32, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int):
+    """Points first, first + 1 ... of sample_2d's sequence to out[at], out[at + 1] ... (CPU); seed: hash_pair(key, dimension)."""
+
+
+def make_draw(features):
+    """Many numbers of a pixel at a time, for the CPU."""
+    sample = make_sample_2d(features)
+
+    @wp.func
+    def draw(key: wp.uint32, dimension: int, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int):
+        """sample_2d(key, first + i, dimension) to out[at + i], for each i below `count`."""
+        if wp.static(features.independent):
+            for i in range(count):
+                out[at + i] = sample(key, wp.uint32(first + i), dimension)
+        else:
+            sample_points(hash_pair(key, wp.uint32(dimension)), first, count, out, at)
+
+    return draw
 
 
 def make_sample_2d(features):

@@ -4,7 +4,7 @@ import warp as wp
 
 from wrt.kernels.shade.shading import BLEND
 from wrt.kernels.shade.surface import Surface, spawn_point
-from wrt.kernels.structs import Material, Ray, Surfaces
+from wrt.kernels.structs import Hit, Material, Ray, Surfaces
 
 OUTSIDE = wp.constant(-1)  # of any glass
 MAX_TRANSPARENT = wp.constant(256)  # surfaces in a row that a ray may go straight through
@@ -114,56 +114,100 @@ def make_pass_surface(features, scatter, is_solid):
     return pass_surface
 
 
-def make_transmittance(features, shading, accel_struct, closest_hit, any_hit):
-    """Shadow rays: one any-hit query, or where a scene lets light through surfaces, one closest hit after another."""
+@wp.struct
+class ShadowWalk:
+    """A shadow ray on its way through surfaces. ray: what is left of it, and end: where the segment ends; surfaces: how many it has
+    met; shadow: what is known when done = 1."""
+
+    ray: Ray
+    end: wp.vec3
+    passage: Passage
+    surfaces: int
+    shadow: Shadow
+    done: int
+
+
+@wp.func
+def begin_shadow(ray: Ray, end: wp.vec3) -> ShadowWalk:
+    walk = ShadowWalk()
+    walk.ray = ray
+    walk.end = end
+    walk.passage.transmittance = wp.vec3(1.0, 1.0, 1.0)
+    walk.passage.medium = OUTSIDE
+    return walk
+
+
+def make_go_through(features, shading):
+    """What a shadow ray does with the closest hit on its way. Nothing here traces a ray."""
     surface_at, resolve, shading_normal, scatter, is_solid = shading
     pass_surface = make_pass_surface(features, scatter, is_solid)
 
     @wp.func
-    def through_surfaces(accel: accel_struct, surfaces: Surfaces, first: Ray, end: wp.vec3) -> Shadow:
-        out = Shadow()
-        p = Passage()
-        p.transmittance = wp.vec3(1.0, 1.0, 1.0)
-        p.medium = OUTSIDE
-        ray = first
-        for i in range(MAX_TRANSPARENT + 1):
-            out.rays += 1
-            hit = closest_hit(accel, surfaces, ray)
-            if hit.prim_id < 0:
-                if wp.static(features.absorption):
-                    if p.medium >= 0 and ray.t_max <= 1.0:  # the light is inside it
-                        p.inside = wp.cw_mul(p.inside, attenuation(surfaces, p.medium, wp.length(ray.direction)))
-                p = left(p)
-                out.transmittance = p.transmittance
-                return out
-            if i == MAX_TRANSPARENT:
-                break
-            s = surface_at(surfaces, ray, hit)
-            m = resolve(surfaces, s)
-            m.roughness = 0.0
-            d = wp.normalize(ray.direction)
-            s.shading = shading_normal(surfaces, m, s, -d)
-            p = pass_surface(surfaces, p, m, s, -d, hit.t * wp.length(ray.direction))
-            now = left(p)
-            if wp.max(now.transmittance) <= 0.0:
-                return out
-            ray.origin = spawn_point(s.point, s.error, s.geometric, d)
-            ray.exclude_plus_one = s.exclude_plus_one
-            if ray.t_max <= 1.0:
-                ray.direction = end - ray.origin
-                if wp.dot(ray.direction, d) <= 0.0:  # the light is within the surface's rounding error
-                    out.transmittance = now.transmittance
-                    return out
+    def through_hit(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
+        walk = before
+        ray = walk.ray
+        s = surface_at(surfaces, ray, hit)
+        m = resolve(surfaces, s)
+        m.roughness = 0.0
+        d = wp.normalize(ray.direction)
+        s.shading = shading_normal(surfaces, m, s, -d)
+        walk.passage = pass_surface(surfaces, walk.passage, m, s, -d, hit.t * wp.length(ray.direction))
+        now = left(walk.passage)
+        if wp.max(now.transmittance) <= 0.0:
+            walk.done = 1
+            return walk
+        walk.ray.origin = spawn_point(s.point, s.error, s.geometric, d)
+        walk.ray.exclude_plus_one = s.exclude_plus_one
+        if ray.t_max <= 1.0:
+            walk.ray.direction = walk.end - walk.ray.origin
+            if wp.dot(walk.ray.direction, d) <= 0.0:  # the light is within the surface's rounding error
+                walk.shadow.transmittance = now.transmittance
+                walk.done = 1
+        return walk
+
+    @wp.func
+    def at_end(surfaces: Surfaces, before: ShadowWalk) -> ShadowWalk:
+        walk = before
+        p = walk.passage
+        if wp.static(features.absorption):
+            if p.medium >= 0 and walk.ray.t_max <= 1.0:  # the light is inside it
+                p.inside = wp.cw_mul(p.inside, attenuation(surfaces, p.medium, wp.length(walk.ray.direction)))
         p = left(p)
-        out.lost = p.transmittance
-        out.cut = 1
-        return out
+        walk.shadow.transmittance = p.transmittance
+        walk.done = 1
+        return walk
+
+    @wp.func
+    def go_through(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
+        """hit: the closest one of walk.ray."""
+        walk = before
+        walk.shadow.rays += 1
+        if hit.prim_id < 0:
+            return at_end(surfaces, walk)
+        if walk.surfaces == MAX_TRANSPARENT:
+            p = left(walk.passage)
+            walk.shadow.lost = p.transmittance
+            walk.shadow.cut = 1
+            walk.done = 1
+            return walk
+        walk.surfaces += 1
+        return through_hit(surfaces, walk, hit)
+
+    return go_through
+
+
+def make_transmittance(features, shading, accel_struct, closest_hit, any_hit):
+    """Shadow rays: one any-hit query, or where a scene lets light through surfaces, one closest hit after another."""
+    go_through = make_go_through(features, shading)
 
     @wp.func
     def transmittance(accel: accel_struct, surfaces: Surfaces, ray: Ray, end: wp.vec3) -> Shadow:
         out = Shadow()
         if wp.static(features.transparent_shadows):
-            out = through_surfaces(accel, surfaces, ray, end)
+            walk = begin_shadow(ray, end)
+            while walk.done == 0:
+                walk = go_through(surfaces, walk, closest_hit(accel, surfaces, walk.ray))
+            out = walk.shadow
         else:
             out.rays = 1
             hit = any_hit(accel, surfaces, ray)

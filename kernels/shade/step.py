@@ -16,7 +16,7 @@ from wrt.kernels.shade.direct import make_light_xi, make_reflected_light, shadow
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
 from wrt.kernels.shade.shading import BLEND
-from wrt.kernels.shade.shadows import MAX_TRANSPARENT, OUTSIDE, attenuation
+from wrt.kernels.shade.shadows import MAX_TRANSPARENT, OUTSIDE, Shadow, attenuation
 from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Hit, Lighting, Limits, Material, Ray, Surfaces, make_ray
 
@@ -122,13 +122,66 @@ def emitted(m: Material, s: Surface) -> wp.vec3:
     return wp.vec3(0.0, 0.0, 0.0)
 
 
+@wp.struct
+class Lit:
+    """A surface while its lights are asked: light and throughput as of Shaded; reflected, refracted: what is lost with those of its
+    new paths that are cut (Sample.lost)."""
+
+    light: wp.vec3
+    throughput: wp.vec3
+    reflected: float
+    refracted: float
+
+
+@wp.func
+def is_lit(scatter: Scatter) -> bool:
+    """Whether light from elsewhere can be seen on a surface."""
+    return wp.max(scatter.diffuse) > 0.0 or wp.max(scatter.highlight) > 0.0
+
+
+@wp.func
+def lit_by(before: Shadow, value: wp.vec3, scatter: Scatter, shadow: Shadow) -> Shadow:
+    """The light of all lamps so far, and of one more, whose ShadowRequest has this value."""
+    out = before
+    out.transmittance += wp.cw_mul(value, shadow.transmittance)
+    out.rays += shadow.rays
+    if shadow.cut > 0:
+        out.cut += shadow.cut
+        out.lost += wp.cw_mul(scatter.diffuse + scatter.highlight, shadow.lost)
+    return out
+
+
+@wp.func
+def add_up(before: Sample, lit: Lit, direct: Shadow) -> Sample:
+    """A sample with what a surface sends to the eye. direct: in `transmittance` the radiance by the lights' rays, and in `lost`
+    what was cut of it."""
+    out = before
+    out.radiance += wp.cw_mul(lit.throughput, lit.light + direct.transmittance)
+    out.rays += direct.rays
+    out.cut_depth += direct.cut
+    if direct.cut > 0:
+        out.lost += mean3(wp.cw_mul(lit.throughput, direct.lost))
+    out.lost += lit.reflected
+    out.lost += lit.refracted
+    return out
+
+
+@wp.func
+def counted(before: Sample, verdict: int) -> Sample:
+    """A sample with one more new path; verdict: of Step.keep."""
+    out = before
+    out.cut_depth += wp.where(verdict == 2, 1, 0)
+    out.cut_throughput += wp.where(verdict == 3, 1, 0)
+    return out
+
+
 class Step(NamedTuple):
     """What a loop is made of.
 
     Path: the struct; first_path(ray, key); ray_of(path). shade(surfaces, lighting, path, ray, hit, index) -> Shaded.
     shadow_requests: how many lights there are beside those of `lighting` (the background is one), and shadow_request(surfaces,
     lighting, shaded, i, index) -> ShadowRequest to each. keep(path, limits, traced): whether a new path is followed, and
-    tally(sample, surfaces, path, verdict) counts those that are not.
+    worth(surfaces, path, verdict) what is lost where it is not.
     """
 
     Path: Any
@@ -138,7 +191,7 @@ class Step(NamedTuple):
     extra_lights: int
     shadow_request: Any
     keep: Any
-    tally: Any
+    worth: Any
 
 
 def make_step(features, shading, counting=False):
@@ -289,7 +342,7 @@ def make_shadow_request(features, counting=False):
         """Lights are numbered; the background comes after the last one."""
         out = ShadowRequest()
         s = shaded.surface
-        sample = choose(lighting, surfaces, i, s, light_xi(shaded.key, index, i))
+        sample = choose(lighting, surfaces, i, s, light_xi(lighting, shaded.key, index, i))
         out.value = reflected(sample, s, shaded.scatter, shaded.wo)
         if wp.max(out.value) > 0.0:
             out.ray = shadow_ray(s, sample)
@@ -300,7 +353,7 @@ def make_shadow_request(features, counting=False):
 
 
 def make_keep(features, counting=False):
-    """Which paths are followed, and the count of those that are not."""
+    """Which paths are followed, and what is lost with those that are not."""
     Path = make_path(counting)
 
     @wp.func
@@ -314,20 +367,14 @@ def make_keep(features, counting=False):
         return wp.where(largest < limits.min_throughput, 3, 1)
 
     @wp.func
-    def tally(before: Sample, surfaces: Surfaces, next: Path, verdict: int) -> Sample:
-        """Keeps the count of rays that were cut."""
-        out = before
+    def worth(surfaces: Surfaces, next: Path, verdict: int) -> float:
+        """What is lost with a path that is cut; 0 for one that is not."""
         if verdict < 2:
-            return out
-        if verdict == 2:
-            out.cut_depth += 1
-        else:
-            out.cut_throughput += 1
+            return 0.0
         worth = mean3(next.throughput)
         if wp.static(features.refraction):
             if next.medium >= 0:  # within, light is denser, and the throughput was divided by as much
                 worth = worth * surfaces.materials[next.medium].ior * surfaces.materials[next.medium].ior
-        out.lost += worth
-        return out
+        return worth
 
-    return keep, tally
+    return keep, worth

@@ -1,15 +1,14 @@
 """Kernels that hold one unit a number of times and little else: what a unit is in machine code is the difference between two."""
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import warp as wp
 
+from wrt.kernels.native import source
 from wrt.kernels.structs import Ray, kernel, size_of
 from wrt.kernels.units.box import RAY_AABB, BoxRay
 from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay
-from wrt.kernels.wide.native import source
 
 
 @wp.struct
@@ -55,7 +54,7 @@ def make_add_numbers(record: Any) -> Any:
     layout = record.numpy_dtype()
     prim_id = layout["offsets"][layout["names"].index("prim_id")] // 4
 
-    @wp.func_native(source(Path(__file__).parent / "add_numbers.h", PRIM_ID=prim_id))
+    @wp.func_native(source("study/add_numbers.h", PRIM_ID=prim_id))
     def add_numbers(total: float, record: record) -> float: ...
 
     return add_numbers

@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.structs import NO_HIT, Hit, Surfaces, kernel
+from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
 from wrt.kernels.traverse.common import Probe, Units, make_intersect
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
@@ -36,13 +36,13 @@ from wrt.kernels.wide.packets import (
     count_of,
     cull,
     lowest_of_all,
+    make_set_up,
     meets,
     pop,
     put_bits,
     put_number,
     put_slot,
     reaching,
-    set_up,
     slot_at,
     step,
     triangles,
@@ -65,6 +65,7 @@ from wrt.kernels.wide.traverse import (
 
 NODE = node_size(WIDTH, False)
 REFERENCES = first_reference(WIDTH, False)
+PRIM_ID = WIDTH * (Primitive.numpy_dtype()["offsets"][-1] // 4)  # where a row has its primitives' numbers
 PACKETS = 4  # set up at a time
 SLOTS = 16  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
@@ -93,6 +94,7 @@ def probe_at(packet: wp.array(dtype=wp.float32), ray: int) -> Probe:
     probe.ray.origin = vector(packet, ray + wp.static(ROW["origin_x"]))
     probe.ray.direction = vector(packet, ray + wp.static(ROW["direction_x"]))
     probe.ray.t_min = number(packet, ray + wp.static(ROW["t_min"]))
+    probe.ray.exclude_plus_one = bits(packet, ray + wp.static(ROW["exclude"]))
     probe.box.origin = probe.ray.origin
     probe.box.inv_dir = vector(packet, ray + wp.static(ROW["inverse_x"]))
     probe.box.t_min = probe.ray.t_min
@@ -116,10 +118,10 @@ def best_at(packet: wp.array(dtype=wp.float32), ray: int) -> Hit:
     return best
 
 
-def make_leaf_test(units: Units, any_hit: bool):
+def make_leaf_test(units: Units, any_hit: bool, accepts=None):
     """The triangles of a row that are in a mask against one ray of a packet; whether the ray has found what it asks for."""
     gather = make_gather(units.triangle_test.record, WIDTH)
-    intersect = make_intersect(units)
+    intersect = make_intersect(units, accepts)
 
     @wp.func
     def test_row(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces, packet: wp.array(dtype=wp.float32),
@@ -130,8 +132,7 @@ def make_leaf_test(units: Units, any_hit: bool):
             best = intersect(probe, surfaces, gather(rows, first + lowest(mask)), best)
             mask = mask & (mask - 1)
             if wp.static(any_hit):
-                if best.prim_id != NO_HIT:
-                    mask = int(0)
+                mask = wp.where(best.prim_id != NO_HIT, 0, mask)
         t = best.t
         if wp.static(any_hit):
             t = wp.where(best.prim_id != NO_HIT, -float(wp.inf), t)  # nothing else is reached
@@ -144,11 +145,20 @@ def make_leaf_test(units: Units, any_hit: bool):
     return test_row
 
 
-def make_packet_walk(units: Units, any_hit: bool):
+@wp.func
+def holds_sphere(rows: wp.array(dtype=wp.float32), first: int, count: int, n_triangles: int) -> bool:
+    """Whether one of a row's primitives is no triangle."""
+    for j in range(count):
+        if bits(rows, first + wp.static(PRIM_ID) + j) >= n_triangles:
+            return True
+    return False
+
+
+def make_packet_walk(units: Units, any_hit: bool, accepts=None):
     """A packet with a beam, from the root."""
     struct = make_struct(units.triangle_test.record)
     size_of_row = row_size(units.triangle_test.record, WIDTH)
-    test_row = make_leaf_test(units, any_hit)
+    test_row = make_leaf_test(units, any_hit, accepts)
 
     @wp.func
     def test_leaf(accel: struct, surfaces: Surfaces, reference: int, mask: int, packet: wp.array(dtype=wp.float32), base: int):
@@ -156,7 +166,10 @@ def make_packet_walk(units: Units, any_hit: bool):
         first = leaf_first(reference) * wp.static(size_of_row)
         while left > 0 and mask != 0:
             n = wp.min(left, WIDTH)
-            if count_of(mask) > FEW:
+            lanes = bool(wp.static(accepts is None) and count_of(mask) > FEW)
+            if wp.static(units.spheres):
+                lanes = lanes and not holds_sphere(accel.primitives, first, n, surfaces.n_triangles)
+            if lanes:
                 found = triangles(accel.primitives, first, n, mask, any_hit, packet, base)
                 if wp.static(any_hit):
                     mask = mask & ~found
@@ -216,11 +229,11 @@ def make_packet_walk(units: Units, any_hit: bool):
     return walk
 
 
-def make_interleaved(units: Units, any_hit: bool):
+def make_interleaved(units: Units, any_hit: bool, accepts=None):
     """Rays of several packets, each for itself, from the root. waiting: a bit for each; lane after lane, packet after packet."""
     struct = make_struct(units.triangle_test.record)
     size_of_row = row_size(units.triangle_test.record, WIDTH)
-    test_row = make_leaf_test(units, any_hit)
+    test_row = make_leaf_test(units, any_hit, accepts)
     call_in = make_call_in(units.triangle_test.record, WIDTH, False, LINES)
 
     @wp.func
@@ -230,20 +243,12 @@ def make_interleaved(units: Units, any_hit: bool):
         call_in(accel.nodes, accel.primitives, next)
 
     @wp.func
-    def visit_leaf(accel: struct, surfaces: Surfaces, scratch: Scratch, slot: int, ray: int, reference: int) -> bool:
-        """Cull the triangles of the last row; those of others are also tested. Whether the ray has found what it asks for."""
-        n = leaf_count(reference)
-        first = leaf_first(reference) * wp.static(size_of_row)
-        while n > WIDTH:
-            candidates = cull(accel.primitives, first, wp.static((1 << WIDTH) - 1), scratch.packets, ray)
-            if test_row(accel.primitives, first, candidates, surfaces, scratch.packets, ray):
-                return True
-            n = n - WIDTH
-            first = first + wp.static(size_of_row)
-        candidates = cull(accel.primitives, first, (2 << (n - 1)) - 1, scratch.packets, ray)
-        put_slot(scratch.slots, slot * SLOT_SIZE + wp.static(SLOT["pending"]), candidates | TO_POP)
-        put_slot(scratch.slots, slot * SLOT_SIZE + wp.static(SLOT["row"]), first)
-        return False
+    def cull_row(accel: struct, scratch: Scratch, words: int, ray: int, first: int, n: int):
+        """Note the triangles of a leaf's next row that are to be tested; n: triangles of the leaf that are left."""
+        candidates = cull(accel.primitives, first, (2 << (wp.min(n, WIDTH) - 1)) - 1, scratch.packets, ray)
+        put_slot(scratch.slots, words + wp.static(SLOT["pending"]), candidates | TO_POP)
+        put_slot(scratch.slots, words + wp.static(SLOT["row"]), first)
+        put_slot(scratch.slots, words + wp.static(SLOT["left"]), n - WIDTH)
 
     @wp.func
     def turn(accel: struct, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
@@ -252,10 +257,14 @@ def make_interleaved(units: Units, any_hit: bool):
         ray = slot_at(scratch.slots, words + wp.static(SLOT["ray"]))
         pending = slot_at(scratch.slots, words + wp.static(SLOT["pending"]))
         if pending != 0:
+            row = slot_at(scratch.slots, words + wp.static(SLOT["row"]))
             if pending != TO_POP:
-                row = slot_at(scratch.slots, words + wp.static(SLOT["row"]))
                 if test_row(accel.primitives, row, pending & (TO_POP - 1), surfaces, scratch.packets, ray):
                     return False
+            left = slot_at(scratch.slots, words + wp.static(SLOT["left"]))
+            if left > 0:
+                cull_row(accel, scratch, words, ray, row + wp.static(size_of_row), left)
+                return True
             t = number(scratch.packets, ray + wp.static(ROW["t"]))
             if not pop(accel.nodes, t, scratch.stacks, slot * STACK_WORDS, scratch.slots, words):
                 return False
@@ -263,7 +272,8 @@ def make_interleaved(units: Units, any_hit: bool):
             return True
         reference = slot_at(scratch.slots, words + wp.static(SLOT["next"]))
         if reference < 0:
-            return not visit_leaf(accel, surfaces, scratch, slot, ray, reference)
+            cull_row(accel, scratch, words, ray, leaf_first(reference) * wp.static(size_of_row), leaf_count(reference))
+            return True
         call_in(accel.nodes, accel.primitives, step(accel.nodes, scratch.packets, scratch.stacks, scratch.slots, words))
         return True
 
@@ -292,17 +302,18 @@ def make_interleaved(units: Units, any_hit: bool):
 
 
 @cache
-def make_kernel(units: Units, any_hit: bool):
+def make_kernel(units: Units, any_hit: bool, rays_struct=RayArrays, accepts=None):
     """Rays first .. end - 1, a block of PACKETS packets a thread, one thread after another in the same scratch. out:
     HitArrays, or for any hit an array of bool. Arrays must have no gaps."""
     struct = make_struct(units.triangle_test.record)
-    walk_packet = make_packet_walk(units, any_hit)
-    interleaved = make_interleaved(units, any_hit)
+    walk_packet = make_packet_walk(units, any_hit, accepts)
+    interleaved = make_interleaved(units, any_hit, accepts)
+    set_up = make_set_up(rays_struct)
     write = write_occluded if any_hit else write_hits
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
     @kernel
-    def trace(accel: struct, surfaces: Surfaces, rays: RayArrays, out: out_type, scratch: Scratch, first: int, end: int):
+    def trace(accel: struct, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
         block = first + wp.static(PACKETS * LANES) * wp.tid()
         if wp.tid() == 0:
             put_slot(scratch.slots, FAILED, 0)
@@ -347,8 +358,8 @@ class BatchTraversal(WideTraversal):
     def __init__(self) -> None:
         super().__init__(WIDTH)
 
-    def make_stream(self, units: Units, any_hit: bool):
+    def make_stream(self, units: Units, any_hit: bool, rays_struct=RayArrays, accepts=None):
         """None for units that it has no lanes for."""
-        if units.triangle != "watertight" or units.box not in ROW_PADS or units.spheres or units.counters or units.instances:
+        if units.triangle != "watertight" or units.box not in ROW_PADS or units.counters or units.instances:
             return None
-        return make_kernel(units, any_hit)
+        return make_kernel(units, any_hit, rays_struct, accepts)

@@ -8,9 +8,9 @@ from functools import cache
 
 import warp as wp
 
+from wrt.kernels.native import source
 from wrt.kernels.units.box import FAR_PAD, BoxRay
 from wrt.kernels.units.triangle import edge_areas, outside, sheared
-from wrt.kernels.wide.native import source
 
 CACHE_LINE = 16  # float32
 
@@ -69,7 +69,7 @@ def bits(rows: wp.array(dtype=wp.float32), i: int) -> int:
     """The int32 that stands in rows[i]."""
 
 
-@wp.func_native(source("prefetch.h", CACHE_LINE=CACHE_LINE))
+@wp.func_native(source("wide/prefetch.h", CACHE_LINE=CACHE_LINE))
 def prefetch(rows: wp.array(dtype=wp.float32), first: int, lines: int):
     """So many cache lines from rows[first] are soon needed."""
 
@@ -112,7 +112,7 @@ def make_plain_cull(width: int):
 def make_native_cull(width: int):
     """make_cull in C++, for the CPU only."""
 
-    @wp.func_native(source("row_cull.h", WIDTH=width))
+    @wp.func_native(source("wide/row_cull.h", WIDTH=width))
     def cull(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int: ...
 
     return cull

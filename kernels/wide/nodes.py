@@ -11,9 +11,9 @@ from functools import cache
 
 import warp as wp
 
+from wrt.kernels.native import source
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, on_cuda, row_type, value
-from wrt.kernels.wide.native import source
 
 # The rows of planes. A low plane and the high plane of the same axis differ in the last bit of their numbers.
 PLANES = ("lo_x", "hi_x", "lo_y", "hi_y", "lo_z", "hi_z")
@@ -127,10 +127,10 @@ def make_native(width: int, compressed: bool):
     layout = {"WIDTH": width, "COMPRESSED": compressed, "WORD": WORD, "FIRST_BYTES": FIRST_BYTES, "EXPONENT_BITS": EXPONENT_BITS,
               "EXIST_SHIFT": EXIST_SHIFT, "MANTISSA_BITS": MANTISSA_BITS}
 
-    @wp.func_native(source("row_entries.h", **layout))
+    @wp.func_native(source("wide/row_entries.h", **layout))
     def row_entries(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row: ...
 
-    @wp.func_native(source("row_entered.h", **layout))
+    @wp.func_native(source("wide/row_entered.h", **layout))
     def row_entered(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int: ...
 
     @wp.func

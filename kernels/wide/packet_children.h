@@ -1,3 +1,4 @@
+    auto once = [&]() __attribute__((noinline)) {  // the compiler would copy it to where it is called
     #include "packet.h"
     #include "rows.h"
     // The beam first. Distances are products of two intervals: bounds are the extreme origin times both reciprocals. The largest
@@ -32,3 +33,5 @@
         out |= (met != 0) << child;
     }
     return out;
+    };
+    return once();

@@ -1,5 +1,6 @@
     // Rays first .. first + count - 1 as rows; lanes beyond the last ray repeat it.
     Rays o_x, o_y, o_z, d_x, d_y, d_z, t_min, t_max;
+    RayInts exclude = 0;
     if (count == LANES) {
         // Three vectors hold 16 times x, y, z: the first two give 11 or 10 numbers of a row, the third gives the rest.
         const float *a = (const float*)(rays.origin.data + first), *b = (const float*)(rays.direction.data + first);
@@ -27,3 +28,6 @@
         o_x = copied(0); o_y = copied(1); o_z = copied(2); d_x = copied(3); d_y = copied(4); d_z = copied(5);
         t_min = copied(6); t_max = copied(7);
     }
+#if QUEUE
+    for (int j = 0; j < LANES; ++j) exclude[j] = rays.exclude.data[first + (j < count ? j : count - 1)];
+#endif

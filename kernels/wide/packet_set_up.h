@@ -1,6 +1,8 @@
+    auto once = [&]() __attribute__((noinline)) {  // the compiler would copy it to where it is called
     #include "packet.h"
     #include "packet_load.h"
     const Rays one = 1.0f, nothing = -__builtin_inff(), largest = LARGEST;
+    int_row(EXCLUDE) = exclude;
     // As kernels.query.load_ray.
     Rays size_x = __builtin_elementwise_abs(d_x), size_y = __builtin_elementwise_abs(d_y), size_z = __builtin_elementwise_abs(d_z);
     Rays longest = size_y > size_x ? size_y : size_x;
@@ -11,8 +13,8 @@
     const auto finite = WITHIN(d_x, largest) & WITHIN(d_y, largest) & WITHIN(d_z, largest);
     ((int*)q)[REFUSED] = RAY_MASK(~(near & finite & (longest > 0.0f) & (t_min >= 0.0f) & (t_max == t_max)));
     const Rays lengthen = LENGTHEN, lengthen_inverse = 1.0f / LENGTHEN, shorten = SHORTEN, shorten_inverse = 1.0f / SHORTEN;
-    const Rays scale = longest > LONGEST ? shorten : (longest < SHORTEST ? lengthen : one);
-    const Rays inverse = longest > LONGEST ? shorten_inverse : (longest < SHORTEST ? lengthen_inverse : one);
+    const Rays scale = QUEUE ? one : longest > LONGEST ? shorten : (longest < SHORTEST ? lengthen : one);
+    const Rays inverse = QUEUE ? one : longest > LONGEST ? shorten_inverse : (longest < SHORTEST ? lengthen_inverse : one);
     d_x = scale * d_x; d_y = scale * d_y; d_z = scale * d_z;
     t_min = t_min * inverse + 0.0f;
     t_max = (t_max > largest ? largest : t_max) * inverse;
@@ -51,3 +53,5 @@
     const int active = RAY_MASK(t_max >= t_min) & ((1 << count) - 1);
     #include "packet_beam.h"
     return active | COHERENT;
+    };
+    return once();

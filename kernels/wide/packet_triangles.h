@@ -1,3 +1,4 @@
+    auto once = [&]() __attribute__((noinline)) {  // the compiler would copy it to where it is called
     // As kernels.units.triangle.ray_triangle and kernels.traverse.common.intersect, one triangle after another.
     #include "packet.h"
     typedef double Doubles __attribute__((ext_vector_type(LANES), aligned(8)));
@@ -24,7 +25,7 @@
         const Rays best = row(T);
         const RayInts id = __builtin_bit_cast(int, p[WIDTH * PRIM_ID_ROW + j]), best_id = int_row(PRIM_ID);
         m &= RAY_MASK((__builtin_elementwise_abs(at) < inf) & (at >= row(T_MIN)) & (at <= best));
-        m &= RAY_MASK(~((at == best) & (id > best_id)));
+        m &= RAY_MASK(~((at == best) & (id > best_id)) & (id + 1 != int_row(EXCLUDE)));
         if (m == 0) continue;
         found |= m;
         const RayInts on = IN(m);
@@ -36,3 +37,5 @@
         if (any_hit && (mask &= ~m) == 0) break;
     }
     return found;
+    };
+    return once();

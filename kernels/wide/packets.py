@@ -4,13 +4,15 @@ The functions are C++ (the `.h` files beside this one), for the CPU only. They c
 bit: a test holds the two together. This file has the layouts that they work on; C++ gets its numbers from here.
 """
 
+from functools import cache
+
 import warp as wp
 
+from wrt.kernels.native import source
 from wrt.kernels.query import FARTHEST, LARGEST, LENGTHEN, LONGEST, SHORTEN, SHORTEST, HitArrays, RayArrays
 from wrt.kernels.structs import NO_HIT, Primitive, size_of
 from wrt.kernels.units.box import FAR_PAD, PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST
 from wrt.kernels.units.triangle import CLAMP_ROUNDING, CLAMP_STEP, SLOWEST
-from wrt.kernels.wide.native import source
 from wrt.kernels.wide.nodes import PLANES, first_reference, node_size
 from wrt.kernels.wide.traverse import STACK_SIZE
 
@@ -19,10 +21,10 @@ LANES = 16  # rays of a packet
 COHERENT = 1 << LANES  # what set_up adds to the mask of active rays if they have a beam
 
 # A packet is a block of floats. It begins with a row of sixteen lanes for each number that a ray has. turned: the origin, in the
-# order kx, ky, kz; axes: kx, ky, kz in AXIS_BITS each; near: where the near planes begin in a node.
+# order kx, ky, kz; axes: kx, ky, kz in AXIS_BITS each; near: where the near planes begin in a node; exclude: Ray.exclude_plus_one.
 ROWS = ("origin_x", "origin_y", "origin_z", "inverse_x", "inverse_y", "inverse_z", "far_x", "far_y", "far_z", "t_min", "t",
         "direction_x", "direction_y", "direction_z", "turned_x", "turned_y", "turned_z", "shear_x", "shear_y", "shear_z",
-        "axes", "u", "v", "prim_id", "scale", "near_x", "near_y", "near_z")
+        "axes", "u", "v", "prim_id", "scale", "near_x", "near_y", "near_z", "exclude")
 ROW = {name: LANES * i for i, name in enumerate(ROWS)}  # where each row begins
 AXIS_BITS = 2
 
@@ -52,8 +54,9 @@ KEY_MASK = 2 * WIDTH - 1
 STACK_WORDS = LEVEL * (STACK_SIZE + 2)
 
 # A slot is where one ray is under way. ray: its column in `packets`; next: the reference to go to; place: where its stack goes on;
-# pending: what comes before that, a mask of triangles to test (whose row begins at `row`), and TO_POP.
-SLOT_WORDS = ("ray", "next", "place", "pending", "row")
+# pending: what comes before that, a mask of triangles to test (whose row begins at `row`), and TO_POP; left: triangles of its leaf
+# in the rows after that one.
+SLOT_WORDS = ("ray", "next", "place", "pending", "row", "left")
 SLOT = {name: i for i, name in enumerate(SLOT_WORDS)}
 SLOT_SIZE = 8
 TO_POP = 1 << WIDTH
@@ -87,62 +90,68 @@ class Scratch:
 # --- a packet, which begins at `base` ---------------------------------------------------------------------------------
 
 
-@wp.func_native(source("packet_set_up.h", **LAYOUT))
-def set_up(rays: RayArrays, first: int, count: int, pad: float, packet: wp.array(dtype=wp.float32), base: int) -> int:
-    """Rays first .. first + count - 1; the mask of those that are not empty, and COHERENT. pad: nodes.far_pad."""
+@cache
+def make_set_up(rays_struct):
+    """set_up for RayArrays, or for a Queue, whose directions are taken as they are."""
+
+    @wp.func_native(source("wide/packet_set_up.h", QUEUE=rays_struct is not RayArrays, **LAYOUT))
+    def set_up(rays: rays_struct, first: int, count: int, pad: float, packet: wp.array(dtype=wp.float32), base: int) -> int:
+        """Rays first .. first + count - 1; the mask of those that are not empty, and COHERENT. pad: nodes.far_pad."""
+
+    return set_up
 
 
-@wp.func_native(source("packet_children.h", **LAYOUT))
+@wp.func_native(source("wide/packet_children.h", **LAYOUT))
 def children(nodes: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32), base: int) -> int:
     """The mask of the children of a node that rays of the mask meet: CHILD_ENTRY and CHILD_RAYS of these. Only with a beam."""
 
 
-@wp.func_native(source("packet_meets.h", **LAYOUT))
+@wp.func_native(source("wide/packet_meets.h", **LAYOUT))
 def meets(nodes: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32), base: int) -> int:
     """The rays of the mask that meet a child of a node, the root; and ROOT_ENTRIES."""
 
 
-@wp.func_native(source("packet_reaching.h", **LAYOUT))
+@wp.func_native(source("wide/packet_reaching.h", **LAYOUT))
 def reaching(t_entry: float, packet: wp.array(dtype=wp.float32), base: int) -> int:
     """The rays that reach so far."""
 
 
-@wp.func_native(source("packet_triangles.h", **LAYOUT))
+@wp.func_native(source("wide/packet_triangles.h", **LAYOUT))
 def triangles(rows: wp.array(dtype=wp.float32), first: int, count: int, mask: int, any_hit: bool,
               packet: wp.array(dtype=wp.float32), base: int) -> int:
     """The first `count` triangles of a row against the rays of the mask; those that hit one. After any hit t is -inf."""
 
 
-@wp.func_native(source("packet_write_hits.h", **LAYOUT))
+@wp.func_native(source("wide/packet_write_hits.h", **LAYOUT))
 def write_hits(hits: HitArrays, first: int, count: int, packet: wp.array(dtype=wp.float32), base: int): ...
 
 
-@wp.func_native(source("packet_write_occluded.h", **LAYOUT))
+@wp.func_native(source("wide/packet_write_occluded.h", **LAYOUT))
 def write_occluded(occluded: wp.array(dtype=wp.bool), first: int, count: int, packet: wp.array(dtype=wp.float32), base: int): ...
 
 
 # --- one ray of a packet, and its slot --------------------------------------------------------------------------------
 
 
-@wp.func_native(source("ray_begin.h", **LAYOUT))
+@wp.func_native(source("wide/ray_begin.h", **LAYOUT))
 def begin(nodes: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), ray: int, stacks: wp.array(dtype=wp.uint32),
           bottom: int, slots: wp.array(dtype=wp.int32), slot: int) -> int:
     """Put a ray into a slot, at the root's children; its stack begins at `bottom`. The reference that is next."""
 
 
-@wp.func_native(source("ray_step.h", **LAYOUT))
+@wp.func_native(source("wide/ray_step.h", **LAYOUT))
 def step(nodes: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint32),
          slots: wp.array(dtype=wp.int32), slot: int) -> int:
     """From a node to its nearest child; the others become a level of the stack. The reference that is next."""
 
 
-@wp.func_native(source("ray_pop.h", **LAYOUT))
+@wp.func_native(source("wide/ray_pop.h", **LAYOUT))
 def pop(nodes: wp.array(dtype=wp.float32), t: float, stacks: wp.array(dtype=wp.uint32), bottom: int,
         slots: wp.array(dtype=wp.int32), slot: int) -> bool:
     """Go to the next child on the stack that begins at or before t; whether there is one."""
 
 
-@wp.func_native(source("ray_cull.h", **LAYOUT))
+@wp.func_native(source("wide/ray_cull.h", **LAYOUT))
 def cull(rows: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32), ray: int) -> int:
     """As lanes.make_cull."""
 

@@ -27,4 +27,5 @@
     words[SLOT_NEXT] = next;
     words[SLOT_PLACE] = n > 1 ? level + 1 : place;
     words[SLOT_PENDING] = n == 0 ? TO_POP : 0;
+    words[SLOT_LEFT] = 0;
     return next;

@@ -12,13 +12,13 @@ from functools import cache
 
 import warp as wp
 
+from wrt.kernels.native import source
 from wrt.kernels.query import LARGEST
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.units.triangle import component
 from wrt.kernels.wide.lanes import LaneRay, bits, lowest, make_cull, prefetch
-from wrt.kernels.wide.native import source
 from wrt.kernels.wide.nodes import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, far_pad, first_reference, make_children, node_size
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 
@@ -50,7 +50,7 @@ def row_size(record, width: int) -> int:
 def make_uninitialized(length: int, dtype):
     """A vector of whatever memory holds: Warp sets every new one to 0, and of a stack's 512 bytes most rays use a few."""
 
-    @wp.func_native(source("uninitialized.h", TYPE=f"wp::vec_t<{length}, wp::{dtype.__name__}>"))
+    @wp.func_native(source("wide/uninitialized.h", TYPE=f"wp::vec_t<{length}, wp::{dtype.__name__}>"))
     def uninitialized() -> wp.types.vector(length, dtype): ...
 
     return uninitialized
@@ -99,7 +99,7 @@ def lane_ray(probe: Probe, pad: float) -> LaneRay:
 def make_gather(record, width):
     """gather(rows, i): the record that has its first number at rows[i], the next at rows[i + width] and so on."""
 
-    @wp.func_native(source("gather.h", WIDTH=width))
+    @wp.func_native(source("wide/gather.h", WIDTH=width))
     def copy_numbers(rows: wp.array(dtype=wp.float32), i: int, out: wp.ref[record]): ...
 
     @wp.func

@@ -84,6 +84,14 @@ class Tracer:
 tracer = made_once(Tracer)
 
 
+def new_scratch(sizes: tuple[int, ...]) -> Scratch:
+    """sizes: as stream_sizes of a traversal's module; aligned, as rows of lanes would else lie in two cache lines each."""
+    out = Scratch()
+    for (name, field), size in zip(Scratch.vars.items(), sizes, strict=False):
+        setattr(out, name, to_warp(empty_aligned((size,), wp.dtype_to_numpy(field.type.dtype))))
+    return out
+
+
 class Worker:
     """A launch that is recorded once, what it works in, and arrays for rays and answers that cannot be used where they are. For one
     thread at a time."""
@@ -92,13 +100,8 @@ class Worker:
         self.given = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
         self.answers = [np.empty(FEWEST, dtype) for dtype in tracer.types.values()]
         self.packed = pack(self.given, self.answers)
-        self.block, self.scratch = tracer.block, Scratch()
-        # Aligned: rows of lanes would else lie in two cache lines each.
-        types = np.float32, np.uint32, np.int32
-        memory = [empty_aligned((size,), dtype) for size, dtype in zip(tracer.sizes, types, strict=False)]
-        for name, array in zip(Scratch.vars, memory, strict=False):
-            setattr(self.scratch, name, to_warp(array))
-        self.slots = memory[-1] if memory else np.zeros(1, np.int32)
+        self.block, self.scratch = tracer.block, new_scratch(tracer.sizes)
+        self.slots = self.scratch.slots.numpy() if tracer.stream else np.zeros(1, np.int32)
         own = [self.scratch, 0] if tracer.stream else []
         self.command = wp.launch(tracer.kernel, dim=1, inputs=[*tracer.inputs, *own, 0], device="cpu", record_cmd=True)
         self.inputs: list[Any] = [None] * (len(own) + 5)  # as they were last

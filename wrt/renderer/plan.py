@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from wrt.renderer.film_arrays import GROUPS
 from wrt.renderer.instancing import instanced_meshes
 from wrt.renderer.options import Options
 from wrt.renderer.upload import camera_kind
+from wrt.renderer.waves import WaveKernels, wave_kernels
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import Settings
@@ -32,11 +34,6 @@ def render_kernel(features: Features, structure: Any) -> Any:
 @made_once
 def aov_kernel(features: Features, structure: Any) -> Any:
     return kernels.make_aov_kernel(features, structure, camera_kind(features.camera))
-
-
-def kernel_hash(kernel: Any, device: str) -> str:
-    """Of the kernel's whole code, the same in every process."""
-    return str(kernel.module.get_module_hash(1 if device == "cpu" else None).hex())
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +63,30 @@ class Plan:
         return (x1 - x0) * (y1 - y0)
 
     @property
+    def by_waves(self) -> bool:
+        """On the CPU many samples are taken at a time; on CUDA, and where rays are counted, one."""
+        return self.options.device == "cpu" and not self.structure.units.counters
+
+    @property
+    def wave_kernels(self) -> WaveKernels:
+        return wave_kernels(self.features, self.structure, bool(self.options.aov))
+
+    @property
     def kernels(self) -> list[Any]:
-        """The render kernel, and the AOV kernel where AOVs are asked for."""
+        """Where pictures are not made by waves, the render kernel, and the AOV kernel where AOVs are asked for."""
+        if self.by_waves:
+            return self.wave_kernels.all()
         kernels = [render_kernel(self.features, self.structure)]
         return [*kernels, aov_kernel(self.features, self.structure)] if self.options.aov else kernels
 
     def kernels_hash(self) -> str:
-        return kernel_hash(self.kernels[0], self.options.device)
+        """Of the whole code that makes pixels, the same in every process."""
+        if self.by_waves:
+            kernels = wave_kernels(self.features, self.structure, aov=False).all()
+        else:
+            kernels = [render_kernel(self.features, self.structure)]
+        hashes = [kernel.module.get_module_hash(1 if self.options.device == "cpu" else None) for kernel in kernels]
+        return hashlib.sha256(b"".join(hashes)).hexdigest()
 
     def limits(self, seed: int) -> Any:
         """The kernels' record of the same name."""

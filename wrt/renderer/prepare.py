@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from wrt.renderer.options import Progress
 from wrt.renderer.plan import Plan
 from wrt.renderer.tiles import Rectangle, Work, corners, tiles
 from wrt.renderer.upload import DeviceScene, camera_struct, upload_scene
+from wrt.renderer.waves import Waves
 from wrt.scene.cameras import CameraKind
 
 TILE_SIZE = 32
@@ -31,7 +33,8 @@ PREPARING_REPORTED = 1.0  # seconds of compiling and building before `progress` 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """kernels: as Plan.kernels, compiled; arrays: the scene on the device; camera: the device's record of plan.camera; seconds: of
+    """kernels: as Plan.kernels, compiled; arrays: the scene on the device; camera: the device's record of plan.camera; waves:
+    what makes pictures on the CPU (Plan.by_waves); seconds: of
     "compile", "upload" and "build"."""
 
     plan: Plan
@@ -41,6 +44,7 @@ class Prepared:
     arrays: DeviceScene
     accel: Accelerator
     camera: Any
+    waves: Waves | None
     seconds: dict[str, float]
 
     def aimed(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> Prepared:
@@ -69,6 +73,9 @@ class Prepared:
     def launch(self, film: DeviceFilm | AovFilm, accel: Any = None) -> Callable[[Work], int]:
         """A function that traces some work into the film, and gives its samples. accel: a record in place of the structure's."""
         accel = self.accel.data if accel is None else accel
+        if self.waves is not None:
+            limits = [] if isinstance(film, AovFilm) else [self.plan.limits(seed) for seed in film.seeds]
+            return self.waves.launch((accel, self.arrays.surfaces, self.arrays.lighting, self.camera), limits, film)
         if isinstance(film, AovFilm):
             kernel, groups = self.kernels[1], [[accel, self.arrays.surfaces, self.camera, film.struct]]
         else:
@@ -117,14 +124,16 @@ def prepare(plan: Plan, device: Any, built: Prepared | None = None) -> Prepared:
 
     Raises InputError where the scene cannot be rendered."""
     work = _Preparation(plan, device)
-    work.run([work.compile] if built is not None else [work.compile, work.build])
+    work.run(([work.build] if built is None else []) + [partial(work.compile, kernel) for kernel in work.kernels])
     arrays, accel = (work.arrays, work.accel) if built is None else (built.arrays, built.accel)
-    return Prepared(plan, device, work.threads, work.kernels, arrays, accel, camera_struct(plan.camera, plan.scene.settings.size),
-                    work.seconds)
+    lights = arrays.lighting.count + (1 if plan.features.sky_light else 0)
+    waves = Waves(plan.wave_kernels, plan.features, lights) if plan.by_waves else None
+    camera = camera_struct(plan.camera, plan.scene.settings.size)
+    return Prepared(plan, device, work.threads, work.kernels, arrays, accel, camera, waves, work.seconds)
 
 
 class _Preparation:
-    """Two threads: one compiles, which takes longest, and meanwhile the other uploads and builds."""
+    """Threads of its own: some compile, which takes longest, and meanwhile one uploads and builds."""
 
     arrays: DeviceScene
     accel: Accelerator
@@ -134,12 +143,12 @@ class _Preparation:
         self.plan, self.device, self.kernels = plan, device, plan.kernels
         self.threads = thread_count(plan.options.threads)
         self.spans: dict[str, list[Span]] = {}
-        self.compiled, self.fraction_built = False, 0.0
+        self.compiled, self.fraction_built = list[Any](), 0.0
 
     def run(self, jobs: list[Callable[[], None]]) -> None:
         """Neither Ctrl-C nor an error waits for the compiler, and no wait is long: Python may hear of Ctrl-C only between two."""
         begin, reported = time.perf_counter(), ("", 0.0)
-        pool = ThreadPoolExecutor(2, thread_name_prefix=PREPARING)
+        pool = ThreadPoolExecutor(1 + min(self.threads, len(self.kernels)), thread_name_prefix=PREPARING)
         pending = {pool.submit(job) for job in jobs}
         try:
             while pending:
@@ -150,22 +159,21 @@ class _Preparation:
                 if pending and seconds >= PREPARING_REPORTED:
                     reported = self._report(seconds, reported)
         finally:
-            pool.shutdown(wait=False)
+            pool.shutdown(wait=False, cancel_futures=True)
         self.seconds = counted_once({"compile": loads_since(begin), **self.spans})
 
     def _report(self, seconds: float, before: tuple[str, float]) -> tuple[str, float]:
         """Call `progress` where there is something new."""
         state = ("build", self.fraction_built) if self.fraction_built > 0.0 else ("compile", 0.0)
         progress = self.plan.options.progress
-        if progress is None or state == before or (state[0] == "compile" and self.compiled):
+        if progress is None or state == before or (state[0] == "compile" and len(self.compiled) == len(self.kernels)):
             return before
         progress(Progress(int(100.0 * state[1]), 100, 0, seconds, stage=state[0]))
         return state
 
-    def compile(self) -> None:
-        for kernel in self.kernels:
-            load_kernel(kernel, self.device)
-        self.compiled = True
+    def compile(self, kernel: Any) -> None:
+        load_kernel(kernel, self.device)
+        self.compiled.append(kernel)
 
     def build(self) -> None:
         options = self.plan.options

@@ -16,6 +16,7 @@ from wrt.kernels.shade.sampling import (
     ggx_normal,
     ggx_visible_share,
     hash_u32,
+    make_draw,
     polygon,
     reverse_bits,
     sample_2d,
@@ -25,6 +26,7 @@ from wrt.kernels.shade.sampling import (
     unit_float,
 )
 from wrt.kernels.structs import kernel
+from wrt.renderer.features import Features
 
 
 @kernel
@@ -379,3 +381,21 @@ def test_search_cdf(weights, before):
     expected = np.searchsorted(cdf, x, side="right")
     assert np.array_equal(out.numpy(), expected)
     assert all(weights[i] > 0 for i in out.numpy())  # what has no weight is never chosen
+
+
+def test_points_in_lanes_are_those_of_one_at_a_time():
+    """What pictures draw on the CPU: the same bits, whichever index a pixel begins with."""
+    n, draw, at = 37, make_draw(Features()), 3
+
+    @kernel
+    def compare(key: wp.uint32, first: int, lanes: wp.array(dtype=wp.vec2), single: wp.array(dtype=wp.vec2)):
+        draw(key, 1, first, n, lanes, at)
+        for i in range(n):
+            single[at + i] = sample_2d(key, wp.uint32(first + i), 1)
+
+    for key, first in ((0, 0), (0xFFFFFFFF, 5), (0x12345678, (1 << 20) - 7), (77, 0x7FFFFFFF - n)):
+        lanes, single = zeros(n + 2 * at, wp.vec2), zeros(n + 2 * at, wp.vec2)
+        launch(compare, 1, wp.uint32(key), first, lanes, single)
+        np.testing.assert_array_equal(lanes.numpy().view(np.int32), single.numpy().view(np.int32))
+        drawn = lanes.numpy().any(axis=1)
+        assert drawn[at : at + n].sum() >= n - 1 and not drawn[:at].any() and not drawn[at + n :].any()

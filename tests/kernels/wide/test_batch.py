@@ -8,7 +8,7 @@ from tests.data import data_path
 from tests.kernel_tools import CPU, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel.batches import FEWEST, MOST, rays_per_launch, tracer
+from wrt.accel.batches import FEWEST, MOST, new_scratch, rays_per_launch, tracer
 from wrt.accel.build import build
 from wrt.accel.built import Built
 from wrt.accel.bvh.wide_tree import stack_need
@@ -17,8 +17,9 @@ from wrt.accel.rays import rays_of, rays_on
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.io.mesh_file import load_mesh
-from wrt.kernels.query import HitArrays
+from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
 from wrt.kernels.traverse.common import Units
+from wrt.kernels.wide.batch import BatchTraversal
 from wrt.kernels.wide.references import EMPTY, leaf_reference
 from wrt.kernels.wide.traverse import STACK_SIZE
 from wrt.lab.bench.rays import ray_sets
@@ -204,7 +205,7 @@ def test_packets_are_given_up_where_they_fall_apart():
 
 def test_units_without_lanes_have_no_stream():
     bvh8 = ACCELERATORS["bvh8"]
-    for units in (Units(triangle="moeller_trumbore"), Units(box="plain"), Units(spheres=True), Units(counters=True)):
+    for units in (Units(triangle="moeller_trumbore"), Units(box="plain"), Units(counters=True), Units(instances=True)):
         assert tracer(Structure(bvh8, units), False).stream is None
     assert tracer(Structure(ACCELERATORS["bvh2"]), False).stream is None
     assert tracer(Structure(bvh8, Units(box="minmax")), True).stream is not None
@@ -218,3 +219,32 @@ def test_a_million_rays(name):
     for inside in (False, True):
         for rays in ray_sets(accel, 125_000, inside=inside).values():
             assert_same(accel, rays.origins, rays.directions, 0.0, rays.t_max)
+
+
+def test_rays_of_a_picture_leave_out_what_they_start_on():
+    """A Queue's rays, and a mesh with spheres in its leaves: as the kernel for one ray."""
+    mesh = icosphere(3)
+    spheres = np.array([[1.0, 0.2, 0.0, 0.3], [0.0, -1.0, 0.1, 0.25], [0.4, 0.4, 0.9, 0.01]], np.float32)
+    accel = build(Geometry(mesh.vertices, mesh.faces, spheres), "bvh8")
+    o, d, _, t_max = mixed_rays(4000, 3)
+    first = accel.closest_hit(o, d).prim_id
+    assert (first >= len(mesh.faces)).any() and (first < 0).any()
+    queue = Queue()
+    queue.origin, queue.direction = vec3s(o), vec3s(d)
+    queue.t_min, queue.t_max = zeros(len(o)), wp.array(t_max.astype(np.float32), dtype=wp.float32, device=CPU)
+    answers = {}
+    for exclude in (np.zeros_like(first), first + 1):
+        queue.exclude = wp.array(exclude, dtype=wp.int32, device=CPU)
+        for any_hit in (False, True):
+            many, block = accel.structure.accel.kernels.make_stream(accel.structure.units, any_hit, Queue), 64
+            one = make_queue_kernel(accel.structure.struct, accel.structure.traversal(any_hit=any_hit), any_hit)
+            for kernel, threads, more in ((many, -(-len(o) // block), [new_scratch(BatchTraversal.stream_sizes)]), (one, len(o), [])):
+                hits = HitArrays()
+                hits.t, hits.u, hits.v, hits.prim_id = zeros(len(o)), zeros(len(o)), zeros(len(o)), zeros(len(o), wp.int32)
+                out = zeros(len(o), wp.bool) if any_hit else hits
+                wp.launch(kernel, threads, [accel.data, accel._surfaces, queue, out, *more, 0, len(o)], device=CPU)
+                arrays = [out.numpy()] if any_hit else [hits.t.numpy(), hits.u.numpy(), hits.v.numpy(), hits.prim_id.numpy()]
+                answers.setdefault((any_hit, bool(exclude.any())), []).append([array.view(np.uint8) for array in arrays])
+    for both in answers.values():
+        np.testing.assert_array_equal(*map(np.concatenate, both))
+    assert (answers[False, True][0][3] != answers[False, False][0][3]).any()

@@ -23,6 +23,7 @@ from wrt.picture.film import Film
 from wrt.renderer import checkpoint as module
 from wrt.renderer.checkpoint import MAGIC, Checkpoint, read
 from wrt.renderer.options import Options, Progress
+from wrt.renderer.plan import Plan
 from wrt.renderer.render import render
 from wrt.renderer.renderer import Renderer
 from wrt.renderer.schedule import LocalTracer, Run, Steps
@@ -225,7 +226,7 @@ def test_a_checkpoint_of_another_render_is_refused(path: Path) -> None:
 def test_a_stale_checkpoint_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     render(SCENE, spp=1, checkpoint=path)
     with monkeypatch.context() as patch:
-        patch.setattr("wrt.renderer.plan.kernel_hash", lambda kernel, device: "0" * 64)
+        patch.setattr(Plan, "kernels_hash", lambda self: "0" * 64)
         refuses("the kernels are another version", path, resume=True)
     monkeypatch.setattr(module, "VERSION", "99.0")
     refuses(r"version was .*, is 99\.0", path, resume=True)

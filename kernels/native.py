@@ -24,8 +24,8 @@ def literal(value: float | str) -> str:
 
 
 def source(file: str | Path, **constants: float | str) -> str:
-    """The body of a native function, for wp.func_native: a file (of this folder, or a path), with those constants (int, float,
-    bool, C++) that it names."""
+    """The body of a native function, for wp.func_native: a file ("wide/gather.h" of this folder, or a path), with those constants
+    (int, float, bool, C++) that it names."""
     body = text_of(Path(__file__).parent / file)
     named = [name for name in constants if re.search(rf"\b{name}\b", body)]
     before = "".join(f"#define {name} {literal(constants[name])}\n" for name in named)

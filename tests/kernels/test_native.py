@@ -9,8 +9,8 @@ from tests.data import ROOT
 from tests.kernel_tools import launch, zeros  # isort: skip (starts Warp)
 import warp as wp
 
+from wrt.kernels.native import source
 from wrt.kernels.structs import kernel
-from wrt.kernels.wide.native import source
 
 
 def result(path):

@@ -1,0 +1,361 @@
+"""Many camera samples at a time, for one CPU thread: the integrator's step in a loop over queues.
+
+A wavefront (Laine, Karras and Aila 2013, "Megakernels Considered Harmful"): the pending rays of a wave of samples wait in one
+queue; one launch traces all of them, and the next shades all hits. Each sample goes through its own paths in the order of loop.py
+and adds up its light in that order, so that pictures have the same bits. Traversal and shading are kernels of their own: another
+scene compiles no traversal.
+
+Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from wrt.kernels.query import HitArrays, Queue, queued_ray
+from wrt.kernels.shade.backgrounds import make_background
+from wrt.kernels.shade.materials import Scatter
+from wrt.kernels.shade.render import center_of, load_pixel, make_camera_sample, make_see, store_pixel, with_sample
+from wrt.kernels.shade.sampling import hash_pair, make_draw
+from wrt.kernels.shade.shading import make_shading
+from wrt.kernels.shade.shadows import Shadow, ShadowWalk, begin_shadow, make_go_through
+from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, lit_by, make_path, make_paths, make_step
+from wrt.kernels.structs import AovFilm, Film, Hit, Lighting, Limits, Surfaces, kernel
+
+Path = make_path(False)
+AHEAD = 4  # hits, of what memory is asked for before it is read
+
+
+@wp.struct
+class Job:
+    """What a wave is: `samples` of each of the first `pixels` of Wave.order, in a tile at x, y; and how many rays are queued."""
+
+    x: int
+    y: int
+    width: int
+    pixels: int
+    first_sample: int
+    samples: int
+    queued: int
+
+
+@wp.struct
+class Wave:
+    """Samples are numbered pixel by pixel; there is room for `capacity`. By number: xi, lens_xi, what places a sample on the film
+    and on the lens; done, the sum so far; size, traced: paths that wait, and rays so far; paths[level * capacity + number]: those
+    that wait.
+
+    By place in the queue: number, rays, hits, lit, scatter, asked (shadow rays of a hit), and for light i from i * capacity on
+    request: the place of its shadow ray, or -1. By place of a shadow ray, for light i from i * capacity on: value, shadow_rays,
+    occluded or, where shadows are transparent, walks and shadow_hits, and waiting: which walks those rays are of. asking: shadow
+    rays to each light.
+    """
+
+    capacity: int
+    job: wp.array(dtype=Job)
+    order: wp.array(dtype=wp.int32)
+    xi: wp.array(dtype=wp.vec2)
+    lens_xi: wp.array(dtype=wp.vec2)
+    done: wp.array(dtype=Sample)
+    size: wp.array(dtype=wp.int32)
+    traced: wp.array(dtype=wp.int32)
+    paths: wp.array(dtype=Path)
+    number: wp.array(dtype=wp.int32)
+    rays: Queue
+    hits: HitArrays
+    lit: wp.array(dtype=Lit)
+    scatter: wp.array(dtype=Scatter)
+    asked: wp.array(dtype=wp.int32)
+    request: wp.array(dtype=wp.int32)
+    asking: wp.array(dtype=wp.int32)
+    value: wp.array(dtype=wp.vec3)
+    shadow_rays: Queue
+    occluded: wp.array(dtype=wp.bool)
+    walks: wp.array(dtype=ShadowWalk)
+    shadow_hits: HitArrays
+    waiting: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def enqueue(wave: Wave, k: int, number: int, path: Path):
+    wave.number[k] = number
+    wave.rays.origin[k] = path.origin
+    wave.rays.direction[k] = path.direction
+    wave.rays.exclude[k] = path.exclude_plus_one
+
+
+@wp.func
+def hit_at(hits: HitArrays, i: int) -> Hit:
+    hit = Hit()
+    hit.t = hits.t[i]
+    hit.u = hits.u[i]
+    hit.v = hits.v[i]
+    hit.prim_id = hits.prim_id[i]
+    return hit
+
+
+@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
+def call_in_face(array: wp.array(dtype=wp.vec3i), i: int): ...
+
+
+@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
+def call_in_number(array: wp.array(dtype=wp.int32), i: int): ...
+
+
+@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
+def call_in_corner(array: wp.array(dtype=wp.vec3), i: int): ...
+
+
+@wp.func
+def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, queued: int):
+    """What the hits after this one will read of their triangles: the face of one, the corners of another before it."""
+    if k + 2 * AHEAD < queued:
+        prim_id = wave.hits.prim_id[k + 2 * AHEAD]
+        if prim_id >= 0 and prim_id < surfaces.n_triangles:
+            call_in_face(surfaces.faces, prim_id)
+            call_in_number(surfaces.prim_material, prim_id)
+    if k + AHEAD < queued:
+        prim_id = wave.hits.prim_id[k + AHEAD]
+        if prim_id >= 0 and prim_id < surfaces.n_triangles:
+            face = surfaces.faces[prim_id]
+            for corner in range(3):
+                call_in_corner(surfaces.vertices, face[corner])
+                if surfaces.normals.shape[0] > 1:
+                    call_in_corner(surfaces.normals, face[corner])
+
+
+def make_begin_kernel(features, camera_kind):
+    """Camera rays of a wave. Where there is none, the sample is done."""
+    camera_struct = camera_kind.Camera
+    camera_sample = make_camera_sample(features, camera_kind)
+    first_path, _, _ = make_paths()
+    draw = make_draw(features)
+
+    @kernel
+    def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film):
+        job = wave.job[0]
+        queued = int(0)
+        for p in range(job.pixels):
+            at = wave.order[p]
+            x = job.x + at % job.width
+            y = job.y + at / job.width
+            key = hash_pair(hash_pair(limits.seed, wp.uint32(x)), wp.uint32(y))
+            draw(key, 0, job.first_sample, job.samples, wave.xi, p * job.samples)
+            if wp.static(features.lens):
+                draw(key, 1, job.first_sample, job.samples, wave.lens_xi, p * job.samples)
+            for i in range(job.samples):
+                number = p * job.samples + i
+                lens_xi = wp.vec2(0.0, 0.0)
+                if wp.static(features.lens):
+                    lens_xi = wave.lens_xi[number]
+                ray = camera_sample(camera, film, x, y, wave.xi[number], lens_xi)
+                wave.done[number] = Sample()
+                wave.size[number] = 0
+                wave.traced[number] = 0
+                if ray.t_max > 0.0:
+                    path = first_path(ray, key)
+                    wave.paths[number] = path
+                    enqueue(wave, queued, number, path)
+                    queued += 1
+        wave.job[0].queued = queued
+
+    return begin_wave
+
+
+def make_shade_kernel(features):
+    """The step at every hit of the queue: its light, its new paths, and its requests for shadow rays."""
+    shading = make_shading(features)
+    step = make_step(features, shading)
+    _, _, ray_of, shade, extra_lights, shadow_request, keep, worth = step
+    background_radiance = make_background(features)
+    lit_at_all = bool(features.lights) or features.sky_light
+
+    @wp.func
+    def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
+        """The number of paths that wait, with this one where it is followed."""
+        if verdict == 1:
+            wave.paths[size * wave.capacity + number] = path
+            return size + 1
+        return size
+
+    @wp.func
+    def ask(wave: Wave, i: int, request: ShadowRequest) -> int:
+        """The place of a shadow ray to light i."""
+        slot = i * wave.capacity + wave.asking[i]
+        wave.asking[i] = wave.asking[i] + 1
+        wave.value[slot] = request.value
+        wave.shadow_rays.origin[slot] = request.ray.origin
+        wave.shadow_rays.direction[slot] = request.ray.direction
+        wave.shadow_rays.t_max[slot] = request.ray.t_max
+        wave.shadow_rays.exclude[slot] = request.ray.exclude_plus_one
+        if wp.static(features.transparent_shadows):
+            wave.walks[slot] = begin_shadow(request.ray, request.end)
+            wave.waiting[slot] = slot
+        return slot
+
+    @kernel
+    def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits):
+        job = wave.job[0]
+        for k in range(job.queued):
+            if wp.static(not features.instances):
+                call_in_surface(wave, surfaces, k, job.queued)
+            number = wave.number[k]
+            size = wave.size[number]
+            traced = wave.traced[number] + 1
+            wave.traced[number] = traced
+            path = wave.paths[size * wave.capacity + number]
+            out = wave.done[number]
+            out.rays += 1
+            asked = int(0)
+            hit = hit_at(wave.hits, k)
+            if hit.prim_id < 0:
+                out.radiance += wp.cw_mul(path.throughput, background_radiance(lighting.background, path.direction))
+            else:
+                index = wp.uint32(job.first_sample + number % job.samples)
+                shaded = shade(surfaces, lighting, path, ray_of(path), hit, index)
+                lit = Lit()
+                lit.light = shaded.light
+                lit.throughput = shaded.throughput
+                if wp.static(features.blend):
+                    verdict = keep(shaded.onward, limits, traced)
+                    size = follow(wave, number, size, shaded.onward, verdict)
+                    out = counted(out, verdict)
+                    out.lost += worth(surfaces, shaded.onward, verdict)
+                if wp.static(features.reflection):
+                    verdict = keep(shaded.reflected, limits, traced)
+                    size = follow(wave, number, size, shaded.reflected, verdict)
+                    out = counted(out, verdict)
+                    lit.reflected = worth(surfaces, shaded.reflected, verdict)
+                if wp.static(features.refraction):
+                    verdict = keep(shaded.refracted, limits, traced)
+                    size = follow(wave, number, size, shaded.refracted, verdict)
+                    out = counted(out, verdict)
+                    lit.refracted = worth(surfaces, shaded.refracted, verdict)
+                if wp.static(lit_at_all):
+                    if is_lit(shaded.scatter):
+                        for i in range(lighting.count + wp.static(extra_lights)):
+                            request = shadow_request(surfaces, lighting, shaded, i, index)
+                            slot = int(-1)
+                            if wp.max(request.value) > 0.0:
+                                slot = ask(wave, i, request)
+                                asked += 1
+                            wave.request[i * wave.capacity + k] = slot
+                if asked > 0:
+                    wave.lit[k] = lit
+                    if wp.static(features.transparent_shadows):
+                        wave.scatter[k] = shaded.scatter
+                else:
+                    out = add_up(out, lit, Shadow())
+            wave.done[number] = out
+            wave.size[number] = size
+            wave.asked[k] = asked
+
+    return shade_wave
+
+
+def make_shadow_kernel(features):
+    """Shadow rays to one light that have met the closest surface on their way."""
+    go_through = make_go_through(features, make_shading(features))
+
+    @kernel
+    def shadow_wave(wave: Wave, surfaces: Surfaces, light: int):
+        first = light * wave.capacity
+        left = int(0)
+        for j in range(wave.asking[light]):
+            slot = wave.waiting[first + j]
+            walk = go_through(surfaces, wave.walks[slot], hit_at(wave.shadow_hits, first + j))
+            wave.walks[slot] = walk
+            if walk.done == 0:
+                wave.waiting[first + left] = slot
+                wave.shadow_rays.origin[first + left] = walk.ray.origin
+                wave.shadow_rays.direction[first + left] = walk.ray.direction
+                wave.shadow_rays.t_max[first + left] = walk.ray.t_max
+                wave.shadow_rays.exclude[first + left] = walk.ray.exclude_plus_one
+                left += 1
+        wave.asking[light] = left
+
+    return shadow_wave
+
+
+@cache
+def make_gather_kernel(transparent_shadows: bool):
+    """What the lights send to the hits of the queue; then the next path of each sample is queued."""
+
+    @kernel
+    def gather_wave(wave: Wave, lights: int):
+        queued = int(0)
+        for k in range(wave.job[0].queued):
+            number = wave.number[k]
+            if wave.asked[k] > 0:
+                direct = Shadow()
+                for i in range(lights):
+                    slot = wave.request[i * wave.capacity + k]
+                    if slot >= 0:
+                        if wp.static(transparent_shadows):
+                            direct = lit_by(direct, wave.value[slot], wave.scatter[k], wave.walks[slot].shadow)
+                        else:
+                            shadow = Shadow()
+                            shadow.rays = 1
+                            if not wave.occluded[slot]:
+                                shadow.transmittance = wp.vec3(1.0, 1.0, 1.0)
+                            direct = lit_by(direct, wave.value[slot], Scatter(), shadow)
+                wave.done[number] = add_up(wave.done[number], wave.lit[k], direct)
+            size = wave.size[number] - 1
+            if size >= 0:
+                wave.size[number] = size
+                enqueue(wave, queued, number, wave.paths[size * wave.capacity + number])
+                queued += 1
+        for i in range(lights):
+            wave.asking[i] = 0
+        wave.job[0].queued = queued
+
+    return gather_wave
+
+
+def make_begin_aov_kernel(camera_kind):
+    """A ray through the middle of each pixel; where there is none, it has no length."""
+    camera_struct = camera_kind.Camera
+    camera_ray = camera_kind.make_camera_ray()
+
+    @kernel
+    def begin_aov(wave: Wave, camera: camera_struct, film: AovFilm):
+        job = wave.job[0]
+        for p in range(job.pixels):
+            x = job.x + wave.order[p] % job.width
+            y = job.y + wave.order[p] / job.width
+            ray = camera_ray(camera, center_of(x, y, film.width, film.height), wp.vec2(0.5, 0.5))
+            wave.rays.origin[p] = ray.origin
+            wave.rays.direction[p] = ray.direction
+            wave.rays.exclude[p] = 0
+            wave.rays.t_max[p] = ray.t_max
+
+    return begin_aov
+
+
+def make_see_kernel(features):
+    """What those rays meet."""
+    see = make_see(features)
+
+    @kernel
+    def see_wave(wave: Wave, surfaces: Surfaces, film: AovFilm):
+        job = wave.job[0]
+        for p in range(job.pixels):
+            at = wave.order[p]
+            pixel = (job.y + at / job.width - film.y) * film.columns + job.x + at % job.width - film.x
+            see(film, pixel, surfaces, queued_ray(wave.rays, p), hit_at(wave.hits, p))
+            wave.rays.t_max[p] = float(wp.inf)
+
+    return see_wave
+
+
+@kernel
+def add_wave(wave: Wave, film: Film):
+    """The samples of a wave to their pixels, in their order."""
+    job = wave.job[0]
+    for p in range(job.pixels):
+        at = wave.order[p]
+        i = (job.y + at / job.width - film.y) * film.columns + job.x + at % job.width - film.x
+        pixel = load_pixel(film, i)
+        for j in range(job.samples):
+            pixel = with_sample(pixel, wave.done[p * job.samples + j])
+        store_pixel(film, i, pixel)

@@ -1,0 +1,141 @@
+"""Waves of samples: the same film as one ray at a time makes, and kernels that scenes share."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.data import ROOT
+from wrt.core.device import load_kernel, start
+from wrt.io.load import load_scene
+from wrt.renderer import waves
+from wrt.renderer.film_arrays import OF_AOVS, AovFilm, DeviceFilm
+from wrt.renderer.options import Options
+from wrt.renderer.plan import aov_kernel, plan_of, render_kernel
+from wrt.renderer.prepare import Prepared, prepare
+from wrt.renderer.tiles import Work, corners
+
+SCENES = ROOT / "scenes"
+TILE = (3, 2, 37, 22)
+
+
+def prepared(name: str, aov: tuple[str, ...] = (), **settings: Any) -> Prepared:
+    scene = load_scene(SCENES / f"{name}.toml").with_settings(size=(48, 27), **settings)
+    return prepare(plan_of(scene, Options(threads=1, crop=corners(TILE), aov=aov)), start("cpu"))
+
+
+def one_ray_at_a_time(ready: Prepared) -> Prepared:
+    """With the loop that CUDA has."""
+    plan = ready.plan
+    makes = (render_kernel, aov_kernel) if plan.options.aov else (render_kernel,)
+    kernels = [make(plan.features, plan.structure) for make in makes]
+    for kernel in kernels:
+        load_kernel(kernel, ready.device)
+    return replace(ready, waves=None, kernels=kernels)
+
+
+def film_of(ready: Prepared, *parts: tuple[int, int], groups: int = 1) -> dict[str, np.ndarray]:
+    film = DeviceFilm(ready.plan.scene.settings, ready.plan.crop, ready.device, 5, groups)
+    trace = ready.launch(film)
+    for first, n in parts:
+        assert trace(Work(TILE, first, n)) == TILE[2] * TILE[3] * n
+    return {name: film.picture(array) for name, array in film.arrays()}
+
+
+def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+    assert one.keys() == other.keys()
+    for name, values in one.items():
+        np.testing.assert_array_equal(values.view(np.uint8), other[name].view(np.uint8), err_msg=name)
+
+
+# What there is beside plain surfaces: shadow rays through glass and panes, cut-outs, instances, an image circle.
+@pytest.mark.parametrize(("name", "settings"), [
+    ("tinted_shadows", {"max_depth": 3}),
+    ("thin_glass", {"max_depth": 2}),
+    ("blend", {}),
+    ("cutout", {"max_depth": 0}),
+    ("instances", {"max_depth": 1}),
+    ("fisheye", {}),
+])
+def test_the_film_is_that_of_one_ray_at_a_time(name: str, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    ready = prepared(name, **settings)
+    expected = film_of(one_ray_at_a_time(ready), (0, 5))
+    assert expected["rays"].min() > 0 or name == "fisheye"
+    if settings:  # something was cut
+        assert expected["cut_depth"].sum() + expected["cut_throughput"].sum() > 0 and expected["lost of group 0"].sum() > 0.0
+    assert_same(film_of(ready, (0, 5)), expected)
+    assert_same(film_of(ready, (0, 1), (1, 4)), expected)
+    monkeypatch.setattr(waves, "CAPACITY", 67)
+    assert_same(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 5)), expected)
+
+
+def test_more_samples_a_pixel_than_a_wave_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    ready = prepared("fisheye")
+    expected = film_of(ready, (0, 150))
+    monkeypatch.setattr(waves, "CAPACITY", 64)
+    assert_same(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 150)), expected)
+
+
+def test_groups_have_samples_of_their_own() -> None:
+    ready = prepared("fisheye")
+    film = film_of(ready, (0, 2), groups=2)
+    assert_same(film, film_of(one_ray_at_a_time(ready), (0, 2), groups=2))
+    assert (film["mean of group 0"] != film["mean of group 1"]).any()
+
+
+@pytest.mark.parametrize("name", ["fisheye", "cutout"])
+def test_aovs_are_those_of_one_ray_at_a_time(name: str) -> None:
+    ready = prepared(name, aov=tuple(OF_AOVS))
+    films = []
+    for way in (ready, one_ray_at_a_time(ready)):
+        film = AovFilm(way.plan.scene.settings, way.plan.crop, way.device)
+        way.launch(film)(Work(TILE, 0, 1))
+        films.append({name: film.picture(name) for name in OF_AOVS})
+    assert_same(*films)
+    assert (films[0]["prim_id"] >= 0).any() and ((films[0]["prim_id"] < 0).any() or name == "cutout")
+
+
+def test_scenes_share_what_they_have_in_common() -> None:
+    """A traversal is compiled once for a structure, and no kernel for another depth."""
+    of = {name: plan_of(load_scene(SCENES / f"{name}.toml"), Options()).wave_kernels for name in ("whitted", "glass_slab", "lens")}
+    for name in ("closest_hit", "any_hit", "gather", "add"):
+        assert len({getattr(kernels, name) for kernels in of.values()}) == 1, name
+    assert of["whitted"].begin is of["glass_slab"].begin is not of["lens"].begin
+    assert len({kernels.shade for kernels in of.values()}) == 3
+    deeper = load_scene(SCENES / "whitted.toml").with_settings(max_depth=64)
+    assert plan_of(deeper, Options()).wave_kernels == of["whitted"]
+
+
+def test_waves_are_smaller_where_each_sample_takes_more_room() -> None:
+    features = plan_of(load_scene(SCENES / "whitted.toml"), Options()).features
+    assert waves.Buffers(features, 2).capacity == waves.CAPACITY
+    many = waves.Buffers(features, 1000)
+    assert 64 <= many.capacity < waves.CAPACITY and len(many.wave.value) == 1000 * many.capacity <= waves.ROOM
+    assert waves.Buffers(replace(features, stack_size=1 << 20), 1).capacity == 64
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (32, 32), (5, 9), (64, 3)])
+def test_neighbours_are_next_to_each_other(width: int, height: int) -> None:
+    order = waves.block_order(width, height)
+    assert sorted(order) == list(range(width * height))
+    y, x = np.divmod(order, width)
+    whole = (x // 4 < width // 4) & (y // 4 < height // 4)
+    if width % 4 == 0 and height % 4 == 0:
+        assert whole.all()
+        for block in order.reshape(-1, 16):
+            assert np.ptp(block % width) == np.ptp(block // width) == 3
+
+
+def test_only_the_cpu_has_waves() -> None:
+    plan = plan_of(load_scene(SCENES / "fisheye.toml"), Options())
+    on_cuda = copy(plan.options)
+    on_cuda.device = "cuda:0"
+    assert plan.by_waves and not replace(plan, options=on_cuda).by_waves
+    counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
+    assert not replace(plan, structure=counting).by_waves
+    assert all(isinstance(kernel, wp.Kernel) for kernel in plan.kernels)

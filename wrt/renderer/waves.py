@@ -1,0 +1,287 @@
+"""Pictures on the CPU by waves of samples (wrt.kernels.shade.wave): which kernels, what they work in, and the loop around them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.batches import new_scratch
+from wrt.core.device import made_once, records, upload
+from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
+from wrt.kernels.shade import wave
+from wrt.kernels.shade.materials import Scatter
+from wrt.kernels.shade.shading import make_cutout
+from wrt.kernels.shade.shadows import ShadowWalk
+from wrt.kernels.shade.step import Lit, Sample
+from wrt.kernels.wide.batch import BatchTraversal
+from wrt.renderer.features import Features
+from wrt.renderer.film_arrays import AovFilm, DeviceFilm
+from wrt.renderer.tiles import Work
+from wrt.renderer.upload import camera_kind
+
+# Samples of a wave: so many that its launches cost little beside them, and so few that a core's cache holds what it works in. Fewer
+# where each has room for many paths or asks many lights: ROOM is for all of them together.
+CAPACITY, ROOM = 4096, 1 << 18
+World = tuple[Any, Any, Any, Any]  # the records of structure, surfaces, lighting and camera
+OF_CAMERA = ("camera", "lens", "blades", "filter", "independent")
+OF_CUTOUT = ("instances", "textures", "checkerboards", "cutout")
+
+
+def some(features: Features, names: tuple[str, ...]) -> Features:
+    """Only those switches, so that scenes that differ in others share a kernel."""
+    return Features(**{name: getattr(features, name) for name in names})
+
+
+@made_once
+def begin_kernel(features: Features) -> Any:
+    return wave.make_begin_kernel(features, camera_kind(features.camera))
+
+
+@made_once
+def shade_kernel(features: Features) -> Any:
+    return wave.make_shade_kernel(features)
+
+
+@made_once
+def shadow_kernel(features: Features) -> Any:
+    return wave.make_shadow_kernel(features)
+
+
+@made_once
+def see_kernel(features: Features) -> Any:
+    return wave.make_see_kernel(features)
+
+
+@made_once
+def begin_aov_kernel(camera: str) -> Any:
+    return wave.make_begin_aov_kernel(camera_kind(camera))
+
+
+@made_once
+def queue_kernel(structure: Any, features: Features, any_hit: bool) -> tuple[Any, int]:
+    """The structure's kernel for many rays at a time, where it has one, or for one ray after another; and the rays of one of its
+    threads. Spheres are always provided for, so that scenes with and without them share it."""
+    structure = structure._replace(units=structure.units._replace(spheres=True))
+    accepts = make_cutout(features) if features.cutout else None
+    make = getattr(structure.accel.kernels, "make_stream", None)
+    kernel = make(structure.units, any_hit, Queue, accepts) if make else None
+    if kernel is not None:
+        return kernel, structure.accel.kernels.stream_block
+    return make_queue_kernel(structure.struct, structure.traversal(any_hit=any_hit, accepts=accepts), any_hit), 1
+
+
+@dataclass(frozen=True)
+class WaveKernels:
+    """Those that a picture is made by; None: not needed. block: of queue_kernel."""
+
+    closest_hit: Any
+    any_hit: Any
+    shade: Any
+    shadow: Any
+    begin: Any
+    gather: Any
+    add: Any
+    begin_aov: Any
+    see: Any
+    block: int
+
+    def all(self) -> list[Any]:
+        """What takes longest to compile comes first."""
+        return [kernel for kernel in vars(self).values() if isinstance(kernel, wp.Kernel)]
+
+
+def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
+    """aov: whether AOVs are asked for."""
+    default = Features()
+    surfaces = replace(features, camera=default.camera, lens=False, blades=False, filter=False, stack_size=default.stack_size)
+    cutout = some(features, OF_CUTOUT)
+    lit, transparent = bool(features.lights) or features.sky_light, features.transparent_shadows
+    closest_hit, block = queue_kernel(structure, cutout, False)
+    return WaveKernels(
+        closest_hit=closest_hit,
+        any_hit=queue_kernel(structure, cutout, True)[0] if lit and not transparent else None,
+        shade=shade_kernel(surfaces),
+        shadow=shadow_kernel(surfaces) if transparent else None,
+        begin=begin_kernel(some(features, OF_CAMERA)),
+        gather=wave.make_gather_kernel(transparent),
+        add=wave.add_wave,
+        begin_aov=begin_aov_kernel(features.camera) if aov else None,
+        see=see_kernel(surfaces) if aov else None,
+        block=block,
+    )
+
+
+@dataclass(frozen=True)
+class Waves:
+    """The kernels of a scene, and what their threads work in. features: those that size it; lights: the background among them;
+    free: what no thread uses at the moment."""
+
+    kernels: WaveKernels
+    features: Features
+    lights: int
+    free: list[Buffers] = field(default_factory=list)
+
+    def launch(self, world: World, limits: list[Any], film: DeviceFilm | AovFilm) -> Callable[[Work], int]:
+        """A function that takes some work's samples into the film, and gives their number; several threads may call it. limits:
+        those of each group of the film."""
+        recorded: dict[int, Picture | Aovs] = {}
+
+        def trace(work: Work) -> int:
+            try:
+                buffers = self.free.pop()
+            except IndexError:
+                buffers = Buffers(self.features, self.lights)
+            if id(buffers) not in recorded:
+                recorded[id(buffers)] = (Aovs(self, buffers, world, film) if isinstance(film, AovFilm)
+                                         else Picture(self, buffers, world, limits, film))
+            recorded[id(buffers)].take(work)
+            self.free.append(buffers)  # not after an error
+            return work.total
+
+        return trace
+
+
+class Buffers:
+    """What one thread works in. job, asking, order: views of the wave's."""
+
+    def __init__(self, features: Features, lights: int) -> None:
+        self.capacity = n = max(min(CAPACITY, ROOM // max(lights, features.stack_size)), 64)
+        shadows = n * lights
+        self.job, self.asking, self.order = records(wave.Job, 1), np.zeros(max(lights, 1), np.int32), np.zeros(n, np.int32)
+        w = self.wave = wave.Wave()
+        w.capacity = n
+        w.job, w.asking, w.order = (upload(array, dtype, "cpu") for array, dtype in (
+            (self.job, wave.Job), (self.asking, wp.int32), (self.order, wp.int32)))
+        w.xi, w.lens_xi = room(n, wp.vec2), room(n, wp.vec2)
+        w.done, w.size, w.traced, w.number = room(n, Sample), room(n, wp.int32), room(n, wp.int32), room(n, wp.int32)
+        w.paths = room(n * features.stack_size, wave.Path)
+        w.rays, w.hits, w.lit, w.asked = queue(n), hit_arrays(n), room(n, Lit), room(n, wp.int32)
+        w.request, w.value, w.shadow_rays = room(shadows, wp.int32), room(shadows, wp.vec3), queue(shadows)
+        if features.transparent_shadows:
+            w.scatter, w.walks, w.waiting = room(n, Scatter), room(shadows, ShadowWalk), room(shadows, wp.int32)
+            w.shadow_hits = hit_arrays(shadows)
+        else:
+            w.occluded = room(shadows, wp.bool)
+        self.scratch = new_scratch(BatchTraversal.stream_sizes)
+
+    def take(self, work: Work, each: Callable[[], None]) -> None:
+        """Call `each` for every wave of some work, with its job and its pixels in place."""
+        job, (x, y, width, height) = self.job[0], work.rectangle
+        job["x"], job["y"], job["width"] = x, y, width
+        order, most = block_order(width, height), min(work.n, self.capacity)
+        for first in range(work.first, work.first + work.n, most):
+            samples = min(most, work.first + work.n - first)
+            count = self.capacity // samples
+            job["first_sample"], job["samples"] = first, samples
+            for begin in range(0, len(order), count):
+                pixels = order[begin : begin + count]
+                self.order[: len(pixels)], job["pixels"] = pixels, len(pixels)
+                each()
+
+
+class Picture:
+    """The launches of a picture in some buffers, packed once: all that changes from wave to wave is in the buffers."""
+
+    def __init__(self, waves: Waves, buffers: Buffers, world: World, limits: list[Any], film: DeviceFilm) -> None:
+        kernels, w, (accel, surfaces, lighting, camera) = waves.kernels, buffers.wave, world
+        self.buffers, self.lights = buffers, range(waves.lights)
+        self.begin = [command(kernels.begin, w, camera, *group) for group in zip(limits, film.groups, strict=True)]
+        self.add = [command(kernels.add, w, group) for group in film.groups]
+        self.shade, self.gather = command(kernels.shade, w, surfaces, lighting, limits[0]), command(kernels.gather, w, waves.lights)
+        self.closest_hit = traversal(kernels.closest_hit, kernels.block, buffers, accel, surfaces, w.rays, w.hits)
+        if kernels.shadow:
+            self.shadow_hit = traversal(kernels.closest_hit, kernels.block, buffers, accel, surfaces, w.shadow_rays, w.shadow_hits)
+        elif kernels.any_hit:
+            self.shadow_hit = traversal(kernels.any_hit, kernels.block, buffers, accel, surfaces, w.shadow_rays, w.occluded)
+        self.go_through = [command(kernels.shadow, w, surfaces, light) for light in self.lights] if kernels.shadow else None
+
+    def take(self, work: Work) -> None:
+        """All samples of some work."""
+        for begin, add in zip(self.begin, self.add, strict=True):
+            self.buffers.take(work, partial(self.trace, begin, add))
+
+    def trace(self, begin: Any, add: Any) -> None:
+        begin.launch()
+        job = self.buffers.job[0]
+        while queued := int(job["queued"]):
+            self.closest_hit(0, queued)
+            self.shade.launch()
+            for light in self.lights:
+                self.look_for(light)
+            self.gather.launch()
+        add.launch()
+
+    def look_for(self, light: int) -> None:
+        """Trace the shadow rays to a light: where they go through surfaces, from one to the next."""
+        asking, first = self.buffers.asking, light * self.buffers.capacity
+        while asked := int(asking[light]):
+            self.shadow_hit(first, first + asked)
+            if self.go_through is None:
+                return
+            self.go_through[light].launch()
+
+
+class Aovs:
+    """As Picture, of AOVs."""
+
+    def __init__(self, waves: Waves, buffers: Buffers, world: World, film: AovFilm) -> None:
+        kernels, w, (accel, surfaces, _, camera) = waves.kernels, buffers.wave, world
+        self.buffers = buffers
+        self.begin, self.see = command(kernels.begin_aov, w, camera, film.struct), command(kernels.see, w, surfaces, film.struct)
+        self.closest_hit = traversal(kernels.closest_hit, kernels.block, buffers, accel, surfaces, w.rays, w.hits)
+
+    def take(self, work: Work) -> None:
+        self.buffers.take(work, self.trace)
+
+    def trace(self) -> None:
+        self.begin.launch()
+        self.closest_hit(0, int(self.buffers.job[0]["pixels"]))
+        self.see.launch()
+
+
+def command(kernel: Any, *inputs: Any) -> Any:
+    return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
+
+
+def traversal(kernel: Any, block: int, buffers: Buffers, *inputs: Any) -> Callable[[int, int], None]:
+    """A function that traces rays first .. end - 1 of a queue."""
+    inputs = (*inputs, buffers.scratch) if block > 1 else inputs
+    launch = command(kernel, *inputs, 0, 0)
+
+    def trace(first: int, end: int) -> None:
+        launch.set_dim(-(-(end - first) // block))
+        launch.set_param_at_index_from_ctype(len(inputs), first)
+        launch.set_param_at_index_from_ctype(len(inputs) + 1, end)
+        launch.launch()
+
+    return trace
+
+
+def room(n: int, dtype: Any) -> Any:
+    return wp.empty(n, dtype=dtype, device="cpu")
+
+
+def queue(n: int) -> Any:
+    out = Queue()
+    out.origin, out.direction, out.exclude = room(n, wp.vec3), room(n, wp.vec3), room(n, wp.int32)
+    out.t_min, out.t_max = wp.zeros(n, dtype=wp.float32, device="cpu"), wp.full(n, np.inf, dtype=wp.float32, device="cpu")
+    return out
+
+
+def hit_arrays(n: int) -> Any:
+    out = HitArrays()
+    out.t, out.u, out.v, out.prim_id = (room(n, dtype) for dtype in (wp.float32, wp.float32, wp.float32, wp.int32))
+    return out
+
+
+@lru_cache(maxsize=64)
+def block_order(width: int, height: int) -> np.ndarray:
+    """The pixels of a rectangle (row by row: y * width + x), int32, in squares of 4x4, 2x2 within: neighbours go the same way."""
+    y, x = np.mgrid[:height, :width]
+    within = (x & 1) | (y & 1) << 1 | (x & 2) << 1 | (y & 2) << 2
+    return np.lexsort((within.ravel(), x.ravel() // 4, y.ravel() // 4)).astype(np.int32)
