@@ -43,13 +43,15 @@ from wrt.cli.common import (
     warnings_reported,
 )
 from wrt.cli.measure import stability
-from wrt.cli.profile import profile, whatif
+from wrt.cli.profile import profile
+from wrt.cli.reporting import measured
 from wrt.cli.save import check_room, checkpoint_options, save_film
 from wrt.cli.view import view
 from wrt.core.address_space import is_out_of_memory, require_modules, told_limit
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code, raise_on_termination
 from wrt.io.meshes import SUFFIXES
+from wrt.lab.plans import WhatIf
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -59,8 +61,9 @@ def cli() -> None:
     require_modules()  # before a command imports them
 
 
-for command in (stability, bench, build, profile, animate, whatif, view):
+for command in (stability, bench, build, profile, animate, view):
     cli.add_command(command)
+measured(cli, WhatIf)
 
 
 @cli.command(help=f"Render SCENE (.toml, .gltf, .glb, or a mesh: {SUFFIXES}) to a picture.")

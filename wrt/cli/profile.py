@@ -1,4 +1,4 @@
-"""Commands of the model of the RT core: `profile`, `whatif`."""
+"""`profile`: what a picture costs on an RT core."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import ACCEL, SET, Crop, Names, Size, load, naming, settings_of, warnings_reported
+from wrt.cli.common import ACCEL, SET, Crop, Size, load, naming, settings_of, warnings_reported
 from wrt.cli.reporting import Reporting, reporting
 
 
@@ -44,37 +44,3 @@ def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu
     paths = [] if how.output is None else report.write_report(found, text, how.output)
     how.end(text, {"scene": found.scene, "size": found.size, "spp": found.spp, "rays": len(found.rays), "seconds": found.seconds,
                    "by_depth": found.by_depth(), "model": [row.as_dict() for row in rows], "output": paths}, paths)
-
-
-STUDIES = ("width", "stack", "planes", "order", "sorting", "rates")
-
-
-@click.command()
-@click.argument("study", type=click.Choice(STUDIES))
-@click.argument("mesh", type=click.Path(path_type=Path))
-@click.option("--kinds", type=Names(), default=("primary", "diffuse"), help="Of rays: primary, shadow, diffuse, random")
-@click.option("--rays", type=int, default=2**15, show_default=True, help="Rays of each kind")
-@click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
-@click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
-@click.option("--inside", is_flag=True, help="The camera stands in the middle of the mesh's box, as in a room")
-@reporting("Write the table as Markdown (.md)")
-def whatif(how: Reporting, study: str, mesh: Path, **options: Any) -> None:
-    """Change one thing of the RT core's design, and count the same rays through MESH again.
-
-    STUDY: width (node width, format and volume), stack (entries, with restarts), planes (bits of a box plane), order (nearer
-    child first, early stop), sorting (of rays), rates (boxes a clock against triangles a clock).
-    """
-    from wrt.lab.rtcore import whatif as studies
-
-    plan = studies.Plan("width" if study == "rates" else study, mesh, **options)
-    how.check_markdown()
-    with warnings_reported(how.quiet):
-        if study == "rates":
-            rates = studies.rates(plan, how.progress)
-            text = studies.rates_markdown(rates)
-            data = [row.as_dict() for row in rates]
-        else:
-            rows = studies.run(plan, lambda row: how.progress("  ".join(studies.cells(row))))
-            text, data = studies.markdown(rows), [row.as_dict() for row in rows]
-    how.write(f"# What if: {study}, {mesh.name}\n\n{text}")
-    how.end(text, {"study": study, "mesh": mesh.name, "rows": data, "output": how.output})

@@ -24,7 +24,7 @@ from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench.error_rows import Reference, Row, Slope, Sweep, Variant
 from wrt.lab.bench.error_statistics import UNKNOWN
-from wrt.lab.bench.report import check_plan
+from wrt.lab.plans import Error as Plan
 from wrt.picture import metrics
 from wrt.picture.film import Film
 from wrt.renderer.features import Features
@@ -186,27 +186,6 @@ def slope_of(rows: Sequence[Row], known: float) -> Slope:
 
 
 # --- the sweep --------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Plan:
-    """What to sweep. knobs: names in KNOBS, empty for all; max_spp: the last power of two; reference_spp: samples of each of
-    the reference's seeds (None: 8 max_spp); row_seconds: a row that would likely take longer is left out."""
-
-    knobs: Sequence[str] = ()
-    max_spp: int = 64
-    repeats: int = 8
-    reference_spp: int | None = None
-    row_seconds: float = 120.0
-
-    def __post_init__(self) -> None:
-        check_plan(self, {"knob": (self.knobs, KNOBS)}, max_spp=(1, 1 << 16), repeats=(3, 1000))  # 2 seeds have no spread
-        if self.reference_spp is not None:
-            check_plan(self, {}, reference_spp=(1, 1 << 24))
-
-    @property
-    def levels(self) -> list[int]:
-        return [1 << i for i in range(self.max_spp.bit_length())]
 
 
 def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], None] = lambda text: None) -> Sweep:

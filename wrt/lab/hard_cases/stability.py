@@ -29,6 +29,7 @@ from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
 from wrt.lab.bench.timing import Quartiles, alternate, quartiles
 from wrt.lab.hard_cases.cases import ASK, HARD_CASES, HardCase, Verdict, check, chunks, generate, judge, judge_all_hits, judge_next
 from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own, own_algorithms
+from wrt.lab.plans import Stability as Plan
 from wrt.renderer.distributed.installed import DIGEST
 from wrt.renderer.distributed.workers import worker_name
 from wrt.renderer.progress import TimeLeft
@@ -42,20 +43,6 @@ COSTLY = {"G_fan": 100}  # 10,000 triangles at one vertex are all tested: so man
 
 COLUMNS = ("case", "algorithm", "rays", "judged", "misses", "false hits", "wrong prim", "self-hits", "duplicates", "ties",
            "near ties", "borderline", "t ulp max", "t ulp 99.9 %", "t / bound")
-
-
-@dataclass(frozen=True)
-class Plan:
-    """rays: of each case, through the default units. sample: of these, how many the oracle judges, and all algorithms get;
-    the others are held to what is known of them without it (`check`). runs: of the measurement of speed."""
-
-    cases: tuple[str, ...] = ()
-    rays: int = 10_000
-    sample: int = 10_000
-    peers: bool = False
-    seed: int = 0
-    threads: int | None = None
-    runs: int = 7
 
 
 @dataclass

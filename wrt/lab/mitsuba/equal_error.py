@@ -19,16 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.checks import as_choice
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench.error import REFERENCE_SEEDS, Reference, finished, make_reference
-from wrt.lab.bench.report import check_plan, table
+from wrt.lab.bench.report import table
 from wrt.lab.bench.timing import Quartiles, quartiles, shown
 from wrt.lab.mitsuba.llvm import NotAvailable
-from wrt.lab.mitsuba.process import VARIANTS, Job, MitsubaProcess, environment_of
-from wrt.lab.mitsuba.translate import INTEGRATORS
+from wrt.lab.mitsuba.process import Job, MitsubaProcess, environment_of
+from wrt.lab.plans import Mitsuba as Plan
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
 from wrt.scene.cameras import Camera
@@ -37,28 +36,6 @@ from wrt.scene.model import Scene
 
 PILOT_SPP = 16
 SAME = 0.25  # of the squared error compared at: a squared bias beyond it means that the pictures are not of the same light
-
-
-@dataclass(frozen=True)
-class Plan:
-    """spp: wrt's samples. repeats: pictures of each. reference_spp: of each of its seeds (None: 8 spp). rival_seconds: no
-    picture of Mitsuba's takes longer. integrator: Mitsuba's, see wrt.lab.mitsuba.translate. variants: Mitsuba's. starts: how
-    often a whole process is timed (0: not at all). Raises InputError."""
-
-    spp: int = 64
-    repeats: int = 7
-    reference_spp: int | None = None
-    rival_seconds: float = 60.0
-    integrator: str = "auto"
-    variants: tuple[str, ...] = VARIANTS
-    starts: int = 3
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_plan(self, {}, spp=(1, 1 << 16), repeats=(3, 1000))
-        as_choice(self.integrator, INTEGRATORS, "integrator")
-        if not self.variants or not set(self.variants) <= set(VARIANTS):
-            raise InputError(f"variants must be of {', '.join(VARIANTS)}; got {', '.join(self.variants) or 'none'}")
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from typing import Any
 
-from wrt.core.html import html_table
-from wrt.lab.bench.report import table
-from wrt.lab.rtcore.model import TERMS, Prediction, Work, predict, sensitivity, span, sweep
+from wrt.lab.bench.report import Columns, Part, Row, tabled, tables_page
+from wrt.lab.rtcore.model import TERMS, Work, predict, sensitivity, span, sweep
 from wrt.lab.rtcore.parameters import PARAMETERS, SWEEPS, Gpu
 
 RANGE = ("boxes", "triangles", "warps")  # what the reported range is swept over
-COLUMNS = ("rays", "nodes", "boxes", "triangles", "lines", *TERMS, "limit", "Grays/s", "range", "moved most by")
-SIMT_COLUMNS = ("rays", "as they come", "packed", "sorted")
+def term(name: str) -> Callable[[Row], str]:
+    return lambda row: f"{row.clocks[name]:.3g} ({row.utilisation[name]:.0%})"
+
+
+MODEL_COLUMNS: Columns = {
+    "rays": "{name}", "nodes": "{nodes:.1f}", "boxes": "{boxes:.1f}", "triangles": "{triangles:.1f}", "lines": "{lines:.1f}",
+    **{name: term(name) for name in TERMS}, "limit": "{limit}", "Grays/s": lambda row: f"{row.rays_per_second / 1e9:.2f}",
+    "range": lambda row: f"{row.low / 1e9:.2f} to {row.high / 1e9:.2f}",
+    "moved most by": lambda row: ", ".join(f"{name} {factor:.2g}x" for name, factor in list(row.factors.items())[:2])}
+SIMT_COLUMNS: Columns = {
+    "rays": "{name}", **{name: f"{{simt_efficiency[{name}]:.0%}}" for name in ("as they come", "packed", "sorted")}}
+PARAMETER_COLUMNS: Columns = {"parameter": "{name}", "value": "{value}", "status": "{status}", "swept over": "{range}",
+                              "source": "{source}"}
 LEGEND = f"""\
 nodes, boxes, triangles: a ray; lines: cache lines a ray that its warp asks for. {", ".join(TERMS)}: clocks a ray and RT core that
 each part needs by itself, and in brackets how busy it is while the slowest (limit) is at its limit. Grays/s: with the assumptions
@@ -22,68 +32,24 @@ Grays/s most when each is swept alone, with the factor from the least to the mos
 and its node format were never published."""
 
 
-@dataclass(frozen=True)
-class ModelRow:
-    """prediction: with the basic assumptions; low, high: rays a second over RANGE; factors: of each assumption alone; simt: SIMT
-    efficiencies; nodes, boxes, triangles, lines: a ray."""
-
-    name: str
-    rays: int
-    nodes: float
-    boxes: float
-    triangles: float
-    lines: float
-    prediction: Prediction
-    low: float
-    high: float
-    factors: dict[str, float]
-    simt: dict[str, float]
-
-    def as_dict(self) -> dict[str, object]:
-        p = self.prediction
-        return {"name": self.name, "rays": self.rays, "nodes": self.nodes, "boxes": self.boxes, "triangles": self.triangles,
-                "lines": self.lines, "gpu": p.gpu.name, "clocks": p.terms, "limit": p.bottleneck, "utilisation": p.utilisation,
-                "rays_per_second": p.rays_per_second, "low": self.low, "high": self.high, "factors": self.factors,
-                "simt_efficiency": self.simt}
-
-
-def model_row(work: Work, gpu: Gpu, simt: dict[str, float]) -> ModelRow:
-    """Everything that the model says of this work; simt: as wrt.lab.rtcore.model.simt gives it."""
-    prediction = predict(work, gpu)
+def model_row(work: Work, gpu: Gpu, simt: dict[str, float], **facts: Any) -> Row:
+    """Everything that the model says of this work: clocks, limit, utilisation and rays_per_second with the basic assumptions; low,
+    high: rays a second over RANGE; factors: of each assumption alone; nodes, boxes, triangles, lines: a ray. simt: as
+    wrt.lab.rtcore.model.simt gives it; facts: more that is known of it."""
+    p = predict(work, gpu)
     low, high = span(sweep(work, gpu, names=RANGE))
-    lines = work.misses(gpu, prediction.core).accesses / len(work)
-    return ModelRow(work.name, len(work), work.mean("nodes"), work.mean("boxes"), work.mean("primitives"), lines, prediction, low,
-                    high, sensitivity(work, gpu), simt)
+    return Row(**facts, name=work.name, rays=len(work), nodes=work.mean("nodes"), boxes=work.mean("boxes"),
+               triangles=work.mean("primitives"), lines=work.misses(gpu, p.core).accesses / len(work), gpu=gpu.name, clocks=p.terms,
+               limit=p.bottleneck, utilisation=p.utilisation, rays_per_second=p.rays_per_second, low=low, high=high,
+               factors=sensitivity(work, gpu), simt_efficiency=simt, _prediction=p)
 
 
-def cells(row: ModelRow) -> tuple[str, ...]:
-    p = row.prediction
-    terms = [f"{p.terms[name]:.3g} ({p.utilisation[name]:.0%})" for name in TERMS]
-    most = ", ".join(f"{name} {factor:.2g}x" for name, factor in list(row.factors.items())[:2])
-    return (row.name, f"{row.nodes:.1f}", f"{row.boxes:.1f}", f"{row.triangles:.1f}", f"{row.lines:.1f}", *terms, p.bottleneck,
-            f"{p.rays_per_second / 1e9:.2f}", f"{row.low / 1e9:.2f} to {row.high / 1e9:.2f}", most)
-
-
-def model_table(rows: Sequence[ModelRow]) -> str:
-    return table(COLUMNS, [cells(row) for row in rows])
-
-
-def simt_cells(row: ModelRow) -> tuple[str, ...]:
-    return (row.name, *(f"{row.simt[name]:.0%}" for name in SIMT_COLUMNS[1:]))
-
-
-def simt_table(rows: Sequence[ModelRow]) -> str:
-    return table(SIMT_COLUMNS, [simt_cells(row) for row in rows])
-
-
-def model_page(rows: Sequence[ModelRow]) -> str:
+def model_page(rows: Sequence[Row]) -> str:
     """Both tables as HTML."""
-    gpu = rows[0].prediction.gpu.name if rows else "a GPU"
-    return html_table(f"Model of {gpu}", COLUMNS, map(cells, rows)) + html_table(
-        "SIMT efficiency", SIMT_COLUMNS, map(simt_cells, rows))
+    gpu = rows[0].gpu if rows else "a GPU"
+    return tables_page([tabled(MODEL_COLUMNS, rows, f"Model of {gpu}"), tabled(SIMT_COLUMNS, rows, "SIMT efficiency")])
 
 
-def parameter_table() -> str:
+def parameters() -> Part:
     """Every number that the model starts from, with its status and source."""
-    columns = ("parameter", "value", "status", "swept over", "source")
-    return table(columns, [(p.name, p.value, p.status, p.range, p.source) for p in PARAMETERS])
+    return tabled(PARAMETER_COLUMNS, PARAMETERS, "The parameters of the model")

@@ -71,7 +71,7 @@ def test_a_notebook_shows_heat_maps_and_the_model(measured: Profile) -> None:
     rows = model_rows(measured, GPUS["rtx2080ti"])
     page = rows._repr_html_()
     assert len(rows) == len(GROUPS) and page.count("<table>") == 2 and "RTX 2080 Ti" in page
-    assert all(f">{row.prediction.bottleneck}</td>" in page for row in rows)
+    assert all(f">{row.limit}</td>" in page for row in rows)
 
 
 def test_the_scale_of_a_heat_map() -> None:
