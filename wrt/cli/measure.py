@@ -19,12 +19,13 @@ from wrt.lab.plans import Error, Mitsuba, Stability
 @planned(Stability)
 @reporting(Stability.REPORT, cluster=True, quiet="No progress")
 def stability(how: Reporting, plan: Stability) -> None:
+    from wrt.lab.bench.report import cells
     from wrt.lab.hard_cases import report
     from wrt.lab.hard_cases import stability as study
 
     def row_done(row: Any) -> None:
         if not how.as_json:
-            click.echo("  ".join(study.cells(row)))
+            click.echo("  ".join(cells(study.COLUMNS, row)))
 
     study.chosen(plan.cases)
     if how.output is not None:

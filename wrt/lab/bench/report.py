@@ -12,6 +12,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 import wrt
 from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
@@ -38,12 +40,21 @@ def load_average() -> float:
 
 
 class Row(SimpleNamespace):
-    """What was measured of one thing, by name: what the names mean, the LEGEND of its study says. All of it goes into JSON but what
-    has a name that begins with _."""
+    """What was measured of one thing, by name: what the names mean, the LEGEND of its study says. All of it goes into JSON but
+    NumPy's arrays, and what has a name that begins with _."""
 
     def as_dict(self) -> dict[str, Any]:
-        return {name: value.as_dict() if isinstance(value, Row) else value
-                for name, value in vars(self).items() if not name.startswith("_")}
+        return {name: plain(value) for name, value in vars(self).items()
+                if not (name.startswith("_") or isinstance(value, np.ndarray))}
+
+
+def plain(value: Any) -> Any:
+    """As it goes into JSON, rows within rows too."""
+    if isinstance(value, list):
+        return [plain(each) for each in value]
+    if isinstance(value, dict):
+        return {name: plain(each) for name, each in value.items()}
+    return value.as_dict() if hasattr(value, "as_dict") else value
 
 
 # The columns of a table: what each is called, and a row's value as a format of the row's names or as a function of the row.

@@ -55,12 +55,16 @@ class Errors:
         index = int(np.searchsorted(np.cumsum(self.histogram), q / 100.0 * total))
         return min(2.0 ** (LOWEST_OCTAVE + index / BINS_PER_OCTAVE), self.largest)
 
+    @property
+    def p999(self) -> float:
+        return self.percentile(99.9)
+
     def __add__(self, other: Errors) -> Errors:
         return Errors(max(self.largest, other.largest), max(self.largest_ratio, other.largest_ratio),
                       self.over + other.over, self.histogram + other.histogram)
 
     def as_dict(self) -> dict[str, float]:
-        return {"max": self.largest, "p999": self.percentile(99.9), "bound_ratio": self.largest_ratio, "over_bound": self.over}
+        return {"max": self.largest, "p999": self.p999, "bound_ratio": self.largest_ratio, "over_bound": self.over}
 
 
 @dataclass
@@ -84,6 +88,10 @@ class Verdict:
     u: Errors = field(default_factory=Errors)
     v: Errors = field(default_factory=Errors)
     examples: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def borderline(self) -> int:
+        return self.borderline_hits + self.borderline_misses
 
     @property
     def ok(self) -> bool:

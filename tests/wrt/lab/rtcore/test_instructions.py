@@ -8,9 +8,9 @@ import pytest
 import warp as wp
 
 from wrt.core.errors import InputError
-from wrt.lab.rtcore.cubin import CLASSES, OPERATIONS, read_cubin
 from wrt.lab.bench.report import markdown, tabled
 from wrt.lab.rtcore import instructions
+from wrt.lab.rtcore.cubin import CLASSES, OPERATIONS, read_cubin
 from wrt.lab.rtcore.instructions import SOFTWARE, UnitCode, box_unit, compiled, of_one, software, tables
 
 
