@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from wrt.cli.bench import bench
-from wrt.cli.common import SET, Size, client_of, load, naming, settings_of, warnings_reported
+from wrt.cli.common import SIZE, client_of, load, naming, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, planned, reporting
 from wrt.lab.plans import Error, Mitsuba, Stability
 
@@ -40,14 +40,10 @@ def stability(how: Reporting, plan: Stability) -> None:
 
 
 @bench.command()
-@click.argument("scene", type=click.Path(path_type=Path))
+@shared("scene")
 @planned(Error)
-@click.option("--size", type=Size(), default="128x72", show_default=True, help="Pixels")
-@click.option("--camera", help="A camera's name or number  [default: the first]")
-@SET
-@click.option("--seed", type=int, default=0, show_default=True, help="Decides on all seeds")
-@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
-@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
+@click.option("--size", type=SIZE, default="128x72", show_default=True, help="Pixels")
+@shared("camera", "given", "seed", "device", "threads")
 @reporting("Folder for a report: Markdown, plot and data")
 def error(how: Reporting, plan: Error, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int],
           **options: Any) -> None:
@@ -68,12 +64,11 @@ def error(how: Reporting, plan: Error, scene: Path, given: tuple[tuple[str, Any]
 
 
 @bench.command()
-@click.argument("scene", type=click.Path(path_type=Path))
+@shared("scene")
 @planned(Mitsuba)
-@click.option("--size", type=Size(), default="320x180", show_default=True, help="Pixels")
+@click.option("--size", type=SIZE, default="320x180", show_default=True, help="Pixels")
 @click.option("--matte", is_flag=True, help="Make every surface diffuse, for the integrator direct, which draws the same light")
-@click.option("--camera", help="A camera's name or number  [default: the first]")
-@SET
+@shared("camera", "given")
 @reporting("Write the table as Markdown (.md)")
 def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int], matte: bool,
             camera: str | None) -> None:

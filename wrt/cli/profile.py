@@ -7,22 +7,15 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import ACCEL, SET, Crop, Size, load, naming, settings_of, warnings_reported
+from wrt.cli.common import load, naming, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, reporting
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--size", type=Size(), help="Pixels  [default: the scene's]")
+@shared("scene", "size")
 @click.option("--spp", type=int, default=1, show_default=True, help="Samples a pixel")
-@click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's]")
-@SET
-@click.option("--crop", type=Crop(), help="Only this rectangle, in pixels from the top left")
-@click.option("--camera", help="A camera's name or number  [default: the first]")
-@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
+@shared("max_depth", "given", "crop", "camera", "accel", "seed", "threads")
 @click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
-@click.option("--seed", type=int, default=0, show_default=True, help="Other samples")
-@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
 @reporting("Folder for heat maps, EXR layers, histograms and a report", quiet="No warnings")
 def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu: str, **options: Any) -> None:
     """What every ray of SCENE costs: counters by pixel, kind and depth, and a model of the RT core."""

@@ -12,12 +12,12 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import ACCEL, CLUSTER, Duration, Names, OneOf, client_of, now_and_then, say, say_json, warnings_reported
+from wrt.cli.common import ACCEL, CLUSTER, DURATION, SHARED, Names, OneOf, client_of, now_and_then, say, say_json, warnings_reported
 from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
 from wrt.lab.plans import STRUCTURES, Plan
 
-TYPES: dict[str, Any] = {"int": int, "int | None": int, "bool": bool, "str": str, "Sequence[str]": Names(), "float": Duration()}
+TYPES: dict[str, Any] = {"int": int, "int | None": int, "bool": bool, "str": str, "Sequence[str]": Names(), "float": DURATION}
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Reporting:
 
 def reporting(report: str, *, cluster: bool = False, quiet: str = "No progress, no warnings") -> Callable[[Any], Any]:
     """A command with these options, which it gets as one argument, `how`. report: help of -o."""
-    options = [click.option("--json", "as_json", is_flag=True, help="Print as JSON"),
+    options = [SHARED["as_json"],
                click.option("-q", "--quiet", is_flag=True, help=quiet),
                click.option("-o", "--output", type=click.Path(path_type=Path), help=report)]
     return gathering("how", Reporting, [*options, CLUSTER] if cluster else options)

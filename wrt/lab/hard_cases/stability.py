@@ -51,7 +51,8 @@ COLUMNS: Columns = {
     "rays": lambda row: {None: str(row.verdict.rays), True: "refused", False: "ACCEPTED"}[row.refused],
     **{head: unless_refused(form) for head, form in {
         "judged": "{judged}", "misses": "{verdict.misses}", "false hits": "{verdict.false_hits}",
-        "wrong prim": "{verdict.wrong_prim}", "self-hits": "{verdict.self_hits}", "duplicates": "{verdict.duplicate_hits}", "ties": "{verdict.ties}",
+        "wrong prim": "{verdict.wrong_prim}", "self-hits": "{verdict.self_hits}", "duplicates": "{verdict.duplicate_hits}",
+        "ties": "{verdict.ties}",
         "near ties": "{verdict.near_ties}", "borderline": "{verdict.borderline}", "t ulp max": "{verdict.t.largest:.3g}",
         "t ulp 99.9 %": "{verdict.t.p999:.3g}", "t / bound": "{verdict.t.largest_ratio:.2g}"}.items()}}
 
