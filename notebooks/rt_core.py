@@ -252,7 +252,7 @@ plt.show()
 # ## Exercises
 # 1. Let the pot be a mirror. Which heat map changes most, and what happens to the range of the model?
 # 2. Which kind of ray is the hardest for the caches?
-#    `wrt.lab.rtcore.profile_work.work_of(profile, "shadow").misses(gpu, BASE)` tells.
+#    `wrt.lab.rtcore.profile_report.work_of(profile, "shadow").misses(gpu, BASE)` tells.
 # 3. `study("order")` with hills seen from above has little depth. Build a mesh with much (several `terrain`s above each other, by
 #    `wrt.Mesh`), and look at what order and early stop save.
 # 4. Later RT cores than Turing's test triangles at twice the rate. For which structure and rays does the model agree that it

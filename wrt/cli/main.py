@@ -21,7 +21,6 @@ import click
 
 import wrt
 from wrt.cli.animate import animate
-from wrt.cli.bench import bench
 from wrt.cli.build import build
 from wrt.cli.common import (
     CLUSTER,
@@ -39,8 +38,7 @@ from wrt.cli.common import (
     spread_options,
     warnings_reported,
 )
-from wrt.cli.measure import stability
-from wrt.cli.profile import profile
+from wrt.cli.measure import bench, profile, stability
 from wrt.cli.reporting import measured
 from wrt.cli.save import check_room, checkpoint_options, save_film
 from wrt.cli.view import view

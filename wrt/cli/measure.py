@@ -1,4 +1,4 @@
-"""The commands that measure scenes and hard cases: `stability`, `bench error`, `bench mitsuba`."""
+"""The commands that measure: `bench` with those below it, `stability`, `profile`, `whatif`. They parse, call and print."""
 
 from __future__ import annotations
 
@@ -9,10 +9,65 @@ from typing import Any
 
 import click
 
-from wrt.cli.bench import bench
-from wrt.cli.common import SIZE, client_of, load, naming, settings_of, shared, warnings_reported
-from wrt.cli.reporting import Reporting, planned, reporting
+from wrt.cli.common import SIZE, Commands, Names, client_of, load, naming, settings_of, shared, warnings_reported
+from wrt.cli.reporting import Reporting, measured, planned, reporting
+from wrt.lab import plans
 from wrt.lab.plans import Error, Mitsuba, Stability
+
+
+@click.group(cls=Commands)
+def bench() -> None:
+    """Measure: speed against error, and one method against another."""
+
+
+for plan in (plans.Visibility, plans.Units, plans.Peers, plans.Accel, plans.Bvh, plans.RtCore):
+    measured(bench, plan)
+
+
+@bench.command()
+@click.option("--structures", type=Names(), default=("bvh2",), show_default=True, help="Closest-hit kernels to look at, by name")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def instructions(structures: tuple[str, ...], as_json: bool) -> None:
+    """The units in machine code for Turing: instructions of each box and triangle test; registers and code of traversals."""
+    from wrt.accel.structures import ACCELERATORS
+    from wrt.lab.bench.report import markdown
+    from wrt.lab.rtcore import instructions as study
+
+    for name in structures:
+        ACCELERATORS.check(name)
+    units, codes = study.units(), study.traversals(structures)
+    Reporting(as_json=as_json).end(markdown(study.tables(units, codes)), {
+        "units": [{"unit": each.unit, "test": each.test, "instructions": each.instructions, **each.classes} for each in units],
+        "traversals": {name: {"registers": code.registers, "stack": code.stack, "code_bytes": len(code.code), **code.classes()}
+                       for name, code in codes.items()}})
+
+
+@click.command()
+@shared("scene", "size")
+@click.option("--spp", type=int, default=1, show_default=True, help="Samples a pixel")
+@shared("max_depth", "given", "crop", "camera", "accel", "seed", "threads")
+@click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
+@reporting("Folder for heat maps, EXR layers, histograms and a report", quiet="No warnings")
+def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu: str, **options: Any) -> None:
+    """What every ray of SCENE costs: counters by pixel, kind and depth, and a model of the RT core."""
+    from wrt.core.checks import require_known
+    from wrt.lab.bench.report import check_folder
+    from wrt.lab.rtcore import profile_report as report
+    from wrt.lab.rtcore.parameters import GPUS
+    from wrt.lab.rtcore.profiler import profile as measure
+
+    require_known(gpu, GPUS, "GPU")
+    if how.output is not None:
+        check_folder(how.output, (report.LAYERS, report.HISTOGRAMS))
+    settings = settings_of(given, {name: options.pop(name) for name in ("size", "max_depth")}, spp="--spp")
+    loaded = load(scene, how.quiet).with_settings(**settings)
+    with warnings_reported(how.quiet), naming(scene):
+        found = measure(loaded, **options)
+    rows = report.model_rows(found, GPUS[gpu])
+    text = report.summary(found, rows, GPUS[gpu])
+    paths = [] if how.output is None else report.write_report(found, text, how.output)
+    how.end(text, {"scene": found.scene, "size": found.size, "spp": found.spp, "rays": len(found.rays), "seconds": found.seconds,
+                   "by_depth": found.by_depth(), "model": [row.as_dict() for row in rows], "output": paths}, paths)
 
 
 @click.command(help=Stability.__doc__)

@@ -17,14 +17,12 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.peak_memory import peak_bytes
 from wrt.lab.bench.plot import LogLogPlot, Series
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, grouped, tabled
-from wrt.lab.bench.report import machine as machine_line
+from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.bench.stadium import in_stadium
-from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.bench.timing import alternate, peak_bytes, spread
 from wrt.lab.bench.visibility import TERRAINS, fit, terrain
 from wrt.lab.plans import Accel as Plan
 from wrt.scene.mesh import Mesh

@@ -25,11 +25,10 @@ from wrt.kernels.traverse.bvh2 import box_volumes
 from wrt.kernels.traverse.bvh2_kdop import kdop_volumes
 from wrt.kernels.traverse.bvh2_sphere import sphere_volumes
 from wrt.lab.bench.accel import differing
-from wrt.lab.bench.peak_memory import peak_bytes
 from wrt.lab.bench.rays import RaySet, ball_around, endless, unit
 from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, load_average, tabled
 from wrt.lab.bench.report import run as run
-from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.bench.timing import alternate, peak_bytes, spread
 from wrt.lab.plans import Bvh as Plan
 
 VOLUMES = ("bvh2", "bvh2_sphere", "bvh2_kdop")

@@ -19,8 +19,7 @@ from wrt.core.device import run_all, thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.accel import timing, warm_up
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, grouped, tabled
-from wrt.lab.bench.report import machine as machine_line
+from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own

@@ -24,7 +24,7 @@ from wrt.lab.plans import Plan
 from wrt.picture.image import check_writable, write_codes
 
 
-def machine(used: str = "", *more: str, device: str = "cpu") -> str:
+def machine_line(used: str = "", *more: str, device: str = "cpu") -> str:
     """The device, the threads that are used, how busy it is, and wrt's version: without them no time means anything."""
     line = next((line for line in describe_devices() if line.startswith(f"{device}:")), device)
     load = "" if math.isnan(load_average()) else f"load average {load_average():.1f} at the start"
@@ -101,7 +101,7 @@ def page(plan: Plan, rows: Sequence[Row]) -> str:
 
 def machine_of(plan: Plan) -> str:
     study = study_of(plan)
-    return study.machine(plan) if hasattr(study, "machine") else machine()
+    return study.machine(plan) if hasattr(study, "machine") else machine_line()
 
 
 def line(plan: Plan, row: Row) -> str:

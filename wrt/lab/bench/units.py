@@ -15,8 +15,7 @@ from wrt.io.mesh_file import as_mesh
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, tabled
-from wrt.lab.bench.report import machine as machine_line
+from wrt.lab.bench.report import Columns, Part, Row, machine_line, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.bench.timing import alternate, quartiles, shown
 from wrt.lab.bench.visibility import terrain

@@ -19,8 +19,7 @@ from wrt.core.device import thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.plot import LogLogPlot, Series
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
-from wrt.lab.bench.report import Columns, Part, Row, grouped, tabled
-from wrt.lab.bench.report import machine as machine_line
+from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility_check import agreement
@@ -50,12 +49,12 @@ COLUMNS: Columns = {
 EXPONENTS: Columns = {"cost": "{cost}", "surface": lambda row: Path(row.surface).name, "n": "{sweep}",
                       "exponent": "{exponent:.3f} ± {error:.3f}", "at the end": "{last:.3f}"}
 LEGEND = """\
-covered: pixels with a triangle. raster: a z-buffer, all triangles; cast: one ray a pixel through a structure that is there;
-build: of that structure. Medians of alternating runs, ratios taken run by run; in brackets the middle half of the runs. cast /
-raster above 1: rasterising is cheaper; with build: as if the structure were built for this one picture. differ: pixels with
-another prim_id, of which ties (depths agree within their bound: common edges, coincident triangles), silhouettes (the rays'
-answer is the exact one within a rounding error, some 1e-4 pixels, of the centre), and unexplained (must be 0). depth error: the
-largest relative one where prim_id agrees, and its share of the bound derived for it (must not be above 1)."""
+covered: pixels with a triangle. raster: a z-buffer, all triangles; cast: one ray a pixel, made beforehand, through a structure
+that is there; build: of that structure. Medians of alternating runs, ratios taken run by run; in brackets the middle half of the
+runs. cast / raster above 1: rasterising is cheaper; with build: as if the structure were built for this one picture. differ:
+pixels with another prim_id, of which ties (depths agree within their bound: common edges, coincident triangles), silhouettes (the
+rays' answer is the exact one within a rounding error, some 1e-4 pixels, of the centre), and unexplained (must be 0). depth error:
+the largest relative one where prim_id agrees, and its share of the bound derived for it (must not be above 1)."""
 
 
 def row_of(sweep: str, surface: str, triangles: int, pixels: int, raster: Sequence[float], cast: Sequence[float],

@@ -13,9 +13,8 @@ from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.lab.bench.plot import LogLogPlot, Series
-from wrt.lab.bench.report import Columns, Part, check_folder, repeating, table, tabled, write
+from wrt.lab.bench.report import Columns, Part, check_folder, machine_line, repeating, table, tabled, write
 from wrt.lab.bench.report import Row as Line
-from wrt.lab.bench.report import machine as machine_line
 from wrt.lab.bench.report import markdown as as_markdown
 from wrt.lab.bench.timing import shown
 from wrt.lab.hard_cases.cases import Verdict

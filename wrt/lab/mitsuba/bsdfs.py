@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
-from wrt.lab.mitsuba.exact import refuse
+from wrt.core.errors import InputError
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.values import Color
+
+
+def refuse(what: str, where: str = "") -> NoReturn:
+    """What Mitsuba cannot draw exactly: a comparison of other light says nothing."""
+    raise InputError(f"not translatable exactly: {what}", None, f"Mitsuba: {where}" if where else "Mitsuba")
 
 
 def bsdf(mi: Any, material: Material) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.lab.mitsuba.exact import refuse
+from wrt.lab.mitsuba.bsdfs import refuse
 from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 

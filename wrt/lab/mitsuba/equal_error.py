@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -105,32 +104,22 @@ class _Measured:
 class _Rivals:
     """The variants that can be used, and why the others cannot. Raises NotAvailable where none can."""
 
-    def __init__(self, stack: ExitStack) -> None:
-        self.stack = stack
+    def __init__(self, jobs: list[Job], stack: ExitStack) -> None:
+        self.jobs, self.stack = {job.variant: job for job in jobs}, stack
         self.measured: dict[str, _Measured] = {}
         self.not_available: dict[str, str] = {}
+        self.each(self._start)
 
-    def start(self, jobs: list[Job]) -> None:
-        for job in jobs:
+    def _start(self, variant: str) -> None:
+        self.measured[variant] = _Measured(self.jobs[variant], self.stack.enter_context(MitsubaProcess(self.jobs[variant])))
+
+    def each(self, do: Callable[[str], None]) -> None:
+        for variant in [name for name in self.jobs if name not in self.not_available]:
             try:
-                self.measured[job.variant] = _Measured(job, self.stack.enter_context(MitsubaProcess(job)))
+                do(variant)
             except NotAvailable as error:
-                self._leave_out(job.variant, error)
-        self._check()
-
-    def each(self, do: Callable[[_Measured], None]) -> None:
-        for variant, measured in list(self.measured.items()):
-            try:
-                do(measured)
-            except NotAvailable as error:
-                self._leave_out(variant, error)
-        self._check()
-
-    def _leave_out(self, variant: str, error: NotAvailable) -> None:
-        self.measured.pop(variant, None)
-        self.not_available[variant] = str(error)
-
-    def _check(self) -> None:
+                self.measured.pop(variant, None)
+                self.not_available[variant] = str(error)
         if not self.measured:
             raise NotAvailable("; ".join(f"Mitsuba {variant}: {why}" for variant, why in self.not_available.items()))
 
@@ -147,9 +136,9 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
     pictures, starts = seeds[REFERENCE_SEEDS:], plan.starts if command else 0
     threads, ours = thread_count(options.threads), []
     with ExitStack() as stack:
-        rivals = _Rivals(stack)
         report("starting Mitsuba")
-        rivals.start([Job(variant, scene, options.camera, plan.integrator, threads) for variant in dict.fromkeys(plan.variants)])
+        jobs = [Job(variant, scene, options.camera, plan.integrator, threads) for variant in dict.fromkeys(plan.variants)]
+        rivals = _Rivals(jobs, stack)
         report(f"reference: {REFERENCE_SEEDS} seeds")
         truth = make_reference(scene, options, plan.reference_spp or 8 * plan.spp, seeds[:REFERENCE_SEEDS],
                                scene.settings.max_depth)
@@ -162,16 +151,16 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
 
         report("pilot")
         target = statistics.mse_of(statistics.gram([our_picture(pictures[0])[1]], truth.pixels), truth.variance)
-        rivals.each(lambda rival: rival.choose_spp(pictures[0], truth, target, plan.rival_seconds))
+        rivals.each(lambda name: rivals.measured[name].choose_spp(pictures[0], truth, target, plan.rival_seconds))
         for turn, seed in enumerate(pictures):
             report(f"picture {turn + 1} of {plan.repeats}")
             if turn % 2 == 0:
                 ours.append(our_picture(seed))
-            rivals.each(partial(_Measured.picture, seed=seed))
+            rivals.each(lambda name, seed=seed: rivals.measured[name].picture(seed))
             if turn % 2 == 1:
                 ours.append(our_picture(seed))
         report("whole processes")
-        rivals.each(lambda rival: rival.time_starts(starts))
+        rivals.each(lambda name: rivals.measured[name].time_starts(starts))
     prepare = sum(renderer.prepared.seconds.get(part, 0.0) for part in ("compile", "upload", "build"))
     side = side_of(plan.spp, ours, truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
     found = {variant: measured.result(side, truth) for variant, measured in rivals.measured.items()}

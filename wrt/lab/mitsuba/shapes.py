@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wrt.lab.mitsuba.bsdfs import bsdf, emission
-from wrt.lab.mitsuba.exact import refuse
+from wrt.lab.mitsuba.bsdfs import bsdf, emission, refuse
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Sphere
 

@@ -25,8 +25,8 @@ import numpy as np
 
 from wrt.core.checks import as_choice
 from wrt.core.errors import InputError
+from wrt.lab.mitsuba.bsdfs import refuse
 from wrt.lab.mitsuba.emitters import background_emitter, light_emitter
-from wrt.lab.mitsuba.exact import refuse
 from wrt.lab.mitsuba.shapes import Part, object_parts, sphere_shape
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.scene.model import Scene

@@ -18,7 +18,7 @@ from wrt.core.errors import InputError
 from wrt.io.mesh_file import load_mesh
 from wrt.lab.bench import bvh as bench
 from wrt.lab.bench.bvh import VOLUMES, Plan, inward, published_cost, run
-from wrt.lab.bench.peak_memory import peak_bytes
+from wrt.lab.bench.timing import peak_bytes
 from wrt.scene.shapes import icosphere
 
 # Of legocar.obj, by tinybvh: SAH cost and the cost of 262,144 cosine-inward rays, with C_trav = C_int = 1.

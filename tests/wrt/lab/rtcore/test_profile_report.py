@@ -13,8 +13,7 @@ from tests.wrt.lab.rtcore.test_profiler import MIRRORS
 from wrt.core.errors import InputError
 from wrt.lab.bench.plot import bins, histograms
 from wrt.lab.rtcore.parameters import GPUS
-from wrt.lab.rtcore.profile_report import model_rows
-from wrt.lab.rtcore.profile_work import GROUPS, warp_order, work_of
+from wrt.lab.rtcore.profile_report import GROUPS, model_rows, warp_order, work_of
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
 from wrt.picture.heatmap import colors, heatmap, short, step_of, top_of
 from wrt.picture.image import read_channels, read_image

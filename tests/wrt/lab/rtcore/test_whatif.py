@@ -18,8 +18,7 @@ from wrt.kernels.study.bvh2_study import STACK_SIZE, Study
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.bench.report import text
 from wrt.lab.rtcore.parameters import SWEEPS
-from wrt.lab.rtcore.whatif import STUDIES, Plan, run
-from wrt.lab.rtcore.whatif_structures import base, quantised, resized, with_planes, with_traversal
+from wrt.lab.rtcore.whatif import STUDIES, Plan, base, quantised, resized, run, with_planes, with_traversal
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
