@@ -24,7 +24,7 @@ from wrt.core.files import open_regular, read_file
 from wrt.core.memory import require
 from wrt.core.write_file import replacing
 from wrt.picture.decode import FORMATS as FORMATS_READ
-from wrt.picture.decode import check_size, decode_png16, decode_rgba8, size_of, texts_of
+from wrt.picture.decode import check_size, decode_png16, decode_rgba8, size_of
 from wrt.picture.tonemap import decode_srgb, to_codes
 
 PathLike = str | os.PathLike[str]
@@ -269,22 +269,6 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
         if pixels is None:
             raise InputError(f"cannot be read as an image: {_reason(source.geterror)}", path)
         return {name: pixels[..., i] for i, name in enumerate(spec.channelnames)}
-
-
-def read_metadata(path: PathLike) -> dict[str, str]:
-    """What wrt wrote about a picture into its PNG, EXR or HDR file, as text by key; empty where there is nothing."""
-    if Path(path).suffix.lower() not in LINEAR_SUFFIXES:
-        with _told(path):
-            pairs = list(texts_of(read_file(path), _formats(path)).items())
-    elif Path(path).suffix.lower() == ".hdr":
-        head = _read(path).split(b"\n\n", 1)[0].decode(errors="replace")
-        lines = [line[2:].partition("=") for line in head.splitlines() if line.startswith("# ")]
-        pairs = [(key, value) for key, equals, value in lines if equals]
-    else:
-        with _opened(path) as source:
-            entries = source.spec().extra_attribs
-            pairs = [(entry.name, str(entry.value)) for entry in entries if entry.name.startswith(METADATA_PREFIX)]
-    return {key.removeprefix(METADATA_PREFIX): value for key, value in pairs if key.startswith(METADATA_PREFIX)}
 
 
 def _read(path: PathLike) -> bytes:

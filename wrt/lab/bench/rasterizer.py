@@ -151,10 +151,10 @@ class RayCaster:
     def draw(self, camera: CameraKind, size: tuple[int, int]) -> None:
         """Cast the ray through every pixel's centre, from the middle of the lens. Rays of the same camera are made once."""
         if self.seen != (camera, size):
-            rays = camera_rays(as_perspective(camera), size)
-            self.rays = [wp.array(array, dtype=wp.vec3, device=self.accel.device) for array in rays]
+            self.origins, self.directions = (wp.array(rays, dtype=wp.vec3, device=self.accel.device)
+                                             for rays in camera_rays(as_perspective(camera), size))
             self.seen = camera, size
-        self.hits = self.accel.closest_hit(*self.rays, threads=self.threads)
+        self.hits = self.accel.closest_hit(self.origins, self.directions, threads=self.threads)
         if self.accel.device.is_cuda:
             wp.synchronize_device(self.accel.device)
 

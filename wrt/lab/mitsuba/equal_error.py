@@ -24,8 +24,7 @@ from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench.error import REFERENCE_SEEDS, finished, make_reference
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
 from wrt.lab.bench.timing import quartiles, shown, spread
-from wrt.lab.mitsuba.llvm import NotAvailable
-from wrt.lab.mitsuba.process import Job, MitsubaProcess, environment_of
+from wrt.lab.mitsuba.process import Job, MitsubaProcess, NotAvailable, environment_of
 from wrt.lab.plans import Mitsuba as Plan
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer

@@ -20,10 +20,9 @@ from wrt.lab.bench.report import Columns, Part, Row, grouped, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.plans import RtCore as Plan
 from wrt.lab.rtcore.instructions import SOFTWARE, Software, software
-from wrt.lab.rtcore.model import Work, simt, trace_rays
+from wrt.lab.rtcore.model import LEGEND as LEGEND
+from wrt.lab.rtcore.model import MODEL_COLUMNS, Work, model_row, parameters, simt, trace_rays
 from wrt.lab.rtcore.parameters import GPUS
-from wrt.lab.rtcore.report import LEGEND as LEGEND
-from wrt.lab.rtcore.report import MODEL_COLUMNS, model_row, parameters
 from wrt.lab.rtcore.warps import WARP, blocks
 
 

@@ -13,10 +13,9 @@ from wrt.accel.answers import Counters
 from wrt.core.html import Rows
 from wrt.lab.bench.plot import histograms
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
-from wrt.lab.rtcore.model import Work, simt
+from wrt.lab.rtcore.model import LEGEND, MODEL_COLUMNS, SIMT_COLUMNS, Work, model_page, model_row, simt
 from wrt.lab.rtcore.parameters import Gpu
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, TITLES, Profile
-from wrt.lab.rtcore.report import LEGEND, MODEL_COLUMNS, SIMT_COLUMNS, model_page, model_row
 from wrt.lab.rtcore.warps import WARP, blocks
 from wrt.picture.image import write_codes, write_exr
 

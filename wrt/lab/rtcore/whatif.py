@@ -28,7 +28,7 @@ from wrt.lab.bench.report import Columns, Part, Row, cells, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.plans import WhatIf as Plan
 from wrt.lab.rtcore.meshes import bvhs, in_warps
-from wrt.lab.rtcore.model import TERMS, Prediction, Work, predict, simt, variants
+from wrt.lab.rtcore.model import TERMS, Work, predict, simt, variants
 from wrt.lab.rtcore.parameters import BASE, GPUS, Gpu
 from wrt.lab.rtcore.warps import by_coherence, packed
 
@@ -118,10 +118,10 @@ TITLE = "What if"
 COLUMNS: Columns = {
     "variant": "{variant}", "rays": "{kind}", "B/node": "{node_bytes}", "nodes": "{nodes:.1f}", "boxes": "{boxes:.1f}",
     "triangles": "{triangles:.1f}", "B/ray": "{bytes:.0f}", "lines": "{lines:.1f}", "L1 missed": "{l1_missed:.0%}",
-    "SIMT": "{simt:.0%}", f"Grays/s, {BASE.warps} warps": lambda row: f"{row.few_warps['rays_per_second'] / 1e9:.2f}",
-    f"limit, {BASE.warps} warps": "{few_warps[limit]}",
-    f"Grays/s, {MANY_WARPS.warps} warps": lambda row: f"{row.many_warps['rays_per_second'] / 1e9:.2f}",
-    f"limit, {MANY_WARPS.warps} warps": "{many_warps[limit]}", "differ": "{differ}"}
+    "SIMT": "{simt:.0%}", f"Grays/s, {BASE.warps} warps": lambda row: f"{row.few_warps.rays_per_second / 1e9:.2f}",
+    f"limit, {BASE.warps} warps": "{few_warps.limit}",
+    f"Grays/s, {MANY_WARPS.warps} warps": lambda row: f"{row.many_warps.rays_per_second / 1e9:.2f}",
+    f"limit, {MANY_WARPS.warps} warps": "{many_warps.limit}", "differ": "{differ}"}
 RATES: Columns = {
     "structure": "{structure}", "rays": "{kind}", "boxes a clock": "{boxes:g}", "triangles a clock": "{triangles:g}",
     "Grays/s": lambda row: f"{row.rays_per_second / 1e9:.2f}", "limit": "{limit}",
@@ -235,7 +235,7 @@ def row_of(variant: Variant, first: Variant, kind: str, gpu: Gpu) -> Row:
     return Row(variant=variant.name, kind=kind, node_bytes=variant.node_bytes, nodes=work.mean("nodes"), boxes=work.mean("boxes"),
                triangles=work.mean("primitives"), bytes=work.mean("node_bytes") + work.mean("primitive_bytes"),
                lines=misses.accesses / len(work), l1_missed=misses.l1 / max(misses.accesses, 1), simt=busy,
-               differ=int(differ.sum()), few_warps=told(predict(work, gpu)), many_warps=told(predict(work, gpu, MANY_WARPS)))
+               differ=int(differ.sum()), few_warps=predict(work, gpu), many_warps=predict(work, gpu, MANY_WARPS))
 
 
 def rate_rows(variant: Variant, kind: str, gpu: Gpu) -> Iterator[Row]:
@@ -244,12 +244,8 @@ def rate_rows(variant: Variant, kind: str, gpu: Gpu) -> Iterator[Row]:
     work = Work(variant.name, variant.counters, packed(len(variant.rays)))
     for core in variants(MANY_WARPS, ("boxes", "triangles")):
         now, twice = predict(work, gpu, core), predict(work, gpu, replace(core, triangles=2.0 * core.triangles))
-        yield Row(structure=variant.name, kind=kind, boxes=core.boxes, triangles=core.triangles, **told(now),
+        yield Row(structure=variant.name, kind=kind, boxes=core.boxes, triangles=core.triangles, **vars(now),
                   doubled=twice.rays_per_second / now.rays_per_second)
-
-
-def told(prediction: Prediction) -> dict[str, Any]:
-    return {"rays_per_second": prediction.rays_per_second, "limit": prediction.bottleneck, "clocks": prediction.terms}
 
 
 def line(row: Row) -> str:

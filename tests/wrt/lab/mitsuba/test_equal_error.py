@@ -19,8 +19,7 @@ from wrt.core.errors import InputError
 from wrt.lab.bench.report import Row
 from wrt.lab.mitsuba import equal_error
 from wrt.lab.mitsuba.equal_error import Plan, matte
-from wrt.lab.mitsuba.llvm import PATH_VARIABLE, NotAvailable
-from wrt.lab.mitsuba.process import VARIANTS, MitsubaProcess
+from wrt.lab.mitsuba.process import PATH_VARIABLE, VARIANTS, MitsubaProcess, NotAvailable
 from wrt.renderer.options import Options
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import PointLight

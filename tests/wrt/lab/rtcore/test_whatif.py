@@ -125,7 +125,7 @@ def test_a_study_has_a_row_for_each_variant_and_no_ray_differs(study: str) -> No
     assert rows._repr_html_().count("<tr>") == 1 + len(rows) and f"What if: {study}" in rows._repr_html_()
     assert len({row.variant for row in rows}) == len(rows) and rows[0].variant in text(rows, Plan(study, icosphere(3)), "")
     for row in rows:
-        assert row.few_warps["rays_per_second"] <= 1.0001 * row.many_warps["rays_per_second"]
+        assert row.few_warps.rays_per_second <= 1.0001 * row.many_warps.rays_per_second
         assert row.boxes == pytest.approx(2.0 * row.nodes) and row.bytes > row.node_bytes
     by_name = {row.variant: row for row in rows}
     if study == "sorting":
