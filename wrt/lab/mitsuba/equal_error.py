@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -155,7 +156,7 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
             report(f"picture {turn + 1} of {plan.repeats}")
             if turn % 2 == 0:
                 ours.append(our_picture(seed))
-            rivals.each(lambda name, seed=seed: rivals.measured[name].picture(seed))
+            rivals.each(partial(lambda seed, name: rivals.measured[name].picture(seed), seed))
             if turn % 2 == 1:
                 ours.append(our_picture(seed))
         report("whole processes")

@@ -21,7 +21,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.study.unit_probes import make_box_probe, make_triangle_probe, numbers_of
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
-from wrt.lab.bench.report import Columns, Part, tabled
+from wrt.lab.bench.report import Columns, Part, Row, tabled
 from wrt.lab.rtcore.cubin import CLASSES, INSTRUCTION, KernelCode, read_cubin
 
 ARCH = 75
@@ -111,38 +111,24 @@ LANES_PER_SECOND = 28 * 128 * 1.582e9  # GTX 1080 Ti: instructions of a lane, se
 CLAIMED = 1.1e9  # rays a second that NVIDIA says it traces
 
 
-@dataclass(frozen=True)
-class Software:
-    """instructions: of both units, a ray; busy: SIMT efficiency; rays_per_second: at most, of a GTX 1080 Ti that does nothing
-    else; share: of the instructions that its claimed rays leave for each ray, lanes that wait counted in."""
-
-    name: str
-    instructions: float
-    busy: float
-
-    @property
-    def rays_per_second(self) -> float:
-        return LANES_PER_SECOND * self.busy / self.instructions
-
-    @property
-    def share(self) -> float:
-        return CLAIMED / self.rays_per_second
-
-
 @cache
 def default_units() -> tuple[UnitCode, UnitCode]:
     """Compiles them for Turing."""
     return box_unit("conservative"), triangle_unit("watertight")
 
 
-def software(name: str, boxes: float, triangles: float, busy: float) -> Software:
-    """boxes, triangles: tests a ray, by the default units. The triangle test is counted as a whole, although most triangles are
+def software(name: str, boxes: float, triangles: float, busy: float) -> Row:
+    """boxes, triangles: tests a ray, by the default units; busy: SIMT efficiency. Gives instructions of both units, a ray;
+    rays_per_second: at most, of a GTX 1080 Ti that does nothing else; share: of the instructions that its claimed rays leave for
+    each ray, lanes that wait counted in. The triangle test is counted as a whole, although most triangles are
     refused early: an upper bound; fetching, stack and loop are not: together a rough figure."""
     box, triangle = default_units()
-    return Software(name, boxes * box.instructions + triangles * triangle.instructions, busy)
+    instructions = boxes * box.instructions + triangles * triangle.instructions
+    speed = LANES_PER_SECOND * busy / instructions
+    return Row(name=name, instructions=instructions, busy=busy, rays_per_second=speed, share=CLAIMED / speed)
 
 
 SOFTWARE: Columns = {
     "rays": "{name}", "instructions": "{instructions:.0f}", "SIMT": "{busy:.0%}",
     "of a lane, with those that wait": lambda row: f"{row.instructions / row.busy:.0f}",
-    "of what 1.1 Grays/s leave": lambda row: f"{row.share:.0%}", "Grays/s at most": lambda row: f"{row.rays_per_second / 1e9:.2f}"}
+    "of what 1.1 Grays/s leave": "{share:.0%}", "Grays/s at most": lambda row: f"{row.rays_per_second / 1e9:.2f}"}

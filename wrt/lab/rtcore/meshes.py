@@ -19,7 +19,7 @@ from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Part, Row, grouped, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.plans import RtCore as Plan
-from wrt.lab.rtcore.instructions import SOFTWARE, Software, software
+from wrt.lab.rtcore.instructions import SOFTWARE, software
 from wrt.lab.rtcore.model import LEGEND as LEGEND
 from wrt.lab.rtcore.model import MODEL_COLUMNS, Work, model_row, parameters, simt, trace_rays
 from wrt.lab.rtcore.parameters import GPUS
@@ -81,11 +81,10 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
 
 
 def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
-    return {"software": [{"name": each.name, "instructions": each.instructions, "rays_per_second": each.rays_per_second}
-                         for each in (in_software(rows) if plan.software else [])]}
+    return {"software": [row.as_dict() for row in in_software(rows)] if plan.software else []}
 
 
-def in_software(rows: Sequence[Row]) -> list[Software]:
+def in_software(rows: Sequence[Row]) -> list[Row]:
     """What the rays of these rows take in software."""
     return [software(f"{row.mesh} {row.structure} {row.name}", row.boxes, row.triangles, row.simt_efficiency["as they come"])
             for row in rows]

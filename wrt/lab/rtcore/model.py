@@ -20,7 +20,7 @@ from wrt.accel.base import Accelerator
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.lab.bench.report import Columns, Part, Row, tabled, tables_page
-from wrt.lab.rtcore.caches import LINE, Level1, Misses, Warps, first_level, second_level
+from wrt.lab.rtcore.caches import LINE, Misses, first_level, second_level
 from wrt.lab.rtcore.parameters import BASE, PARAMETERS, SWEEPS, Core, Gpu
 from wrt.lab.rtcore.warps import by_coherence, efficiency, longest_of, packed
 
@@ -53,16 +53,12 @@ class Work:
 
     def misses(self, gpu: Gpu, core: Core) -> Misses:
         """What misses in the caches of that GPU."""
-        key = (gpu.sms, gpu.l1, gpu.l2, core.warps, core.warm)
+        above = (gpu.sms, core.warps, gpu.l1)
+        if above not in self._simulated:
+            self._simulated[above] = first_level(self.warp, self.counters, *above)
+        key = (*above, gpu.l2, core.warm)
         if key not in self._simulated:
-            self._simulated[key] = second_level(self._first_level(gpu, core), gpu.l2, core.warm)
-        return self._simulated[key]
-
-    def _first_level(self, gpu: Gpu, core: Core) -> Level1:
-        key = (gpu.sms, gpu.l1, core.warps)
-        if key not in self._simulated:
-            c = self.counters
-            self._simulated[key] = first_level(Warps(self.warp, c.first, c.address, c.size), gpu.sms, core.warps, gpu.l1)
+            self._simulated[key] = second_level(self._simulated[above], gpu.l2, core.warm)
         return self._simulated[key]
 
 

@@ -49,19 +49,11 @@ def with_traversal(accel: Accelerator, study: Study) -> Accelerator:
     return studied(study).restore(accel.built, accel.geometry)
 
 
-@dataclass(frozen=True, eq=False)
-class Planes:
-    """lo, hi: (N, C, 3) float32 boxes as they come out of their few bits, none smaller than it was; node_bytes."""
-
-    lo: np.ndarray
-    hi: np.ndarray
-    node_bytes: int
-
-
-def quantised(lo: np.ndarray, hi: np.ndarray, bits: int, reference_bytes: int = REFERENCE_BYTES) -> Planes:
+def quantised(lo: np.ndarray, hi: np.ndarray, bits: int, reference_bytes: int = REFERENCE_BYTES
+              ) -> tuple[np.ndarray, np.ndarray, int]:
     """Planes of so many bits in the frame of their node: its lowest corner, and for each axis a step that is a power of two, as
     in compressed wide BVHs (Ylitie, Karras and Laine 2017, section 3.1). lo, hi: (N, C, 3) float32, of C children; empty
-    ones (lo = inf) stay as they are.
+    ones (lo = inf) stay as they are. Gives the boxes as they come out of their few bits, and the bytes of a node.
 
     Rounded outwards, and moved one step on where float32 arithmetic would still cut something off: no box shrinks.
     """
@@ -83,18 +75,18 @@ def quantised(lo: np.ndarray, hi: np.ndarray, bits: int, reference_bytes: int = 
         above += (plane(above) < hi) & (above < (1 << bits) - 1)
     out_lo, out_hi = np.where(empty, lo, plane(below)), np.where(empty, hi, plane(above))
     size = -(-lo.shape[1] * 6 * bits // 8) + FRAME_BYTES + reference_bytes
-    return Planes(out_lo.astype(np.float32), out_hi.astype(np.float32), size)
+    return out_lo.astype(np.float32), out_hi.astype(np.float32), size
 
 
 def with_planes(accel: Accelerator, bits: int) -> tuple[Accelerator, int]:
     """The same tree with planes of so many bits, and the bytes of a node."""
     nodes = accel.built.arrays["nodes"].copy()
     lo, hi = (np.stack([nodes[f"{end}_{side}"] for side in (0, 1)], axis=1) for end in ("lo", "hi"))
-    planes = quantised(lo, hi, bits)
+    lo, hi, size = quantised(lo, hi, bits)
     for side in (0, 1):
-        nodes[f"lo_{side}"], nodes[f"hi_{side}"] = planes.lo[:, side], planes.hi[:, side]
+        nodes[f"lo_{side}"], nodes[f"hi_{side}"] = lo[:, side], hi[:, side]
     built: Built = replace(accel.built, arrays={**accel.built.arrays, "nodes": nodes})
-    return Bvh2.restore(built, accel.geometry), planes.node_bytes
+    return Bvh2.restore(built, accel.geometry), size
 
 
 def resized(counters: Counters, before: int, after: int) -> Counters:

@@ -83,14 +83,14 @@ def test_planes_of_few_bits_contain_the_box_that_they_stand_for() -> None:
         lo[::7, 2], hi[::7, 2] = np.inf, -np.inf
         empty = lo[..., 0] == np.inf
         for bits, size in ((16, 48 + 16 + 16), (8, 24 + 16 + 16), (4, 12 + 16 + 16)):
-            planes = quantised(lo, hi, bits)
-            assert planes.node_bytes == size
-            assert (planes.lo <= lo).all() and (planes.hi >= hi).all()
-            assert (planes.lo[empty] == np.inf).all() and (planes.hi[empty] == -np.inf).all()
+            below, above, node_bytes = quantised(lo, hi, bits)
+            assert node_bytes == size
+            assert (below <= lo).all() and (above >= hi).all()
+            assert (below[empty] == np.inf).all() and (above[empty] == -np.inf).all()
             extent = np.where(empty[..., None], -np.inf, hi).max(axis=1) - np.where(empty[..., None], np.inf, lo).min(axis=1)
             ulp = np.spacing(np.abs(lo[~empty]).max())
             room = 4.0 * extent[:, None, :] / ((1 << bits) - 2) + 4.0 * ulp + 2.0**-99
-            assert (lo[~empty] - planes.lo[~empty] <= np.broadcast_to(room, lo.shape)[~empty]).all()
+            assert (lo[~empty] - below[~empty] <= np.broadcast_to(room, lo.shape)[~empty]).all()
 
 
 @pytest.mark.parametrize("bits", [16, 8, 4])
