@@ -121,7 +121,7 @@ def measured(group: click.Group, plan: type[Plan]) -> None:
         elif how.output is not None:
             report.check_folder(how.output, plots)
         client = client_of(how.cluster)
-        machine = report.machine_of(plan)
+        machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
         if client is not None:
             from wrt.renderer.distributed.dask import machines
 

@@ -113,13 +113,9 @@ def variants(scene: Scene, options: Options, features: Features, knobs: Sequence
             left_out.append(f"{name}: it changes nothing in this scene")
             continue
         now = getattr(scene.settings if knob.kind == "settings" else options, name)
-        for value in knob.values(scene):
-            if value == now:
-                continue
-            if knob.kind == "settings":
-                found.append(Variant(name, value, scene.with_settings(**{name: value}), options))
-            else:
-                found.append(Variant(name, value, scene, replace(options, **{name: value})))
+        for turned in [{name: value} for value in knob.values(scene) if value != now]:
+            here = (scene.with_settings(**turned), options) if knob.kind == "settings" else (scene, replace(options, **turned))
+            found.append(Variant(name, turned[name], *here))
     return found, left_out
 
 
@@ -138,19 +134,12 @@ def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int
     scene = scene.with_settings(max_depth=depth, min_throughput=throughput, fresnel="exact", sampler="sobol")
     renderer = Renderer(scene, Options(device=options.device, threads=options.threads, camera=options.camera))
     begin = time.perf_counter()
-    mean: Any = 0.0
-    squares: Any = 0.0
-    lost = 0.0
-    for n, seed in enumerate(seeds, start=1):  # Welford 1962
-        film = finished(renderer.run(seed=seed, spp=spp))
-        delta = film.pixels.astype(np.float64) - mean
-        mean = mean + delta / n
-        squares = squares + delta * (film.pixels - mean)
-        lost += film.stats["lost_throughput_per_sample"] / len(seeds)
-    variance = float(np.mean(squares)) / (len(seeds) * (len(seeds) - 1))
-    return Row(pixels=np.asarray(mean), variance=variance, rmse=math.sqrt(variance), lost_throughput_per_sample=lost,
-               seeds=len(seeds), spp_each=spp, max_depth=depth, min_throughput=throughput, seconds=time.perf_counter() - begin,
-               mean=float(np.mean(mean)))
+    films = [finished(renderer.run(seed=seed, spp=spp)) for seed in seeds]
+    pictures = np.stack([film.pixels for film in films]).astype(np.float64)
+    variance = float(pictures.var(axis=0, ddof=1).mean()) / len(seeds)
+    return Row(pixels=pictures.mean(axis=0), variance=variance, rmse=math.sqrt(variance), mean=float(pictures.mean()),
+               lost_throughput_per_sample=float(np.mean([film.stats["lost_throughput_per_sample"] for film in films])),
+               seeds=len(seeds), spp_each=spp, max_depth=depth, min_throughput=throughput, seconds=time.perf_counter() - begin)
 
 
 def finished(film: Film) -> Film:

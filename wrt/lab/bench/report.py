@@ -99,11 +99,6 @@ def page(plan: Plan, rows: Sequence[Row]) -> str:
     return tables_page(study_of(plan).parts(rows, plan))
 
 
-def machine_of(plan: Plan) -> str:
-    study = study_of(plan)
-    return study.machine(plan) if hasattr(study, "machine") else machine_line()
-
-
 def line(plan: Plan, row: Row) -> str:
     """A row, for the progress."""
     study = study_of(plan)
@@ -114,9 +109,8 @@ def line(plan: Plan, row: Row) -> str:
 
 def data(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
     """For JSON."""
-    study = study_of(plan)
-    facts = study.facts(rows, plan) if hasattr(study, "facts") else {}
-    return {"rows": [row.as_dict() for row in rows], **facts}
+    facts = getattr(study_of(plan), "facts", lambda rows, plan: {})
+    return {"rows": [row.as_dict() for row in rows], **facts(rows, plan)}
 
 
 def text(rows: Sequence[Row], plan: Plan, machine: str, plots: Iterable[str] = ()) -> str:

@@ -85,7 +85,8 @@ def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
     fetch = core.l1_latency + l2_share * core.l2_latency + dram_share * core.dram_latency
     wait = fetches * fetch + counts["box_operations"] * core.box_latency + counts["primitives"] * core.triangle_latency
     terms = {
-        "box": boxes_of(work) / core.boxes,
+        # Where a structure has planes or cells and no boxes, their tests take the box unit instead.
+        "box": max(work.mean("boxes"), work.mean("box_operations")) / core.boxes,
         "triangle": work.mean("primitives") / core.triangles,
         "L1": misses.accesses / n / core.l1_lines,
         "L2": misses.l1 * LINE / n / core.l2_bytes,
@@ -95,11 +96,6 @@ def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
     limit = max(terms, key=lambda name: terms[name])
     return Prediction(work=work.name, gpu=gpu.name, clocks=terms, limit=limit, rays_per_second=gpu.sms * gpu.clock / terms[limit],
                       utilisation={name: value / terms[limit] for name, value in terms.items()})
-
-
-def boxes_of(work: Work) -> float:
-    """Box tests a ray; where a structure has planes or cells and no boxes, their tests take the box unit instead."""
-    return max(work.mean("boxes"), work.mean("box_operations"))
 
 
 def sweep(work: Work, gpu: Gpu, core: Core = BASE, names: tuple[str, ...] = ("boxes", "triangles")) -> list[Prediction]:

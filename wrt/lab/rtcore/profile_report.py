@@ -61,11 +61,6 @@ def work_of(profile: Profile, group: str) -> Work | None:
     return Work(group, Counters(rays.counts[rows], begin, rays.address[fetch], rays.size[fetch]), warp)
 
 
-def efficiency_rows(profile: Profile, group: str) -> np.ndarray:
-    """All rays of a group, traced or not, in the order of the log."""
-    return np.flatnonzero(np.isin(profile.rays.kind, [KINDS.index(name) for name in GROUPS[group]]))
-
-
 PER_RAY = ("nodes", "boxes", "primitives", "leaves", "stack", "lines")
 LAYERS, HISTOGRAMS, REPORT = "counters.exr", "histograms.png", "profile.md"
 DEPTHS: Columns = {
@@ -99,7 +94,8 @@ def model_rows(profile: Profile, gpu: Gpu) -> Rows[Row]:
         work = work_of(profile, group)
         if work is None:
             continue
-        order, warp = warp_order(profile, efficiency_rows(profile, group))
+        every = np.flatnonzero(np.isin(profile.rays.kind, [KINDS.index(name) for name in GROUPS[group]]))  # traced or not
+        order, warp = warp_order(profile, every)
         chosen = profile.rays.rays[order]
         rows.append(model_row(work, gpu, simt(profile.rays.counts[order], warp, chosen["origin"], chosen["direction"])))
     return Rows(rows, model_page)
