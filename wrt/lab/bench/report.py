@@ -132,7 +132,7 @@ def repeating(plan: Plan) -> str:
         elif isinstance(value, bool):
             words += [flag] if value else []
         elif value not in (None, ()) and (value != each.default or isinstance(value, int)):
-            words.append(f"{flag} {','.join(value) if isinstance(value, tuple) else value}")
+            words.append(f"{flag} {value if isinstance(value, str | int | float) else ','.join(value)}")
     return " ".join(words)
 
 
