@@ -109,7 +109,7 @@ def line(plan: Plan, row: Row) -> str:
 
 def data(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
     """For JSON."""
-    facts = getattr(study_of(plan), "facts", lambda rows, plan: {})
+    facts: Any = getattr(study_of(plan), "facts", lambda rows, plan: {})
     return {"rows": [row.as_dict() for row in rows], **facts(rows, plan)}
 
 

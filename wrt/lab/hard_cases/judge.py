@@ -174,7 +174,7 @@ def _plain_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np
 
 
 def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[np.ndarray, ...],
-            verdict: Verdict) -> np.recarray:
+            verdict: Verdict) -> Any:
     """Hold claimed hits against the primitives that they name: false hits, and the errors of t, u and v."""
     t, u, v = (x[rows].astype(np.float64) for x in said[:3])
     prim_id = said[3][rows]
@@ -210,7 +210,7 @@ def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[
     return np.rec.fromarrays([rows, t, prim_id, bound[0], sound, hit], dtype=CLAIM)
 
 
-def _judge_closeness(case: HardCase, reference: Reference, claims: np.recarray, verdict: Verdict, lowest: bool) -> None:
+def _judge_closeness(case: HardCase, reference: Reference, claims: Any, verdict: Verdict, lowest: bool) -> None:
     """Whether anything nearer than the claimed hits had to be found, and which of them are ties."""
     n = len(claims.row)
     verdict.asked += n

@@ -44,7 +44,7 @@ SLAB = 8.0 * UNIT  # a slab's distance carries three roundings in float64
 # on spheres. Of an array of hits these are attributes: hits.ray.
 HIT = np.dtype([("ray", np.int64), ("prim_id", np.int32), ("t", np.float64), ("u", np.float64), ("v", np.float64),
                 ("t_error", np.float64), ("place", np.int8)])
-AllHits = np.recarray
+AllHits = Any  # np.recarray, whose stubs do not know its attributes
 
 
 @dataclass(frozen=True, eq=False)
