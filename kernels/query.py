@@ -115,7 +115,7 @@ def queued_ray(queue: Queue, i: int) -> Ray:
     return ray
 
 
-def make_queue_kernel(accel_struct, traverse, any_hit):
+def make_queue_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
     """Rays first .. end - 1 of a picture's queue, one at a time. out: HitArrays, or for any hit an array of bool."""
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 

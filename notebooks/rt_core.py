@@ -107,9 +107,8 @@ rows
 fig, ax = plt.subplots(figsize=(6.4, 3.4), dpi=80, layout="constrained")
 height = 0.8 / len(rows)
 for i, row in enumerate(rows):
-    p = row.prediction
     y = np.arange(len(TERMS)) + (i - 0.5 * (len(rows) - 1)) * height
-    ax.barh(y, [p.terms[name] for name in TERMS], height, label=f"{row.name}: {p.rays_per_second / 1e9:.1f} Grays/s")
+    ax.barh(y, [row.clocks[name] for name in TERMS], height, label=f"{row.name}: {row.rays_per_second / 1e9:.1f} Grays/s")
 ax.set_yticks(np.arange(len(TERMS)), TERMS)
 ax.invert_yaxis()
 ax.set(xlabel=f"clocks a ray and RT core ({BASE.boxes:g} boxes or {BASE.triangles:g} triangle a clock, {BASE.warps} warps)")
@@ -228,18 +227,18 @@ study("sorting")
 # L2.
 
 # %%
-rates = [rate for rate in whatif.rates(whatif.Plan("width", hills, ("diffuse",), RAYS)) if rate.structure in ("bvh2", "bvh8")]
-fastest = max(rate.prediction.rays_per_second for rate in rates)
+rates = [rate for rate in whatif.run(whatif.Plan("rates", hills, ("diffuse",), RAYS)) if rate.structure in ("bvh2", "bvh8")]
+fastest = max(rate.rays_per_second for rate in rates)
 fig, axes = plt.subplots(1, 2, figsize=(7.4, 3.0), dpi=80, layout="constrained")
 for ax, structure in zip(axes, ("bvh2", "bvh8"), strict=True):
     mine = [rate for rate in rates if rate.structure == structure]
     boxes, triangles = sorted({rate.boxes for rate in mine}), sorted({rate.triangles for rate in mine})
-    at = {(rate.boxes, rate.triangles): rate.prediction for rate in mine}
+    at = {(rate.boxes, rate.triangles): rate for rate in mine}
     speeds = [[at[b, t].rays_per_second for b in boxes] for t in triangles]
     ax.imshow(speeds, origin="lower", cmap="Blues", vmin=0, vmax=2 * fastest, aspect="auto")
     for x, b in enumerate(boxes):
         for y, t in enumerate(triangles):
-            ax.text(x, y, f"{speeds[y][x] / 1e9:.1f}\n{at[b, t].bottleneck}", ha="center", va="center", fontsize=9)
+            ax.text(x, y, f"{speeds[y][x] / 1e9:.1f}\n{at[b, t].limit}", ha="center", va="center", fontsize=9)
     ax.set(title=f"{structure}: Grays/s, and what limits", xlabel="boxes a clock", ylabel="triangles a clock",
            xticks=range(len(boxes)), xticklabels=[f"{b:g}" for b in boxes],
            yticks=range(len(triangles)), yticklabels=[f"{t:g}" for t in triangles])
@@ -253,8 +252,8 @@ plt.show()
 # ## Exercises
 # 1. Let the pot be a mirror. Which heat map changes most, and what happens to the range of the model?
 # 2. Which kind of ray is the hardest for the caches?
-#    `wrt.lab.rtcore.profile_work.work_of(profile, "shadow").misses(gpu, BASE)` tells.
+#    `wrt.lab.rtcore.profile_report.work_of(profile, "shadow").misses(gpu, BASE)` tells.
 # 3. `study("order")` with hills seen from above has little depth. Build a mesh with much (several `terrain`s above each other, by
 #    `wrt.Mesh`), and look at what order and early stop save.
 # 4. Later RT cores than Turing's test triangles at twice the rate. For which structure and rays does the model agree that it
-#    pays? `whatif.rates` tells (`doubled`).
+#    pays? The study "rates" tells (`doubled`).

@@ -70,7 +70,7 @@ def axes():
 
 ax = axes()
 for label, name in {"as it is": "sobol (the default)", "sampler = independent": "independent"}.items():
-    rows = [row for row in sweep.rows if row.variant.label == label]
+    rows = [row for row in sweep.rows if row.variant == label]
     rmse = np.array([row.rmse.value for row in rows])
     bars = np.abs(np.array([(row.rmse.low, row.rmse.high) for row in rows]).T - rmse)
     ax.errorbar([row.spp for row in rows], rmse, bars, fmt="o-", capsize=3, label=name)
@@ -79,7 +79,7 @@ ax.plot(n, rmse[0] / n**0.5, "k:", linewidth=1, label="one over the square root 
 ax.legend()
 plt.show()
 for slope in sweep.slopes:
-    print(f"{slope.variant.label:22} squared error falls as the samples to the power {slope.mse.value:.2f}; theory: {slope.theory}")
+    print(f"{slope.variant:22} squared error falls as the samples to the power {slope.mse.value:.2f}; theory: {slope.theory}")
 
 # %% [markdown]
 # ## Can a picture tell its own error?

@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
+from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
@@ -65,7 +65,7 @@ from wrt.kernels.wide.traverse import (
 
 NODE = node_size(WIDTH, False)
 REFERENCES = first_reference(WIDTH, False)
-PRIM_ID = WIDTH * (Primitive.numpy_dtype()["offsets"][-1] // 4)  # where a row has its primitives' numbers
+PRIM_ID = WIDTH * (size_of(Primitive) // 4 - 1)  # where a row has its primitives' numbers
 PACKETS = 4  # set up at a time
 SLOTS = 16  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf

@@ -231,10 +231,10 @@ def read_picture(path: Path) -> object:
     """As an environment, as a texture, and what is written about it."""
     from wrt.core.errors import InputError
     from wrt.picture.decode import decode_rgba8
-    from wrt.picture.image import read_image, read_metadata
+    from wrt.picture.image import read_image
 
     results: list[object] = []
-    for read in (read_image, lambda path: decode_rgba8(path.read_bytes()), read_metadata):
+    for read in (read_image, lambda path: decode_rgba8(path.read_bytes())):
         try:
             results.append(read(path))
         except InputError as error:

@@ -16,7 +16,7 @@ from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, load_kernel, made_once, run_all
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.structs import Surfaces
+from wrt.kernels.structs import Surfaces, fields_of
 from wrt.kernels.wide.packets import Scratch
 
 # Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Up to FEWEST
@@ -84,10 +84,10 @@ class Tracer:
 tracer = made_once(Tracer)
 
 
-def new_scratch(sizes: tuple[int, ...]) -> Scratch:
+def new_scratch(sizes: tuple[int, ...]) -> Any:
     """sizes: as stream_sizes of a traversal's module; aligned, as rows of lanes would else lie in two cache lines each."""
-    out = Scratch()
-    for (name, field), size in zip(Scratch.vars.items(), sizes, strict=False):
+    out: Any = Scratch()
+    for (name, field), size in zip(fields_of(Scratch).items(), sizes, strict=False):
         setattr(out, name, to_warp(empty_aligned((size,), wp.dtype_to_numpy(field.type.dtype))))
     return out
 
@@ -127,8 +127,9 @@ def readable(array: np.ndarray) -> bool:
 
 def pack(given: list[np.ndarray], answers: list[np.ndarray]) -> tuple[Any, Any]:
     """Rays and answers as kernels get them: RayArrays, and HitArrays or an array of bool. Nothing keeps the memory."""
-    rays, hits = RayArrays().__ctype__(), HitArrays().__ctype__()
-    for struct, names, arrays in ((rays, RayArrays.vars, given), (hits, HitArrays.vars, answers)):
+    records: list[Any] = [RayArrays(), HitArrays()]
+    rays, hits = (record.__ctype__() for record in records)
+    for struct, names, arrays in ((rays, fields_of(RayArrays), given), (hits, fields_of(HitArrays), answers)):
         for name, array in zip(names, arrays, strict=False):
             setattr(struct, name, array_t(array.ctypes.data, ndim=1, shape=array.shape, strides=array.strides))
     return rays, hits if len(answers) > 1 else hits.t
@@ -149,7 +150,7 @@ def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out
     there = [array if isinstance(array, wp.array) else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device)
              for array in out]
     hits = HitArrays()
-    for name, array in zip(HitArrays.vars, there, strict=False) if len(out) > 1 else ():
+    for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
         setattr(hits, name, array)
     kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
     inputs = [data, surfaces, rays_on(device, rays), hits if len(out) > 1 else there[0], 0]

@@ -12,6 +12,7 @@ from wrt.core.arrays import check_no_gradients, float32, real_numbers, taken
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST, RayArrays
+from wrt.kernels.structs import fields_of
 
 LOWEST = {"t_min": 0.0, "t_max": -np.inf}
 
@@ -58,7 +59,7 @@ def rays_of(origins: Any, directions: Any, t_min: Any, t_max: Any) -> Rays:
 def rays_on(device: Any, rays: Rays) -> RayArrays:
     """Checked, as Warp arrays on a device."""
     out = RayArrays()
-    for name, array, dtype in zip(RayArrays.vars, rays.checked(), (wp.vec3, wp.vec3, wp.float32, wp.float32), strict=True):
+    for name, array, dtype in zip(fields_of(RayArrays), rays.checked(), (wp.vec3, wp.vec3, wp.float32, wp.float32), strict=True):
         setattr(out, name, array if isinstance(array, wp.array) else upload(array, dtype, device))
     return out
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import ACCEL, SET, Size, depth_hint, load, naming, say, say_json, settings_of, warnings_reported
+from wrt.cli.common import depth_hint, load, naming, say, say_json, settings_of, shared, warnings_reported
 from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path))
+@shared("scene")
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path),
               help="A folder for PNG frames, or one file: .gif, .png or .apng (an animated PNG)")
 @click.option("--frames", type=int, default=36, show_default=True, help="How many")
@@ -22,16 +22,7 @@ from wrt.core.interrupts import exit_code
 @click.option("--fps", type=float, default=24.0, show_default=True, help="Frames a second, of one file")
 @click.option("--rebuild-at", type=float, default=1.5, show_default=True,
               help="Growth of the structure's SAH cost from which it is built anew, not refitted")
-@click.option("--spp", type=int, help="Samples a pixel  [default: the scene's]")
-@click.option("--size", type=Size(), help="Pixels  [default: the scene's, 640x360]")
-@SET
-@click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another noise, the same in all frames")
-@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
-@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
-@click.option("--camera", help="A camera's name or number  [default: the first]")
-@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
-@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
-@click.option("--json", "as_json", is_flag=True, help="Print what each frame took as JSON")
+@shared("spp", "size", "given", "seed", "device", "threads", "camera", "accel", "quiet", "as_json")
 def animate(scene: Path, output: Path, fps: float, given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool,
             **options: Any) -> None:
     """A turntable of SCENE, or its motion (`motion` and `morph` of TOML scenes), frame by frame."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import ACCEL, Setting, now_and_then, say, say_json, warnings_reported
+from wrt.cli.common import Setting, now_and_then, say, say_json, shared, warnings_reported
 from wrt.core.errors import InputError
 from wrt.io.meshes import SUFFIXES
 
@@ -15,11 +15,8 @@ from wrt.io.meshes import SUFFIXES
 @click.command(help=f"Build a structure over MESH ({SUFFIXES}) once, and write it to a file for wrt.load_accel.")
 @click.argument("mesh", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write: .accel")
-@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
 @click.option("--set", "settings", type=Setting(), multiple=True, help="An option of the structure, such as max_leaf=8; repeatable")
-@click.option("--threads", type=int, help="Threads to build with  [default: all cores]")
-@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
-@click.option("--json", "as_json", is_flag=True, help="Print the statistics as JSON")
+@shared("accel", "threads", "quiet", "as_json")
 def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any], ...], threads: int | None, quiet: bool,
           as_json: bool) -> None:
     from dataclasses import asdict

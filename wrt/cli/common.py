@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import functools
 import importlib
 import re
 import sys
@@ -21,40 +22,24 @@ DIGITS = "[0-9]{1,9}"  # more are no pixel, and Python refuses to read thousands
 SEEN = 0.003  # of the pixels: a patch of 26x26 in a picture of 640x360; fewer are seen neither as a patch nor told from noise
 
 
-class Size(click.ParamType):
-    """640x360"""
+class Written(click.ParamType):
+    """A value that is written by a pattern. form: how to write it; value: of the groups that the pattern finds."""
 
-    name = "WxH"
+    def __init__(self, name: str, pattern: str, form: str, value: Callable[..., Any]) -> None:
+        self.name, self.pattern, self.form, self.value = name, pattern, form, value
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, int]:
-        match = re.fullmatch(f"({DIGITS})[xX]({DIGITS})", str(value))
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        match = re.fullmatch(self.pattern, str(value))
         if not match:
-            self.fail(f"{value!r} is not a size; write 640x360", param, ctx)
-        return int(match[1]), int(match[2])
+            self.fail(f"{value!r} is not {self.form}", param, ctx)
+        return self.value(*match.groups())
 
 
-class Crop(click.ParamType):
-    """X0,Y0,X1,Y1"""
-
-    name = "X0,Y0,X1,Y1"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
-        numbers = [number.strip() for number in str(value).split(",")]
-        if len(numbers) != 4 or not all(re.fullmatch(DIGITS, number) for number in numbers):
-            self.fail(f"{value!r} is not a rectangle; write X0,Y0,X1,Y1 in pixels from the top left", param, ctx)
-        return tuple(int(number) for number in numbers)
-
-
-class Duration(click.ParamType):
-    """30, 30s, 5m or 1h"""
-
-    name = "TIME"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        match = re.fullmatch(r"([0-9]+(?:\.[0-9]*)?)\s*([smh]?)", str(value))
-        if not match:
-            self.fail(f"{value!r} is not a time; write 30s, 5m or 1h", param, ctx)
-        return float(match[1]) * {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}[match[2]]
+SIZE = Written("WxH", f"({DIGITS})[xX]({DIGITS})", "a size; write 640x360", lambda *sides: tuple(map(int, sides)))
+CROP = Written("X0,Y0,X1,Y1", ",".join([rf"\s*({DIGITS})\s*"] * 4),
+               "a rectangle; write X0,Y0,X1,Y1 in pixels from the top left", lambda *ends: tuple(map(int, ends)))
+DURATION = Written("TIME", r"([0-9]+(?:\.[0-9]*)?)\s*([smh]?)", "a time; write 30s, 5m or 1h",
+                   lambda number, unit: float(number) * {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}[unit])
 
 
 class Names(click.ParamType):
@@ -149,6 +134,29 @@ SET = click.option(
     "--set", "given", type=SceneSetting(), multiple=True,
     help="A setting of the scene, such as glass_shadows=tinted; repeatable. There is size, spp, max_depth, min_throughput, filter,"
          " fresnel, glass_shadows, sampler, exposure and tonemap (docs/scene_format.md)")
+
+
+# What several commands take, by the names of the arguments.
+SHARED = {
+    "scene": click.argument("scene", type=click.Path(path_type=Path)),
+    "spp": click.option("--spp", type=int, help="Samples a pixel  [default: the scene's]"),
+    "size": click.option("--size", type=SIZE, help="Pixels  [default: the scene's, 640x360]"),
+    "max_depth": click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's, 8]"),
+    "crop": click.option("--crop", type=CROP, help="Render only this rectangle, in pixels from the top left"),
+    "camera": click.option("--camera", help="A camera's name or number  [default: the first]"),
+    "given": SET,
+    "seed": click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another noise"),
+    "device": click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)"),
+    "threads": click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]"),
+    "accel": click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure"),
+    "quiet": click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings"),
+    "as_json": click.option("--json", "as_json", is_flag=True, help="Print as JSON"),
+}
+
+
+def shared(*names: str) -> Callable[[Any], Any]:
+    """A command with these of SHARED."""
+    return lambda command: functools.reduce(lambda wrapped, name: SHARED[name](wrapped), reversed(names), command)
 
 
 def settings_of(given: tuple[tuple[str, Any], ...], flags: dict[str, Any] | None = None, **taken: str) -> dict[str, Any]:

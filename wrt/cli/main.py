@@ -21,35 +21,32 @@ import click
 
 import wrt
 from wrt.cli.animate import animate
-from wrt.cli.bench import bench
 from wrt.cli.build import build
 from wrt.cli.common import (
-    ACCEL,
     CLUSTER,
-    SET,
+    DURATION,
     Commands,
-    Crop,
-    Duration,
     Names,
     OneOf,
-    Size,
     depth_hint,
     load,
     naming,
     say,
     say_json,
     settings_of,
+    shared,
     spread_options,
     warnings_reported,
 )
-from wrt.cli.measure import stability
-from wrt.cli.profile import profile, whatif
+from wrt.cli.measure import bench, profile, stability
+from wrt.cli.reporting import measured
 from wrt.cli.save import check_room, checkpoint_options, save_film
 from wrt.cli.view import view
 from wrt.core.address_space import is_out_of_memory, require_modules, told_limit
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code, raise_on_termination
 from wrt.io.meshes import SUFFIXES
+from wrt.lab.plans import WhatIf
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -59,44 +56,38 @@ def cli() -> None:
     require_modules()  # before a command imports them
 
 
-for command in (stability, bench, build, profile, animate, whatif, view):
+for command in (stability, bench, build, profile, animate, view):
     cli.add_command(command)
+measured(cli, WhatIf)
 
 
 @cli.command(help=f"Render SCENE (.toml, .gltf, .glb, or a mesh: {SUFFIXES}) to a picture.")
-@click.argument("scene", type=click.Path(path_type=Path))
+@shared("scene")
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Picture to write: .png, .exr or .hdr  [default: the scene's name with .png]")
-@click.option("--spp", type=int, help="Samples a pixel  [default: the scene's]")
-@click.option("--size", type=Size(), help="Pixels  [default: the scene's, 640x360]")
-@click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another noise")
+@shared("spp", "size", "seed")
 @click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`); several share: cuda:0,cuda:1")
 @CLUSTER
-@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
-@click.option("--crop", type=Crop(), help="Render only this rectangle, in pixels from the top left")
-@click.option("--camera", help="A camera's name or number  [default: the first]")
-@click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's, 8]")
+@shared("threads", "crop", "camera", "max_depth")
 @click.option("--min-throughput", type=float, help="Cut rays that carry less than this share  [default: 0.001]")
 @click.option("--filter", "filter_name", type=OneOf("wrt.scene.settings:FILTERS"), help="Pixel filter")
 @click.option("--fresnel", type=OneOf("wrt.scene.settings:FRESNELS"), help="exact, or schlick (cheaper, approximate)")
 @click.option("--sampler", type=OneOf("wrt.scene.settings:SAMPLERS"), help="sobol (evenly spread), or independent (random)")
-@SET
-@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure")
+@shared("given", "accel")
 @click.option("--instancing", type=OneOf("wrt.renderer.instancing:INSTANCING"), default="auto", show_default=True,
               help="Keep shared meshes once: auto (large ones), always or never")
 @click.option("--aov", type=Names(), default=(), help="Also depth, normal, albedo, prim_id, material_id")
 @click.option("--bits", type=int, help="PNG: 8 or 16; EXR: 16 or 32")
 @click.option("--tonemap", type=OneOf("wrt.scene.settings:TONEMAPS"), help="Curve from linear to display  [default: the scene's]")
 @click.option("--exposure", type=float, help="Stops  [default: the scene's, 0]")
-@click.option("--time-limit", type=Duration(), help="Stop after 30s, 5m, 1h of tracing, with what there is")
+@click.option("--time-limit", type=DURATION, help="Stop after 30s, 5m, 1h of tracing, with what there is")
 @click.option("--target-error", type=float,
               help="Stop when the picture's estimated error is no larger: the root mean square, over pixels and channels, of"
                    " the standard error in linear radiance (noise alone); --spp is then the most to take  [default: 65536]")
-@click.option("--checkpoint", "every", type=Duration(), help="Save the work so far this often, for --resume")
+@click.option("--checkpoint", "every", type=DURATION, help="Save the work so far this often, for --resume")
 @click.option("--checkpoint-file", type=click.Path(path_type=Path), help="Where to  [default: the picture's name + .checkpoint]")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint; without one, from the beginning")
-@click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings")
-@click.option("--json", "as_json", is_flag=True, help="Print the statistics as JSON")
+@shared("quiet", "as_json")
 def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool,
            **options: Any) -> None:
     begin = time.perf_counter()
@@ -190,10 +181,7 @@ def _seconds(stats: dict[str, Any]) -> str:
 
 
 @cli.command()
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--camera", help="A camera's name or number  [default: the first]")
-@SET
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+@shared("scene", "camera", "given", "as_json")
 def info(scene: Path, camera: str | None, given: tuple[tuple[str, Any], ...], as_json: bool) -> None:
     """Tell what SCENE holds, and which features its kernel is compiled with."""
     from wrt.renderer.features import describe
@@ -256,7 +244,7 @@ def validate(scenes: tuple[Path, ...]) -> None:
 @click.option("--tonemap", type=OneOf("wrt.scene.settings:TONEMAPS"), default="none", show_default=True,
               help="For PSNR and FLIP, which see what a display shows")
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, likewise")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+@shared("as_json")
 def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float, as_json: bool, **limits: Any) -> None:
     """Measure the error of picture A against the reference B."""
     from wrt.picture import metrics

@@ -1,41 +1,87 @@
-"""The commands that measure scenes and hard cases: `stability`, `bench error`, `bench mitsuba`."""
+"""The commands that measure: `bench` with those below it, `stability`, `profile`, `whatif`. They parse, call and print."""
 
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
-from wrt.cli.bench import bench
-from wrt.cli.common import SET, Duration, Names, Size, client_of, load, naming, settings_of, warnings_reported
-from wrt.cli.reporting import Reporting, reporting
+from wrt.cli.common import SIZE, Commands, Names, client_of, load, naming, settings_of, shared, warnings_reported
+from wrt.cli.reporting import Reporting, measured, planned, reporting
+from wrt.lab import plans
+from wrt.lab.plans import Error, Mitsuba, Stability
+
+
+@click.group(cls=Commands)
+def bench() -> None:
+    """Measure: speed against error, and one method against another."""
+
+
+for plan in (plans.Visibility, plans.Units, plans.Peers, plans.Accel, plans.Bvh, plans.RtCore):
+    measured(bench, plan)
+
+
+@bench.command()
+@click.option("--structures", type=Names(), default=("bvh2",), show_default=True, help="Closest-hit kernels to look at, by name")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
+def instructions(structures: tuple[str, ...], as_json: bool) -> None:
+    """The units in machine code for Turing: instructions of each box and triangle test; registers and code of traversals."""
+    from wrt.accel.structures import ACCELERATORS
+    from wrt.lab.bench.report import markdown
+    from wrt.lab.rtcore import instructions as study
+
+    for name in structures:
+        ACCELERATORS.check(name)
+    units, codes = study.units(), study.traversals(structures)
+    Reporting(as_json=as_json).end(markdown(study.tables(units, codes)), {
+        "units": [{"unit": each.unit, "test": each.test, "instructions": each.instructions, **each.classes} for each in units],
+        "traversals": {name: {"registers": code.registers, "stack": code.stack, "code_bytes": len(code.code), **code.classes()}
+                       for name, code in codes.items()}})
 
 
 @click.command()
-@click.argument("cases", nargs=-1)
-@click.option("--rays", type=click.IntRange(min=1), default=10_000, show_default=True, help="Rays of each case, for the default")
-@click.option("--sample", type=click.IntRange(min=1), default=10_000, show_default=True,
-              help="How many of them the oracle judges, and the other tests and peers get")
-@click.option("--seed", type=int, default=0, show_default=True, help="Other rays")
-@click.option("--peers", is_flag=True, help="Also Embree (robust and fast), Warp's mesh_query_ray and Open3D, where installed")
-@click.option("--threads", type=int, help="Threads for the rays beyond the sample  [default: all cores]")
-@click.option("--runs", type=click.IntRange(min=1), default=7, show_default=True, help="Runs of each for the speed, by turns")
-@reporting("Write a report: Markdown with plots beside it (.md), or one page (.html)", cluster=True, quiet="No progress")
-def stability(how: Reporting, **options: Any) -> None:
-    """The hard cases against the intersection tests: rays lost and errors, with the speed beside them.
+@shared("scene", "size")
+@click.option("--spp", type=int, default=1, show_default=True, help="Samples a pixel")
+@shared("max_depth", "given", "crop", "camera", "accel", "seed", "threads")
+@click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
+@reporting("Folder for heat maps, EXR layers, histograms and a report", quiet="No warnings")
+def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu: str, **options: Any) -> None:
+    """What every ray of SCENE costs: counters by pixel, kind and depth, and a model of the RT core."""
+    from wrt.core.checks import require_known
+    from wrt.lab.bench.report import check_folder
+    from wrt.lab.rtcore import profile_report as report
+    from wrt.lab.rtcore.parameters import GPUS
+    from wrt.lab.rtcore.profiler import profile as measure
 
-    CASES: names such as E_grid, or the letters of groups; without any, all.
-    """
+    require_known(gpu, GPUS, "GPU")
+    if how.output is not None:
+        check_folder(how.output, (report.LAYERS, report.HISTOGRAMS))
+    settings = settings_of(given, {name: options.pop(name) for name in ("size", "max_depth")}, spp="--spp")
+    loaded = load(scene, how.quiet).with_settings(**settings)
+    with warnings_reported(how.quiet), naming(scene):
+        found = measure(loaded, **options)
+    rows = report.model_rows(found, GPUS[gpu])
+    text = report.summary(found, rows, GPUS[gpu])
+    paths = [] if how.output is None else report.write_report(found, text, how.output)
+    how.end(text, {"scene": found.scene, "size": found.size, "spp": found.spp, "rays": len(found.rays), "seconds": found.seconds,
+                   "by_depth": found.by_depth(), "model": [row.as_dict() for row in rows], "output": paths}, paths)
+
+
+@click.command(help=Stability.__doc__)
+@planned(Stability)
+@reporting(Stability.REPORT, cluster=True, quiet="No progress")
+def stability(how: Reporting, plan: Stability) -> None:
+    from wrt.lab.bench.report import cells
     from wrt.lab.hard_cases import report
     from wrt.lab.hard_cases import stability as study
 
     def row_done(row: Any) -> None:
         if not how.as_json:
-            click.echo("  ".join(study.cells(row)))
+            click.echo("  ".join(cells(study.COLUMNS, row)))
 
-    plan = study.Plan(**options)
     study.chosen(plan.cases)
     if how.output is not None:
         report.check_report(how.output)
@@ -49,29 +95,19 @@ def stability(how: Reporting, **options: Any) -> None:
 
 
 @bench.command()
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--knobs", type=Names(), default=(),
-              help="Which to turn: sampler, max_depth, triangle ... (a wrong name lists them)  [default: all]")
-@click.option("--size", type=Size(), default="128x72", show_default=True, help="Pixels")
-@click.option("--max-spp", type=int, default=64, show_default=True, help="Samples a pixel: 1, 2, 4 ... up to this")
-@click.option("--repeats", type=int, default=8, show_default=True, help="Seeds of each picture, for the intervals")
-@click.option("--reference-spp", type=int, help="Samples of each of the reference's seeds  [default: 8 times --max-spp]")
-@click.option("--row-limit", "row_seconds", type=Duration(), default="120s", show_default=True,
-              help="Leave out what would take longer than this, with all its seeds")
-@click.option("--camera", help="A camera's name or number  [default: the first]")
-@SET
-@click.option("--seed", type=int, default=0, show_default=True, help="Decides on all seeds")
-@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
-@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
+@shared("scene")
+@planned(Error)
+@click.option("--size", type=SIZE, default="128x72", show_default=True, help="Pixels")
+@shared("camera", "given", "seed", "device", "threads")
 @reporting("Folder for a report: Markdown, plot and data")
-def error(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int], **options: Any) -> None:
+def error(how: Reporting, plan: Error, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int],
+          **options: Any) -> None:
     """Speed against error of SCENE over the knobs that a render has: each picture against a converged reference."""
     from wrt.lab.bench import error as study
     from wrt.lab.bench import error_report as report
     from wrt.renderer.options import Options
 
-    rendering = Options(**{name: options.pop(name) for name in ("camera", "seed", "device", "threads")})
-    plan = study.Plan(**options)
+    rendering = Options(**options)
     settings = settings_of(given, size="--size", spp="--max-spp")
     paths = {} if how.output is None else report.report_paths(how.output, scene.stem)
     loaded = load(scene, how.quiet).with_settings(size=size, **settings)
@@ -83,25 +119,14 @@ def error(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], size:
 
 
 @bench.command()
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--spp", type=int, default=64, show_default=True, help="wrt's samples a pixel; its error is what Mitsuba must reach")
-@click.option("--size", type=Size(), default="320x180", show_default=True, help="Pixels")
-@click.option("--repeats", type=int, default=7, show_default=True, help="Pictures of each, alternating, each with its own seed")
-@click.option("--reference-spp", type=int, help="Samples of each of the reference's 8 seeds  [default: 8 times --spp]")
-@click.option("--rival-limit", "rival_seconds", type=Duration(), default="60s", show_default=True,
-              help="No picture of Mitsuba's takes longer")
-@click.option("--integrator", default="auto", show_default=True,
-              help="Mitsuba's: path, volpath, direct or whitted (in Python, scalar_rgb only)")
-@click.option("--variants", type=Names(), default=("scalar_rgb", "llvm_ad_rgb"),
-              help="Mitsuba's; llvm_ad_rgb needs an LLVM library  [default: scalar_rgb,llvm_ad_rgb]")
+@shared("scene")
+@planned(Mitsuba)
+@click.option("--size", type=SIZE, default="320x180", show_default=True, help="Pixels")
 @click.option("--matte", is_flag=True, help="Make every surface diffuse, for the integrator direct, which draws the same light")
-@click.option("--starts", type=int, default=3, show_default=True, help="How often to time whole processes; 0: not at all")
-@click.option("--camera", help="A camera's name or number  [default: the first]")
-@SET
-@click.option("--seed", type=int, default=0, show_default=True, help="Decides on all seeds")
+@shared("camera", "given")
 @reporting("Write the table as Markdown (.md)")
-def mitsuba(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int], matte: bool,
-            camera: str | None, **options: Any) -> None:
+def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int], matte: bool,
+            camera: str | None) -> None:
     """SCENE by wrt and by Mitsuba 3 (scalar_rgb and llvm_ad_rgb), on all threads: time to equal error, process start included and
     excluded.
 
@@ -110,9 +135,8 @@ def mitsuba(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], siz
     from wrt.lab.mitsuba import equal_error
     from wrt.renderer.options import Options
 
-    if matte and options["integrator"] == "auto":
-        options["integrator"] = "direct"
-    plan = equal_error.Plan(**options)
+    if matte and plan.integrator == "auto":
+        plan = replace(plan, integrator="direct")
     how.check_markdown()
     settings = settings_of(given, size="--size", spp="--spp")
     loaded = load(scene, how.quiet).with_settings(size=size, **settings)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Any
 
 import click
 
-from wrt.cli.common import CLUSTER, client_of, now_and_then, say, say_json, warnings_reported
+from wrt.cli.common import ACCEL, CLUSTER, DURATION, SHARED, Names, OneOf, client_of, now_and_then, say, say_json, warnings_reported
 from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
+from wrt.lab.plans import STRUCTURES, Plan
 
-MESHES = click.argument("meshes", nargs=-1, type=click.Path(path_type=Path))
+TYPES: dict[str, Any] = {"int": int, "int | None": int, "bool": bool, "str": str, "Sequence[str]": Names(), "float": DURATION}
 
 
 @dataclass(frozen=True)
@@ -56,48 +59,78 @@ class Reporting:
             raise SystemExit(exit_code(interrupted))
 
 
-def reporting(report: str | None, *, cluster: bool = False, quiet: str = "No progress, no warnings") -> Callable[[Any], Any]:
-    """A command with these options, which it gets as one argument, `how`. report: help of -o (None: no such option)."""
-    options = [click.option("--json", "as_json", is_flag=True, help="Print as JSON"),
-               click.option("-q", "--quiet", is_flag=True, help=quiet)]
-    options += [click.option("-o", "--output", type=click.Path(path_type=Path), help=report)] if report else []
-    options += [CLUSTER] if cluster else []
+def reporting(report: str, *, cluster: bool = False, quiet: str = "No progress, no warnings") -> Callable[[Any], Any]:
+    """A command with these options, which it gets as one argument, `how`. report: help of -o."""
+    options = [SHARED["as_json"],
+               click.option("-q", "--quiet", is_flag=True, help=quiet),
+               click.option("-o", "--output", type=click.Path(path_type=Path), help=report)]
+    return gathering("how", Reporting, [*options, CLUSTER] if cluster else options)
+
+
+def planned(plan: type[Plan]) -> Callable[[Any], Any]:
+    """A command with a plan's options, which it gets as one argument, `plan`."""
+    return gathering("plan", plan, [parameter(each) for each in dataclasses.fields(plan)][::-1])
+
+
+def gathering(name: str, kind: type, options: Sequence[Any]) -> Callable[[Any], Any]:
+    """A command with these options, of which it gets a dataclass as one argument of that name."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
-        def reported(**given: Any) -> None:
-            how = {name: given.pop(name) for name in ("output", "cluster", "quiet", "as_json") if name in given}
-            command(how=Reporting(**how), **given)
+        def gathered(**given: Any) -> None:
+            of_kind = {each.name: given.pop(each.name) for each in dataclasses.fields(kind) if each.name in given}
+            command(**given, **{name: kind(**of_kind)})
 
-        return functools.reduce(lambda wrapped, option: option(wrapped), options, reported)
+        return functools.reduce(lambda wrapped, option: option(wrapped), options, gathered)
 
     return decorate
 
 
-def measure(how: Reporting, study: Any, options: dict[str, Any]) -> None:
-    """Run a study of wrt.lab.bench, each mesh on one worker where there is a cluster. study: the module, with Plan, run, machine,
-    line, text and data; one with PLOTS writes a folder (write_report), else its text is a Markdown file."""
-    from wrt.lab.bench.report import check_folder
-    from wrt.lab.bench.sweep import by_mesh
+def parameter(each: dataclasses.Field[Any]) -> Any:
+    """A field of a plan as an argument or an option of a command."""
+    known, needed = each.metadata, each.default is MISSING
+    kind = TYPES.get(str(each.type), click.Path(path_type=Path))
+    if known["form"] == "argument":
+        several: Any = {"nargs": -1, "required": needed} if str(each.type).startswith("Sequence") else {}
+        kind = OneOf(known["of"][1]) if known["of"] else str if each.name == "cases" else kind
+        return click.argument(each.name, type=kind, metavar=each.name.upper() if known["of"] else None, **several)
+    flag = f"--{known['flag'] or each.name.replace('_', '-')}"
+    if kind is bool:
+        return click.option(flag, each.name, is_flag=True, help=known["text"])
+    if known["of"] == STRUCTURES and kind is str:
+        kind = ACCEL
+    return click.option(flag, each.name, type=kind, default=each.default, show_default="[default" not in known["text"],
+                        help=known["text"])
 
-    plan, plots = study.Plan(**options), getattr(study, "PLOTS", None)
-    if plots is None:
-        how.check_markdown()
-    elif how.output is not None:
-        check_folder(how.output, plots)
-    client = client_of(how.cluster)
-    machine = study.machine(plan)
-    if client is not None:
-        from wrt.renderer.distributed.dask import machines
 
-        machine = f"a cluster, each mesh on one worker: {machines(client)}; started from {machine}"
-    with warnings_reported(how.quiet):
-        rows = by_mesh(study.run, plan, lambda row: how.progress(study.line(row)), client)
-    text, data, paths = study.text(rows, machine), {"machine": machine, **study.data(rows)}, []
-    if plots is None:
-        how.write(text)
-    elif how.output is not None:
-        paths = study.write_report(rows, plan, how.output, machine)
-    if "output" in click.get_current_context().params:
-        data["output"] = how.output if plots is None else paths
-    how.end(text, data, paths)
+def measured(group: click.Group, plan: type[Plan]) -> None:
+    """The command that runs the study of a plan, each mesh on one worker where there is a cluster. The study is a module with rows,
+    parts, and what wrt.lab.bench.report asks of it."""
+
+    @group.command(plan.COMMAND.split()[-1], help=plan.__doc__)
+    @planned(plan)
+    @reporting(plan.REPORT, cluster="meshes" in plan.__annotations__)
+    def command(how: Reporting, plan: Any) -> None:
+        from wrt.lab.bench import report
+        from wrt.lab.bench.sweep import by_mesh
+
+        study = importlib.import_module(plan.STUDY)
+        plots = getattr(study, "PLOTS", None)
+        if plots is None:
+            how.check_markdown()
+        elif how.output is not None:
+            report.check_folder(how.output, plots)
+        client = client_of(how.cluster)
+        machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
+        if client is not None:
+            from wrt.renderer.distributed.dask import machines
+
+            machine = f"a cluster, each mesh on one worker: {machines(client)}; started from {machine}"
+        with warnings_reported(how.quiet):
+            rows = by_mesh(report.run, plan, lambda row: how.progress(report.line(plan, row)), client)
+        text, paths = report.text(rows, plan, machine), []
+        if plots is None:
+            how.write(text)
+        elif how.output is not None:
+            paths = report.write_report(rows, plan, how.output, machine)
+        how.end(text, {"machine": machine, **report.data(rows, plan), "output": how.output if plots is None else paths}, paths)

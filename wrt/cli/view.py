@@ -13,11 +13,11 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import ACCEL, SET, load, naming, say, settings_of
+from wrt.cli.common import load, naming, say, settings_of, shared
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path))
+@shared("scene")
 @click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="Where to listen; 0 is any free one")
 @click.option("--host", default="127.0.0.1", show_default=True,
               help="For which machines: 127.0.0.1 is this one only, 0.0.0.0 all that reach it and have the printed address")
@@ -25,12 +25,7 @@ from wrt.cli.common import ACCEL, SET, load, naming, say, settings_of
               help="Another address under which browsers find it, such as https://example.org of a proxy; repeatable")
 @click.option("--open/--no-open", "open_browser", default=True, help="Open a browser  [default: where there is a desktop]")
 @click.option("--spp", type=click.IntRange(1, 1 << 24), default=1024, show_default=True, help="Samples a pixel to refine until")
-@click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)")
-@click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]")
-@click.option("--camera", help="A camera's name or number to begin with  [default: the first]")
-@click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure to begin with")
-@SET
-@click.option("-q", "--quiet", is_flag=True, help="No warnings")
+@shared("device", "threads", "camera", "accel", "given", "quiet")
 def view(scene: Path, port: int, host: str, allow_origin: tuple[str, ...], open_browser: bool, spp: int,
          given: tuple[tuple[str, Any], ...], quiet: bool, **options: Any) -> None:
     """Look around in SCENE: an orbit camera in the browser, whose picture gets finer while it stands still.

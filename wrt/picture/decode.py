@@ -74,12 +74,6 @@ def size_of(data: bytes, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
         return picture.size
 
 
-def texts_of(data: bytes, formats: tuple[str, ...] = FORMATS) -> dict[str, str]:
-    """The texts that stand before an encoded picture's pixels, by keyword. Raises InputError as decode_rgba8 does."""
-    with _opened(data, formats) as picture:
-        return {key: value for key, value in picture.info.items() if isinstance(value, str)}
-
-
 @contextmanager
 def _opened(data: bytes, formats: tuple[str, ...], bytes_of_pixel: float = BYTES_OF_PIXEL) -> Iterator[Any]:
     """The picture, whose pixels are decoded when they are asked for."""

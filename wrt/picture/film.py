@@ -188,16 +188,6 @@ def _view_id(ids: np.ndarray) -> np.ndarray:
     return np.where(ids[..., None] >= 0, colors, 0).astype(np.uint8)
 
 
-def _view_variance(variance: np.ndarray) -> np.ndarray:
-    """The standard error, on the scale of the picture itself without exposure and tone mapping; unknown is white."""
-    return to_codes(np.sqrt(np.maximum(variance, 0.0)))
-
-
-def _view_samples(samples: np.ndarray) -> np.ndarray:
-    """0 is black, the most there are is white."""
-    return _grey(255.0 * samples / max(int(samples.max(initial=0)), 1))
-
-
 def _grey(values: np.ndarray) -> np.ndarray:
     return np.repeat(np.rint(values).astype(np.uint8)[..., None], 3, axis=-1)
 
@@ -208,8 +198,10 @@ AOV_VIEWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "albedo": to_codes,
     "prim_id": _view_id,
     "material_id": _view_id,
-    "variance": _view_variance,
-    "samples": _view_samples,
+    # The standard error, on the scale of the picture itself without exposure and tone mapping; unknown is white.
+    "variance": lambda variance: to_codes(np.sqrt(np.maximum(variance, 0.0))),
+    # 0 is black, the most there are is white.
+    "samples": lambda samples: _grey(255.0 * samples / max(int(samples.max(initial=0)), 1)),
 }
 
 

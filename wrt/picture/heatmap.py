@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from wrt.picture.tonemap import encode_srgb
+
 INK, PALE = (30, 30, 30), (110, 110, 110)
 BAR, MARGIN, TITLE = 18, 14, 30  # pixels: width of the bar, around everything, height of the title
 LEAST = 480  # a picture narrower than this is shown larger, by a whole number
@@ -26,9 +28,7 @@ def colors() -> np.ndarray:
                     lightness - 0.0894841775 * a - 1.2914855480 * b]) ** 3
     matrix = np.array([[4.0767416621, -3.3077115913, 0.2309699292], [-1.2684380046, 2.6097574011, -0.3413193965],
                        [-0.0041960863, -0.7034186147, 1.7076147010]])
-    linear = np.clip(matrix @ lms, 0.0, 1.0)
-    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-    return np.rint(255.0 * coded.T).astype(np.uint8)
+    return np.rint(255.0 * encode_srgb(np.clip(matrix @ lms, 0.0, 1.0)).T).astype(np.uint8)
 
 
 def top_of(values: np.ndarray) -> float:

@@ -24,7 +24,7 @@ from wrt.core.files import open_regular, read_file
 from wrt.core.memory import require
 from wrt.core.write_file import replacing
 from wrt.picture.decode import FORMATS as FORMATS_READ
-from wrt.picture.decode import check_size, decode_png16, decode_rgba8, size_of, texts_of
+from wrt.picture.decode import check_size, decode_png16, decode_rgba8, size_of
 from wrt.picture.tonemap import decode_srgb, to_codes
 
 PathLike = str | os.PathLike[str]
@@ -74,7 +74,9 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
     those nor negative values (they become 0, or its brightest). What is replaced is counted in one SceneWarning. Raises
     InputError where the file cannot be written; an existing file is then as it was.
     """
-    pixels = _as_picture(pixels, path)
+    pixels = np.asarray(pixels, dtype=np.float32)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
+        raise InputError(f"pixels must be (H, W, 3), got {pixels.shape}", path)
     suffix, bits = output_format(path, bits)
     WRITERS[suffix](path, pixels, bits, exposure, tonemap, metadata or {})
 
@@ -184,13 +186,6 @@ def _warn_replaced(path: PathLike, where: np.ndarray, what: str) -> None:
         warnings.warn(f"{os.fspath(path)}: {count} pixel{'s' * (count != 1)} {what}", SceneWarning, stacklevel=2)
 
 
-def _as_picture(pixels: np.ndarray, path: PathLike) -> np.ndarray:
-    pixels = np.asarray(pixels, dtype=np.float32)
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
-        raise InputError(f"pixels must be (H, W, 3), got {pixels.shape}", path)
-    return pixels
-
-
 def encode_png(codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> bytes:
     """A PNG file of (H, W, 3) uint8 or uint16 sRGB codes; metadata as iTXt (UTF-8) entries named `wrt:key`.
 
@@ -227,7 +222,8 @@ def read_image(path: PathLike) -> np.ndarray:
     suffix = Path(path).suffix.lower()
     if suffix in LINEAR_SUFFIXES:
         return _pick_colors(read_channels(path), path)
-    data = _read(path)
+    with _told(path):
+        data = read_file(path)
     if suffix not in DISPLAY_SUFFIXES:
         raise InputError(f"not an image format that wrt reads ({', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)})", path)
     with _told(path):
@@ -269,27 +265,6 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
         if pixels is None:
             raise InputError(f"cannot be read as an image: {_reason(source.geterror)}", path)
         return {name: pixels[..., i] for i, name in enumerate(spec.channelnames)}
-
-
-def read_metadata(path: PathLike) -> dict[str, str]:
-    """What wrt wrote about a picture into its PNG, EXR or HDR file, as text by key; empty where there is nothing."""
-    if Path(path).suffix.lower() not in LINEAR_SUFFIXES:
-        with _told(path):
-            pairs = list(texts_of(read_file(path), _formats(path)).items())
-    elif Path(path).suffix.lower() == ".hdr":
-        head = _read(path).split(b"\n\n", 1)[0].decode(errors="replace")
-        lines = [line[2:].partition("=") for line in head.splitlines() if line.startswith("# ")]
-        pairs = [(key, value) for key, equals, value in lines if equals]
-    else:
-        with _opened(path) as source:
-            entries = source.spec().extra_attribs
-            pairs = [(entry.name, str(entry.value)) for entry in entries if entry.name.startswith(METADATA_PREFIX)]
-    return {key.removeprefix(METADATA_PREFIX): value for key, value in pairs if key.startswith(METADATA_PREFIX)}
-
-
-def _read(path: PathLike) -> bytes:
-    with _told(path):
-        return read_file(path)
 
 
 def _formats(path: PathLike) -> tuple[str, ...]:

@@ -27,8 +27,8 @@ from wrt.scene.settings import TONEMAPS
 from wrt.viewer.access import access_for
 from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
 from wrt.viewer.refine import COSTS, Viewer
+from wrt.viewer.renderers import Shown
 from wrt.viewer.server import Door, import_viser, listen, quiet, to_stderr
-from wrt.viewer.view import Shown
 
 MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser one
 RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}

@@ -23,8 +23,7 @@ from wrt.renderer.options import Options, Progress
 from wrt.renderer.progress import COMPILING
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
-from wrt.viewer.renderers import Renderers
-from wrt.viewer.view import Shown, View
+from wrt.viewer.renderers import Renderers, Shown, View
 
 COARSE = 0.08  # seconds that the first picture after a change should take
 PATIENCE = 0.5  # seconds after which it is given up, where the next change is waiting

@@ -238,7 +238,8 @@ def test_rays_of_a_picture_leave_out_what_they_start_on():
         for any_hit in (False, True):
             many, block = accel.structure.accel.kernels.make_stream(accel.structure.units, any_hit, Queue), 64
             one = make_queue_kernel(accel.structure.struct, accel.structure.traversal(any_hit=any_hit), any_hit)
-            for kernel, threads, more in ((many, -(-len(o) // block), [new_scratch(BatchTraversal.stream_sizes)]), (one, len(o), [])):
+            scratch = new_scratch(BatchTraversal.stream_sizes)
+            for kernel, threads, more in ((many, -(-len(o) // block), [scratch]), (one, len(o), [])):
                 hits = HitArrays()
                 hits.t, hits.u, hits.v, hits.prim_id = zeros(len(o)), zeros(len(o)), zeros(len(o)), zeros(len(o), wp.int32)
                 out = zeros(len(o), wp.bool) if any_hit else hits

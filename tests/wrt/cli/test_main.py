@@ -19,11 +19,12 @@ from PIL import Image
 from tests.command_line import BOX_OBJ, Result, largest_file, without_compiling
 from tests.command_line import wrt as run
 from tests.data import ROOT
+from tests.picture_metadata import read_metadata
 from wrt import __version__
 from wrt.cli import common as cli_common
 from wrt.io.load import load_scene, schema
 from wrt.picture import film as film_module
-from wrt.picture.image import read_channels, read_image, read_metadata, write_image
+from wrt.picture.image import read_channels, read_image, write_image
 from wrt.renderer import progress as progress_module
 from wrt.renderer.features import features_of
 from wrt.renderer.options import Progress

@@ -24,7 +24,7 @@ from wrt.accel.build import build, build_cached
 from wrt.core import write_file
 from wrt.core.errors import InputError
 from wrt.core.write_file import LONG_AGO, aside, check_writable, remove_leftovers, replacing, this_system
-from wrt.lab.bench import peak_memory
+from wrt.lab.bench import timing
 from wrt.picture.image import write_codes, write_image
 from wrt.renderer import checkpoint
 from wrt.renderer.animate import save_movie
@@ -393,5 +393,5 @@ def test_memory_is_measured_where_there_is_no_c_library_without_a_name(monkeypat
     def no_name(name: Any) -> Any:
         raise TypeError("argument of type 'NoneType' is not iterable")  # as on Windows
 
-    monkeypatch.setattr(peak_memory.ctypes, "CDLL", no_name)
-    assert peak_memory.peak_bytes(lambda: 7)[0] == 7
+    monkeypatch.setattr(timing.ctypes, "CDLL", no_name)
+    assert timing.peak_bytes(lambda: 7)[0] == 7

@@ -14,7 +14,7 @@ from PIL import Image
 
 from wrt.core.errors import InputError
 from wrt.picture import image
-from wrt.picture.decode import decode_rgba8, texts_of
+from wrt.picture.decode import decode_rgba8
 from wrt.picture.tonemap import to_codes
 
 
@@ -98,11 +98,3 @@ def test_no_other_format_is_tried(form: str, tmp_path: Path) -> None:
         (tmp_path / f"a{suffix}").write_bytes(buffer.getvalue())
         with pytest.raises(InputError, match=rf"a\{suffix}: cannot be read as an image: it is no"):
             image.read_image(tmp_path / f"a{suffix}")
-
-
-def test_texts_of_a_png() -> None:
-    data = image.encode_png(np.zeros((1, 1, 3), np.uint8), {"a": "ö", "b": "x\0y"})
-    assert texts_of(data) == {"wrt:a": "ö", "wrt:b": "x\0y"}
-    for damaged in (data[:50], b""):
-        with pytest.raises(InputError, match="cannot be read as an image"):
-            texts_of(damaged)

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.picture_metadata import read_metadata
 from wrt.core.errors import InputError
 from wrt.picture.decode import decode_rgba8
 from wrt.picture.film import AOV_VIEWS, Film, aov_path, aov_to_srgb8
-from wrt.picture.image import read_channels, read_image, read_metadata
+from wrt.picture.image import read_channels, read_image
 from wrt.picture.tonemap import to_codes
 
 H, W = 12, 17

@@ -15,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from tests.command_line import largest_file
+from tests.picture_metadata import read_metadata
 from wrt.core.errors import InputError, SceneWarning
 from wrt.picture.decode import decode_rgba8
 from wrt.picture.image import (
@@ -24,7 +25,6 @@ from wrt.picture.image import (
     encode_png,
     read_channels,
     read_image,
-    read_metadata,
     write_exr,
     write_image,
 )

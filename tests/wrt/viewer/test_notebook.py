@@ -230,7 +230,6 @@ def test_a_list_of_rows_is_a_list_with_a_page() -> None:
 def test_reports_are_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     from wrt.lab.hard_cases import stability
     from wrt.lab.rtcore.model import TERMS, Prediction
-    from wrt.lab.rtcore.parameters import BASE, GPUS
     from wrt.lab.rtcore.profiler import Profile
 
     result = stability.Result(rows=[stability.Row("A_case", EVIL)])
@@ -238,6 +237,7 @@ def test_reports_are_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Profile, "by_depth", lambda self: [{"depth": 0, "kind": "primary", "nodes": 1234}])
     profile = Profile(EVIL, (16, 9), 1, np.zeros((9, 16, 3)), rays=(), accel=None)  # type: ignore[arg-type]
     assert Tables(profile._repr_html_()).rows == [["depth", "kind", "nodes"], ["0", "primary", "1,234"]]
-    prediction = Prediction(EVIL, next(iter(GPUS.values())), BASE, {name: 1.0 + (name == "L2") for name in TERMS})
+    prediction = Prediction(work=EVIL, gpu="a GPU", clocks={name: 1.0 + (name == "L2") for name in TERMS}, limit="L2",
+                            utilisation={name: 0.5 + 0.5 * (name == "L2") for name in TERMS}, rays_per_second=1e9)
     rows = Tables(prediction._repr_html_()).rows
     assert ["L2", "2", "100%"] in rows and ["box", "1", "50%"] in rows and len(rows) == 1 + len(TERMS)

@@ -29,7 +29,7 @@ from wrt.scene.shapes import box, quad
 from wrt.viewer import refine as module
 from wrt.viewer import renderers
 from wrt.viewer.refine import COARSE, DEEPEST, SCALES, Viewer
-from wrt.viewer.view import Shown
+from wrt.viewer.renderers import Shown
 
 # A box on a mirror, through an open lens: as the viewer compiles every scene. One kernel serves all tests here.
 CAMERA = Camera.look_at((2, 2, 4), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -16,30 +15,35 @@ from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.device import thread_count
 from wrt.core.errors import InputError
-from wrt.core.html import Rows
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.peak_memory import peak_bytes
 from wrt.lab.bench.plot import LogLogPlot, Series
-from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
-from wrt.lab.bench.report import Part, check_plan, gathered, markdown, page, write
-from wrt.lab.bench.report import machine as machine_line
+from wrt.lab.bench.rays import RaySet, ray_sets
+from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled
+from wrt.lab.bench.report import run as run
 from wrt.lab.bench.stadium import in_stadium
-from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.bench.timing import alternate, peak_bytes, spread
 from wrt.lab.bench.visibility import TERRAINS, fit, terrain
+from wrt.lab.plans import Accel as Plan
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 YARDSTICK = "bvh2"  # every ray is compared with it, and as many as BRUTE_FORCE_TESTS allow with brute force
 BRUTE_FORCE_TESTS = 200_000_000
 COUNTED_RAYS = 20_000
-COLUMNS = ("structure", "rays", "build ms", "B/triangle", "peak B", "SAH", "depth", "refs", "nodes", "boxes", "triangles", "Mray/s",
-           "/ first", "differ", "wrong")
-REPORT = "accel.md"
-AXES = {"accel-build.png": "microseconds of build a triangle", "accel-memory.png": "bytes a triangle",
-        "accel-growth.png": "triangles"}
-PLOTS = tuple(AXES)
+TITLE = "Structures"
+COLUMNS: Columns = {
+    "structure": "{structure}", "rays": "{kind}", "build ms": lambda row: f"{1e3 * row.build_median:.3g}",
+    "B/triangle": "{bytes_per_triangle:.0f}", "peak B": lambda row: f"{row.peak_bytes / row.triangles:.0f}",
+    "SAH": "{sah_cost:.3g}", "depth": "{depth}", "refs": lambda row: f"{row.references / row.triangles:.2f}",
+    "nodes": "{nodes:.3g}", "boxes": "{boxes:.3g}", "triangles": "{primitives:.3g}", "Mray/s": lambda row: spread(row.mrays),
+    "/ first": "{over_first:.2f}", "differ": "{differ}", "wrong": "{wrong} of {checked}"}
+REFUSED: Columns = {"structure": "{structure}", "mesh": "{mesh}", "reason": "{reason}"}
+GROWTH: Columns = {
+    "structure": "{structure}", "mesh": "{mesh}", "rays": "{kind}", "cost": "{cost}",
+    "triangles": lambda row: f"{vars(row)['from']} to {row.to}", "exponent": "{exponent:.3f} ± {error:.3f}", "times": "{times:.2f}"}
+PLOTS = {"accel-build.png": "microseconds of build a triangle", "accel-memory.png": "bytes a triangle",
+         "accel-growth.png": "triangles"}
 LEGEND = f"""\
 build: median of the builds, all cores. B/triangle: of the whole structure, triangles included; peak B: what the process grew by
 at the first build, a triangle. SAH: expected nodes and triangles of a random line through the root, costing 1 each. refs:
@@ -49,78 +53,11 @@ rays with another prim_id or another bit of t than {YARDSTICK}, of all; wrong: t
 2e8 tests allow. Both must be 0."""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What to measure: meshes or their files (none: a terrain that grows up to max_triangles), structures (none: all but brute
-    force), kinds of ray, rays of each kind, runs of each, builds of each; stadium: each mesh stands in a stadium a thousand times
-    its size, and the rays are those that it has alone. Raises InputError."""
-
-    meshes: Sequence[Mesh | str | Path] = ()
-    structures: Sequence[str] = ()
-    kinds: Sequence[str] = tuple(RAY_KINDS)
-    rays: int = 100_000
-    runs: int = 5
-    builds: int = 1
-    max_triangles: int = 1_000_000
-    threads: int = 1
-    seed: int = 0
-    stadium: bool = False
-
-    def __post_init__(self) -> None:
-        check_plan(self, {"structure": (self.structures, ACCELERATORS), "kind of ray": (self.kinds, RAY_KINDS)},
-                   rays=(1, 2**28), runs=(1, 1000), builds=(1, 100), max_triangles=(1000, 2**28))
-        thread_count(self.threads)
-
-    @property
-    def names(self) -> list[str]:
-        """Structures in the order of the registry, each once."""
-        if self.structures:
-            return list(dict.fromkeys(self.structures))
-        return [name for name, cls in ACCELERATORS.items() if name == cls.name and name != "brute_force"]
-
-
-@dataclass(frozen=True)
-class Row:
-    """One structure, mesh and kind of ray. build: seconds of each build; seconds: of each run over `rays` rays; nodes, boxes,
-    primitives: fetched and tested, a ray (mean; of any-hit rays: as if the closest hit were asked); differ: rays whose prim_id or
-    bits of t are not the yardstick's; checked, wrong: rays given to brute force, and those that it contradicts; peak_bytes: what
-    the process grew by at the first build (NaN where the system does not tell)."""
-
-    mesh: str
-    triangles: int
-    structure: str
-    kind: str
-    rays: int
-    build: tuple[float, ...]
-    bytes_per_triangle: float
-    sah_cost: float
-    depth: int
-    references: int
-    nodes: float
-    boxes: float
-    primitives: float
-    seconds: tuple[float, ...]
-    differ: int
-    checked: int
-    wrong: int
-    peak_bytes: float = float("nan")
-
-    @property
-    def mrays(self) -> np.ndarray:
-        """Million rays a second, run by run."""
-        return self.rays / np.array(self.seconds) / 1e6
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self) | {"build_median": float(np.median(self.build)), "mrays_median": float(np.median(self.mrays))}
-
-
-@dataclass(frozen=True)
-class Refused:
-    """A structure that cannot be built over a mesh, in its own words."""
-
-    mesh: str
-    structure: str
-    reason: str
+def names(plan: Plan) -> list[str]:
+    """Structures in the order of the registry, each once."""
+    if plan.structures:
+        return list(dict.fromkeys(plan.structures))
+    return [name for name, cls in ACCELERATORS.items() if name == cls.name and name != "brute_force"]
 
 
 def meshes(plan: Plan) -> Iterator[Mesh]:
@@ -130,55 +67,55 @@ def meshes(plan: Plan) -> Iterator[Mesh]:
         yield from map(terrain, cells)
 
 
-def run(plan: Plan, report: Callable[[Row | Refused], None] | None = None) -> Rows[Row | Refused]:
-    """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a structure)."""
-    rows = (row for mesh in meshes(plan) for row in _Bench(plan, mesh).rows())
-    return Rows(gathered(rows, report), lambda rows: page(parts(rows)))
+def rows(plan: Plan) -> Iterator[Row]:
+    for mesh in meshes(plan):
+        yield from mesh_rows(plan, mesh)
 
 
-class _Bench:
-    """One mesh, all structures, all kinds of ray."""
-
-    def __init__(self, plan: Plan, mesh: Mesh) -> None:
-        self.plan, alone = plan, build(Geometry.of(mesh), YARDSTICK)
-        self.rays = {kind: rays for kind, rays in ray_sets(alone, plan.rays, plan.seed).items() if kind in plan.kinds}
-        mesh = in_stadium(mesh) if plan.stadium else mesh
-        self.name, self.geometry = Path(mesh.name or "mesh").name, Geometry.of(mesh)
-        self.yardstick = build(self.geometry, YARDSTICK) if plan.stadium else alone
-        self.checked = max(min(BRUTE_FORCE_TESTS // max(len(self.geometry), 1), plan.rays), 1)
-
-    def rows(self) -> Iterator[Row | Refused]:
-        built: dict[str, tuple[Accelerator, tuple[float, ...]]] = {}
-        peaks: dict[str, float] = {}
-        for name in self.plan.names:
-            warm_up(name)
-            try:
-                first, peaks[name] = peak_bytes(partial(build, self.geometry, name))
-                accels = [first, *(build(self.geometry, name) for _ in range(self.plan.builds - 1))]
-            except InputError as error:
-                yield Refused(self.name, name, str(error))
-                continue
-            built[name] = accels[-1], tuple(accel.stats.build_seconds for accel in accels)
-        brute_force = build(self.geometry, "brute_force")
-        for rays in self.rays.values():
-            truth = answer(self.yardstick, rays, None)
-            few = rays.part(slice(None, None, max(len(rays) // self.checked, 1)))
-            exact = answer(brute_force, few, None)
-            seconds = alternate({name: partial(answer, accel, rays, self.plan.threads) for name, (accel, _) in built.items()},
-                                self.plan.runs)
-            for name, (accel, build_seconds) in built.items():
-                answers = (differing(answer(accel, rays, None), truth), len(few), differing(answer(accel, few, None), exact))
-                yield replace(self._row(name, accel, build_seconds, rays, seconds[name], answers), peak_bytes=peaks[name])
-
-    def _row(self, name: str, accel: Accelerator, build_seconds: tuple[float, ...], rays: RaySet, seconds: np.ndarray,
-             answers: tuple[int, int, int]) -> Row:
-        """answers: Row's differ, checked and wrong."""
+def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
+    """A row for each kind of ray and each structure, and before them one for each that refuses, with its reason in its words."""
+    yardstick = build(Geometry.of(mesh), YARDSTICK)
+    sets = ray_sets(yardstick, plan.rays, plan.seed)
+    mesh = in_stadium(mesh) if plan.stadium else mesh
+    where, geometry = Path(mesh.name or "mesh").name, Geometry.of(mesh)
+    yardstick = build(geometry, YARDSTICK) if plan.stadium else yardstick
+    n = len(geometry)
+    built: dict[str, Accelerator] = {}
+    facts: dict[str, dict[str, Any]] = {}
+    for name in names(plan):
+        warm_up(name)
+        try:
+            first, peak = peak_bytes(partial(build, geometry, name))
+            accels = [first, *(build(geometry, name) for _ in range(plan.builds - 1))]
+        except InputError as error:
+            yield Row(mesh=where, structure=name, reason=str(error))
+            continue
+        built[name], seconds, s = accels[-1], [accel.stats.build_seconds for accel in accels], accels[-1].stats
+        facts[name] = {"mesh": where, "triangles": n, "structure": name, "build": seconds,
+                       "build_median": float(np.median(seconds)), "peak_bytes": peak, "bytes_per_triangle": s.bytes / n,
+                       "sah_cost": s.sah_cost, "depth": s.depth, "references": s.references}
+    brute_force = build(geometry, "brute_force")
+    checked = max(min(BRUTE_FORCE_TESTS // max(n, 1), plan.rays), 1)
+    for rays in (rays for kind, rays in sets.items() if kind in plan.kinds):
+        truth = answer(yardstick, rays, None)
+        few = rays.part(slice(None, None, max(len(rays) // checked, 1)))
+        exact = answer(brute_force, few, None)
         counted = rays.part(slice(None, None, max(len(rays) // COUNTED_RAYS, 1)))
-        c = accel.closest_hit(counted.origins, counted.directions, 0.0, counted.t_max, counters=True).counters
-        assert c is not None
-        s, n = accel.stats, len(self.geometry)
-        return Row(self.name, n, name, rays.kind, len(rays), build_seconds, s.bytes / n, s.sah_cost, s.depth, s.references,
-                   float(c.nodes.mean()), float(c.boxes.mean()), float(c.primitives.mean()), tuple(seconds.tolist()), *answers)
+        timed = alternate({name: partial(answer, accel, rays, plan.threads) for name, accel in built.items()}, plan.runs)
+        for name, accel in built.items():
+            c = accel.closest_hit(counted.origins, counted.directions, 0.0, counted.t_max, counters=True).counters
+            assert c is not None
+            yield Row(**facts[name], kind=rays.kind, rays=len(rays), nodes=float(c.nodes.mean()), boxes=float(c.boxes.mean()),
+                      primitives=float(c.primitives.mean()), **timing(len(rays), timed[name], next(iter(timed.values()))),
+                      differ=differing(answer(accel, rays, None), truth), checked=len(few),
+                      wrong=differing(answer(accel, few, None), exact))
+
+
+def timing(rays: int, seconds: np.ndarray, first: np.ndarray) -> dict[str, Any]:
+    """Of runs over so many rays: seconds, million rays a second, and how many times as fast as the first, run by run."""
+    mrays = rays / seconds / 1e6
+    return {"seconds": seconds.tolist(), "mrays": mrays.tolist(), "mrays_median": float(np.median(mrays)),
+            "over_first": float(np.median(first / seconds))}
 
 
 @cache
@@ -201,55 +138,32 @@ def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
     return int((np.asarray(found) != np.asarray(truth)).sum())
 
 
-def cells(row: Row, first: Row) -> tuple[str, ...]:
-    """One line of the table, as COLUMNS names it."""
-    return (row.structure, row.kind, f"{1e3 * float(np.median(row.build)):.3g}", f"{row.bytes_per_triangle:.0f}",
-            f"{row.peak_bytes / row.triangles:.0f}", f"{row.sah_cost:.3g}", f"{row.depth}",
-            f"{row.references / row.triangles:.2f}", f"{row.nodes:.3g}", f"{row.boxes:.3g}",
-            f"{row.primitives:.3g}", spread(row.mrays), f"{np.median(row.mrays / first.mrays):.2f}", f"{row.differ}",
-            f"{row.wrong} of {row.checked}")
-
-
-def parts(rows: Sequence[Row | Refused]) -> list[Part]:
+def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
     """A table for each mesh, what was refused, and how costs grow."""
-    groups: dict[tuple[str, int], list[Row]] = {}
-    for row in rows:
-        if isinstance(row, Row):
-            groups.setdefault((row.mesh, row.triangles), []).append(row)
-    out = []
-    for (mesh, triangles), group in groups.items():
-        first = {row.kind: row for row in reversed(group)}
-        out.append(Part(f"{mesh}, {triangles} triangles", "", COLUMNS, [cells(row, first[row.kind]) for row in group]))
-    refused = [(row.structure, row.mesh, row.reason) for row in rows if isinstance(row, Refused)]
-    if refused:
-        out.append(Part("Not built", "", ("structure", "mesh", "reason"), refused))
-    grown = growth(rows)
-    if grown:
-        out.append(Part("As triangles grow", "seconds ~ n^exponent (± one standard deviation); times: last over first.",
-                        ("structure", "mesh", "rays", "cost", "triangles", "exponent", "times"), [
-                            (g["structure"], g["mesh"], g["kind"], g["cost"], f"{g['from']} to {g['to']}",
-                             f"{g['exponent']:.3f} ± {g['error']:.3f}", f"{g['times']:.2f}") for g in grown]))
-    return out
+    out = [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles")
+           for (mesh, triangles), group in grouped(measured(rows), "mesh", "triangles").items()]
+    refused, grown = [row for row in rows if "reason" in vars(row)], [Row(**each) for each in growth(rows)]
+    told = "seconds ~ n^exponent (± one standard deviation); times: last over first."
+    return [*out, *([tabled(REFUSED, refused, "Not built")] if refused else []),
+            *([tabled(GROWTH, grown, "As triangles grow", told)] if grown else [])]
 
 
-def growth(rows: Sequence[Row | Refused]) -> list[dict[str, Any]]:
+def measured(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if "reason" not in vars(row)]
+
+
+def growth(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """How seconds a ray and seconds of the build grow with the triangles: exponents over meshes of one name, where there are three
     sizes or more."""
     out = []
-    series: dict[tuple[str, str, str], list[Row]] = {}
-    for row in rows:
-        if isinstance(row, Row):
-            series.setdefault((row.mesh, row.structure, row.kind), []).append(row)
-    for (mesh, structure, kind), group in series.items():
+    for (mesh, structure, kind), group in grouped(measured(rows), "mesh", "structure", "kind").items():
         sizes = [row.triangles for row in group]
         if len(set(sizes)) < 3:
             continue
-        costs = {"search": [float(np.median(row.seconds)) / row.rays for row in group],
-                 "build": [float(np.median(row.build)) for row in group]}
+        costs = {"search": [1.0 / row.mrays_median / 1e6 for row in group], "build": [row.build_median for row in group]}
         for cost, seconds in costs.items():
-            found = fit(sizes, seconds)
             out.append({"mesh": mesh, "structure": structure, "kind": kind, "cost": cost, "from": min(sizes), "to": max(sizes),
-                        "times": seconds[-1] / seconds[0], **asdict(found)})
+                        "times": seconds[-1] / seconds[0], **fit(sizes, seconds)})
     return out
 
 
@@ -257,43 +171,27 @@ def machine(plan: Plan) -> str:
     return machine_line(f"{plan.threads} used to search", f"{plan.runs} runs of {plan.rays} rays")
 
 
-def line(row: Row | Refused) -> str:
-    """For the progress."""
-    if isinstance(row, Refused):
+def line(row: Row) -> str:
+    if "reason" in vars(row):
         return f"{row.mesh}: {row.structure}: {row.reason}"
-    return f"{row.mesh}: {row.structure}, {row.kind} rays: {np.median(row.mrays):.3g} Mray/s, {row.differ} differ"
+    return f"{row.mesh}: {row.structure}, {row.kind} rays: {row.mrays_median:.3g} Mray/s, {row.differ} differ"
 
 
-def text(rows: Sequence[Row | Refused], machine: str) -> str:
-    """For the terminal."""
-    return f"{machine}\n\n{markdown(parts(rows))}\n{LEGEND}"
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
+    return {"rows": [row.as_dict() for row in measured(rows)],
+            "refused": [row.as_dict() for row in rows if "reason" in vars(row)], "growth": growth(rows)}
 
 
-def data(rows: Sequence[Row | Refused]) -> dict[str, object]:
-    """For JSON."""
-    return {"rows": [row.as_dict() for row in rows if isinstance(row, Row)],
-            "refused": [vars(row) for row in rows if isinstance(row, Refused)], "growth": growth(rows)}
-
-
-def plot(rows: Sequence[Row | Refused], name: str) -> LogLogPlot:
+def plot(rows: Sequence[Row], name: str) -> LogLogPlot:
     """Time to build or memory against time to search (one point a mesh; the last kind of ray that was measured), or the cost of
     a ray as triangles grow."""
-    kind = next((row.kind for row in reversed(rows) if isinstance(row, Row)), "")
-    series: dict[str, list[tuple[float, float]]] = {}
-    for row in rows:
-        if isinstance(row, Row) and row.kind == kind:
-            search = float(np.median(row.seconds)) / row.rays * 1e6
-            x = (float(np.median(row.build)) / row.triangles * 1e6, row.bytes_per_triangle, float(row.triangles))
-            series.setdefault(row.structure, []).append((x[PLOTS.index(name)], search))
-    lines = [Series(structure, sorted(points) if name == PLOTS[2] else points) for structure, points in series.items()]
-    return LogLogPlot(f"Structures, {kind} rays", AXES[name], "microseconds a ray", lines)
-
-
-def write_report(rows: Sequence[Row | Refused], plan: Plan, folder: Path, machine: str) -> list[Path]:
-    """Markdown and plots; the paths. Raises InputError where the system refuses."""
-    names = [Path(mesh.name if isinstance(mesh, Mesh) else mesh).name for mesh in plan.meshes]
-    command = " ".join(["python -m wrt bench accel", *names, f"--rays {plan.rays}", f"--runs {plan.runs}",
-                        f"--threads {plan.threads}"])
-    text = f"# Structures\n\nMachine: {machine}\n\nTo repeat: `{command}`\n\n{LEGEND}\n\n"
-    return write(folder / REPORT, text + markdown([*parts(rows), *(Part(plot=name) for name in PLOTS)]),
-                 {name: plot(rows, name) for name in PLOTS})
+    rows = measured(rows)
+    kind = rows[-1].kind if rows else ""
+    across: dict[str, Callable[[Row], float]] = {
+        "accel-build.png": lambda row: row.build_median / row.triangles * 1e6,
+        "accel-memory.png": lambda row: row.bytes_per_triangle, "accel-growth.png": lambda row: float(row.triangles)}
+    lines = []
+    for (structure,), group in grouped([row for row in rows if row.kind == kind], "structure").items():
+        points = [(across[name](row), 1.0 / row.mrays_median) for row in group]
+        lines.append(Series(structure, sorted(points) if name == "accel-growth.png" else points))
+    return LogLogPlot(f"Structures, {kind} rays", PLOTS[name], "microseconds a ray", lines)

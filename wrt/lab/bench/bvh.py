@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter, process_time
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -17,25 +17,33 @@ from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
 from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.geometry import Geometry
+from wrt.accel.rays import rays_of, rays_on
 from wrt.core.device import load_kernel, thread_count, upload
-from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.kernels.query import RayArrays
 from wrt.kernels.study.query_volumes import count_popped, make_enter_kernel
 from wrt.kernels.traverse.bvh2 import box_volumes
 from wrt.kernels.traverse.bvh2_kdop import kdop_volumes
 from wrt.kernels.traverse.bvh2_sphere import sphere_volumes
-from wrt.lab.bench.peak_memory import peak_bytes
-from wrt.lab.bench.rays import RaySet, endless, unit
-from wrt.lab.bench.report import Part, check_plan, gathered, load_average, markdown
-from wrt.lab.bench.report import machine as machine_line
-from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.bench.accel import differing
+from wrt.lab.bench.rays import RaySet, ball_around, endless, unit
+from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, load_average, tabled
+from wrt.lab.bench.report import run as run
+from wrt.lab.bench.timing import alternate, peak_bytes, spread
+from wrt.lab.plans import Bvh as Plan
 
 VOLUMES = ("bvh2", "bvh2_sphere", "bvh2_kdop")
 TESTED_RAYS, TESTED_NODES = 1024, 1024
-BUILDER_COLUMNS = ("builder", "SAH", "cost", "nodes", "leaves", "triangles", "depth", "refs", "build s", "CPU s", "peak B")
-VOLUME_COLUMNS = ("volume", "B/node", "inner area", "leaf area", "SAH", "nodes", "triangles", "ns/test", "/ box", "Mray/s",
-                  "differ")
+TITLE = "Builders of binary BVHs, and bounding volumes"
+BUILDERS: Columns = {
+    "builder": "{builder}", "SAH": "{sah_cost:.2f}", "cost": "{cost:.2f}", "nodes": "{nodes:.2f}", "leaves": "{leaves:.2f}",
+    "triangles": "{triangles:.2f}", "depth": "{depth}", "refs": lambda row: f"{row.references / row.n_triangles:.2f}",
+    "build s": lambda row: spread(row.seconds), "CPU s": "{cpu_seconds:.3g}",
+    "peak B": lambda row: f"{row.peak_bytes / row.n_triangles:.0f}"}
+VOLUME: Columns = {
+    "volume": "{volume}", "B/node": "{node_bytes}", "inner area": "{inner_area:.3f}", "leaf area": "{leaf_area:.3f}",
+    "SAH": "{sah_cost:.2f}", "nodes": "{nodes:.2f}", "triangles": "{triangles:.2f}",
+    "ns/test": lambda row: spread(row.test_seconds, 1e9), "/ box": lambda row: spread(row.ratios),
+    "Mray/s": lambda row: spread(row.rays / np.array(row.seconds) / 1e6), "differ": "{differ}"}
 LEGEND = """\
 Rays: they start on the sphere around the root's box, inwards with a cosine distribution; those that pass by the box are left out.
 SAH: expected nodes and triangles of a random line through the root's box, costing 1 each. cost: nodes and leaves popped and
@@ -47,101 +55,17 @@ ns/test: of one volume, tested on one thread with nothing around it; / box: over
 differ: rays with another prim_id or another bit of t than bvh2."""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Mesh files, builders (none: all), rays, builds of each builder and runs of each volume. Raises InputError."""
-
-    meshes: Sequence[str | Path]
-    builders: Sequence[str] = ()
-    rays: int = 2**18
-    builds: int = 3
-    runs: int = 7
-    threads: int | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not self.meshes:
-            raise InputError("name the meshes")
-        check_plan(self, {BVH_BUILDERS.kind: (self.builders, BVH_BUILDERS)}, rays=(1, 2**26), builds=(1, 100), runs=(1, 1000))
-        thread_count(self.threads)
-
-
-@dataclass(frozen=True)
-class BuilderRow:
-    """What LEGEND says of a builder; seconds: of each build; cpu_seconds: of one, on average; load: of the machine before the
-    first."""
-
-    mesh: str
-    n_triangles: int
-    builder: str
-    sah_cost: float
-    cost: float
-    nodes: float
-    leaves: float
-    triangles: float
-    depth: int
-    references: int
-    seconds: tuple[float, ...]
-    cpu_seconds: float
-    peak_bytes: float
-    load: float
-
-    def cells(self) -> tuple[str, ...]:
-        return (self.builder, f"{self.sah_cost:.2f}", f"{self.cost:.2f}", f"{self.nodes:.2f}", f"{self.leaves:.2f}",
-                f"{self.triangles:.2f}", f"{self.depth}", f"{self.references / self.n_triangles:.2f}", spread(self.seconds),
-                f"{self.cpu_seconds:.3g}", f"{self.peak_bytes / self.n_triangles:.0f}")
-
-
-@dataclass(frozen=True)
-class VolumeRow:
-    """What LEGEND says of a volume; test_seconds, ratios: of one test, and over the box's in the same run; seconds: of all rays."""
-
-    mesh: str
-    n_triangles: int
-    volume: str
-    node_bytes: int
-    inner_area: float
-    leaf_area: float
-    sah_cost: float
-    nodes: float
-    triangles: float
-    test_seconds: tuple[float, ...]
-    ratios: tuple[float, ...]
-    rays: int
-    seconds: tuple[float, ...]
-    differ: int
-
-    def cells(self) -> tuple[str, ...]:
-        mrays = self.rays / np.array(self.seconds) / 1e6
-        return (self.volume, f"{self.node_bytes}", f"{self.inner_area:.3f}", f"{self.leaf_area:.3f}", f"{self.sah_cost:.2f}",
-                f"{self.nodes:.2f}", f"{self.triangles:.2f}", spread(self.test_seconds, 1e9), spread(self.ratios),
-                spread(mrays), f"{self.differ}")
-
-
-Rows = list[BuilderRow | VolumeRow]
-
-
-def run(plan: Plan, report: Callable[[BuilderRow | VolumeRow], None] | None = None) -> Rows:
-    """Measure everything; `report` gets each row as it is done. Raises InputError (a file)."""
-    return gathered((row for path in plan.meshes for row in _mesh_rows(plan, path)), report)
-
-
-def _mesh_rows(plan: Plan, path: str | Path) -> Iterator[BuilderRow | VolumeRow]:
-    geometry, name = Geometry.of(as_mesh(path)), Path(path).name
-    rays = inward(geometry, plan.rays, plan.seed)
-    yield from builder_rows(plan, name, geometry, rays)
-    yield from volume_rows(plan, name, geometry, rays)
-
-
-def machine(plan: Plan) -> str:
-    return machine_line()
+def rows(plan: Plan) -> Iterator[Row]:
+    for mesh in map(as_mesh, plan.meshes):
+        geometry, name = Geometry.of(mesh), Path(mesh.name or "mesh").name
+        rays = inward(geometry, plan.rays, plan.seed)
+        for measured in (*builder_rows(plan, geometry, rays), *volume_rows(plan, geometry, rays)):
+            yield Row(mesh=name, n_triangles=len(geometry), **measured)
 
 
 def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
     """n rays from the sphere around the geometry's box, inwards with a cosine distribution, that meet the box: uniform lines."""
-    lo, hi = (bound.astype(np.float64) for bound in geometry.bounds())
-    lo, hi = lo.min(axis=0), hi.max(axis=0)
-    center, radius = 0.5 * (lo + hi), 0.5 * float(np.linalg.norm(hi - lo))
+    lo, hi, center, radius = ball_around(geometry)
     rng = np.random.default_rng(seed)
     origins, directions = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
     while len(origins) < n:
@@ -154,7 +78,7 @@ def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
     return RaySet("inward", origins[:n], directions[:n], endless(n))
 
 
-def builder_rows(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet) -> Iterator[BuilderRow]:
+def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[str, Any]]:
     small = Geometry(geometry.vertices, geometry.faces[:64], geometry.spheres)
     for name in plan.builders or BVH_BUILDERS:
         build_binary(small, BvhOptions(name), 1)  # the kernels are compiled
@@ -170,16 +94,10 @@ def builder_rows(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet) -> Ite
         accel = build(geometry, "bvh2", builder=name)
         c = accel.closest_hit(rays.origins, rays.directions, counters=True).counters
         assert c is not None
-        yield BuilderRow(mesh, len(geometry), name, accel.stats.sah_cost, published_cost(accel, rays), float(c.nodes.mean()),
-                         float(c.leaves.mean()), float(c.primitives.mean()), accel.stats.depth, accel.stats.references,
-                         tuple(seconds), cpu_seconds, peak, busy)
-
-
-def device_rays(rays: RaySet, n: int | None = None) -> RayArrays:
-    out, part = RayArrays(), rays.part(slice(n))
-    out.origin, out.direction = upload(part.origins, wp.vec3, "cpu"), upload(part.directions, wp.vec3, "cpu")
-    out.t_min, out.t_max = upload(np.zeros(len(part), np.float32), wp.float32, "cpu"), upload(part.t_max, wp.float32, "cpu")
-    return out
+        yield {"builder": name, "sah_cost": accel.stats.sah_cost, "cost": published_cost(accel, rays),
+               "nodes": float(c.nodes.mean()), "leaves": float(c.leaves.mean()), "triangles": float(c.primitives.mean()),
+               "depth": accel.stats.depth, "references": accel.stats.references, "seconds": seconds, "cpu_seconds": cpu_seconds,
+               "peak_bytes": peak, "load": busy}
 
 
 def published_cost(accel: Accelerator, rays: RaySet) -> float:
@@ -187,8 +105,9 @@ def published_cost(accel: Accelerator, rays: RaySet) -> float:
     hits = accel.closest_hit(rays.origins, rays.directions)
     counts = [wp.zeros(len(rays), dtype=wp.int32, device="cpu") for _ in range(2)]
     load_kernel(count_popped, accel.device)
+    device_rays = rays_on("cpu", rays_of(rays.origins, rays.directions, 0.0, rays.t_max))
     wp.launch(count_popped, dim=len(rays), device="cpu", inputs=[
-        accel.data.nodes, upload(accel.built.order.copy(), wp.int32, "cpu"), device_rays(rays), upload(hits.t, wp.float32, "cpu"),
+        accel.data.nodes, upload(accel.built.order.copy(), wp.int32, "cpu"), device_rays, upload(hits.t, wp.float32, "cpu"),
         upload(hits.prim_id, wp.int32, "cpu"), *counts])
     return float(sum(count.numpy().mean() for count in counts))
 
@@ -204,7 +123,7 @@ def surfaces(accel: Accelerator) -> np.ndarray:
     return np.stack([2.0 * half_areas(nodes[f"lo_{side}"], nodes[f"hi_{side}"]) for side in "01"])
 
 
-def volume_rows(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet) -> Iterator[VolumeRow]:
+def volume_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[str, Any]]:
     accels = {name: build(geometry, name) for name in VOLUMES}
     boxes, truth = surfaces(accels["bvh2"]), accels["bvh2"].closest_hit(rays.origins, rays.directions)
     nodes = accels["bvh2"].built.arrays["nodes"]
@@ -219,11 +138,12 @@ def volume_rows(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet) -> Iter
         hits = accel.closest_hit(rays.origins, rays.directions, counters=True)
         c = hits.counters
         assert c is not None
-        differ = (hits.prim_id != truth.prim_id) | (hits.t.view(np.int32) != truth.t.view(np.int32))
-        yield VolumeRow(mesh, len(geometry), name, accel.built.arrays["nodes"].itemsize,
-                        float(area[~leaf].sum() / max(boxes[~leaf].sum(), 1e-300)), float(area[leaf].sum() / boxes[leaf].sum()),
-                        accel.stats.sah_cost, float(c.nodes.mean()), float(c.primitives.mean()), tuple(tested[name].tolist()),
-                        tuple((tested[name] / tested["bvh2"]).tolist()), len(rays), tuple(traced[name].tolist()), int(differ.sum()))
+        yield {"volume": name, "node_bytes": accel.built.arrays["nodes"].itemsize,
+               "inner_area": float(area[~leaf].sum() / max(boxes[~leaf].sum(), 1e-300)),
+               "leaf_area": float(area[leaf].sum() / boxes[leaf].sum()), "sah_cost": accel.stats.sah_cost,
+               "nodes": float(c.nodes.mean()), "triangles": float(c.primitives.mean()), "test_seconds": tested[name].tolist(),
+               "ratios": (tested[name] / tested["bvh2"]).tolist(), "rays": len(rays), "seconds": traced[name].tolist(),
+               "differ": differing(hits, truth)}
 
 
 def tester_of(accel: Accelerator, rays: RaySet) -> Callable[[], int]:
@@ -240,7 +160,8 @@ def tester_of(accel: Accelerator, rays: RaySet) -> Callable[[], int]:
     if accel.name == "bvh2_kdop":
         data.middle = accel.data.middle
     n = min(TESTED_RAYS, len(rays))
-    inputs = [data, device_rays(rays, n), wp.zeros(n, dtype=wp.int32, device="cpu")]
+    some = rays_on("cpu", rays_of(rays.origins[:n], rays.directions[:n], 0.0, rays.t_max[:n]))
+    inputs = [data, some, wp.zeros(n, dtype=wp.int32, device="cpu")]
 
     def test() -> int:
         wp.launch(kernel, dim=n, inputs=inputs, device="cpu")
@@ -249,24 +170,21 @@ def tester_of(accel: Accelerator, rays: RaySet) -> Callable[[], int]:
     return test
 
 
-def line(row: BuilderRow | VolumeRow) -> str:
-    """For the progress."""
-    return f"{row.mesh}: {'  '.join(row.cells())}"
+def columns(row: Row) -> Columns:
+    return BUILDERS if "builder" in vars(row) else VOLUME
 
 
-def text(rows: Rows, machine: str) -> str:
-    """All tables as Markdown."""
-    parts = [Part("", machine)]
-    for mesh in dict.fromkeys(row.mesh for row in rows):
-        group = [row for row in rows if row.mesh == mesh]
-        for kind, columns in ((BuilderRow, BUILDER_COLUMNS), (VolumeRow, VOLUME_COLUMNS)):
-            parts.append(Part("", f"{mesh}, {group[0].n_triangles} triangles", columns,
-                              [row.cells() for row in group if isinstance(row, kind)]))
-    loads = [row.load for row in rows if isinstance(row, BuilderRow)]
-    return markdown([*parts, Part("", f"Load average at the builds: {min(loads):.1f} to {max(loads):.1f}."), Part("", LEGEND)])
+def line(row: Row) -> str:
+    return f"{row.mesh}: {'  '.join(cells(columns(row), row))}"
 
 
-def data(rows: Rows) -> dict[str, object]:
-    """For JSON."""
-    return {"builders": [vars(row) for row in rows if isinstance(row, BuilderRow)],
-            "volumes": [vars(row) for row in rows if isinstance(row, VolumeRow)]}
+def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
+    loads = [row.load for row in rows if "load" in vars(row)]
+    return [*(tabled(kind, [row for row in group if columns(row) is kind], f"{mesh}, {n} triangles")
+              for (mesh, n), group in grouped(rows, "mesh", "n_triangles").items() for kind in (BUILDERS, VOLUME)),
+            Part("", f"Load average at the builds: {min(loads):.1f} to {max(loads):.1f}.")]
+
+
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
+    return {name: [row.as_dict() for row in rows if columns(row) is kind]
+            for name, kind in (("builders", BUILDERS), ("volumes", VOLUME))}

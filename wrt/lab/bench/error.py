@@ -7,6 +7,7 @@ defaults have them; each setting is rendered with 1, 2, 4 ... samples a pixel an
 from __future__ import annotations
 
 import hashlib
+import math
 import platform
 import signal
 import time
@@ -22,9 +23,10 @@ from wrt.core.interrupts import Interrupted
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench import error_statistics as statistics
-from wrt.lab.bench.error_rows import Reference, Row, Slope, Sweep, Variant
-from wrt.lab.bench.error_statistics import UNKNOWN
-from wrt.lab.bench.report import check_plan
+from wrt.lab.bench.error_report import BASE, THEORY, Sweep
+from wrt.lab.bench.error_statistics import CONFIDENCE, UNKNOWN
+from wrt.lab.bench.report import Row, grouped
+from wrt.lab.plans import Error as Plan
 from wrt.picture import metrics
 from wrt.picture.film import Film
 from wrt.renderer.features import Features
@@ -88,6 +90,20 @@ KNOBS = {knob.name: knob for knob in (
 )}
 
 
+@dataclass(frozen=True)
+class Variant:
+    """One knob at one value (knob "" and value None: none is turned), ready to be rendered with."""
+
+    knob: str
+    value: Any
+    scene: Scene
+    options: Options
+
+    @property
+    def label(self) -> str:
+        return f"{self.knob} = {self.value}" if self.knob else BASE
+
+
 def variants(scene: Scene, options: Options, features: Features, knobs: Sequence[str]) -> tuple[list[Variant], list[str]]:
     """The scene as it is, then every value of every knob; and a sentence for each knob that changes nothing."""
     found, left_out = [Variant("", None, scene, options)], []
@@ -97,21 +113,20 @@ def variants(scene: Scene, options: Options, features: Features, knobs: Sequence
             left_out.append(f"{name}: it changes nothing in this scene")
             continue
         now = getattr(scene.settings if knob.kind == "settings" else options, name)
-        for value in knob.values(scene):
-            if value == now:
-                continue
-            if knob.kind == "settings":
-                found.append(Variant(name, value, scene.with_settings(**{name: value}), options))
-            else:
-                found.append(Variant(name, value, scene, replace(options, **{name: value})))
+        for turned in [{name: value} for value in knob.values(scene) if value != now]:
+            here = (scene.with_settings(**turned), options) if knob.kind == "settings" else (scene, replace(options, **turned))
+            found.append(Variant(name, turned[name], *here))
     return found, left_out
 
 
 # --- the reference ----------------------------------------------------------------------------------------------------
 
 
-def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int], depth: int | None = None) -> Reference:
-    """Exact Fresnel, the even sampler, the default tests and structure, deep (REFERENCE_DEPTH at least, or just `depth`) and
+def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int], depth: int | None = None) -> Row:
+    """What counts as the truth. pixels: (H, W, 3) float64, the mean over the seeds; variance: of that mean, averaged over pixels
+    and channels; lost_throughput_per_sample: the share of light that was not followed (a bound on what its own cuts may hide).
+
+    Exact Fresnel, the even sampler, the default tests and structure, deep (REFERENCE_DEPTH at least, or just `depth`) and
     with a low cut-off; float64 over the seeds."""
     settings = scene.settings
     depth = max(settings.max_depth, REFERENCE_DEPTH) if depth is None else depth
@@ -119,17 +134,12 @@ def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int
     scene = scene.with_settings(max_depth=depth, min_throughput=throughput, fresnel="exact", sampler="sobol")
     renderer = Renderer(scene, Options(device=options.device, threads=options.threads, camera=options.camera))
     begin = time.perf_counter()
-    mean: Any = 0.0
-    squares: Any = 0.0
-    lost = 0.0
-    for n, seed in enumerate(seeds, start=1):  # Welford 1962
-        film = finished(renderer.run(seed=seed, spp=spp))
-        delta = film.pixels.astype(np.float64) - mean
-        mean = mean + delta / n
-        squares = squares + delta * (film.pixels - mean)
-        lost += film.stats["lost_throughput_per_sample"] / len(seeds)
-    variance = float(np.mean(squares)) / (len(seeds) * (len(seeds) - 1))
-    return Reference(np.asarray(mean), variance, lost, len(seeds), spp, depth, throughput, time.perf_counter() - begin)
+    films = [finished(renderer.run(seed=seed, spp=spp)) for seed in seeds]
+    pictures = np.stack([film.pixels for film in films]).astype(np.float64)
+    variance = float(pictures.var(axis=0, ddof=1).mean()) / len(seeds)
+    return Row(pixels=pictures.mean(axis=0), variance=variance, rmse=math.sqrt(variance), mean=float(pictures.mean()),
+               lost_throughput_per_sample=float(np.mean([film.stats["lost_throughput_per_sample"] for film in films])),
+               seeds=len(seeds), spp_each=spp, max_depth=depth, min_throughput=throughput, seconds=time.perf_counter() - begin)
 
 
 def finished(film: Film) -> Film:
@@ -142,7 +152,7 @@ def finished(film: Film) -> Film:
 # --- one row ----------------------------------------------------------------------------------------------------------
 
 
-def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int], truth: Reference) -> Row:
+def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int], truth: Row) -> Row:
     """Render with every seed and compare."""
     films = [finished(renderer.run(seed=seed, spp=spp)) for seed in seeds]
     n, settings = len(films), variant.scene.settings
@@ -160,7 +170,7 @@ def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int]
     measurable = mse(np.arange(n)) > 0.0
     bias, bias_below = statistics.bias_with_bound(products, truth.variance)
     return Row(
-        variant, spp, products,
+        variant=variant.label, knob=variant.knob or None, value=variant.value, spp=spp, products=products, pareto=False,
         seconds=statistics.mean_estimate(seconds.tolist()),
         rmse=statistics.estimate(lambda i: max(mse(i), 0.0) ** 0.5, n, logarithmic=True) if measurable else UNKNOWN,
         efficiency=statistics.estimate(efficiency, n, logarithmic=True) if measurable else UNKNOWN,
@@ -169,44 +179,28 @@ def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int]
         bias=bias, bias_below=bias_below, noise=max(statistics.noise_of(products), 0.0) ** 0.5,
         build_seconds=films[0].stats["accel"]["build_seconds"],
         rays_per_sample=float(np.mean([film.stats["rays_per_sample"] for film in films])),
-        digest=hashlib.sha256(b"".join(film.pixels.tobytes() for film in films)).hexdigest())
+        _digest=hashlib.sha256(b"".join(film.pixels.tobytes() for film in films)).hexdigest())
 
 
-def slope_of(rows: Sequence[Row], known: float) -> Slope:
+def slope_of(rows: Sequence[Row], known: float, sampler: str) -> Row:
     """Over the rows of one variant; known: the reference's variance."""
 
-    def mse(indices: np.ndarray) -> list[float]:
-        return [statistics.mse_of(row.products[np.ix_(indices, indices)], known) for row in rows]
+    def fit(of: Callable[[np.ndarray], float]) -> statistics.Estimate:
+        return statistics.slope([row.spp for row in rows], lambda some: [of(row.products[np.ix_(some, some)]) for row in rows],
+                                len(rows[0].products))
 
-    def noise(indices: np.ndarray) -> list[float]:
-        return [statistics.noise_of(row.products[np.ix_(indices, indices)]) for row in rows]
+    return Row(variant=rows[0].variant, mse=fit(lambda products: statistics.mse_of(products, known)),
+               noise=fit(statistics.noise_of), theory=THEORY[sampler])
 
-    spp, repeats = [row.spp for row in rows], len(rows[0].products)
-    return Slope(rows[0].variant, statistics.slope(spp, mse, repeats), statistics.slope(spp, noise, repeats))
+
+def same_pixels(rows: Sequence[Row]) -> list[str]:
+    """The variants whose pictures are, bit for bit, those of the scene as it is."""
+    base = {row.spp: row._digest for row in rows if row.knob is None}
+    return [variant for (variant, knob), group in grouped(rows, "variant", "knob").items()
+            if knob is not None and all(row._digest == base.get(row.spp) for row in group)]
 
 
 # --- the sweep --------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Plan:
-    """What to sweep. knobs: names in KNOBS, empty for all; max_spp: the last power of two; reference_spp: samples of each of
-    the reference's seeds (None: 8 max_spp); row_seconds: a row that would likely take longer is left out."""
-
-    knobs: Sequence[str] = ()
-    max_spp: int = 64
-    repeats: int = 8
-    reference_spp: int | None = None
-    row_seconds: float = 120.0
-
-    def __post_init__(self) -> None:
-        check_plan(self, {"knob": (self.knobs, KNOBS)}, max_spp=(1, 1 << 16), repeats=(3, 1000))  # 2 seeds have no spread
-        if self.reference_spp is not None:
-            check_plan(self, {}, reference_spp=(1, 1 << 24))
-
-    @property
-    def levels(self) -> list[int]:
-        return [1 << i for i in range(self.max_spp.bit_length())]
 
 
 def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], None] = lambda text: None) -> Sweep:
@@ -224,7 +218,8 @@ def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], No
     truth = make_reference(scene, options, reference_spp, words[:REFERENCE_SEEDS])
     machine = {"device": base.prepared.device.name or "CPU", "threads": base.prepared.threads, "system": platform.machine(),
                "wrt": wrt.__version__}
-    result = Sweep(scene.name, scene.settings.size, plan.repeats, options.seed, truth, machine, left_out=left_out)
+    result = Sweep(scene=scene.name, size=list(scene.settings.size), repeats=plan.repeats, seed=options.seed, confidence=CONFIDENCE,
+                   reference=truth, machine=machine, left_out=left_out, interrupted=None)
     rows: dict[str, list[Row]] = {variant.label: [] for variant in found}
     try:
         for number, variant in enumerate(found):
@@ -245,7 +240,8 @@ def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], No
         result.interrupted = int(getattr(stop, "number", signal.SIGINT))
         result.left_out.append(f"what was not done when it was interrupted: {', '.join(each.label for each in found[number:])}")
     result.rows = [row for each in rows.values() for row in each]
-    result.slopes = [slope_of(each, truth.variance) for each in rows.values() if each]
+    result.slopes = [slope_of(rows[each.label], truth.variance, each.scene.settings.sampler) for each in found if rows[each.label]]
+    result.same_pixels = same_pixels(result.rows)
     for i in statistics.pareto_front([(row.seconds.value, row.rmse.value) for row in result.rows]):
         result.rows[i].pareto = True
     return result

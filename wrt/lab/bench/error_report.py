@@ -1,15 +1,63 @@
-"""What `bench error` shows: a table for the terminal, and Markdown with a plot for a folder."""
+"""What `bench error` finds, and what is shown of it: tables for the terminal and a notebook, a report with a plot for a folder."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from wrt.core.json_text import json_text
-from wrt.lab.bench.error_rows import COLUMNS, SLOPE_COLUMNS, Sweep, cells, number, slope_cells
-from wrt.lab.bench.error_statistics import CONFIDENCE
+from wrt.lab.bench.error_statistics import CONFIDENCE, Estimate
 from wrt.lab.bench.plot import LogLogPlot, Series
-from wrt.lab.bench.report import Part, check_folder, table, write
+from wrt.lab.bench.report import Columns, Part, Row, check_folder, grouped, tabled, tables_page, write
 from wrt.lab.bench.report import markdown as as_markdown
+
+BASE = "as it is"
+# Of the variance. Independent samples: -1. Scrambled nets: -3 where the integrand is smooth (Owen 1997, "Scrambled Net Variance
+# for Integrals of Smooth Functions"), -1 - 1/d where an edge crosses d dimensions (He and Wang 2015, "On the Convergence Rate
+# of Randomized Quasi-Monte Carlo for Discontinuous Functions"): -1.5 here. Each pair of dimensions is a net by itself, so that
+# what depends on two pairs at once (pixel and lens, pixel and light) falls as for independent samples.
+THEORY = {"independent": "-1", "sobol": "-1 to -3"}
+
+
+class Sweep(Row):
+    """Everything that was measured, and what it was measured on.
+
+    rows: each a variant (one knob at one value; knob "": none is turned) at one number of samples. products: of the repeats'
+    errors (statistics.gram). rmse: of one picture, the reference's own error taken out; NaN where it is below that. bias, noise:
+    root mean squares over the pixels, rmse^2 = bias^2 + noise^2; bias is NaN where it cannot be told from noise, and `bias_below`
+    bounds it. efficiency: 1 / (mse x seconds). slopes: how a variant's log mse, and the log of its variance alone, fall with log
+    spp. same_pixels: variants whose pictures are, bit for bit, those of the scene as it is. interrupted: the number of the signal
+    that ended it early.
+    """
+
+    def _repr_html_(self) -> str:
+        return tables_page([tabled(COLUMNS, self.rows, f"Speed against error: {self.scene}"),
+                            tabled(SLOPE_COLUMNS, self.slopes, "How fast the error falls")])
+
+
+def number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3g}"
+
+
+def interval(x: Estimate) -> str:
+    """The value and how far it may be off, as a percentage."""
+    if math.isnan(x.value):
+        return "-"
+    half = 0.5 * (x.high - x.low) / abs(x.value) if x.value else math.nan
+    return number(x.value) + ("" if math.isnan(half) else f" ±{100.0 * half:.0f}%")
+
+
+def range_of(x: Estimate, digits: str) -> str:
+    return "-" if math.isnan(x.value) else f"{x.value:{digits}} [{x.low:{digits}}, {x.high:{digits}}]"
+
+
+COLUMNS: Columns = {
+    "setting": "{variant}", "spp": "{spp}", "seconds": lambda row: interval(row.seconds), "RMSE": lambda row: interval(row.rmse),
+    "bias": lambda row: f"< {number(row.bias_below)}" if math.isnan(row.bias) else number(row.bias),
+    "noise": lambda row: number(row.noise), "relMSE": lambda row: number(row.relmse.value), "FLIP": lambda row: interval(row.flip),
+    "efficiency": lambda row: range_of(row.efficiency, ".3g"), "front": lambda row: "*" if row.pareto else ""}
+SLOPE_COLUMNS: Columns = {"setting": "{variant}", "slope of MSE": lambda slope: range_of(slope.mse, ".2f"),
+                          "slope of noise": lambda slope: range_of(slope.noise, ".2f"), "theory": "{theory}"}
 
 
 def notes(sweep: Sweep) -> list[str]:
@@ -18,9 +66,9 @@ def notes(sweep: Sweep) -> list[str]:
     lines = [
         f"{sweep.size[0]}x{sweep.size[1]} pixels, {sweep.repeats} seeds each, on {machine['device']},"
         f" {machine['threads']} threads ({machine['system']}), wrt {machine['wrt']}.",
-        f"Reference: the mean (float64) of {r.seeds} seeds of {r.spp} spp, exact Fresnel, max_depth {r.max_depth},"
+        f"Reference: the mean (float64) of {r.seeds} seeds of {r.spp_each} spp, exact Fresnel, max_depth {r.max_depth},"
         f" min_throughput {r.min_throughput:g}, in {r.seconds:.0f} s. Its standard error is {number(r.rmse)} (root mean square"
-        f" over the pixels, whose mean is {number(float(r.pixels.mean()))}); {number(r.lost)} of the light was not followed.",
+        f" over the pixels, whose mean is {number(r.mean)}); {number(r.lost_throughput_per_sample)} of the light was not followed.",
         f"Seconds are of tracing alone. Intervals are {CONFIDENCE:.0%}, from the seeds. The reference's variance is taken out"
         " of RMSE, bias and efficiency, not out of relMSE and FLIP. RMSE^2 = bias^2 + noise^2; < is a bias that noise hides."
         " Efficiency is 1 / (MSE x seconds). * is on the Pareto front: nothing here is faster and as near, to 1%.",
@@ -35,8 +83,8 @@ def notes(sweep: Sweep) -> list[str]:
 
 def text(sweep: Sweep) -> str:
     """For the terminal."""
-    tables = table(COLUMNS, [*map(cells, sweep.rows)]), table(SLOPE_COLUMNS, [*map(slope_cells, sweep.slopes)])
-    return "\n\n".join([*tables, "\n".join(notes(sweep))])
+    tables = tabled(COLUMNS, sweep.rows), tabled(SLOPE_COLUMNS, sweep.slopes)
+    return as_markdown([*tables, Part("", "\n".join(notes(sweep)))]).rstrip()
 
 
 def markdown(sweep: Sweep, picture: str, command: str) -> str:
@@ -45,18 +93,15 @@ def markdown(sweep: Sweep, picture: str, command: str) -> str:
     told = "\n\n".join([f"`{command}`", *(note.replace("*", "\\*") for note in notes(sweep))])
     return as_markdown([
         Part(f"Speed against error: {sweep.scene}", told), Part("Error over seconds", plot=picture),
-        Part("The Pareto front", "", COLUMNS, [*map(cells, front)]),
-        Part("How fast the error falls", "Log MSE, and log variance alone, over log spp.", SLOPE_COLUMNS,
-             [*map(slope_cells, sweep.slopes)]),
-        Part("Everything", "", COLUMNS, [*map(cells, sweep.rows)])])
+        tabled(COLUMNS, front, "The Pareto front"),
+        tabled(SLOPE_COLUMNS, sweep.slopes, "How fast the error falls", "Log MSE, and log variance alone, over log spp."),
+        tabled(COLUMNS, sweep.rows, "Everything")])
 
 
 def plot(sweep: Sweep) -> LogLogPlot:
     """RMSE over seconds: a line a variant, a colour a knob, the Pareto front on top."""
-    series = []
-    for variant in dict.fromkeys(row.variant.label for row in sweep.rows):
-        mine = [row for row in sweep.rows if row.variant.label == variant]
-        series.append(Series(mine[0].variant.knob or variant, [(row.seconds.value, row.rmse.value) for row in mine]))
+    series = [Series(rows[0].knob or variant, [(row.seconds.value, row.rmse.value) for row in rows])
+              for (variant,), rows in grouped(sweep.rows, "variant").items()]
     front = sorted((row.seconds.value, row.rmse.value) for row in sweep.rows if row.pareto)
     return LogLogPlot(sweep.scene, "seconds of tracing", "RMSE (linear radiance)", series, front, "Pareto front")
 

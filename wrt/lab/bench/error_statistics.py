@@ -23,7 +23,7 @@ class Estimate:
     high: float
 
     def as_dict(self) -> dict[str, float]:
-        return {"value": self.value, "low": self.low, "high": self.high}
+        return vars(self)
 
 
 UNKNOWN = Estimate(math.nan, math.nan, math.nan)
@@ -112,14 +112,11 @@ def slope(spp: Sequence[int], errors: Callable[[np.ndarray], Sequence[float]], r
 
     UNKNOWN for fewer than three levels, and where an error is not positive.
     """
-    x = np.log(np.asarray(spp, dtype=np.float64))
-    x -= x.mean()
-
     def fit(indices: np.ndarray) -> float:
         y = np.asarray(errors(indices))
-        return float((x * np.log(y)).sum() / (x * x).sum()) if (y > 0.0).all() else math.nan
+        return float(np.polyfit(np.log(spp), np.log(y), 1)[0]) if (y > 0.0).all() else math.nan
 
-    return estimate(fit, repeats) if len(x) >= 3 and not math.isnan(fit(np.arange(repeats))) else UNKNOWN
+    return estimate(fit, repeats) if len(spp) >= 3 and not math.isnan(fit(np.arange(repeats))) else UNKNOWN
 
 
 def pareto_front(points: Sequence[tuple[float, float]], tolerance: float = 0.01) -> list[int]:

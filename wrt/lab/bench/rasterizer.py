@@ -6,7 +6,6 @@ miss) and prim_id (H, W) int32 (-1 on a miss), and share nothing on the way to t
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,13 +13,11 @@ import warp as wp
 
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
-from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import load_kernel, run_all, start, thread_count, upload
 from wrt.core.errors import InputError
-from wrt.kernels.structs import Surfaces, Tile
 from wrt.kernels.study import rasterize as kernels
-from wrt.kernels.study.primary_rays import make_primary_rays_kernel
+from wrt.renderer.pixel_rays import camera_rays
 from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera, CameraKind
 
@@ -28,7 +25,6 @@ NOTHING = np.uint64(0x7F800000_FFFFFFFF)  # depth inf, prim_id -1
 TRIANGLES_PER_LAUNCH = 65536
 BANDS_PER_THREAD = 4  # where triangles are many differs from row to row
 ROWS_ON_CUDA = 16  # a band: one thread draws a triangle's part of it
-TILE_SIZE = 32
 
 
 def as_perspective(camera: CameraKind) -> Camera:
@@ -144,48 +140,26 @@ class Rasterizer:
         return np.ascontiguousarray(halves).view(dtype).reshape(self.size[1], self.size[0])
 
 
-@cache
-def primary_rays_kernel(structure: Structure) -> Any:
-    return make_primary_rays_kernel(structure.struct, structure.traversal(any_hit=False))
-
-
 class RayCaster:
-    """The same pictures by rays, one a pixel, through a structure that is built here; `build_seconds` tells how long."""
+    """The same pictures by rays, one a pixel, through a structure that is built here and asked as anybody asks it."""
 
     def __init__(self, geometry: Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None) -> None:
         ACCELERATORS.check(accel)
-        self.device, self.threads = start(device), thread_count(threads)
-        self.accel = build(geometry, accel, device, threads)
-        self.build_seconds = self.accel.stats.build_seconds
-        self.surfaces = Surfaces()
-        self.surfaces.n_triangles = len(geometry.faces)
-        self.surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)
-        self.kernel = primary_rays_kernel(self.accel.structure)
-        load_kernel(self.kernel, self.device)
-        self.size = (0, 0)
+        self.accel, self.threads = build(geometry, accel, device, threads), threads
+        self.seen: tuple[CameraKind | None, tuple[int, int]] = None, (0, 0)  # whose rays there are
 
     def draw(self, camera: CameraKind, size: tuple[int, int]) -> None:
-        """Cast the ray through every pixel's centre, from the middle of the camera's lens."""
-        width, height = size
-        if self.size != size:
-            self.size = size
-            self._depth = wp.empty(width * height, dtype=wp.float32, device=self.device)
-            self._prim_id = wp.empty(width * height, dtype=wp.int32, device=self.device)
-        c = camera_struct(as_perspective(camera), size)
-        step = max(size) if self.device.is_cuda else TILE_SIZE
-
-        def job(x: int, y: int) -> Any:
-            tile = Tile()
-            tile.x, tile.y, tile.width = x, y, min(step, width - x)
-            return lambda: wp.launch(self.kernel, dim=tile.width * min(step, height - y), device=self.device, inputs=[
-                self.accel.data, self.surfaces, c, tile, width, height, self._depth, self._prim_id])
-
-        run_all([job(x, y) for y in range(0, height, step) for x in range(0, width, step)], self.threads)
-        if self.device.is_cuda:
-            wp.synchronize_device(self.device)
+        """Cast the ray through every pixel's centre, from the middle of the lens. Rays of the same camera are made once."""
+        if self.seen != (camera, size):
+            self.origins, self.directions = (wp.array(rays, dtype=wp.vec3, device=self.accel.device)
+                                             for rays in camera_rays(as_perspective(camera), size))
+            self.seen = camera, size
+        self.hits = self.accel.closest_hit(self.origins, self.directions, threads=self.threads)
+        if self.accel.device.is_cuda:
+            wp.synchronize_device(self.accel.device)
 
     def depth(self) -> np.ndarray:
-        return self._depth.numpy().reshape(self.size[1], self.size[0]).copy()
+        return self.hits.t.numpy().reshape(self.seen[1][::-1])
 
     def prim_id(self) -> np.ndarray:
-        return self._prim_id.numpy().reshape(self.size[1], self.size[0]).copy()
+        return self.hits.prim_id.numpy().reshape(self.seen[1][::-1])

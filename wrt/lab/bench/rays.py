@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wrt.accel.base import Accelerator
+from wrt.accel.geometry import Geometry
 
 SEEN = 0.55  # half of the picture's height, over distance: a field of view of 58 degrees
 
@@ -44,6 +45,13 @@ class _View:
 
 def unit(v: np.ndarray) -> np.ndarray:
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def ball_around(geometry: Geometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """The lowest and highest corner of the geometry's box, float64, and the centre and radius of the sphere around it."""
+    lo, hi = (bound.astype(np.float64) for bound in geometry.bounds())
+    lo, hi = lo.min(axis=0), hi.max(axis=0)
+    return lo, hi, 0.5 * (lo + hi), 0.5 * float(np.linalg.norm(hi - lo))
 
 
 def endless(n: int) -> np.ndarray:
@@ -100,9 +108,7 @@ def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) ->
     finds what the camera sees. The same for the same geometry, n and seed. inside: the camera stands in the middle of the
     mesh's box, as in a room, and not before it."""
     g = accel.geometry
-    lo, hi = g.bounds()
-    lo, hi = lo.min(axis=0).astype(np.float64), hi.max(axis=0).astype(np.float64)
-    center, radius = 0.5 * (lo + hi), 0.5 * float(np.linalg.norm(hi - lo))
+    _, _, center, radius = ball_around(g)
     rng = np.random.default_rng(seed)
     eye = center + 1.5 * radius * unit(np.array([0.6, 0.35, 0.8]))
     seen = _camera(eye, center, n)

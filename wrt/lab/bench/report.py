@@ -1,40 +1,30 @@
-"""What all measurements tell with: the machine, tables as Markdown and as HTML, a report's files."""
+"""What all measurements share: the machine, rows, tables as Markdown and as HTML, a report's files."""
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
 
 import wrt
-from wrt.core.checks import as_integer, require_known
 from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
-from wrt.core.html import html_table
+from wrt.core.html import Rows, html_table
 from wrt.core.write_file import replacing
 from wrt.lab.bench.plot import LogLogPlot, new_figure
+from wrt.lab.plans import Plan
 from wrt.picture.image import check_writable, write_codes
 
-T = TypeVar("T")
 
-
-# --- before -----------------------------------------------------------------------------------------------------------
-
-
-def check_plan(plan: Any, names: Mapping[str, tuple[Iterable[str], Any]], **ranges: tuple[int, int]) -> None:
-    """Raise InputError where one of a plan's numbers is out of its range, or there is nothing of a name. names: what they are,
-    the names, and the table that has them; ranges: field -> least and most."""
-    for name, (low, high) in ranges.items():
-        as_integer(getattr(plan, name), name, low, high)
-    for what, (chosen, known) in names.items():
-        for name in chosen:
-            require_known(name, known, what)
-
-
-def machine(used: str = "", *more: str, device: str = "cpu") -> str:
+def machine_line(used: str = "", *more: str, device: str = "cpu") -> str:
     """The device, the threads that are used, how busy it is, and wrt's version: without them no time means anything."""
     line = next((line for line in describe_devices() if line.startswith(f"{device}:")), device)
     load = "" if math.isnan(load_average()) else f"load average {load_average():.1f} at the start"
@@ -46,17 +36,114 @@ def load_average() -> float:
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
 
 
-def gathered(rows: Iterable[T], report: Callable[[T], None] | None) -> list[T]:
-    """All rows; `report` gets each as it is done."""
-    out = []
+# --- a study ----------------------------------------------------------------------------------------------------------
+
+
+class Row(SimpleNamespace):
+    """What was measured of one thing, by name: what the names mean, the LEGEND of its study says. All of it goes into JSON but
+    NumPy's arrays, and what has a name that begins with _."""
+
+    def as_dict(self) -> dict[str, Any]:
+        return {name: plain(value) for name, value in vars(self).items()
+                if not (name.startswith("_") or isinstance(value, np.ndarray))}
+
+
+def plain(value: Any) -> Any:
+    """As it goes into JSON, rows within rows too."""
+    if isinstance(value, list):
+        return [plain(each) for each in value]
+    if isinstance(value, dict):
+        return {name: plain(each) for name, each in value.items()}
+    return value.as_dict() if hasattr(value, "as_dict") else value
+
+
+# The columns of a table: what each is called, and a row's value as a format of the row's names or as a function of the row.
+Columns = Mapping[str, str | Callable[[Any], str]]
+
+
+def cells(columns: Columns, row: Any) -> list[str]:
+    """One line of a table."""
+    return [column.format_map(vars(row)) if isinstance(column, str) else column(row) for column in columns.values()]
+
+
+def grouped(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Rows by the values of these names, in their order."""
+    out: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
+        out.setdefault(tuple(getattr(row, name) for name in names), []).append(row)
+    return out
+
+
+def study_of(plan: Plan) -> Any:
+    """The module that measures what is planned.
+
+    It has rows(plan), which yields each Row as it is done; parts(rows, plan), tables and text; a TITLE and a LEGEND. It may have
+    machine(plan); line(row), for the progress; facts(rows, plan), for JSON beside the rows; PLOTS, by the names of their files,
+    with plot(rows, name).
+    """
+    return importlib.import_module(plan.STUDY)
+
+
+def run(plan: Plan, report: Callable[[Row], None] | None = None) -> Rows[Row]:
+    """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a device)."""
+    out = Rows[Row]([], partial(page, plan))
+    for row in study_of(plan).rows(plan):
         out.append(row)
         if report is not None:
             report(row)
     return out
 
 
-# --- after ------------------------------------------------------------------------------------------------------------
+def page(plan: Plan, rows: Sequence[Row]) -> str:
+    """The tables of a study as HTML, for a notebook."""
+    return tables_page(study_of(plan).parts(rows, plan))
+
+
+def line(plan: Plan, row: Row) -> str:
+    """A row, for the progress."""
+    study = study_of(plan)
+    if hasattr(study, "line"):
+        return study.line(row)
+    return "  ".join([*([row.mesh] if "mesh" in vars(row) else []), *cells(study.COLUMNS, row)])
+
+
+def data(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
+    """For JSON."""
+    facts: Any = getattr(study_of(plan), "facts", lambda rows, plan: {})
+    return {"rows": [row.as_dict() for row in rows], **facts(rows, plan)}
+
+
+def text(rows: Sequence[Row], plan: Plan, machine: str, plots: Iterable[str] = ()) -> str:
+    """Everything as Markdown. plots: names of files beside it."""
+    study = study_of(plan)
+    head = f"# {study.TITLE}\n\nMachine: {machine}\n\nTo repeat: `{repeating(plan)}`\n\n"
+    return f"{head}{markdown([*study.parts(rows, plan), *(Part(plot=name) for name in plots)])}\n{study.LEGEND}"
+
+
+def repeating(plan: Plan) -> str:
+    """The command line that measures the same; of files only the names."""
+    words = [f"python -m wrt {plan.COMMAND}"]
+    for each in fields(plan):
+        value, known = getattr(plan, each.name), each.metadata
+        flag = f"--{known['flag'] or each.name.replace('_', '-')}"
+        if known["form"] == "argument":
+            things = value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
+            words += [Path(getattr(thing, "name", thing) or "mesh").name for thing in things]
+        elif isinstance(value, bool):
+            words += [flag] if value else []
+        elif value not in (None, ()) and (value != each.default or isinstance(value, int)):
+            words.append(f"{flag} {value if isinstance(value, str | int | float) else ','.join(value)}")
+    return " ".join(words)
+
+
+def write_report(rows: Sequence[Row], plan: Plan, folder: Path, machine: str) -> list[Path]:
+    """The text and the plots of a study in a folder; the paths. Raises InputError where the system refuses."""
+    study = study_of(plan)
+    plots = {name: study.plot(rows, name) for name in study.PLOTS}
+    return write(folder / f"{plan.STUDY.split('.')[-1]}.md", text(rows, plan, machine, plots) + "\n", plots)
+
+
+# --- its report -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -68,6 +155,10 @@ class Part:
     head: Sequence[str] = ()
     lines: Sequence[Sequence[str]] = ()
     plot: str = ""
+
+
+def tables_page(parts: Iterable[Part]) -> str:
+    return "".join(html_table(part.title, part.head, part.lines) for part in parts if part.lines)
 
 
 def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
@@ -91,9 +182,9 @@ def markdown(parts: Iterable[Part]) -> str:
     return "\n\n".join(filter(None, pieces)) + "\n"
 
 
-def page(parts: Iterable[Part]) -> str:
-    """The tables as HTML, for a notebook."""
-    return "".join(html_table(part.title, part.head, part.lines) for part in parts if part.lines)
+def tabled(columns: Columns, rows: Iterable[Any], title: str = "", text: str = "") -> Part:
+    """A part with the table of some rows."""
+    return Part(title, text, tuple(columns), [cells(columns, row) for row in rows])
 
 
 def check_folder(folder: Path, names: Iterable[str], *, parents: bool = False) -> None:

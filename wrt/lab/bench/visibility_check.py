@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
-
 import numpy as np
 
 from wrt.accel.geometry import Geometry
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster, directions_from_pixels
+from wrt.lab.bench.report import Row
 from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera
 
@@ -20,9 +18,15 @@ AROUND = [(np.cos(a), np.sin(a)) for a in np.arange(8) * (np.pi / 4.0)]
 MAX_RINGS = 8  # the last of 128 times the smallest radius
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Two answers to one question, pixel by pixel.
+def agreement(rasterizer: Rasterizer, caster: RayCaster, geometry: Geometry, camera: Camera, size: tuple[int, int]) -> Row:
+    """Draw the same picture with both, and `compare`. The rasterizer's picture is another one afterwards."""
+    caster.draw(camera, size)
+    return compare(rasterizer, caster.depth(), caster.prim_id(), geometry, camera, size)
+
+
+def compare(rasterizer: Rasterizer, depth: np.ndarray, prim_id: np.ndarray, geometry: Geometry, camera: Camera,
+            size: tuple[int, int]) -> Row:
+    """Hold pictures by rays, depth (H, W) float32 and prim_id (H, W) int32, against the rasterizer's, pixel by pixel.
 
     pixels, covered: all, and those where the z-buffer has a triangle. differ: another prim_id, of which: ties, where the
     depths agree within their bound (the centre is on a common edge, or triangles coincide); silhouettes, where the rays'
@@ -30,29 +34,6 @@ class Agreement:
     prim_id is the same: depth_error, the largest relative difference of depth, and depth_share, of its bound (above 1: out
     of bound).
     """
-
-    pixels: int
-    covered: int
-    differ: int
-    ties: int
-    silhouettes: int
-    unexplained: int
-    depth_error: float
-    depth_share: float
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-
-def agreement(rasterizer: Rasterizer, caster: RayCaster, geometry: Geometry, camera: Camera, size: tuple[int, int]) -> Agreement:
-    """Draw the same picture with both, and compare. The rasterizer's picture is another one afterwards."""
-    caster.draw(camera, size)
-    return compare(rasterizer, caster.depth(), caster.prim_id(), geometry, camera, size)
-
-
-def compare(rasterizer: Rasterizer, depth: np.ndarray, prim_id: np.ndarray, geometry: Geometry, camera: Camera,
-            size: tuple[int, int]) -> Agreement:
-    """Hold pictures by rays, depth (H, W) float32 and prim_id (H, W) int32, against the rasterizer's."""
     rasterizer.draw(camera, size)
     exact_depth, exact_id = rasterizer.depth(), rasterizer.prim_id()
     same = (exact_id == prim_id) & (exact_id >= 0)
@@ -69,7 +50,7 @@ def compare(rasterizer: Rasterizer, depth: np.ndarray, prim_id: np.ndarray, geom
     reach = np.maximum(edge_reach(geometry, camera, size, exact_id, exact_depth),
                        edge_reach(geometry, camera, size, prim_id, depth))
     beside = _beside(rasterizer, depth, bound, np.where(asked, reach, 0.0), camera, size, geometry)
-    return Agreement(
+    return Row(
         pixels=differ.size, covered=int((exact_id >= 0).sum()), differ=int(differ.sum()), ties=int(tied.sum()),
         silhouettes=int(beside.sum()), unexplained=int((asked & ~beside).sum()),
         depth_error=float(relative.max(initial=0.0)), depth_share=float(share.max(initial=0.0)))

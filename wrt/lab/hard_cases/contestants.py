@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
+from wrt.lab.bench.rays import RaySet
 
 
 class Algorithm(ABC):
@@ -21,6 +23,7 @@ class Algorithm(ABC):
     name: str
     bytes_per_triangle: float = float("nan")
     is_peer: ClassVar[bool] = False
+    has_threads: ClassVar[bool] = True  # search() can use several
     package: ClassVar[str] = ""  # what a peer imports
 
     @classmethod
@@ -35,19 +38,27 @@ class Algorithm(ABC):
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
         """As wrt.accel.base.Accelerator.closest_hit."""
 
+    @abstractmethod
+    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+        """The work that is timed, with rays and results in arrays of the library's own kind."""
+
+    def occluded(self, out: Any) -> np.ndarray:
+        """The result of a search with any-hit rays."""
+        return out.numpy().astype(bool)
+
 
 class Own(Algorithm):
-    """wrt's BVH with one triangle test and one box test."""
+    """A structure of wrt with one triangle test and one box test."""
 
     accel: Accelerator | None = None
 
-    def __init__(self, triangle: str = "watertight", box: str = "conservative") -> None:
-        self.triangle, self.box = triangle, box
+    def __init__(self, triangle: str = "watertight", box: str = "conservative", structure: str = "bvh") -> None:
+        self.structure, self.units = structure, {"triangle": triangle, "box": box}
         self.name = triangle if box == "conservative" else f"{triangle}, {box} boxes"
 
     def prepare(self, geometry: Geometry) -> bool:
         if self.accel is None or self.accel.geometry is not geometry:
-            self.accel = build(geometry, "bvh", triangle=self.triangle, box=self.box, threads=1)
+            self.accel = build(geometry, self.structure, threads=1, **self.units)
         self.bytes_per_triangle = self.accel.stats.bytes / max(len(geometry), 1)
         return True
 
@@ -55,11 +66,21 @@ class Own(Algorithm):
         assert self.accel is not None  # prepare() comes first
         return self.accel.closest_hit(origins, directions, t_min, t_max, threads=1)
 
+    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+        import warp as wp
+
+        assert self.accel is not None
+        origins, directions = (wp.array(a, dtype=wp.vec3, device="cpu") for a in (rays.origins, rays.directions))
+        t_max = wp.array(rays.t_max, dtype=wp.float32, device="cpu")
+        ask = self.accel.any_hit if rays.any_hit else self.accel.closest_hit
+        return lambda: ask(origins, directions, 0.0, t_max, threads=threads)
+
 
 class Peer(Algorithm):
     """Another library: triangles only. Segments are cut after the query where it has no t_min."""
 
     is_peer = True
+    has_threads = False
 
     def prepare(self, geometry: Geometry) -> bool:
         if len(geometry.spheres) or not len(geometry.faces):
@@ -90,11 +111,21 @@ class Embree(Peer):
         except TypeError as error:
             raise InputError('embreex is too old to be asked for a mode; pip install "embreex>=4.4"') from error
         self.mesh = TriangleMesh(self.scene, geometry.vertices, geometry.faces)
+        self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # it builds when it is first asked
 
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
         out = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
         prim_id = out["primID"].astype(np.int32)
         return _cut(out["tfar"], prim_id, out["u"], out["v"], t_min, t_max)
+
+    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+        o, d = np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)
+        if rays.any_hit:
+            return lambda: self.scene.run(o, d, dists=rays.t_max, query="OCCLUDED")
+        return lambda: self.scene.run(o, d, query="INTERSECT")
+
+    def occluded(self, out: Any) -> np.ndarray:
+        return out >= 0
 
 
 class EmbreeFast(Embree):
@@ -120,20 +151,36 @@ class WarpMesh(Peer):
         self.mesh = wp.Mesh(points=points, indices=indices, bvh_constructor="sah")
 
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
+        t, u, v, prim_id = (array.numpy() for array in self.search(RaySet("", origins, directions, np.ones(len(origins))), 1)())
+        length = np.linalg.norm(directions.astype(np.float64), axis=1)
+        # Warp's u and v belong to the first two corners; wrt's to the last two.
+        return _cut((t / length).astype(np.float32), prim_id, v, 1.0 - u - v, t_min, t_max)
+
+    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+        """Warp wants unit directions, and its any-hit query a length beside them."""
         import warp as wp
 
-        from wrt.kernels.study.peers import warp_mesh_query
+        from wrt.core.device import load_kernel
+        from wrt.kernels.study.peers import warp_mesh_any, warp_mesh_query
 
-        n = len(origins)
-        length = np.linalg.norm(directions.astype(np.float64), axis=1)
-        rays = [wp.array(np.ascontiguousarray(x, np.float32), dtype=wp.vec3, device=self.device)
-                for x in (origins, directions / length[:, None])]
-        t, u, v = (wp.zeros(n, dtype=wp.float32, device=self.device) for _ in range(3))  # a miss leaves u and v as they are
-        prim_id = wp.empty(n, dtype=wp.int32, device=self.device)
-        wp.launch(warp_mesh_query, dim=n, inputs=[self.mesh.id, *rays, t, u, v, prim_id], device=self.device)
-        # Warp's u and v belong to the first two corners; wrt's to the last two.
-        told = (t.numpy() / length).astype(np.float32)
-        return _cut(told, prim_id.numpy(), v.numpy(), 1.0 - u.numpy() - v.numpy(), t_min, t_max)
+        n, device = len(rays), self.device
+        length = np.linalg.norm(rays.directions.astype(np.float64), axis=1)
+        inputs = [self.mesh.id, *(wp.array(np.ascontiguousarray(x, np.float32), dtype=wp.vec3, device=device)
+                                  for x in (rays.origins, rays.directions / length[:, None]))]
+        reach = wp.array(np.minimum(rays.t_max * length, 1e38).astype(np.float32), dtype=wp.float32, device=device)
+        load_kernel(warp_mesh_any if rays.any_hit else warp_mesh_query, device)
+
+        def any_hit() -> Any:
+            occluded = wp.empty(n, dtype=wp.bool, device=device)
+            wp.launch(warp_mesh_any, dim=n, inputs=[*inputs, reach, occluded], device=device)
+            return occluded
+
+        def closest() -> Any:
+            out = [wp.zeros(n, dtype=dtype, device=device) for dtype in (wp.float32, wp.float32, wp.float32, wp.int32)]
+            wp.launch(warp_mesh_query, dim=n, inputs=[*inputs, *out], device=device)
+            return out
+
+        return any_hit if rays.any_hit else closest
 
 
 class Open3D(Peer):
@@ -141,6 +188,7 @@ class Open3D(Peer):
 
     name = "Open3D RaycastingScene"
     package = "open3d"
+    has_threads = True
 
     def load(self, geometry: Geometry) -> None:
         import open3d
@@ -156,6 +204,12 @@ class Open3D(Peer):
         prim_id = np.where(told["primitive_ids"] == self.none, -1, told["primitive_ids"].astype(np.int64)).astype(np.int32)
         u, v = told["primitive_uvs"].T
         return _cut(told["t_hit"], prim_id, u, v, t_min, t_max)
+
+    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+        bundle = self.tensor(np.concatenate([rays.origins, rays.directions], axis=1))
+        if rays.any_hit:
+            return lambda: self.scene.test_occlusions(bundle, tnear=0.0, tfar=1.0, nthreads=threads)
+        return lambda: self.scene.cast_rays(bundle, nthreads=threads)
 
 
 def _cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min: Any, t_max: Any) -> Hits:

@@ -55,12 +55,16 @@ class Errors:
         index = int(np.searchsorted(np.cumsum(self.histogram), q / 100.0 * total))
         return min(2.0 ** (LOWEST_OCTAVE + index / BINS_PER_OCTAVE), self.largest)
 
+    @property
+    def p999(self) -> float:
+        return self.percentile(99.9)
+
     def __add__(self, other: Errors) -> Errors:
         return Errors(max(self.largest, other.largest), max(self.largest_ratio, other.largest_ratio),
                       self.over + other.over, self.histogram + other.histogram)
 
     def as_dict(self) -> dict[str, float]:
-        return {"max": self.largest, "p999": self.percentile(99.9), "bound_ratio": self.largest_ratio, "over_bound": self.over}
+        return {"max": self.largest, "p999": self.p999, "bound_ratio": self.largest_ratio, "over_bound": self.over}
 
 
 @dataclass
@@ -84,6 +88,10 @@ class Verdict:
     u: Errors = field(default_factory=Errors)
     v: Errors = field(default_factory=Errors)
     examples: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def borderline(self) -> int:
+        return self.borderline_hits + self.borderline_misses
 
     @property
     def ok(self) -> bool:
@@ -112,16 +120,9 @@ class Verdict:
                 "t_min": float(case.t_min[row]), "t_max": float(case.t_max[row])})
 
 
-@dataclass(frozen=True, eq=False)
-class _Claims:
-    """What the unit says of rays `row`, and what is exact for the primitive that it names."""
-
-    row: np.ndarray
-    t: np.ndarray
-    prim_id: np.ndarray
-    t_bound: np.ndarray
-    sound: np.ndarray
-    hit: np.ndarray
+# What a unit says of the rays `row`, and what is exact for the primitive that it names.
+CLAIM = np.dtype([("row", np.int64), ("t", np.float64), ("prim_id", np.int64), ("t_bound", np.float64), ("sound", bool),
+                  ("hit", bool)])
 
 
 def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool = True) -> Verdict:
@@ -141,13 +142,12 @@ def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool =
     parts = [_claims(case, reference, rows[i:i + RAYS_AT_ONCE], (t, u, v, prim_id), verdict)
              for i in range(0, len(rows), RAYS_AT_ONCE)]
     if parts:
-        claims = _Claims(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(_Claims)))
+        claims = np.concatenate(parts).view(np.recarray)
         asked = case.asked if asked is None else asked
         chosen = np.flatnonzero(claims.sound)
         if len(chosen) > asked:
             chosen = np.sort(np.random.default_rng(0).choice(chosen, asked, replace=False))
-        chosen_claims = _Claims(*(getattr(claims, f.name)[chosen] for f in fields(_Claims)))
-        _judge_closeness(case, reference, chosen_claims, verdict, lowest)
+        _judge_closeness(case, reference, claims[chosen], verdict, lowest)
     _judge_misses(case, reference, np.flatnonzero(~reported & (case.expected == ASK)), verdict)
     return verdict
 
@@ -174,7 +174,7 @@ def _plain_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np
 
 
 def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[np.ndarray, ...],
-            verdict: Verdict) -> _Claims:
+            verdict: Verdict) -> Any:
     """Hold claimed hits against the primitives that they name: false hits, and the errors of t, u and v."""
     t, u, v = (x[rows].astype(np.float64) for x in said[:3])
     prim_id = said[3][rows]
@@ -207,10 +207,10 @@ def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[
     over[known] |= verdict.u.add(np.abs(u - exact_u)[known], 2.0**-24, bound[1, known], hit[known])
     over[known] |= verdict.v.add(np.abs(v - exact_v)[known], 2.0**-24, bound[2, known], hit[known])
     verdict.wrong("", case, rows[over], "t, u or v is off by more than the derived bound", said[3])
-    return _Claims(rows, t, prim_id, bound[0], sound, hit)
+    return np.rec.fromarrays([rows, t, prim_id, bound[0], sound, hit], dtype=CLAIM)
 
 
-def _judge_closeness(case: HardCase, reference: Reference, claims: _Claims, verdict: Verdict, lowest: bool) -> None:
+def _judge_closeness(case: HardCase, reference: Reference, claims: Any, verdict: Verdict, lowest: bool) -> None:
     """Whether anything nearer than the claimed hits had to be found, and which of them are ties."""
     n = len(claims.row)
     verdict.asked += n
@@ -226,7 +226,7 @@ def _judge_closeness(case: HardCase, reference: Reference, claims: _Claims, verd
     wrong[found.ray[passed & certain & other]] = True
     if case.closed:
         skipped = passed & ~certain & other & (claims.t[found.ray] > found.t + bound + claims.t_bound[found.ray])
-        wrong |= _leaks(case, found.chosen(skipped), bound[skipped], claims.row, claims.t)
+        wrong |= _leaks(case, found[skipped], bound[skipped], claims.row, claims.t)
     same = claims.prim_id == answer.prim_id
     for ray, tied in answer.ties.items():
         same[ray] |= claims.prim_id[ray] in tied
@@ -270,7 +270,7 @@ def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdic
         border[found.ray] = True
         if case.closed:
             left = ~missed[found.ray] & np.isfinite(bound)
-            missed |= _leaks(case, found.chosen(left), bound[left], part, np.full(len(part), np.inf))
+            missed |= _leaks(case, found[left], bound[left], part, np.full(len(part), np.inf))
         verdict.borderline_misses += int((border & ~missed).sum())
         verdict.wrong("misses", case, part[missed], "has a hit that had to be found")
 

@@ -27,6 +27,7 @@ from wrt.lab.hard_cases.common import (
 BAD_TRIANGLE = ((-1113.45459, -79.049614, -56.2431908), (-1113.45459, -87.0922699, -56.2431908),
                 (-1113.45459, -79.2090149, -56.2431908))
 BAD_ORIGIN, BAD_DIRECTION, BAD_T_MAX = (-1081.47925, 99.9999542, 87.7701111), (-32.1072998, -183.355865, -144.607635), 0.9999
+TURN = np.array([[np.cos(0.4), np.sin(0.4), 0.0], [-np.sin(0.4), np.cos(0.4), 0.0], [0.0, 0.0, 1.0]])
 
 
 def _signed_powers(rng: np.random.Generator, shape: tuple[int, ...], low: float, high: float) -> np.ndarray:
@@ -99,12 +100,7 @@ def among_bad(rng: np.random.Generator, n: int) -> HardCase:
     """D: a closed sphere with such triangles inside: the sphere must be hit, through them."""
     origins = in_ball(rng, n, 0.5).astype(np.float32)
     directions = _points(_without_area(), rng, n) - origins.astype(np.float64)
-    return hard_case(_sphere_with_bad(), origins, directions, HIT, closed=True)
-
-
-@cache
-def _sphere_with_bad() -> Geometry:
-    return joined(sphere(32, 16, 8.0), _without_area())
+    return hard_case(joined(sphere(32, 16, 8.0), _without_area()), origins, directions, HIT, closed=True)
 
 
 def published_bad(rng: np.random.Generator, n: int) -> HardCase:
@@ -202,8 +198,7 @@ def _square(size: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def _floor(turned: bool) -> Geometry:
     i, j, faces = _square(100.0, 32)
     points = np.stack([i, np.zeros(i.size), j], axis=1)
-    c, s = np.cos(0.4), np.sin(0.4)
-    return surface(points @ (np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) if turned else np.eye(3)), faces)
+    return surface(points @ (TURN if turned else np.eye(3)), faces)
 
 
 def grazing(rng: np.random.Generator, n: int, *, turned: bool) -> HardCase:
@@ -214,9 +209,7 @@ def grazing(rng: np.random.Generator, n: int, *, turned: bool) -> HardCase:
     away = np.stack([np.cos(heading) * np.cos(angle), np.sin(angle), np.sin(heading) * np.cos(angle)], axis=1)
     origins = points + away * 10.0 ** rng.uniform(-2.0, 1.5, (n, 1))
     if turned:
-        c, s = np.cos(0.4), np.sin(0.4)
-        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        points, origins = points @ turn, origins @ turn
+        points, origins = points @ TURN, origins @ TURN
     case = _towards(_floor(turned), rng, origins, points)
     if turned:
         return case
@@ -252,11 +245,6 @@ def exact_ends(rng: np.random.Generator, n: int) -> HardCase:
                      t_min=t_min, t_max=t_max)
 
 
-@cache
-def _cube() -> Geometry:
-    return surface(*cube(np.full(3, -1.0), np.full(3, 1.0)))
-
-
 def beside_boxes(rng: np.random.Generator, n: int) -> HardCase:
     """E: along the axes, one float32 step inside and outside of a cube's faces, and in them."""
     row, axis = np.arange(n), rng.integers(3, size=n)
@@ -267,7 +255,7 @@ def beside_boxes(rng: np.random.Generator, n: int) -> HardCase:
     origins[row, axis] = -3.0 * sign
     directions = np.where(rng.random((n, 3)) < 0.5, 0.0, -0.0)
     directions[row, axis] = sign
-    return hard_case(_cube(), origins, directions, ASK, closed=True)
+    return hard_case(surface(*cube(np.full(3, -1.0), np.full(3, 1.0))), origins, directions, ASK, closed=True)
 
 
 def rays_not_finite(rng: np.random.Generator, n: int) -> HardCase:

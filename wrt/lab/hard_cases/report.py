@@ -13,12 +13,12 @@ from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.lab.bench.plot import LogLogPlot, Series
-from wrt.lab.bench.report import Part, check_folder, table, write
-from wrt.lab.bench.report import machine as machine_line
+from wrt.lab.bench.report import Columns, Part, check_folder, machine_line, repeating, table, tabled, write
+from wrt.lab.bench.report import Row as Line
 from wrt.lab.bench.report import markdown as as_markdown
 from wrt.lab.bench.timing import shown
 from wrt.lab.hard_cases.cases import Verdict
-from wrt.lab.hard_cases.stability import ASKED, COLUMNS, Plan, Result, Row, cells
+from wrt.lab.hard_cases.stability import ASKED, COLUMNS, Plan, Result, Row
 from wrt.picture.image import encode_png
 
 PLOTS = {"lost": ("Rays lost or wrong, all hard cases", "rays lost or wrong per million"),
@@ -53,45 +53,43 @@ def usual_error(rows: Sequence[Row], algorithm: str) -> float:
     return float(np.median([error for error in errors if np.isfinite(error)] or [np.nan]))
 
 
+WRONG: Columns = {"misses": "{v.misses}", "false hits": "{v.false_hits}", "wrong prim": "{v.wrong_prim}",
+                  "self-hits": "{v.self_hits}", "t over bound": "{v.t.over}"}
+ALL: Columns = {
+    "algorithm": "{name}", "rays": "{v.rays}", **WRONG,
+    "wrong per million": lambda row: f"{1e6 * wrong(row.v) / max(row.v.rays, 1):.3g}", "usual t ulp": "{error:.3g}",
+    "Mray/s": lambda row: shown(row.mrays_per_second), "speed / default": lambda row: shown(row.ratio_to_default),
+    "B/tri": "{bytes_per_triangle:.0f}"}
+GROUPS: Columns = {"group": "{name}", "rays": "{v.rays}", "judged": "{judged}", **WRONG, "t / bound": "{v.t.largest_ratio:.2g}"}
+
+
 def _summary(result: Result) -> Part:
-    head = ("algorithm", "rays", "misses", "false hits", "wrong prim", "self-hits", "t over bound", "wrong per million",
-            "usual t ulp", "Mray/s", "speed / default", "B/tri")
-    lines = []
-    for name, v in sums(result.rows).items():
-        speed = result.speeds[name]
-        lines.append((name, f"{v.rays}", f"{v.misses}", f"{v.false_hits}", f"{v.wrong_prim}", f"{v.self_hits}", f"{v.t.over}",
-                      f"{1e6 * wrong(v) / max(v.rays, 1):.3g}", f"{usual_error(result.rows, name):.3g}", shown(speed.mrays),
-                      shown(speed.ratio), f"{speed.bytes_per_triangle:.0f}"))
+    lines = [Line(name=name, v=v, error=usual_error(result.rows, name), **vars(result.speed[name]))
+             for name, v in sums(result.rows).items()]
     text = ("Summed over all cases. usual t ulp: the 99.9th percentile in the middle one of the cases. Speed on one thread, case "
             "A's sphere of 159,200 triangles, runs by turns: median [quartiles].")
-    return Part("All cases", text, head, lines)
+    return tabled(ALL, lines, "All cases", text)
 
 
 def _groups(result: Result) -> Part:
     """The default by the letters of the cases."""
-    default = next(iter(result.speeds))
-    lines = []
-    for letter in (*sorted({row.case[0] for row in result.rows}), "A to H"):
-        mine = [row for row in result.rows if row.algorithm == default and (
-            row.case[0] == letter or (letter == "A to H" and row.case[0] in "ABCDEFGH"))]
-        v = sum((row.verdict for row in mine), Verdict())
-        counts = (v.rays, sum(row.judged for row in mine), v.misses, v.false_hits, v.wrong_prim, v.self_hits, v.t.over)
-        lines.append((letter, *map(str, counts), f"{v.t.largest_ratio:.2g}"))
-    head = ("group", "rays", "judged", "misses", "false hits", "wrong prim", "self-hits", "t over bound", "t / bound")
-    return Part(f"The default ({default}) by group", "", head, lines)
+    default = next(iter(result.speed))
+    rows = [row for row in result.rows if row.algorithm == default]
+    letters = {letter: letter for letter in sorted({row.case[0] for row in result.rows})} | {"A to H": "ABCDEFGH"}
+    groups = {name: [row for row in rows if row.case[0] in those] for name, those in letters.items()}
+    return tabled(GROUPS, [Line(name=name, judged=sum(row.judged for row in mine), v=sum((row.verdict for row in mine), Verdict()))
+                           for name, mine in groups.items()], f"The default ({default}) by group")
 
 
 def parts(result: Result, plan: Plan, stem: str = "") -> list[Part]:
     """The whole report, in order; stem: plots are STEM-lost.png and STEM-error.png."""
-    command = " ".join(["python -m wrt stability", *plan.cases, f"--rays {plan.rays}", f"--sample {plan.sample}",
-                        *(["--peers"] if plan.peers else []), *([f"--seed {plan.seed}"] if plan.seed else [])])
-    told = "\n\n".join([f"Machine: {machine(plan)}; {result.seconds:.0f} s in all.", f"To repeat: `{command}`",
+    told = "\n\n".join([f"Machine: {machine(plan)}; {result.seconds:.0f} s in all.", f"To repeat: `{repeating(plan)}`",
                         LEGEND.format(sample=plan.sample), *(f"{line}." for line in _notes(result))])
     lost, error = (f"{stem}-{which}.png" for which in PLOTS)
     return [Part("Stability of the intersection tests", told), _summary(result),
             Part("Speed against rays lost or wrong", f"None is drawn at {NO_LOSS} rays: the more rays, the lower.", plot=lost),
             Part("Speed against error of t", "", plot=error), _groups(result),
-            Part("Every case", "", COLUMNS, [cells(row) for row in result.rows])]
+            tabled(COLUMNS, result.rows, "Every case")]
 
 
 def summary(result: Result) -> str:
@@ -103,7 +101,7 @@ def summary(result: Result) -> str:
 def _notes(result: Result) -> list[str]:
     """What is not in it."""
     undone = [f"Interrupted; not done, or not with all algorithms: {', '.join(result.undone)}"] if result.undone else []
-    return [*undone, *(f"{name}: not installed" for name in result.missing)]
+    return [*undone, *(f"{name}: not installed" for name in result.not_installed)]
 
 
 def machine(plan: Plan) -> str:
@@ -116,7 +114,7 @@ def plot(result: Result, which: str) -> LogLogPlot:
     for name, v in sums(result.rows).items():
         lost = 1e6 * max(wrong(v), NO_LOSS) / max(v.rays, 1)
         error = lost if which == "lost" else usual_error(result.rows, name)
-        series.append(Series(name, [(1e3 / result.speeds[name].mrays[1], error)]))
+        series.append(Series(name, [(1e3 / result.speed[name].mrays_per_second[1], error)]))
     title, label = PLOTS[which]
     return LogLogPlot(title, "ns a ray, one thread", label, series)
 

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import chain
 from typing import Any
@@ -19,16 +19,18 @@ from wrt.accel.structure import Structure
 from wrt.core.checks import require_known
 from wrt.core.device import load_kernel, thread_count, upload
 from wrt.core.errors import InputError
-from wrt.core.html import html_table
-from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
+from wrt.kernels.query import HitList, make_all_hits_kernel
 from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
 from wrt.kernels.traverse.common import Units
+from wrt.lab.bench.report import Columns, tabled, tables_page
+from wrt.lab.bench.report import Row as Line
 from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
-from wrt.lab.bench.timing import Quartiles, alternate, quartiles
+from wrt.lab.bench.timing import alternate, quartiles
 from wrt.lab.hard_cases.cases import ASK, HARD_CASES, HardCase, Verdict, check, chunks, generate, judge, judge_all_hits, judge_next
 from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own, own_algorithms
+from wrt.lab.plans import Stability as Plan
 from wrt.renderer.distributed.installed import DIGEST
 from wrt.renderer.distributed.workers import worker_name
 from wrt.renderer.progress import TimeLeft
@@ -40,22 +42,19 @@ ASKED = 2000  # of a rival's claimed hits in one case: is anything nearer? Of th
 CHUNK = 2**18
 COSTLY = {"G_fan": 100}  # 10,000 triangles at one vertex are all tested: so many times fewer rays
 
-COLUMNS = ("case", "algorithm", "rays", "judged", "misses", "false hits", "wrong prim", "self-hits", "duplicates", "ties",
-           "near ties", "borderline", "t ulp max", "t ulp 99.9 %", "t / bound")
+def unless_refused(form: str) -> Callable[[Any], str]:
+    return lambda row: form.format_map(vars(row)) if row.refused is None else ""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """rays: of each case, through the default units. sample: of these, how many the oracle judges, and all algorithms get;
-    the others are held to what is known of them without it (`check`). runs: of the measurement of speed."""
-
-    cases: tuple[str, ...] = ()
-    rays: int = 10_000
-    sample: int = 10_000
-    peers: bool = False
-    seed: int = 0
-    threads: int | None = None
-    runs: int = 7
+COLUMNS: Columns = {
+    "case": "{case}", "algorithm": "{algorithm}",
+    "rays": lambda row: {None: str(row.verdict.rays), True: "refused", False: "ACCEPTED"}[row.refused],
+    **{head: unless_refused(form) for head, form in {
+        "judged": "{judged}", "misses": "{verdict.misses}", "false hits": "{verdict.false_hits}",
+        "wrong prim": "{verdict.wrong_prim}", "self-hits": "{verdict.self_hits}", "duplicates": "{verdict.duplicate_hits}",
+        "ties": "{verdict.ties}",
+        "near ties": "{verdict.near_ties}", "borderline": "{verdict.borderline}", "t ulp max": "{verdict.t.largest:.3g}",
+        "t ulp 99.9 %": "{verdict.t.p999:.3g}", "t / bound": "{verdict.t.largest_ratio:.2g}"}.items()}}
 
 
 @dataclass
@@ -76,52 +75,16 @@ class Row:
         self.verdict, self.offset_self_hits = self.verdict + verdict, self.offset_self_hits + offset_self_hits
 
     def as_dict(self) -> dict[str, Any]:
-        return {"case": self.case, "algorithm": self.algorithm, "judged": self.judged,
-                "offset_self_hits": self.offset_self_hits, "refused": self.refused, **self.verdict.as_dict()}
+        return {name: value for name, value in vars(self).items() if name != "verdict"} | self.verdict.as_dict()
 
 
-def cells(row: Row) -> tuple[str, ...]:
-    """A row as text, in the order of COLUMNS."""
-    v = row.verdict
-    if row.refused is not None:
-        return (row.case, row.algorithm, "refused" if row.refused else "ACCEPTED", *[""] * (len(COLUMNS) - 3))
-    counts = (v.rays, row.judged, v.misses, v.false_hits, v.wrong_prim, v.self_hits, v.duplicate_hits, v.ties, v.near_ties,
-              v.borderline_hits + v.borderline_misses)
-    return (row.case, row.algorithm, *map(str, counts), f"{v.t.largest:.3g}", f"{v.t.percentile(99.9):.3g}",
-            f"{v.t.largest_ratio:.2g}")
-
-
-@dataclass(frozen=True)
-class Speed:
-    """On one thread, on case A's sphere: Mray/s; its share of the default's, taken run by run; bytes a triangle."""
-
-    mrays: Quartiles
-    ratio: Quartiles
-    bytes_per_triangle: float
-
-    def as_dict(self) -> dict[str, Any]:
-        return {"mrays_per_second": self.mrays, "ratio_to_default": self.ratio, "bytes_per_triangle": self.bytes_per_triangle}
-
-
-@dataclass
-class Result:
-    """All rows, the speeds by algorithm, the peers that were asked for and are not installed, and the seconds it took.
-    interrupted: the number of the signal that ended it early; undone: the cases that it has not finished."""
-
-    rows: list[Row] = field(default_factory=list)
-    speeds: dict[str, Speed] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()
-    seconds: float = 0.0
-    interrupted: int | None = None
-    undone: tuple[str, ...] = ()
+class Result(Line):
+    """rows: by case and algorithm; speed: by algorithm, see `measure_speed`; not_installed: the peers that were asked for and are
+    not; seconds that it took; interrupted: the number of the signal that ended it early; undone: the cases that it has not
+    finished."""
 
     def _repr_html_(self) -> str:
-        return html_table("Stability", COLUMNS, map(cells, self.rows))
-
-    def as_dict(self) -> dict[str, Any]:
-        return {"seconds": self.seconds, "not_installed": self.missing, "interrupted": self.interrupted, "undone": self.undone,
-                "speed": {name: speed.as_dict() for name, speed in self.speeds.items()},
-                "rows": [row.as_dict() for row in self.rows]}
+        return tables_page([tabled(COLUMNS, self.rows, "Stability")])
 
 
 def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
@@ -136,13 +99,12 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
     begin = time.perf_counter()
     names = chosen(plan.cases)
     algorithms, peers = all_algorithms(plan), PEERS.values() if plan.peers else ()
-    found = Result(missing=tuple(peer.name for peer in peers if not peer.is_installed()))
     progress("measuring the speed")
-    found.speeds = measure_speed(algorithms, plan.runs)
-    rows = _rows(names, algorithms, plan, progress) if executor is None else _spread_rows(
-        names, [algorithm.name for algorithm in algorithms], plan, progress, submitter(executor))
+    found = Result(rows=[], speed=measure_speed(algorithms, plan.runs), interrupted=None, undone=[],
+                   not_installed=[peer.name for peer in peers if not peer.is_installed()])
+    pool = None if executor is None else submitter(executor)
     try:
-        for row in rows:
+        for row in _rows(names, [algorithm.name for algorithm in algorithms], plan, progress, pool):
             found.rows.append(row)
             report(row)
     except KeyboardInterrupt as stop:
@@ -150,7 +112,7 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
             raise
         found.interrupted = int(getattr(stop, "number", signal.SIGINT))
         last = found.rows[-1]
-        found.undone = tuple(names[names.index(last.case) + (last.algorithm == algorithms[-1].name):])
+        found.undone = names[names.index(last.case) + (last.algorithm == algorithms[-1].name):]
     found.seconds = time.perf_counter() - begin
     return found
 
@@ -161,48 +123,36 @@ def all_algorithms(plan: Plan) -> list[Algorithm]:
     return [*own_algorithms(), *(peer() for peer in peers if peer.is_installed())]
 
 
-def _rows(names: list[str], algorithms: list[Algorithm], plan: Plan, progress: Callable[[str], None]) -> Iterator[Row]:
-    left = TimeLeft(len(names) * len(algorithms))
-    for i, name in enumerate(names):
-        for j, algorithm in enumerate(algorithms):
-            left.done = i * len(algorithms) + j
-            progress(f"case {i + 1} of {len(names)}, {name}, {algorithm.name}{left}")
-            row = run_case(name, fewer(name, min(plan.sample, plan.rays)), algorithm, plan.seed)
-            if row is None:
-                continue
-            if algorithm is algorithms[0] and row.refused is None:
-                row.add(*run_more(name, plan, progress))
-            yield row
-
-
-def _spread_rows(names: list[str], algorithms: list[str], plan: Plan, progress: Callable[[str], None],
-                 pool: Any) -> Iterator[Row]:
-    """The same rows in the same order: each case with each algorithm is a task, and so is each chunk of the rays beyond."""
-    rows = [(name, algorithm, pool.submit(one_at_a_time, DIGEST, case_row, name, algorithm, plan))
-            for name in names for algorithm in algorithms]
-    more = {name: [pool.submit(one_at_a_time, DIGEST, more_part, name, plan, index) for index in range(parts(name, plan))]
-            for name in names}
-    left = TimeLeft(len(rows))
+def _rows(names: list[str], algorithms: list[str], plan: Plan, progress: Callable[[str], None], pool: Any) -> Iterator[Row]:
+    """Each case with each algorithm; with a pool, each is a task, and so is each chunk of the rays beyond the sample."""
+    tasks = [(name, algorithm) for name in names for algorithm in algorithms]
+    futures, more = {}, {}
+    if pool is not None:
+        futures = {task: pool.submit(one_at_a_time, DIGEST, case_row, *task, plan) for task in tasks}
+        more = {name: [pool.submit(one_at_a_time, DIGEST, more_part, name, plan, index) for index in range(parts(name, plan))]
+                for name in names}
+    left = TimeLeft(len(tasks))
     try:
-        for i, (name, algorithm, future) in enumerate(rows):
+        for i, (name, algorithm) in enumerate(tasks):
             left.done = i
-            progress(f"{i} of {len(rows)} are done; {name}, {algorithm}{left}")
-            row = result(pool, future)
+            progress(f"{i} of {len(tasks)} are done; {name}, {algorithm}{left}")
+            row = result(pool, futures[name, algorithm]) if pool is not None else case_row(name, algorithm, plan)
             if row is None:
                 continue
             if algorithm == algorithms[0] and row.refused is None:
-                row.add(*_sum(result(pool, part) for part in more[name]))
+                row.add(*(_sum(result(pool, part) for part in more[name]) if pool is not None else run_more(name, plan, progress)))
             yield row
     finally:
-        cancel(pool, chain((future for _, _, future in rows), *more.values()))
+        if pool is not None:
+            cancel(pool, chain(futures.values(), *more.values()))
 
 
 def case_row(name: str, algorithm: str, plan: Plan) -> Row | None:
-    """On a worker: run_case of an algorithm by name. Raises InputError where it is not installed there."""
-    for each in all_algorithms(plan):
-        if each.name == algorithm:
-            return run_case(name, fewer(name, min(plan.sample, plan.rays)), each, plan.seed)
-    raise InputError(f"worker {worker_name()} has no {algorithm}, which is installed here")
+    """run_case of an algorithm by name. Raises InputError where it is not installed, on a worker."""
+    known = {each.name: each for each in all_algorithms(plan)}
+    if algorithm not in known:
+        raise InputError(f"worker {worker_name()} has no {algorithm}, which is installed here")
+    return run_case(name, fewer(name, min(plan.sample, plan.rays)), known[algorithm], plan.seed)
 
 
 def chosen(cases: Sequence[str]) -> list[str]:
@@ -327,14 +277,6 @@ def _surfaces(case: HardCase, device: Any) -> Any:
     return surfaces
 
 
-def _rays(case: HardCase, device: Any, rows: slice = slice(None)) -> Any:
-    rays = RayArrays()
-    rays.origin = upload(case.origins[rows], wp.vec3, device)
-    rays.direction = upload(case.directions[rows], wp.vec3, device)
-    rays.t_min, rays.t_max = upload(case.t_min[rows], wp.float32, device), upload(case.t_max[rows], wp.float32, device)
-    return rays
-
-
 @cache
 def _respawn_kernel(structure: Structure) -> Any:
     surface_at = make_surface_at(structure.units.spheres, False, False, False)
@@ -351,7 +293,7 @@ def respawn(algorithm: Own, case: HardCase, *, exclude: bool) -> tuple[np.ndarra
     out.direction = upload(case.next_directions, wp.vec3, accel.device)
     out.exclude = int(exclude)
     out.first_prim_id, out.next_prim_id = (wp.empty(n, dtype=wp.int32, device=accel.device) for _ in range(2))
-    wp.launch(kernel, dim=n, inputs=[accel.data, _surfaces(case, accel.device), _rays(case, accel.device), out, 0],
+    wp.launch(kernel, dim=n, inputs=[accel.data, _surfaces(case, accel.device), case.on(accel.device), out, 0],
               device=accel.device)
     return out.first_prim_id.numpy(), out.next_prim_id.numpy()
 
@@ -372,23 +314,25 @@ def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
     out.prim_id = wp.zeros(n * out.capacity, dtype=wp.int32, device=accel.device)
     out.t = wp.zeros(n * out.capacity, dtype=wp.float32, device=accel.device)
     primitives = upload(case.geometry.primitives(units), units.triangle_test.record, accel.device)
+    part = replace(case, origins=case.origins[:n], directions=case.directions[:n], t_min=case.t_min[:n], t_max=case.t_max[:n],
+                   expected=case.expected[:n])
     wp.launch(_all_hits_kernel(units), dim=n, device=accel.device,
-              inputs=[primitives, _surfaces(case, accel.device), _rays(case, accel.device, slice(n)), out, 0])
+              inputs=[primitives, _surfaces(case, accel.device), part.on(accel.device), out, 0])
     count = out.count.numpy()
     told = np.arange(out.capacity)[None, :] < count[:, None]
-    part = HardCase(case.geometry, case.origins[:n], case.directions[:n], case.t_min[:n], case.t_max[:n], case.expected[:n],
-                    closed=case.closed, name=case.name)
     prim_id, t = (array.numpy().reshape(n, -1)[told] for array in (out.prim_id, out.t))
     verdict = judge_all_hits(part, np.nonzero(told)[0], prim_id, t)
     return Verdict(duplicate_hits=verdict.duplicate_hits, examples=[e for e in verdict.examples if "twice" in e["why"]])
 
 
-def measure_speed(algorithms: Sequence[Algorithm], runs: int) -> dict[str, Speed]:
-    """On one thread, by turns, on case A's sphere of 159,200 triangles. The first algorithm is the default."""
+def measure_speed(algorithms: Sequence[Algorithm], runs: int) -> dict[str, Line]:
+    """On one thread, by turns, on case A's sphere of 159,200 triangles: Mray/s; its share of the default's, which is the first
+    algorithm, taken run by run; bytes a triangle."""
     case = generate("A_origin_uniform", SPEED_RAYS, seed=1)
     for algorithm in algorithms:
         algorithm.prepare(case.geometry)
     seconds = alternate({a.name: partial(a.closest, case.origins, case.directions) for a in algorithms}, runs)
     default = seconds[algorithms[0].name]
-    return {a.name: Speed(quartiles(SPEED_RAYS / seconds[a.name] / 1e6), quartiles(default / seconds[a.name]),
-                          a.bytes_per_triangle) for a in algorithms}
+    return {a.name: Line(mrays_per_second=quartiles(SPEED_RAYS / seconds[a.name] / 1e6),
+                         ratio_to_default=quartiles(default / seconds[a.name]), bytes_per_triangle=a.bytes_per_triangle)
+            for a in algorithms}

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
-from wrt.lab.mitsuba.exact import refuse
+from wrt.core.errors import InputError
+from wrt.picture.tonemap import decode_srgb
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.values import Color
+
+
+def refuse(what: str, where: str = "") -> NoReturn:
+    """What Mitsuba cannot draw exactly: a comparison of other light says nothing."""
+    raise InputError(f"not translatable exactly: {what}", None, f"Mitsuba: {where}" if where else "Mitsuba")
 
 
 def bsdf(mi: Any, material: Material) -> dict[str, Any]:
@@ -48,7 +54,7 @@ def _mirror(mi: Any, material: Material) -> dict[str, Any]:
 
 
 def _conductor(mi: Any, material: Material) -> dict[str, Any]:
-    result: dict[str, Any] = {"type": "conductor", "eta": _rgb(material.eta), "k": _rgb(material.k)}
+    result: dict[str, Any] = {"type": "conductor", "eta": rgb(material.eta), "k": rgb(material.k)}
     return result | _ggx("roughconductor", material) if material.is_rough else result
 
 
@@ -74,14 +80,14 @@ BSDFS: dict[str, Callable[[Any, Material], dict[str, Any]]] = {
 # --- textures ---------------------------------------------------------------------------------------------------------
 
 
-def _rgb(color: Color) -> dict[str, Any]:
+def rgb(color: Color) -> dict[str, Any]:
     return {"type": "rgb", "value": list(color)}
 
 
 def _color(mi: Any, factor: Color, texture: Texture | Checkerboard | None) -> dict[str, Any]:
     """factor times the texture's RGB, linear."""
     if texture is None:
-        return _rgb(factor)
+        return rgb(factor)
     if isinstance(texture, Checkerboard):
         return _checkerboard(mi, factor, texture)
     return _bitmap(mi, texture, linear_rgb(texture) * np.asarray(factor, np.float32))
@@ -89,7 +95,7 @@ def _color(mi: Any, factor: Color, texture: Texture | Checkerboard | None) -> di
 
 def _checkerboard(mi: Any, factor: Color, texture: Checkerboard) -> dict[str, Any]:
     # Mitsuba's board has two squares to one unit of its coordinates, and color0 in the one at the origin.
-    first, second = (_rgb(np.multiply(color, factor).tolist()) for color in (texture.color_a, texture.color_b))
+    first, second = (rgb(np.multiply(color, factor).tolist()) for color in (texture.color_a, texture.color_b))
     to_uv = mi.ScalarTransform3f().scale([0.5 * texture.scale, 0.5 * texture.scale])
     return {"type": "checkerboard", "color0": first, "color1": second, "to_uv": to_uv}
 
@@ -97,9 +103,7 @@ def _checkerboard(mi: Any, factor: Color, texture: Checkerboard) -> dict[str, An
 def linear_rgb(texture: Texture) -> np.ndarray:
     """(H, W, 3) float32 linear RGB of the texels (IEC 61966-2-1 where the texture is sRGB-encoded)."""
     steps = np.arange(256, dtype=np.float64) / 255.0
-    if texture.srgb:
-        steps = np.where(steps <= 0.04045, steps / 12.92, ((steps + 0.055) / 1.055) ** 2.4)
-    return steps.astype(np.float32)[texture.image[..., :3]]
+    return (decode_srgb(steps) if texture.srgb else steps).astype(np.float32)[texture.image[..., :3]]
 
 
 def _bitmap(mi: Any, texture: Texture, values: np.ndarray) -> dict[str, Any]:

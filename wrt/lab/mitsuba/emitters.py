@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.lab.mitsuba.exact import refuse
+from wrt.lab.mitsuba.bsdfs import refuse, rgb
 from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 
@@ -27,15 +27,11 @@ def light_emitter(mi: Any, light: Light) -> dict[str, Any]:
 
 
 def _point(mi: Any, light: PointLight) -> dict[str, Any]:
-    return {"type": "point", "position": list(light.position), "intensity": _rgb(light.intensity)}
+    return {"type": "point", "position": list(light.position), "intensity": rgb(light.intensity)}
 
 
 def _directional(mi: Any, light: DirectionalLight) -> dict[str, Any]:
-    return {"type": "directional", "direction": list(light.direction), "irradiance": _rgb(light.irradiance)}
-
-
-def _rgb(color: Any) -> dict[str, Any]:
-    return {"type": "rgb", "value": list(color)}
+    return {"type": "directional", "direction": list(light.direction), "irradiance": rgb(light.irradiance)}
 
 
 def _spot(mi: Any, light: SpotLight) -> dict[str, Any]:
@@ -45,7 +41,7 @@ def _spot(mi: Any, light: SpotLight) -> dict[str, Any]:
     cutoff = math.degrees(light.outer)
     target = np.array(light.position) + direction
     spot: dict[str, Any] = {
-        "type": "spot", "intensity": _rgb(light.intensity), "cutoff_angle": cutoff, "beam_width": cutoff * (1.0 - 1e-6),
+        "type": "spot", "intensity": rgb(light.intensity), "cutoff_angle": cutoff, "beam_width": cutoff * (1.0 - 1e-6),
         "to_world": mi.ScalarTransform4f().look_at(list(light.position), target.tolist(), up.tolist()),
     }
     if light.inner >= light.outer:
@@ -74,7 +70,7 @@ def background_emitter(mi: Any, background: Background) -> dict[str, Any] | None
 
 
 def _constant(mi: Any, background: ConstantBackground) -> dict[str, Any] | None:
-    return {"type": "constant", "radiance": _rgb(background.color)} if max(background.color) > 0.0 else None
+    return {"type": "constant", "radiance": rgb(background.color)} if max(background.color) > 0.0 else None
 
 
 def _gradient(mi: Any, background: GradientBackground) -> dict[str, Any]:

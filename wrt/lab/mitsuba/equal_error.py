@@ -8,27 +8,25 @@ squared error falls as 1 / time. Runs alternate; each has a seed of its own. All
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from wrt.core.checks import as_choice
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.lab.bench import error_statistics as statistics
-from wrt.lab.bench.error import REFERENCE_SEEDS, Reference, finished, make_reference
-from wrt.lab.bench.report import check_plan, table
-from wrt.lab.bench.timing import Quartiles, quartiles, shown
-from wrt.lab.mitsuba.llvm import NotAvailable
-from wrt.lab.mitsuba.process import VARIANTS, Job, MitsubaProcess, environment_of
-from wrt.lab.mitsuba.translate import INTEGRATORS
+from wrt.lab.bench.error import REFERENCE_SEEDS, finished, make_reference
+from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
+from wrt.lab.bench.timing import quartiles, shown, spread
+from wrt.lab.mitsuba.process import Job, MitsubaProcess, NotAvailable, environment_of
+from wrt.lab.plans import Mitsuba as Plan
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
 from wrt.scene.cameras import Camera
@@ -37,78 +35,6 @@ from wrt.scene.model import Scene
 
 PILOT_SPP = 16
 SAME = 0.25  # of the squared error compared at: a squared bias beyond it means that the pictures are not of the same light
-
-
-@dataclass(frozen=True)
-class Plan:
-    """spp: wrt's samples. repeats: pictures of each. reference_spp: of each of its seeds (None: 8 spp). rival_seconds: no
-    picture of Mitsuba's takes longer. integrator: Mitsuba's, see wrt.lab.mitsuba.translate. variants: Mitsuba's. starts: how
-    often a whole process is timed (0: not at all). Raises InputError."""
-
-    spp: int = 64
-    repeats: int = 7
-    reference_spp: int | None = None
-    rival_seconds: float = 60.0
-    integrator: str = "auto"
-    variants: tuple[str, ...] = VARIANTS
-    starts: int = 3
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_plan(self, {}, spp=(1, 1 << 16), repeats=(3, 1000))
-        as_choice(self.integrator, INTEGRATORS, "integrator")
-        if not self.variants or not set(self.variants) <= set(VARIANTS):
-            raise InputError(f"variants must be of {', '.join(VARIANTS)}; got {', '.join(self.variants) or 'none'}")
-
-
-@dataclass(frozen=True)
-class Side:
-    """One renderer: samples a pixel, seconds of each picture, root mean squared error over all its pictures, and its bias
-    against the reference (NaN where it cannot be told from noise; `bias_below` bounds it). prepare_seconds: structure and
-    scene; process_seconds: a whole process at this many samples, start included (NaN where it was not timed)."""
-
-    spp: int
-    seconds: np.ndarray
-    rmse: float
-    bias: float
-    bias_below: float
-    prepare_seconds: float
-    process_seconds: float
-
-    def as_dict(self) -> dict[str, Any]:
-        return vars(self) | {"seconds": self.seconds.tolist()}
-
-
-@dataclass(frozen=True)
-class Rival:
-    """A variant of Mitsuba. ratio: its seconds over those of wrt at wrt's error, tracing alone; process_ratio: of whole
-    processes. same_light: whether its picture has wrt's expectation, as far as its noise at equal error can tell."""
-
-    side: Side
-    ratio: Quartiles
-    process_ratio: float
-    same_light: bool
-
-    def as_dict(self) -> dict[str, Any]:
-        return {**self.side.as_dict(), **{name: value for name, value in vars(self).items() if name != "side"}}
-
-
-@dataclass(frozen=True)
-class Result:
-    """mitsuba: by variant. not_available: variants that could not be used, and why."""
-
-    scene: str
-    size: tuple[int, int]
-    integrator: str
-    threads: int
-    wrt: Side
-    mitsuba: dict[str, Rival]
-    not_available: dict[str, str]
-    reference: Reference
-
-    def as_dict(self) -> dict[str, Any]:
-        return vars(self) | {"wrt": self.wrt.as_dict(), "reference": self.reference.as_dict(),
-                             "mitsuba": {name: rival.as_dict() for name, rival in self.mitsuba.items()}}
 
 
 def matte(scene: Scene) -> Scene:
@@ -122,24 +48,15 @@ def matte(scene: Scene) -> Scene:
     return replace(scene, objects=objects, spheres=spheres, cameras=cameras, ambient=(0.0, 0.0, 0.0))
 
 
-class _Runs:
-    """Pictures of one renderer at its number of samples, and their seconds."""
-
-    def __init__(self, spp: int) -> None:
-        self.spp = spp
-        self.seconds: list[float] = []
-        self.films: list[np.ndarray] = []
-
-    def add(self, seconds: float, film: np.ndarray) -> None:
-        self.seconds.append(seconds)
-        self.films.append(film)
-
-    def side(self, truth: Reference, prepare: float, start: float) -> Side:
-        """start: seconds of a process but for tracing."""
-        products = statistics.gram(self.films, truth.pixels)
-        bias, below = statistics.bias_with_bound(products, truth.variance)
-        return Side(self.spp, np.array(self.seconds), max(statistics.mse_of(products, truth.variance), 0.0) ** 0.5, bias, below,
-                    prepare, start + float(np.median(self.seconds)))
+def side_of(spp: int, runs: Sequence[tuple[float, np.ndarray]], truth: Row, prepare: float, start: float) -> Row:
+    """One renderer: samples a pixel, seconds of each picture, root mean squared error over all its pictures, and its bias
+    against the reference (NaN where it cannot be told from noise; `bias_below` bounds it). prepare_seconds: structure and
+    scene; process_seconds: a whole process at this many samples, of which `start` is all but tracing (NaN: was not timed)."""
+    seconds, films = zip(*runs, strict=True)
+    products = statistics.gram(films, truth.pixels)
+    bias, below = statistics.bias_with_bound(products, truth.variance)
+    return Row(spp=spp, seconds=list(seconds), rmse=max(statistics.mse_of(products, truth.variance), 0.0) ** 0.5, bias=bias,
+               bias_below=below, prepare_seconds=prepare, process_seconds=start + float(np.median(seconds)))
 
 
 class _Measured:
@@ -147,20 +64,20 @@ class _Measured:
 
     def __init__(self, job: Job, process: MitsubaProcess) -> None:
         self.job, self.process = job, process
-        self.runs = _Runs(PILOT_SPP)
-        self.start = float("nan")
+        self.runs: list[tuple[float, np.ndarray]] = []
+        self.spp, self.start = PILOT_SPP, math.nan
 
-    def choose_spp(self, seed: int, truth: Reference, target: float, longest: float) -> None:
+    def choose_spp(self, seed: int, truth: Row, target: float, longest: float) -> None:
         """As many samples as likely give the squared error `target`, in pictures that take no longer than `longest`. Kernels are
         compiled as a picture is rendered, and others for another number of samples: the first of each is not counted."""
         self.process.render(PILOT_SPP, seed)
         seconds, film = self.process.render(PILOT_SPP, seed)
         needed = PILOT_SPP * statistics.mse_of(statistics.gram([film], truth.pixels), truth.variance) / max(target, 1e-30)
-        self.runs.spp = int(np.clip(round(needed), 1, max(1.0, PILOT_SPP * longest / seconds)))
-        self.process.render(self.runs.spp, seed)
+        self.spp = int(np.clip(round(needed), 1, max(1.0, PILOT_SPP * longest / seconds)))
+        self.process.render(self.spp, seed)
 
     def picture(self, seed: int) -> None:
-        self.runs.add(*self.process.render(self.runs.spp, seed))
+        self.runs.append(self.process.render(self.spp, seed))
 
     def time_starts(self, times: int) -> None:
         """All that a process takes but for tracing, with its first picture at 1 spp, as wrt's process is timed. (It is handed
@@ -174,49 +91,41 @@ class _Measured:
         with MitsubaProcess(self.job) as process:
             return process.load_seconds + process.render(1, 0)[0]
 
-    def result(self, ours: Side, truth: Reference) -> Rival:
-        side = self.runs.side(truth, self.process.load_seconds, self.start)
+    def result(self, ours: Row, truth: Row) -> Row:
+        """What `side_of` tells; ratio: its seconds over those of wrt at wrt's error, tracing alone; process_ratio: of whole
+        processes; same_light: whether its picture has wrt's expectation, as far as its noise at equal error can tell."""
+        side = side_of(self.spp, self.runs, truth, self.process.load_seconds, self.start)
         factor = (side.rmse / ours.rmse) ** 2
-        process_seconds = self.start + factor * float(np.median(side.seconds))
-        return Rival(replace(side, process_seconds=process_seconds), quartiles(factor * side.seconds / ours.seconds),
-                     process_seconds / ours.process_seconds, not side.bias**2 > SAME * ours.rmse**2)
+        side.process_seconds = self.start + factor * float(np.median(side.seconds))
+        return Row(**vars(side), ratio=quartiles(factor * np.array(side.seconds) / np.array(ours.seconds)),
+                   process_ratio=side.process_seconds / ours.process_seconds, same_light=not side.bias**2 > SAME * ours.rmse**2)
 
 
 class _Rivals:
     """The variants that can be used, and why the others cannot. Raises NotAvailable where none can."""
 
-    def __init__(self, stack: ExitStack) -> None:
-        self.stack = stack
+    def __init__(self, jobs: list[Job], stack: ExitStack) -> None:
+        self.jobs, self.stack = {job.variant: job for job in jobs}, stack
         self.measured: dict[str, _Measured] = {}
         self.not_available: dict[str, str] = {}
+        self.each(self._start)
 
-    def start(self, jobs: list[Job]) -> None:
-        for job in jobs:
+    def _start(self, variant: str) -> None:
+        self.measured[variant] = _Measured(self.jobs[variant], self.stack.enter_context(MitsubaProcess(self.jobs[variant])))
+
+    def each(self, do: Callable[[str], None]) -> None:
+        for variant in [name for name in self.jobs if name not in self.not_available]:
             try:
-                self.measured[job.variant] = _Measured(job, self.stack.enter_context(MitsubaProcess(job)))
+                do(variant)
             except NotAvailable as error:
-                self._leave_out(job.variant, error)
-        self._check()
-
-    def each(self, do: Callable[[_Measured], None]) -> None:
-        for variant, measured in list(self.measured.items()):
-            try:
-                do(measured)
-            except NotAvailable as error:
-                self._leave_out(variant, error)
-        self._check()
-
-    def _leave_out(self, variant: str, error: NotAvailable) -> None:
-        self.measured.pop(variant, None)
-        self.not_available[variant] = str(error)
-
-    def _check(self) -> None:
+                self.measured.pop(variant, None)
+                self.not_available[variant] = str(error)
         if not self.measured:
             raise NotAvailable("; ".join(f"Mitsuba {variant}: {why}" for variant, why in self.not_available.items()))
 
 
 def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = None,
-        report: Callable[[str], None] = lambda line: None) -> Result:
+        report: Callable[[str], None] = lambda line: None) -> Row:
     """Measure. command: arguments of `python -m wrt` that render this scene at 1 spp: what a process takes but for tracing
     (None: not timed). A variant of Mitsuba that cannot be used is left out, and named in the result.
 
@@ -225,11 +134,11 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
     scene = scene.with_settings(filter="box")  # the only one whose pixels Mitsuba takes by themselves
     seeds = [int(word) for word in np.random.SeedSequence(plan.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     pictures, starts = seeds[REFERENCE_SEEDS:], plan.starts if command else 0
-    threads, ours = thread_count(options.threads), _Runs(plan.spp)
+    threads, ours = thread_count(options.threads), []
     with ExitStack() as stack:
-        rivals = _Rivals(stack)
         report("starting Mitsuba")
-        rivals.start([Job(variant, scene, options.camera, plan.integrator, threads) for variant in dict.fromkeys(plan.variants)])
+        jobs = [Job(variant, scene, options.camera, plan.integrator, threads) for variant in dict.fromkeys(plan.variants)]
+        rivals = _Rivals(jobs, stack)
         report(f"reference: {REFERENCE_SEEDS} seeds")
         truth = make_reference(scene, options, plan.reference_spp or 8 * plan.spp, seeds[:REFERENCE_SEEDS],
                                scene.settings.max_depth)
@@ -242,20 +151,21 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
 
         report("pilot")
         target = statistics.mse_of(statistics.gram([our_picture(pictures[0])[1]], truth.pixels), truth.variance)
-        rivals.each(lambda rival: rival.choose_spp(pictures[0], truth, target, plan.rival_seconds))
+        rivals.each(lambda name: rivals.measured[name].choose_spp(pictures[0], truth, target, plan.rival_seconds))
         for turn, seed in enumerate(pictures):
             report(f"picture {turn + 1} of {plan.repeats}")
             if turn % 2 == 0:
-                ours.add(*our_picture(seed))
-            rivals.each(partial(_Measured.picture, seed=seed))
+                ours.append(our_picture(seed))
+            rivals.each(partial(lambda seed, name: rivals.measured[name].picture(seed), seed))
             if turn % 2 == 1:
-                ours.add(*our_picture(seed))
+                ours.append(our_picture(seed))
         report("whole processes")
-        rivals.each(lambda rival: rival.time_starts(starts))
+        rivals.each(lambda name: rivals.measured[name].time_starts(starts))
     prepare = sum(renderer.prepared.seconds.get(part, 0.0) for part in ("compile", "upload", "build"))
-    side = ours.side(truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
+    side = side_of(plan.spp, ours, truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
     found = {variant: measured.result(side, truth) for variant, measured in rivals.measured.items()}
-    return Result(scene.name, scene.settings.size, plan.integrator, threads, side, found, rivals.not_available, truth)
+    return Row(scene=scene.name, size=scene.settings.size, integrator=plan.integrator, threads=threads, wrt=side, mitsuba=found,
+               not_available=rivals.not_available, reference=truth)
 
 
 def process_seconds(arguments: list[str], times: int, environment: Mapping[str, str] | None = None) -> float:
@@ -270,36 +180,33 @@ def process_seconds(arguments: list[str], times: int, environment: Mapping[str, 
     return float(np.median(seconds[1:])) if times else float("nan")
 
 
-COLUMNS = ("", "spp", "seconds, tracing", "RMSE", "bias against the reference", "scene and structure, s",
-           "process to wrt's error, s", "times wrt's, tracing", "times wrt's, process")
+def known(value: float, form: str) -> str:
+    return "not timed" if math.isnan(value) else form.format(value)
 
 
-def text(result: Result) -> str:
+COLUMNS: Columns = {
+    "": "{name}", "spp": "{spp}", "seconds, tracing": lambda side: spread(side.seconds), "RMSE": "{rmse:.4g}",
+    "bias against the reference":
+        lambda side: f"below {side.bias_below:.2g}" if math.isnan(side.bias) else f"{side.bias:.2g}",
+    "scene and structure, s": "{prepare_seconds:.2f}",
+    "process to wrt's error, s": lambda side: known(side.process_seconds, "{:.2f}"),
+    "times wrt's, tracing": lambda side: shown(side.ratio) if side.ratio else "1",
+    "times wrt's, process": lambda side: known(side.process_ratio, "{:.3g}")}
+
+
+def text(result: Row) -> str:
     """For the terminal and for a report, as Markdown."""
-    lines = [("wrt", *_cells(result.wrt), "1", "1")]
-    for variant, rival in result.mitsuba.items():
-        lines.append((f"Mitsuba {variant}, {result.integrator}", *_cells(rival.side), shown(rival.ratio),
-                      _known(rival.process_ratio, "{:.3g}")))
+    sides = [Row(**vars(result.wrt), name="wrt", ratio=None, process_ratio=1.0),
+             *(Row(**vars(rival), name=f"Mitsuba {variant}, {result.integrator}") for variant, rival in result.mitsuba.items())]
     width, height = result.size
-    told = [f"{result.scene}, {width}x{height}, {result.threads} threads; the reference's own RMSE is {result.reference.rmse:.2g}.",
-            "", table(COLUMNS, lines), "", LEGEND]
-    told += [f"Mitsuba {variant} is not available: {why}." for variant, why in result.not_available.items()]
+    told = [f"Mitsuba {variant} is not available: {why}." for variant, why in result.not_available.items()]
     told += [f"The picture of {variant} is not of the same light: its ratio says nothing. Try --matte, or another --integrator."
              for variant, rival in result.mitsuba.items() if not rival.same_light]
-    return "\n".join(told)
+    head = f"{result.scene}, {width}x{height}, {result.threads} threads; the reference's own RMSE is {result.reference.rmse:.2g}."
+    return markdown([tabled(COLUMNS, sides, "", head), Part("", "\n".join([LEGEND, *told]))]).rstrip()
 
 
 LEGEND = """\
 times wrt's: how many times as long Mitsuba takes to wrt's error, tracing alone (median and quartiles) and as a whole process, with
 start, imports, scene, structure and compiler; what both programs' compilers keep on disk was there before. Mitsuba traces with
 Embree in its robust mode."""
-
-
-def _cells(side: Side) -> tuple[str, ...]:
-    bias = f"below {side.bias_below:.2g}" if np.isnan(side.bias) else f"{side.bias:.2g}"
-    return (str(side.spp), shown(quartiles(side.seconds)), f"{side.rmse:.4g}", bias, f"{side.prepare_seconds:.2f}",
-            _known(side.process_seconds, "{:.2f}"))
-
-
-def _known(value: float, form: str) -> str:
-    return "not timed" if np.isnan(value) else form.format(value)

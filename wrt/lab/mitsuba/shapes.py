@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wrt.lab.mitsuba.bsdfs import bsdf, emission
-from wrt.lab.mitsuba.exact import refuse
+from wrt.lab.mitsuba.bsdfs import bsdf, emission, refuse
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Sphere
 
@@ -26,6 +25,11 @@ class Triangles(NamedTuple):
     faces: np.ndarray
     normals: np.ndarray | None
     uvs: np.ndarray | None
+
+    def of(self, vertices: np.ndarray, faces: np.ndarray) -> Triangles:
+        """Faces of these vertices."""
+        normals, uvs = (None if array is None else array[vertices] for array in (self.normals, self.uvs))
+        return Triangles(self.vertices[vertices], faces.reshape(-1, 3), normals, uvs)
 
 
 def object_parts(mi: Any, thing: Object, object_id: int) -> Iterator[tuple[str, Any, Part]]:
@@ -82,7 +86,7 @@ def _to_world(thing: Object) -> Triangles:
     if not flat[faces].any():
         return world._replace(normals=normals)
     # Zero means flat there: such corners get their face's own normal, so that no corner may be shared any more.
-    corners = _unshared(world._replace(normals=normals))
+    corners = world._replace(normals=normals).of(faces.reshape(-1), np.arange(faces.size))
     assert corners.normals is not None
     own = np.repeat(_face_normals(corners), 3, axis=0)
     return corners._replace(normals=np.where(np.any(corners.normals, axis=1, keepdims=True), corners.normals, own))
@@ -93,15 +97,7 @@ def _select(triangles: Triangles, chosen: np.ndarray) -> Triangles:
     if len(chosen) == len(triangles.faces):
         return triangles
     used, faces = np.unique(triangles.faces[chosen], return_inverse=True)
-    pick = lambda array: None if array is None else array[used]
-    return Triangles(triangles.vertices[used], faces.reshape(-1, 3), pick(triangles.normals), pick(triangles.uvs))
-
-
-def _unshared(triangles: Triangles) -> Triangles:
-    corner = triangles.faces.reshape(-1)
-    pick = lambda array: None if array is None else array[corner]
-    faces = np.arange(len(corner)).reshape(-1, 3)
-    return Triangles(triangles.vertices[corner], faces, pick(triangles.normals), pick(triangles.uvs))
+    return triangles.of(used, faces)
 
 
 def _face_normals(triangles: Triangles) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Mitsuba 3 as an independent oracle and a rival: the same scene, rays and camera, answered by someone else's code.
 
 As an oracle the variant is scalar_rgb, in this process; as a rival also llvm_ad_rgb, which is faster, but ends the whole process
-where the LLVM library does not suit it (llvm.py chooses one, process.py is the process). Both trace with Embree,
+where the LLVM library does not suit it (process.py chooses one). Both trace with Embree,
 which is asked for its robust mode; Mitsuba unasked takes the fast one.
 
 What can be compared exactly (Mitsuba's estimate has the same expectation as wrt's picture):
@@ -25,8 +25,8 @@ import numpy as np
 
 from wrt.core.checks import as_choice
 from wrt.core.errors import InputError
+from wrt.lab.mitsuba.bsdfs import refuse
 from wrt.lab.mitsuba.emitters import background_emitter, light_emitter
-from wrt.lab.mitsuba.exact import refuse
 from wrt.lab.mitsuba.shapes import Part, object_parts, sphere_shape
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.scene.model import Scene
@@ -81,7 +81,9 @@ def translate(mi: Any, scene: Scene, camera: CameraKind | str | int | None = Non
         contents[name] = sphere_shape(mi, sphere)
         parts[name] = Part(len(scene.objects) + index, None, sphere.material)
 
-    integrator = _resolve_integrator(scene, integrator)
+    if integrator == "auto":
+        passes = any(m.alpha_mode != "opaque" or max(m.absorption) > 0.0 for m in scene.materials)
+        integrator = "volpath" if passes else "path"
     for index, light in enumerate(scene.lights):
         contents[f"light{index}"] = light_emitter(mi, light)
     background = background_emitter(mi, scene.background)
@@ -98,13 +100,6 @@ def translate(mi: Any, scene: Scene, camera: CameraKind | str | int | None = Non
         return Translation(mi.load_dict(contents), parts)
     except RuntimeError as error:
         raise InputError(f"Mitsuba refuses the scene: {error}") from error
-
-
-def _resolve_integrator(scene: Scene, integrator: str) -> str:
-    if integrator != "auto":
-        return integrator
-    passes = any(m.alpha_mode != "opaque" or max(m.absorption) > 0.0 for m in scene.materials)
-    return "volpath" if passes else "path"
 
 
 def _check_light_transport(scene: Scene, integrator: str) -> None:
@@ -150,15 +145,16 @@ def _integrator(mi: Any, name: str, scene: Scene, lit: bool, parts: dict[str, Pa
 
 
 def _sensor(mi: Any, scene: Scene, camera: CameraKind) -> dict[str, Any]:
-    far = _farthest(scene, camera)
+    far, (width, height) = _farthest(scene, camera), scene.settings.size
     # Mitsuba's camera looks along +z with +x to the left: half a turn about y away from glTF's.
     pose = camera.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
     sensor: dict[str, Any] = {
-        "near_clip": 1e-5 * far, "far_clip": 4.0 * far, "film": _film(scene),
+        "near_clip": 1e-5 * far, "far_clip": 4.0 * far,
+        "film": {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb", "component_format": "float32",
+                 "rfilter": {"type": "box"}},
         "sampler": {"type": "independent", "sample_count": scene.settings.spp},
     }
     if isinstance(camera, OrthographicCamera):
-        width, height = scene.settings.size
         half_width = 0.5 * camera.height * width / height
         pose = pose @ np.diag([half_width, half_width, 1.0, 1.0])
         sensor |= {"type": "orthographic"}
@@ -186,9 +182,3 @@ def _farthest(scene: Scene, camera: CameraKind) -> float:
 
 def _focus(camera: CameraKind) -> float:
     return camera.focus_distance if isinstance(camera, Camera) else 1.0
-
-
-def _film(scene: Scene) -> dict[str, Any]:
-    width, height = scene.settings.size
-    return {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb", "component_format": "float32",
-            "rfilter": {"type": "box"}}

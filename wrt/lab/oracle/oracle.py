@@ -40,32 +40,11 @@ PAIRS_AT_ONCE = 1_000_000
 SLAB = 8.0 * UNIT  # a slab's distance carries three roundings in float64
 
 
-@dataclass(frozen=True, eq=False)
-class AllHits:
-    """Every hit, ordered by ray, then t, then prim_id: ray (M,) int64, prim_id (M,) int32, place (M,) int8 (of Place);
-    t, u, v (M,) float64, t to 1e-14 relative; t_error: bound on |t - exact t|. u = v = 0 on spheres."""
-
-    ray: np.ndarray
-    prim_id: np.ndarray
-    t: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
-    t_error: np.ndarray
-    place: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.ray)
-
-    def chosen(self, rows: np.ndarray) -> AllHits:
-        return AllHits(*(getattr(self, name)[rows] for name in AllHits.__dataclass_fields__))
-
-
-_NO_HITS = AllHits(np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0),
-                   np.zeros(0, np.int8))
-
-
-def _merged(parts: list[AllHits]) -> AllHits:
-    return AllHits(*(np.concatenate([getattr(part, name) for part in parts]) for name in AllHits.__dataclass_fields__))
+# Every hit, ordered by ray, then t, then prim_id; place: of Place; t to 1e-14 relative; t_error: bound on |t - exact t|; u = v = 0
+# on spheres. Of an array of hits these are attributes: hits.ray.
+HIT = np.dtype([("ray", np.int64), ("prim_id", np.int32), ("t", np.float64), ("u", np.float64), ("v", np.float64),
+                ("t_error", np.float64), ("place", np.int8)])
+AllHits = Any  # np.recarray, whose stubs do not know its attributes
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +60,10 @@ class Answer:
     place: np.ndarray
     tie: np.ndarray
     ties: dict[int, np.ndarray] = field(default_factory=dict)
+
+
+def _hits(*columns: np.ndarray) -> AllHits:
+    return np.rec.fromarrays(columns, dtype=HIT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +147,8 @@ class Reference:
         or (N,). Rays that are not finite, or have no direction, hit nothing."""
         rays = _Rays.of(origins, directions, t_min, t_max)
         found = [self._tested(rays, ray, prim_id) for ray, prim_id in self.candidates(rays)]
-        hits = _merged([_NO_HITS, *found])
-        return hits.chosen(np.lexsort((hits.prim_id, hits.t, hits.ray)))
+        hits = np.concatenate([np.recarray(0, HIT), *found]).view(np.recarray)
+        return hits[np.lexsort((hits.prim_id, hits.t, hits.ray))]
 
     def _tested(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> AllHits:
         """The hits among these pairs."""
@@ -180,8 +163,8 @@ class Reference:
                                       & ((end == 0) | ~found.touching))
                 place = np.where(found.touching[keep], Place.EDGE, Place.INSIDE).astype(np.int8)
                 zero = np.zeros(len(keep))
-                parts.append(AllHits(r[keep], p[keep], t[keep], zero, zero, t_error[keep], place))
-        return _merged(parts)
+                parts.append(_hits(r[keep], p[keep], t[keep], zero, zero, t_error[keep], place))
+        return np.concatenate(parts).view(np.recarray)
 
     def _tested_triangles(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> AllHits:
         o, d = rays.origin[:, ray], rays.direction[:, ray]
@@ -197,8 +180,7 @@ class Reference:
             for row, exact in zip(close, _fractions(o[:, rows], d[:, rows], self.triangles(prim_id[rows])), strict=True):
                 inside[row] = low[row] <= exact <= high[row]
         keep = keep[inside]
-        return AllHits(ray[keep], prim_id[keep], found.t[keep], found.u[keep], found.v[keep], found.t_error[keep],
-                       found.place[keep])
+        return _hits(ray[keep], prim_id[keep], found.t[keep], found.u[keep], found.v[keep], found.t_error[keep], found.place[keep])
 
     def _sphere_columns(self, rays: _Rays, ray: np.ndarray,
                         prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

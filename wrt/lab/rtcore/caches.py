@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from wrt.accel.answers import Counters
 from wrt.core.device import load_kernel, run_all, start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.kernels.study.cache_lru import Caches, Missed, Trace, replay_lru, replay_warps
@@ -31,17 +32,6 @@ class Cache:
     @property
     def sets(self) -> int:
         return self.size // (LINE * self.ways)
-
-
-@dataclass(frozen=True, eq=False)
-class Warps:
-    """Recorded rays in the order of warps and lanes. warp: (N,) of each ray, 0 to W - 1, ascending, 32 rays at most in one; ray i
-    has the fetches first[i] to first[i + 1]; address, size: of each, in bytes."""
-
-    warp: np.ndarray
-    first: np.ndarray
-    address: np.ndarray
-    size: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,24 +97,26 @@ def caches_of(cache: Cache, count: int) -> Any:
     return out
 
 
-def first_level(warps: Warps, sms: int, slots: int, l1: Cache) -> Level1:
-    """What misses in the L1s, one an SM. Warps go to the SMs by turns; an SM has so many slots, and a warp begins when one is
+def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: Cache) -> Level1:
+    """warp: (N,) of each ray, 0 to W - 1, ascending, 32 rays at most in one; fetches: of the rays in that order.
+
+    What misses in the L1s, one an SM. Warps go to the SMs by turns; an SM has so many slots, and a warp begins when one is
     free. In each round every lane of a warp makes its next fetch, and each line that they touch is asked for once: nothing waits
     for memory, so that the order of warps is that of their lengths."""
     cpu = start("cpu")
     # In one memory the primitives stand behind the nodes.
-    space, node = int(PRIMITIVE_SPACE), warps.address < int(PRIMITIVE_SPACE)
-    behind = LINE * -(-int((warps.address + warps.size)[node].max(initial=0)) // LINE)
-    address = np.where(node, warps.address, warps.address - space + behind)
-    touched = (address + warps.size - 1) // LINE - address // LINE + 1
-    count = int(warps.warp[-1]) + 1 if len(warps.warp) else 0
-    warp_first = np.searchsorted(warps.warp, np.arange(count + 1))
-    most = np.diff(np.concatenate([[0], np.cumsum(touched)])[warps.first[warp_first]])  # lines, a warp
+    space, node = int(PRIMITIVE_SPACE), fetches.address < int(PRIMITIVE_SPACE)
+    behind = LINE * -(-int((fetches.address + fetches.size)[node].max(initial=0)) // LINE)
+    address = np.where(node, fetches.address, fetches.address - space + behind)
+    touched = (address + fetches.size - 1) // LINE - address // LINE + 1
+    count = int(warp[-1]) + 1 if len(warp) else 0
+    warp_first = np.searchsorted(warp, np.arange(count + 1))
+    most = np.diff(np.concatenate([[0], np.cumsum(touched)])[fetches.first[warp_first]])  # lines, a warp
     room = np.concatenate([[0], np.cumsum([int(most[sm::sms].sum()) for sm in range(sms)])])
     trace = Trace()
     trace.sms, trace.slots = sms, slots
-    trace.warp_first, trace.first = upload(warp_first, wp.int64, cpu), upload(warps.first, wp.int64, cpu)
-    trace.address, trace.size = upload(address, wp.int64, cpu), upload(warps.size, wp.int64, cpu)
+    trace.warp_first, trace.first = upload(warp_first, wp.int64, cpu), upload(fetches.first, wp.int64, cpu)
+    trace.address, trace.size = upload(address, wp.int64, cpu), upload(fetches.size, wp.int64, cpu)
     out = Missed()
     out.room = upload(room, wp.int64, cpu)
     out.line, out.time, out.lanes = (wp.empty(int(room[-1]), dtype=wp.int64, device=cpu) for _ in range(3))

@@ -6,9 +6,9 @@ Read from the binary, without a GPU. The counts are static: of the code that the
 from __future__ import annotations
 
 import tempfile
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.study.unit_probes import make_box_probe, make_triangle_probe, numbers_of
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
-from wrt.lab.bench.report import table
+from wrt.lab.bench.report import Columns, Part, Row, tabled
 from wrt.lab.rtcore.cubin import CLASSES, INSTRUCTION, KernelCode, read_cubin
 
 ARCH = 75
@@ -94,19 +94,15 @@ Static counts of the code that there is: the watertight test refuses most triang
 rate of fp32 on Turing. Fetching the box or the triangle, the stack and the loop are left out."""
 
 
-def unit_table(rows: Sequence[UnitCode]) -> str:
-    shown = [name for name in (*CLASSES, "other") if any(abs(row.classes[name]) > 0.01 for row in rows)]
-    return table(("unit", "test", "instructions", *shown), [
-        (row.unit, row.test, f"{row.instructions:.0f}", *(f"{row.classes[name]:.0f}" for name in shown)) for row in rows])
-
-
-def traversal_table(codes: dict[str, KernelCode]) -> str:
-    rows = []
-    for name, code in codes.items():
-        classes: Counter[str] = code.classes()
-        rows.append((name, f"{code.registers}", f"{code.stack}", f"{len(code.opcodes()) * INSTRUCTION}",
-                     *(f"{classes[each]}" for each in (*CLASSES, "other"))))
-    return table(("closest hit", "registers", "stack bytes", "code bytes", *CLASSES, "other"), rows)
+def tables(units: Sequence[UnitCode], codes: dict[str, KernelCode]) -> list[Part]:
+    shown = [name for name in (*CLASSES, "other") if any(abs(unit.classes[name]) > 0.01 for unit in units)]
+    lines = [(name, str(code.registers), str(code.stack), str(len(code.opcodes()) * INSTRUCTION),
+              *(str(code.classes()[each]) for each in (*CLASSES, "other"))) for name, code in codes.items()]
+    return [
+        tabled({"unit": "{unit}", "test": "{test}", "instructions": lambda unit: f"{unit.instructions:.0f}",
+                **{name: f"{{classes[{name}]:.0f}}" for name in shown}}, units),
+        Part("", "", ("closest hit", "registers", "stack bytes", "code bytes", *CLASSES, "other"), lines),
+        Part("", SOFTWARE_LEGEND)]
 
 
 # --- what software needs for the same rays ----------------------------------------------------------------------------
@@ -115,31 +111,24 @@ LANES_PER_SECOND = 28 * 128 * 1.582e9  # GTX 1080 Ti: instructions of a lane, se
 CLAIMED = 1.1e9  # rays a second that NVIDIA says it traces
 
 
-@dataclass(frozen=True)
-class Software:
-    """instructions: of both units, a ray; busy: SIMT efficiency; rays_per_second: at most, of a GTX 1080 Ti that does nothing
-    else; share: of the instructions that its claimed rays leave for each ray, lanes that wait counted in."""
-
-    name: str
-    instructions: float
-    busy: float
-
-    @property
-    def rays_per_second(self) -> float:
-        return LANES_PER_SECOND * self.busy / self.instructions
-
-    @property
-    def share(self) -> float:
-        return CLAIMED / self.rays_per_second
+@cache
+def default_units() -> tuple[UnitCode, UnitCode]:
+    """Compiles them for Turing."""
+    return box_unit("conservative"), triangle_unit("watertight")
 
 
-def software(name: str, boxes: float, triangles: float, busy: float, codes: tuple[UnitCode, UnitCode]) -> Software:
-    """boxes, triangles: tests a ray; codes: of the box unit and of the triangle unit. The triangle test is counted as a whole,
-    although most triangles are refused early: an upper bound; fetching, stack and loop are not: together a rough figure."""
-    return Software(name, boxes * codes[0].instructions + triangles * codes[1].instructions, busy)
+def software(name: str, boxes: float, triangles: float, busy: float) -> Row:
+    """boxes, triangles: tests a ray, by the default units; busy: SIMT efficiency. Gives instructions of both units, a ray;
+    rays_per_second: at most, of a GTX 1080 Ti that does nothing else; share: of the instructions that its claimed rays leave for
+    each ray, lanes that wait counted in. The triangle test is counted as a whole, although most triangles are
+    refused early: an upper bound; fetching, stack and loop are not: together a rough figure."""
+    box, triangle = default_units()
+    instructions = boxes * box.instructions + triangles * triangle.instructions
+    speed = LANES_PER_SECOND * busy / instructions
+    return Row(name=name, instructions=instructions, busy=busy, rays_per_second=speed, share=CLAIMED / speed)
 
 
-def software_table(rows: Sequence[Software]) -> str:
-    columns = ("rays", "instructions", "SIMT", "of a lane, with those that wait", "of what 1.1 Grays/s leave", "Grays/s at most")
-    return table(columns, [(row.name, f"{row.instructions:.0f}", f"{row.busy:.0%}", f"{row.instructions / row.busy:.0f}",
-                            f"{row.share:.0%}", f"{row.rays_per_second / 1e9:.2f}") for row in rows])
+SOFTWARE: Columns = {
+    "rays": "{name}", "instructions": "{instructions:.0f}", "SIMT": "{busy:.0%}",
+    "of a lane, with those that wait": lambda row: f"{row.instructions / row.busy:.0f}",
+    "of what 1.1 Grays/s leave": "{share:.0%}", "Grays/s at most": lambda row: f"{row.rays_per_second / 1e9:.2f}"}

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,59 +14,21 @@ from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.bvh.wide import WideBvh
 from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.html import Rows
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench import report
-from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
-from wrt.lab.bench.report import Part, check_plan, gathered
-from wrt.lab.rtcore.instructions import Software, box_unit, software, triangle_unit
-from wrt.lab.rtcore.model import Work, simt, trace_rays
+from wrt.lab.bench.rays import RaySet, ray_sets
+from wrt.lab.bench.report import Columns, Part, Row, grouped, tabled
+from wrt.lab.bench.report import run as run
+from wrt.lab.plans import RtCore as Plan
+from wrt.lab.rtcore.instructions import SOFTWARE, software
+from wrt.lab.rtcore.model import LEGEND as LEGEND
+from wrt.lab.rtcore.model import MODEL_COLUMNS, Work, model_row, parameters, simt, trace_rays
 from wrt.lab.rtcore.parameters import GPUS
-from wrt.lab.rtcore.report import COLUMNS, ModelRow, cells, model_row
 from wrt.lab.rtcore.warps import WARP, blocks
-from wrt.scene.mesh import Mesh
-
-
-@dataclass(frozen=True)
-class Plan:
-    """meshes: Meshes or files; structures: names (none: all BVHs of the registry); kinds: of ray; rays: of each kind; gpu: a name
-    in GPUS; inside: the camera is in a room. Raises InputError."""
-
-    meshes: Sequence[Mesh | str | Path]
-    structures: Sequence[str] = ()
-    kinds: Sequence[str] = ("primary", "diffuse")
-    rays: int = 2**16
-    gpu: str = "rtx2080ti"
-    seed: int = 0
-    inside: bool = False
-
-    def __post_init__(self) -> None:
-        check_plan(self, {"structure": (self.structures, ACCELERATORS), "kind of ray": (self.kinds, RAY_KINDS),
-                          "GPU": ([self.gpu], GPUS)}, rays=(1, 2**22))
-
-    @property
-    def names(self) -> list[str]:
-        """Structures, each once."""
-        return list(dict.fromkeys(self.structures)) or bvhs()
 
 
 def bvhs() -> list[str]:
     """Every BVH of the registry by its own name: what is built from a binary tree."""
     return [name for name, cls in ACCELERATORS.items() if name == cls.name and issubclass(cls, Bvh2 | WideBvh)]
-
-
-@dataclass(frozen=True)
-class Row:
-    """One mesh, structure and kind of ray; row: what the model says; bytes: of the structure."""
-
-    mesh: str
-    triangles: int
-    structure: str
-    bytes: int
-    row: ModelRow
-
-    def as_dict(self) -> dict[str, object]:
-        return {**{name: getattr(self, name) for name in ("mesh", "triangles", "structure", "bytes")}, **self.row.as_dict()}
 
 
 def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
@@ -88,56 +50,41 @@ def work_of(accel: Accelerator, rays: RaySet) -> Work:
     return trace_rays(accel, rays.kind, rays.origins, rays.directions, t_max=rays.t_max)
 
 
-def run(plan: Plan, tell: Callable[[Row], None] = lambda row: None) -> Rows[Row]:
-    """Every row in turn; `tell` gets each when it is there. Raises InputError for a mesh that cannot be read."""
-    rows = (row for mesh in map(as_mesh, plan.meshes) for row in _mesh_rows(plan, mesh))
-    return Rows(gathered(rows, tell), lambda rows: report.page(parts(rows)))
-
-
-def _mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
-    mesh_name, geometry = Path(mesh.name or "mesh").name, Geometry.of(mesh)
-    sets = None
-    for name in plan.names:
-        accel = build(geometry, name)
-        sets = sets or in_warps(accel, ray_sets(accel, plan.rays, plan.seed, plan.inside))
-        for kind in plan.kinds:
-            rays = sets[kind]
-            work = work_of(accel, rays)
-            efficiencies = simt(work.counters.counts, work.warp, rays.origins, rays.directions)
-            yield Row(mesh_name, len(geometry), name, accel.stats.bytes, model_row(work, GPUS[plan.gpu], efficiencies))
-
-
-MESH_COLUMNS = ("structure", "kind", "B/triangle", *COLUMNS[1:], "SIMT", "sorted")
-
-
-def line(row: Row) -> str:
-    """For the progress."""
-    return "  ".join((row.mesh, row.structure, *cells(row.row)))
-
-
-def parts(rows: Sequence[Row]) -> list[Part]:
-    """A table for each mesh, with the structures' memory."""
-    out = []
-    for mesh in dict.fromkeys(row.mesh for row in rows):
-        group = [row for row in rows if row.mesh == mesh]
-        out.append(Part(f"{mesh}, {group[0].triangles} triangles", "", MESH_COLUMNS, [
-            (row.structure, row.row.name, f"{row.bytes / row.triangles:.0f}", *cells(row.row)[1:],
-             *(f"{row.row.simt[name]:.0%}" for name in ("as they come", "sorted"))) for row in group]))
-    return out
-
-
-def markdown(rows: Sequence[Row]) -> str:
-    return report.markdown(parts(rows))
-
-
+TITLE = "The model of the RT core on meshes"
+COLUMNS: Columns = {
+    "structure": "{structure}", "kind": "{name}", "B/triangle": lambda row: f"{row.bytes / row.mesh_triangles:.0f}",
+    **{head: column for head, column in MODEL_COLUMNS.items() if head != "rays"},
+    "SIMT": "{simt_efficiency[as they come]:.0%}", "sorted": "{simt_efficiency[sorted]:.0%}"}
 SOFTWARE_TITLE = """\
-## In software, on a GTX 1080 Ti (28 SMs x 128 lanes, 1.582 GHz; 1.1 Grays/s claimed: 5154 instructions of a lane a ray)
-
-Instructions of the default box test and triangle test alone, as they stand in the code for Turing."""
+In software, on a GTX 1080 Ti (28 SMs x 128 lanes, 1.582 GHz; 1.1 Grays/s claimed: 5154 instructions of a lane a ray)"""
 
 
-def in_software(rows: Sequence[Row]) -> list[Software]:
-    """What the rays of these rows take in software; compiles the default units for Turing."""
-    codes = box_unit("conservative"), triangle_unit("watertight")
-    return [software(f"{row.mesh} {row.structure} {row.row.name}", row.row.boxes, row.row.triangles, row.row.simt["as they come"],
-                     codes) for row in rows]
+def rows(plan: Plan) -> Iterator[Row]:
+    for mesh in map(as_mesh, plan.meshes):
+        geometry, sets = Geometry.of(mesh), None
+        for name in dict.fromkeys(plan.structures) or bvhs():
+            accel = build(geometry, name)
+            sets = sets or in_warps(accel, ray_sets(accel, plan.rays, plan.seed, plan.inside))
+            for rays in (sets[kind] for kind in plan.kinds):
+                work = work_of(accel, rays)
+                efficiencies = simt(work.counters.counts, work.warp, rays.origins, rays.directions)
+                yield model_row(work, GPUS[plan.gpu], efficiencies, mesh=Path(mesh.name or "mesh").name,
+                                mesh_triangles=len(geometry), structure=name, bytes=accel.stats.bytes)
+
+
+def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
+    """A table for each mesh, with the structures' memory; the parameters; and what software takes, if that is asked for."""
+    out = [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles")
+           for (mesh, triangles), group in grouped(rows, "mesh", "mesh_triangles").items()]
+    told = "Instructions of the default box test and triangle test alone, as they stand in the code for Turing."
+    return [*out, parameters(), *([tabled(SOFTWARE, in_software(rows), SOFTWARE_TITLE, told)] if plan.software else [])]
+
+
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
+    return {"software": [row.as_dict() for row in in_software(rows)] if plan.software else []}
+
+
+def in_software(rows: Sequence[Row]) -> list[Row]:
+    """What the rays of these rows take in software."""
+    return [software(f"{row.mesh} {row.structure} {row.name}", row.boxes, row.triangles, row.simt_efficiency["as they come"])
+            for row in rows]

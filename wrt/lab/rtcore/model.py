@@ -7,7 +7,7 @@ never published: what comes out is a range over assumptions, for orderings and s
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -19,8 +19,9 @@ from wrt.accel.answers import Counters
 from wrt.accel.base import Accelerator
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
-from wrt.lab.rtcore.caches import LINE, Level1, Misses, Warps, first_level, second_level
-from wrt.lab.rtcore.parameters import BASE, SWEEPS, Core, Gpu
+from wrt.lab.bench.report import Columns, Part, Row, tabled, tables_page
+from wrt.lab.rtcore.caches import LINE, Misses, first_level, second_level
+from wrt.lab.rtcore.parameters import BASE, PARAMETERS, SWEEPS, Core, Gpu
 from wrt.lab.rtcore.warps import by_coherence, efficiency, longest_of, packed
 
 TERMS = ("box", "triangle", "L1", "L2", "DRAM", "latency")
@@ -52,50 +53,23 @@ class Work:
 
     def misses(self, gpu: Gpu, core: Core) -> Misses:
         """What misses in the caches of that GPU."""
-        key = (gpu.sms, gpu.l1, gpu.l2, core.warps, core.warm)
+        above = (gpu.sms, core.warps, gpu.l1)
+        if above not in self._simulated:
+            self._simulated[above] = first_level(self.warp, self.counters, *above)
+        key = (*above, gpu.l2, core.warm)
         if key not in self._simulated:
-            self._simulated[key] = second_level(self._first_level(gpu, core), gpu.l2, core.warm)
-        return self._simulated[key]
-
-    def _first_level(self, gpu: Gpu, core: Core) -> Level1:
-        key = (gpu.sms, gpu.l1, core.warps)
-        if key not in self._simulated:
-            c = self.counters
-            self._simulated[key] = first_level(Warps(self.warp, c.first, c.address, c.size), gpu.sms, core.warps, gpu.l1)
+            self._simulated[key] = second_level(self._simulated[above], gpu.l2, core.warm)
         return self._simulated[key]
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """terms: clocks a ray and RT core that each part needs, by TERMS; gpu, core: what they were reckoned for."""
-
-    work: str
-    gpu: Gpu
-    core: Core
-    terms: dict[str, float]
+class Prediction(Row):
+    """clocks: a ray and RT core, that each part needs, by TERMS; limit: the part that needs most; utilisation: how busy each is
+    while that one is at its limit, 0 to 1; rays_per_second; work, gpu: the names of what it was reckoned for."""
 
     def _repr_html_(self) -> str:
-        busy = self.utilisation
-        rows = [(name, value, f"{busy[name]:.0%}") for name, value in self.terms.items()]
-        title = f"{self.work} on {self.gpu.name}: {self.rays_per_second / 1e9:.3g} Gray/s, bound by {self.bottleneck}"
+        title = f"{self.work} on {self.gpu}: {self.rays_per_second / 1e9:.3g} Gray/s, bound by {self.limit}"
+        rows = [(name, value, f"{self.utilisation[name]:.0%}") for name, value in self.clocks.items()]
         return html_table(title, ("part", "clocks a ray", "busy"), rows)
-
-    @property
-    def clocks(self) -> float:
-        return max(self.terms.values())
-
-    @property
-    def bottleneck(self) -> str:
-        return max(self.terms, key=lambda name: self.terms[name])
-
-    @property
-    def utilisation(self) -> dict[str, float]:
-        """How busy each part is while the busiest is at its limit, 0 to 1."""
-        return {name: value / self.clocks for name, value in self.terms.items()}
-
-    @property
-    def rays_per_second(self) -> float:
-        return self.gpu.sms * self.gpu.clock / self.clocks
 
 
 def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
@@ -111,19 +85,17 @@ def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
     fetch = core.l1_latency + l2_share * core.l2_latency + dram_share * core.dram_latency
     wait = fetches * fetch + counts["box_operations"] * core.box_latency + counts["primitives"] * core.triangle_latency
     terms = {
-        "box": boxes_of(work) / core.boxes,
+        # Where a structure has planes or cells and no boxes, their tests take the box unit instead.
+        "box": max(work.mean("boxes"), work.mean("box_operations")) / core.boxes,
         "triangle": work.mean("primitives") / core.triangles,
         "L1": misses.accesses / n / core.l1_lines,
         "L2": misses.l1 * LINE / n / core.l2_bytes,
         "DRAM": misses.l2 * LINE / n / (gpu.dram / gpu.clock / gpu.sms),
         "latency": float(longest_of(wait, work.warp).sum()) / core.warps / n,
     }
-    return Prediction(work.name, gpu, core, terms)
-
-
-def boxes_of(work: Work) -> float:
-    """Box tests a ray; where a structure has planes or cells and no boxes, their tests take the box unit instead."""
-    return max(work.mean("boxes"), work.mean("box_operations"))
+    limit = max(terms, key=lambda name: terms[name])
+    return Prediction(work=work.name, gpu=gpu.name, clocks=terms, limit=limit, rays_per_second=gpu.sms * gpu.clock / terms[limit],
+                      utilisation={name: value / terms[limit] for name, value in terms.items()})
 
 
 def sweep(work: Work, gpu: Gpu, core: Core = BASE, names: tuple[str, ...] = ("boxes", "triangles")) -> list[Prediction]:
@@ -167,3 +139,51 @@ def trace_rays(accel: Accelerator, name: str, origins: np.ndarray, directions: n
     counters = accel.closest_hit(origins, directions, t_max=t_max, trace=True).counters
     assert counters is not None
     return Work(name, counters, packed(len(origins)) if warp is None else warp)
+
+
+# --- as rows of tables ------------------------------------------------------------------------------------------------
+
+RANGE = ("boxes", "triangles", "warps")  # what the reported range is swept over
+def term(name: str) -> Callable[[Row], str]:
+    return lambda row: f"{row.clocks[name]:.3g} ({row.utilisation[name]:.0%})"
+
+
+MODEL_COLUMNS: Columns = {
+    "rays": "{name}", "nodes": "{nodes:.1f}", "boxes": "{boxes:.1f}", "triangles": "{triangles:.1f}", "lines": "{lines:.1f}",
+    **{name: term(name) for name in TERMS}, "limit": "{limit}", "Grays/s": lambda row: f"{row.rays_per_second / 1e9:.2f}",
+    "range": lambda row: f"{row.low / 1e9:.2f} to {row.high / 1e9:.2f}",
+    "moved most by": lambda row: ", ".join(f"{name} {factor:.2g}x" for name, factor in list(row.factors.items())[:2])}
+SIMT_COLUMNS: Columns = {
+    "rays": "{name}", **{name: f"{{simt_efficiency[{name}]:.0%}}" for name in ("as they come", "packed", "sorted")}}
+PARAMETER_COLUMNS: Columns = {"parameter": "{name}", "value": "{value}", "status": "{status}", "swept over": "{range}",
+                              "source": "{source}"}
+LEGEND = f"""\
+nodes, boxes, triangles: a ray; lines: cache lines a ray that its warp asks for. {", ".join(TERMS)}: clocks a ray and RT core that
+each part needs by itself, and in brackets how busy it is while the slowest (limit) is at its limit. Grays/s: with the assumptions
+of the table of parameters (4 boxes or 1 triangle a clock, 4 warps at a time, L2 empty); range: over {", ".join(RANGE)} =
+{"; ".join(", ".join(f"{value:g}" for value in SWEEPS[name]) for name in RANGE)}. moved most by: the assumptions that move the
+Grays/s most when each is swept alone, with the factor from the least to the most. None of this is a measurement: Turing's rates
+and its node format were never published."""
+
+
+def model_row(work: Work, gpu: Gpu, simt: dict[str, float], **facts: Any) -> Row:
+    """Everything that the model says of this work: clocks, limit, utilisation and rays_per_second with the basic assumptions; low,
+    high: rays a second over RANGE; factors: of each assumption alone; nodes, boxes, triangles, lines: a ray. simt: as
+    wrt.lab.rtcore.model.simt gives it; facts: more that is known of it."""
+    prediction = vars(predict(work, gpu))
+    low, high = span(sweep(work, gpu, names=RANGE))
+    return Row(**facts, **{name: value for name, value in prediction.items() if name != "work"}, name=work.name, rays=len(work),
+               nodes=work.mean("nodes"), boxes=work.mean("boxes"), triangles=work.mean("primitives"),
+               lines=work.misses(gpu, BASE).accesses / len(work), low=low, high=high, factors=sensitivity(work, gpu),
+               simt_efficiency=simt)
+
+
+def model_page(rows: Sequence[Row]) -> str:
+    """Both tables as HTML."""
+    gpu = rows[0].gpu if rows else "a GPU"
+    return tables_page([tabled(MODEL_COLUMNS, rows, f"Model of {gpu}"), tabled(SIMT_COLUMNS, rows, "SIMT efficiency")])
+
+
+def parameters() -> Part:
+    """Every number that the model starts from, with its status and source."""
+    return tabled(PARAMETER_COLUMNS, PARAMETERS, "The parameters of the model")

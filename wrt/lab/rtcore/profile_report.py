@@ -1,82 +1,117 @@
-"""What `profile` reports and writes: tables, heat maps with their scale, EXR layers, histograms, and the model's summary."""
+"""What `profile` makes of the rays of a picture: the model's work, by the warps that would trace them; tables, heat maps with their
+scale, EXR layers and histograms."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from wrt.accel.answers import Counters
 from wrt.core.html import Rows
 from wrt.lab.bench.plot import histograms
-from wrt.lab.bench.report import table
-from wrt.lab.rtcore.model import simt
+from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
+from wrt.lab.rtcore.model import LEGEND, MODEL_COLUMNS, SIMT_COLUMNS, Work, model_page, model_row, simt
 from wrt.lab.rtcore.parameters import Gpu
-from wrt.lab.rtcore.profile_work import GROUPS, efficiency_rows, warp_order, work_of
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, TITLES, Profile
-from wrt.lab.rtcore.report import LEGEND, ModelRow, model_page, model_row, model_table, simt_table
+from wrt.lab.rtcore.warps import WARP, blocks
 from wrt.picture.image import write_codes, write_exr
+
+GROUPS = {"primary": ("primary",), "shadow": ("shadow",), "secondary": ("reflection", "refraction", "straight"), "all": KINDS}
+
+
+def warp_order(profile: Profile, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows in the order of warps and lanes, and the warp of each, from 0 on.
+
+    A warp is a block of 8 x 4 pixels; those of its pixels that trace a ray of the same kind and depth, the first of them, the
+    second ..., trace it together, and the lanes of the others wait.
+    """
+    rays = profile.rays
+    pixel, kind, depth = rays.pixel[rows].astype(np.int64), rays.kind[rows].astype(np.int64), rays.depth[rows].astype(np.int64)
+    deepest = int(depth.max(initial=0)) + 1
+    group = (pixel * deepest + depth) * len(KINDS) + kind
+    order = np.argsort(group, kind="stable")
+    fresh = np.ones(len(rows), bool)
+    fresh[1:] = group[order][1:] != group[order][:-1]
+    begin = np.maximum.accumulate(np.where(fresh, np.arange(len(rows)), 0))
+    turn = np.empty(len(rows), np.int64)  # how many such rays the pixel traced before
+    turn[order] = np.arange(len(rows)) - begin
+    warp, lane = blocks(*profile.size)
+    step = ((warp[pixel] * deepest + depth) * len(KINDS) + kind) * (int(turn.max(initial=0)) + 1) + turn
+    order = np.argsort(step * WARP + lane[pixel], kind="stable")
+    return rows[order], np.unique(step[order], return_inverse=True)[1]
+
+
+def work_of(profile: Profile, group: str) -> Work | None:
+    """The traced rays of a group (in GROUPS) as the model's work; None where there are none."""
+    rays = profile.rays
+    kinds = [KINDS.index(name) for name in GROUPS[group]]
+    at = np.flatnonzero(np.isin(rays.kind[rays.trace_rows], kinds))
+    if not len(at):
+        return None
+    place = np.full(len(rays), -1)
+    place[rays.trace_rows] = np.arange(len(rays.trace_rows))
+    rows, warp = warp_order(profile, rays.trace_rows[at])
+    which = place[rows]
+    first, length = rays.trace_first[which], np.diff(rays.trace_first)[which]
+    begin = np.concatenate([[0], np.cumsum(length)])
+    fetch = np.repeat(first - begin[:-1], length) + np.arange(begin[-1])
+    return Work(group, Counters(rays.counts[rows], begin, rays.address[fetch], rays.size[fetch]), warp)
+
 
 PER_RAY = ("nodes", "boxes", "primitives", "leaves", "stack", "lines")
 LAYERS, HISTOGRAMS, REPORT = "counters.exr", "histograms.png", "profile.md"
+DEPTHS: Columns = {
+    "depth": "{depth}", "kind": "{kind}", "rays": "{probes}", "hit": lambda row: f"{row.hits / row.probes:.0%}",
+    **{head: partial(lambda row, name: f"{getattr(row, name) / row.probes:.1f}", name=name) for head, name in
+       {"nodes": "nodes", "boxes": "boxes", "triangles": "primitives", "leaves": "leaves"}.items()},
+    "bytes": lambda row: f"{(row.node_bytes + row.primitive_bytes) / row.probes:.0f}",
+    "lines": lambda row: f"{row.lines / row.probes:.1f}", "stack (most)": "{stack}"}
 
 
-def ray_values(profile: Profile, name: str) -> np.ndarray:
-    return profile.rays.lines if name == "lines" else profile.rays.counts[name]
-
-
-def depth_table(profile: Profile) -> str:
-    columns = ("depth", "kind", "rays", "hit", "nodes", "boxes", "triangles", "leaves", "bytes", "lines", "stack (most)")
-    rows = []
-    for row in profile.by_depth():
-        n = row["probes"]
-        means = [f"{row[name] / n:.1f}" for name in ("nodes", "boxes", "primitives", "leaves")]
-        size = (row["node_bytes"] + row["primitive_bytes"]) / n
-        rows.append((f"{row['depth']}", row["kind"], f"{n}", f"{row['hits'] / n:.0%}", *means, f"{size:.0f}",
-                     f"{row['lines'] / n:.1f}", f"{row['stack']}"))
-    return table(columns, rows)
-
-
-def percentile_table(profile: Profile) -> str:
+def percentiles(profile: Profile) -> Part:
     """Of each counter a ray, by kind."""
-    columns = ("counter", "kind", "mean", "50%", "90%", "99%", "99.9%", "largest")
-    rows = []
+    lines = []
     for name in PER_RAY:
-        values = ray_values(profile, name)
-        for i, kind in enumerate(KINDS):
-            chosen = values[profile.rays.kind == i]
-            if len(chosen):
-                shares = np.percentile(chosen, (50, 90, 99, 99.9))
-                rows.append((TITLES[name], kind, f"{chosen.mean():.1f}", *(f"{x:.0f}" for x in shares), f"{chosen.max()}"))
-    return table(columns, rows)
+        for kind, values in by_kind(profile, name).items():
+            shares = np.percentile(values, (50, 90, 99, 99.9))
+            lines.append((TITLES[name], kind, f"{values.mean():.1f}", *(f"{x:.0f}" for x in shares), f"{values.max()}"))
+    return Part("What a ray costs", "", ("counter", "kind", "mean", "50%", "90%", "99%", "99.9%", "largest"), lines)
 
 
-def model_rows(profile: Profile, gpu: Gpu) -> Rows[ModelRow]:
+def by_kind(profile: Profile, name: str) -> dict[str, np.ndarray]:
+    """A counter of all rays, of the kinds that there are."""
+    values = profile.rays.lines if name == "lines" else profile.rays.counts[name]
+    return {kind: values[profile.rays.kind == i] for i, kind in enumerate(KINDS) if (profile.rays.kind == i).any()}
+
+
+def model_rows(profile: Profile, gpu: Gpu) -> Rows[Row]:
     """The model on the rays that were traced, by group; SIMT efficiency on all of them."""
     rows = []
     for group in GROUPS:
         work = work_of(profile, group)
         if work is None:
             continue
-        order, warp = warp_order(profile, efficiency_rows(profile, group))
+        every = np.flatnonzero(np.isin(profile.rays.kind, [KINDS.index(name) for name in GROUPS[group]]))  # traced or not
+        order, warp = warp_order(profile, every)
         chosen = profile.rays.rays[order]
         rows.append(model_row(work, gpu, simt(profile.rays.counts[order], warp, chosen["origin"], chosen["direction"])))
     return Rows(rows, model_page)
 
 
-def summary(profile: Profile, rows: Sequence[ModelRow], gpu: Gpu) -> str:
-    rays = profile.rays
-    traced = len(rays.trace_rows) / max(len(rays), 1)
+def summary(profile: Profile, rows: Sequence[Row], gpu: Gpu) -> str:
+    rays, stats = profile.rays, profile.accel.stats
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in profile.seconds.items())
-    stats = profile.accel.stats
-    return "\n\n".join([
-        f"{profile.scene}: {profile.size[0]}x{profile.size[1]}, {profile.spp} spp, {len(rays)} rays; {profile.accel.name} over"
-        f" {len(profile.accel.geometry)} primitives, {stats.nodes} nodes, {stats.bytes / 1e6:.1f} MB; seconds: {seconds}",
-        "## Rays by depth and kind (means a ray)", depth_table(profile), "## What a ray costs", percentile_table(profile),
-        f"## Model of {gpu.name} ({traced:.0%} of the rays, in whole tiles)", model_table(rows), LEGEND,
-        "## SIMT efficiency: warps of 8 x 4 pixels as they come, without gaps, and sorted by origin and direction",
-        simt_table(rows)])
+    told = (f"{profile.scene}: {profile.size[0]}x{profile.size[1]}, {profile.spp} spp, {len(rays)} rays; {profile.accel.name} over"
+            f" {len(profile.accel.geometry)} primitives, {stats.nodes} nodes, {stats.bytes / 1e6:.1f} MB; seconds: {seconds}")
+    traced = f"{len(rays.trace_rows) / max(len(rays), 1):.0%} of the rays, in whole tiles"
+    return markdown([
+        Part("", told), tabled(DEPTHS, [Row(**row) for row in profile.by_depth()], "Rays by depth and kind (means a ray)"),
+        percentiles(profile), tabled(MODEL_COLUMNS, rows, f"Model of {gpu.name} ({traced})"), Part("", LEGEND),
+        tabled(SIMT_COLUMNS, rows, "SIMT efficiency",
+               "Warps of 8 x 4 pixels as they come, without gaps, and sorted by origin and direction.")])
 
 
 def write_report(profile: Profile, text: str, folder: Path) -> list[Path]:
@@ -88,8 +123,7 @@ def write_report(profile: Profile, text: str, folder: Path) -> list[Path]:
             write_codes(paths[-1], np.asarray(profile.heatmap(name)))
     write_exr(folder / LAYERS, {name: profile.maps[name].astype(np.float32) for name in PICTURES},
               {"scene": profile.scene, "spp": profile.spp})
-    kinds: dict[str, Any] = {TITLES[name]: {kind: ray_values(profile, name)[profile.rays.kind == i] for i, kind in enumerate(KINDS)
-                                            if (profile.rays.kind == i).any()} for name in PER_RAY}
+    kinds = {TITLES[name]: by_kind(profile, name) for name in PER_RAY}
     write_codes(folder / HISTOGRAMS, histograms(kinds, f"{profile.scene}: what a ray costs, and the share of rays that cost it"))
-    (folder / REPORT).write_text(f"# Profile of {text}\n", encoding="utf-8")
+    (folder / REPORT).write_text(f"# Profile of {text}", encoding="utf-8")
     return [*paths, folder / LAYERS, folder / HISTOGRAMS, folder / REPORT]

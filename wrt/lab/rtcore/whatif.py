@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,48 +16,115 @@ import numpy as np
 from wrt.accel.answers import Counters
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build
+from wrt.accel.built import Built
+from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.geometry import Geometry
-from wrt.core.html import Rows, html_table
+from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.kernels.study.bvh2_study import STACK_SIZE, Study
-from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
-from wrt.lab.bench.report import check_plan, gathered, table
+from wrt.kernels.study.bvh2_study import LEVELS, STACK_SIZE, Study
+from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.lab.bench.rays import RaySet, ray_sets
+from wrt.lab.bench.report import Columns, Part, Row, cells, tabled
+from wrt.lab.bench.report import run as run
+from wrt.lab.plans import WhatIf as Plan
 from wrt.lab.rtcore.meshes import bvhs, in_warps
-from wrt.lab.rtcore.model import TERMS, Prediction, Work, predict, simt
-from wrt.lab.rtcore.parameters import BASE, GPUS, SWEEPS, Core, Gpu
+from wrt.lab.rtcore.model import TERMS, Work, predict, simt, variants
+from wrt.lab.rtcore.parameters import BASE, GPUS, Gpu
 from wrt.lab.rtcore.warps import by_coherence, packed
-from wrt.lab.rtcore.whatif_structures import base, resized, with_planes, with_traversal
-from wrt.scene.mesh import Mesh
+
+FRAME_BYTES = 16  # of a node with quantised planes: its corner (12) and an exponent of the step for each axis
+REFERENCE_BYTES = 16  # of a binary node, as Bvh2Node has them
+
+
+@cache
+def studied(study: Study) -> type[Bvh2]:
+    """The structure class whose kernels are those of a study."""
+    return type("Bvh2Study", (Bvh2,), {"kernels": study, "__doc__": Bvh2.__doc__})
+
+
+def with_traversal(accel: Accelerator, study: Study) -> Accelerator:
+    """The same tree, walked otherwise. Raises InputError where it is too deep for a trail."""
+    if study.entries < STACK_SIZE and accel.stats.depth > LEVELS:
+        raise InputError(f"the tree is {accel.stats.depth} deep: more than the {LEVELS} levels that a restart trail has bits for")
+    return studied(study).restore(accel.built, accel.geometry)
+
+
+def quantised(lo: np.ndarray, hi: np.ndarray, bits: int, reference_bytes: int = REFERENCE_BYTES
+              ) -> tuple[np.ndarray, np.ndarray, int]:
+    """Planes of so many bits in the frame of their node: its lowest corner, and for each axis a step that is a power of two, as
+    in compressed wide BVHs (Ylitie, Karras and Laine 2017, section 3.1). lo, hi: (N, C, 3) float32, of C children; empty
+    ones (lo = inf) stay as they are. Gives the boxes as they come out of their few bits, and the bytes of a node.
+
+    Rounded outwards, and moved one step on where float32 arithmetic would still cut something off: no box shrinks.
+    """
+    empty = ~(lo <= hi).all(axis=2, keepdims=True)
+    low = np.where(empty, np.inf, lo).min(axis=1, keepdims=True)
+    high = np.where(empty, -np.inf, hi).max(axis=1, keepdims=True)
+    origin = np.where(np.isfinite(low), low, 0.0).astype(np.float32)
+    extent = np.where(np.isfinite(high - low), high.astype(np.float64) - low, 0.0)
+    # One step to spare, for planes that have to move on.
+    step = np.exp2(np.ceil(np.log2(np.maximum(extent / ((1 << bits) - 2), 2.0**-100)))).astype(np.float32)
+
+    def plane(code: np.ndarray) -> np.ndarray:
+        return origin + code.astype(np.float32) * step
+
+    with np.errstate(invalid="ignore"):
+        below = np.clip(np.floor((lo.astype(np.float64) - origin) / step), 0, (1 << bits) - 1)
+        above = np.clip(np.ceil((hi.astype(np.float64) - origin) / step), 0, (1 << bits) - 1)
+        below -= (plane(below) > lo) & (below > 0)
+        above += (plane(above) < hi) & (above < (1 << bits) - 1)
+    out_lo, out_hi = np.where(empty, lo, plane(below)), np.where(empty, hi, plane(above))
+    size = -(-lo.shape[1] * 6 * bits // 8) + FRAME_BYTES + reference_bytes
+    return out_lo.astype(np.float32), out_hi.astype(np.float32), size
+
+
+def with_planes(accel: Accelerator, bits: int) -> tuple[Accelerator, int]:
+    """The same tree with planes of so many bits, and the bytes of a node."""
+    nodes = accel.built.arrays["nodes"].copy()
+    lo, hi = (np.stack([nodes[f"{end}_{side}"] for side in (0, 1)], axis=1) for end in ("lo", "hi"))
+    lo, hi, size = quantised(lo, hi, bits)
+    for side in (0, 1):
+        nodes[f"lo_{side}"], nodes[f"hi_{side}"] = lo[:, side], hi[:, side]
+    built: Built = replace(accel.built, arrays={**accel.built.arrays, "nodes": nodes})
+    return Bvh2.restore(built, accel.geometry), size
+
+
+def resized(counters: Counters, before: int, after: int) -> Counters:
+    """The same fetches from nodes of another size."""
+    node = counters.address < int(PRIMITIVE_SPACE)
+    counts: Any = counters.counts.copy()
+    counts["node_bytes"] = counts["nodes"] * after
+    return Counters(counts, counters.first, np.where(node, counters.address // before * after, counters.address),
+                    np.where(node, after, counters.size))
+
+
+def base(geometry: Geometry) -> Accelerator:
+    """The binary BVH that all studies start from."""
+    return Bvh2(geometry)
+
 
 MANY_WARPS = replace(BASE, warps=32, warm=True)  # beside BASE: where latency is hidden and the L2 full, units and lines decide
 ENTRIES = (STACK_SIZE, 8, 4, 2, 1, 0)
 BITS = (16, 8, 6, 4)
-COLUMNS = ("variant", "rays", "B/node", "nodes", "boxes", "triangles", "B/ray", "lines", "L1 missed", "SIMT",
-           f"Grays/s, {BASE.warps} warps", "limit", f"Grays/s, {MANY_WARPS.warps} warps", "limit", "differ")
+TITLE = "What if"
+COLUMNS: Columns = {
+    "variant": "{variant}", "rays": "{kind}", "B/node": "{node_bytes}", "nodes": "{nodes:.1f}", "boxes": "{boxes:.1f}",
+    "triangles": "{triangles:.1f}", "B/ray": "{bytes:.0f}", "lines": "{lines:.1f}", "L1 missed": "{l1_missed:.0%}",
+    "SIMT": "{simt:.0%}", f"Grays/s, {BASE.warps} warps": lambda row: f"{row.few_warps.rays_per_second / 1e9:.2f}",
+    f"limit, {BASE.warps} warps": "{few_warps.limit}",
+    f"Grays/s, {MANY_WARPS.warps} warps": lambda row: f"{row.many_warps.rays_per_second / 1e9:.2f}",
+    f"limit, {MANY_WARPS.warps} warps": "{many_warps.limit}", "differ": "{differ}"}
+RATES: Columns = {
+    "structure": "{structure}", "rays": "{kind}", "boxes a clock": "{boxes:g}", "triangles a clock": "{triangles:g}",
+    "Grays/s": lambda row: f"{row.rays_per_second / 1e9:.2f}", "limit": "{limit}",
+    **{name: f"{{clocks[{name}]:.3g}}" for name in TERMS}, "twice the triangles": "{doubled:.2f}x"}
 LEGEND = f"""\
 nodes, boxes, triangles: a ray; B/ray: fetched, of nodes and triangles; lines: cache lines a ray that its warp asks for; L1 missed:
 of those. SIMT: share of the lanes' time that rays use. Grays/s: of the model with {BASE.boxes:g} boxes and {BASE.triangles:g}
 triangle a clock: with {BASE.warps} warps at a time in each RT core and an empty L2, and with {MANY_WARPS.warps} and an L2 that has
 seen the same rays before; limit: the term that decides. A model's numbers, for comparing variants. differ: rays with another hit
-than the first variant's; must be 0."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """study: a name in STUDIES; mesh: a Mesh or a file; kinds of ray, rays of each, gpu: a name in GPUS; inside: the camera is in
-    a room. Raises InputError."""
-
-    study: str
-    mesh: Mesh | str | Path
-    kinds: Sequence[str] = ("primary", "diffuse")
-    rays: int = 2**15
-    gpu: str = "rtx2080ti"
-    seed: int = 0
-    inside: bool = False
-
-    def __post_init__(self) -> None:
-        check_plan(self, {"study": ([self.study], STUDIES), "kind of ray": (self.kinds, RAY_KINDS), "GPU": ([self.gpu], GPUS)},
-                   rays=(1, 2**22))
+than the first variant's; must be 0. Of the study of rates: clocks a ray and RT core of each part, with {MANY_WARPS.warps} warps at
+a time and an L2 that has seen the same rays before; twice the triangles: rays a second with twice that rate, over these."""
 
 
 @dataclass(frozen=True)
@@ -69,30 +137,6 @@ class Variant:
     prim_id: np.ndarray
     t: np.ndarray
     counters: Counters
-
-
-@dataclass(frozen=True)
-class Row:
-    """One variant with one kind of ray; few, many: the model's predictions with BASE's warps and with MANY_WARPS."""
-
-    variant: str
-    kind: str
-    node_bytes: int
-    nodes: float
-    boxes: float
-    triangles: float
-    bytes: float
-    lines: float
-    l1_missed: float
-    simt: float
-    few: Prediction
-    many: Prediction
-    differ: int
-
-    def as_dict(self) -> dict[str, Any]:
-        plain = {name: value for name, value in vars(self).items() if name not in ("few", "many")}
-        return plain | {f"{name}_warps": {"rays_per_second": p.rays_per_second, "limit": p.bottleneck, "clocks": p.terms}
-                        for name, p in (("few", self.few), ("many", self.many))}
 
 
 def traced(name: str, accel: Accelerator, rays: RaySet, node_bytes: tuple[int, int] | None = None) -> Variant:
@@ -152,100 +196,62 @@ def sorting(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
         yield replace(variant, prim_id=variant.prim_id[back], t=variant.t[back])
 
 
+def rates(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
+    """Box rate against triangle rate: every BVH of the registry, and no new rays, only the model."""
+    yield from width(geometry, rays)
+
+
 STUDIES: dict[str, Callable[[Geometry, RaySet], Iterator[Variant]]] = {
-    "width": width, "stack": stack, "planes": planes, "order": order, "sorting": sorting}
+    "width": width, "stack": stack, "planes": planes, "order": order, "sorting": sorting, "rates": rates}
 
 
-def run(plan: Plan, tell: Callable[[Row], None] = lambda row: None) -> Rows[Row]:
-    """All rows of a study; `tell` gets each when it is there. Raises InputError for a mesh that cannot be read."""
-    return Rows(gathered(_rows(plan), tell), lambda rows: html_table(f"What if: {plan.study}", COLUMNS, map(cells, rows)))
-
-
-def _rows(plan: Plan) -> Iterator[Row]:
-    geometry, sets = rays_of(plan)
+def rows(plan: Plan) -> Iterator[Row]:
+    geometry = Geometry.of(as_mesh(plan.mesh))
+    tree = base(geometry)
+    sets = in_warps(tree, ray_sets(tree, plan.rays, plan.seed, plan.inside))
     for kind in dict.fromkeys(plan.kinds):
         first = None
         for variant in STUDIES[plan.study](geometry, sets[kind]):
             first = first or variant
-            yield row_of(variant, first, kind, GPUS[plan.gpu])
-
-
-def rays_of(plan: Plan) -> tuple[Geometry, dict[str, RaySet]]:
-    geometry = Geometry.of(as_mesh(plan.mesh))
-    tree = base(geometry)
-    return geometry, in_warps(tree, ray_sets(tree, plan.rays, plan.seed, plan.inside))
+            if plan.study == "rates":
+                yield from rate_rows(variant, kind, GPUS[plan.gpu])
+            else:
+                yield row_of(variant, first, kind, GPUS[plan.gpu])
 
 
 def row_of(variant: Variant, first: Variant, kind: str, gpu: Gpu) -> Row:
     work = Work(variant.name, variant.counters, packed(len(variant.rays)))
     misses = work.misses(gpu, BASE)
     differ = (variant.prim_id != first.prim_id) | (variant.t != first.t)
-    size = work.mean("node_bytes") + work.mean("primitive_bytes")
     busy = simt(variant.counters.counts, work.warp, variant.rays.origins, variant.rays.directions)["as they come"]
-    return Row(variant.name, kind, variant.node_bytes, work.mean("nodes"), work.mean("boxes"), work.mean("primitives"), size,
-               misses.accesses / len(work), misses.l1 / max(misses.accesses, 1), busy, predict(work, gpu),
-               predict(work, gpu, MANY_WARPS), int(differ.sum()))
+    return Row(variant=variant.name, kind=kind, node_bytes=variant.node_bytes, nodes=work.mean("nodes"), boxes=work.mean("boxes"),
+               triangles=work.mean("primitives"), bytes=work.mean("node_bytes") + work.mean("primitive_bytes"),
+               lines=misses.accesses / len(work), l1_missed=misses.l1 / max(misses.accesses, 1), simt=busy,
+               differ=int(differ.sum()), few_warps=predict(work, gpu), many_warps=predict(work, gpu, MANY_WARPS))
 
 
-def cells(row: Row) -> tuple[str, ...]:
-    return (row.variant, row.kind, f"{row.node_bytes}", f"{row.nodes:.1f}", f"{row.boxes:.1f}", f"{row.triangles:.1f}",
-            f"{row.bytes:.0f}", f"{row.lines:.1f}", f"{row.l1_missed:.0%}", f"{row.simt:.0%}",
-            f"{row.few.rays_per_second / 1e9:.2f}", row.few.bottleneck, f"{row.many.rays_per_second / 1e9:.2f}",
-            row.many.bottleneck, f"{row.differ}")
+def rate_rows(variant: Variant, kind: str, gpu: Gpu) -> Iterator[Row]:
+    """Every box rate against every triangle rate, with MANY_WARPS: where latency is hidden, rates matter most. doubled: how many
+    times more rays a second with twice the triangle rate."""
+    work = Work(variant.name, variant.counters, packed(len(variant.rays)))
+    for core in variants(MANY_WARPS, ("boxes", "triangles")):
+        now, twice = predict(work, gpu, core), predict(work, gpu, replace(core, triangles=2.0 * core.triangles))
+        yield Row(structure=variant.name, kind=kind, boxes=core.boxes, triangles=core.triangles, **vars(now),
+                  doubled=twice.rays_per_second / now.rays_per_second)
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    return f"{table(COLUMNS, [cells(row) for row in rows])}\n\n{LEGEND}"
+def line(row: Row) -> str:
+    return "  ".join(cells(columns(row), row))
 
 
-# --- box rate against triangle rate: no new rays, only the model ------------------------------------------------------
+def columns(row: Row) -> Columns:
+    return RATES if "doubled" in vars(row) else COLUMNS
 
 
-@dataclass(frozen=True)
-class Rate:
-    """What the model says of one structure and kind of ray at these rates; doubled: how many times more rays a second with twice
-    the triangle rate."""
-
-    structure: str
-    kind: str
-    boxes: float
-    triangles: float
-    prediction: Prediction
-    doubled: float
-
-    def as_dict(self) -> dict[str, Any]:
-        p = self.prediction
-        return {"structure": self.structure, "kind": self.kind, "boxes": self.boxes, "triangles": self.triangles,
-                "rays_per_second": p.rays_per_second, "limit": p.bottleneck, "clocks": p.terms, "doubled": self.doubled}
+def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
+    mesh = Path(getattr(plan.mesh, "name", plan.mesh) or "mesh").name
+    return [tabled(columns(rows[0]), rows, f"What if: {plan.study}, {mesh}")]
 
 
-def rates(plan: Plan, tell: Callable[[str], None] = lambda line: None) -> Rows[Rate]:
-    """Every box rate against every triangle rate for every BVH of the registry, with MANY_WARPS: where latency is hidden, rates
-    matter most."""
-    geometry, sets = rays_of(plan)
-    out = []
-    for name in bvhs():
-        accel = build(geometry, name)
-        for kind in dict.fromkeys(plan.kinds):
-            tell(f"{name} {kind}")
-            work = Work(name, traced(name, accel, sets[kind]).counters, packed(len(sets[kind])))
-            for boxes in SWEEPS["boxes"]:
-                for triangles in SWEEPS["triangles"]:
-                    core: Core = replace(MANY_WARPS, boxes=boxes, triangles=triangles)
-                    now, twice = (predict(work, GPUS[plan.gpu], replace(core, triangles=f * triangles)) for f in (1.0, 2.0))
-                    out.append(Rate(name, kind, boxes, triangles, now, twice.rays_per_second / now.rays_per_second))
-    return Rows(out, lambda rows: html_table("Box rate against triangle rate", RATE_COLUMNS, map(rate_cells, rows)))
-
-
-RATE_COLUMNS = ("structure", "rays", "boxes a clock", "triangles a clock", "Grays/s", "limit", *TERMS, "twice the triangles")
-
-
-def rate_cells(row: Rate) -> tuple[str, ...]:
-    return (row.structure, row.kind, f"{row.boxes:g}", f"{row.triangles:g}", f"{row.prediction.rays_per_second / 1e9:.2f}",
-            row.prediction.bottleneck, *(f"{row.prediction.terms[name]:.3g}" for name in TERMS), f"{row.doubled:.2f}x")
-
-
-def rates_markdown(rows: Sequence[Rate]) -> str:
-    lines = [rate_cells(row) for row in rows]
-    return (f"{table(RATE_COLUMNS, lines)}\n\n{', '.join(TERMS)}: clocks a ray and RT core, with {MANY_WARPS.warps} warps at a time"
-            " and an L2 that has seen the same rays before; twice the triangles: rays a second with twice that rate, over these.")
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
+    return {"study": plan.study, "mesh": Path(getattr(plan.mesh, "name", plan.mesh) or "mesh").name}

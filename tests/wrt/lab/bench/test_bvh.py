@@ -17,8 +17,8 @@ from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import load_mesh
 from wrt.lab.bench import bvh as bench
-from wrt.lab.bench.bvh import VOLUMES, BuilderRow, Plan, VolumeRow, inward, published_cost, run
-from wrt.lab.bench.peak_memory import peak_bytes
+from wrt.lab.bench.bvh import VOLUMES, Plan, inward, published_cost, run
+from wrt.lab.bench.timing import peak_bytes
 from wrt.scene.shapes import icosphere
 
 # Of legocar.obj, by tinybvh: SAH cost and the cost of 262,144 cosine-inward rays, with C_trav = C_int = 1.
@@ -68,7 +68,7 @@ def test_peak_memory_is_what_was_taken_and_given_back() -> None:
 
 def test_rows_and_command(box) -> None:
     rows = run(Plan((box,), rays=500, builds=1, runs=1))
-    builders, volumes = ([row for row in rows if isinstance(row, kind)] for kind in (BuilderRow, VolumeRow))
+    builders, volumes = ([row for row in rows if bench.columns(row) is kind] for kind in (bench.BUILDERS, bench.VOLUME))
     assert [row.builder for row in builders] == list(BVH_BUILDERS) and [row.volume for row in volumes] == list(VOLUMES)
     assert all(row.differ == 0 for row in volumes)
     assert volumes[0].inner_area == volumes[0].leaf_area == 1.0 < volumes[1].leaf_area and volumes[2].leaf_area < 1.0001

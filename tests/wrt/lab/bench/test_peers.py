@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +16,18 @@ from wrt.accel.geometry import Geometry
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.lab.bench import peers
-from wrt.lab.bench.peers import Plan, Row, differing, means, ratio, run
+from wrt.lab.bench.peers import Plan, answer, differing, means, run, searching
 from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.report import Row, text
 from wrt.lab.hard_cases.contestants import PEERS
 from wrt.scene.shapes import icosphere
 
 RIVALS = [name for name, peer in PEERS.items() if peer.is_installed()]
 
 
-def made(name: str, seconds: tuple[float, ...], mesh: str = "m", kind: str = "primary") -> Row:
-    return Row(mesh, 100, kind, 10**6, 0.5, name, 0.1, seconds, 0)
+def made(name: str, first_over_it: float = 1.0, mesh: str = "m", kind: str = "primary", threads: int = 1) -> Row:
+    return Row(mesh=mesh, triangles=100, kind=kind, rays=10**6, hit=0.5, name=name, build=0.1, mrays=[1.0], threads=threads,
+               first_over_it=first_over_it, differ=0)
 
 
 @pytest.fixture
@@ -57,13 +58,14 @@ def test_segments_end_where_they_end(box) -> None:
 @pytest.mark.parametrize("rival", RIVALS)
 def test_parts_of_the_rays_are_put_together_again(rival: str) -> None:
     geometry = Geometry.of(icosphere(3))
-    who = peers.Rival(PEERS[rival](), geometry)
+    who = PEERS[rival]()
+    who.prepare(geometry)
     rays = ray_sets(build(geometry, "bvh"), 997, 0)
     for kind in ("primary", "shadow"):
-        one, some = (who.search(rays[kind], threads)() for threads in (1, 3))
+        one, some = (searching(who, rays[kind], threads)() for threads in (1, 3))
         assert rival == "open3d" or (len(one), len(some)) == (1, -(-len(rays[kind]) // -(-len(rays[kind]) // 12)))
-        assert differing(who.told(rays[kind], some), who.told(rays[kind], one)) == 0
-        dark = who.told(rays[kind], some)
+        assert differing(answer(who, rays[kind], some), answer(who, rays[kind], one)) == 0
+        dark = answer(who, rays[kind], some)
         assert not rays[kind].any_hit or (len(dark) == len(rays[kind]) and 0 < np.sum(dark) < len(dark))
 
 
@@ -79,16 +81,23 @@ def test_differing_counts_misses_and_other_places_but_no_ties() -> None:
     assert differing(np.array([True, False]), np.array([True, True])) == 1
 
 
-def test_ratios_are_medians_of_the_runs_and_means_are_geometric() -> None:
-    first, other = made("wrt", (1.0, 2.0, 4.0)), made("it", (2.0, 6.0, 4.0))
-    assert ratio(first, other) == 2.0
-    rows = [first, other, made("wrt", (1.0,), "n"), made("it", (8.0,), "n"), made("wrt", (1.0,), "n", "random"),
-            made("it", (0.5,), "n", "random")]
+def test_means_are_geometric_and_of_each_number_of_threads() -> None:
+    rows = [made("wrt"), made("it", 2.0), made("wrt", mesh="n"), made("it", 8.0, "n"), made("wrt", mesh="n", kind="random"),
+            made("it", 0.5, "n", "random")]
     assert means(rows) == {"it": {"primary": pytest.approx(4.0), "random": pytest.approx(0.5)}}
-    several = [replace(row, threads=2, seconds=tuple(0.5 * s for s in row.seconds)) for row in rows]
+    several = [Row(**vars(row) | {"threads": 2}) for row in rows]
     assert means([*rows, *several]) == means(rows) | {"it, 2 threads": means(rows)["it"]}
-    text = peers.text(rows, "a machine")
-    assert text.startswith("a machine") and "| primary |" in text and "4.00" in text and "Geometric means over 2 meshes" in text
+    page = text(rows, Plan(), "a machine")
+    assert "a machine" in page and "| primary |" in page and "4.00" in page and "Geometric means over 2 meshes" in page
+
+
+def test_ratios_are_medians_of_the_runs(monkeypatch) -> None:
+    monkeypatch.setattr(peers, "alternate", lambda jobs, runs, clock: {0: np.array([1.0, 2.0, 4.0]), 1: np.array([2.0, 6.0, 4.0])})
+    monkeypatch.setattr(peers, "searching", lambda who, rays, threads: lambda: None)
+    monkeypatch.setattr(peers, "answer", lambda who, rays, out: np.array([True]))
+    rays = ray_sets(build(Geometry.of(icosphere(0))), 16)["shadow"]
+    first, other = peers.compared([None, None], rays, 1, 3)
+    assert (first["first_over_it"], other["first_over_it"]) == (1.0, 2.0)
 
 
 @pytest.mark.parametrize(("options", "message"), [

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
-import numpy as np
 import pytest
 
-from wrt.accel.build import build
-from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench import units
+from wrt.lab.bench.report import Row, text
 from wrt.lab.bench.timing import alternate, quartiles, shown
 from wrt.lab.bench.visibility import terrain
 from wrt.scene.shapes import icosphere
@@ -27,25 +26,15 @@ def test_jobs_run_by_turns_and_the_first_run_is_not_counted() -> None:
     assert quartiles([5, 1, 2, 3, 4]) == (2.0, 3.0, 4.0) and shown((2.0, 3.0, 4.0)) == "3 [2, 4]"
 
 
-@pytest.mark.parametrize("kind", ["primary", "random"])
-def test_rays_meet_the_mesh(kind: str) -> None:
-    geometry = Geometry.of(icosphere(3))
-    origins, directions = units.rays_at(geometry, kind, 5000, 1)
-    assert origins.shape == directions.shape == (5000, 3) and origins.dtype == directions.dtype == np.float32
-    hit = build(geometry).closest_hit(origins, directions).prim_id >= 0
-    assert hit.mean() > 0.6
-    assert (len(np.unique(origins, axis=0)) == 1) == (kind == "primary")
-
-
 def test_every_unit_has_a_row_on_every_mesh(monkeypatch) -> None:
-    assert {name for name, _ in units.surfaces(units.Plan())} == {"sphere", "terrain", "teapot"}
-    small = [("sphere", Geometry.of(icosphere(2))), ("terrain", Geometry.of(terrain(8))), ("ball", Geometry.of(icosphere(1)))]
-    monkeypatch.setattr(units, "surfaces", lambda plan: small)
-    told: list[str] = []
+    assert {mesh.name for mesh in units.meshes(units.Plan())} == {"icosphere", "terrain", "teapot"}
+    small = [icosphere(2), terrain(8), replace(icosphere(1), name="ball")]
+    monkeypatch.setattr(units, "meshes", lambda plan: small)
+    told: list[Row] = []
     plan = units.Plan(rays=500, runs=2)
     rows = units.run(plan, told.append)
     on_meshes = {(row.mesh, row.rays) for row in rows if "no structure" not in row.mesh}
-    assert len(on_meshes) == 6 and len(told) == 7
+    assert len(on_meshes) == 6 and told == rows
     names = [*RAY_TRIANGLE, *(f"{box} boxes" for box in list(RAY_AABB)[1:])]
     for place in on_meshes:
         assert [row.unit for row in rows if (row.mesh, row.rays) == place] == names
@@ -53,7 +42,8 @@ def test_every_unit_has_a_row_on_every_mesh(monkeypatch) -> None:
     for row in rows:
         assert row.extremes[0] <= row.price[0] <= row.price[1] <= row.price[2] <= row.extremes[1]
         assert row.unit != "watertight" or row.price == (1.0, 1.0, 1.0)
-    assert "| terrain" in units.text(rows, plan, "here") and "--rays 500 --runs 2" in units.text(rows, plan, "here")
+    page = text(rows, plan, "here")
+    assert "| terrain" in page and "--rays 500 --runs 2" in page
 
 
 def test_bad_plans_are_refused() -> None:

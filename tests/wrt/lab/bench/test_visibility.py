@@ -20,8 +20,9 @@ from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.lab.bench import visibility
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
-from wrt.lab.bench.visibility import Plan, Row, crossings, fit, fits, framing, run, series, subdivided, surfaces, terrain
-from wrt.lab.bench.visibility_check import Agreement, agreement, compare
+from wrt.lab.bench.report import Row, text
+from wrt.lab.bench.visibility import Plan, crossings, fit, fits, framing, row_of, run, series, subdivided, surfaces, terrain
+from wrt.lab.bench.visibility_check import agreement, compare
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
@@ -53,7 +54,7 @@ def geometry_of(mesh: Mesh) -> Geometry:
     return Geometry(mesh.vertices.copy(), mesh.faces.copy(), np.zeros((0, 4), np.float32))
 
 
-def checked(mesh: Mesh, camera: Camera, size: tuple[int, int] = SIZE) -> Agreement:
+def checked(mesh: Mesh, camera: Camera, size: tuple[int, int] = SIZE) -> Row:
     """The z-buffer against the renderer's own AOVs."""
     scene = Scene(objects=(Object(replace(mesh, normals=None), (Material(),)),), cameras=(camera,))
     aov = wrt.render(scene, size=size, spp=1, max_depth=0, aov=("depth", "prim_id")).aov
@@ -61,7 +62,7 @@ def checked(mesh: Mesh, camera: Camera, size: tuple[int, int] = SIZE) -> Agreeme
     return compare(Rasterizer(geometry), aov["depth"], aov["prim_id"], geometry, camera, size)
 
 
-def assert_agree(result: Agreement) -> None:
+def assert_agree(result: Row) -> None:
     assert result.covered > 0.01 * result.pixels
     assert result.unexplained == 0
     assert result.depth_share <= 1.0
@@ -129,7 +130,7 @@ def ball() -> tuple[Geometry, Camera, np.ndarray, np.ndarray]:
     return geometry, camera, caster.depth(), caster.prim_id()
 
 
-def judged(depth: np.ndarray, prim_id: np.ndarray) -> Agreement:
+def judged(depth: np.ndarray, prim_id: np.ndarray) -> Row:
     geometry, camera, *_ = ball()
     return compare(Rasterizer(geometry), depth, prim_id, geometry, camera, (64, 64))
 
@@ -233,21 +234,22 @@ def test_surfaces_grow_to_the_limit_and_cover_the_same(tmp_path: Path) -> None:
 
 
 def row(sweep: str, triangles: int, pixels: int, raster: float, cast: float, build: float = 1.0, surface: str = "s") -> Row:
-    same = Agreement(pixels, pixels // 2, 3, 2, 1, 0, 1e-6, 0.3)
-    return Row(sweep, surface, triangles, pixels, (raster,) * 3, (cast,) * 3, (build,) * 2, same)
+    same = Row(pixels=pixels, covered=pixels // 2, differ=3, ties=2, silhouettes=1, unexplained=0, depth_error=1e-6,
+               depth_share=0.3)
+    return row_of(sweep, surface, triangles, pixels, (raster,) * 3, (cast,) * 3, (build,) * 2, same)
 
 
 def test_fit_finds_the_exponent_of_a_power_and_its_uncertainty() -> None:
     n = np.array([1e3, 4e3, 1.6e4, 6.4e4, 2.56e5])
     found = fit(n, 3e-9 * n**0.7)
-    assert found.exponent == pytest.approx(0.7) and found.error == pytest.approx(0.0, abs=1e-9) and found.last == pytest.approx(0.7)
+    assert found == {"exponent": pytest.approx(0.7), "error": pytest.approx(0.0, abs=1e-9), "last": pytest.approx(0.7)}
     # Against the textbook's variance of the slope, over many noisy sweeps.
     rng = np.random.default_rng(1)
     noisy = [fit(n, n**0.7 * np.exp(0.1 * rng.normal(size=5))) for _ in range(2000)]
-    spread = np.std([f.exponent for f in noisy])
-    assert np.mean([f.exponent for f in noisy]) == pytest.approx(0.7, abs=0.005)
-    assert np.sqrt(np.mean([f.error**2 for f in noisy])) == pytest.approx(spread, rel=0.05)
-    assert math.isnan(fit([1.0, 2.0], [1.0, 4.0]).error)
+    spread = np.std([f["exponent"] for f in noisy])
+    assert np.mean([f["exponent"] for f in noisy]) == pytest.approx(0.7, abs=0.005)
+    assert np.sqrt(np.mean([f["error"]**2 for f in noisy])) == pytest.approx(spread, rel=0.05)
+    assert math.isnan(fit([1.0, 2.0], [1.0, 4.0])["error"])
     with pytest.raises(ValueError, match="two points"):
         fit([1.0], [1.0])
 
@@ -270,7 +272,7 @@ def test_fits_and_crossings_come_from_the_rows() -> None:
     assert steep["cheaper"] == "cast" and steep["n"] == pytest.approx(10_000)
     finer, = crossings([row("pixels", 1000, n, 1e-3, 1e-7 * n) for n in (100, 1000, 1_000_000)])
     assert finer["cheaper"] == "raster" and finer["n"] == pytest.approx(10_000)
-    assert rows[0].ratios(with_build=True)[0] == pytest.approx((1e-4 * math.log2(64000) + 1.0) / 64e-5)
+    assert rows[0].cast_and_build_over_raster == pytest.approx((1e-4 * math.log2(64000) + 1.0) / 64e-5)
 
 
 def test_a_run_measures_both_sweeps_and_finds_no_difference_unexplained(tmp_path: Path) -> None:
@@ -300,15 +302,15 @@ def test_a_plan_that_cannot_be_run_is_refused(option: str, value: object) -> Non
 
 def test_the_tables_hold_what_was_measured() -> None:
     rows = [row("triangles", 1000, 4096, 0.002, 0.006), row("triangles", 4000, 4096, 0.003, 0.006)]
-    text = visibility.text(rows, "")
-    lines = [line for line in text.splitlines() if line.startswith("| s ")]
+    page = text(rows, Plan(), "")
+    lines = [line for line in page.splitlines() if line.startswith("| s ")]
     first = [cell.strip() for cell in lines[0].strip("|").split("|")]
     named = dict(zip(visibility.COLUMNS, first, strict=True))
     assert named["triangles"] == "1000" and named["covered"] == "50.0%" and named["raster ms"] == "2 [2, 2]"
     assert named["cast / raster"] == "3 [3, 3]" and named["with build"] == "503" and named["build ms"] == "1e+03"
     assert (named["differ"], named["ties"], named["silhouettes"], named["unexplained"]) == ("3", "2", "1", "0")
-    assert len({len(line) for line in text.splitlines() if line.startswith("| s ") and line.count("|") == 16}) == 1
-    assert "s, as triangles grow: raster costs less throughout." in text
+    assert len({len(line) for line in page.splitlines() if line.startswith("| s ") and line.count("|") == 16}) == 1
+    assert "s, as triangles grow: raster costs less throughout." in page
 
 
 # --- the command ----------------------------------------------------------------------------------------------------------
@@ -327,10 +329,10 @@ def test_the_command_prints_tables_and_writes_a_report(folder: Path) -> None:
     result = command(*QUICK, "-o", "report")
     assert result.code == 0, result.err
     assert "## As triangles grow" in result.out and "| cast   | box.obj |" in result.out
-    text = Path("report/visibility.md").read_text()
-    assert "python -m wrt bench visibility box.obj --size 32 --max-size 64" in text
+    told = Path("report/visibility.md").read_text()
+    assert "python -m wrt bench visibility box.obj --size 32 --max-size 64" in told
     for name in visibility.PLOTS:
-        assert f"]({name})" in text
+        assert f"]({name})" in told
         picture = np.asarray(Image.open(folder / "report" / name))
         assert picture.ndim == 3 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
 

@@ -16,10 +16,10 @@ import pytest
 from tests import command_line
 from tests.data import ROOT
 from wrt.core.errors import InputError
+from wrt.lab.bench.report import Row
 from wrt.lab.mitsuba import equal_error
-from wrt.lab.mitsuba.equal_error import Plan, Result, matte
-from wrt.lab.mitsuba.llvm import PATH_VARIABLE, NotAvailable
-from wrt.lab.mitsuba.process import VARIANTS, MitsubaProcess
+from wrt.lab.mitsuba.equal_error import Plan, matte
+from wrt.lab.mitsuba.process import PATH_VARIABLE, VARIANTS, MitsubaProcess, NotAvailable
 from wrt.renderer.options import Options
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import PointLight
@@ -39,7 +39,7 @@ ROOM = Scene(
 PLAN = Plan(spp=8, repeats=3, reference_spp=64, rival_seconds=1.0, starts=0)
 
 
-def measured(integrator: str, variant: str) -> Result:
+def measured(integrator: str, variant: str) -> Row:
     try:
         return equal_error.run(ROOM, replace(PLAN, integrator=integrator, variants=(variant,)), Options())
     except NotAvailable as error:
@@ -53,12 +53,12 @@ def test_direct_light_is_the_same_and_the_ratio_is_its_own_definition(variant: s
     result = measured("direct", variant)
     (name, rival), = result.mitsuba.items()
     assert name == variant and rival.same_light and not result.not_available
-    assert result.wrt.spp == 8 and len(result.wrt.seconds) == len(rival.side.seconds) == 3
+    assert result.wrt.spp == 8 and len(result.wrt.seconds) == len(rival.seconds) == 3
     assert result.reference.max_depth == ROOM.settings.max_depth
-    expected = np.median(rival.side.seconds / result.wrt.seconds) * (rival.side.rmse / result.wrt.rmse) ** 2
+    expected = np.median(np.array(rival.seconds) / np.array(result.wrt.seconds)) * (rival.rmse / result.wrt.rmse) ** 2
     assert rival.ratio[1] == pytest.approx(expected)
     # Mitsuba was given about as many samples as it needs: the two errors are near each other.
-    assert 0.4 < rival.side.rmse / result.wrt.rmse < 2.5
+    assert 0.4 < rival.rmse / result.wrt.rmse < 2.5
     assert math.isnan(rival.process_ratio)
     assert f"Mitsuba {variant}, direct" in equal_error.text(result) and "not of the same light" not in equal_error.text(result)
 
@@ -97,7 +97,7 @@ def test_a_variant_that_ends_on_its_way_is_left_out(monkeypatch) -> None:
 
     monkeypatch.setattr(equal_error, "MitsubaProcess", Mortal)
     result = equal_error.run(ROOM, replace(PLAN, integrator="direct"), Options())
-    assert len(result.mitsuba["scalar_rgb"].side.seconds) == PLAN.repeats
+    assert len(result.mitsuba["scalar_rgb"].seconds) == PLAN.repeats
     assert set(result.not_available) == {"llvm_ad_rgb"} and "its process ended by SIGABRT" in result.not_available["llvm_ad_rgb"]
 
 
@@ -109,8 +109,8 @@ def test_starts_have_all_that_a_process_takes(tmp_path) -> None:
     result = equal_error.run(ROOM, plan, Options(), command)
     rival = result.mitsuba["scalar_rgb"]
     assert result.wrt.process_seconds > np.median(result.wrt.seconds)
-    assert rival.side.process_seconds > rival.side.prepare_seconds
-    assert rival.process_ratio == pytest.approx(rival.side.process_seconds / result.wrt.process_seconds)
+    assert rival.process_seconds > rival.prepare_seconds
+    assert rival.process_ratio == pytest.approx(rival.process_seconds / result.wrt.process_seconds)
 
 
 def test_matte_leaves_the_albedo_and_what_lights_others() -> None:

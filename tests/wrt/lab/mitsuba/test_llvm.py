@@ -12,10 +12,8 @@ import pytest
 
 from tests.mitsuba_oracle import render_mitsuba
 from wrt.core.errors import InputError
-from wrt.lab.mitsuba import llvm
 from wrt.lab.mitsuba import process as mitsuba_process
-from wrt.lab.mitsuba.llvm import NotAvailable, candidates, llvm_library, trial
-from wrt.lab.mitsuba.process import Job, MitsubaProcess
+from wrt.lab.mitsuba.process import PATH_VARIABLE, Job, MitsubaProcess, NotAvailable, candidates, llvm_library, trial
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
@@ -42,9 +40,9 @@ def library() -> str:
 @pytest.fixture
 def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder, the only one where libraries are looked for."""
-    monkeypatch.delenv(llvm.PATH_VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "PLACES", (str(tmp_path),))
-    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: None)
+    monkeypatch.delenv(mitsuba_process.PATH_VARIABLE, raising=False)
+    monkeypatch.setattr(mitsuba_process, "PLACES", (str(tmp_path),))
+    monkeypatch.setattr(mitsuba_process.ctypes.util, "find_library", lambda name: None)
     return tmp_path
 
 
@@ -61,45 +59,45 @@ def test_the_newest_library_comes_first_and_each_once(places: Path) -> None:
 
 def test_what_the_linker_finds_is_tried_too(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (places / "libLLVM-18.so.1").write_text("")
-    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: "libLLVM.so.20.1")
+    monkeypatch.setattr(mitsuba_process.ctypes.util, "find_library", lambda name: "libLLVM.so.20.1")
     assert candidates() == ["libLLVM.so.20.1", str(places / "libLLVM-18.so.1")]
-    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: "libLLVM-18.so.1")
+    monkeypatch.setattr(mitsuba_process.ctypes.util, "find_library", lambda name: "libLLVM-18.so.1")
     assert candidates() == [str(places / "libLLVM-18.so.1")]
 
 
 def test_a_library_that_is_named_is_the_only_one(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (places / "libLLVM.so.19.1").write_text("")
-    monkeypatch.setenv(llvm.PATH_VARIABLE, "/nowhere/libLLVM.so")
+    monkeypatch.setenv(mitsuba_process.PATH_VARIABLE, "/nowhere/libLLVM.so")
     assert candidates() == ["/nowhere/libLLVM.so"]
 
 
 def test_the_next_one_is_taken_where_one_ends_its_process(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("libLLVM-16.so.1", "libLLVM-15.so.1", "libLLVM-14.so.1"):
         (places / name).write_text("")
-    monkeypatch.setattr(llvm, "TRIAL", f"import os\nif 'libLLVM-16' in os.environ['{llvm.PATH_VARIABLE}']: os.abort()")
+    monkeypatch.setattr(mitsuba_process, "TRIAL", f"import os\nif 'libLLVM-16' in os.environ['{PATH_VARIABLE}']: os.abort()")
     assert Path(llvm_library()).name == "libLLVM-15.so.1"
 
 
 def test_every_library_is_named_with_what_came_of_it(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(NotAvailable, match=f"no LLVM library .* found.*{llvm.PATH_VARIABLE}"):
+    with pytest.raises(NotAvailable, match=f"no LLVM library .* found.*{PATH_VARIABLE}"):
         llvm_library()
     for name in ("libLLVM-16.so.1", "libLLVM-15.so.1"):
         (places / name).write_text("")
-    monkeypatch.setattr(llvm, "TRIAL", f"import os\nif 'libLLVM-16' in os.environ['{llvm.PATH_VARIABLE}']: os.abort()\n"
+    monkeypatch.setattr(mitsuba_process, "TRIAL", f"import os\nif 'libLLVM-16' in os.environ['{PATH_VARIABLE}']: os.abort()\n"
                                        "raise ImportError('it lacks what is needed')")
     with pytest.raises(NotAvailable, match=r"-16\.so\.1: ended by SIGABRT.*; .*-15\.so\.1: exit code 1 \(ImportError: it lacks"):
         llvm_library()
 
 
 def test_a_trial_sees_no_kernels_of_another_library_and_ends() -> None:
-    assert trial("x", f"import os; assert os.listdir(os.environ['{llvm.CACHE_VARIABLE}']) == []", 60.0) is None
+    assert trial("x", f"import os; assert os.listdir(os.environ['{mitsuba_process.CACHE_VARIABLE}']) == []", 60.0) is None
     assert trial("x", "import time; time.sleep(60)", 0.5) == "not done after 0.5 s"
 
 
 def test_what_is_no_library_fails_the_trial(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')
     (tmp_path / "libLLVM.so").write_text("not a library")
-    reason = trial(str(tmp_path / "libLLVM.so"), llvm.TRIAL, llvm.TRIAL_SECONDS)
+    reason = trial(str(tmp_path / "libLLVM.so"), mitsuba_process.TRIAL, mitsuba_process.TRIAL_SECONDS)
     assert reason is not None and "libLLVM.so" in reason
 
 

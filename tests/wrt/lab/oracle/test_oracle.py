@@ -167,7 +167,7 @@ def test_closest_and_all_hits_against_rational_numbers(kind: str) -> None:
     for i in range(n):
         end = Fraction(10) ** 60 if np.isinf(t_max[i]) else Fraction(float(t_max[i]))
         truth = brute_force(origin[i], direction[i], triangles, Fraction(float(t_min[i])), end)
-        mine = hits.chosen(hits.ray == i)
+        mine = hits[hits.ray == i]
         assert sorted(mine.prim_id.tolist()) == sorted(prim_id for _, prim_id in truth)
         assert (np.diff(mine.t) >= 0.0).all()
         if not truth:

@@ -7,11 +7,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from wrt.accel.answers import Counters
 from wrt.accel.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
-from wrt.lab.rtcore.caches import LINE, Cache, Misses, Warps, distinct_lines, first_level, lines_of, replay, second_level
+from wrt.lab.rtcore.caches import LINE, Cache, Misses, distinct_lines, first_level, lines_of, replay, second_level
 from wrt.scene.shapes import icosphere
+
+
+def made(warp: np.ndarray, first: np.ndarray, address: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, Counters]:
+    return warp, Counters(np.zeros(0), first, address, size)
 
 
 def plain_replay(line: list[int], cache: Cache) -> list[bool]:
@@ -61,21 +66,21 @@ def test_lines_of_fetches() -> None:
     assert distinct_lines(np.array([0, 2, 2, 4]), address, size).tolist() == [2, 0, 3]
 
 
-def simulate(warps: Warps, machine: tuple[int, int, Cache, Cache], warm: bool = False) -> Misses:
+def simulate(warps: tuple[np.ndarray, Counters], machine: tuple[int, int, Cache, Cache], warm: bool = False) -> Misses:
     sms, slots, l1, l2 = machine
-    return second_level(first_level(warps, sms, slots, l1), l2, warm)
+    return second_level(first_level(*warps, sms, slots, l1), l2, warm)
 
 
 def test_warps_wait_for_a_slot() -> None:
     """Warps of one ray that touch a new line in each round: every access misses, in the round in which it is made."""
     length = [5, 7, 2, 1, 4, 9]
     first = np.concatenate([[0], np.cumsum(length)])
-    warps = Warps(np.arange(6), first, np.arange(28) * LINE, np.full(28, 4))
-    missed = first_level(warps, 2, 1, Cache(LINE, 1))
+    warps = made(np.arange(6), first, np.arange(28) * LINE, np.full(28, 4))
+    missed = first_level(*warps, 2, 1, Cache(LINE, 1))
     begin = {0: 0, 2: 5, 4: 7, 1: 0, 3: 7, 5: 8}  # SM 0 runs warps 0, 2, 4; SM 1 the others
     assert missed.accesses == 28 and missed.line.tolist() == [i for w in begin for i in range(first[w], first[w + 1])]
     assert missed.time.tolist() == [begin[w] + k for w in begin for k in range(length[w])]
-    missed = first_level(warps, 1, 2, Cache(LINE, 1))
+    missed = first_level(*warps, 1, 2, Cache(LINE, 1))
     begin = {0: 0, 1: 0, 2: 5, 3: 7, 4: 7, 5: 8}  # two slots: warp 3 in that of 2, and 5 in that of 3
     assert sorted(zip(missed.time.tolist(), missed.line.tolist(), strict=True)) == sorted(
         (begin[w] + k, int(first[w]) + k) for w in begin for k in range(length[w]))
@@ -85,8 +90,8 @@ def test_a_warp_asks_for_a_line_once_a_round() -> None:
     """Four rays, two warps, one SM with one slot."""
     first = np.array([0, 2, 4, 5, 6])
     address = np.array([0, 128, 64, 256, 0, int(PRIMITIVE_SPACE)])
-    warps = Warps(np.array([0, 0, 1, 1]), first, address, np.full(6, 32))
-    missed = first_level(warps, 1, 1, Cache(8 * LINE, 8))
+    warps = made(np.array([0, 0, 1, 1]), first, address, np.full(6, 32))
+    missed = first_level(*warps, 1, 1, Cache(8 * LINE, 8))
     assert missed.accesses == 5 and missed.line.tolist() == [0, 1, 2, 3]  # the primitive's line stands behind the nodes' three
     assert missed.time.tolist() == [0, 1, 1, 2]
     machine = (1, 1, Cache(LINE, 1), Cache(8 * LINE, 8))
@@ -97,7 +102,7 @@ def test_a_warp_asks_for_a_line_once_a_round() -> None:
 def test_no_rays() -> None:
     none = np.zeros(0, np.int64)
     machine = (4, 2, Cache(LINE, 1), Cache(LINE, 1))
-    assert simulate(Warps(none, np.zeros(1, np.int64), none, none), machine) == Misses(0, 0, 0, 0, 0, 0, 0)
+    assert simulate(made(none, np.zeros(1, np.int64), none, none), machine) == Misses(0, 0, 0, 0, 0, 0, 0)
 
 
 def test_a_recorded_trace_in_the_order_of_warps() -> None:
@@ -131,7 +136,7 @@ def test_a_recorded_trace_in_the_order_of_warps() -> None:
              for event, hit in zip([e for e in sorted(events) if e[1] == sm], hits[sm], strict=True)]
     missed = [event[4] for event, hit in sorted(below, key=lambda each: each[0][:2]) if not hit]
     waits = {(event[0], event[1], event[2], event[4]) for event, hit in below if not hit}
-    found = simulate(Warps(warp, counters.first, counters.address, counters.size), (sms, slots, l1, l2))
+    found = simulate(made(warp, counters.first, counters.address, counters.size), (sms, slots, l1, l2))
     assert found.accesses == len(events) and found.compulsory == len({event[4] for event in events})
     assert found.l1 == len(missed) < len(events) and found.l2 == plain_replay(missed, l2).count(False) < len(missed)
     assert found.wanted == len(lanes) > len(events) and found.wait_l2 == sum(key in waits for key, _ in lanes)

@@ -8,8 +8,10 @@ import pytest
 import warp as wp
 
 from wrt.core.errors import InputError
+from wrt.lab.bench.report import markdown, tabled
+from wrt.lab.rtcore import instructions
 from wrt.lab.rtcore.cubin import CLASSES, OPERATIONS, read_cubin
-from wrt.lab.rtcore.instructions import UnitCode, box_unit, compiled, of_one, software, software_table, unit_table
+from wrt.lab.rtcore.instructions import SOFTWARE, UnitCode, box_unit, compiled, of_one, software, tables
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -41,7 +43,7 @@ def test_a_box_test_is_six_differences_and_seven_products() -> None:
     unit = box_unit("conservative")
     assert 13 <= unit.classes["fp32"] < 60 and abs(unit.instructions - unit.classes["fp32"]) < 1.0  # a move now and then
     assert unit.classes["control"] == unit.classes["fp64"] == unit.classes["special"] == 0.0
-    assert "conservative" in unit_table([unit])
+    assert "conservative" in markdown(tables([unit], {}))
 
 
 def test_a_kernel_whose_body_stands_twice_is_refused() -> None:
@@ -57,9 +59,10 @@ def test_classes_are_of_all_instructions(tmp_path: Path) -> None:
     assert sum(code.classes().values()) == len(code.opcodes()) <= len(code.code) // 16
 
 
-def test_software_by_hand() -> None:
+def test_software_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """100 boxes of 30 instructions and 5 triangles of 200, with half of the lanes waiting: 8000 of a lane a ray."""
     codes = UnitCode("box", "b", {"fp32": 30.0}), UnitCode("triangle", "t", {"fp32": 150.0, "fp64": 50.0})
-    row = software("made", 100.0, 5.0, 0.5, codes)
+    monkeypatch.setattr(instructions, "default_units", lambda: codes)
+    row = software("made", 100.0, 5.0, 0.5)
     assert row.instructions == 4000.0 and row.rays_per_second == pytest.approx(28 * 128 * 1.582e9 / 8000.0)
-    assert row.share == pytest.approx(8000.0 / 5154.0, rel=1e-3) and "8000" in software_table([row])
+    assert row.share == pytest.approx(8000.0 / 5154.0, rel=1e-3) and "8000" in markdown([tabled(SOFTWARE, [row])])

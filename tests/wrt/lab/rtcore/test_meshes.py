@@ -13,7 +13,8 @@ from tests.command_line import wrt as command
 from wrt.accel.build import build
 from wrt.core.errors import InputError
 from wrt.lab.bench.rays import ray_sets
-from wrt.lab.rtcore.meshes import Plan, bvhs, in_warps, markdown, run
+from wrt.lab.bench.report import text
+from wrt.lab.rtcore.meshes import Plan, bvhs, in_warps, run
 from wrt.scene.shapes import icosphere
 
 
@@ -36,16 +37,16 @@ def test_rows_and_command(tmp_path: Path) -> None:
     mesh, report = tmp_path / "box.obj", tmp_path / "out.md"
     mesh.write_text(BOX_OBJ)
     rows = run(Plan((mesh,), ("bvh2",), ("primary",), 1024))
-    assert [(row.structure, row.row.name, row.triangles, row.row.rays) for row in rows] == [("bvh2", "primary", 12, 1024)]
-    assert rows[0].row.boxes == pytest.approx(2.0 * rows[0].row.nodes)
-    assert rows[0].row.low <= rows[0].row.prediction.rays_per_second <= rows[0].row.high
+    assert [(row.structure, row.name, row.mesh_triangles, row.rays) for row in rows] == [("bvh2", "primary", 12, 1024)]
+    assert rows[0].boxes == pytest.approx(2.0 * rows[0].nodes)
+    assert rows[0].low <= rows[0].rays_per_second <= rows[0].high
     assert "<b>box.obj, 12 triangles</b>" in rows._repr_html_()
-    assert "box.obj, 12 triangles" in markdown(rows) and {"bvh2", "bvh4"} <= set(bvhs())
+    assert "box.obj, 12 triangles" in text(rows, Plan((mesh,)), "") and {"bvh2", "bvh4"} <= set(bvhs())
     arguments = ("bench", "rtcore", str(mesh), "--structures", "bvh2", "--kinds", "primary", "--rays", "1024", "-q")
     result = command(*arguments, "-o", str(report))
-    assert result.code == 0 and "published" in result.out and report.read_text().startswith("## box.obj")
+    assert result.code == 0 and "published" in result.out and report.read_text().startswith("# The model of the RT core")
     told = json.loads(command(*arguments, "--json").out)["rows"][0]
-    assert told["nodes"] == rows[0].row.nodes and told["limit"] in told["clocks"]
+    assert told["nodes"] == rows[0].nodes and told["limit"] in told["clocks"]
 
 
 def test_what_there_is_not_is_refused(tmp_path: Path) -> None:

@@ -44,26 +44,26 @@ def test_every_term_by_hand() -> None:
     expected = {"box": 20 / 4.0, "triangle": 3 / 0.5, "L1": accesses / 128 / 2.0, "L2": l1 * LINE / 128 / 16.0,
                 "DRAM": l2 * LINE / 128 / 32.0, "latency": 4 * wait / 1 / 128}
     found = predict(work, SMALL, core)
-    assert found.terms == pytest.approx(expected) and tuple(found.terms) == TERMS
-    assert found.bottleneck == "latency" and found.rays_per_second == pytest.approx(2 * 1e9 / expected["latency"])
+    assert found.clocks == pytest.approx(expected) and tuple(found.clocks) == TERMS
+    assert found.limit == "latency" and found.rays_per_second == pytest.approx(2 * 1e9 / expected["latency"])
     assert found.utilisation["latency"] == 1.0 and found.utilisation["box"] == pytest.approx(5.0 / expected["latency"])
-    assert predict(work, SMALL, replace(core, warps=10**6)).bottleneck == "triangle"
-    assert predict(work, SMALL, replace(core, warm=True)).terms["DRAM"] == 0.0
+    assert predict(work, SMALL, replace(core, warps=10**6)).limit == "triangle"
+    assert predict(work, SMALL, replace(core, warm=True)).clocks["DRAM"] == 0.0
 
 
 def test_a_warp_holds_its_place_until_its_longest_ray_ends() -> None:
     nodes = np.full(64, 2)
     nodes[7] = 40
     core = Core(l2_latency=0.0, dram_latency=0.0)
-    even = predict(made(np.full(64, 2), np.zeros(64, int)), SMALL, core).terms["latency"]
-    odd = predict(made(nodes, np.zeros(64, int)), SMALL, core).terms["latency"]
+    even = predict(made(np.full(64, 2), np.zeros(64, int)), SMALL, core).clocks["latency"]
+    odd = predict(made(nodes, np.zeros(64, int)), SMALL, core).clocks["latency"]
     assert odd == pytest.approx(even * (2 + 40) / (2 + 2))
 
 
 def test_rates_and_ranges() -> None:
     work = made(np.full(64, 10), np.full(64, 3))
     base = replace(Core(), warps=10**4)
-    by_rate = [predict(work, SMALL, replace(base, boxes=rate)).terms["box"] for rate in SWEEPS["boxes"]]
+    by_rate = [predict(work, SMALL, replace(base, boxes=rate)).clocks["box"] for rate in SWEEPS["boxes"]]
     assert by_rate == pytest.approx([20.0, 10.0, 5.0, 2.5])
     all_of_them = sweep(work, SMALL, base)
     assert len(all_of_them) == len(SWEEPS["boxes"]) * len(SWEEPS["triangles"])
@@ -86,9 +86,9 @@ def test_a_structure_on_a_gpu() -> None:
     assert len(work) == 32 * (int(work.warp[-1]) + 1)
     prediction = predict(work, GPUS["rtx2080ti"])
     assert 0.1e9 < prediction.rays_per_second < 100e9
-    assert prediction.terms["box"] == pytest.approx(work.mean("boxes") / 4.0)
+    assert prediction.clocks["box"] == pytest.approx(work.mean("boxes") / 4.0)
     planes = trace_rays(build(icosphere(3), "kdtree"), "planes", origins, directions)
-    assert predict(planes, GPUS["rtx2080ti"]).terms["box"] == pytest.approx(planes.mean("box_operations") / 4.0) != 0.0
+    assert predict(planes, GPUS["rtx2080ti"]).clocks["box"] == pytest.approx(planes.mean("box_operations") / 4.0) != 0.0
 
 
 def test_published_numbers() -> None:

@@ -13,8 +13,7 @@ from tests.wrt.lab.rtcore.test_profiler import MIRRORS
 from wrt.core.errors import InputError
 from wrt.lab.bench.plot import bins, histograms
 from wrt.lab.rtcore.parameters import GPUS
-from wrt.lab.rtcore.profile_report import model_rows
-from wrt.lab.rtcore.profile_work import GROUPS, warp_order, work_of
+from wrt.lab.rtcore.profile_report import GROUPS, model_rows, warp_order, work_of
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
 from wrt.picture.heatmap import colors, heatmap, short, step_of, top_of
 from wrt.picture.image import read_channels, read_image
@@ -71,7 +70,7 @@ def test_a_notebook_shows_heat_maps_and_the_model(measured: Profile) -> None:
     rows = model_rows(measured, GPUS["rtx2080ti"])
     page = rows._repr_html_()
     assert len(rows) == len(GROUPS) and page.count("<table>") == 2 and "RTX 2080 Ti" in page
-    assert all(f">{row.prediction.bottleneck}</td>" in page for row in rows)
+    assert all(f">{row.limit}</td>" in page for row in rows)
 
 
 def test_the_scale_of_a_heat_map() -> None:

@@ -1,0 +1,26 @@
+"""What wrt wrote about a picture into its file, read by others: by Pillow, by OpenImageIO, and line by line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import OpenImageIO as oiio
+from PIL import Image
+
+from wrt.picture.image import METADATA_PREFIX
+
+
+def read_metadata(path: str | Path) -> dict[str, str]:
+    """As text by key."""
+    suffix = Path(path).suffix.lower()
+    if suffix == ".png":
+        with Image.open(path) as picture:
+            pairs = [(key, str(value)) for key, value in picture.info.items()]
+    elif suffix == ".hdr":
+        lines = Path(path).read_bytes().split(b"\n\n", 1)[0].decode(errors="replace").splitlines()
+        pairs = [(key, value) for key, _, value in (line.removeprefix("# ").partition("=") for line in lines)]
+    else:
+        source = oiio.ImageInput.open(str(path))
+        pairs = [(entry.name, str(entry.value)) for entry in source.spec().extra_attribs]
+        source.close()
+    return {key.removeprefix(METADATA_PREFIX): value for key, value in pairs if key.startswith(METADATA_PREFIX)}

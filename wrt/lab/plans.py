@@ -1,0 +1,267 @@
+"""What the measurements are asked for: each option is declared once, for Python and for the command line.
+
+A field of a Plan is an option of its command. Nothing heavy is imported here: the command line reads all plans for its help.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any, ClassVar
+
+STRUCTURES = ("structure", "wrt.accel.structures:ACCELERATORS")
+KINDS = ("kind of ray", "wrt.lab.bench.rays:RAY_KINDS")
+GPUS = ("GPU", "wrt.lab.rtcore.parameters:GPUS")
+FOLDER, MARKDOWN = "Folder for a report with plots", "Write the tables as Markdown (.md)"
+
+
+def option(default: Any, text: str, between: tuple[int, int] | None = None, of: tuple[str, str] | None = None, flag: str = "",
+           form: str = "") -> Any:
+    """A field of a Plan. text: of --help; between: the least and the most that it may be (None is not looked at); of: what it
+    names, and the table that has the names; flag: where it is not called as the field is; form: "argument", or "duration"."""
+    return field(default=default, metadata={"text": text, "between": between, "of": of, "flag": flag, "form": form})
+
+
+def the_meshes(default: Any = ()) -> Any:
+    """Files, or from Python Meshes."""
+    return option(default, "", form="argument")
+
+
+def the_kinds(*default: str) -> Any:
+    return option(default or ("primary", "shadow", "diffuse", "random"), "Of rays: primary, shadow, diffuse, random", of=KINDS)
+
+
+def the_threads(text: str = "Threads on the CPU  [default: all cores]") -> Any:
+    return option(None, text)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Raises InputError where a number is out of its range, and where there is nothing of a name.
+
+    COMMAND: what asks for it; STUDY: the module that measures it; REPORT: what -o writes.
+    """
+
+    COMMAND: ClassVar[str] = ""
+    STUDY: ClassVar[str] = ""
+    REPORT: ClassVar[str] = MARKDOWN
+
+    def __post_init__(self) -> None:
+        from wrt.core.checks import as_integer, require_known
+        from wrt.core.device import thread_count
+        from wrt.core.errors import InputError
+
+        for each in fields(self):
+            value, between, of = getattr(self, each.name), each.metadata["between"], each.metadata["of"]
+            if between is not None and value is not None:
+                as_integer(value, each.name, *between)
+            if of is not None:
+                module, table = of[1].split(":")
+                for name in (value,) if isinstance(value, str) else value:
+                    require_known(name, getattr(importlib.import_module(module), table), of[0])
+            if each.name == "threads" and not isinstance(value, str):
+                thread_count(value)
+            if each.name == "meshes" and each.default is MISSING and not value:
+                raise InputError("name the meshes")
+
+
+@dataclass(frozen=True)
+class Visibility(Plan):
+    """Rasterising against ray casting, as triangles and pixels grow: the cost of both, and where they differ.
+
+    MESHES: mesh files; without any, a sphere and a terrain.
+    """
+
+    COMMAND, STUDY = "bench visibility", "wrt.lab.bench.visibility"
+    REPORT = FOLDER
+    meshes: Sequence[Any] = the_meshes()
+    size: int = option(512, "Pixels a side as triangles grow", (1, 16384))
+    max_size: int = option(1024, "Pixels a side at the end of the sweep from 64 on", (64, 16384))
+    max_triangles: int = option(1_500_000, "Meshes are cut finer up to this many", (1, 2**30))
+    runs: int = option(7, "Runs of each kind, alternating", (1, 1000))
+    accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
+    device: str = option("cpu", "cpu, cuda:0, ... (see `devices`)")
+    threads: int | None = the_threads()
+
+    def __post_init__(self) -> None:
+        from wrt.core.device import start
+
+        super().__post_init__()
+        start(self.device)
+
+
+@dataclass(frozen=True)
+class Units(Plan):
+    """The default triangle and box tests beside the others: what they cost, as ratios with their spread, on one thread.
+
+    MESHES: mesh files; without any, a sphere, a terrain and a teapot.
+    """
+
+    COMMAND, STUDY = "bench units", "wrt.lab.bench.units"
+    meshes: Sequence[Any] = the_meshes()
+    rays: int = option(2**17, "Rays of each kind", (1, 2**28))
+    runs: int = option(9, "Runs of each unit, by turns", (1, 1000))
+    accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
+    seed: int = option(0, "Other rays")
+
+
+@dataclass(frozen=True)
+class Peers(Plan):
+    """wrt beside Embree (robust and fast) and Warp's mesh_query_ray: the same rays by turns, on one thread and on all, with ratios
+    and answers that differ.
+
+    MESHES: mesh files; without any, a sphere.
+    """
+
+    COMMAND, STUDY = "bench peers", "wrt.lab.bench.peers"
+    meshes: Sequence[Any] = the_meshes()
+    structures: Sequence[str] = option(("bvh",), "Of wrt, by name; ratios are of the first", of=STRUCTURES)
+    rivals: Sequence[str] = option((), "embree, embree_fast, warp, open3d  [default: those that are installed]",
+                                   of=("rival", "wrt.lab.hard_cases.contestants:PEERS"))
+    kinds: Sequence[str] = the_kinds()
+    rays: int = option(100_000, "Rays of each kind", (1, 2**28))
+    runs: int = option(7, "Runs of each, by turns", (1, 1000))
+    seed: int = option(0, "Other rays")
+    threads: str = option("both", "one (by its CPU time), all (by the clock) or both")
+
+    def __post_init__(self) -> None:
+        from wrt.core.errors import InputError
+        from wrt.lab.hard_cases.contestants import PEERS
+
+        super().__post_init__()
+        for name in self.rivals:
+            if not PEERS[name].is_installed():
+                raise InputError(f'{name} is not installed: pip install "wrt[peers]"')
+        if not self.structures:
+            raise InputError("structures must name one or more")
+        if self.threads not in ("one", "all", "both"):
+            raise InputError(f"threads must be one, all, both, got {self.threads!r}")
+
+
+@dataclass(frozen=True)
+class Accel(Plan):
+    """Structure against structure: time to build, memory, steps and time to search, and answers that differ (none may).
+
+    MESHES: mesh files; without any, a terrain that grows from a thousand triangles on.
+    """
+
+    COMMAND, STUDY = "bench accel", "wrt.lab.bench.accel"
+    REPORT = FOLDER
+    meshes: Sequence[Any] = the_meshes()
+    structures: Sequence[str] = option((), "Which, by name  [default: all but brute_force]", of=STRUCTURES)
+    kinds: Sequence[str] = the_kinds()
+    rays: int = option(100_000, "Rays of each kind", (1, 2**28))
+    runs: int = option(5, "Runs of each structure, alternating", (1, 1000))
+    builds: int = option(1, "Builds of each structure", (1, 100))
+    max_triangles: int = option(1_000_000, "Without meshes, the terrain grows to this", (1000, 2**28))
+    threads: int = option(1, "Threads to search with (builds use all cores)")
+    seed: int = option(0, "Other rays")
+    stadium: bool = option(False, "Each mesh in a stadium a thousand times its size, with the rays it has alone")
+
+
+@dataclass(frozen=True)
+class Bvh(Plan):
+    """Builders of binary BVHs over MESHES: quality, time and memory; and boxes, spheres and 14-DOPs around the same tree."""
+
+    COMMAND, STUDY = "bench bvh", "wrt.lab.bench.bvh"
+    meshes: Sequence[Any] = the_meshes(MISSING)
+    builders: Sequence[str] = option((), "Which, by name  [default: all]", of=("builder", "wrt.accel.bvh.builders:BVH_BUILDERS"))
+    rays: int = option(2**18, "Rays into each mesh", (1, 2**26))
+    builds: int = option(3, "Builds of each builder, after the first", (1, 100))
+    runs: int = option(7, "Runs of each volume, alternating", (1, 1000))
+    threads: int | None = the_threads("Threads to build with  [default: all cores]")
+    seed: int = option(0, "Other rays")
+
+
+@dataclass(frozen=True)
+class RtCore(Plan):
+    """The model of the RT core on MESHES: what limits it, rays a second as ranges, and which assumption moves them most."""
+
+    COMMAND, STUDY = "bench rtcore", "wrt.lab.rtcore.meshes"
+    meshes: Sequence[Any] = the_meshes(MISSING)
+    structures: Sequence[str] = option((), "Which, by name  [default: every BVH]", of=STRUCTURES)
+    kinds: Sequence[str] = the_kinds("primary", "diffuse")
+    rays: int = option(2**16, "Rays of each kind", (1, 2**22))
+    gpu: str = option("rtx2080ti", "What the model reckons for: rtx2080ti or rtx2060", of=GPUS)
+    seed: int = option(0, "Other rays")
+    inside: bool = option(False, "The camera stands in the middle of the mesh's box, as in a room")
+    software: bool = option(False, "Also what the same rays take in software on a GTX 1080 Ti (compiles for Turing)")
+
+
+@dataclass(frozen=True)
+class WhatIf(Plan):
+    """Change one thing of the RT core's design, and count the same rays through MESH again.
+
+    STUDY: width (node width, format and volume), stack (entries, with restarts), planes (bits of a box plane), order (nearer
+    child first, early stop), sorting (of rays), rates (boxes a clock against triangles a clock).
+    """
+
+    COMMAND, STUDY = "whatif", "wrt.lab.rtcore.whatif"
+    study: str = option(MISSING, "", of=("study", "wrt.lab.rtcore.whatif:STUDIES"), form="argument")
+    mesh: Any = option(MISSING, "", form="argument")  # noqa: RUF009
+    kinds: Sequence[str] = the_kinds("primary", "diffuse")
+    rays: int = option(2**15, "Rays of each kind", (1, 2**22))
+    gpu: str = option("rtx2080ti", "What the model reckons for: rtx2080ti or rtx2060", of=GPUS)
+    seed: int = option(0, "Other rays")
+    inside: bool = option(False, "The camera stands in the middle of the mesh's box, as in a room")
+
+
+@dataclass(frozen=True)
+class Error(Plan):
+    """What to turn in a scene, and how often it is rendered."""
+
+    knobs: Sequence[str] = option((), "Which to turn: sampler, max_depth, triangle ... (a wrong name lists them)  [default: all]",
+                                  of=("knob", "wrt.lab.bench.error:KNOBS"))
+    max_spp: int = option(64, "Samples a pixel: 1, 2, 4 ... up to this", (1, 1 << 16))
+    repeats: int = option(8, "Seeds of each picture, for the intervals", (3, 1000))  # 2 seeds have no spread
+    reference_spp: int | None = option(None, "Samples of each of the reference's seeds  [default: 8 times --max-spp]", (1, 1 << 24))
+    row_seconds: float = option(120.0, "Leave out what would take longer than this, with all its seeds  [default: 120s]",
+                                flag="row-limit", form="duration")
+
+    @property
+    def levels(self) -> list[int]:
+        return [1 << i for i in range(self.max_spp.bit_length())]
+
+
+@dataclass(frozen=True)
+class Mitsuba(Plan):
+    """How much each renderer draws."""
+
+    spp: int = option(64, "wrt's samples a pixel; its error is what Mitsuba must reach", (1, 1 << 16))
+    repeats: int = option(7, "Pictures of each, alternating, each with its own seed", (3, 1000))
+    reference_spp: int | None = option(None, "Samples of each of the reference's 8 seeds  [default: 8 times --spp]")
+    rival_seconds: float = option(60.0, "No picture of Mitsuba's takes longer  [default: 60s]", flag="rival-limit", form="duration")
+    integrator: str = option("auto", "Mitsuba's: path, volpath, direct or whitted (in Python, scalar_rgb only)")
+    variants: Sequence[str] = option(("scalar_rgb", "llvm_ad_rgb"), "Mitsuba's; llvm_ad_rgb needs an LLVM library")
+    starts: int = option(3, "How often to time whole processes; 0: not at all")
+    seed: int = option(0, "Decides on all seeds")
+
+    def __post_init__(self) -> None:
+        from wrt.core.checks import as_choice
+        from wrt.core.errors import InputError
+        from wrt.lab.mitsuba.process import VARIANTS
+        from wrt.lab.mitsuba.translate import INTEGRATORS
+
+        super().__post_init__()
+        as_choice(self.integrator, INTEGRATORS, "integrator")
+        if not self.variants or not set(self.variants) <= set(VARIANTS):
+            raise InputError(f"variants must be of {', '.join(VARIANTS)}; got {', '.join(self.variants) or 'none'}")
+
+
+@dataclass(frozen=True)
+class Stability(Plan):
+    """The hard cases against the intersection tests: rays lost and errors, with the speed beside them.
+
+    CASES: names such as E_grid, or the letters of groups; without any, all.
+    """
+
+    COMMAND = "stability"
+    REPORT = "Write a report: Markdown with plots beside it (.md), or one page (.html)"
+    cases: Sequence[str] = option((), "", form="argument")
+    rays: int = option(10_000, "Rays of each case, for the default", (1, 2**40))
+    sample: int = option(10_000, "How many of them the oracle judges, and the other tests and peers get", (1, 2**40))
+    peers: bool = option(False, "Also Embree (robust and fast), Warp's mesh_query_ray and Open3D, where installed")
+    seed: int = option(0, "Other rays")
+    threads: int | None = the_threads("Threads for the rays beyond the sample  [default: all cores]")
+    runs: int = option(7, "Runs of each for the speed, by turns", (1, 1000))
