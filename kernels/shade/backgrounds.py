@@ -93,12 +93,12 @@ BACKGROUNDS = {
 # --- the scene's ------------------------------------------------------------------------------------------------------
 
 
-def make_background(features):
+def make_background(features: Any) -> Any:
     """Radiance from beyond all surfaces: (background, unit direction) -> radiance."""
     return BACKGROUNDS[features.background].radiance
 
 
-def make_sky_sample(features):
+def make_sky_sample(features: Any) -> Any:
     """One direction to the background."""
     radiance, by_kind = BACKGROUNDS[features.background]
     of_cosine = by_kind is None

@@ -1,5 +1,7 @@
 """Direct light: one sample of one light, as what it sends to the eye and as the segment to look along."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.shade.backgrounds import make_sky_sample
@@ -25,7 +27,7 @@ def shadow_ray(s: Surface, sample: LightSample) -> Ray:
     return ray
 
 
-def make_reflected_light(features):
+def make_reflected_light(features: Any) -> Any:
     """The light that one sample sends to the eye, before shadows, and which sample that is."""
     light_sample = make_light_sample(features)
     sky_sample = make_sky_sample(features)
@@ -59,7 +61,7 @@ def make_reflected_light(features):
     return choose, reflected
 
 
-def make_light_xi(features):
+def make_light_xi(features: Any) -> Any:
     """The numbers that place a sample on a light."""
     sample_2d = make_sample_2d(features)
     single = {number for number, name in enumerate(LIGHTS) if name in features.lights and name in WITHOUT_AREA}

@@ -1,5 +1,7 @@
 """Light kinds: one sample of what arrives from a light at a surface. One function a kind, and a row in LIGHTS."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, search_cdf, share_of_row, triangle
@@ -80,7 +82,7 @@ def spot_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface,
     return sample
 
 
-def make_mesh_light(features):
+def make_mesh_light(features: Any) -> Any:
     """A point on the emitters of one light, by power and then uniformly by area."""
     place_of = make_place_of(features.instances)
 
@@ -197,7 +199,7 @@ WITHOUT_AREA = ("point", "directional", "spot")
 # --- any of them ------------------------------------------------------------------------------------------------------
 
 
-def make_light_sample(features):
+def make_light_sample(features: Any) -> Any:
     """The scene's kinds, one `if` after another, as in materials.py."""
     light_sample = no_light
     for number, name in reversed(list(enumerate(LIGHTS))):
@@ -211,7 +213,7 @@ def no_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, x
     return LightSample()
 
 
-def make_link(number, function, others):
+def make_link(number: int, function: Any, others: Any) -> Any:
     """`function` for lights of that number, and the others for all other ones."""
 
     @wp.func

@@ -1,5 +1,7 @@
 """One ray at a time: a loop around the integrator's step that traces what it asks for. Pending paths wait on a small stack."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.shade.backgrounds import make_background
@@ -9,7 +11,7 @@ from wrt.kernels.shade.step import Lit, Sample, add_up, counted, is_lit, lit_by,
 from wrt.kernels.structs import Lighting, Limits, Ray, Surfaces
 
 
-def make_direct_light(features, accel_struct, transmittance, step, counting=False):
+def make_direct_light(features: Any, accel_struct: Any, transmittance: Any, step: Any, counting: bool = False) -> Any:
     """Light straight from every light (and the background) by one shadow ray each."""
     Shaded = make_shaded(counting)
     shadow_request, extra_lights = step.shadow_request, step.extra_lights
@@ -27,7 +29,7 @@ def make_direct_light(features, accel_struct, transmittance, step, counting=Fals
     return direct_light
 
 
-def make_radiance(features, accel_struct, closest_hit, any_hit, counting=False):
+def make_radiance(features: Any, accel_struct: Any, closest_hit: Any, any_hit: bool, counting: bool = False) -> Any:
     """The whole tree of rays behind one camera ray. `features`: wrt.renderer.features.Features; counting: rays carry a label."""
     shading = make_shading(features)
     step = make_step(features, shading, counting)

@@ -1,5 +1,7 @@
 """Material kinds: what a surface sends back, and where rays go on from it. One function a kind, and a row in MATERIALS."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.shade.fresnel import fresnel_conductor, fresnel_dielectric, fresnel_schlick, fresnel_tint
@@ -91,7 +93,7 @@ def conductor(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) ->
     return with_highlight(m, result)
 
 
-def make_glass(features):
+def make_glass(features: Any) -> Any:
     """Reflection and refraction at a boundary to index m.ior, or at a thin pane of it."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
 
@@ -122,7 +124,7 @@ def make_glass(features):
     return glass
 
 
-def make_metallic_roughness(features):
+def make_metallic_roughness(features: Any) -> Any:
     """glTF 2.0, appendix B: a metal and a coated diffuse (or clear) body, mixed by `metallic`."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
     glass = make_glass(features)
@@ -161,7 +163,7 @@ MATERIALS = {
 # --- any of them ------------------------------------------------------------------------------------------------------
 
 
-def make_of_kind(features):
+def make_of_kind(features: Any) -> Any:
     """The scene's kinds, one `if` after another: a table that is looked up in a device function keeps the code of before an
     edit."""
     of_kind = no_kind
@@ -176,7 +178,7 @@ def no_kind(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> S
     return out
 
 
-def make_link(number, function, others):
+def make_link(number: int, function: Any, others: Any) -> Any:
     """`function` for materials of that number, and the others for all other ones."""
 
     @wp.func
@@ -188,7 +190,7 @@ def make_link(number, function, others):
     return of_kind
 
 
-def make_scatter(features):
+def make_scatter(features: Any) -> Any:
     """How a surface splits what arrives."""
     of_kind = make_of_kind(features)
 

@@ -1,5 +1,7 @@
 """The rays of a camera by themselves, and the ray that there is not."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.structs import Ray, kernel, make_ray
@@ -13,7 +15,7 @@ def no_ray() -> Ray:
     return ray
 
 
-def make_camera_rays_kernel(camera_kind):
+def make_camera_rays_kernel(camera_kind: Any) -> Any:
     """camera_kind: a module as wrt.kernels.shade.cameras says. Through the middle of the lens; the direction is 0 where there is no
     ray."""
     camera_struct = camera_kind.Camera

@@ -1,5 +1,7 @@
 """The kernels that make pictures: camera, integrator, film."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.shade.loop import make_radiance
@@ -17,13 +19,13 @@ def filter_offset(icdf: wp.array(dtype=wp.float32), x: float) -> float:
     return wp.lerp(icdf[i], icdf[i + 1], position - float(i))
 
 
-def make_traversals(features, structure):
+def make_traversals(features: Any, structure: Any) -> Any:
     """closest_hit and any_hit of a structure (wrt.accel.structure.Structure); with cut-outs both look at each hit's alpha."""
     accepts = make_cutout(features) if features.cutout else None
     return structure.traversal(any_hit=False, accepts=accepts), structure.traversal(any_hit=True, accepts=accepts)
 
 
-def make_camera_sample(features, camera_kind):
+def make_camera_sample(features: Any, camera_kind: Any) -> Any:
     """The ray of one sample of a pixel."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray(features)
@@ -98,7 +100,7 @@ def with_sample(before: Pixel, sample: Sample) -> Pixel:
     return pixel
 
 
-def make_render_kernel(features, structure, camera_kind):
+def make_render_kernel(features: Any, structure: Any, camera_kind: Any) -> Any:
     """A kernel that adds samples to the pixels of a tile; it holds only the code that `features` asks for.
 
     camera_kind: a module as wrt.kernels.shade.cameras says.
@@ -151,7 +153,7 @@ def center_of(x: int, y: int, width: int, height: int) -> wp.vec2:
     return wp.vec2((float(x) + 0.5) / float(width), (float(y) + 0.5) / float(height))
 
 
-def make_see(features):
+def make_see(features: Any) -> Any:
     """What a pixel's center shows."""
     surface_at, resolve, shading_normal, _, _ = make_shading(features)
 
@@ -171,7 +173,7 @@ def make_see(features):
     return see
 
 
-def make_aov_kernel(features, structure, camera_kind):
+def make_aov_kernel(features: Any, structure: Any, camera_kind: Any) -> Any:
     """What the ray through each pixel's centre (and the lens' centre) meets first."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray()

@@ -6,6 +6,8 @@ both by hashing (Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4))
 constants of Vegdahl 2021 ("Building a Better LK Hash"). Independent random numbers are there to be compared with it.
 """
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.native import source
@@ -97,11 +99,11 @@ def independent_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
 
 @wp.func_native(source("shade/sample_points.h", HASH_1=HASH_1, HASH_2=HASH_2, LK_1=LK_1, LK_2=LK_2, LK_3=LK_3, SEED_X=SEED_X,
                        SEED_Y=SEED_Y, BITS_1=BITS_1, BITS_2=BITS_2, BITS_4=BITS_4, BITS_8=BITS_8, UNIT=UNIT))
-def sample_points(seed: wp.uint32, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int):
+def sample_points(seed: wp.uint32, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int) -> None:
     """Points first, first + 1 ... of sample_2d's sequence to out[at], out[at + 1] ... (CPU); seed: hash_pair(key, dimension)."""
 
 
-def make_draw(features):
+def make_draw(features: Any) -> Any:
     """Many numbers of a pixel at a time, for the CPU."""
     sample = make_sample_2d(features)
 
@@ -117,7 +119,7 @@ def make_draw(features):
     return draw
 
 
-def make_sample_2d(features):
+def make_sample_2d(features: Any) -> Any:
     """The sampler that the scene's settings ask for."""
     return independent_2d if features.independent else sample_2d
 

@@ -13,7 +13,7 @@ MASK = 1  # alpha modes; 0 is opaque
 BLEND = 2
 
 
-def make_resolve(features, sample_texture):
+def make_resolve(features: Any, sample_texture: Any) -> Any:
     """The material at a point: parameters times textures."""
 
     @wp.func
@@ -35,7 +35,7 @@ def make_resolve(features, sample_texture):
     return resolve
 
 
-def make_cutout(features):
+def make_cutout(features: Any) -> Any:
     """Cut-outs: a hit on a masked texture's clear part is none. For the traversal units, which call it at every hit."""
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
     place_of = make_place_of(features.instances)
@@ -57,7 +57,7 @@ def make_cutout(features):
     return accepts
 
 
-def make_bump(features, sample_texture):
+def make_bump(features: Any, sample_texture: Any) -> Any:
     """Normal maps: the shading normal that the picture says."""
 
     @wp.func
@@ -82,7 +82,7 @@ def make_bump(features, sample_texture):
     return bump
 
 
-def make_is_solid(features):
+def make_is_solid(features: Any) -> Any:
     """Glass with an inside: what a ray enters at the front of a surface and leaves at its back."""
 
     @wp.func
@@ -106,7 +106,7 @@ class Shading(NamedTuple):
     is_solid: Any
 
 
-def make_shading(features):
+def make_shading(features: Any) -> Any:
     """Once for a kernel: the integrator's step, shadow rays and AOVs share it."""
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
     uvs = features.textures or features.checkerboards

@@ -1,5 +1,7 @@
 """Shadow rays: what is left of a light on its way to a surface."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.shade.shading import BLEND
@@ -61,7 +63,7 @@ def left(p: Passage) -> Passage:
     return out
 
 
-def make_pass_surface(features, scatter, is_solid):
+def make_pass_surface(features: Any, scatter: Any, is_solid: Any) -> Any:
     """One more surface on light's way."""
 
     @wp.func
@@ -137,7 +139,7 @@ def begin_shadow(ray: Ray, end: wp.vec3) -> ShadowWalk:
     return walk
 
 
-def make_go_through(features, shading):
+def make_go_through(features: Any, shading: Any) -> Any:
     """What a shadow ray does with the closest hit on its way. Nothing here traces a ray."""
     surface_at, resolve, shading_normal, scatter, is_solid = shading
     pass_surface = make_pass_surface(features, scatter, is_solid)
@@ -196,7 +198,7 @@ def make_go_through(features, shading):
     return go_through
 
 
-def make_transmittance(features, shading, accel_struct, closest_hit, any_hit):
+def make_transmittance(features: Any, shading: Any, accel_struct: Any, closest_hit: Any, any_hit: bool) -> Any:
     """Shadow rays: one any-hit query, or where a scene lets light through surfaces, one closest hit after another."""
     go_through = make_go_through(features, shading)
 

@@ -32,7 +32,7 @@ def label(branch: int, depth: int) -> int:
 
 
 @cache
-def make_path(counting):
+def make_path(counting: bool) -> Any:
     """A pending ray; `counting`: it also knows what kind of ray it is."""
 
     @wp.struct
@@ -56,7 +56,7 @@ def make_path(counting):
 
 
 @cache
-def make_shaded(counting):
+def make_shaded(counting: bool) -> Any:
     """What `shade` makes of a path and a hit."""
     path_struct = make_path(counting)
 
@@ -194,7 +194,7 @@ class Step(NamedTuple):
     worth: Any
 
 
-def make_step(features, shading, counting=False):
+def make_step(features: Any, shading: Any, counting: bool = False) -> Any:
     """The step of a scene's kernel. `features`: wrt.renderer.features.Features; `shading`: of make_shading."""
     Path = make_path(counting)
     first_path, ray_of, child = make_paths(counting)
@@ -202,7 +202,7 @@ def make_step(features, shading, counting=False):
                 make_shadow_request(features, counting), *make_keep(features, counting))
 
 
-def make_paths(counting=False):
+def make_paths(counting: bool = False) -> Any:
     """Where paths begin: at the camera, or at a surface."""
     Path = make_path(counting)
 
@@ -241,7 +241,7 @@ def make_paths(counting=False):
     return first_path, ray_of, child
 
 
-def make_missing(features, is_solid):
+def make_missing(features: Any, is_solid: Any) -> Any:
     """How far a blended surface is not there."""
 
     @wp.func
@@ -261,7 +261,7 @@ def make_missing(features, is_solid):
     return missing
 
 
-def make_shade(features, shading, child, counting=False):
+def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) -> Any:
     """One device function from a path and its hit to everything that follows from them."""
     Path, Shaded = make_path(counting), make_shaded(counting)
     surface_at, resolve, shading_normal, scatter_at, is_solid = shading
@@ -331,7 +331,7 @@ def make_shade(features, shading, child, counting=False):
     return shade
 
 
-def make_shadow_request(features, counting=False):
+def make_shadow_request(features: Any, counting: bool = False) -> Any:
     """What a surface asks of a light."""
     Shaded = make_shaded(counting)
     light_xi = make_light_xi(features)
@@ -352,7 +352,7 @@ def make_shadow_request(features, counting=False):
     return shadow_request
 
 
-def make_keep(features, counting=False):
+def make_keep(features: Any, counting: bool = False) -> Any:
     """Which paths are followed, and what is lost with those that are not."""
     Path = make_path(counting)
 

@@ -1,5 +1,7 @@
 """From a hit to the surface there: point with error bound, normals, texture coordinates, and where new rays start."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x
@@ -58,7 +60,7 @@ class Place:
     instance: int
 
 
-def make_place_of(instances: bool):
+def make_place_of(instances: bool) -> Any:
     """From a prim_id to its data."""
 
     @wp.func
@@ -155,7 +157,7 @@ def triangle_normal(surfaces: Surfaces, index: int) -> wp.vec3:
     return wp.normalize(wp.cross(e1 / largest(e1), e2 / largest(e2)))
 
 
-def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False):
+def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False) -> Any:
     """Interpolation at a hit, with only those attributes that the scene has."""
     place_of = make_place_of(instances)
 

@@ -1,5 +1,7 @@
 """Textures: 8-bit pictures sampled bilinearly, and the checkerboard."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.structs import Surfaces, Texture
@@ -58,7 +60,7 @@ def checkerboard(texture: Texture, u: float, v: float) -> wp.vec4:
     return wp.vec4(color[0], color[1], color[2], 1.0)
 
 
-def make_sample_texture(pictures: bool, checkerboards: bool):
+def make_sample_texture(pictures: bool, checkerboards: bool) -> Any:
     """The look-up, with only those kinds of texture that the scene has."""
 
     @wp.func

@@ -9,6 +9,7 @@ Each kernel is one thread with a loop over its queue: it counts without atomics,
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -95,15 +96,15 @@ def hit_at(hits: HitArrays, i: int) -> Hit:
 
 
 @wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_face(array: wp.array(dtype=wp.vec3i), i: int): ...
+def call_in_face(array: wp.array(dtype=wp.vec3i), i: int) -> None: ...
 
 
 @wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_number(array: wp.array(dtype=wp.int32), i: int): ...
+def call_in_number(array: wp.array(dtype=wp.int32), i: int) -> None: ...
 
 
 @wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_corner(array: wp.array(dtype=wp.vec3), i: int): ...
+def call_in_corner(array: wp.array(dtype=wp.vec3), i: int) -> None: ...
 
 
 @wp.func
@@ -124,7 +125,7 @@ def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, queued: int):
                     call_in_corner(surfaces.normals, face[corner])
 
 
-def make_begin_kernel(features, camera_kind):
+def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
     """Camera rays of a wave. Where there is none, the sample is done."""
     camera_struct = camera_kind.Camera
     camera_sample = make_camera_sample(features, camera_kind)
@@ -162,7 +163,7 @@ def make_begin_kernel(features, camera_kind):
     return begin_wave
 
 
-def make_shade_kernel(features):
+def make_shade_kernel(features: Any) -> Any:
     """The step at every hit of the queue: its light, its new paths, and its requests for shadow rays."""
     shading = make_shading(features)
     step = make_step(features, shading)
@@ -253,7 +254,7 @@ def make_shade_kernel(features):
     return shade_wave
 
 
-def make_shadow_kernel(features):
+def make_shadow_kernel(features: Any) -> Any:
     """Shadow rays to one light that have met the closest surface on their way."""
     go_through = make_go_through(features, make_shading(features))
 
@@ -278,7 +279,7 @@ def make_shadow_kernel(features):
 
 
 @cache
-def make_gather_kernel(transparent_shadows: bool):
+def make_gather_kernel(transparent_shadows: bool) -> Any:
     """What the lights send to the hits of the queue; then the next path of each sample is queued."""
 
     @kernel
@@ -312,7 +313,7 @@ def make_gather_kernel(transparent_shadows: bool):
     return gather_wave
 
 
-def make_begin_aov_kernel(camera_kind):
+def make_begin_aov_kernel(camera_kind: Any) -> Any:
     """A ray through the middle of each pixel; where there is none, it has no length."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray()
@@ -332,7 +333,7 @@ def make_begin_aov_kernel(camera_kind):
     return begin_aov
 
 
-def make_see_kernel(features):
+def make_see_kernel(features: Any) -> Any:
     """What those rays meet."""
     see = make_see(features)
 

@@ -7,6 +7,7 @@ something to do while a ray waits for memory or for its own last result.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -118,7 +119,7 @@ def best_at(packet: wp.array(dtype=wp.float32), ray: int) -> Hit:
     return best
 
 
-def make_leaf_test(units: Units, any_hit: bool, accepts=None):
+def make_leaf_test(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The triangles of a row that are in a mask against one ray of a packet; whether the ray has found what it asks for."""
     gather = make_gather(units.triangle_test.record, WIDTH)
     intersect = make_intersect(units, accepts)
@@ -154,7 +155,7 @@ def holds_sphere(rows: wp.array(dtype=wp.float32), first: int, count: int, n_tri
     return False
 
 
-def make_packet_walk(units: Units, any_hit: bool, accepts=None):
+def make_packet_walk(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """A packet with a beam, from the root."""
     struct = make_struct(units.triangle_test.record)
     size_of_row = row_size(units.triangle_test.record, WIDTH)
@@ -229,7 +230,7 @@ def make_packet_walk(units: Units, any_hit: bool, accepts=None):
     return walk
 
 
-def make_interleaved(units: Units, any_hit: bool, accepts=None):
+def make_interleaved(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """Rays of several packets, each for itself, from the root. waiting: a bit for each; lane after lane, packet after packet."""
     struct = make_struct(units.triangle_test.record)
     size_of_row = row_size(units.triangle_test.record, WIDTH)
@@ -302,7 +303,7 @@ def make_interleaved(units: Units, any_hit: bool, accepts=None):
 
 
 @cache
-def make_kernel(units: Units, any_hit: bool, rays_struct=RayArrays, accepts=None):
+def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
     """Rays first .. end - 1, a block of PACKETS packets a thread, one thread after another in the same scratch. out:
     HitArrays, or for any hit an array of bool. Arrays must have no gaps."""
     struct = make_struct(units.triangle_test.record)
@@ -358,7 +359,7 @@ class BatchTraversal(WideTraversal):
     def __init__(self) -> None:
         super().__init__(WIDTH)
 
-    def make_stream(self, units: Units, any_hit: bool, rays_struct=RayArrays, accepts=None):
+    def make_stream(self, units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
         """None for units that it has no lanes for."""
         if units.triangle != "watertight" or units.box not in ROW_PADS or units.counters or units.instances:
             return None

@@ -5,6 +5,7 @@ for the CPU, and plain Warp, lane by lane, for CUDA.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -70,18 +71,18 @@ def bits(rows: wp.array(dtype=wp.float32), i: int) -> int:
 
 
 @wp.func_native(source("wide/prefetch.h", CACHE_LINE=CACHE_LINE))
-def prefetch(rows: wp.array(dtype=wp.float32), first: int, lines: int):
+def prefetch(rows: wp.array(dtype=wp.float32), first: int, lines: int) -> None:
     """So many cache lines from rows[first] are soon needed."""
 
 
 @cache
-def row_type(width: int):
+def row_type(width: int) -> Any:
     """A row of `width` float32."""
     return wp.types.vector(width, wp.float32)
 
 
 @cache
-def make_plain_cull(width: int):
+def make_plain_cull(width: int) -> Any:
     """make_cull in plain Warp, lane by lane."""
 
     @wp.func
@@ -109,7 +110,7 @@ def make_plain_cull(width: int):
 
 
 @cache
-def make_native_cull(width: int):
+def make_native_cull(width: int) -> Any:
     """make_cull in C++, for the CPU only."""
 
     @wp.func_native(source("wide/row_cull.h", WIDTH=width))
@@ -119,7 +120,7 @@ def make_native_cull(width: int):
 
 
 @cache
-def make_cull(width: int):
+def make_cull(width: int) -> Any:
     """cull(rows, first, ray) -> mask of the triangles whose rows begin at `first`, without those that the watertight unit refuses
     in float32."""
     plain, vector = make_plain_cull(width), make_native_cull(width)

@@ -8,6 +8,7 @@ box. An origin that is NaN says nothing about its axis: no ray is stopped there.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -40,7 +41,7 @@ def node_size(width: int, compressed: bool) -> int:
 
 
 @cache
-def make_plane(width: int, compressed: bool):
+def make_plane(width: int, compressed: bool) -> Any:
     """plane(nodes, first, row, lane): a number of one of PLANES; and exists(nodes, first, lane): whether there is such a child."""
 
     @wp.func
@@ -62,7 +63,7 @@ def make_plane(width: int, compressed: bool):
     return plane, exists
 
 
-def lane_by_lane(width: int, compressed: bool, enters):
+def lane_by_lane(width: int, compressed: bool, enters: Any) -> Any:
     """make_children from what is said of one child: enters(nodes, first, lane, ray, t_max) -> distance, inf where it is missed."""
     row = row_type(width)
     _, exists = make_plane(width, compressed)
@@ -82,7 +83,7 @@ def lane_by_lane(width: int, compressed: bool, enters):
 
 
 @cache
-def make_scalar(width: int, compressed: bool, box: str):
+def make_scalar(width: int, compressed: bool, box: str) -> Any:
     """make_children by the scalar unit of that name in RAY_AABB, for a box test that has no form in rows."""
     plane, _ = make_plane(width, compressed)
     ray_aabb = RAY_AABB[box]
@@ -97,7 +98,7 @@ def make_scalar(width: int, compressed: bool, box: str):
 
 
 @cache
-def make_plain(width: int, compressed: bool):
+def make_plain(width: int, compressed: bool) -> Any:
     """make_children of rows in plain Warp."""
     plane, _ = make_plane(width, compressed)
 
@@ -121,7 +122,7 @@ def make_plain(width: int, compressed: bool):
 
 
 @cache
-def make_native(width: int, compressed: bool):
+def make_native(width: int, compressed: bool) -> Any:
     """make_children of rows in C++, for the CPU only."""
     row = row_type(width)
     layout = {"WIDTH": width, "COMPRESSED": compressed, "WORD": WORD, "FIRST_BYTES": FIRST_BYTES, "EXPONENT_BITS": EXPONENT_BITS,
@@ -141,7 +142,7 @@ def make_native(width: int, compressed: bool):
 
 
 @cache
-def make_children(width: int, compressed: bool, box: str):
+def make_children(width: int, compressed: bool, box: str) -> Any:
     """children(nodes, first, ray, t_max) -> (row, mask): the mask of the children of the node that begins at `first` which the ray
     enters before it leaves them, and at or before t_max (finite); the row of where it enters these, at least t_min.
 

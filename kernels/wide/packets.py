@@ -5,6 +5,7 @@ bit: a test holds the two together. This file has the layouts that they work on;
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -91,7 +92,7 @@ class Scratch:
 
 
 @cache
-def make_set_up(rays_struct):
+def make_set_up(rays_struct: Any) -> Any:
     """set_up for RayArrays, or for a Queue, whose directions are taken as they are."""
 
     @wp.func_native(source("wide/packet_set_up.h", QUEUE=rays_struct is not RayArrays, **LAYOUT))
@@ -123,11 +124,12 @@ def triangles(rows: wp.array(dtype=wp.float32), first: int, count: int, mask: in
 
 
 @wp.func_native(source("wide/packet_write_hits.h", **LAYOUT))
-def write_hits(hits: HitArrays, first: int, count: int, packet: wp.array(dtype=wp.float32), base: int): ...
+def write_hits(hits: HitArrays, first: int, count: int, packet: wp.array(dtype=wp.float32), base: int) -> None: ...
 
 
 @wp.func_native(source("wide/packet_write_occluded.h", **LAYOUT))
-def write_occluded(occluded: wp.array(dtype=wp.bool), first: int, count: int, packet: wp.array(dtype=wp.float32), base: int): ...
+def write_occluded(occluded: wp.array(dtype=wp.bool), first: int, count: int, packet: wp.array(dtype=wp.float32),
+                   base: int) -> None: ...
 
 
 # --- one ray of a packet, and its slot --------------------------------------------------------------------------------
@@ -165,11 +167,11 @@ def count_of(mask: int) -> int: ...
 
 
 @wp.func_native("packet.data[(long long)i] = value;")
-def put_number(packet: wp.array(dtype=wp.float32), i: int, value: float): ...
+def put_number(packet: wp.array(dtype=wp.float32), i: int, value: float) -> None: ...
 
 
 @wp.func_native("__builtin_memcpy(packet.data + (long long)i, &value, sizeof(value));")
-def put_bits(packet: wp.array(dtype=wp.float32), i: int, value: int): ...
+def put_bits(packet: wp.array(dtype=wp.float32), i: int, value: int) -> None: ...
 
 
 @wp.func_native("return slots.data[(long long)i];")
@@ -177,4 +179,4 @@ def slot_at(slots: wp.array(dtype=wp.int32), i: int) -> int: ...
 
 
 @wp.func_native("slots.data[(long long)i] = value;")
-def put_slot(slots: wp.array(dtype=wp.int32), i: int, value: int): ...
+def put_slot(slots: wp.array(dtype=wp.int32), i: int, value: int) -> None: ...

@@ -9,6 +9,7 @@ boxes last.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -27,7 +28,7 @@ STACK_SIZE = 64
 
 
 @cache
-def make_struct(record):
+def make_struct(record: Any) -> Any:
     """nodes: as in kernels.wide.nodes, the root first. primitives: rows of as many primitives as a node has children: first the
     first number of `record` of all of them, then the second ... Leaves begin with a row of their own, and their references count
     rows; where nodes are compressed, leaves follow each other without a gap, and references count primitives."""
@@ -41,13 +42,13 @@ def make_struct(record):
     return WideBvh
 
 
-def row_size(record, width: int) -> int:
+def row_size(record: Any, width: int) -> int:
     """Numbers of a row of primitives."""
     return record.numpy_dtype()["itemsize"] // 4 * width
 
 
 @cache
-def make_uninitialized(length: int, dtype):
+def make_uninitialized(length: int, dtype: Any) -> Any:
     """A vector of whatever memory holds: Warp sets every new one to 0, and of a stack's 512 bytes most rays use a few."""
 
     @wp.func_native(source("wide/uninitialized.h", TYPE=f"wp::vec_t<{length}, wp::{dtype.__name__}>"))
@@ -96,11 +97,11 @@ def lane_ray(probe: Probe, pad: float) -> LaneRay:
 
 
 @cache
-def make_gather(record, width):
+def make_gather(record: Any, width: int) -> Any:
     """gather(rows, i): the record that has its first number at rows[i], the next at rows[i + width] and so on."""
 
     @wp.func_native(source("wide/gather.h", WIDTH=width))
-    def copy_numbers(rows: wp.array(dtype=wp.float32), i: int, out: wp.ref[record]): ...
+    def copy_numbers(rows: wp.array(dtype=wp.float32), i: int, out: wp.ref[record]) -> None: ...
 
     @wp.func
     def gather(rows: wp.array(dtype=wp.float32), i: int) -> record:
@@ -111,7 +112,7 @@ def make_gather(record, width):
     return gather
 
 
-def make_row_test(units: Units, any_hit, accepts, width):
+def make_row_test(units: Units, any_hit: bool, accepts: Any, width: int) -> Any:
     """The unit that tests those primitives of a row that are in the mask; its numbers begin at `first`."""
     intersect = make_intersect(units, accepts)
     gather = make_gather(units.triangle_test.record, width)
@@ -135,7 +136,7 @@ def make_row_test(units: Units, any_hit, accepts, width):
 
 
 @cache
-def make_call_in(record, width: int, compressed: bool, lines: int):
+def make_call_in(record: Any, width: int, compressed: bool, lines: int) -> Any:
     """call_in(nodes, primitives, reference): the first cache lines of what a reference leads to, as it is needed soon."""
     unit = 1 if compressed else width  # of primitives, in which references count
 
@@ -149,7 +150,7 @@ def make_call_in(record, width: int, compressed: bool, lines: int):
     return call_in
 
 
-def make_traversal(units: Units, any_hit: bool, accepts, width: int, compressed: bool):
+def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compressed: bool) -> Any:
     """The closest hit, or any (the first that is found), in a tree of nodes of `width` children."""
     children = make_children(width, compressed, units.box)
     probe_of = make_probe(units)
@@ -283,8 +284,8 @@ class WideTraversal:
         self.width = width
         self.compressed = compressed
 
-    def make_struct(self, record):
+    def make_struct(self, record: Any) -> Any:
         return make_struct(record)
 
-    def make_traversal(self, units: Units, any_hit: bool, accepts=None):
+    def make_traversal(self, units: Units, any_hit: bool, accepts: Any = None) -> Any:
         return make_traversal(units, any_hit, accepts, self.width, self.compressed)

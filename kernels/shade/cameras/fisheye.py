@@ -1,5 +1,7 @@
 """An equidistant fisheye: the angle to the axis grows in proportion to the distance from the picture's centre."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.shade.pixel_rays import no_ray
@@ -36,5 +38,5 @@ def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
     return make_ray(camera.origin, wp.normalize(direction))
 
 
-def make_camera_ray(features=None):
+def make_camera_ray(features: Any = None) -> Any:
     return camera_ray

@@ -1,5 +1,7 @@
 """Parallel rays: things look equally large at any distance, and parallel lines stay parallel."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.structs import Ray, make_ray
@@ -25,5 +27,5 @@ def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
     return make_ray(camera.origin + x * camera.right + y * camera.up, camera.forward)
 
 
-def make_camera_ray(features=None):
+def make_camera_ray(features: Any = None) -> Any:
     return camera_ray

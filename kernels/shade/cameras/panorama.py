@@ -1,5 +1,7 @@
 """Everything around one point, equirectangular: columns are longitudes, rows are latitudes."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.structs import Ray, make_ray
@@ -23,5 +25,5 @@ def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
     return make_ray(camera.origin, wp.normalize(wp.sin(colatitude) * level + wp.cos(colatitude) * camera.up))
 
 
-def make_camera_ray(features=None):
+def make_camera_ray(features: Any = None) -> Any:
     return camera_ray

@@ -1,5 +1,7 @@
 """A pinhole, or a thin lens with a round or polygonal aperture."""
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.shade.sampling import disk, polygon
@@ -30,7 +32,7 @@ def chief_ray(camera: Camera, film: wp.vec2) -> wp.vec3:
     return camera.forward + x * camera.right + y * camera.up
 
 
-def make_camera_ray(features=None):
+def make_camera_ray(features: Any = None) -> Any:
     lens = features is not None and features.lens
     blades = lens and features.blades
 
