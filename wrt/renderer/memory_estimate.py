@@ -10,12 +10,13 @@ from typing import Any
 from wrt.accel.base import Accelerator
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.address_space import told_limit
-from wrt.core.device import free_memory
+from wrt.core.device import free_memory, thread_count
 from wrt.core.errors import InputError
 from wrt.core.memory import SMALL, gib
 from wrt.renderer.film_arrays import BYTES_OF_FILM, BYTES_OF_GROUP
 from wrt.renderer.instancing import is_instance
 from wrt.renderer.plan import Plan
+from wrt.renderer.waves import capacity
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.materials import Texture
 from wrt.scene.model import Scene
@@ -24,6 +25,9 @@ BYTES_OF_FACE, BYTES_OF_VERTEX = 55.0, 60.0  # of a mesh in the world: joined, t
 BYTES_OF_EMITTER = 120.0  # of a triangle that lights others, beside that
 BYTES_OF_OBJECT, BYTES_OF_TEXEL, BYTES_OF_SKY = 1000.0, 12.0, 40.0
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
+# Of a sample of a wave (wrt.renderer.waves.Buffers), of each path that it has room for, and of its ray to each light.
+BYTES_OF_SAMPLE, BYTES_OF_PATH, BYTES_OF_SHADOW = 350.0, 60.0, 55.0
+BYTES_OF_WALK = 200.0  # of a shadow ray that goes through surfaces, beside that
 
 
 def require_memory(plan: Plan, device: Any) -> None:
@@ -31,12 +35,24 @@ def require_memory(plan: Plan, device: Any) -> None:
     much."""
     x0, y0, x1, y1 = plan.crop
     pixel = BYTES_OF_FILM + BYTES_OF_GROUP * (plan.groups - 1) + (BYTES_OF_AOVS if plan.options.aov else 0)
-    film = plan.area * (pixel + BYTES_OF_RESULT)
+    film = plan.area * (pixel + BYTES_OF_RESULT) + bytes_of_waves(plan)
     scene = bytes_of_scene(plan.scene, ACCELERATORS[plan.options.accel], plan.meshes)
     free = free_memory(device)
     if film + scene > max(free, SMALL):
         raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {gib(film)} of memory, its scene {gib(scene)};"
                          f" {device} has {gib(free)} free (WRT_MEMORY can say otherwise){told_limit()}")
+
+
+def bytes_of_waves(plan: Plan) -> float:
+    """Bytes that all threads of this process take to trace."""
+    if not plan.by_waves:
+        return 0.0
+    features, scene = plan.features, plan.scene
+    lights = len(scene.lights) + sum(any(m.lights_others for m in thing.materials) for thing in scene.objects) + sum(
+        sphere.material.lights_others for sphere in scene.spheres) + 1
+    shadow = BYTES_OF_SHADOW + (BYTES_OF_WALK if features.transparent_shadows else 0.0)
+    sample = BYTES_OF_SAMPLE + BYTES_OF_PATH * features.stack_size + shadow * lights
+    return thread_count(plan.options.threads) * capacity(features, lights) * sample
 
 
 def bytes_of_scene(scene: Scene, accel: type[Accelerator], kept_once: frozenset[int] = frozenset()) -> float:

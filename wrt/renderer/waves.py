@@ -146,11 +146,16 @@ class Waves:
         return trace
 
 
+def capacity(features: Features, lights: int) -> int:
+    """Samples of a wave."""
+    return max(min(CAPACITY, ROOM // max(lights, features.stack_size)), 64)
+
+
 class Buffers:
     """What one thread works in. job, asking, order: views of the wave's."""
 
     def __init__(self, features: Features, lights: int) -> None:
-        self.capacity = n = max(min(CAPACITY, ROOM // max(lights, features.stack_size)), 64)
+        self.capacity = n = capacity(features, lights)
         shadows = n * lights
         self.job, self.asking, self.order = records(wave.Job, 1), np.zeros(max(lights, 1), np.int32), np.zeros(n, np.int32)
         w = self.wave = wave.Wave()
