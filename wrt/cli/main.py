@@ -38,6 +38,7 @@ from wrt.cli.common import (
     spread_options,
     warnings_reported,
 )
+from wrt.cli.compile import compile_kernels
 from wrt.cli.measure import bench, profile, stability
 from wrt.cli.reporting import measured
 from wrt.cli.save import check_room, checkpoint_options, save_film
@@ -56,7 +57,7 @@ def cli() -> None:
     require_modules()  # before a command imports them
 
 
-for command in (stability, bench, build, profile, animate, view):
+for command in (stability, bench, build, compile_kernels, profile, animate, view):
     cli.add_command(command)
 measured(cli, WhatIf)
 

@@ -1,0 +1,20 @@
+"""`python -m wrt compile`."""
+
+from __future__ import annotations
+
+import json
+
+from click.testing import CliRunner
+
+from tests.data import ROOT
+from wrt.cli.compile import compile_kernels
+
+
+def test_it_tells_what_it_compiled() -> None:
+    scene = str(ROOT / "scenes" / "fisheye.toml")
+    result = CliRunner().invoke(compile_kernels, [scene, "--accel", "bvh2", "--json"])
+    done = json.loads(result.stdout)["compiled"]
+    assert result.exit_code == 0 and [entry["for"] for entry in done] == ["queries of bvh2", scene]
+    assert "shade_wave" in done[1]["kernels"] and all(entry["seconds"] >= 0.0 for entry in done)
+    result = CliRunner().invoke(compile_kernels, ["--accel", "bvh2"])
+    assert result.exit_code == 0 and result.stdout.startswith("queries of bvh2: 2 kernels, ")

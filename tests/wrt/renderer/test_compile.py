@@ -1,0 +1,32 @@
+"""Kernels that are compiled beforehand are those that a render then takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.data import ROOT
+from wrt.core import device
+from wrt.core.errors import InputError
+from wrt.io.load import load_scene
+from wrt.renderer import prepare
+from wrt.renderer.compile import compile_picture, compile_queries
+from wrt.renderer.film_arrays import OF_AOVS
+from wrt.renderer.render import render
+
+
+def test_a_render_finds_its_kernels_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene(ROOT / "scenes" / "fisheye.toml").with_settings(size=(8, 8), spp=1, max_depth=7)
+    names = compile_picture(scene, "bvh")
+    assert {"shade_wave", "begin_wave", "see_wave", "trace"} <= set(names)
+    asked: list[Any] = []
+    monkeypatch.setattr(prepare, "load_kernel", lambda kernel, target: asked.append(kernel))
+    render(scene, aov=tuple(OF_AOVS))
+    assert len(asked) == len(names) and all("cpu" in device._loaded[kernel].devices for kernel in asked)
+
+
+def test_queries_of_a_structure_and_wrong_names() -> None:
+    assert compile_queries("bvh2") == ["closest_hit", "any_hit"]
+    with pytest.raises(InputError, match="nosuch"):
+        compile_queries("nosuch")

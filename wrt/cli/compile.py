@@ -1,0 +1,36 @@
+"""The command that fills the kernel cache beforehand: `compile`."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wrt.cli.common import load, naming, say_json, shared, warnings_reported
+
+
+@click.command("compile", help="Compile what queries of a structure, and pictures of SCENES with all AOVs, take: into Warp's cache"
+               " (WARP_CACHE_PATH), for a container or a cluster. What is there is not compiled again.")
+@click.argument("scenes", nargs=-1, type=click.Path(path_type=Path))
+@shared("accel", "device", "threads", "quiet", "as_json")
+def compile_kernels(scenes: tuple[Path, ...], accel: str, device: str, threads: int | None, quiet: bool, as_json: bool) -> None:
+    from wrt.core.device import thread_count
+    from wrt.renderer.compile import compile_picture, compile_queries
+
+    count, clock, done = thread_count(threads), dict[str, float](), list[dict[str, Any]]()
+
+    def tell(what: str, names: list[str], begin: float) -> None:
+        done.append({"for": what, "kernels": names, "seconds": time.perf_counter() - begin})
+        if not as_json:
+            click.echo(f"{what}: {len(names)} kernels, {done[-1]['seconds']:.1f} s")
+
+    begin = time.perf_counter()
+    tell(f"queries of {accel}", compile_queries(accel, device), begin)
+    for path in scenes:
+        begin, scene = time.perf_counter(), load(path, quiet, clock)
+        with warnings_reported(quiet), naming(path):
+            tell(str(path), compile_picture(scene, accel, device, count), begin)
+    if as_json:
+        say_json({"compiled": done})

@@ -1,0 +1,32 @@
+"""Kernels compiled before they are needed: what a container or the workers of a cluster start with."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from wrt.accel.build import build
+from wrt.core.device import load_kernel, run_all, start
+from wrt.renderer.film_arrays import OF_AOVS
+from wrt.renderer.options import Options
+from wrt.renderer.plan import plan_of
+from wrt.scene.model import Scene
+from wrt.scene.shapes import icosphere
+
+
+def compile_queries(accel: str, device: str = "cpu") -> list[str]:
+    """What builds a structure of that name and answers queries of it. Returns the kernels' names. Raises InputError."""
+    structure = build(icosphere(2), accel, device)
+    rays = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32)
+    structure.closest_hit(*rays)
+    structure.any_hit(*rays)
+    return ["closest_hit", "any_hit"]
+
+
+def compile_picture(scene: Scene, accel: str, device: str = "cpu", threads: int = 1) -> list[str]:
+    """What pictures of a scene take, with all AOVs, on so many threads. Returns the kernels' names. Raises InputError."""
+    target = start(device)
+    kernels = plan_of(scene, Options(accel=accel, device=device, aov=tuple(OF_AOVS))).kernels
+    run_all([partial(load_kernel, kernel, target) for kernel in kernels], threads)
+    return [kernel.key.rsplit("__", 1)[-1] for kernel in kernels]
