@@ -33,7 +33,8 @@ STANDS_FOR = {"MESH...": "model.ply", "MESH": "model.ply", "SCENE": "scenes/whit
 # Cheap options, added behind a command's own, of the commands that are run; the others are only parsed: they take minutes, or
 # compile for minutes, and have tests of their own.
 CHEAP = {
-    "render": ("--size", "32x18", "--spp", "4"), "info": (), "compare": (), "validate": (), "schema": (), "devices": (),
+    "render": ("--size", "32x18", "--spp", "4"), "info": (), "compile": (), "compare": (), "validate": (), "schema": (),
+    "devices": (),
     "profile": ("--size", "24x14"), "animate": ("--frames", "2", "--size", "32x18", "--spp", "1"), "build": (),
     "bench accel": ("--structures", "bvh", "--kinds", "primary", "--rays", "200", "--runs", "1", "--max-triangles", "2000"),
 }
