@@ -169,7 +169,7 @@ def without_counting(text: str) -> str:
         if depth is None:
             out.append(line)
     bare = "\n".join(out) + "\n"
-    for old, new in (("counting=False", ""), (", counting)", ")"), ("(counting)", "()"), (", )", ")"),
-                     ("    counting = structure.units.counters\n", "")):
+    for old, new in (("counting: bool = False", ""), ("counting: bool", "counting"), (", counting)", ")"), ("(counting)", "()"),
+                     (", )", ")"), ("    counting = structure.units.counters\n", "")):
         bare = bare.replace(old, new)
     return "".join(line + "\n" for line in bare.splitlines() if "counting" not in line)
