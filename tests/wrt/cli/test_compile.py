@@ -12,9 +12,9 @@ from wrt.cli.compile import compile_kernels
 
 def test_it_tells_what_it_compiled() -> None:
     scene = str(ROOT / "scenes" / "fisheye.toml")
-    result = CliRunner().invoke(compile_kernels, [scene, "--accel", "bvh2", "--json"])
+    result = CliRunner().invoke(compile_kernels, [scene, "--json"])
     done = json.loads(result.stdout)["compiled"]
-    assert result.exit_code == 0 and [entry["for"] for entry in done] == ["queries of bvh2", scene]
+    assert result.exit_code == 0 and [entry["for"] for entry in done] == ["queries of bvh", scene]
     assert "shade_wave" in done[1]["kernels"] and all(entry["seconds"] >= 0.0 for entry in done)
-    result = CliRunner().invoke(compile_kernels, ["--accel", "bvh2"])
-    assert result.exit_code == 0 and result.stdout.startswith("queries of bvh2: 2 kernels, ")
+    result = CliRunner().invoke(compile_kernels, ["--accel", "bvh"])
+    assert result.exit_code == 0 and result.stdout.startswith("queries of bvh: 2 kernels, ")

@@ -27,6 +27,6 @@ def test_a_render_finds_its_kernels_loaded(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_queries_of_a_structure_and_wrong_names() -> None:
-    assert compile_queries("bvh2") == ["closest_hit", "any_hit"]
+    assert compile_queries("bvh") == ["closest_hit", "any_hit"]
     with pytest.raises(InputError, match="nosuch"):
         compile_queries("nosuch")

@@ -59,9 +59,9 @@ def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> Non
 @pytest.mark.parametrize(("name", "settings"), [
     ("tinted_shadows", {"max_depth": 3}),
     ("thin_glass", {"max_depth": 2}),
-    ("blend", {}),
+    pytest.param("blend", {}, marks=pytest.mark.slow),
     ("cutout", {"max_depth": 0}),
-    ("instances", {"max_depth": 1}),
+    pytest.param("instances", {"max_depth": 1}, marks=pytest.mark.slow),
     ("fisheye", {}),
 ])
 def test_the_film_is_that_of_one_ray_at_a_time(name: str, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
