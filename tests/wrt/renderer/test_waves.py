@@ -55,12 +55,13 @@ def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> Non
         np.testing.assert_array_equal(values.view(np.uint8), other[name].view(np.uint8), err_msg=name)
 
 
-# What there is beside plain surfaces: shadow rays through glass and panes, cut-outs, instances, an image circle.
+# What there is beside plain surfaces: shadow rays through glass and panes, cut-outs, instances, an image circle. Each slow one
+# compiles the loop for its scene; tests/test_bits.py holds all their pixels.
 @pytest.mark.parametrize(("name", "settings"), [
     ("tinted_shadows", {"max_depth": 3}),
-    ("thin_glass", {"max_depth": 2}),
+    pytest.param("thin_glass", {"max_depth": 2}, marks=pytest.mark.slow),
     pytest.param("blend", {}, marks=pytest.mark.slow),
-    ("cutout", {"max_depth": 0}),
+    pytest.param("cutout", {"max_depth": 0}, marks=pytest.mark.slow),
     pytest.param("instances", {"max_depth": 1}, marks=pytest.mark.slow),
     ("fisheye", {}),
 ])
@@ -90,7 +91,7 @@ def test_groups_have_samples_of_their_own() -> None:
     assert (film["mean of group 0"] != film["mean of group 1"]).any()
 
 
-@pytest.mark.parametrize("name", ["fisheye", "cutout"])
+@pytest.mark.parametrize("name", ["fisheye", pytest.param("cutout", marks=pytest.mark.slow)])
 def test_aovs_are_those_of_one_ray_at_a_time(name: str) -> None:
     ready = prepared(name, aov=tuple(OF_AOVS))
     films = []
