@@ -29,7 +29,7 @@ def make_direct_light(features: Any, accel_struct: Any, transmittance: Any, step
     return direct_light
 
 
-def make_radiance(features: Any, accel_struct: Any, closest_hit: Any, any_hit: bool, counting: bool = False) -> Any:
+def make_radiance(features: Any, accel_struct: Any, closest_hit: Any, any_hit: Any, counting: bool = False) -> Any:
     """The whole tree of rays behind one camera ray. `features`: wrt.renderer.features.Features; counting: rays carry a label."""
     shading = make_shading(features)
     step = make_step(features, shading, counting)

@@ -21,7 +21,7 @@ def filter_offset(icdf: wp.array(dtype=wp.float32), x: float) -> float:
 
 def make_traversals(features: Any, structure: Any) -> Any:
     """closest_hit and any_hit of a structure (wrt.accel.structure.Structure); with cut-outs both look at each hit's alpha."""
-    accepts = make_cutout(features) if features.cutout else None
+    accepts = make_cutout(features)
     return structure.traversal(any_hit=False, accepts=accepts), structure.traversal(any_hit=True, accepts=accepts)
 
 

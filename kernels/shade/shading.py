@@ -36,7 +36,10 @@ def make_resolve(features: Any, sample_texture: Any) -> Any:
 
 
 def make_cutout(features: Any) -> Any:
-    """Cut-outs: a hit on a masked texture's clear part is none. For the traversal units, which call it at every hit."""
+    """Cut-outs: a hit on a masked texture's clear part is none. For the traversal units, which call it at every hit; None where a
+    scene has no cut-outs."""
+    if not features.cutout:
+        return None
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
     place_of = make_place_of(features.instances)
 

@@ -198,7 +198,7 @@ def make_go_through(features: Any, shading: Any) -> Any:
     return go_through
 
 
-def make_transmittance(features: Any, shading: Any, accel_struct: Any, closest_hit: Any, any_hit: bool) -> Any:
+def make_transmittance(features: Any, shading: Any, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
     """Shadow rays: one any-hit query, or where a scene lets light through surfaces, one closest hit after another."""
     go_through = make_go_through(features, shading)
 

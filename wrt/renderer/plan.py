@@ -73,19 +73,19 @@ class Plan:
 
     @property
     def kernels(self) -> list[Any]:
-        """Where pictures are not made by waves, the render kernel, and the AOV kernel where AOVs are asked for."""
+        """All that are compiled; without waves, the render kernel, and the AOV kernel where AOVs are asked for."""
+        return self._kernels(bool(self.options.aov))
+
+    def _kernels(self, aov: bool) -> list[Any]:
         if self.by_waves:
-            return self.wave_kernels.all()
+            return wave_kernels(self.features, self.structure, aov).all()
         kernels = [render_kernel(self.features, self.structure)]
-        return [*kernels, aov_kernel(self.features, self.structure)] if self.options.aov else kernels
+        return [*kernels, aov_kernel(self.features, self.structure)] if aov else kernels
 
     def kernels_hash(self) -> str:
         """Of the whole code that makes pixels, the same in every process."""
-        if self.by_waves:
-            kernels = wave_kernels(self.features, self.structure, aov=False).all()
-        else:
-            kernels = [render_kernel(self.features, self.structure)]
-        hashes = [kernel.module.get_module_hash(1 if self.options.device == "cpu" else None) for kernel in kernels]
+        block_dim = 1 if self.options.device == "cpu" else None
+        hashes = [kernel.module.get_module_hash(block_dim) for kernel in self._kernels(aov=False)]
         return hashlib.sha256(b"".join(hashes)).hexdigest()
 
     def limits(self, seed: int) -> Any:

@@ -67,7 +67,7 @@ def queue_kernel(structure: Any, features: Features, any_hit: bool) -> tuple[Any
     """The structure's kernel for many rays at a time, where it has one, or for one ray after another; and the rays of one of its
     threads. Spheres are always provided for, so that scenes with and without them share it."""
     structure = structure._replace(units=structure.units._replace(spheres=True))
-    accepts = make_cutout(features) if features.cutout else None
+    accepts = make_cutout(features)
     make = getattr(structure.accel.kernels, "make_stream", None)
     kernel = make(structure.units, any_hit, Queue, accepts) if make else None
     if kernel is not None:
