@@ -24,10 +24,8 @@ def wrapped(i: int, size: int, wrap: int) -> int:
 
 @wp.func
 def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec4:
-    """One texel, linear; alpha is never sRGB-encoded."""
-    x = wrapped(column, texture.width, texture.wrap_u)
-    y = wrapped(row, texture.height, texture.wrap_v)
-    packed = surfaces.texels[texture.first + y * texture.width + x]
+    """One texel, linear; alpha is never sRGB-encoded. Column and row are within the picture."""
+    packed = surfaces.texels[texture.first + row * texture.width + column]
     r = int(packed & wp.uint32(255))
     g = int((packed >> wp.uint32(8)) & wp.uint32(255))
     b = int((packed >> wp.uint32(16)) & wp.uint32(255))
@@ -44,13 +42,18 @@ def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4
     # Texture coordinates beyond 1e6 have no digits left for a position within the picture.
     x = wp.clamp(u, -1.0e6, 1.0e6) * float(texture.width) - 0.5
     y = wp.clamp(v, -1.0e6, 1.0e6) * float(texture.height) - 0.5
-    column = int(wp.floor(x))
-    row = int(wp.floor(y))
+    left = wrapped(int(wp.floor(x)), texture.width, texture.wrap_u)
+    right = wrapped(int(wp.floor(x)) + 1, texture.width, texture.wrap_u)
     fx = x - wp.floor(x)
     fy = y - wp.floor(y)
-    top = (1.0 - fx) * texel(surfaces, texture, column, row) + fx * texel(surfaces, texture, column + 1, row)
-    bottom = (1.0 - fx) * texel(surfaces, texture, column, row + 1) + fx * texel(surfaces, texture, column + 1, row + 1)
-    return (1.0 - fy) * top + fy * bottom
+    above = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    here = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    rows = wp.where(texture.height > 0, 2, 0)  # not a constant: the body would be compiled twice at each of a surface's textures
+    for i in range(rows):
+        row = wrapped(int(wp.floor(y)) + i, texture.height, texture.wrap_v)
+        above = here
+        here = (1.0 - fx) * texel(surfaces, texture, left, row) + fx * texel(surfaces, texture, right, row)
+    return (1.0 - fy) * above + fy * here
 
 
 @wp.func

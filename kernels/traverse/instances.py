@@ -82,13 +82,15 @@ def power_of_two(longest: wp.float64) -> wp.float64:
     """What brings a number > 0 to where a direction's longest component must be, between 2^-64 and 2^64; 1 for most."""
     scale = wp.float64(1.0)
     x = longest
-    for _ in range(16):  # enough for all float64
+    steps = int(0)
+    while steps < 16 and (x > wp.float64(wp.static(2.0**64)) or x < wp.float64(wp.static(2.0**-64))):  # 16 do for all float64
         if x > wp.float64(wp.static(2.0**64)):
             x = x * wp.float64(wp.static(2.0**-96))
             scale = scale * wp.float64(wp.static(2.0**-96))
-        elif x < wp.float64(wp.static(2.0**-64)):
+        else:
             x = x * wp.float64(wp.static(2.0**96))
             scale = scale * wp.float64(wp.static(2.0**96))
+        steps += 1
     return scale
 
 

@@ -155,11 +155,10 @@ def holds_sphere(rows: wp.array(dtype=wp.float32), first: int, count: int, n_tri
     return False
 
 
-def make_packet_walk(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """A packet with a beam, from the root."""
+def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -> Any:
+    """A packet with a beam, from the root. test_row: make_leaf_test."""
     struct = make_struct(units.triangle_test.record)
     size_of_row = row_size(units.triangle_test.record, WIDTH)
-    test_row = make_leaf_test(units, any_hit, accepts)
 
     @wp.func
     def test_leaf(accel: struct, surfaces: Surfaces, reference: int, mask: int, packet: wp.array(dtype=wp.float32), base: int):
@@ -230,11 +229,10 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     return walk
 
 
-def make_interleaved(units: Units, any_hit: bool, accepts: Any = None) -> Any:
+def make_interleaved(units: Units, test_row: Any) -> Any:
     """Rays of several packets, each for itself, from the root. waiting: a bit for each; lane after lane, packet after packet."""
     struct = make_struct(units.triangle_test.record)
     size_of_row = row_size(units.triangle_test.record, WIDTH)
-    test_row = make_leaf_test(units, any_hit, accepts)
     call_in = make_call_in(units.triangle_test.record, WIDTH, False, LINES)
 
     @wp.func
@@ -307,8 +305,9 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
     """Rays first .. end - 1, a block of PACKETS packets a thread, one thread after another in the same scratch. out:
     HitArrays, or for any hit an array of bool. Arrays must have no gaps."""
     struct = make_struct(units.triangle_test.record)
-    walk_packet = make_packet_walk(units, any_hit, accepts)
-    interleaved = make_interleaved(units, any_hit, accepts)
+    test_row = make_leaf_test(units, any_hit, accepts)
+    walk_packet = make_packet_walk(units, any_hit, accepts, test_row)
+    interleaved = make_interleaved(units, test_row)
     set_up = make_set_up(rays_struct)
     write = write_occluded if any_hit else write_hits
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
@@ -321,31 +320,29 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
             put_slot(scratch.slots, PAUSED, 0)
             put_slot(scratch.slots, ANY_REFUSED, 0)
         alone = wp.uint64(0)
-        for p in range(PACKETS):
+        packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # not a constant: the walk would be there once for each
+        for p in range(packets):
+            base = PACKET_SIZE * p
             count = wp.min(end - block - LANES * p, LANES)
-            if count > 0:
-                base = PACKET_SIZE * p
-                active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch.packets, base)
-                if bits(scratch.packets, base + REFUSED) != 0:
-                    put_slot(scratch.slots, ANY_REFUSED, 1)
-                paused = slot_at(scratch.slots, PAUSED)
-                if active >= COHERENT and paused == 0:
-                    worth = walk_packet(accel, surfaces, scratch.packets, base, active - COHERENT)
-                    failed = wp.where(worth > 0, 0, slot_at(scratch.slots, FAILED) - worth)
-                    if failed == IN_A_ROW:  # after the pause one more that fails is enough for the next
-                        failed = failed - 1
-                        put_slot(scratch.slots, PAUSED, PAUSE)
-                    put_slot(scratch.slots, FAILED, failed)
-                else:
-                    put_slot(scratch.slots, PAUSED, wp.max(paused - 1, 0))
-                    active = active & wp.static(COHERENT - 1)
-                    active = meets(accel.nodes, 0, active, scratch.packets, base)
-                    alone = alone | (wp.uint64(active) << wp.uint64(LANES * p))
+            active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch.packets, base)
+            if bits(scratch.packets, base + REFUSED) != 0:
+                put_slot(scratch.slots, ANY_REFUSED, 1)
+            paused = slot_at(scratch.slots, PAUSED)
+            if active >= COHERENT and paused == 0:
+                worth = walk_packet(accel, surfaces, scratch.packets, base, active - COHERENT)
+                failed = wp.where(worth > 0, 0, slot_at(scratch.slots, FAILED) - worth)
+                if failed == IN_A_ROW:  # after the pause one more that fails is enough for the next
+                    failed = failed - 1
+                    put_slot(scratch.slots, PAUSED, PAUSE)
+                put_slot(scratch.slots, FAILED, failed)
+            else:
+                put_slot(scratch.slots, PAUSED, wp.max(paused - 1, 0))
+                active = active & wp.static(COHERENT - 1)
+                active = meets(accel.nodes, 0, active, scratch.packets, base)
+                alone = alone | (wp.uint64(active) << wp.uint64(LANES * p))
         interleaved(accel, surfaces, scratch, alone)
-        for p in range(PACKETS):
-            count = wp.min(end - block - LANES * p, LANES)
-            if count > 0:
-                write(out, block + LANES * p, count, scratch.packets, PACKET_SIZE * p)
+        for p in range(packets):
+            write(out, block + LANES * p, wp.min(end - block - LANES * p, LANES), scratch.packets, PACKET_SIZE * p)
 
     return trace
 

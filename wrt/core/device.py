@@ -25,6 +25,7 @@ import warp as wp
 
 from wrt.core.address_space import LLVM, is_limited, require_warp, room_to_compile
 from wrt.core.checks import shown
+from wrt.core.compiler import prepare_compiler
 from wrt.core.errors import InputError
 from wrt.core.memory import available
 from wrt.core.seconds import loading
@@ -86,6 +87,7 @@ def _start_warp() -> None:
     require_warp(min(thread_count(None), 4) + 2)  # two that prepare; if more cannot be started, that is told then
     with _stderr_without(b"NVIDIA CUDA driver"), _cache_told():  # where there is no GPU, it says so each time
         wp.init()
+        prepare_compiler()
 
 
 @made_once
