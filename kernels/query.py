@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Ray, Surfaces, kernel
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, kernel
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 
 LARGEST = wp.constant(3.4028234663852886e38)  # of float32
@@ -84,10 +84,7 @@ def make_closest_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
         i = first + wp.tid()
         scale = direction_scale(rays.direction[i])
         hit = traverse(accel, surfaces, load_ray(rays, i))
-        hits.t[i] = hit.t * scale
-        hits.u[i] = hit.u
-        hits.v[i] = hit.v
-        hits.prim_id[i] = hit.prim_id
+        put_hit(hits, i, hit, scale)
 
     return closest_hit
 
@@ -115,6 +112,34 @@ def queued_ray(queue: Queue, i: int) -> Ray:
     return ray
 
 
+@wp.func
+def put_ray(queue: Queue, i: int, ray: Ray):
+    """All of a ray but t_min, which is 0 throughout a queue."""
+    queue.origin[i] = ray.origin
+    queue.direction[i] = ray.direction
+    queue.t_max[i] = ray.t_max
+    queue.exclude[i] = ray.exclude_plus_one
+
+
+@wp.func
+def hit_at(hits: HitArrays, i: int) -> Hit:
+    hit = Hit()
+    hit.t = hits.t[i]
+    hit.u = hits.u[i]
+    hit.v = hits.v[i]
+    hit.prim_id = hits.prim_id[i]
+    return hit
+
+
+@wp.func
+def put_hit(hits: HitArrays, i: int, hit: Hit, scale: float):
+    """scale: what t is multiplied by."""
+    hits.t[i] = hit.t * scale
+    hits.u[i] = hit.u
+    hits.v[i] = hit.v
+    hits.prim_id[i] = hit.prim_id
+
+
 def make_queue_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
     """Rays first .. end - 1 of a picture's queue, one at a time. out: HitArrays, or for any hit an array of bool."""
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
@@ -126,10 +151,7 @@ def make_queue_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
         if wp.static(any_hit):
             out[i] = hit.prim_id >= 0
         else:
-            out.t[i] = hit.t
-            out.u[i] = hit.u
-            out.v[i] = hit.v
-            out.prim_id[i] = hit.prim_id
+            put_hit(out, i, hit, 1.0)
 
     return trace_queue
 

@@ -37,7 +37,6 @@ def make_radiance(features: Any, accel_struct: Any, closest_hit: Any, any_hit: A
     background_radiance = make_background(features)
     transmittance = make_transmittance(features, shading, accel_struct, closest_hit, any_hit)
     direct_light = make_direct_light(features, accel_struct, transmittance, step, counting)
-    lit_at_all = bool(features.lights) or features.sky_light
 
     @wp.func
     def radiance(
@@ -85,7 +84,7 @@ def make_radiance(features: Any, accel_struct: Any, closest_hit: Any, any_hit: A
                 out = counted(out, verdict)
                 lit.refracted = worth(surfaces, shaded.refracted, verdict)
             direct = Shadow()
-            if wp.static(lit_at_all):
+            if wp.static(features.lit):
                 if is_lit(shaded.scatter):
                     direct = direct_light(accel, surfaces, lighting, shaded, index)
             out = add_up(out, lit, direct)

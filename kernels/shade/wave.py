@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.query import HitArrays, Queue, queued_ray
+from wrt.kernels.query import HitArrays, Queue, hit_at, put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import make_background
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.render import center_of, load_pixel, make_camera_sample, make_see, store_pixel, with_sample
@@ -21,9 +21,10 @@ from wrt.kernels.shade.sampling import hash_pair, make_draw
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, ShadowWalk, begin_shadow, make_go_through
 from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, lit_by, make_path, make_paths, make_step
-from wrt.kernels.structs import AovFilm, Film, Hit, Lighting, Limits, Surfaces, kernel
+from wrt.kernels.structs import AovFilm, Film, Lighting, Limits, Surfaces, kernel
 
 Path = make_path(False)
+first_path, ray_of, _ = make_paths()
 AHEAD = 4  # hits, of what memory is asked for before it is read
 
 
@@ -80,19 +81,13 @@ class Wave:
 @wp.func
 def enqueue(wave: Wave, k: int, number: int, path: Path):
     wave.number[k] = number
-    wave.rays.origin[k] = path.origin
-    wave.rays.direction[k] = path.direction
-    wave.rays.exclude[k] = path.exclude_plus_one
+    put_ray(wave.rays, k, ray_of(path))
 
 
 @wp.func
-def hit_at(hits: HitArrays, i: int) -> Hit:
-    hit = Hit()
-    hit.t = hits.t[i]
-    hit.u = hits.u[i]
-    hit.v = hits.v[i]
-    hit.prim_id = hits.prim_id[i]
-    return hit
+def pixel_of(job: Job, at: int, x: int, y: int, columns: int) -> int:
+    """Where the pixel `at` of a tile is in a film that begins at x, y."""
+    return (job.y + at / job.width - y) * columns + job.x + at % job.width - x
 
 
 @wp.func_native("__builtin_prefetch(array.data + (long long)i);")
@@ -129,7 +124,6 @@ def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
     """Camera rays of a wave. Where there is none, the sample is done."""
     camera_struct = camera_kind.Camera
     camera_sample = make_camera_sample(features, camera_kind)
-    first_path, _, _ = make_paths()
     draw = make_draw(features)
 
     @kernel
@@ -167,9 +161,8 @@ def make_shade_kernel(features: Any) -> Any:
     """The step at every hit of the queue: its light, its new paths, and its requests for shadow rays."""
     shading = make_shading(features)
     step = make_step(features, shading)
-    _, _, ray_of, shade, extra_lights, shadow_request, keep, worth = step
+    _, _, _, shade, extra_lights, shadow_request, keep, worth = step
     background_radiance = make_background(features)
-    lit_at_all = bool(features.lights) or features.sky_light
 
     @wp.func
     def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
@@ -185,10 +178,7 @@ def make_shade_kernel(features: Any) -> Any:
         slot = i * wave.capacity + wave.asking[i]
         wave.asking[i] = wave.asking[i] + 1
         wave.value[slot] = request.value
-        wave.shadow_rays.origin[slot] = request.ray.origin
-        wave.shadow_rays.direction[slot] = request.ray.direction
-        wave.shadow_rays.t_max[slot] = request.ray.t_max
-        wave.shadow_rays.exclude[slot] = request.ray.exclude_plus_one
+        put_ray(wave.shadow_rays, slot, request.ray)
         if wp.static(features.transparent_shadows):
             wave.walks[slot] = begin_shadow(request.ray, request.end)
             wave.waiting[slot] = slot
@@ -232,7 +222,7 @@ def make_shade_kernel(features: Any) -> Any:
                     size = follow(wave, number, size, shaded.refracted, verdict)
                     out = counted(out, verdict)
                     lit.refracted = worth(surfaces, shaded.refracted, verdict)
-                if wp.static(lit_at_all):
+                if wp.static(features.lit):
                     if is_lit(shaded.scatter):
                         for i in range(lighting.count + wp.static(extra_lights)):
                             request = shadow_request(surfaces, lighting, shaded, i, index)
@@ -268,10 +258,7 @@ def make_shadow_kernel(features: Any) -> Any:
             wave.walks[slot] = walk
             if walk.done == 0:
                 wave.waiting[first + left] = slot
-                wave.shadow_rays.origin[first + left] = walk.ray.origin
-                wave.shadow_rays.direction[first + left] = walk.ray.direction
-                wave.shadow_rays.t_max[first + left] = walk.ray.t_max
-                wave.shadow_rays.exclude[first + left] = walk.ray.exclude_plus_one
+                put_ray(wave.shadow_rays, first + left, walk.ray)
                 left += 1
         wave.asking[light] = left
 
@@ -325,10 +312,7 @@ def make_begin_aov_kernel(camera_kind: Any) -> Any:
             x = job.x + wave.order[p] % job.width
             y = job.y + wave.order[p] / job.width
             ray = camera_ray(camera, center_of(x, y, film.width, film.height), wp.vec2(0.5, 0.5))
-            wave.rays.origin[p] = ray.origin
-            wave.rays.direction[p] = ray.direction
-            wave.rays.exclude[p] = 0
-            wave.rays.t_max[p] = ray.t_max
+            put_ray(wave.rays, p, ray)
 
     return begin_aov
 
@@ -341,10 +325,8 @@ def make_see_kernel(features: Any) -> Any:
     def see_wave(wave: Wave, surfaces: Surfaces, film: AovFilm):
         job = wave.job[0]
         for p in range(job.pixels):
-            at = wave.order[p]
-            pixel = (job.y + at / job.width - film.y) * film.columns + job.x + at % job.width - film.x
+            pixel = pixel_of(job, wave.order[p], film.x, film.y, film.columns)
             see(film, pixel, surfaces, queued_ray(wave.rays, p), hit_at(wave.hits, p))
-            wave.rays.t_max[p] = float(wp.inf)
 
     return see_wave
 
@@ -354,8 +336,7 @@ def add_wave(wave: Wave, film: Film):
     """The samples of a wave to their pixels, in their order."""
     job = wave.job[0]
     for p in range(job.pixels):
-        at = wave.order[p]
-        i = (job.y + at / job.width - film.y) * film.columns + job.x + at % job.width - film.x
+        i = pixel_of(job, wave.order[p], film.x, film.y, film.columns)
         pixel = load_pixel(film, i)
         for j in range(job.samples):
             pixel = with_sample(pixel, wave.done[p * job.samples + j])

@@ -62,6 +62,11 @@ class Features:
     refraction: bool = False
     stack_size: int = 1
 
+    @property
+    def lit(self) -> bool:
+        """Whether lights are asked for at a hit."""
+        return bool(self.lights) or self.sky_light
+
     def switches(self) -> dict[str, bool]:
         """Every on/off feature by name, each kind being one."""
         on_off = {f.name: getattr(self, f.name) for f in fields(self) if f.type == "bool"}

@@ -100,11 +100,11 @@ def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
     default = Features()
     surfaces = replace(features, camera=default.camera, lens=False, blades=False, filter=False, stack_size=default.stack_size)
     cutout = some(features, OF_CUTOUT)
-    lit, transparent = bool(features.lights) or features.sky_light, features.transparent_shadows
+    transparent = features.transparent_shadows
     closest_hit, block = queue_kernel(structure, cutout, False)
     return WaveKernels(
         closest_hit=closest_hit,
-        any_hit=queue_kernel(structure, cutout, True)[0] if lit and not transparent else None,
+        any_hit=queue_kernel(structure, cutout, True)[0] if features.lit and not transparent else None,
         shade=shade_kernel(surfaces),
         shadow=shadow_kernel(surfaces) if transparent else None,
         begin=begin_kernel(some(features, OF_CAMERA)),
@@ -274,7 +274,7 @@ def room(n: int, dtype: Any) -> Any:
 def queue(n: int) -> Any:
     out = Queue()
     out.origin, out.direction, out.exclude = room(n, wp.vec3), room(n, wp.vec3), room(n, wp.int32)
-    out.t_min, out.t_max = wp.zeros(n, dtype=wp.float32, device="cpu"), wp.full(n, np.inf, dtype=wp.float32, device="cpu")
+    out.t_min, out.t_max = wp.zeros(n, dtype=wp.float32, device="cpu"), room(n, wp.float32)
     return out
 
 
