@@ -13,7 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache, partial, wraps
 from math import prod
 from pathlib import Path
@@ -25,7 +25,7 @@ import warp as wp
 
 from wrt.core.address_space import LLVM, is_limited, require_warp, room_to_compile
 from wrt.core.checks import shown
-from wrt.core.compiler import prepare_compiler
+from wrt.core.compiler import first_with_headers, prepare_compiler
 from wrt.core.errors import InputError
 from wrt.core.memory import available
 from wrt.core.seconds import loading
@@ -153,7 +153,7 @@ def _load(kernel: Any, device: Any) -> None:
         else:
             _require_room_to_compile(cache)
             folder = f"{name}_p{os.getpid()}_t{threading.get_ident()}"  # as Warp calls it
-            with room_to_compile(), compiling(cache, folder):
+            with room_to_compile(), compiling(cache, folder), first_with_headers() if device.is_cpu else nullcontext():
                 kernel.module.load(device, block_dim=block_dim)
 
 

@@ -9,6 +9,7 @@ import pytest
 from tests.kernel_tools import launch, zeros  # isort: skip
 import warp as wp
 
+from wrt.core import compiler
 from wrt.core.device import load_kernel, start
 from wrt.kernels.structs import kernel
 
@@ -59,3 +60,43 @@ def test_a_folder_that_cannot_be_made_is_not_needed(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "file"))
     folder = wp._src.context.runtime.get_clang_pch_dir()
     assert Path(folder).is_dir() and tmp_path not in Path(folder).parents
+
+
+def test_others_wait_for_the_first_until_the_headers_are_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(compiler, "_headers", lambda: tmp_path)
+    inside, left = threading.Event(), threading.Event()
+
+    def compile_second():
+        with compiler.first_with_headers():
+            inside.set()
+        left.set()
+
+    with compiler.first_with_headers():
+        second = threading.Thread(target=compile_second)
+        second.start()
+        assert not inside.wait(5 * compiler.POLL)
+        (tmp_path / "made.pch").write_text("")
+        assert inside.wait(30.0)
+    assert left.wait(30.0)
+    second.join()
+
+
+def test_where_no_headers_are_made_one_compiles_after_another(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(compiler, "_headers", lambda: tmp_path)
+    most, now, lock = [0], [0], threading.Lock()
+
+    def compile_one():
+        with compiler.first_with_headers():
+            with lock:
+                now[0] += 1
+                most[0] = max(most[0], now[0])
+            threading.Event().wait(compiler.POLL)
+            with lock:
+                now[0] -= 1
+
+    threads = [threading.Thread(target=compile_one) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1]
