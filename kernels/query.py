@@ -60,18 +60,24 @@ def direction_scale(direction: wp.vec3) -> float:
 
 
 @wp.func
-def load_ray(rays: RayArrays, i: int) -> Ray:
-    """Ray i in units of its scaled direction: t times `direction_scale` is in the caller's.
+def scaled_ray(origin: wp.vec3, direction: wp.vec3, t_min: float, t_max: float) -> Ray:
+    """A ray in units of its scaled direction: t times `direction_scale` is in the caller's.
 
     The segment ends where t in the caller's units would be beyond float32, so that no traversal finds what cannot be told.
     """
-    scale = direction_scale(rays.direction[i])
+    scale = direction_scale(direction)
     inverse = wp.where(scale > 1.0, wp.static(1.0 / LENGTHEN), wp.where(scale < 1.0, wp.static(1.0 / SHORTEN), 1.0))
     ray = Ray()
-    ray.origin = rays.origin[i]
-    ray.direction = scale * rays.direction[i]
-    ray.t_min = rays.t_min[i] * inverse
-    ray.t_max = wp.where(rays.t_max[i] > LARGEST, LARGEST, rays.t_max[i]) * inverse
+    ray.origin = origin
+    ray.direction = scale * direction
+    ray.t_min = t_min * inverse
+    ray.t_max = wp.where(t_max > LARGEST, LARGEST, t_max) * inverse
+    return ray
+
+
+@wp.func
+def load_ray(rays: RayArrays, i: int) -> Ray:
+    ray = scaled_ray(rays.origin[i], rays.direction[i], rays.t_min[i], rays.t_max[i])
     ray.slot = i
     return ray
 

@@ -1,6 +1,7 @@
 """wrt: a Whitted ray tracer on NVIDIA Warp, a model of the RT-core split, and a laboratory for both.
 
-Rays by themselves: load_mesh, Mesh, build, ACCELERATORS, load_accel, camera_rays.
+Rays by themselves: load_mesh, Mesh, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits, first_hits.
+Rays from kernels of your own: kernel, ray_query.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
 FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; ConstantBackground, GradientBackground,
@@ -19,13 +20,18 @@ from typing import TYPE_CHECKING, Any
 from wrt.core.version import VERSION as __version__
 
 if TYPE_CHECKING:
+    from wrt.accel.all_hits import all_hits as all_hits
+    from wrt.accel.all_hits import count_hits as count_hits
+    from wrt.accel.all_hits import first_hits as first_hits
     from wrt.accel.build import build as build
     from wrt.accel.build import load_accel as load_accel
+    from wrt.accel.ray_query import ray_query as ray_query
     from wrt.accel.structures import ACCELERATORS as ACCELERATORS
     from wrt.core.errors import InputError as InputError
     from wrt.core.errors import SceneWarning as SceneWarning
     from wrt.io.load import load_scene as load_scene
     from wrt.io.mesh_file import load_mesh as load_mesh
+    from wrt.kernels.structs import kernel as kernel
     from wrt.lab.rtcore.profiler import profile as profile
     from wrt.picture.film import Film as Film
     from wrt.renderer.options import Options as Options
@@ -57,11 +63,14 @@ if TYPE_CHECKING:
 
 # The same names at run time, each imported when it is first used: `python -m wrt --help` must not wait for Warp.
 _PUBLIC = {
+    "wrt.accel.all_hits": ("all_hits", "count_hits", "first_hits"),
     "wrt.accel.build": ("build", "load_accel"),
+    "wrt.accel.ray_query": ("ray_query",),
     "wrt.accel.structures": ("ACCELERATORS",),
     "wrt.core.errors": ("InputError", "SceneWarning"),
     "wrt.io.load": ("load_scene",),
     "wrt.io.mesh_file": ("load_mesh",),
+    "wrt.kernels.structs": ("kernel",),
     "wrt.lab.rtcore.profiler": ("profile",),
     "wrt.picture.film": ("Film",),
     "wrt.renderer.options": ("Options", "Progress"),

@@ -11,14 +11,16 @@ from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay, triangle_ray
 
 
 class Units(NamedTuple):
-    """What a traversal unit is made of: names in RAY_TRIANGLE and RAY_AABB, whether there are spheres, whether it counts, and
-    whether it walks instances (Ray.first_prim is then added to each prim_id)."""
+    """What a traversal unit is made of: names in RAY_TRIANGLE and RAY_AABB, whether there are spheres, whether it counts, whether
+    it walks instances (Ray.first_prim is then added to each prim_id), and whether it goes on behind a hit: at t_min, only
+    primitives from Ray.slot on are hit. Spheres have two hits, and cannot be gone on from."""
 
     triangle: str = "watertight"
     box: str = "conservative"
     spheres: bool = False
     counters: bool = False
     instances: bool = False
+    resumes: bool = False
 
     @property
     def triangle_test(self) -> Any:
@@ -96,6 +98,9 @@ def make_intersect(units: Units, accepts: Any = None) -> Any:
             return best
         if prim_id + 1 == probe.ray.exclude_plus_one:
             return best
+        if wp.static(units.resumes):
+            if hit.t == probe.ray.t_min and prim_id < probe.ray.slot:
+                return best
         if wp.static(accepts is not None):
             if not accepts(surfaces, prim_id, hit.u, hit.v):
                 return best

@@ -18,6 +18,7 @@ from wrt.accel.batches import trace_on_gpu, tracer
 from wrt.accel.built import Built, State
 from wrt.accel.counting import counted
 from wrt.accel.geometry import Geometry
+from wrt.accel.ray_query import world_of
 from wrt.accel.rays import Rays, rays_of, vectors
 from wrt.accel.store import save
 from wrt.accel.structure import Structure, check_options, check_units
@@ -92,6 +93,11 @@ class Accelerator(ABC):
     def data(self) -> Any:
         """The Warp struct that kernels get. It is never written to: a refit makes another."""
         return self._state.data
+
+    @property
+    def world(self) -> Any:
+        """The structure, as it is now, as an argument of a kernel of one's own (wrt.ray_query)."""
+        return world_of(self.structure, self.data, self._surfaces)
 
     @property
     def stats(self) -> AccelStats:

@@ -1,0 +1,173 @@
+"""Queries from inside a kernel of one's own: the functions, and what they take and give.
+
+They are the traversal units for one ray, with the scaling that extreme directions need: the answers have the bits of
+Accelerator.closest_hit, if the kernel is compiled without fused multiply-add (structs.kernel).
+"""
+
+from typing import Any
+
+import warp as wp
+
+from wrt.kernels.query import RayArrays, direction_scale, scaled_ray
+from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
+
+
+@wp.struct
+class QueryRay:
+    """origin, direction: in world space, the direction of any length; the closed segment from t_min (>= 0) to t_max, in units of
+    |direction|. What is not finite hits nothing, nor does a direction of 0."""
+
+    origin: wp.vec3
+    direction: wp.vec3
+    t_min: float
+    t_max: float
+
+
+@wp.struct
+class QueryHit:
+    """t: in units of |direction|, inf on a miss; prim_id: -1 on a miss; the point is (1 - u - v) v0 + u v1 + v v2. scaled_t: t in
+    the traversal's units, which next_hit goes on from."""
+
+    t: float
+    u: float
+    v: float
+    prim_id: int
+    scaled_t: float
+
+
+@wp.func
+def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
+    """From the origin to infinity."""
+    ray = QueryRay()
+    ray.origin = origin
+    ray.direction = direction
+    ray.t_max = float(wp.inf)
+    return ray
+
+
+# 1 + 2^-12 squared is 1 + 2^-11 in float32, and 2^-24 more where the subtraction is fused with it. Volatile: or the compiler, which
+# never fuses, would reckon.
+@wp.func_native("""
+    volatile float x = 1.000244140625f;
+    const float y = x;
+    return y * y - 1.00048828125f != 0.0f;
+""")
+def fused() -> bool:
+    """Whether this kernel is compiled with fused multiply-add, with which rays would be lost at edges."""
+
+
+@wp.func_native("""
+    static bool told = false;
+    if (!told) printf("wrt: a kernel that asks for hits must be made with wrt.kernel: fused multiply-add loses rays\\n");
+    told = true;
+""")
+def say_so() -> None: ...
+
+
+@wp.func
+def traversed(ray: QueryRay) -> Ray:
+    """As the traversal units take it; a ray that hits nothing where the kernel is not compiled as it must be."""
+    out = scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max)
+    if fused():
+        say_so()
+        out.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
+    return out
+
+
+@wp.func
+def as_asked(hit: Hit, direction: wp.vec3) -> QueryHit:
+    out = QueryHit()
+    out.t = hit.t * direction_scale(direction)
+    out.u = hit.u
+    out.v = hit.v
+    out.prim_id = hit.prim_id
+    out.scaled_t = hit.t
+    return out
+
+
+def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any) -> tuple[Any, Any, Any, Any]:
+    """World, closest_hit, any_hit, next_hit. closest, any_of, resuming: traversal units; the last one with Units.resumes."""
+
+    @wp.struct
+    class World:
+        """A structure and what it is over: one argument of a kernel."""
+
+        accel: accel_struct
+        surfaces: Surfaces
+
+    @wp.func
+    def closest_hit(world: World, ray: QueryRay) -> QueryHit:
+        """The closest hit in the segment; at equal t the lowest prim_id."""
+        return as_asked(closest(world.accel, world.surfaces, traversed(ray)), ray.direction)
+
+    @wp.func
+    def any_hit(world: World, ray: QueryRay) -> bool:
+        """Whether there is a hit in the segment."""
+        hit = any_of(world.accel, world.surfaces, traversed(ray))
+        return hit.prim_id >= 0
+
+    @wp.func
+    def next_hit(world: World, ray: QueryRay, hit: QueryHit) -> QueryHit:
+        """The first hit after one that this ray gave, in the order of t and, where that is equal, of prim_id: from the closest hit
+        on, each hit of the segment once."""
+        going = traversed(ray)
+        going.t_min = hit.scaled_t
+        going.slot = hit.prim_id + 1
+        return as_asked(resuming(world.accel, world.surfaces, going), ray.direction)
+
+    return World, closest_hit, any_hit, next_hit
+
+
+@wp.struct
+class HitRows:
+    """Hits in order: rows first[i] .. first[i + 1] - 1 are for those of ray i."""
+
+    most: int
+    first: wp.array(dtype=wp.int64)
+    t: wp.array(dtype=wp.float32)
+    u: wp.array(dtype=wp.float32)
+    v: wp.array(dtype=wp.float32)
+    prim_id: wp.array(dtype=wp.int32)
+
+
+def make_hit_kernels(query: Any) -> tuple[Any, Any]:
+    """count_hits: how many each ray has; write_hits: what they are. query: of make_ray_query."""
+    world_struct, closest_hit, _, next_hit = query
+
+    @wp.func
+    def loaded(rays: RayArrays, i: int) -> QueryRay:
+        ray = QueryRay()
+        ray.origin = rays.origin[i]
+        ray.direction = rays.direction[i]
+        ray.t_min = rays.t_min[i]
+        ray.t_max = rays.t_max[i]
+        return ray
+
+    @kernel
+    def count_hits(world: world_struct, rays: RayArrays, counts: wp.array(dtype=wp.int32), start: int):
+        i = start + wp.tid()
+        ray = loaded(rays, i)
+        hit = closest_hit(world, ray)
+        n = int(0)
+        while hit.prim_id >= 0:
+            n += 1
+            hit = next_hit(world, ray, hit)
+        counts[i] = n
+
+    @kernel
+    def write_hits(world: world_struct, rays: RayArrays, rows: HitRows, start: int):
+        i = start + wp.tid()
+        ray = loaded(rays, i)
+        at = rows.first[i]
+        end = rows.first[i + 1]
+        hit = closest_hit(world, ray)
+        while at < end:
+            rows.t[at] = hit.t
+            rows.u[at] = hit.u
+            rows.v[at] = hit.v
+            rows.prim_id[at] = hit.prim_id
+            at += wp.int64(1)
+            if hit.prim_id >= 0 and at < end:  # after a miss there are misses
+                hit = next_hit(world, ray, hit)
+
+    return count_hits, write_hits

@@ -1,0 +1,120 @@
+"""All hits of a ray: what testing every primitive by itself finds, in order, none lost and none twice."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import wrt
+from tests.kernel_tools import floats, launch, vec3s, zeros
+from wrt.accel.structures import ACCELERATORS
+from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
+from wrt.kernels.traverse.common import Units
+from wrt.scene import shapes
+
+STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
+CAPACITY = 64
+
+
+def soup(rng: np.random.Generator) -> wrt.Mesh:
+    """200 triangles, 20 of them there five times."""
+    corners = rng.uniform(-1.0, 1.0, (200, 1, 3)) + 0.4 * rng.normal(size=(200, 3, 3))
+    corners = np.concatenate([corners, np.repeat(corners[:20], 4, axis=0)])[rng.permutation(280)]
+    return wrt.Mesh(corners.reshape(-1, 3), np.arange(840).reshape(-1, 3))
+
+
+def rays(rng: np.random.Generator, mesh: wrt.Mesh, n: int) -> tuple[Any, ...]:
+    """From around and within; a third of them at corners, a third at edges; directions of lengths from 1e-30 to 1e30."""
+    a, b, c = (mesh.vertices[mesh.faces[rng.integers(0, len(mesh.faces), n), i]].astype(np.float64) for i in range(3))
+    kind = rng.integers(0, 3, (n, 1))
+    target = np.where(kind == 0, a, np.where(kind == 1, a + rng.random((n, 1)) * (b - a), (a + b + c) / 3.0))
+    origin = np.float32(rng.normal(size=(n, 3)) * rng.choice([0.3, 3.0], (n, 1)))
+    length = rng.choice([1.0, 1e-30, 1e30], n, p=[0.8, 0.1, 0.1])
+    direction = np.float32((target - origin) * length[:, None])
+    t_min = np.where(rng.random(n) < 0.5, 0.0, 0.7) / length
+    return origin, direction, np.float32(t_min), np.float32(np.where(rng.random(n) < 0.5, np.inf, 1.5 / length))
+
+
+def one_by_one(mesh: wrt.Mesh, asked: tuple[Any, ...]) -> list[list[tuple[float, int]]]:
+    """(t, prim_id) of each ray's hits, sorted: every primitive tested, without a structure."""
+    accel = wrt.build(mesh, "brute_force")
+    n = len(asked[0])
+    arrays, found = RayArrays(), HitList()
+    arrays.origin, arrays.direction, arrays.t_min, arrays.t_max = (
+        vec3s(asked[0]), vec3s(asked[1]), floats(asked[2]), floats(asked[3]))
+    found.capacity, found.count = CAPACITY, zeros(n, wp.int32)
+    found.prim_id, found.t = zeros(n * CAPACITY, wp.int32), zeros(n * CAPACITY)
+    launch(make_all_hits_kernel(Units()), n, accel.data.primitives, accel._surfaces, arrays, found, 0)
+    counts, prim_id, t = (array.numpy() for array in (found.count, found.prim_id, found.t))
+    assert counts.max() <= CAPACITY
+    rows = [slice(i * CAPACITY, i * CAPACITY + counts[i]) for i in range(n)]
+    return [sorted(zip(t[row].tolist(), prim_id[row].tolist(), strict=True)) for row in rows]
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_the_first_hits_are_those_of_testing_all(name: str) -> None:
+    rng = np.random.default_rng(0)
+    mesh = soup(rng)
+    asked = rays(rng, mesh, 3000)
+    expected = one_by_one(mesh, asked)
+    accel = wrt.build(mesh, name)
+    hits = wrt.first_hits(accel, 40, *asked)
+    assert 30 < max(map(len, expected)) + 15 and sum(map(len, expected)) > 10_000
+    for i, row in enumerate(expected):
+        n = min(len(row), 40)
+        assert list(zip(hits.t[i, :n].tolist(), hits.prim_id[i, :n].tolist(), strict=True)) == row[:n], i
+        assert (hits.prim_id[i, n:] == -1).all() and np.isinf(hits.t[i, n:]).all()
+    closest = accel.closest_hit(*asked)
+    for field in ("t", "u", "v", "prim_id"):
+        assert np.array_equal(getattr(hits, field)[:, 0], getattr(closest, field))
+
+
+def test_all_hits_are_the_first_ones_without_the_misses() -> None:
+    rng = np.random.default_rng(1)
+    mesh = soup(rng)
+    asked = rays(rng, mesh, 2000)
+    accel = wrt.build(mesh)
+    found, first = wrt.all_hits(accel, *asked, threads=2), wrt.first_hits(accel, CAPACITY, *asked, threads=1)
+    there = first.prim_id >= 0
+    assert np.array_equal(found.counts, there.sum(axis=1)) and np.array_equal(found.ray_id, np.nonzero(there)[0])
+    for field in ("t", "u", "v", "prim_id"):
+        assert np.array_equal(getattr(found, field), getattr(first, field)[there])
+    assert np.array_equal(wrt.count_hits(accel, *asked), found.counts) and len(found) == 2000
+    assert repr(found) == f"AllHits(2000 rays, {len(found.t)} hits)"
+
+
+def test_a_closed_surface_is_crossed_an_even_number_of_times_from_outside() -> None:
+    # Rays that meet no edge: one through an edge hits both of its triangles.
+    rng = np.random.default_rng(2)
+    mesh = shapes.torus(1.0, 0.4, 64, 32)
+    origin = 5.0 * rng.normal(size=(20_000, 3))
+    origin = origin[np.linalg.norm(origin, axis=1) > 2.0]
+    found = wrt.all_hits(wrt.build(mesh), origin, 0.5 * rng.normal(size=origin.shape) - origin)
+    corners = np.stack([1.0 - found.u - found.v, found.u, found.v])
+    inside = np.ones(len(found), bool)
+    np.logical_and.at(inside, found.ray_id, corners.min(axis=0) > 1e-5)
+    assert (found.counts[inside] % 2 == 0).all() and np.bincount(found.counts[inside])[[2, 4]].min() > 100
+
+
+def test_no_rays_and_no_triangles() -> None:
+    empty = np.zeros((0, 3), np.float32)
+    accel = wrt.build(shapes.icosphere(1))
+    assert len(wrt.all_hits(accel, empty, empty)) == 0 and wrt.first_hits(accel, 3, empty, empty).t.shape == (0, 3)
+    nothing = wrt.build(wrt.Mesh(empty, np.zeros((0, 3), np.int32)))
+    assert wrt.count_hits(nothing, [[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]]).tolist() == [0]
+
+
+@pytest.mark.parametrize("call, said", [
+    (lambda accel, o: wrt.all_hits("bvh", o, o), "accel must be a structure over one mesh"),  # type: ignore[arg-type]
+    (lambda accel, o: wrt.first_hits(accel, 0, o, o), "k must be a whole number of 1 or more, got 0"),
+    (lambda accel, o: wrt.first_hits(accel, 1.5, o, o), "k must be a whole number of 1 or more, got 1.5"),  # type: ignore[arg-type]
+    (lambda accel, o: wrt.all_hits(accel, o, o * np.nan), "directions must be finite"),
+    (lambda accel, o: wrt.count_hits(accel, o, o[:1]), "directions must have as many rows as origins"),
+    (lambda accel, o: wrt.count_hits(accel, o, o, t_min=-1.0), "t_min must not be NaN or below 0"),
+])
+def test_what_is_refused(call: Any, said: str) -> None:
+    with pytest.raises(wrt.InputError, match=said):
+        call(wrt.build(shapes.icosphere(1)), np.ones((2, 3), np.float32))

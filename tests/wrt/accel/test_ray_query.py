@@ -1,0 +1,77 @@
+"""Hits from inside a kernel of one's own."""
+
+import ctypes
+
+import numpy as np
+import pytest
+import warp as wp
+
+import wrt
+from tests.kernel_tools import floats, launch, vec3s, zeros
+from tests.wrt.accel.test_all_hits import rays, soup
+from wrt.scene import shapes
+
+
+def make_kernel(query, decorate):
+    """closest_hit and any_hit of rays."""
+
+    def asking(world: query.World, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+               t_min: wp.array(dtype=float), t_max: wp.array(dtype=float), t: wp.array(dtype=float),
+               prim_id: wp.array(dtype=int), occluded: wp.array(dtype=wp.bool)):
+        i = wp.tid()
+        ray = query.ray(origins[i], directions[i])
+        ray.t_min = t_min[i]
+        ray.t_max = t_max[i]
+        hit = query.closest_hit(world, ray)
+        t[i] = hit.t
+        prim_id[i] = hit.prim_id
+        occluded[i] = query.any_hit(world, ray)
+
+    return decorate(asking)
+
+
+def answers(kernel, accel, asked):
+    t, prim_id, occluded = zeros(len(asked[0])), zeros(len(asked[0]), wp.int32), zeros(len(asked[0]), wp.bool)
+    launch(kernel, len(asked[0]), accel.world, vec3s(asked[0]), vec3s(asked[1]), floats(asked[2]), floats(asked[3]), t, prim_id,
+           occluded)
+    return t.numpy(), prim_id.numpy(), occluded.numpy()
+
+
+@pytest.mark.parametrize("name", ["bvh", "bvh2", "kdtree"])
+def test_a_kernel_has_the_bits_of_closest_hit(name: str) -> None:
+    rng = np.random.default_rng(3)
+    mesh = soup(rng)
+    asked, accel = rays(rng, mesh, 20_000), wrt.build(mesh, name)
+    t, prim_id, occluded = answers(make_kernel(wrt.ray_query(name), wrt.kernel), accel, asked)
+    hits = accel.closest_hit(*asked)
+    assert np.array_equal(t.view(np.int32), hits.t.view(np.int32)) and np.array_equal(prim_id, hits.prim_id)
+    assert np.array_equal(occluded, accel.any_hit(*asked)) and 0.2 < occluded.mean() < 0.99
+
+
+def test_one_query_is_for_all_structures_of_a_kind_and_follows_a_refit() -> None:
+    query, accel = wrt.ray_query("bvh"), wrt.build(shapes.icosphere(2))
+    assert wrt.ray_query(accel) == query
+    kernel = make_kernel(query, wrt.kernel)
+    asked = np.zeros((1, 3), np.float32), np.float32([[0.1, 0.2, 3.0]]), np.zeros(1, np.float32), np.full(1, np.inf, np.float32)
+    before = answers(kernel, accel, asked)[0][0]
+    accel.refit(2.0 * accel.geometry.vertices)
+    assert np.isclose(answers(kernel, accel, asked)[0][0], 2.0 * before)
+
+
+def test_a_kernel_that_fuses_says_so_and_hits_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    accel = wrt.build(shapes.icosphere(1), "bvh2")
+    asked = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32), np.full(1, np.inf, np.float32)
+    # As CUDA's compiler does by Warp's default; that for the CPU has to be told.
+    options = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags} -ffp-contract=fast"}
+    kernel = make_kernel(wrt.ray_query(accel), lambda function: wp.kernel(function, enable_backward=False, module="unique",
+                                                                          module_options=options))
+    t, prim_id, occluded = answers(kernel, accel, asked)
+    ctypes.CDLL(None).fflush(None)
+    assert "must be made with wrt.kernel" in capfd.readouterr().out
+    assert (t[0], prim_id[0], occluded[0]) == (np.inf, -1, False)
+
+
+@pytest.mark.parametrize("accel, said", [("bvg", "no structure 'bvg'"), (3, "accel must be a structure over one mesh")])
+def test_what_is_refused(accel: object, said: str) -> None:
+    with pytest.raises(wrt.InputError, match=said):
+        wrt.ray_query(accel)

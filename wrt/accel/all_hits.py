@@ -1,0 +1,120 @@
+"""All hits of a ray, in order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.answers import Hits
+from wrt.accel.base import Accelerator
+from wrt.accel.ray_query import query_of
+from wrt.accel.rays import rays_of, rays_on
+from wrt.accel.structure import Structure
+from wrt.core.checks import shown
+from wrt.core.device import launch, made_once, thread_count
+from wrt.core.errors import InputError
+from wrt.core.memory import require
+from wrt.kernels.query import RayArrays
+from wrt.kernels.ray_query import HitRows, make_hit_kernels
+
+RAYS_PER_LAUNCH = 16384
+BYTES = 16  # of a hit
+
+
+@dataclass(frozen=True, eq=False)
+class AllHits:
+    """Those of ray i are rows first[i] to first[i + 1] of t, u, v (float32) and prim_id (int32), in the order of t and, where that
+    is equal, of prim_id; first: (N + 1,) int64."""
+
+    first: np.ndarray
+    t: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    prim_id: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.first) - 1
+
+    @property
+    def counts(self) -> np.ndarray:
+        """(N,) int64."""
+        return np.diff(self.first)
+
+    @property
+    def ray_id(self) -> np.ndarray:
+        """The ray of each hit, (len(t),) int64."""
+        return np.repeat(np.arange(len(self)), self.counts)
+
+    def __repr__(self) -> str:
+        return f"AllHits({len(self)} rays, {len(self.t)} hits)"
+
+
+class _Asked:
+    """A question to a structure: its rays on the device, and launches over them."""
+
+    def __init__(self, accel: Accelerator, origins: Any, directions: Any, t_min: Any, t_max: Any, threads: int | None) -> None:
+        if not isinstance(accel, Accelerator) or accel.structure.units.instances or accel.structure.units.spheres:
+            raise InputError(f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
+        self.threads = thread_count(threads)
+        rays = rays_of(origins, directions, t_min, t_max)
+        self.n, self.device, self.world = len(rays.origins), accel.device, accel.world
+        self.rays: RayArrays = rays_on(accel.device, rays)
+        self.count_hits, self.write_hits = hit_kernels(accel.structure)
+
+    def launch(self, kernel: Any, *inputs: Any) -> None:
+        if self.device.is_cpu:
+            launch(kernel, self.n, self.world, self.rays, *inputs, None, threads=self.threads, step=RAYS_PER_LAUNCH)
+        else:
+            wp.launch(kernel, dim=self.n, inputs=[self.world, self.rays, *inputs, 0], device=self.device)
+
+    def counts(self) -> np.ndarray:
+        counts = wp.zeros(self.n, dtype=wp.int32, device=self.device)
+        self.launch(self.count_hits, counts)
+        return np.asarray(counts.numpy())
+
+    def rows(self, first: np.ndarray) -> list[np.ndarray]:
+        """t, u, v, prim_id of so many hits of each ray, misses where it has fewer."""
+        require(float(first[-1]) * BYTES, f"{first[-1]} hits")
+        empty = partial(wp.empty, int(first[-1]), device=self.device)
+        rows: Any = HitRows()
+        rows.first = wp.array(first, dtype=wp.int64, device=self.device)
+        rows.t, rows.u, rows.v, rows.prim_id = *(empty(dtype=wp.float32) for _ in range(3)), empty(dtype=wp.int32)
+        self.launch(self.write_hits, rows)
+        return [np.asarray(array.numpy()) for array in (rows.t, rows.u, rows.v, rows.prim_id)]
+
+
+@made_once
+def hit_kernels(structure: Structure) -> tuple[Any, Any]:
+    return make_hit_kernels(query_of(structure))
+
+
+def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
+             threads: int | None = None) -> AllHits:
+    """Every hit of each ray in its segment, in order. Arguments as in Accelerator.closest_hit.
+
+    None is lost and none is there twice: a ray through an edge hits both triangles there, at a corner all of them. A hit takes one
+    walk from the root, and the count another. Raises InputError, also where memory does not suffice.
+    """
+    asked = _Asked(accel, origins, directions, t_min, t_max, threads)
+    first = np.concatenate([[0], np.cumsum(asked.counts(), dtype=np.int64)])
+    return AllHits(first, *asked.rows(first))
+
+
+def count_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
+               threads: int | None = None) -> np.ndarray:
+    """How many hits each ray has in its segment, (N,) int32; as all_hits."""
+    return _Asked(accel, origins, directions, t_min, t_max, threads).counts()
+
+
+def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
+               threads: int | None = None) -> Hits:
+    """The first k hits of each ray in order, as Hits of (N, k) arrays; what a ray has not is a miss. As all_hits."""
+    if isinstance(k, bool) or not hasattr(k, "__index__") or int(k) < 1:
+        raise InputError(f"k must be a whole number of 1 or more, got {shown(k)}")
+    asked = _Asked(accel, origins, directions, t_min, t_max, threads)
+    t, u, v, prim_id = (row.reshape(asked.n, int(k)) for row in asked.rows(np.arange(asked.n + 1, dtype=np.int64) * int(k)))
+    return Hits(t, u, v, prim_id)

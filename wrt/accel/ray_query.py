@@ -1,0 +1,63 @@
+"""Hits from inside a kernel of one's own: what wrt.ray_query gives."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from wrt.accel.structure import Structure, check_units
+from wrt.accel.structures import ACCELERATORS
+from wrt.core.device import made_once
+from wrt.core.errors import InputError
+from wrt.kernels.ray_query import QueryHit, QueryRay, make_ray_query, query_ray
+from wrt.kernels.traverse.common import Units
+
+
+class RayQuery(NamedTuple):
+    """Warp functions and types for kernels over structures of one kind; they have the answers of Accelerator.closest_hit, to the
+    last bit.
+
+    World: the type of the argument that Accelerator.world is. ray(origin, direction) -> Ray, from the origin to infinity; its
+    t_min and t_max can be set. closest_hit(world, ray) -> Hit, with t, u, v and prim_id, which is -1 on a miss.
+    any_hit(world, ray) -> bool. next_hit(world, ray, hit) -> Hit: the one after a hit of this ray, in the order of t and prim_id.
+    """
+
+    World: Any
+    Ray: Any
+    Hit: Any
+    ray: Any
+    closest_hit: Any
+    any_hit: Any
+    next_hit: Any
+
+
+def ray_query(accel: Any = "bvh", *, triangle: str = "watertight", box: str = "conservative") -> RayQuery:
+    """What a kernel needs to ask structures for hits, on the CPU and on CUDA.
+
+    accel: a structure that the kernel is for, or for all of a kind its name in wrt.ACCELERATORS, with the intersection tests that
+    they are built with. Make the kernel with wrt.kernel: compiled by wp.kernel, it prints so and hits nothing. Raises InputError
+    for unknown names, and for structures over several meshes.
+    """
+    structure = getattr(accel, "structure", None)
+    if isinstance(accel, str):
+        ACCELERATORS.check(accel)
+        check_units(triangle, box)
+        structure = Structure(ACCELERATORS[accel], Units(triangle, box))
+    if not isinstance(structure, Structure) or structure.units.instances or structure.units.spheres:
+        raise InputError("accel must be a structure over one mesh, or the name of one")
+    world, closest_hit, any_hit, next_hit = query_of(structure)
+    return RayQuery(world, QueryRay, QueryHit, query_ray, closest_hit, any_hit, next_hit)
+
+
+@made_once
+def query_of(structure: Structure) -> tuple[Any, Any, Any, Any]:
+    """make_ray_query of a structure."""
+    resuming = structure._replace(units=structure.units._replace(resumes=True))
+    return make_ray_query(structure.struct, structure.traversal(any_hit=False), structure.traversal(any_hit=True),
+                          resuming.traversal(any_hit=False))
+
+
+def world_of(structure: Structure, data: Any, surfaces: Any) -> Any:
+    """A structure and what it is over as one record."""
+    world = query_of(structure)[0]()
+    world.accel, world.surfaces = data, surfaces
+    return world
