@@ -36,6 +36,7 @@ BELOW_KERNELS = {
     "units": {"structs"},
     "traverse": {"units", "structs"},
     "query": {"traverse", "units", "structs"},
+    "ray_query": {"query", "traverse", "units", "structs"},
     "wide": {"native", "query", "traverse", "units", "structs"},
     "shade": {"native", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
