@@ -130,8 +130,13 @@ class HitRows:
     prim_id: wp.array(dtype=wp.int32)
 
 
-def make_hit_kernels(query: Any) -> tuple[Any, Any]:
-    """count_hits: how many each ray has; write_hits: what they are. query: of make_ray_query."""
+ON_SURFACE, AT_EDGE = wp.constant(-1), wp.constant(-2)
+NEAR_EDGE = wp.constant(1e-6)  # in barycentric coordinates, where rounding puts a hit on an edge by 1e-7 beside it
+
+
+def make_hit_kernels(query: Any) -> tuple[Any, Any, Any]:
+    """count_hits: how many each ray has; write_hits: what they are; cross: how many there are of a closed surface, ON_SURFACE where
+    the ray begins there, or AT_EDGE where it meets an edge, at which a crossing is no crossing or two. query: of make_ray_query."""
     world_struct, closest_hit, _, next_hit = query
 
     @wp.func
@@ -170,4 +175,19 @@ def make_hit_kernels(query: Any) -> tuple[Any, Any]:
             if hit.prim_id >= 0 and at < end:  # after a miss there are misses
                 hit = next_hit(world, ray, hit)
 
-    return count_hits, write_hits
+    @kernel
+    def cross(world: world_struct, rays: RayArrays, crossings: wp.array(dtype=wp.int32), start: int):
+        i = start + wp.tid()
+        ray = loaded(rays, i)
+        hit = closest_hit(world, ray)
+        n = int(0)
+        if hit.prim_id >= 0 and hit.t == 0.0:
+            n = ON_SURFACE
+        while hit.prim_id >= 0 and n >= 0:
+            n += 1
+            if wp.min(wp.min(hit.u, hit.v), 1.0 - hit.u - hit.v) < NEAR_EDGE:
+                n = AT_EDGE
+            hit = next_hit(world, ray, hit)
+        crossings[i] = n
+
+    return count_hits, write_hits, cross

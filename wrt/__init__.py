@@ -1,6 +1,7 @@
 """wrt: a Whitted ray tracer on NVIDIA Warp, a model of the RT-core split, and a laboratory for both.
 
-Rays by themselves: load_mesh, Mesh, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits, first_hits.
+Rays by themselves: load_mesh, Mesh, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits, first_hits,
+contains.
 Rays from kernels of your own: kernel, ray_query.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from wrt.accel.all_hits import first_hits as first_hits
     from wrt.accel.build import build as build
     from wrt.accel.build import load_accel as load_accel
+    from wrt.accel.contains import contains as contains
     from wrt.accel.ray_query import ray_query as ray_query
     from wrt.accel.structures import ACCELERATORS as ACCELERATORS
     from wrt.core.errors import InputError as InputError
@@ -65,6 +67,7 @@ if TYPE_CHECKING:
 _PUBLIC = {
     "wrt.accel.all_hits": ("all_hits", "count_hits", "first_hits"),
     "wrt.accel.build": ("build", "load_accel"),
+    "wrt.accel.contains": ("contains",),
     "wrt.accel.ray_query": ("ray_query",),
     "wrt.accel.structures": ("ACCELERATORS",),
     "wrt.core.errors": ("InputError", "SceneWarning"),

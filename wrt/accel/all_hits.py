@@ -53,7 +53,7 @@ class AllHits:
         return f"AllHits({len(self)} rays, {len(self.t)} hits)"
 
 
-class _Asked:
+class Asked:
     """A question to a structure: its rays on the device, and launches over them."""
 
     def __init__(self, accel: Accelerator, origins: Any, directions: Any, t_min: Any, t_max: Any, threads: int | None) -> None:
@@ -63,7 +63,7 @@ class _Asked:
         rays = rays_of(origins, directions, t_min, t_max)
         self.n, self.device, self.world = len(rays.origins), accel.device, accel.world
         self.rays: RayArrays = rays_on(accel.device, rays)
-        self.count_hits, self.write_hits = hit_kernels(accel.structure)
+        self.count_hits, self.write_hits, self.cross = hit_kernels(accel.structure)
 
     def launch(self, kernel: Any, *inputs: Any) -> None:
         if self.device.is_cpu:
@@ -71,9 +71,10 @@ class _Asked:
         else:
             wp.launch(kernel, dim=self.n, inputs=[self.world, self.rays, *inputs, 0], device=self.device)
 
-    def counts(self) -> np.ndarray:
+    def counts(self, kernel: Any = None) -> np.ndarray:
+        """A number for each ray, of `count_hits` or `cross`."""
         counts = wp.zeros(self.n, dtype=wp.int32, device=self.device)
-        self.launch(self.count_hits, counts)
+        self.launch(kernel or self.count_hits, counts)
         return np.asarray(counts.numpy())
 
     def rows(self, first: np.ndarray) -> list[np.ndarray]:
@@ -88,7 +89,7 @@ class _Asked:
 
 
 @made_once
-def hit_kernels(structure: Structure) -> tuple[Any, Any]:
+def hit_kernels(structure: Structure) -> tuple[Any, Any, Any]:
     return make_hit_kernels(query_of(structure))
 
 
@@ -99,7 +100,7 @@ def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0
     None is lost and none is there twice: a ray through an edge hits both triangles there, at a corner all of them. A hit takes one
     walk from the root, and the count another. Raises InputError, also where memory does not suffice.
     """
-    asked = _Asked(accel, origins, directions, t_min, t_max, threads)
+    asked = Asked(accel, origins, directions, t_min, t_max, threads)
     first = np.concatenate([[0], np.cumsum(asked.counts(), dtype=np.int64)])
     return AllHits(first, *asked.rows(first))
 
@@ -107,7 +108,7 @@ def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0
 def count_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                threads: int | None = None) -> np.ndarray:
     """How many hits each ray has in its segment, (N,) int32; as all_hits."""
-    return _Asked(accel, origins, directions, t_min, t_max, threads).counts()
+    return Asked(accel, origins, directions, t_min, t_max, threads).counts()
 
 
 def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
@@ -115,6 +116,6 @@ def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min:
     """The first k hits of each ray in order, as Hits of (N, k) arrays; what a ray has not is a miss. As all_hits."""
     if isinstance(k, bool) or not hasattr(k, "__index__") or int(k) < 1:
         raise InputError(f"k must be a whole number of 1 or more, got {shown(k)}")
-    asked = _Asked(accel, origins, directions, t_min, t_max, threads)
+    asked = Asked(accel, origins, directions, t_min, t_max, threads)
     t, u, v, prim_id = (row.reshape(asked.n, int(k)) for row in asked.rows(np.arange(asked.n + 1, dtype=np.int64) * int(k)))
     return Hits(t, u, v, prim_id)

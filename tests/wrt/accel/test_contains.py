@@ -1,0 +1,65 @@
+"""Points inside closed meshes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import wrt
+from wrt.scene import shapes
+
+
+def lattice(low: float, high: float, n: int) -> np.ndarray:
+    """Points in rows along the axes, so that rays between them and corners run through edges."""
+    return np.stack(np.meshgrid(*[np.linspace(low, high, n)] * 3), axis=-1).reshape(-1, 3)
+
+
+def test_of_a_box_every_point_of_a_lattice() -> None:
+    points = lattice(-1.45, 1.45, 24)
+    inside = wrt.contains(wrt.build(shapes.box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))), points, threads=2)
+    assert np.array_equal(inside, (np.abs(points) < 1.0).all(axis=1)) and inside.any()
+
+
+def test_of_a_ball() -> None:
+    ball = shapes.icosphere(4)
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-1.2, 1.2, (20_000, 3)), 0.99 * ball.vertices, 1.01 * ball.vertices, [[0.0, 0.0, 0.0]]])
+    radius = np.linalg.norm(np.float32(points).astype(np.float64), axis=1)
+    clear = (radius < 0.995) | (radius > 1.0)  # the mesh is inscribed
+    inside = wrt.contains(wrt.build(ball), points)
+    assert np.array_equal(inside[clear], radius[clear] < 1.0) and 0.1 < inside.mean() < 0.9
+
+
+def test_shells_within_each_other_are_counted() -> None:
+    shells = shapes.merged([shapes.icosphere(3, 1.0), shapes.icosphere(3, 0.5)], "shells")
+    points = np.linspace(0.0, 1.2, 49)[:, None] * np.array([0.6, 0.64, 0.48])
+    inside, radius = wrt.contains(wrt.build(shells), points), np.linalg.norm(points, axis=1)
+    clear = (np.abs(radius - 1.0) > 0.02) & (np.abs(radius - 0.5) > 0.02)
+    assert np.array_equal(inside[clear], ((radius < 1.0) & (radius > 0.5))[clear])
+
+
+def test_a_mesh_whose_corners_are_there_twice_is_closed() -> None:
+    box = shapes.box()
+    apart = wrt.Mesh(box.vertices[box.faces].reshape(-1, 3), np.arange(36).reshape(-1, 3))
+    assert wrt.contains(wrt.build(apart), [[0.1, 0.2, 0.3], [0.6, 0.0, 0.0]]).tolist() == [True, False]
+
+
+def test_after_a_refit_it_is_the_new_mesh() -> None:
+    accel = wrt.build(shapes.icosphere(2))
+    points = np.array([[0.0, 1.5, 0.1]])
+    assert not wrt.contains(accel, points)[0]
+    accel.refit(2.0 * accel.geometry.vertices)
+    assert wrt.contains(accel, points)[0]
+
+
+def test_what_is_refused_and_what_is_empty() -> None:
+    ball, none = wrt.build(shapes.icosphere(1)), np.zeros((0, 3))
+    assert wrt.contains(ball, none).shape == (0,)
+    assert wrt.contains(wrt.build(wrt.Mesh(none, np.zeros((0, 3), np.int32))), [[0.0, 0.0, 0.0]]).tolist() == [False]
+    flat = wrt.build(shapes.quad())
+    for accel, points, said in ((flat, [[0.0, 0.0, 0.0]], "the mesh is not closed: 4 edges"),
+                                (ball, [[0.0, np.nan, 0.0]], "points must be finite"),
+                                (ball, [0.0, 1.0], r"points must be \(N, 3\)"),
+                                ("bvh", [[0.0, 0.0, 0.0]], "accel must be a structure over one mesh")):
+        with pytest.raises(wrt.InputError, match=said):
+            wrt.contains(accel, points)  # type: ignore[arg-type]
