@@ -190,6 +190,19 @@ class RtCore(Plan):
 
 
 @dataclass(frozen=True)
+class Pictures(Plan):
+    """SCENES by waves of samples, as the CPU makes pictures, beside the loop of one ray: nanoseconds a sample on one thread, by
+    turns, and pixels that differ (none may)."""
+
+    COMMAND, STUDY = "bench pictures", "wrt.lab.bench.pictures"
+    scenes: Sequence[Any] = option(MISSING, "", form="argument")
+    size: str = option("640x360", "Pixels of each picture")
+    spp: int = option(16, "Samples a pixel", (1, 1 << 16))
+    runs: int = option(5, "Runs of each, by turns", (1, 1000))
+    accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
+
+
+@dataclass(frozen=True)
 class WhatIf(Plan):
     """Change one thing of the RT core's design, and count the same rays through MESH again.
 

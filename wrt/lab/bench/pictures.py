@@ -1,0 +1,67 @@
+"""`python -m wrt bench pictures`: what waves of samples bring over the loop of one ray, in whole pictures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from wrt.core.checks import as_size
+from wrt.core.device import load_kernel, start
+from wrt.io.load import load_scene
+from wrt.lab.bench.report import Columns, Part, Row, cells
+from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.plans import Pictures as Plan
+from wrt.renderer.film_arrays import DeviceFilm
+from wrt.renderer.options import Options
+from wrt.renderer.plan import plan_of, render_kernel
+from wrt.renderer.prepare import Prepared, prepare
+from wrt.renderer.tiles import Work
+
+TITLE = "Pictures by waves against one ray at a time"
+COLUMNS: Columns = {
+    "scene": "{scene}", "triangles": "{triangles}", "rays a sample": "{rays:.2f}",
+    "loop ns": lambda row: spread(row.loop), "waves ns": lambda row: spread(row.waves),
+    "loop / waves": lambda row: spread(row.ratio), "differ": "{differ}"}
+LEGEND = """\
+loop: one ray at a time, as on CUDA; waves: many samples share queues, which packets trace (kernels/shade/wave.py). Nanoseconds of a
+thread's CPU time a sample: camera ray, tracing, shading and film; medians of runs by turns, in brackets their middle half; loop /
+waves run by run. rays a sample: with shadow rays. differ: pixels of another value (must be 0)."""
+
+
+def rows(plan: Plan) -> Iterator[Row]:
+    for path in plan.scenes:
+        scene = load_scene(path).with_settings(size=as_size(plan.size), spp=plan.spp)
+        waves = prepare(plan_of(scene, Options(threads=1, accel=plan.accel)), start("cpu"))
+        kernel = render_kernel(waves.plan.features, waves.plan.structure)
+        load_kernel(kernel, waves.device)
+        yield row_of(Path(path).name, {"loop": replace(waves, waves=None, kernels=[kernel]), "waves": waves}, plan)
+
+
+def row_of(name: str, ways: dict[str, Prepared], plan: Plan) -> Row:
+    films: dict[str, DeviceFilm] = {}
+
+    def draw(way: str) -> None:
+        prepared = ways[way]
+        film = films[way] = DeviceFilm(prepared.plan.scene.settings, prepared.plan.crop, prepared.device, seed=0)
+        trace: Callable[[Work], int] = prepared.launch(film)
+        for rectangle in prepared.tiles():
+            trace(Work(rectangle, 0, plan.spp))
+
+    seconds = alternate({way: partial(draw, way) for way in ways}, plan.runs, time.thread_time)
+    samples = plan.spp * ways["waves"].plan.area
+    loop, waves = (seconds[way] * 1e9 / samples for way in ("loop", "waves"))
+    pixels = [np.asarray(films[way].groups[0].mean.numpy()).view(np.int32) for way in ways]
+    differ = int((pixels[0] != pixels[1]).reshape(len(pixels[0]), -1).any(axis=1).sum())
+    return Row(scene=name, triangles=ways["waves"].facts()["triangles"], rays=films["waves"].rays / samples, loop=loop.tolist(),
+               waves=waves.tolist(), ratio=(loop / waves).tolist(), ratio_median=float(np.median(loop / waves)), differ=differ)
+
+
+def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
+    mean = np.exp(np.mean(np.log([row.ratio_median for row in rows])))
+    return [Part(head=list(COLUMNS), lines=[cells(COLUMNS, row) for row in rows]),
+            Part(text=f"Geometric mean of loop / waves: {mean:.2f}")]
