@@ -41,10 +41,10 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
         corners = faces[face].tolist()
         raise InputError(f"face {face} is {corners}, but there are {len(vertices)} vertices", None, "faces")
 
-    faces, source = flip_collinear(vertices, faces)
-    kept = has_area(vertices, faces)
-    dropped = len(faces) - int(np.count_nonzero(kept))
-    faces, source = faces[kept], source[kept]
+    faces, source, flat = _flipped(vertices, faces)
+    dropped = len(flat)
+    if dropped:
+        faces, source = np.delete(faces, flat, axis=0), np.delete(source, flat)
     face_group = face_group[source] if face_group is not None else None
 
     used = np.zeros(len(vertices), dtype=bool)
@@ -120,11 +120,15 @@ def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     part now, whose material and group it has. Faces with two corners in one place stay, as those whose longest edge has no
     other face, or more than one.
     """
+    return _flipped(vertices, faces)[:2]
+
+
+def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As flip_collinear; and the numbers of the faces that have no area still, in their order."""
     faces, source = faces.copy(), np.arange(len(faces))
-    suspects = np.arange(len(faces))
+    suspects, without = source.copy(), ~has_area(vertices, faces)
     for _ in range(ROUNDS):
-        flat = suspects[~has_area(vertices, faces[suspects])]
-        flat, ends, middle = _longest_edges(vertices, faces, flat)
+        flat, ends, middle = _longest_edges(vertices, faces, suspects[without[suspects]])
         if not len(flat):
             break
         neighbour = _across(faces, flat, ends, len(vertices))
@@ -148,7 +152,8 @@ def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
         faces[flat], faces[neighbour] = np.stack([p, middle, d], axis=1), np.stack([middle, q, d], axis=1)
         source[flat] = source[neighbour]
         suspects = np.union1d(suspects[place[suspects] >= 0], neighbour)
-    return faces, source
+        without[suspects] = ~has_area(vertices, faces[suspects])
+    return faces, source, np.flatnonzero(without)
 
 
 def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
