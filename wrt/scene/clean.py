@@ -35,16 +35,16 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     """
     vertices = np.asarray(vertices, dtype=np.float32).reshape(-1, 3)
     faces = np.asarray(faces).reshape(-1, 3)
-    outside = ((faces < 0) | (faces >= len(vertices))).any(axis=1)
-    if outside.any():
-        face = int(np.nonzero(outside)[0][0])
+    if faces.min(initial=0) < 0 or faces.max(initial=-1) >= len(vertices):
+        face = int(np.argmax(((faces < 0) | (faces >= len(vertices))).any(axis=1)))
         corners = faces[face].tolist()
         raise InputError(f"face {face} is {corners}, but there are {len(vertices)} vertices", None, "faces")
 
-    faces, source, flat = _flipped(vertices, faces)
-    dropped = len(flat)
+    faces, source, without = _flipped(vertices, faces)
+    dropped = int(np.count_nonzero(without))
     if dropped:
-        faces, source = np.delete(faces, flat, axis=0), np.delete(source, flat)
+        kept = np.flatnonzero(~without)
+        faces, source = faces.take(kept, axis=0), source.take(kept)
     face_group = face_group[source] if face_group is not None else None
 
     used = np.zeros(len(vertices), dtype=bool)
@@ -124,7 +124,7 @@ def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
 
 
 def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As flip_collinear; and the numbers of the faces that have no area still, in their order."""
+    """As flip_collinear; and whether a face has no area still, (F,) bool."""
     faces, source = faces.copy(), np.arange(len(faces))
     suspects, without = source.copy(), ~has_area(vertices, faces)
     for _ in range(ROUNDS):
@@ -153,7 +153,7 @@ def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
         source[flat] = source[neighbour]
         suspects = np.union1d(suspects[place[suspects] >= 0], neighbour)
         without[suspects] = ~has_area(vertices, faces[suspects])
-    return faces, source, np.flatnonzero(without)
+    return faces, source, without
 
 
 def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
