@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 INCLUDE = re.compile(r'^ *#include "(\w+\.h)"$', re.MULTILINE)
+WORD = re.compile(r"\w+")
 MACRO = re.compile(r"^ *#define (\w+)", re.MULTILINE)
 
 
@@ -27,7 +28,8 @@ def source(file: str | Path, **constants: float | str) -> str:
     """The body of a native function, for wp.func_native: a file ("wide/gather.h" of this folder, or a path), with those constants
     (int, float, bool, C++) that it names."""
     body = text_of(Path(__file__).parent / file)
-    named = [name for name in constants if re.search(rf"\b{name}\b", body)]
+    words = set(WORD.findall(body))
+    named = [name for name in constants if name in words]
     before = "".join(f"#define {name} {literal(constants[name])}\n" for name in named)
     after = "".join(f"#undef {name}\n" for name in dict.fromkeys([*named, *MACRO.findall(body)]))
     return f"\n{before}{body}{after}"

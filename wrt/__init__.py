@@ -12,6 +12,7 @@ What a picture costs: profile. What goes wrong: InputError, SceneWarning.
 
 from __future__ import annotations
 
+import gc
 import importlib
 import importlib.util
 import sys
@@ -111,11 +112,22 @@ def _find_kernels() -> None:
 _find_kernels()
 
 
+def _imported(module: str) -> Any:
+    """What an import makes stays: to look through it for garbage again and again took a tenth of the start."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        return importlib.import_module(module)
+    finally:
+        if collects:
+            gc.enable()
+
+
 def __getattr__(name: str) -> Any:
     if name in _HOME:
         if _HOME[name] != "wrt.core.errors":
             importlib.import_module("wrt.core.address_space").require_modules()
-        value = getattr(importlib.import_module(_HOME[name]), name)
+        value = getattr(_imported(_HOME[name]), name)
         globals()[name] = value
         return value
     raise AttributeError(f"module 'wrt' has no attribute {name!r}")

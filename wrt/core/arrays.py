@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ def to_warp(array: Any, dtype: Any = None) -> Any:
 def real_numbers(value: Any, name: str, shape: str) -> np.ndarray:
     """An array of what somebody gives as real numbers: arrays of integers or floats of any size as they are, lists, scalars;
     objects as float32. Raises InputError that calls it `name`, and says that `shape` was expected."""
-    if isinstance(value, np.ma.MaskedArray):
+    if "numpy.ma" in sys.modules and isinstance(value, np.ma.MaskedArray):  # else there is none, and that module takes long
         raise InputError(f"{name} must not be a masked array: its mask would be ignored; leave masked rows out, or fill them")
     try:
         array = np.asarray(value)

@@ -119,8 +119,9 @@ def _finite(array: np.ndarray | None, attribute: str, path: Path) -> np.ndarray 
         return None
     with np.errstate(over="ignore"):
         array = np.asarray(array, dtype=np.float32)
-    bad = ~np.isfinite(array).all(axis=1)
-    if bad.any():
+    finite = np.isfinite(array)
+    if not finite.all():
+        bad = ~finite.all(axis=1)
         warnings.warn(f"{path}: {int(bad.sum())} {attribute} are not finite and taken as zero", SceneWarning,
                       stacklevel=3)
         array = np.where(bad[:, None], np.float32(0.0), array)

@@ -31,6 +31,8 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
     fan = np.maximum(counts - 2, 0)
     require(BYTES_OF_TRIANGLE * int(fan.sum()) + BYTES_OF_POLYGON * len(counts), "the mesh")
     small = np.int32 if max(len(corners), len(counts)) < 1 << 31 else np.int64
+    if (counts == 3).all():
+        return np.arange(3 * len(counts), dtype=small).reshape(-1, 3), np.arange(len(counts), dtype=small)
     start = np.cumsum(counts) - counts
     polygon = np.repeat(np.arange(len(counts), dtype=small), fan)
     step = np.arange(len(polygon), dtype=small) - np.repeat((np.cumsum(fan) - fan).astype(small), fan)

@@ -35,16 +35,16 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     """
     vertices = np.asarray(vertices, dtype=np.float32).reshape(-1, 3)
     faces = np.asarray(faces).reshape(-1, 3)
-    outside = ((faces < 0) | (faces >= len(vertices))).any(axis=1)
-    if outside.any():
-        face = int(np.nonzero(outside)[0][0])
+    if faces.min(initial=0) < 0 or faces.max(initial=-1) >= len(vertices):
+        face = int(np.argmax(((faces < 0) | (faces >= len(vertices))).any(axis=1)))
         corners = faces[face].tolist()
         raise InputError(f"face {face} is {corners}, but there are {len(vertices)} vertices", None, "faces")
 
-    faces, source = flip_collinear(vertices, faces)
-    kept = has_area(vertices, faces)
-    dropped = len(faces) - int(np.count_nonzero(kept))
-    faces, source = faces[kept], source[kept]
+    faces, source, without = _flipped(vertices, faces)
+    dropped = int(np.count_nonzero(without))
+    if dropped:
+        kept = np.flatnonzero(~without)
+        faces, source = faces.take(kept, axis=0), source.take(kept)
     face_group = face_group[source] if face_group is not None else None
 
     used = np.zeros(len(vertices), dtype=bool)
@@ -120,11 +120,15 @@ def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     part now, whose material and group it has. Faces with two corners in one place stay, as those whose longest edge has no
     other face, or more than one.
     """
+    return _flipped(vertices, faces)[:2]
+
+
+def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As flip_collinear; and whether a face has no area still, (F,) bool."""
     faces, source = faces.copy(), np.arange(len(faces))
-    suspects = np.arange(len(faces))
+    suspects, without = source.copy(), ~has_area(vertices, faces)
     for _ in range(ROUNDS):
-        flat = suspects[~has_area(vertices, faces[suspects])]
-        flat, ends, middle = _longest_edges(vertices, faces, flat)
+        flat, ends, middle = _longest_edges(vertices, faces, suspects[without[suspects]])
         if not len(flat):
             break
         neighbour = _across(faces, flat, ends, len(vertices))
@@ -148,7 +152,8 @@ def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
         faces[flat], faces[neighbour] = np.stack([p, middle, d], axis=1), np.stack([middle, q, d], axis=1)
         source[flat] = source[neighbour]
         suspects = np.union1d(suspects[place[suspects] >= 0], neighbour)
-    return faces, source
+        without[suspects] = ~has_area(vertices, faces[suspects])
+    return faces, source, without
 
 
 def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

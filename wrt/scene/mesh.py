@@ -44,9 +44,8 @@ class Mesh:
             row = int(np.argmax(np.abs(vertices).max(axis=1)))
             raise InputError(f"vertex {row} is {vertices[row].tolist()}; at most {LARGEST:g} can be traced", self.name or None,
                              "vertices")
-        outside = (faces < 0) | (faces >= len(vertices))
-        if outside.any():
-            face = int(np.nonzero(outside.any(axis=1))[0][0])
+        if faces.min(initial=0) < 0 or faces.max(initial=-1) >= len(vertices):
+            face = int(np.argmax(((faces < 0) | (faces >= len(vertices))).any(axis=1)))
             raise InputError(f"face {face} is {faces[face].tolist()}, but there are {len(vertices)} vertices",
                              self.name or None, "faces")
         for attribute, width in (("normals", 3), ("uvs", 2)):
@@ -131,9 +130,10 @@ def _corner(point: np.ndarray) -> str:
 
 
 def _require_finite(array: np.ndarray, name: str, attribute: str) -> None:
-    bad = ~np.isfinite(array).all(axis=1)
-    if bad.any():
-        row = int(np.nonzero(bad)[0][0])
+    finite = np.isfinite(array)
+    if not finite.all():
+        bad = ~finite.all(axis=1)
+        row = int(np.argmax(bad))
         raise InputError(f"{attribute} {row} is {array[row].tolist()} ({int(bad.sum())} not finite in all)",
                          name or None, attribute)
 

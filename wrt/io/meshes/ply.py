@@ -80,8 +80,8 @@ def read(path: Path) -> RawMesh:
 
     referenced = np.zeros(len(vertices), dtype=bool)
     referenced[corners] = True
-    bad = np.nonzero(referenced & ~np.isfinite(vertices).all(axis=1))[0]
-    if len(bad):
+    finite = np.isfinite(vertices)
+    if not finite.all() and len(bad := np.flatnonzero(referenced & ~finite.all(axis=1))):
         source.fail(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", f"vertex {bad[0]}")
 
     normals = _columns(vertex, ("nx", "ny", "nz"))
