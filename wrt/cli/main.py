@@ -7,6 +7,7 @@ long to import is imported by the command that needs it.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import gc
 import io
@@ -314,12 +315,16 @@ def main() -> None:
         code = 2
     except SystemExit as error:
         code = error.code
+    if not code and (sys.getprofile() or sys.gettrace()):
+        sys.exit()  # who measures Python writes what he has when it ends
     _leave(code if isinstance(code, int) else 1 if code else 0)
 
 
 def _leave(code: int) -> NoReturn:
     """Exit without waiting for a thread that compiles, and without freeing one by one what the system frees at once. Nothing is
     lost by it: files are whole or were never there."""
+    if not code:
+        atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, OSError, ValueError):  # closed, or on a full disk
             stream.flush()

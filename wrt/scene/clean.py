@@ -35,7 +35,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     """
     vertices = np.asarray(vertices, dtype=np.float32).reshape(-1, 3)
     faces = np.asarray(faces).reshape(-1, 3)
-    if faces.min(initial=0) < 0 or faces.max(initial=-1) >= len(vertices):
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         face = int(np.argmax(((faces < 0) | (faces >= len(vertices))).any(axis=1)))
         corners = faces[face].tolist()
         raise InputError(f"face {face} is {corners}, but there are {len(vertices)} vertices", None, "faces")

@@ -44,7 +44,7 @@ class Mesh:
             row = int(np.argmax(np.abs(vertices).max(axis=1)))
             raise InputError(f"vertex {row} is {vertices[row].tolist()}; at most {LARGEST:g} can be traced", self.name or None,
                              "vertices")
-        if faces.min(initial=0) < 0 or faces.max(initial=-1) >= len(vertices):
+        if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
             face = int(np.argmax(((faces < 0) | (faces >= len(vertices))).any(axis=1)))
             raise InputError(f"face {face} is {faces[face].tolist()}, but there are {len(vertices)} vertices",
                              self.name or None, "faces")

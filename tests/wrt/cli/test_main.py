@@ -603,3 +603,9 @@ wrt.renderer.prepare.load_kernel, wrt.renderer.prepare.upload_scene = slow, fail
 
 def test_an_error_does_not_wait_for_the_compiler() -> None:
     refused(finish(process("render", "box.obj", code=FAILING)), "box.obj: a transform that is found late")
+
+
+def test_a_profile_of_a_command_is_written(folder: Path) -> None:
+    result = subprocess.run([sys.executable, "-m", "cProfile", "-o", "a.prof", "-m", "wrt", "--version"], capture_output=True,
+                            text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "") and Path("a.prof").stat().st_size > 1000
