@@ -287,7 +287,7 @@ def test_neighbours_see_their_edge_from_both_sides(seed):
     direction = directions(rng, n)
     across = np.cross(edge[:, 1] - edge[:, 0], direction)
     middle = edge.mean(axis=1)
-    c, d = (rounded(middle + sign * across + 0.2 * rng.normal(size=(n, 3)) * np.linalg.norm(across, axis=1, keepdims=True))
+    c, d = (rounded(middle + sign * across + rng.uniform(-0.4, 0.4, (n, 3)) * np.linalg.norm(across, axis=1, keepdims=True))
             for sign in (1.0, -1.0))
     target = edge[:, 0] + rng.uniform(0.3, 0.7, (n, 1)) * (edge[:, 1] - edge[:, 0])
     origin = rounded(target - direction * 10.0 ** rng.uniform(-2, 2, (n, 1)))
