@@ -6,11 +6,10 @@ and Warp's Python finds `cuda:0`, `cuda:1` ... So the host code for CUDA and the
     python -m pytest --device cuda:0 tests/kernels          tests on a virtual GPU
     python -m tests.virtual_gpu render scenes/lens.toml --device cuda:0
 
-
-It finds: a kernel that gets an array of the host, of another device or a freed one (VirtualGpuError names the argument); host
-code that reads device memory (a segmentation fault: pages are closed while no kernel runs); kernels that leave their arrays
-(likewise) or read what nobody wrote (0xA5); what depends on the order of threads (it is random, by a seed); CUDA branches that do
-not compile, or say something else. It counts launches, copies and synchronisations.
+It finds: a kernel that gets an array of another device, of the host (or on the CPU, of a device) or a freed one: VirtualGpuError
+names the argument; other host code that reads device memory (a segmentation fault: pages are closed while no kernel runs); kernels
+that leave their arrays (likewise) or read what nobody wrote (0xA5); what depends on the order of threads (it is random, by a seed);
+CUDA branches that do not compile, or say something else. It counts launches, copies and synchronisations.
 
 It does not find: what NVIDIA's compilers and driver do; speed; a wait that lacks (each call is done when it returns); races
 (threads run one after another). Warp's own CUDA code (Mesh, Bvh, sort, graphs) is not there. sin, pow, exp and the like are the
@@ -19,6 +18,7 @@ host's, not NVIDIA's, whose last bits differ.
 
 from __future__ import annotations
 
+import ctypes
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ def install(devices: int = 2, arch: int = 75, seed: int | None = 0, memory: int 
         raise NotImplementedError(f"virtual GPUs know the insides of Warp 1.19, not of {wp.config.version}")
     load_dll = warp_context.Runtime.load_dll
     output_name = warp_context.Module._get_compile_output_name
-    get_hooks = warp_context.ModuleExec.get_kernel_hooks
+    get_hooks, invoke = warp_context.ModuleExec.get_kernel_hooks, warp_context.invoke
 
     def load(self: Any, path: str) -> Any:
         library = load_dll(self, path)
@@ -57,7 +57,15 @@ def install(devices: int = 2, arch: int = 75, seed: int | None = 0, memory: int 
             gpus().objects[hooks.forward].arguments = [(each.label, each.type) for each in kernel.adj.args]
         return hooks
 
+    def invoked(kernel: Any, hooks: Any, params: Any, adjoint: bool) -> Any:
+        """A launch on the CPU."""
+        given = zip(kernel.adj.args, params[1:], strict=False)
+        gpus().check_arguments(kernel.key, [(each.label, each.type, ctypes.addressof(value)) for each, value in given
+                                            if isinstance(value, ctypes.Structure)], None)
+        return invoke(kernel, hooks, params, adjoint)
+
     warp_context.Runtime.load_dll = load
+    warp_context.invoke = invoked
     warp_context.Module._get_compile_output_name = named
     warp_context.ModuleExec.get_kernel_hooks = described
 

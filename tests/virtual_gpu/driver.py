@@ -8,7 +8,7 @@ import itertools
 import os
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -317,20 +317,23 @@ class Gpus:
             self.counts.launches[function.name, context - CONTEXT] += 1
         grid = Grid(Triple(x, y, z), Triple(threads, 1, 1), None if order is None else order.ctypes.data)
         with self.at_work[context - CONTEXT], self.memory.opened():
-            self.check_arguments(function, ctypes.cast(arguments, ctypes.POINTER(ctypes.c_void_p)), context - CONTEXT)
+            values = ctypes.cast(arguments, ctypes.POINTER(ctypes.c_void_p))
+            self.check_arguments(function.name, [(name, kind, values[i + 1]) for i, (name, kind) in enumerate(function.arguments)],
+                                 context - CONTEXT)  # the first value is the launch's bounds
             function.run(address(arguments), grid)
         return 0
 
-    def check_arguments(self, function: Function, values: Any, device: int) -> None:
-        """Raise VirtualGpuError that names the array that the device cannot reach."""
-        for i, (label, kind) in enumerate(function.arguments):
-            for name, array, size in arrays_of(label, kind, values[i + 1]):  # the first is the launch's bounds
+    def check_arguments(self, kernel: str, arguments: Iterable[tuple[str, Any, int]], device: int | None) -> None:
+        """Raise VirtualGpuError that names the array that the device, or the host (None), cannot reach. arguments: of each name,
+        type and address."""
+        for label, kind, at in arguments:
+            for name, array, size in arrays_of(label, kind, at):
                 shape, strides = array.shape[:array.ndim], array.strides[:array.ndim]
                 if not array.data or 0 in shape:  # nothing is there to be read
                     continue
                 reach = [(n - 1) * step for n, step in zip(shape, strides, strict=True)]
                 first = array.data + sum(min(step, 0) for step in reach)
-                self.check(f"{function.name}: {name}", first, sum(map(abs, reach)) + size, device)
+                self.check(f"{kernel}: {name}", first, sum(map(abs, reach)) + size, device)
 
 
 class Core:

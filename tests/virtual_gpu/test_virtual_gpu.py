@@ -128,6 +128,13 @@ def test_an_array_that_the_device_cannot_reach_is_told_by_its_name(place: str, w
         wp.launch(*((wave, 8, [bad, out]) if place == "x" else (scale_rows, 8, [given, out])), device="cuda:0")
 
 
+def test_a_kernel_on_the_cpu_that_gets_an_array_of_a_device() -> None:
+    given, there = Rows(), wp.ones(8, dtype=float, device="cuda:1")
+    given.row.values = there
+    with pytest.raises(VirtualGpuError, match=r"given.row.values must be 32 bytes on the host, and is byte 0 of 32 on cuda:1"):
+        wp.launch(scale_rows, 8, [given, wp.ones(8, dtype=float, device="cpu")], device="cpu")
+
+
 def test_an_array_that_ends_too_soon() -> None:
     there = wp.ones(8, dtype=float, device="cuda:0")
     longer = wp.array(ptr=there.ptr, shape=9, dtype=float, device="cuda:0")

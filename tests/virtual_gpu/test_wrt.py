@@ -3,16 +3,22 @@ tests run on `--device` too."""
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 import wrt
 from tests import bits, device
 from tests.data import ROOT
 from tests.virtual_gpu import gpus
+from wrt.accel.build import build
 from wrt.accel.structures import ACCELERATORS
+from wrt.core.arrays import to_numpy
+from wrt.core.errors import InputError
+from wrt.scene import shapes
 
 pytestmark = pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0")
 PICTURE = {"spp": 2, "size": (48, 27), "seed": 5}
@@ -44,3 +50,23 @@ def test_two_devices_share_a_picture() -> None:
     two = wrt.render(SCENE, devices=["cuda:0", "cuda:1"], tile_size=16, **PICTURE)
     assert {number for _, number in gpus().counts.launches - before} == {0, 1}
     assert np.array_equal(one.pixels, two.pixels) and one.pixels.max() > 0.0
+
+
+def test_rays_on_other_devices_are_copied_and_answers_there_are_refused() -> None:
+    origins, directions = bits.primary_rays(16, 9)
+    mesh, ends = shapes.icosphere(1), np.linspace(1.0, 9.0, len(origins), dtype=np.float32)
+    given = (origins, wp.vec3), (directions, wp.vec3), (ends, float)
+    expected = build(mesh, "bvh8", device="cpu").closest_hit(origins, directions, 0.0, ends)
+    assert (expected.prim_id >= 0).any()
+    for mine, other in (("cpu", "cuda:0"), ("cuda:0", "cpu"), ("cuda:0", "cuda:1")):
+        accel = build(mesh, "bvh8", device=mine)
+        there = [wp.array(array, dtype=kind, device=other) for array, kind in given]
+        for rays in (there, [there[0].to(mine), there[1], there[2]], [origins, directions, there[2]]):
+            hits = accel.closest_hit(*rays[:2], 0.0, rays[2])
+            assert hits.t.device == wp.get_device(mine) if isinstance(hits.t, wp.array) else rays[0] is origins
+            for name in ("t", "u", "v", "prim_id"):
+                assert to_numpy(getattr(hits, name)).tobytes() == getattr(expected, name).tobytes()
+        with pytest.raises(InputError, match=rf"out must be a Warp array \({len(origins)},\) of bool, on {mine}"):
+            accel.any_hit(*there[:2], out=wp.zeros(len(origins), dtype=wp.bool, device=other))
+        with pytest.raises(InputError, match="t_max must not be NaN") if "cpu" in (mine, other) else nullcontext():
+            accel.closest_hit(*there[:2], 0.0, wp.full(len(origins), np.nan, dtype=float, device=other))
