@@ -1,6 +1,7 @@
 """Small launches on the device of the tests, for those that run device functions by themselves."""
 
 import numpy as np
+import pytest
 
 from tests import device
 
@@ -8,6 +9,7 @@ from wrt.core.device import start  # isort: skip (before warp: it silences Warp'
 import warp as wp
 
 DEVICE = start(device.NAME)
+cpu_only = pytest.mark.skipif(DEVICE.is_cuda, reason="of code that runs on the CPU alone")
 
 
 def vec3s(rows) -> wp.array:

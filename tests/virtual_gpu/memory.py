@@ -17,13 +17,13 @@ from contextlib import contextmanager
 SPACE = 1 << 42  # bytes of address space; pages cost nothing until they are used
 ALIGNMENT = 256  # as of cudaMalloc
 UNWRITTEN = 0xA5  # what memory holds before anybody writes to it
+FIXED = 0x10  # MAP_FIXED, on Linux and macOS
 CLOSED, OPEN = 0, mmap.PROT_READ | mmap.PROT_WRITE
 
 libc = ctypes.CDLL(None, use_errno=True)
 libc.mmap.restype = ctypes.c_void_p
 libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long]
 libc.mprotect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
-libc.madvise.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
 
 
 def whole(size: int, unit: int) -> int:
@@ -31,16 +31,22 @@ def whole(size: int, unit: int) -> int:
     return -(-size // unit) * unit
 
 
+def reserve(place: int | None, size: int, more: int) -> int:
+    """Address space without pages. Freed memory is reserved anew: only so do its pages melt into those beside them, of which the
+    system lets a process have some ten thousand groups."""
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0) | more
+    found = libc.mmap(place, size, CLOSED, flags, -1, 0)
+    if found in (None, ctypes.c_void_p(-1).value):
+        raise MemoryError(f"a virtual GPU takes {SPACE >> 40} TiB of address space (ulimit -v)")
+    return int(found)
+
+
 class Memory:
     """Of all devices together. limit: bytes that may be in use on each."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
-        flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0)
-        begin = libc.mmap(None, SPACE, CLOSED, flags, -1, 0)
-        if begin in (None, ctypes.c_void_p(-1).value):
-            raise MemoryError(f"a virtual GPU takes {SPACE >> 40} TiB of address space (ulimit -v)")
-        self.begin, self.next = begin, begin
+        self.begin = self.next = reserve(None, SPACE, 0)
         self.starts: list[int] = []  # ascending, as addresses only grow
         self.known: dict[int, tuple[int, int]] = {}  # by start: size, and the device's number
         self.working, self.lock = 0, threading.RLock()
@@ -67,9 +73,8 @@ class Memory:
                 raise RuntimeError(f"{start:#x} is freed, and is {self.describe(start)}")
             size, _ = self.known.pop(start)
             self.starts.remove(start)
-            self._protect(start, size, CLOSED)
             first = start // mmap.PAGESIZE * mmap.PAGESIZE
-            libc.madvise(first, whole(start + size - first, mmap.PAGESIZE), mmap.MADV_DONTNEED)
+            reserve(first, whole(start + size - first, mmap.PAGESIZE), FIXED)
 
     def used(self, device: int) -> int:
         """Bytes of a device that are not free."""

@@ -13,6 +13,7 @@ import pytest
 
 from tests import device
 from tests.virtual_gpu import VirtualGpuError, gpus
+from tests.virtual_gpu.memory import Memory
 
 from wrt.core.device import record_dtype, start  # isort: skip (before warp: it silences Warp's banner)
 import warp as wp
@@ -153,6 +154,17 @@ def test_memory_is_given_back_and_begins_unwritten() -> None:
     assert gpus().memory.used(0) == used
     with pytest.raises(RuntimeError, match="Failed to allocate"):
         wp.empty(2**30 + 2**8, dtype=wp.float64, device="cuda:1")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc is Linux's")
+def test_freed_memory_leaves_nothing_behind() -> None:
+    memory, maps = Memory(2**30), Path("/proc/self/maps")
+    before = len(maps.read_text().splitlines())
+    for _ in range(300):
+        memory.free(memory.allocate(5000, 0))
+    assert len(maps.read_text().splitlines()) < before + 100  # a process may have some 65,000
+    with pytest.raises(RuntimeError, match="is freed, and is device memory that was freed"):
+        memory.free(memory.begin + 256)
 
 
 def test_what_is_asked_of_devices_is_counted() -> None:

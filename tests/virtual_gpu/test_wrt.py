@@ -3,8 +3,14 @@ tests run on `--device` too."""
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
+import subprocess
+import sys
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,3 +76,36 @@ def test_rays_on_other_devices_are_copied_and_answers_there_are_refused() -> Non
             accel.any_hit(*there[:2], out=wp.zeros(len(origins), dtype=wp.bool, device=other))
         with pytest.raises(InputError, match="t_max must not be NaN") if "cpu" in (mine, other) else nullcontext():
             accel.closest_hit(*there[:2], 0.0, wp.full(len(origins), np.nan, dtype=float, device=other))
+
+
+# Of a branch for CUDA alone: one bit of the mask of triangles that a ray may hit is cleared.
+CHANGED, WAS, IS = "kernels/wide/lanes.py", "return plain(rows, first, ray)", "return plain(rows, first, ray) & ~1"
+
+
+def checked(folder: Path, *more: str) -> tuple[int, dict[str, Any]]:
+    """`devices --check` of the project in a folder: exit code, and what it says."""
+    words = ["-m", "tests.virtual_gpu", "devices", "--check", "--rays", "400", "--json", "-q", *more]
+    ended = subprocess.run([sys.executable, *words], cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True,
+                           text=True, check=False)
+    return ended.returncode, json.loads(ended.stdout) if ended.returncode < 2 else {"error": ended.stderr}
+
+
+@pytest.mark.slow
+def test_one_bit_in_a_branch_for_cuda_fails_the_check(tmp_path: Path) -> None:
+    for name in ("wrt", "kernels", "tests/virtual_gpu", "scenes"):
+        shutil.copytree(ROOT / name, tmp_path / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    text = (tmp_path / CHANGED).read_text()
+    assert text.count(WAS) == 1
+    (tmp_path / CHANGED).write_text(text.replace(WAS, IS))
+    code, told = checked(tmp_path, "--scene", "scenes/spot.toml")
+    assert code == 1, told
+    differ = {row["what"]: row["differ"] for row in told["rows"]}
+    assert differ["bvh8"] > 100 and differ["spot"] > 100 and differ["bvh2"] == differ["brute_force"] == 0
+
+
+@pytest.mark.slow
+def test_a_check_of_everything() -> None:
+    code, told = checked(ROOT)
+    assert code == 0 and told["differ"] == 0 and told["speed"] == []
+    assert "Warp, sah: a virtual GPU has no wp_mesh_create_device" in told["speed_skipped"]
+    assert {row["what"] for row in told["rows"]} >= {*STRUCTURES, "brute_force", *(scene.stem for scene in bits.SCENES)}

@@ -5,7 +5,7 @@ import pytest
 
 from tests.data import data_path
 
-from tests.kernel_tools import DEVICE, launch, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, cpu_only, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel.batches import FEWEST, MOST, new_scratch, rays_per_launch, tracer
@@ -72,6 +72,7 @@ def test_any_number_of_rays(sphere, n):
     assert n < 1000 or 0.2 < (prim_id >= 0).mean() < 0.9
 
 
+@cpu_only
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_more_rays_than_a_launch(sphere, threads):
     free = tracer(sphere.structure, False).free
@@ -221,6 +222,7 @@ def test_a_million_rays(name):
             assert_same(accel, rays.origins, rays.directions, 0.0, rays.t_max)
 
 
+@cpu_only
 def test_rays_of_a_picture_leave_out_what_they_start_on():
     """A Queue's rays, and a mesh with spheres in its leaves: as the kernel for one ray."""
     mesh = icosphere(3)

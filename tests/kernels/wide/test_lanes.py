@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import DEVICE, floats, ints, launch, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, cpu_only, floats, ints, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel.bvh.compress import compress
@@ -18,6 +18,7 @@ from wrt.kernels.wide.nodes import make_native, make_plain, node_size
 from wrt.kernels.wide.traverse import lane_ray
 
 WIDTHS = (4, 8)
+pytestmark = cpu_only
 
 
 @cache
