@@ -86,7 +86,7 @@ def checked(folder: Path, *more: str) -> tuple[int, dict[str, Any]]:
     """`devices --check` of the project in a folder: exit code, and what it says."""
     words = ["-m", "tests.virtual_gpu", "devices", "--check", "--rays", "400", "--json", "-q", *more]
     ended = subprocess.run([sys.executable, *words], cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True,
-                           text=True, check=False)
+                           text=True, check=False, timeout=1200)
     return ended.returncode, json.loads(ended.stdout) if ended.returncode < 2 else {"error": ended.stderr}
 
 
