@@ -255,6 +255,7 @@ class Result:
 
 def run(plan: Check, tell: Callable[[str], None] = lambda line: None) -> Result:
     """Raises InputError."""
+    machine = machine_line(f"{thread_count(None)} threads for the CPU", f"Warp {wp.__version__}", device=plan.device)
     compared = []
     for each in rows(plan, tell):
         compared.append(each)
@@ -262,5 +263,4 @@ def run(plan: Check, tell: Callable[[str], None] = lambda line: None) -> Result:
             tell(f"{each.part} of {each.what}: {each.differ} of {each.count} differ")
     tell("speed")
     speed, skipped = speed_rows(plan)
-    return Result(machine_line(f"{thread_count(None)} threads for the CPU", f"Warp {wp.__version__}", device=plan.device),
-                  compared, speed, skipped)
+    return Result(machine, compared, speed, skipped)
