@@ -48,5 +48,5 @@ def _set_option(command: Any, name: str) -> None:
     for each in getattr(command, "commands", {}).values():
         _set_option(each, name)
     for parameter in command.params:
-        if parameter.name == "device":
+        if (parameter.name, parameter.default) == ("device", "cpu"):
             parameter.default = name
