@@ -1,41 +1,45 @@
-"""Small launches on the CPU device, for tests that run device functions by themselves."""
+"""Small launches on the device of the tests, for those that run device functions by themselves."""
 
 import numpy as np
+import pytest
+
+from tests import device
 
 from wrt.core.device import start  # isort: skip (before warp: it silences Warp's banner)
 import warp as wp
 
-CPU = start("cpu")
+DEVICE = start(device.NAME)
+cpu_only = pytest.mark.skipif(DEVICE.is_cuda, reason="of code that runs on the CPU alone")
 
 
 def vec3s(rows) -> wp.array:
     """Rows of three numbers as a Warp array of vec3."""
-    return wp.array(np.ascontiguousarray(rows, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device=CPU)
+    return wp.array(np.ascontiguousarray(rows, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device=DEVICE)
 
 
 def vec2s(rows) -> wp.array:
-    return wp.array(np.ascontiguousarray(rows, dtype=np.float32).reshape(-1, 2), dtype=wp.vec2, device=CPU)
+    return wp.array(np.ascontiguousarray(rows, dtype=np.float32).reshape(-1, 2), dtype=wp.vec2, device=DEVICE)
 
 
 def floats(values) -> wp.array:
-    return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=wp.float32, device=CPU)
+    return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=wp.float32, device=DEVICE)
 
 
 def ints(values) -> wp.array:
-    return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=CPU)
+    return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=DEVICE)
 
 
 def uints(values) -> wp.array:
-    return wp.array(np.ascontiguousarray(values, dtype=np.uint32), dtype=wp.uint32, device=CPU)
+    return wp.array(np.ascontiguousarray(values, dtype=np.uint32), dtype=wp.uint32, device=DEVICE)
 
 
 def zeros(n: int, dtype=wp.float32) -> wp.array:
-    return wp.zeros(n, dtype=dtype, device=CPU)
+    return wp.zeros(n, dtype=dtype, device=DEVICE)
 
 
 def launch(kernel, n: int, *arguments) -> None:
     """Run `kernel` over n threads; its last arguments are usually the arrays that it fills."""
-    wp.launch(kernel, dim=n, inputs=list(arguments), device=CPU)
+    wp.launch(kernel, dim=n, inputs=list(arguments), device=DEVICE)
 
 
 def unit(rows: np.ndarray) -> np.ndarray:

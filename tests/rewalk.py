@@ -99,17 +99,17 @@ def rays(geometry, origins, directions, t_min=0.0, t_max=np.inf, capacity=256) -
 
     yardstick = build(geometry, "brute_force")
     kernel = make_all_hits_kernel(yardstick.structure.units)
-    n = len(origins)
+    n, device = len(origins), yardstick.device
     arrays = RayArrays()
-    arrays.origin, arrays.direction = (upload(np.ascontiguousarray(a, np.float32), wp.vec3, "cpu") for a in (origins, directions))
-    arrays.t_min, arrays.t_max = (upload(np.full(n, t, np.float32), wp.float32, "cpu") for t in (t_min, t_max))
+    arrays.origin, arrays.direction = (upload(np.ascontiguousarray(a, np.float32), wp.vec3, device) for a in (origins, directions))
+    arrays.t_min, arrays.t_max = (upload(np.full(n, t, np.float32), wp.float32, device) for t in (t_min, t_max))
     out = HitList()
     out.capacity = capacity
-    out.count = wp.zeros(n, dtype=wp.int32, device="cpu")
-    out.prim_id = wp.zeros(n * capacity, dtype=wp.int32, device="cpu")
-    out.t = wp.zeros(n * capacity, dtype=wp.float32, device="cpu")
-    load_kernel(kernel, yardstick.device)
-    wp.launch(kernel, dim=n, inputs=[yardstick.data.primitives, yardstick._surfaces, arrays, out, 0], device="cpu")
+    out.count = wp.zeros(n, dtype=wp.int32, device=device)
+    out.prim_id = wp.zeros(n * capacity, dtype=wp.int32, device=device)
+    out.t = wp.zeros(n * capacity, dtype=wp.float32, device=device)
+    load_kernel(kernel, device)
+    wp.launch(kernel, dim=n, inputs=[yardstick.data.primitives, yardstick._surfaces, arrays, out, 0], device=device)
     count = out.count.numpy()
     assert count.max(initial=0) <= capacity, "more hits on a ray than there is room for"
     prim_id, t = out.prim_id.numpy().reshape(n, capacity), out.t.numpy().reshape(n, capacity)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.kernel_tools import CPU, floats, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, floats, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel.build import build
@@ -48,10 +48,10 @@ def test_only_the_rows_asked_for_are_written(name, cls):
     data = build(TRIANGLE, name).data
     hits = HitArrays()
     hits.t, hits.u, hits.v = (floats(np.full(10, -7.0)) for _ in range(3))
-    hits.prim_id = wp.full(10, -7, dtype=wp.int32, device=CPU)
+    hits.prim_id = wp.full(10, -7, dtype=wp.int32, device=DEVICE)
     dark = zeros(10, wp.bool)
-    wp.launch(closest, dim=7, inputs=[data, surfaces(), ray_arrays(), hits, 2], device=CPU)
-    wp.launch(anything, dim=7, inputs=[data, surfaces(), ray_arrays(), dark, 2], device=CPU)
+    wp.launch(closest, dim=7, inputs=[data, surfaces(), ray_arrays(), hits, 2], device=DEVICE)
+    wp.launch(anything, dim=7, inputs=[data, surfaces(), ray_arrays(), dark, 2], device=DEVICE)
     hit = np.array([2, 8])
     miss = np.array([3, 4, 5, 6, 7])
     untouched = np.array([0, 1, 9])
@@ -130,7 +130,7 @@ def ray_defaults(origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.v
 
 def test_make_ray_goes_to_infinity_and_leaves_nothing_out():
     out = zeros(2, Ray)
-    wp.launch(ray_defaults, dim=2, inputs=[vec3s(np.ones((2, 3))), vec3s(np.full((2, 3), 2.0)), out], device=CPU)
+    wp.launch(ray_defaults, dim=2, inputs=[vec3s(np.ones((2, 3))), vec3s(np.full((2, 3), 2.0)), out], device=DEVICE)
     zero, ray = out.numpy()
     assert (ray["origin"] == 1.0).all() and (ray["direction"] == 2.0).all()
     assert ray["t_min"] == 0.0 and ray["t_max"] == np.inf and ray["exclude_plus_one"] == ray["slot"] == ray["first_prim"] == 0
@@ -158,5 +158,5 @@ def test_a_ray_with_nothing_said_of_it_leaves_no_triangle_out(name, cls):
         prim_id[i] = traverse(accel, known, ray).prim_id
 
     found = zeros(4, wp.int32)
-    wp.launch(own, dim=4, inputs=[build(TRIANGLE, name).data, surfaces(), vec3s([[0.0, 0.0, -2.0]]), found], device=CPU)
+    wp.launch(own, dim=4, inputs=[build(TRIANGLE, name).data, surfaces(), vec3s([[0.0, 0.0, -2.0]]), found], device=DEVICE)
     assert found.numpy().tolist() == [0, 0, -1, 0]

@@ -49,7 +49,8 @@ class Tracer:
     def trace(self, data: Any, surfaces: Any, rays: Rays, out: list[Any], threads: int) -> None:
         """Write the answers to arrays without gaps. Raises InputError for rays that are refused; by then they have been traced, and
         the answers are nothing to go by."""
-        load_kernel(self.kernel, wp.get_device("cpu"))
+        load_kernel(self.kernel, cpu := wp.get_device("cpu"))
+        rays = rays.on(cpu)
         if not self.stream:  # which says itself whether it met such
             rays = rays.checked()
         given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in out]

@@ -30,6 +30,10 @@ class Rays(NamedTuple):
     def as_warp(self) -> bool:
         return isinstance(self.origins, wp.array)
 
+    def on(self, device: Any) -> Rays:
+        """The same, with Warp arrays of other devices copied to this one."""
+        return Rays(*(array.to(device) if isinstance(array, wp.array) else array for array in self))
+
     def checked(self) -> Rays:
         """The same as float32 without gaps. Raises InputError that names the first that kernels must not get; of Warp arrays, only
         t_min and t_max on the CPU are looked at."""
@@ -57,9 +61,10 @@ def rays_of(origins: Any, directions: Any, t_min: Any, t_max: Any) -> Rays:
 
 
 def rays_on(device: Any, rays: Rays) -> RayArrays:
-    """Checked, as Warp arrays on a device."""
+    """Checked, as Warp arrays on a device; what is on another is copied."""
     out = RayArrays()
-    for name, array, dtype in zip(fields_of(RayArrays), rays.checked(), (wp.vec3, wp.vec3, wp.float32, wp.float32), strict=True):
+    for name, array, dtype in zip(fields_of(RayArrays), rays.checked().on(device), (wp.vec3, wp.vec3, wp.float32, wp.float32),
+                                  strict=True):
         setattr(out, name, array if isinstance(array, wp.array) else upload(array, dtype, device))
     return out
 

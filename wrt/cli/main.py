@@ -1,8 +1,8 @@
 """The command line: it parses, calls and prints; it knows nothing of rendering.
 
-stdout is data, stderr is talk. Exit codes: 0; 1 where `compare` finds more difference than allowed; 2 for a user's mistake,
-with one message; 128 and the signal's number when interrupted: 130 by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP. Whatever takes
-long to import is imported by the command that needs it.
+stdout is data, stderr is talk. Exit codes: 0; 1 where `compare` or `devices --check` finds more difference than allowed; 2 for a
+user's mistake, with one message; 128 and the signal's number when interrupted: 130 by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP.
+Whatever takes long to import is imported by the command that needs it.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from wrt.cli.common import (
     warnings_reported,
 )
 from wrt.cli.compile import compile_kernels
+from wrt.cli.devices import devices
 from wrt.cli.measure import bench, profile, stability
 from wrt.cli.reporting import measured
 from wrt.cli.save import check_room, checkpoint_options, save_film
@@ -61,7 +62,7 @@ def cli() -> None:
     require_modules()  # before a command imports them
 
 
-for command in (stability, bench, build, compile_kernels, profile, animate, view):
+for command in (stability, bench, build, compile_kernels, devices, profile, animate, view):
     cli.add_command(command)
 measured(cli, WhatIf)
 
@@ -276,15 +277,6 @@ def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float
         say(sentence)
     if broken:
         raise SystemExit(1)
-
-
-@cli.command()
-def devices() -> None:
-    """List the devices that Warp can compute on."""
-    from wrt.core.device import describe_devices
-
-    for line in describe_devices():
-        click.echo(line)
 
 
 def main() -> None:

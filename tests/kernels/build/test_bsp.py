@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.kernel_tools import CPU, launch, unit  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, launch, unit  # isort: skip (starts Warp)
 import warp as wp
 from scipy.spatial import ConvexHull
 
@@ -36,9 +36,9 @@ def cut_cell(cells: Cells, lo: wp.vec3d, hi: wp.vec3d, normal: wp.array(dtype=wp
 def cut(lo, hi, normals, offsets, eps=1e-12):
     """Predicted and clipped areas, (N, 2) each, and the cells: slot 0 what is left, 1 and 2 below and above the last plane."""
     n, cells = len(normals), cells_of(3)
-    areas = wp.zeros(2 * n, dtype=wp.vec3d, device=CPU)
-    launch(cut_cell, 1, cells, wp.vec3d(*lo), wp.vec3d(*hi), wp.array(normals, dtype=wp.vec3d, device=CPU),
-           wp.array(offsets, dtype=wp.float64, device=CPU), wp.float64(eps), areas)
+    areas = wp.zeros(2 * n, dtype=wp.vec3d, device=DEVICE)
+    launch(cut_cell, 1, cells, wp.vec3d(*lo), wp.vec3d(*hi), wp.array(normals, dtype=wp.vec3d, device=DEVICE),
+           wp.array(offsets, dtype=wp.float64, device=DEVICE), wp.float64(eps), areas)
     out = areas.numpy()[:, :2]
     return out[0::2], out[1::2], cells
 
@@ -129,9 +129,9 @@ def test_clipped_triangles_keep_their_area():
         getattr(pieces, name).zero_()
     pieces.first.numpy()[::3], pieces.count.numpy()[::3] = 100 * np.arange(n), 3
     pieces.points.numpy().reshape(n, 100, 3)[:, :3] = corners
-    end = wp.zeros(n, dtype=wp.int32, device=CPU)
-    launch(clip, n, pieces, wp.array(rng.normal(size=(n, 3)), dtype=wp.vec3d, device=CPU),
-           wp.array(inside, dtype=wp.vec3d, device=CPU), end)
+    end = wp.zeros(n, dtype=wp.int32, device=DEVICE)
+    launch(clip, n, pieces, wp.array(rng.normal(size=(n, 3)), dtype=wp.vec3d, device=DEVICE),
+           wp.array(inside, dtype=wp.vec3d, device=DEVICE), end)
     first, count, points = pieces.first.numpy(), pieces.count.numpy(), pieces.points.numpy()
     assert (count[1::3] >= 3).all() and (count[2::3] >= 3).all() and (count[1::3] + count[2::3] == end.numpy() % 100 - 20).all()
     for i in range(n):
@@ -154,8 +154,8 @@ def write_planes(normal: wp.array(dtype=wp.vec3d), point: wp.array(dtype=wp.vec3
 def test_planes_are_what_float32_holds():
     rng = np.random.default_rng(2)
     normal, point = rng.normal(size=(100, 3)) * 10.0 ** rng.uniform(-20, 20, (100, 1)), rng.normal(size=(100, 3))
-    out = wp.zeros(100, dtype=wp.vec4d, device=CPU)
-    launch(write_planes, 100, wp.array(normal, dtype=wp.vec3d, device=CPU), wp.array(point, dtype=wp.vec3d, device=CPU), out)
+    out = wp.zeros(100, dtype=wp.vec4d, device=DEVICE)
+    launch(write_planes, 100, wp.array(normal, dtype=wp.vec3d, device=DEVICE), wp.array(point, dtype=wp.vec3d, device=DEVICE), out)
     plane = out.numpy()
     assert (plane == plane.astype(np.float32)).all()
     np.testing.assert_allclose(plane[:, :3], unit(normal), atol=1e-7)

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import CPU, directions, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
+from tests.kernel_tools import DEVICE, directions, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
 import warp as wp
 
 from wrt.accel.build import build
@@ -59,7 +59,7 @@ def environment_kernel(b: Background, direction: wp.array(dtype=wp.vec3), out: w
 def take(scene, point=(0.0, 0.0, 0.0), n=(0.0, 1.0, 0.0), light=0, xi=None, features=ALL_LIGHTS):
     """Light samples and their shadow rays, structured arrays; light = number of lights is the background."""
     xi = sobol_like(1 << 15, np.random.default_rng(0)) if xi is None else xi
-    on_device = upload_scene(scene, CPU)
+    on_device = upload_scene(scene, DEVICE)
     out, ray = zeros(len(xi), LightSample), zeros(len(xi), Ray)
     rows = [vec3s(np.broadcast_to(np.asarray(a, float), (len(xi), 3))) for a in (point, n)]
     launch(light_kernel(features), len(xi), on_device.lighting, on_device.surfaces, *rows, light, vec2s(xi), out, ray)
@@ -225,7 +225,7 @@ def test_inside_a_glowing_sphere_the_irradiance_is_pi_l(point, scale):
         out, ray = take(scene, at, n, xi=rng.random((2000, 2)))
         each = out["weight"] * np.maximum(out["wi"].astype(np.float64) @ n, 0.0)[:, None]
         assert np.allclose(each, np.pi * np.array([3.0, 2.0, 1.0]), rtol=1e-3)  # each sample alone: there is no noise
-        structure = build(upload_scene(scene, CPU).world.geometry, "bvh")
+        structure = build(upload_scene(scene, DEVICE).world.geometry, "bvh")
         assert not structure.any_hit(ray["origin"], ray["direction"], 0.0, ray["t_max"]).any()
         assert structure.any_hit(ray["origin"], ray["direction"], 0.0, 1.02).mean() > 0.999
 
@@ -263,7 +263,7 @@ def test_the_shadow_ray_ends_just_before_the_light(kind, scale):
     out, ray = take(scene, point, xi=rng.random((n, 2)))
     lit = out["weight"].max(axis=1) > 0.0
     assert lit.sum() > 1000
-    structure = build(upload_scene(scene, CPU).world.geometry, "bvh")
+    structure = build(upload_scene(scene, DEVICE).world.geometry, "bvh")
     origin, direction = ray["origin"][lit], ray["direction"][lit]
     blocked = structure.any_hit(origin, direction, 0.0, ray["t_max"][lit])
     # At the rim of a ball the way touches it: a few in ten thousand may graze.
@@ -301,7 +301,7 @@ ENVIRONMENT = replace(ALL_LIGHTS, background="environment")
 
 def radiance_of(background, direction):
     out = zeros(len(direction), wp.vec3)
-    launch(environment_kernel, len(direction), upload_scene(Scene(background=background), CPU).lighting.background,
+    launch(environment_kernel, len(direction), upload_scene(Scene(background=background), DEVICE).lighting.background,
            vec3s(direction), out)
     return out.numpy().astype(np.float64)
 

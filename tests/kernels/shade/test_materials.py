@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import CPU, floats, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
+from tests.kernel_tools import DEVICE, floats, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
 import warp as wp
 
 from wrt.core.device import upload
@@ -180,7 +180,7 @@ def scatter_kernel(features):
 def scatter(material, wo, xi=None, front=True, shading=(0.0, 0.0, 1.0), geometric=(0.0, 0.0, 1.0), features=EVERYTHING):
     wo = np.asarray(wo, np.float64).reshape(-1, 3)
     xi = np.full((len(wo), 2), 0.5) if xi is None else xi
-    records = upload(material_records((material,), TextureTable()), structs.Material, CPU)
+    records = upload(material_records((material,), TextureTable()), structs.Material, DEVICE)
     out = zeros(len(wo), Scatter)
     launch(scatter_kernel(features), len(wo), records, int(front), wp.vec3(*shading), wp.vec3(*geometric), vec3s(wo),
            vec2s(xi), out)

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import CPU, directions, floats, ints, launch, rounded, unit, vec3s, zeros  # isort: skip
+from tests.kernel_tools import DEVICE, directions, floats, ints, launch, rounded, unit, vec3s, zeros  # isort: skip
 import warp as wp
 
 from wrt.accel.build import build
@@ -64,7 +64,7 @@ def surfaces_at(scene, origin, direction, hits, onward=None):
     out, start = zeros(n, Surface), zeros(n, wp.vec3)
     onward = direction if onward is None else onward
     smooth = any(thing.mesh.normals is not None for thing in scene.objects)
-    launch(surface_kernel(smooth), n, upload_scene(scene, CPU).surfaces, vec3s(origin), vec3s(direction), floats(hits.t),
+    launch(surface_kernel(smooth), n, upload_scene(scene, DEVICE).surfaces, vec3s(origin), vec3s(direction), floats(hits.t),
            floats(hits.u), floats(hits.v), ints(hits.prim_id), vec3s(onward), out, start)
     return out.numpy(), start.numpy()
 
@@ -229,7 +229,7 @@ def test_sphere_coordinates():
     # u runs around +y from -x, v from the top down, as wrt.scene.model.Sphere says.
     scene = scene_of(spheres=[[0.0, 0.0, 0.0, 2.0]])
     where = np.array([[1, 0, 0], [0, 0, 1], [0, 0, -1], [0.6, 0.8, 0.0], [0.6, -0.8, 0.0], [-0.6, 0.0, 0.8], [0, 1, 0]], float)
-    hits = build(upload_scene(scene, CPU).world.geometry, "bvh").closest_hit(4.0 * where, -where)
+    hits = build(upload_scene(scene, DEVICE).world.geometry, "bvh").closest_hit(4.0 * where, -where)
     found, _ = surfaces_at(scene, 4.0 * where, -where, hits)
     assert np.allclose(found["uv"][:, 1], np.arccos(where[:, 1]) / np.pi, atol=1e-5)
     # From -x (the seam) over +z, +x and -z, which is to the right for who looks at it from outside with +y up.
@@ -239,7 +239,7 @@ def test_sphere_coordinates():
     tangent = found["tangent"]
     step = 1e-3
     moved = unit(where[:6] + step * tangent[:6])
-    hits = build(upload_scene(scene, CPU).world.geometry, "bvh").closest_hit(4.0 * moved, -moved)
+    hits = build(upload_scene(scene, DEVICE).world.geometry, "bvh").closest_hit(4.0 * moved, -moved)
     further, _ = surfaces_at(scene, 4.0 * moved, -moved, hits)
     assert (further["uv"][:6, 0] > found["uv"][:6, 0]).all()  # the tangent points along growing u
     assert np.allclose(further["uv"][:3, 1], found["uv"][:3, 1], atol=1e-5)

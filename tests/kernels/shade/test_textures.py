@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import CPU, ints, launch, vec2s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, ints, launch, vec2s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.core.device import upload
@@ -32,9 +32,9 @@ def look_up(textures, index, uv):
     table = TextureTable()
     assert [table.index(texture) for texture in textures] == list(range(len(textures)))
     surfaces = Surfaces()
-    surfaces.textures = upload(table.records(), structs.Texture, CPU)
-    surfaces.texels = upload(np.concatenate([*table.texels, np.zeros(1, np.uint32)]), wp.uint32, CPU)
-    surfaces.srgb_to_linear = upload(srgb_table(), wp.float32, CPU)
+    surfaces.textures = upload(table.records(), structs.Texture, DEVICE)
+    surfaces.texels = upload(np.concatenate([*table.texels, np.zeros(1, np.uint32)]), wp.uint32, DEVICE)
+    surfaces.srgb_to_linear = upload(srgb_table(), wp.float32, DEVICE)
     uv = np.asarray(uv, np.float32).reshape(-1, 2)
     out = zeros(len(uv), wp.vec4)
     launch(texture_kernel(True, True), len(uv), surfaces, ints(np.broadcast_to(index, (len(uv),))), vec2s(uv), out)

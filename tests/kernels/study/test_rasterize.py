@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.kernel_tools import CPU, launch, zeros  # before warp: it silences Warp's banner
+from tests.kernel_tools import DEVICE, launch, zeros  # before warp: it silences Warp's banner
 from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.kernels.structs import kernel
@@ -316,9 +316,9 @@ def test_turn_has_the_exact_sign() -> None:
     q[1::4] = p[1::4] * 0.5  # exactly collinear
     q[2::4] *= 1.0 + 2.0**-52 * rng.integers(-1, 2, (1000, 2))
     out = zeros(4000, wp.float64)
-    launch(turns, 4000, *(wp.array(rows, dtype=wp.vec2d, device=CPU) for rows in (p, q)), out)
+    launch(turns, 4000, *(wp.array(rows, dtype=wp.vec2d, device=DEVICE) for rows in (p, q)), out)
     back = zeros(4000, wp.float64)
-    launch(turns, 4000, *(wp.array(rows, dtype=wp.vec2d, device=CPU) for rows in (q, p)), back)
+    launch(turns, 4000, *(wp.array(rows, dtype=wp.vec2d, device=DEVICE) for rows in (q, p)), back)
     np.testing.assert_array_equal(out.numpy(), -back.numpy())
     exact = np.array([int(np.sign(Fraction(a) * Fraction(d) - Fraction(b) * Fraction(c)))
                       for (a, b), (c, d) in zip(p.tolist(), q.tolist(), strict=True)])

@@ -6,7 +6,7 @@ from inspect import signature
 import numpy as np
 import pytest
 
-from tests.kernel_tools import CPU, directions, floats, ints, launch, rounded, unit, vec3s, zeros  # isort: skip
+from tests.kernel_tools import directions, floats, ints, launch, rounded, unit, vec3s, zeros  # isort: skip
 import warp as wp
 
 from wrt.accel.build import build
@@ -405,7 +405,3 @@ def test_far_rays_find_a_small_ball():
     for offset, expected in ((0.9, True), (1.1, False)):
         target = side * offset
         assert (structure.any_hit(origin, target - origin) == expected).all()
-
-
-def test_the_device_is_the_cpu():
-    assert CPU.is_cpu

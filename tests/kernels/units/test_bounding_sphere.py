@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.kernel_tools import directions, floats, launch, rounded, unit, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, directions, floats, launch, rounded, unit, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.kernels.structs import Ray, kernel
@@ -27,7 +27,7 @@ def entries(origin, direction, center, radius, t_min=0.0, t_max=np.inf):
     spheres = np.concatenate([np.broadcast_to(center, (n, 3)), np.broadcast_to(radius, n)[:, None]], axis=1)
     out = zeros(n)
     launch(sphere_kernel, n, vec3s(origin), vec3s(np.broadcast_to(direction, (n, 3))), floats(np.broadcast_to(t_min, n)),
-           floats(np.broadcast_to(t_max, n)), wp.array(spheres.astype(np.float32), dtype=wp.vec4, device="cpu"), out)
+           floats(np.broadcast_to(t_max, n)), wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=DEVICE), out)
     return out.numpy()
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.kernel_tools import directions, floats, launch, rounded, unit, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, directions, floats, launch, rounded, unit, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel.bvh.volumes import cuts
@@ -59,7 +59,7 @@ def run(origin, direction, corners, middle, t_max=INF):
     lo, hi = geometry.bounds()
     cut_lo, cut_hi = cuts(geometry, np.asarray(middle, np.float32))
     around.corners, around.lo, around.hi = vec3s(geometry.vertices), vec3s(lo), vec3s(hi)
-    around.cut_lo, around.cut_hi = (wp.array(c, dtype=wp.vec4, device="cpu") for c in (cut_lo, cut_hi))
+    around.cut_lo, around.cut_hi = (wp.array(c, dtype=wp.vec4, device=DEVICE) for c in (cut_lo, cut_hi))
     around.middle = wp.vec3(*np.asarray(middle, float).tolist())
     out = [zeros(n) for _ in range(3)]
     launch(kdop_kernel, n, vec3s(origin), vec3s(direction), floats(np.broadcast_to(t_max, n)), around, *out)
@@ -68,7 +68,7 @@ def run(origin, direction, corners, middle, t_max=INF):
 
 def test_host_and_device_project_alike():
     v = rounded(np.random.default_rng(1).normal(size=(1000, 3)) * 10.0 ** np.random.default_rng(2).uniform(-9, 9, (1000, 1)))
-    out = wp.zeros(1000, dtype=wp.vec4, device="cpu")
+    out = wp.zeros(1000, dtype=wp.vec4, device=DEVICE)
     launch(project_kernel, 1000, vec3s(v), out)
     np.testing.assert_array_equal(out.numpy(), host_project(v.astype(np.float32)))
 

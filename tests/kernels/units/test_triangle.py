@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.kernel_tools import directions, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, directions, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel.build import build
@@ -406,7 +406,7 @@ def test_kernels_are_compiled_without_fused_multiply_add():
     m[:, 3] = m[:, 0] * m[:, 1] / m[:, 2]
     assert products_kernel.module.options["fuse_fp"] is False  # on a CPU without such an instruction this alone tells
     forth, back = zeros(len(m)), zeros(len(m))
-    launch(products_kernel, len(m), wp.array(m, dtype=wp.vec4, device="cpu"), forth, back)
+    launch(products_kernel, len(m), wp.array(m, dtype=wp.vec4, device=DEVICE), forth, back)
     assert np.array_equal(forth.numpy(), -back.numpy())
     assert np.array_equal(forth.numpy(), m[:, 0] * m[:, 1] - m[:, 2] * m[:, 3])
 

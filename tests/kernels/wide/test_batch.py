@@ -5,7 +5,7 @@ import pytest
 
 from tests.data import data_path
 
-from tests.kernel_tools import CPU, launch, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, cpu_only, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel.batches import FEWEST, MOST, new_scratch, rays_per_launch, tracer
@@ -72,6 +72,7 @@ def test_any_number_of_rays(sphere, n):
     assert n < 1000 or 0.2 < (prim_id >= 0).mean() < 0.9
 
 
+@cpu_only
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_more_rays_than_a_launch(sphere, threads):
     free = tracer(sphere.structure, False).free
@@ -101,7 +102,7 @@ def test_strided_arrays_are_read_with_their_gaps(sphere):
     t_max = t_max.astype(np.float32)
     expected = sphere.closest_hit(o[::2], d[::2], 0.0, t_max[::2])
     assert not vec3s(o)[::2].is_contiguous
-    found = sphere.closest_hit(vec3s(o)[::2], vec3s(d)[::2], 0.0, wp.array(t_max, dtype=wp.float32, device=CPU)[::2]).numpy()
+    found = sphere.closest_hit(vec3s(o)[::2], vec3s(d)[::2], 0.0, wp.array(t_max, dtype=wp.float32, device=DEVICE)[::2]).numpy()
     np.testing.assert_array_equal(found.prim_id, expected.prim_id)
     np.testing.assert_array_equal(found.t, expected.t)
 
@@ -221,6 +222,7 @@ def test_a_million_rays(name):
             assert_same(accel, rays.origins, rays.directions, 0.0, rays.t_max)
 
 
+@cpu_only
 def test_rays_of_a_picture_leave_out_what_they_start_on():
     """A Queue's rays, and a mesh with spheres in its leaves: as the kernel for one ray."""
     mesh = icosphere(3)
@@ -231,10 +233,10 @@ def test_rays_of_a_picture_leave_out_what_they_start_on():
     assert (first >= len(mesh.faces)).any() and (first < 0).any()
     queue = Queue()
     queue.origin, queue.direction = vec3s(o), vec3s(d)
-    queue.t_min, queue.t_max = zeros(len(o)), wp.array(t_max.astype(np.float32), dtype=wp.float32, device=CPU)
+    queue.t_min, queue.t_max = zeros(len(o)), wp.array(t_max.astype(np.float32), dtype=wp.float32, device=DEVICE)
     answers = {}
     for exclude in (np.zeros_like(first), first + 1):
-        queue.exclude = wp.array(exclude, dtype=wp.int32, device=CPU)
+        queue.exclude = wp.array(exclude, dtype=wp.int32, device=DEVICE)
         for any_hit in (False, True):
             many, block = accel.structure.accel.kernels.make_stream(accel.structure.units, any_hit, Queue), 64
             one = make_queue_kernel(accel.structure.struct, accel.structure.traversal(any_hit=any_hit), any_hit)
@@ -243,7 +245,7 @@ def test_rays_of_a_picture_leave_out_what_they_start_on():
                 hits = HitArrays()
                 hits.t, hits.u, hits.v, hits.prim_id = zeros(len(o)), zeros(len(o)), zeros(len(o)), zeros(len(o), wp.int32)
                 out = zeros(len(o), wp.bool) if any_hit else hits
-                wp.launch(kernel, threads, [accel.data, accel._surfaces, queue, out, *more, 0, len(o)], device=CPU)
+                wp.launch(kernel, threads, [accel.data, accel._surfaces, queue, out, *more, 0, len(o)], device=DEVICE)
                 arrays = [out.numpy()] if any_hit else [hits.t.numpy(), hits.u.numpy(), hits.v.numpy(), hits.prim_id.numpy()]
                 answers.setdefault((any_hit, bool(exclude.any())), []).append([array.view(np.uint8) for array in arrays])
     for both in answers.values():

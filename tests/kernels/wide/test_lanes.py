@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import CPU, floats, ints, launch, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, cpu_only, floats, ints, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel.bvh.compress import compress
@@ -18,6 +18,7 @@ from wrt.kernels.wide.nodes import make_native, make_plain, node_size
 from wrt.kernels.wide.traverse import lane_ray
 
 WIDTHS = (4, 8)
+pytestmark = cpu_only
 
 
 @cache
@@ -169,7 +170,8 @@ def test_rows_of_boxes_leave_out_none_that_the_box_unit_enters():
     rays = origin, direction, np.zeros(n), np.full(n, t_max)
     native, _ = results(8, False, nodes, np.zeros((n, 9, 8)), rays)
     t = zeros(8 * n)
-    wp.launch(scalar_boxes, dim=(n, 8), inputs=[floats(nodes.reshape(-1)), vec3s(origin), vec3s(direction), t_max, t], device=CPU)
+    inputs = [floats(nodes.reshape(-1)), vec3s(origin), vec3s(direction), t_max, t]
+    wp.launch(scalar_boxes, dim=(n, 8), inputs=inputs, device=DEVICE)
     t = t.numpy().reshape(n, 8)
     entered = (native["entered"][:, None] >> np.arange(8) & 1).astype(bool)
     assert entered[np.isfinite(t)].all() and 0.02 < np.isinf(t).mean() < 0.98

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.kernel_tools import CPU, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 import wrt
@@ -127,7 +127,7 @@ def test_warp_arrays_come_back_as_warp_arrays(name: str) -> None:
     hits = structure.closest_hit(vec3s(origin), vec3s(direction))
     assert all(isinstance(array, wp.array) for array in (hits.t, hits.u, hits.v, hits.prim_id))
     assert np.array_equal(hits.t.numpy(), expected.t) and np.array_equal(hits.prim_id.numpy(), expected.prim_id)
-    ends = wp.array(np.full(300, 0.5, np.float32), dtype=wp.float32, device=CPU)
+    ends = wp.array(np.full(300, 0.5, np.float32), dtype=wp.float32, device=DEVICE)
     dark = structure.any_hit(vec3s(origin), vec3s(direction), t_max=ends)
     assert isinstance(dark, wp.array) and np.array_equal(dark.numpy(), expected.t <= 0.5)
 
@@ -214,7 +214,7 @@ def test_gradients_are_refused_and_not_lost_in_silence() -> None:
     structure = build(BALL, "bvh2")
     plain, down = vec3s([[0.0, 0.0, 3.0], [0.0, 0.0, 4.0]]), vec3s([[0.0, 0.0, -1.0]] * 2)
     needed = wp.clone(plain, requires_grad=True)
-    end = wp.array(np.float32([9, 9]), dtype=wp.float32, device=CPU, requires_grad=True)
+    end = wp.array(np.float32([9, 9]), dtype=wp.float32, device=DEVICE, requires_grad=True)
     expected = structure.closest_hit(needed, down, t_max=end).t.numpy()  # without a tape nobody waits for them
     for query in (structure.closest_hit, structure.any_hit):
         for arguments, name in (((needed, down), "origins"), ((down, needed), "directions"), ((plain, down, 0.0, end), "t_max")):
@@ -238,15 +238,15 @@ def test_bad_warp_arrays_are_named() -> None:
     with pytest.raises(InputError, match="both be Warp arrays of vec3"):
         structure.closest_hit(np.ones((1, 3)), good)
     with pytest.raises(InputError, match="both be Warp arrays of vec3"):
-        structure.closest_hit(wp.zeros(1, dtype=wp.vec2, device=CPU), good)
+        structure.closest_hit(wp.zeros(1, dtype=wp.vec2, device=DEVICE), good)
     with pytest.raises(InputError, match="as many rows"):
         structure.closest_hit(good, vec3s(np.ones((2, 3))))
     with pytest.raises(InputError, match="t_max must be"):
-        structure.closest_hit(good, good, t_max=wp.zeros(3, dtype=wp.float32, device=CPU))
+        structure.closest_hit(good, good, t_max=wp.zeros(3, dtype=wp.float32, device=DEVICE))
     for name, value, message in (("t_min", -0.5, "t_min must not be NaN or below 0"), ("t_min", np.nan, "t_min must not be NaN"),
                                  ("t_max", np.nan, "t_max must not be NaN")):
         with pytest.raises(InputError, match=message):
-            structure.closest_hit(good, good, **{name: wp.array([value], dtype=wp.float32, device=CPU)})
+            structure.closest_hit(good, good, **{name: wp.array([value], dtype=wp.float32, device="cpu")})
 
 
 def test_threads_must_be_positive() -> None:

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.kernel_tools import DEVICE
 from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
 from wrt.accel.batches import FEWEST
 from wrt.accel.build import build
-from wrt.core.arrays import to_warp
+from wrt.core.arrays import to_numpy, to_warp
 from wrt.core.errors import InputError
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
@@ -37,7 +38,7 @@ def some_rays(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bits(hits: Hits) -> list[bytes]:
-    return [np.asarray(getattr(hits, name)).tobytes() for name in FIELDS]
+    return [to_numpy(getattr(hits, name)).tobytes() for name in FIELDS]
 
 
 def unaligned(a: np.ndarray) -> np.ndarray:
@@ -105,13 +106,13 @@ def test_answers_go_where_the_caller_says(ball: Accelerator, n: int, as_warp: bo
     expected, dark = ball.closest_hit(*rays, threads=1), ball.any_hit(*rays)
     room: list[Any] = [np.full(n, 7, np.int32 if name == "prim_id" else np.float32) for name in FIELDS] + [np.ones(n, bool)]
     if as_warp:
-        rays, room = tuple(to_warp(a, wp.vec3) for a in rays), [to_warp(a) for a in room]
+        rays, room = tuple(to_warp(a, wp.vec3) for a in rays), [to_warp(a).to(DEVICE) for a in room]
     out = Hits(*room[:4])
     for threads in (1, 2):
         hits = ball.closest_hit(*rays, threads=threads, out=out)
         assert all(getattr(hits, name) is array for name, array in zip(FIELDS, room, strict=False))
         assert bits(hits) == bits(expected)
-        assert ball.any_hit(*rays, threads=threads, out=room[4]) is room[4] and np.array_equal(np.asarray(room[4]), dark)
+        assert ball.any_hit(*rays, threads=threads, out=room[4]) is room[4] and np.array_equal(to_numpy(room[4]), dark)
     counted = ball.closest_hit(*rays, counters=True, out=out)
     assert bits(counted) == bits(expected) and counted.t is room[0] and len(counted.counters.counts) == n  # type: ignore[union-attr]
     assert out.counters is None
@@ -140,10 +141,10 @@ def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
         ball.closest_hit(*rays, out=np.zeros(3))  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"out must be a NumPy array \(3,\) of bool.*, got an array \(3,\) of float32"):
         ball.any_hit(*rays, out=np.zeros(3, np.float32))
-    with pytest.raises(InputError, match=r"out must be a Warp array \(3,\) of bool, on cpu, without gaps, got an array"):
+    with pytest.raises(InputError, match=rf"out must be a Warp array \(3,\) of bool, on {DEVICE}, without gaps, got an array"):
         ball.any_hit(*on_warp, out=np.zeros(3, bool))
-    for wrong in (wp.zeros(4, dtype=wp.bool, device="cpu"), wp.zeros(3, dtype=wp.int32, device="cpu"),
-                  wp.zeros(6, dtype=wp.bool, device="cpu")[::2]):
+    for wrong in (wp.zeros(4, dtype=wp.bool, device=DEVICE), wp.zeros(3, dtype=wp.int32, device=DEVICE),
+                  wp.zeros(6, dtype=wp.bool, device=DEVICE)[::2]):
         with pytest.raises(InputError, match=r"out must be a Warp array \(3,\) of bool"):
             ball.any_hit(*on_warp, out=wrong)
 
@@ -244,7 +245,7 @@ def test_calls_of_all_sizes_on_several_threads(ball: Accelerator) -> None:
 
 
 def test_rays_in_place_need_no_memory_of_their_size() -> None:
-    accel = build(icosphere(1), "bvh8")
+    accel = build(icosphere(1), "bvh8", device="cpu")
     n = 20 * FEWEST
     origins, directions = some_rays(n)
     out, dark = accel.closest_hit(origins, directions), accel.any_hit(origins, directions)
@@ -266,7 +267,7 @@ def test_rays_in_place_need_no_memory_of_their_size() -> None:
 
 
 def test_a_small_call_wakes_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    accel = build(icosphere(1), "bvh8")
+    accel = build(icosphere(1), "bvh8", device="cpu")
     rays = some_rays(FEWEST)
     seen: set[int] = set()
     launch = wp.Launch.launch
@@ -279,7 +280,7 @@ def test_a_small_call_wakes_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_call_packs_no_launch_and_makes_no_warp_array(monkeypatch: pytest.MonkeyPatch) -> None:
     # Each costs as much as the rest of a call of one ray.
-    accel = build(icosphere(1), "bvh8")
+    accel = build(icosphere(1), "bvh8", device="cpu")
     asked = [some_rays(n) for n in (1, 5000)]
     expected = [(bits(accel.closest_hit(*rays)), accel.any_hit(*rays).tobytes()) for rays in asked]
 

@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 import wrt
 from tests.data import data_path
 from tests.gltf_files import GltfFile
+from tests.kernel_tools import DEVICE
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances, place
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.device import start, upload
+from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import RayArrays
 from wrt.kernels.shade.surface import make_surface_at
@@ -151,7 +152,7 @@ def test_no_new_ray_meets_the_surface_it_leaves(scale: float, far: float, aside:
         matrix = turned(1, scale * np.array([1.0, 0.5, 1.3]), *center)
         matrix[:3, 3] -= matrix[:3, :3] @ np.full(3, aside) - np.array([0.0, 0.0, away])
         objects.append(Object(moved, (Material(),), matrix))
-    device = start("cpu")
+    device = DEVICE
     described = Scene(tuple(objects))
     scene = upload_scene(described, device, instanced_meshes(described, "always"))
     accel = build(scene.world.geometry, "bvh")

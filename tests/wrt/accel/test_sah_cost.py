@@ -85,12 +85,13 @@ ALL = [pytest.param(name, case, id="-".join([name, *map(str, case.options.values
 
 def let_through(accel: Accelerator) -> None:
     """Make all primitives ones that no ray hits: the structure stays, and every ray goes to its end."""
-    records = accel.data.primitives.numpy()  # shares its memory on the CPU
+    records = accel.data.primitives.numpy()
     if records.dtype.names is None:
         records[...] = np.nan
     for name in records.dtype.names or ():
         if records.dtype[name].base.kind == "f":
             records[name] = np.nan
+    accel.data.primitives.assign(records)
 
 
 def check(geometry: Geometry, name: str, case: Case, n: int, most: float) -> None:

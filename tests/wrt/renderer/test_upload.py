@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from tests.kernel_tools import CPU, unit  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, unit  # isort: skip (starts Warp)
 
 from wrt.core.errors import InputError, SceneWarning
 from wrt.kernels.shade import lights
@@ -104,7 +104,7 @@ def test_objects_are_joined_with_their_materials() -> None:
 
 
 def test_an_empty_scene_uploads() -> None:
-    device = upload_scene(Scene(), CPU)
+    device = upload_scene(Scene(), DEVICE)
     assert len(device.world.geometry) == 0 and device.surfaces.n_triangles == 0 and device.lighting.count == 0
 
 
@@ -207,12 +207,12 @@ def test_emission_that_light_samples_cannot_reach_is_told_once() -> None:
                Material(name="lamp", emission=(1, 1, 1)), Material(name="dark", alpha_mode="blend")]
     objects = tuple(Object(quad(), (material,)) for material in glowing)
     with pytest.warns(SceneWarning) as told:
-        upload_scene(Scene(objects=objects), CPU)
+        upload_scene(Scene(objects=objects), DEVICE)
     assert len(told) == 1
     assert "seen but lights nothing" in str(told[0].message) and "materials sign, veil, 2 (" in str(told[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        upload_scene(Scene(objects=objects[3:]), CPU)
+        upload_scene(Scene(objects=objects[3:]), DEVICE)
 
 
 def test_emitters_without_area_or_light_are_never_chosen() -> None:
@@ -232,9 +232,9 @@ def test_glowing_spheres() -> None:
 
 
 def test_backgrounds() -> None:
-    flat = upload_scene(Scene(background=ConstantBackground((1, 2, 3))), CPU).lighting.background
+    flat = upload_scene(Scene(background=ConstantBackground((1, 2, 3))), DEVICE).lighting.background
     assert list(flat.bottom) == list(flat.top) == [1, 2, 3]
-    gradient = upload_scene(Scene(background=GradientBackground((0, 0, 1), (1, 0, 0))), CPU).lighting.background
+    gradient = upload_scene(Scene(background=GradientBackground((0, 0, 1), (1, 0, 0))), DEVICE).lighting.background
     assert list(gradient.bottom) == [0, 0, 1] and list(gradient.top) == [1, 0, 0]
 
 
@@ -242,7 +242,7 @@ def test_backgrounds() -> None:
 def test_environment_tables_cover_every_pixel(black: bool) -> None:
     rng = np.random.default_rng(1)
     image = np.zeros((7, 9, 3), np.float32) if black else (rng.random((7, 9, 3)) ** 8).astype(np.float32)
-    b = upload_scene(Scene(background=EnvironmentBackground(image, 2.0, 0.5)), CPU).lighting.background
+    b = upload_scene(Scene(background=EnvironmentBackground(image, 2.0, 0.5)), DEVICE).lighting.background
     rows, columns = b.row_cdf.numpy(), b.column_cdf.numpy().reshape(7, 9)
     assert (b.height, b.width, b.scale, b.rotation) == (7, 9, 2.0, 0.5)
     assert rows[-1] == 1.0 and (columns[:, -1] == 1.0).all()
@@ -253,7 +253,7 @@ def test_environment_tables_cover_every_pixel(black: bool) -> None:
 def test_a_cut_out_texture_on_a_sphere_is_refused() -> None:
     leaf = Material(alpha_mode="mask", albedo_texture=Checkerboard(), name="leaf")
     with pytest.raises(InputError, match=r"sphere 'ball'.*needs a mesh.*leaf"):
-        upload_scene(Scene(spheres=(Sphere((0, 0, 0), 1.0, leaf, name="ball"),)), CPU)
+        upload_scene(Scene(spheres=(Sphere((0, 0, 0), 1.0, leaf, name="ball"),)), DEVICE)
 
 
 @pytest.mark.parametrize("size", [(640, 360), (10, 30)])

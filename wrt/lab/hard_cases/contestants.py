@@ -52,13 +52,14 @@ class Own(Algorithm):
 
     accel: Accelerator | None = None
 
-    def __init__(self, triangle: str = "watertight", box: str = "conservative", structure: str = "bvh") -> None:
-        self.structure, self.units = structure, {"triangle": triangle, "box": box}
+    def __init__(self, triangle: str = "watertight", box: str = "conservative", structure: str = "bvh",
+                 device: str = "cpu") -> None:
+        self.structure, self.device, self.units = structure, device, {"triangle": triangle, "box": box}
         self.name = triangle if box == "conservative" else f"{triangle}, {box} boxes"
 
     def prepare(self, geometry: Geometry) -> bool:
         if self.accel is None or self.accel.geometry is not geometry:
-            self.accel = build(geometry, self.structure, threads=1, **self.units)
+            self.accel = build(geometry, self.structure, self.device, threads=1, **self.units)
         self.bytes_per_triangle = self.accel.stats.bytes / max(len(geometry), 1)
         return True
 
@@ -70,8 +71,8 @@ class Own(Algorithm):
         import warp as wp
 
         assert self.accel is not None
-        origins, directions = (wp.array(a, dtype=wp.vec3, device="cpu") for a in (rays.origins, rays.directions))
-        t_max = wp.array(rays.t_max, dtype=wp.float32, device="cpu")
+        origins, directions = (wp.array(a, dtype=wp.vec3, device=self.device) for a in (rays.origins, rays.directions))
+        t_max = wp.array(rays.t_max, dtype=wp.float32, device=self.device)
         ask = self.accel.any_hit if rays.any_hit else self.accel.closest_hit
         return lambda: ask(origins, directions, 0.0, t_max, threads=threads)
 
@@ -136,19 +137,24 @@ class EmbreeFast(Embree):
 
 
 class WarpMesh(Peer):
-    """Warp's own mesh_query_ray on wp.Mesh with its SAH constructor. It says where, but not at which t below 0."""
+    """Warp's own mesh_query_ray on wp.Mesh with one of its constructors. It says where, but not at which t below 0."""
 
     name = "Warp mesh_query_ray"
+
+    def __init__(self, device: str = "cpu", constructor: str = "sah") -> None:
+        self.place, self.constructor = device, constructor
+        if constructor != "sah":
+            self.name = f"{type(self).name}, {constructor}"
 
     def load(self, geometry: Geometry) -> None:
         import warp as wp
 
         from wrt.core.device import start
 
-        self.device = start("cpu")
+        self.device = start(self.place)
         points = wp.array(geometry.vertices.copy(), dtype=wp.vec3, device=self.device)
         indices = wp.array(geometry.faces.ravel().copy(), dtype=wp.int32, device=self.device)
-        self.mesh = wp.Mesh(points=points, indices=indices, bvh_constructor="sah")
+        self.mesh = wp.Mesh(points=points, indices=indices, bvh_constructor=self.constructor)
 
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
         t, u, v, prim_id = (array.numpy() for array in self.search(RaySet("", origins, directions, np.ones(len(origins))), 1)())

@@ -243,12 +243,12 @@ def test_random_lines_cost_what_the_heuristic_says(kind: str, options: dict[str,
     lo, hi = (np.array(tree.built.arrays[name], np.float64) for name in ("lo", "hi"))
     rays = rays_on(tree.device, rays_of(*lines_through(lo, hi, rng, 40_000), 0.0, np.inf))
     hits = HitArrays()
-    hits.t, hits.u, hits.v = (wp.zeros(len(rays.t_min), dtype=wp.float32, device="cpu") for _ in range(3))
-    hits.prim_id = wp.zeros(len(rays.t_min), dtype=wp.int32, device="cpu")
+    hits.t, hits.u, hits.v = (wp.zeros(len(rays.t_min), dtype=wp.float32, device=tree.device) for _ in range(3))
+    hits.prim_id = wp.zeros(len(rays.t_min), dtype=wp.int32, device=tree.device)
     n, refusing = len(rays.t_min), refusing_kernel()
 
     def trace(structure, data):
-        wp.launch(refusing, dim=n, inputs=[data, tree._surfaces, rays, hits, 0], device="cpu")
+        wp.launch(refusing, dim=n, inputs=[data, tree._surfaces, rays, hits, 0], device=tree.device)
 
     counts = counted(trace, tree.structure, tree.data, n, tree.device, False).counts
     steps = counts["nodes"] + counts["primitives"]

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.kernel_tools import launch, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel.answers import Hits
@@ -206,15 +206,15 @@ def spawned(case: HardCase, hits: Hits) -> np.ndarray:
     geometry, rows = case.geometry, np.flatnonzero(hits.prim_id >= 0)
     surfaces = Surfaces()
     surfaces.n_triangles = len(geometry.faces)
-    surfaces.vertices, surfaces.faces = vec3s(geometry.vertices), wp.array(geometry.faces, dtype=wp.vec3i, device="cpu")
-    surfaces.spheres = wp.array(geometry.spheres, dtype=wp.vec4, device="cpu")
+    surfaces.vertices, surfaces.faces = vec3s(geometry.vertices), wp.array(geometry.faces, dtype=wp.vec3i, device=DEVICE)
+    surfaces.spheres = wp.array(geometry.spheres, dtype=wp.vec4, device=DEVICE)
     surfaces.prim_material = zeros(len(geometry), wp.int32)
     records = np.zeros(len(rows), dtype=Hit.numpy_dtype())
     for name in ("t", "u", "v", "prim_id"):
         records[name] = getattr(hits, name)[rows]
     origin, direction = zeros(len(rows), wp.vec3), zeros(len(rows), wp.vec3)
     launch(spawning(len(geometry.spheres) > 0), len(rows), surfaces, vec3s(case.origins[rows]), vec3s(case.directions[rows]),
-           wp.array(records, dtype=Hit, device="cpu"), vec3s(case.next_directions[rows]), origin, direction)
+           wp.array(records, dtype=Hit, device=DEVICE), vec3s(case.next_directions[rows]), origin, direction)
     out = np.full(len(case), -1)
     out[rows] = structure(geometry).closest_hit(origin.numpy(), direction.numpy()).prim_id
     return out

@@ -1,0 +1,52 @@
+"""The device that tests run on: the CPU, or what `pytest --device` names."""
+
+from __future__ import annotations
+
+import gc
+import importlib
+from types import FunctionType
+from typing import Any
+
+NAME = "cpu"
+IS_VIRTUAL = False
+# Where functions have "cpu" as their default device.
+MODULES = ("wrt.accel.base", "wrt.accel.build", "wrt.accel.instances", "wrt.accel.store", "wrt.renderer.compile",
+           "wrt.renderer.options", "wrt.lab.bench.rasterizer", "wrt.lab.plans")
+
+
+def use(name: str, *, real: bool = False, seed: int = 0) -> None:
+    """Before Warp starts: run on that device what names none. real: of this machine; else a virtual one (tests/virtual_gpu), whose
+    threads run in an order by `seed`."""
+    global NAME, IS_VIRTUAL
+    if not real:
+        from tests.virtual_gpu import install
+
+        install(seed=seed)
+    from wrt.core.device import start
+
+    start(name)
+    NAME, IS_VIRTUAL = name, not real
+    for module in MODULES:
+        importlib.import_module(module)
+    for function in gc.get_objects():
+        if isinstance(function, FunctionType) and function.__module__ in MODULES:
+            _set_default(function, name)
+    from wrt.cli.main import cli
+
+    _set_option(cli, name)
+
+
+def _set_default(function: FunctionType, name: str) -> None:
+    code, values = function.__code__, function.__defaults__ or ()
+    names = code.co_varnames[code.co_argcount - len(values) : code.co_argcount]
+    function.__defaults__ = tuple(name if (each, value) == ("device", "cpu") else value
+                                  for each, value in zip(names, values, strict=True)) or None
+
+
+def _set_option(command: Any, name: str) -> None:
+    """Of a command and those below it."""
+    for each in getattr(command, "commands", {}).values():
+        _set_option(each, name)
+    for parameter in command.params:
+        if (parameter.name, parameter.default) == ("device", "cpu"):
+            parameter.default = name

@@ -1,0 +1,75 @@
+"""Virtual GPUs: what wrt does on CUDA devices runs on a machine without one.
+
+Warp writes CUDA C++ for every kernel, as ever; Warp's own Clang compiles it for the host, blocks and threads are walked in a loop,
+and Warp's Python finds `cuda:0`, `cuda:1` ... So the host code for CUDA and the CUDA branches of device code run as they are.
+
+    python -m pytest --device cuda:0 tests/kernels          tests on a virtual GPU
+    python -m tests.virtual_gpu render scenes/lens.toml --device cuda:0
+
+It finds: a kernel that gets an array of another device, of the host (or on the CPU, of a device) or a freed one: VirtualGpuError
+names the argument; other host code that reads device memory (a segmentation fault: pages are closed while no kernel runs); kernels
+that leave their arrays (likewise) or read what nobody wrote (0xA5); what depends on the order of threads (it is random, by a seed);
+CUDA branches that do not compile, or say something else. It counts launches, copies and synchronisations.
+
+It does not find: what NVIDIA's compilers and driver do; speed; a wait that lacks (each call is done when it returns); races
+(threads run one after another). Warp's own CUDA code (Mesh, Bvh, sort, graphs) is not there. sin, pow, exp and the like are the
+host's, not NVIDIA's, whose last bits differ.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+from warp._src import context as warp_context
+
+from tests.virtual_gpu.compiler import SUFFIX
+from tests.virtual_gpu.driver import NAME, Core, Gpus, VirtualGpuError
+
+__all__ = ["NAME", "VirtualGpuError", "gpus", "install"]
+
+
+def install(devices: int = 2, arch: int = 75, seed: int | None = 0, memory: int = 8 << 30) -> None:
+    """Let Warp find virtual GPUs; before wp.init(). The arguments are those of Gpus."""
+    if warp_context.runtime is not None:
+        raise RuntimeError("virtual GPUs are installed before Warp starts")
+    if not wp.config.version.startswith("1.19."):
+        raise NotImplementedError(f"virtual GPUs know the insides of Warp 1.19, not of {wp.config.version}")
+    load_dll = warp_context.Runtime.load_dll
+    output_name = warp_context.Module._get_compile_output_name
+    get_hooks, invoke = warp_context.ModuleExec.get_kernel_hooks, warp_context.invoke
+
+    def load(self: Any, path: str) -> Any:
+        library = load_dll(self, path)
+        return library if "clang" in Path(path).name else Core(library, Gpus(library, devices, arch, seed, memory))
+
+    def named(self: Any, device: Any, *args: Any, **kwargs: Any) -> str:
+        """Nothing takes a file of ours for NVIDIA's; without a device it is NVIDIA's that is asked for."""
+        name: str = output_name(self, device, *args, **kwargs)
+        return str(Path(name).with_suffix(SUFFIX)) if device and device.is_cuda else name
+
+    def described(self: Any, kernel: Any) -> Any:
+        """Here the names and the types of a kernel's arguments are known."""
+        hooks = get_hooks(self, kernel)
+        if self.device.is_cuda:
+            gpus().objects[hooks.forward].arguments = [(each.label, each.type) for each in kernel.adj.args]
+        return hooks
+
+    def invoked(kernel: Any, hooks: Any, params: Any, adjoint: bool) -> Any:
+        """A launch on the CPU."""
+        given = zip(kernel.adj.args, params[1:], strict=False)
+        gpus().check_arguments(kernel.key, [(each.label, each.type, ctypes.addressof(value)) for each, value in given
+                                            if isinstance(value, ctypes.Structure)], None)
+        return invoke(kernel, hooks, params, adjoint)
+
+    warp_context.Runtime.load_dll = load
+    warp_context.invoke = invoked
+    warp_context.Module._get_compile_output_name = named
+    warp_context.ModuleExec.get_kernel_hooks = described
+
+
+def gpus() -> Gpus:
+    """Those of this process, after wp.init()."""
+    return warp_context.runtime.core.gpus  # type: ignore[no-any-return]

@@ -1,0 +1,64 @@
+// Between Warp's headers, compiled as for the CPU, and the text of a CUDA module: what that text asks of CUDA's compiler, and a loop
+// over the threads of a grid. A module is loaded for one device, which runs one launch at a time and one thread after another:
+// statics are enough for the built-in variables, and Warp's atomic functions for the CPU are atomic. There is nothing that threads
+// of a block could do together (__syncthreads, shuffles, votes, tiles): a module that asks for it does not compile.
+
+#undef WP_TILE_BLOCK_DIM
+#define WP_TILE_BLOCK_DIM MODULE_BLOCK_DIM
+#define __CUDA_ARCH__ MODULE_ARCH
+
+#define __global__
+#define __device__
+#define __forceinline__ inline
+#define __launch_bounds__(...)
+
+struct uint3 {
+    unsigned x, y, z;
+};
+
+static uint3 threadIdx, blockIdx, blockDim, gridDim;
+
+namespace wp {
+inline int device_block_dim() { return ::blockDim.x; }
+}
+#define block_dim device_block_dim
+
+// Of CUDA's functions, those that kernels name; `atomicMin` and the like are named through Warp's.
+inline int __ffs(int mask) { return __builtin_ffs(mask); }
+inline int __popc(unsigned mask) { return __builtin_popcount(mask); }
+inline int __clz(int mask) { return mask ? __builtin_clz(mask) : 32; }
+inline float __int_as_float(int bits) { return __builtin_bit_cast(float, bits); }
+inline int __float_as_int(float number) { return __builtin_bit_cast(int, number); }
+
+namespace virtual_gpu {
+
+struct Grid {
+    uint3 blocks, threads;
+    const unsigned* order;  // the threads' numbers in the grid in the order in which they run; 0: as they are
+};
+
+template <int... I> struct Places {};
+template <class T, T... I> using PlacesOf = Places<I...>;
+
+template <class... Arguments, int... I>
+void run_each(void (*kernel)(Arguments...), void** arguments, const Grid& grid, Places<I...>)
+{
+    gridDim = grid.blocks;
+    blockDim = grid.threads;
+    const unsigned long long count = 1ull * gridDim.x * gridDim.y * gridDim.z * blockDim.x;
+    for (unsigned long long i = 0; i < count; ++i) {
+        const unsigned long long thread = grid.order ? grid.order[i] : i;
+        const unsigned long long block = thread / blockDim.x;
+        threadIdx = { unsigned(thread % blockDim.x), 0, 0 };
+        blockIdx = { unsigned(block % gridDim.x), unsigned(block / gridDim.x % gridDim.y), unsigned(block / gridDim.x / gridDim.y) };
+        kernel(*static_cast<Arguments*>(arguments[I])...);
+    }
+}
+
+template <class... Arguments> void run(void (*kernel)(Arguments...), void** arguments, const Grid& grid)
+{
+    run_each(kernel, arguments, grid, __make_integer_seq<PlacesOf, int, sizeof...(Arguments)>());
+}
+
+}
+

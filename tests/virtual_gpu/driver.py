@@ -1,0 +1,360 @@
+"""What stands in for the GPUs, their driver and Warp's code for them. The methods of `Gpus` are called as Warp's C functions are
+(warp/native/warp.h), without `wp_`; each has done its work when it returns. What is wrong raises VirtualGpuError at once."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import os
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import warp as wp
+from warp._src import context as warp_context
+from warp._src.codegen import Struct
+from warp._src.types import array_t, matches_array_class, type_size_in_bytes
+
+from tests.virtual_gpu.compiler import SUFFIX, compile_module, entry
+from tests.virtual_gpu.memory import Memory
+
+CONTEXT = 1 << 8  # the handle of cuda:0's; cuda:1's is the next
+NAME = "virtual GPU"
+MOST_BLOCKS = 2**31 - 1  # of a grid in x
+# Functions that always answer the same.
+CONSTANT: dict[str, Any] = {
+    "is_cuda_enabled": 1, "cuda_driver_is_initialized": 1, "cuda_device_get_name": NAME.encode(), "cuda_device_get_sm_count": 1,
+    "cuda_device_get_max_shared_memory": 48 << 10, "cuda_device_is_uva": 1, "cuda_device_is_mempool_supported": 1,
+    "cuda_context_is_primary": 1, "cuda_context_check": 0, "cuda_get_kernel_static_shared_memory": 0, "cuda_stream_is_blocking": 1,
+    **dict.fromkeys((
+        "cuda_device_get_pageable_memory_access", "cuda_device_get_direct_managed_mem_access_from_host",
+        "cuda_device_get_host_native_atomic_supported", "cuda_device_get_managed_memory_supported",
+        "cuda_device_get_concurrent_managed_access_supported", "cuda_device_is_ipc_supported", "cuda_device_get_pci_domain_id",
+        "cuda_device_get_pci_bus_id", "cuda_device_get_pci_device_id", "cuda_device_set_mempool_release_threshold",
+        "cuda_is_peer_access_supported", "cuda_is_peer_access_enabled", "cuda_is_mempool_access_enabled", "cuda_stream_destroy",
+        "cuda_stream_register", "cuda_stream_unregister", "cuda_stream_query", "cuda_stream_wait_event", "cuda_stream_wait_stream",
+        "cuda_stream_is_capturing", "cuda_stream_get_capture_id", "cuda_stream_get_priority", "cuda_event_destroy",
+        "cuda_event_query"), 0),
+}
+
+
+class VirtualGpuError(RuntimeError):
+    """What a GPU would answer with an error, later or never."""
+
+
+class Triple(ctypes.Structure):
+    _fields_ = [(axis, ctypes.c_uint32) for axis in "xyz"]
+
+
+class Grid(ctypes.Structure):
+    """As in device.h."""
+
+    _fields_ = [("blocks", Triple), ("threads", Triple), ("order", ctypes.c_void_p)]
+
+
+RUN = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.POINTER(Grid))
+
+
+@dataclass
+class Function:
+    """A kernel that is loaded. arguments: their names and types, where Warp knows them."""
+
+    name: str
+    run: Any
+    arguments: list[tuple[str, Any]] = field(default_factory=list)
+
+
+@dataclass
+class Counts:
+    """What has been asked of all devices. launches: by the kernel's name and the device's number; copies: "h2d", "d2h", "d2d" and
+    "p2p" (to another device); synchronisations: waits of the host for a device."""
+
+    launches: Counter[tuple[str, int]] = field(default_factory=Counter)
+    copies: Counter[str] = field(default_factory=Counter)
+    synchronisations: int = 0
+
+    def __str__(self) -> str:
+        copies = ", ".join(f"{n} {kind}" for kind, n in sorted(self.copies.items())) or "none"
+        return (f"{self.launches.total()} launches of {len(self.launches)} kernels, copies: {copies},"
+                f" {self.synchronisations} synchronisations")
+
+
+def address(pointer: Any) -> int:
+    """Of what Warp gives for a pointer: a number, ctypes' pointer, or a structure itself."""
+    if pointer is None or isinstance(pointer, int):
+        return pointer or 0
+    if hasattr(pointer, "_obj"):  # of ctypes.byref
+        return ctypes.addressof(pointer._obj)
+    if isinstance(pointer, ctypes.Structure | ctypes.Array):
+        return ctypes.addressof(pointer)
+    return ctypes.cast(pointer, ctypes.c_void_p).value or 0
+
+
+def arrays_of(name: str, kind: Any, at: int) -> Iterator[tuple[str, array_t, int]]:
+    """The arrays of a kernel's argument, and those of their records that hold arrays: name, record and bytes of an element.
+
+    An array is given before what is in it, so that who asks can look first whether it may be read."""
+    if matches_array_class(kind, wp.array):
+        array = array_t.from_address(at)
+        yield name, array, type_size_in_bytes(kind.dtype)
+        if isinstance(kind.dtype, Struct) and has_arrays(kind.dtype):
+            for i in range(array.shape[0]):
+                yield from arrays_of(f"{name}[{i}]", kind.dtype, array.data + i * array.strides[0])
+    elif isinstance(kind, Struct):
+        for label, variable in kind.vars.items():
+            yield from arrays_of(f"{name}.{label}", variable.type, at + getattr(kind.ctype, label).offset)
+
+
+def has_arrays(struct: Struct) -> bool:
+    return any(matches_array_class(each.type, wp.array) or (isinstance(each.type, Struct) and has_arrays(each.type))
+               for each in struct.vars.values())
+
+
+class Gpus:
+    """devices: how many; arch: their compute capability, 75 for 7.5; seed: of the order of a grid's threads, None: as they are
+    numbered; memory: bytes of each device."""
+
+    def __init__(self, real: Any, devices: int, arch: int, seed: int | None, memory: int) -> None:
+        self.real, self.devices, self.arch = real, devices, arch
+        self.memory, self.counts = Memory(memory), Counts()
+        self.random = None if seed is None else np.random.default_rng(seed)
+        self.handles, self.objects = itertools.count(1 << 12), dict[int, Any]()
+        self.local, self.lock = threading.local(), threading.Lock()
+        self.at_work = [threading.Lock() for _ in range(devices)]
+        self.streams, self.times = dict[int, int](), dict[int, float]()
+
+    # Devices, contexts, streams, events
+
+    def cuda_driver_version(self) -> int:
+        return int(self.real.wp_cuda_toolkit_version())
+
+    def cuda_device_get_count(self) -> int:
+        return self.devices
+
+    def cuda_device_get_arch(self, device: int) -> int:
+        return self.arch
+
+    def cuda_device_get_uuid(self, device: int, out: Any) -> None:
+        ctypes.memset(out, device + 1, 16)
+
+    def cuda_device_get_memory_info(self, device: int, free: Any, total: Any) -> None:
+        if free is not None:
+            free._obj.value = self.memory.limit - self.memory.used(device)
+        if total is not None:
+            total._obj.value = self.memory.limit
+
+    def cuda_device_get_primary_context(self, device: int) -> int:
+        return CONTEXT + device
+
+    def cuda_context_get_device_ordinal(self, context: int) -> int:
+        return context - CONTEXT
+
+    @property
+    def current(self) -> list[int | None]:
+        """This thread's contexts, the current one last."""
+        if not hasattr(self.local, "contexts"):
+            self.local.contexts = [None]
+        return self.local.contexts  # type: ignore[no-any-return]
+
+    def cuda_context_get_current(self) -> int | None:
+        return self.current[-1]
+
+    def cuda_context_set_current(self, context: int | None) -> None:
+        self.current[-1] = context
+
+    def cuda_context_push_current(self, context: int) -> None:
+        self.current.append(context)
+
+    def cuda_context_pop_current(self) -> None:
+        self.current.pop()
+
+    def cuda_context_get_stream(self, context: int) -> int | None:
+        return self.streams.get(context)
+
+    def cuda_context_set_stream(self, context: int, stream: Any, sync: int) -> None:
+        self.streams[context] = address(stream)
+
+    def cuda_stream_create(self, *args: Any) -> int:
+        return next(self.handles)
+
+    def cuda_event_create(self, *args: Any) -> int:
+        return next(self.handles)
+
+    def cuda_event_record(self, event: int, *args: Any) -> None:
+        self.times[event] = perf_counter()
+
+    def cuda_event_elapsed_time(self, begin: int, end: int) -> float:
+        return 1000.0 * (self.times[end] - self.times[begin])
+
+    def cuda_context_synchronize(self, *args: Any) -> bool:
+        with self.lock:
+            self.counts.synchronisations += 1
+        return True
+
+    cuda_stream_synchronize = cuda_event_synchronize = cuda_context_synchronize
+
+    # Memory
+
+    def alloc_device_default(self, context: int, size: int, *args: Any) -> int:
+        return self.memory.allocate(size, context - CONTEXT)
+
+    def free_device_default(self, context: int, at: Any, *args: Any) -> None:
+        if address(at):
+            self.memory.free(address(at))
+
+    alloc_device_async, free_device_async = alloc_device_default, free_device_default
+
+    def check(self, what: str, at: int, size: int, device: int | None) -> None:
+        """device: whose bytes they must be; None: the host's."""
+        good = not self.memory.is_device(at) if device is None else self.memory.holds(at, size, device)
+        if size and not good:
+            place = "the host" if device is None else f"cuda:{device}"
+            raise VirtualGpuError(f"{what} must be {size} bytes on {place}, and is {self.memory.describe(at)}")
+
+    def copy(self, kind: str, to: Any, device: int | None, of: Any, other: int | None, size: int) -> bool:
+        """Between two devices, or the host (None)."""
+        self.check(f"{kind}: the target", address(to), size, device)
+        self.check(f"{kind}: the source", address(of), size, other)
+        with self.lock:
+            self.counts.copies[kind] += 1
+        with self.memory.opened():
+            ctypes.memmove(address(to), address(of), size)
+        return True
+
+    def memcpy_h2d(self, context: int, to: Any, of: Any, size: int, stream: Any) -> bool:
+        return self.copy("h2d", to, context - CONTEXT, of, None, size)
+
+    def memcpy_d2h(self, context: int, to: Any, of: Any, size: int, stream: Any) -> bool:
+        return self.copy("d2h", to, None, of, context - CONTEXT, size)
+
+    def memcpy_d2d(self, context: int, to: Any, of: Any, size: int, stream: Any) -> bool:
+        return self.copy("d2d", to, context - CONTEXT, of, context - CONTEXT, size)
+
+    def memcpy_p2p(self, context: int, to: Any, other: int, of: Any, size: int, stream: Any) -> bool:
+        return self.copy("p2p", to, context - CONTEXT, of, other - CONTEXT, size)
+
+    def memset_device(self, context: int, at: Any, value: int, size: int, stream: Any) -> bool:
+        self.check("memset: the target", address(at), size, context - CONTEXT)
+        with self.memory.opened():
+            ctypes.memset(address(at), value, size)
+        return True
+
+    def memtile_device(self, context: int, at: Any, value: Any, size: int, count: int) -> None:
+        self.check("fill: the target", address(at), size * count, context - CONTEXT)
+        with self.memory.opened():
+            self.real.wp_memtile_host(at, value, size, count)
+
+    def array_fill_device(self, context: int, *args: Any) -> None:
+        with self.memory.opened():
+            self.real.wp_array_fill_host(*args)
+
+    def array_copy_device(self, context: int, *args: Any) -> bool:
+        with self.lock:
+            self.counts.copies["d2d"] += 1
+        with self.memory.opened():
+            return bool(self.real.wp_array_copy_host(*args))
+
+    # Modules
+
+    def cuda_compile_program(self, source: bytes, *args: Any) -> int:
+        """For the host where it is for a virtual GPU; all else is NVIDIA's, which needs no GPU."""
+        arch, fuse_fp, path = args[1], args[11], os.fsdecode(args[15])
+        if not path.endswith(SUFFIX):
+            nvidias, declared = self.real.wp_cuda_compile_program, warp_context.runtime.core.wp_cuda_compile_program
+            nvidias.argtypes, nvidias.restype = declared.argtypes, declared.restype
+            return int(nvidias(source, *args))
+        return compile_module(source.decode(), arch, path, fuse_fp=fuse_fp)
+
+    def cuda_load_module(self, context: int, path: bytes) -> int:
+        handle = next(self.handles)
+        if warp_context.runtime.llvm.wp_load_obj(path, self.module(handle), False):
+            raise VirtualGpuError(f"{os.fsdecode(path)} cannot be loaded")
+        return handle
+
+    def cuda_unload_module(self, context: int, handle: int) -> None:
+        warp_context.runtime.llvm.wp_unload_obj(self.module(handle))
+
+    @staticmethod
+    def module(handle: int) -> bytes:
+        return f"virtual_gpu_{handle}".encode()
+
+    def cuda_get_kernel(self, context: int, handle: int, name: bytes) -> int | None:
+        at = warp_context.runtime.llvm.wp_lookup(self.module(handle), entry(name.decode()).encode())
+        if not at:
+            return None
+        function = next(self.handles)
+        self.objects[function] = Function(name.decode().removesuffix("_cuda_kernel_forward"), RUN(at))
+        return function
+
+    def cuda_configure_kernel_shared_memory(self, function: int, size: int) -> bool:
+        if size:
+            raise VirtualGpuError(f"{self.objects[function].name} takes shared memory, and a virtual GPU has none")
+        return True
+
+    # Launches
+
+    def cuda_launch_kernel(self, context: int, handle: int, dim: int, max_blocks: int, block_dim: int, grid_stride: int,
+                           cluster_dim: int, shared: int, arguments: Any, *args: Any) -> int:
+        """The grid is that of wp_cuda_launch_kernel (warp/native/warp.cu)."""
+        if dim == 0:
+            return 0
+        function: Function = self.objects[handle]
+        threads = block_dim if block_dim > 0 else 256
+        needed = -(-dim // threads)
+        if grid_stride:
+            x = min(needed, max_blocks if max_blocks > 0 else MOST_BLOCKS)
+            y = z = 1
+        else:
+            x = min(needed, (1 << 24) // threads)
+            y = min(-(-needed // x), 65535)
+            z = -(-needed // (x * y))
+        with self.lock:
+            order = None if self.random is None else self.random.permutation(x * y * z * threads).astype(np.uint32)
+            self.counts.launches[function.name, context - CONTEXT] += 1
+        grid = Grid(Triple(x, y, z), Triple(threads, 1, 1), None if order is None else order.ctypes.data)
+        with self.at_work[context - CONTEXT], self.memory.opened():
+            values = ctypes.cast(arguments, ctypes.POINTER(ctypes.c_void_p))
+            self.check_arguments(function.name, [(name, kind, values[i + 1]) for i, (name, kind) in enumerate(function.arguments)],
+                                 context - CONTEXT)  # the first value is the launch's bounds
+            function.run(address(arguments), grid)
+        return 0
+
+    def check_arguments(self, kernel: str, arguments: Iterable[tuple[str, Any, int]], device: int | None) -> None:
+        """Raise VirtualGpuError that names the array that the device, or the host (None), cannot reach. arguments: of each name,
+        type and address."""
+        for label, kind, at in arguments:
+            for name, array, size in arrays_of(label, kind, at):
+                shape, strides = array.shape[:array.ndim], array.strides[:array.ndim]
+                if not array.data or 0 in shape:  # nothing is there to be read
+                    continue
+                reach = [(n - 1) * step for n, step in zip(shape, strides, strict=True)]
+                first = array.data + sum(min(step, 0) for step in reach)
+                self.check(f"{kernel}: {name}", first, sum(map(abs, reach)) + size, device)
+
+
+class Core:
+    """Warp's C library with functions of Gpus in place of those that need a GPU; the rest of these raise when they are called."""
+
+    def __init__(self, real: Any, gpus: Gpus) -> None:
+        self.real, self.gpus = real, gpus
+
+    def __getattr__(self, name: str) -> Any:
+        short = name.removeprefix("wp_")
+        found: Callable[..., Any]
+        if short in CONSTANT:
+            def found(*args: Any) -> Any:
+                return CONSTANT[short]
+        elif hasattr(Gpus, short):
+            def found(*args: Any) -> Any:  # not the method itself: Warp writes `argtypes` on it
+                return getattr(self.gpus, short)(*args)
+        elif short.endswith(("_device", "_device_managed")) or (short.startswith("cuda_") and short != "cuda_toolkit_version"):
+            def found(*args: Any) -> Any:
+                raise NotImplementedError(f"a virtual GPU has no {name}")
+        else:
+            found = getattr(self.real, name)
+        setattr(self, name, found)
+        return found

@@ -1,0 +1,111 @@
+"""wrt on virtual GPUs: `python -m pytest --device cuda:0 tests/virtual_gpu`. Here is what shows most for the least time; all other
+tests run on `--device` too."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import wrt
+from tests import bits, device
+from tests.data import ROOT
+from tests.virtual_gpu import gpus
+from wrt.accel.build import build
+from wrt.accel.structures import ACCELERATORS
+from wrt.core.arrays import to_numpy
+from wrt.core.errors import InputError
+from wrt.scene import shapes
+
+pytestmark = pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0")
+PICTURE = {"spp": 2, "size": (48, 27), "seed": 5}
+SCENE = ROOT / "scenes" / "spot.toml"
+STRUCTURES = sorted({kind.name for kind in ACCELERATORS.values()} - {"brute_force"})
+QUICK = ("bvh8", "kdtree")
+
+
+@pytest.mark.parametrize("accel", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in STRUCTURES])
+def test_hits_have_the_bits_of_the_cpu(accel: str) -> None:
+    before = gpus().counts.launches.total()
+    assert bits.hits(accel) == bits.stored()["hits"]
+    assert gpus().counts.launches.total() == before + 3
+
+
+@pytest.mark.parametrize("scene", [path if path == SCENE else pytest.param(path, marks=pytest.mark.slow) for path in bits.SCENES],
+                         ids=lambda path: path.stem)
+def test_pixels_have_the_bits_of_the_cpu(scene: Path) -> None:
+    before = gpus().counts.launches.total()
+    there, here = (wrt.render(scene, device=name, aov="depth", **PICTURE) for name in ("cuda:0", "cpu"))
+    assert gpus().counts.launches.total() > before
+    assert there.pixels.tobytes() == here.pixels.tobytes() and there.pixels.max() > 0.0
+    assert there.aov["depth"].tobytes() == here.aov["depth"].tobytes()
+
+
+def test_two_devices_share_a_picture() -> None:
+    one = wrt.render(SCENE, device="cuda:0", **PICTURE)
+    before = gpus().counts.launches.copy()
+    two = wrt.render(SCENE, devices=["cuda:0", "cuda:1"], tile_size=16, **PICTURE)
+    assert {number for _, number in gpus().counts.launches - before} == {0, 1}
+    assert np.array_equal(one.pixels, two.pixels) and one.pixels.max() > 0.0
+
+
+def test_rays_on_other_devices_are_copied_and_answers_there_are_refused() -> None:
+    origins, directions = bits.primary_rays(16, 9)
+    mesh, ends = shapes.icosphere(1), np.linspace(1.0, 9.0, len(origins), dtype=np.float32)
+    given = (origins, wp.vec3), (directions, wp.vec3), (ends, float)
+    expected = build(mesh, "bvh8", device="cpu").closest_hit(origins, directions, 0.0, ends)
+    assert (expected.prim_id >= 0).any()
+    for mine, other in (("cpu", "cuda:0"), ("cuda:0", "cpu"), ("cuda:0", "cuda:1")):
+        accel = build(mesh, "bvh8", device=mine)
+        there = [wp.array(array, dtype=kind, device=other) for array, kind in given]
+        for rays in (there, [there[0].to(mine), there[1], there[2]], [origins, directions, there[2]]):
+            hits = accel.closest_hit(*rays[:2], 0.0, rays[2])
+            assert hits.t.device == wp.get_device(mine) if isinstance(hits.t, wp.array) else rays[0] is origins
+            for name in ("t", "u", "v", "prim_id"):
+                assert to_numpy(getattr(hits, name)).tobytes() == getattr(expected, name).tobytes()
+        with pytest.raises(InputError, match=rf"out must be a Warp array \({len(origins)},\) of bool, on {mine}"):
+            accel.any_hit(*there[:2], out=wp.zeros(len(origins), dtype=wp.bool, device=other))
+        with pytest.raises(InputError, match="t_max must not be NaN") if "cpu" in (mine, other) else nullcontext():
+            accel.closest_hit(*there[:2], 0.0, wp.full(len(origins), np.nan, dtype=float, device=other))
+
+
+# Of a branch for CUDA alone: one bit of the mask of triangles that a ray may hit is cleared.
+CHANGED, WAS, IS = "kernels/wide/lanes.py", "return plain(rows, first, ray)", "return plain(rows, first, ray) & ~1"
+
+
+def checked(folder: Path, *more: str) -> tuple[int, dict[str, Any]]:
+    """`devices --check` of the project in a folder: exit code, and what it says."""
+    words = ["-m", "tests.virtual_gpu", "devices", "--check", "--rays", "400", "--json", "-q", *more]
+    ended = subprocess.run([sys.executable, *words], cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True,
+                           text=True, check=False, timeout=1200)
+    return ended.returncode, json.loads(ended.stdout) if ended.returncode < 2 else {"error": ended.stderr}
+
+
+@pytest.mark.slow
+def test_one_bit_in_a_branch_for_cuda_fails_the_check(tmp_path: Path) -> None:
+    for name in ("wrt", "kernels", "tests/virtual_gpu", "scenes"):
+        shutil.copytree(ROOT / name, tmp_path / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    text = (tmp_path / CHANGED).read_text()
+    assert text.count(WAS) == 1
+    (tmp_path / CHANGED).write_text(text.replace(WAS, IS))
+    code, told = checked(tmp_path, "--scene", "scenes/spot.toml")
+    assert code == 1, told
+    differ = {row["what"]: row["differ"] for row in told["rows"]}
+    assert differ["bvh8"] > 100 and differ["spot"] > 100 and differ["bvh2"] == differ["brute_force"] == 0
+
+
+@pytest.mark.slow
+def test_a_check_of_everything() -> None:
+    code, told = checked(ROOT)
+    assert code == 0 and told["differ"] == 0 and told["speed"] == []
+    assert "Warp, sah: a virtual GPU has no wp_mesh_create_device" in told["speed_skipped"]
+    assert {row["what"] for row in told["rows"]} >= {*STRUCTURES, "brute_force", *(scene.stem for scene in bits.SCENES)}

@@ -1,0 +1,126 @@
+"""`devices --check`, here of the CPU against itself; of virtual GPUs in tests/virtual_gpu."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.command_line import wrt as run
+from wrt.accel.answers import Hits
+from wrt.core.errors import InputError
+from wrt.lab import device_check
+from wrt.lab.device_check import Check, built_in, different, structures
+from wrt.renderer.render import render
+
+SCENE = """
+[cameras.main]
+position = [0, 2, 3]
+target = [0, 0, 0]
+[[quads]]
+corner = [-1, 0, 1]
+edge_u = [2, 0, 0]
+edge_v = [0, 0, -2]
+material = "floor"
+[materials.floor]
+albedo = 0.5
+[[lights]]
+type = "point"
+position = [2, 3, 4]
+intensity = [9, 9, 9]
+"""
+WORDS = "devices", "--check", "--device", "cpu", "--rays", "300", "-q", "--scene"
+
+
+@pytest.fixture
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A small one; and little to compare."""
+    (tmp_path / "floor.toml").write_text(SCENE, encoding="utf-8")
+    for name, value in {"MESHES": {"ball": device_check.MESHES["ball"]}, "TIMED_CELLS": 8, "SLOW": 400, "RUNS": 1,
+                        "HARD_CASES": {name: device_check.HARD_CASES[name] for name in ("C_spheres", "I_rays_not_finite")}}.items():
+        monkeypatch.setattr(device_check, name, value)
+    monkeypatch.setattr(device_check, "structures", lambda: ["bvh8", "brute_force"])
+    return tmp_path / "floor.toml"
+
+
+def strict(text: str) -> dict[str, Any]:
+    def refuse(constant: str) -> None:
+        raise ValueError(constant)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_a_device_that_does_as_it_should(scene: Path) -> None:
+    result = run(*WORDS, str(scene), "--json")
+    assert result.code == 0, result.err
+    told = strict(result.out)
+    assert told["differ"] == 0 and told["machine"].startswith("cpu: ")
+    compared = {(row["part"], row["what"]): row["count"] for row in told["rows"]}
+    assert compared == {**{("library", name): 50_000 for name in ("sin", "cos", "exp", "log", "pow", "acos", "atan2")},
+                        ("hits", "bvh8"): 4 * 17**2, ("hits", "brute_force"): 4 * 17**2, ("hits", "bvh8, 1 hard cases"): 2000,
+                        ("pixels", "floor"): 64 * 36}
+    assert {row["who"] for row in told["speed"]} >= {"wrt bvh8", "Warp, sah"}
+    assert all(rate > 0.0 for row in told["speed"] for rate in row["mrays"])
+
+
+def test_one_bit_of_one_answer_is_told(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer, asked = device_check.answer, []
+
+    def wrong(accel: Any, rays: Any, threads: Any) -> Any:
+        hits = answer(accel, rays, threads)
+        asked.append(rays.kind)
+        if isinstance(hits, Hits) and len(asked) == 1:
+            hits.v.view(np.int32)[7] ^= 1
+        return hits
+
+    monkeypatch.setattr(device_check, "answer", wrong)
+    result = run(*WORDS, str(scene))
+    assert result.code == 1
+    assert "1 answers differ from the CPU's" in result.out
+    line = next(line for line in result.out.splitlines() if line.startswith("| hits") and " bvh8 " in line)
+    assert [cell.strip() for cell in line.split("|")][3:6] == [str(4 * 17**2), "1", f"ball, {asked[0]}"]
+
+
+def test_bits_are_compared_and_not_numbers() -> None:
+    a = np.array([[0.0, 1.0], [np.nan, 2.0], [3.0, 4.0]], np.float32)
+    b = a.copy()
+    assert not different(a, b).any()
+    b[0, 0], b[2, 1] = -0.0, np.nextafter(np.float32(4.0), np.float32(5.0))
+    assert different(a, b).tolist() == [True, False, True]
+
+
+def test_without_a_folder_of_scenes_there_is_one_built_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shipped = Check("cpu").pictures
+    assert {"whitted", "lens"} <= shipped.keys()
+    monkeypatch.setattr(device_check, "FOLDER", tmp_path)
+    assert list(Check("cpu").pictures) == ["built in"]
+    assert set(structures()) >= {"bvh8", "bsp", "brute_force"}
+
+
+@pytest.mark.slow  # it compiles a scene's kernels
+def test_the_built_in_scene_has_light_and_glass() -> None:
+    film = render(built_in(), size=(64, 36), spp=4)
+    assert 0.02 < film.pixels.mean() < 5.0 and film.stats["not_finite"] == 0
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    (("--device", "cuda:7", "--check"), "no device 'cuda:7'; there is cpu"),
+    (("--device", "cpu"), "--device, --scene and --rays belong to --check"),
+    (("--check", "--device", "cpu", "--rays", "0"), "rays must be"),
+    (("--check", "--device", "cpu", "--scene", "none.toml"), "none.toml"),
+])
+def test_mistakes_are_told(words: tuple[str, ...], message: str) -> None:
+    result = run("devices", *words)
+    assert result.code == 2 and message in result.err
+
+
+def test_devices_are_listed_as_json_too() -> None:
+    assert strict(run("devices", "--json").out)["devices"][0].startswith("cpu: ")
+
+
+def test_rays_are_whole_numbers() -> None:
+    with pytest.raises(InputError, match="rays must be"):
+        Check("cpu", rays=1.5)  # type: ignore[arg-type]

@@ -1,0 +1,44 @@
+"""The command that tells what there is to compute on, and whether it computes as it should: `devices`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from wrt.cli.common import say, say_json, shared, warnings_reported
+from wrt.core.errors import InputError
+
+
+@click.command()
+@click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit, and measure its speed; exit code 1 where"
+                                            " a bit differs. Minutes, as all kernels are compiled")
+@click.option("--device", help="To check: cuda:0, ...  [default: cuda:0]")
+@click.option("--scene", "scenes", type=click.Path(path_type=Path), multiple=True,
+              help="To check by, repeatable  [default: those that ship with wrt]")
+@click.option("--rays", type=int, help="To check by, of each kind for each mesh and structure  [default: 20000]")
+@shared("quiet", "as_json")
+def devices(check: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool, as_json: bool) -> None:
+    """List the devices that Warp can compute on, or check one."""
+    from wrt.core.device import describe_devices
+
+    if not check:
+        if scenes or device is not None or rays is not None:
+            raise InputError("--device, --scene and --rays belong to --check")
+        lines = describe_devices()
+        if as_json:
+            say_json({"devices": lines})
+        else:
+            click.echo("\n".join(lines))
+        return
+    from wrt.lab.device_check import Check, run
+
+    plan = Check(device or "cuda:0", scenes, 20_000 if rays is None else rays)
+    with warnings_reported(quiet):
+        result = run(plan, (lambda line: None) if quiet else say)
+    if as_json:
+        say_json(result.as_dict())
+    else:
+        click.echo(result.text())
+    if result.differ:
+        raise SystemExit(1)

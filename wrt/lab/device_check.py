@@ -1,0 +1,266 @@
+"""`python -m wrt devices --check`: whether a device answers as the CPU does, to the last bit, and how fast.
+
+The CPU's answers are those of the default structure: all structures have the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.answers import Hits
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.structures import ACCELERATORS
+from wrt.core.checks import as_integer
+from wrt.core.device import load_kernel, run_all, start, thread_count
+from wrt.io.load import load_scene
+from wrt.kernels.study.library import LIBRARY, call_library
+from wrt.lab.bench.accel import BRUTE_FORCE_TESTS, answer
+from wrt.lab.bench.rays import RaySet, ray_sets
+from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled
+from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.bench.visibility import terrain
+from wrt.lab.hard_cases.cases import HARD_CASES, generate
+from wrt.lab.hard_cases.contestants import Own, WarpMesh
+from wrt.picture.film import Film
+from wrt.renderer.compile import compile_queries
+from wrt.renderer.options import Options
+from wrt.renderer.plan import plan_of
+from wrt.renderer.render import render
+from wrt.scene import shapes
+from wrt.scene.backgrounds import GradientBackground
+from wrt.scene.lights import PointLight
+from wrt.scene.materials import Material
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Object, Scene, Sphere
+
+FOLDER = Path(__file__).parents[2] / "scenes"  # of a checkout; an installed package has none
+PICTURE: dict[str, Any] = {"size": (64, 36), "spp": 4, "seed": 3}
+MESHES: dict[str, Callable[[], Mesh]] = {
+    "ball": partial(shapes.icosphere, 3), "torus": partial(shapes.torus, 1.0, 0.4, 64, 32), "terrain": partial(terrain, 48),
+    "teapot": partial(shapes.teapot, 32), "teapot in a ring": lambda: large_and_small(shapes.torus(500.0), shapes.teapot(16))}
+CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")  # of Warp's BVH
+FAST, SLOW, RUNS = 1 << 20, 1 << 15, 7  # rays to time on CUDA, and on the CPU
+TIMED_CELLS = 192  # a side of the terrain for it
+COLUMNS: Columns = {"part": "{part}", "what": "{what}", "compared": "{count}", "differ": "{differ}",
+                    "where": lambda row: ", ".join(row.where[:4]) + (", ..." if len(row.where) > 4 else "")}
+SPEED: Columns = {"who": "{who}", "rays": "{kind}", "Mray/s": lambda row: spread(row.mrays), "wrt / it": "{first_over_it:.2f}"}
+LEGEND = """\
+compared: answers, whose bits must be those of the CPU; differ: those that are not, and where. A library function that differs is
+the compiler's, and pictures that call it differ in last bits. All else that differs is a fault: report it, with this table."""
+TIMED = """\
+Rays and answers are on the device; median of the runs by turns, the middle half of them in brackets. wrt / it: how many times as
+fast wrt's default structure is."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """device: its name; scenes: files (none: those that ship with wrt); rays: of each kind, for each mesh; cases: of each hard
+    one, rays. Raises InputError."""
+
+    device: str
+    scenes: Sequence[Path] = ()
+    rays: int = 20_000
+    cases: int = 2000
+
+    def __post_init__(self) -> None:
+        start(self.device)
+        as_integer(self.rays, "rays", 1, 2**26)
+
+    @cached_property
+    def pictures(self) -> dict[str, Scene]:
+        found = self.scenes or sorted(FOLDER.glob("*.toml"))
+        return {path.stem: load_scene(path) for path in found} or {"built in": built_in()}
+
+
+def built_in() -> Scene:
+    """A picture with most of what needs light and rays of several kinds."""
+    glass, mirror = (Material(kind=kind, albedo=(0.9, 0.9, 0.9), name=kind) for kind in ("glass", "mirror"))
+    return Scene(objects=(Object(shapes.quad((-4.0, 0.0, 4.0), (8.0, 0.0, 0.0), (0.0, 0.0, -8.0)), (Material(),)),
+                          Object(shapes.teapot(16), (mirror,))),
+                 spheres=(Sphere((1.6, 0.7, 0.8), 0.7, glass), Sphere((-1.8, 0.5, 0.5), 0.5, Material(specular=(0.3, 0.3, 0.3)))),
+                 lights=(PointLight((-4.0, 7.0, 5.0), (190.0, 185.0, 170.0)),),
+                 background=GradientBackground((0.5, 0.7, 0.9), (0.1, 0.2, 0.5)), name="built in")
+
+
+def large_and_small(large: Mesh, small: Mesh) -> Mesh:
+    return Mesh(np.concatenate([large.vertices, small.vertices]), np.concatenate([large.faces, small.faces + len(large.vertices)]))
+
+
+def structures() -> list[str]:
+    return list(dict.fromkeys(kind.name for kind in ACCELERATORS.values()))
+
+
+def rows(plan: Check, tell: Callable[[str], None]) -> Iterator[Row]:
+    """What is compared, each as it is done. tell: what is done next."""
+    tell("compiling")
+    compile_all(plan)
+    yield from library_rows(plan)
+    tell("hits")
+    yield from hit_rows(plan)
+    tell("hard cases")
+    yield hard_row(plan)
+    for name, scene in plan.pictures.items():
+        tell(f"picture of {name}")
+        yield picture_row(plan, name, scene)
+
+
+def compile_all(plan: Check) -> None:
+    """For the device, on all cores."""
+    device = start(plan.device)
+    jobs: list[Callable[[], Any]] = [partial(compile_queries, name, plan.device) for name in structures()]
+    jobs += [partial(load_kernel, kernel, device) for scene in plan.pictures.values()
+             for kernel in plan_of(scene, Options(device=plan.device)).kernels]
+    run_all(jobs, thread_count(None))
+
+
+def library_rows(plan: Check) -> Iterator[Row]:
+    x = (10.0 * np.random.default_rng(0).normal(size=50_000)).astype(np.float32)
+    here, there = (called_library(x, device) for device in ("cpu", plan.device))
+    for i, name in enumerate(LIBRARY):
+        yield row("library", name, len(x), {"": different(here[:, i], there[:, i])})
+
+
+def called_library(x: np.ndarray, name: str) -> np.ndarray:
+    device = start(name)
+    out = wp.empty((len(x), len(LIBRARY)), dtype=wp.float32, device=device)
+    load_kernel(call_library, device)
+    wp.launch(call_library, len(x), [wp.array(x, dtype=wp.float32, device=device), out], device=device)
+    return out.numpy()
+
+
+def hit_rows(plan: Check) -> Iterator[Row]:
+    """A row for each structure."""
+    worlds = {name: Geometry.of(make()) for name, make in MESHES.items()}
+    on_cpu = {name: build(geometry, device="cpu") for name, geometry in worlds.items()}
+    rays = {name: ray_sets(accel, plan.rays) for name, accel in on_cpu.items()}
+    for structure in structures():
+        differ, count = dict[str, np.ndarray](), 0
+        for mesh, geometry in worlds.items():
+            accel = build(geometry, structure, device=plan.device)
+            n = BRUTE_FORCE_TESTS // (20 * len(geometry)) if structure == "brute_force" else plan.rays
+            for kind, some in rays[mesh].items():
+                part = some.part(slice(0, n))
+                differ[f"{mesh}, {kind}"] = compare(accel, on_cpu[mesh], part)
+                count += len(part)
+        yield row("hits", structure, count, differ)
+
+
+def compare(accel: Accelerator, truth: Accelerator, rays: RaySet) -> np.ndarray:
+    """Which rays have another answer."""
+    found, expected = (answer(each, rays, None) for each in (accel, truth))
+    if not (isinstance(found, Hits) and isinstance(expected, Hits)):
+        return different(np.asarray(found), np.asarray(expected))
+    return np.logical_or.reduce([different(getattr(found, name), getattr(expected, name)) for name in ("t", "u", "v", "prim_id")])
+
+
+def different(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Which rows have other bits."""
+    a, b = (np.ascontiguousarray(each).reshape(len(each), -1).view(np.uint8) for each in (a, b))
+    return (a != b).any(axis=1)
+
+
+def hard_row(plan: Check) -> Row:
+    """The default structure in all hard cases whose rays the host does not refuse."""
+    differ, count = dict[str, np.ndarray](), 0
+    for name in HARD_CASES:
+        case = generate(name, plan.cases)
+        if not case.refused:
+            rays = RaySet(name, case.origins, case.directions, case.t_max)
+            differ[name] = compare(build(case.geometry, device=plan.device), build(case.geometry, device="cpu"), rays)
+            count += len(case)
+    return row("hits", f"{ACCELERATORS['bvh'].name}, {len(differ)} hard cases", count, differ)
+
+
+def picture_row(plan: Check, name: str, scene: Scene) -> Row:
+    here, there = (pixels(render(scene, device=device, **PICTURE)) for device in ("cpu", plan.device))
+    return row("pixels", name, len(here), {"": different(here, there)})
+
+
+def pixels(film: Film) -> np.ndarray:
+    return film.pixels.reshape(-1, 3)
+
+
+def row(part: str, what: str, count: int, differ: dict[str, np.ndarray]) -> Row:
+    """differ: which answers differ, by where; the report has their numbers."""
+    numbers = {place: int(each.sum()) for place, each in differ.items()}
+    return Row(part=part, what=what, count=count, differ=sum(numbers.values()),
+               where=[place for place, number in numbers.items() if number and place])
+
+
+def speed_rows(plan: Check) -> tuple[list[Row], str]:
+    """wrt's structures beside Warp's own query with each constructor that the device has (without any there are no rows), and
+    what was skipped and why."""
+    geometry, device = Geometry.of(terrain(TIMED_CELLS)), start(plan.device)
+    everybody: dict[str, Any] = {f"wrt {name}": Own(structure=name, device=plan.device) for name in structures()
+                                 if name != "brute_force"}
+    skipped, warps = [], dict[str, Any]()
+    for constructor in CONSTRUCTORS:
+        warp = WarpMesh(plan.device, constructor)
+        try:
+            warp.prepare(geometry)
+            warps[f"Warp, {constructor}"] = warp
+        except RuntimeError as error:  # also what is not implemented
+            skipped.append(f"Warp, {constructor}: {error}")
+    out = list[Row]()
+    for own in everybody.values() if warps else ():
+        own.prepare(geometry)
+    everybody |= warps
+    kinds = ray_sets(build(geometry, device="cpu"), FAST if device.is_cuda else SLOW) if warps else {}
+    for kind, rays in kinds.items():
+        jobs = {name: partial(finished, each.search(rays, thread_count(None)), device) for name, each in everybody.items()}
+        seconds = alternate(jobs, RUNS)
+        first = seconds[next(iter(everybody))]
+        out += [Row(who=name, kind=kind, rays=len(rays), mrays=(len(rays) / taken / 1e6).tolist(),
+                    first_over_it=float(np.median(taken / first))) for name, taken in seconds.items()]
+    return out, "; ".join(skipped)
+
+
+def finished(search: Callable[[], Any], device: Any) -> None:
+    search()
+    wp.synchronize_device(device)
+
+
+@dataclass(frozen=True)
+class Result:
+    """machine: what was compared, and where; rows, speed, skipped: as `rows` and `speed_rows` give them."""
+
+    machine: str
+    rows: list[Row]
+    speed: list[Row]
+    skipped: str
+
+    @property
+    def differ(self) -> int:
+        return sum(each.differ for each in self.rows)
+
+    def text(self) -> str:
+        verdict = "Every bit is the CPU's." if self.differ == 0 else f"{self.differ} answers differ from the CPU's."
+        parts = [tabled(COLUMNS, self.rows, "Bits", f"Machine: {self.machine}\n\n{verdict}\n\n{LEGEND}"),
+                 tabled(SPEED, self.speed, "Speed", "\n\n".join(filter(None, [
+                     TIMED if self.speed else "", f"Skipped: {self.skipped}" if self.skipped else ""])))]
+        return markdown(parts)
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"machine": self.machine, "differ": self.differ, "rows": [each.as_dict() for each in self.rows],
+                "speed": [each.as_dict() for each in self.speed], "speed_skipped": self.skipped or None}
+
+
+def run(plan: Check, tell: Callable[[str], None] = lambda line: None) -> Result:
+    """Raises InputError."""
+    machine = machine_line(f"{thread_count(None)} threads for the CPU", f"Warp {wp.__version__}", device=plan.device)
+    compared = []
+    for each in rows(plan, tell):
+        compared.append(each)
+        if each.differ:
+            tell(f"{each.part} of {each.what}: {each.differ} of {each.count} differ")
+    tell("speed")
+    speed, skipped = speed_rows(plan)
+    return Result(machine, compared, speed, skipped)
