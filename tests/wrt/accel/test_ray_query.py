@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import wrt
-from tests.kernel_tools import floats, launch, vec3s, zeros
+from tests.kernel_tools import cpu_only, floats, launch, vec3s, zeros
 from tests.wrt.accel.test_all_hits import rays, soup
 from wrt.scene import shapes
 
@@ -58,6 +58,7 @@ def test_one_query_is_for_all_structures_of_a_kind_and_follows_a_refit() -> None
     assert np.isclose(answers(kernel, accel, asked)[0][0], 2.0 * before)
 
 
+@cpu_only
 def test_a_kernel_that_fuses_says_so_and_hits_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     accel = wrt.build(shapes.icosphere(1), "bvh2")
     asked = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32), np.full(1, np.inf, np.float32)

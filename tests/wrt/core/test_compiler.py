@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.kernel_tools import launch, zeros  # isort: skip
+from tests.kernel_tools import cpu_only, launch, zeros  # isort: skip
 import warp as wp
 
 from wrt.core import compiler
 from wrt.core.device import load_kernel, start
 from wrt.kernels.structs import kernel
+
+pytestmark = cpu_only
 
 
 @wp.struct
