@@ -86,12 +86,13 @@ def test_a_scene_renders(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
-def test_kernels_compile_for_turing_and_hopper(path: Path, tmp_path: Path) -> None:
+def test_kernels_compile_for_turing_and_some_for_hopper(path: Path, tmp_path: Path) -> None:
     start("cpu")
+    archs = [75, 90] if path in SCENES[::8] else [75]  # up to a minute each
     for variant in features(path):
         kernel = render_kernel(variant, Structure(ACCELERATORS["bvh"], Units(spheres=variant.spheres, instances=variant.instances)))
-        binaries = wp.compile_aot_module(kernel.module, arch=[75, 90], module_dir=tmp_path)
-        assert [Path(binary).stat().st_size > 10_000 for binary in binaries] == [True, True]
+        binaries = wp.compile_aot_module(kernel.module, arch=archs, module_dir=tmp_path)
+        assert [Path(binary).stat().st_size > 10_000 for binary in binaries] == [True] * len(archs)
 
 
 def test_the_other_kernels_compile_for_turing_and_hopper(tmp_path: Path) -> None:
