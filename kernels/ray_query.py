@@ -64,12 +64,24 @@ def fused() -> bool:
 def say_so() -> None: ...
 
 
+@wp.func_native("""
+    static bool told = false;
+    if (!told) printf("wrt: accel.world is of another structure or triangle test than the kernel's wrt.ray_query\\n");
+    told = true;
+""")
+def say_other() -> None: ...
+
+
 @wp.func
-def traversed(ray: QueryRay) -> Ray:
-    """As the traversal units take it; a ray that hits nothing where the kernel is not compiled as it must be."""
+def traversed(ray: QueryRay, is_other: bool) -> Ray:
+    """As the traversal units take it; a ray that hits nothing where the kernel is not compiled as it must be, and where the world
+    is another one."""
     out = scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max)
     if fused():
         say_so()
+        out.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
+    if is_other:
+        say_other()
         out.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
     return out
 
@@ -85,32 +97,34 @@ def as_asked(hit: Hit, direction: wp.vec3) -> QueryHit:
     return out
 
 
-def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any) -> tuple[Any, Any, Any, Any]:
-    """World, closest_hit, any_hit, next_hit. closest, any_of, resuming: traversal units; the last one with Units.resumes."""
+def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, kind: int) -> tuple[Any, Any, Any, Any]:
+    """World, closest_hit, any_hit, next_hit. closest, any_of, resuming: traversal units, the last one with Units.resumes; kind: a
+    number of theirs, which a World must have."""
 
     @wp.struct
     class World:
-        """A structure and what it is over: one argument of a kernel."""
+        """A structure and what it is over: one argument of a kernel. kind: Warp does not compare records."""
 
+        kind: int
         accel: accel_struct
         surfaces: Surfaces
 
     @wp.func
     def closest_hit(world: World, ray: QueryRay) -> QueryHit:
         """The closest hit in the segment; at equal t the lowest prim_id."""
-        return as_asked(closest(world.accel, world.surfaces, traversed(ray)), ray.direction)
+        return as_asked(closest(world.accel, world.surfaces, traversed(ray, world.kind != kind)), ray.direction)
 
     @wp.func
     def any_hit(world: World, ray: QueryRay) -> bool:
         """Whether there is a hit in the segment."""
-        hit = any_of(world.accel, world.surfaces, traversed(ray))
+        hit = any_of(world.accel, world.surfaces, traversed(ray, world.kind != kind))
         return hit.prim_id >= 0
 
     @wp.func
     def next_hit(world: World, ray: QueryRay, hit: QueryHit) -> QueryHit:
         """The first hit after one that this ray gave, in the order of t and, where that is equal, of prim_id: from the closest hit
         on, each hit of the segment once."""
-        going = traversed(ray)
+        going = traversed(ray, world.kind != kind)
         going.t_min = hit.scaled_t
         going.slot = hit.prim_id + 1
         return as_asked(resuming(world.accel, world.surfaces, going), ray.direction)
@@ -122,7 +136,6 @@ def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any) 
 class HitRows:
     """Hits in order: rows first[i] .. first[i + 1] - 1 are for those of ray i."""
 
-    most: int
     first: wp.array(dtype=wp.int64)
     t: wp.array(dtype=wp.float32)
     u: wp.array(dtype=wp.float32)

@@ -11,12 +11,11 @@ import warp as wp
 
 from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
-from wrt.accel.ray_query import query_of
+from wrt.accel.ray_query import query_of, require_one_mesh, world_of
 from wrt.accel.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
-from wrt.core.checks import shown
+from wrt.core.checks import as_integer, shown
 from wrt.core.device import launch, made_once, thread_count
-from wrt.core.errors import InputError
 from wrt.core.memory import require
 from wrt.kernels.query import RayArrays
 from wrt.kernels.ray_query import HitRows, make_hit_kernels
@@ -54,16 +53,23 @@ class AllHits:
 
 
 class Asked:
-    """A question to a structure: its rays on the device, and launches over them."""
+    """A structure that is asked, as it is now: `of` gives it rays, and launches over them follow."""
 
-    def __init__(self, accel: Accelerator, origins: Any, directions: Any, t_min: Any, t_max: Any, threads: int | None) -> None:
-        if not isinstance(accel, Accelerator) or accel.structure.units.instances or accel.structure.units.spheres:
-            raise InputError(f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
-        self.threads = thread_count(threads)
+    n = 0
+    rays: RayArrays
+
+    def __init__(self, accel: Accelerator, threads: int | None) -> None:
+        structure = require_one_mesh(getattr(accel, "structure", None),
+                                     f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
+        self.threads, self.device, state = thread_count(threads), accel.device, accel._state
+        self.geometry, self.world = state.geometry, world_of(structure, state.data, accel._surfaces)
+        self.count_hits, self.write_hits, self.cross = hit_kernels(structure)
+
+    def of(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Asked:
+        """Raises InputError that names the argument."""
         rays = rays_of(origins, directions, t_min, t_max)
-        self.n, self.device, self.world = len(rays.origins), accel.device, accel.world
-        self.rays: RayArrays = rays_on(accel.device, rays)
-        self.count_hits, self.write_hits, self.cross = hit_kernels(accel.structure)
+        self.n, self.rays = len(rays.origins), rays_on(self.device, rays)
+        return self
 
     def launch(self, kernel: Any, *inputs: Any) -> None:
         if self.device.is_cpu:
@@ -79,7 +85,6 @@ class Asked:
 
     def rows(self, first: np.ndarray) -> list[np.ndarray]:
         """t, u, v, prim_id of so many hits of each ray, misses where it has fewer."""
-        require(float(first[-1]) * BYTES, f"{first[-1]} hits")
         empty = partial(wp.empty, int(first[-1]), device=self.device)
         rows: Any = HitRows()
         rows.first = wp.array(first, dtype=wp.int64, device=self.device)
@@ -95,27 +100,29 @@ def hit_kernels(structure: Structure) -> tuple[Any, Any, Any]:
 
 def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
              threads: int | None = None) -> AllHits:
-    """Every hit of each ray in its segment, in order. Arguments as in Accelerator.closest_hit.
+    """Every hit of each ray in its segment, in order. Arguments as in Accelerator.closest_hit; the answer is of NumPy.
 
     None is lost and none is there twice: a ray through an edge hits both triangles there, at a corner all of them. A hit takes one
-    walk from the root, and the count another. Raises InputError, also where memory does not suffice.
+    walk from the root, and the count another; each walk tests all that is hit at the same t. Raises InputError, also where memory
+    does not suffice.
     """
-    asked = Asked(accel, origins, directions, t_min, t_max, threads)
+    asked = Asked(accel, threads).of(origins, directions, t_min, t_max)
     first = np.concatenate([[0], np.cumsum(asked.counts(), dtype=np.int64)])
+    require(float(first[-1]) * BYTES, f"{first[-1]} hits")
     return AllHits(first, *asked.rows(first))
 
 
 def count_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                threads: int | None = None) -> np.ndarray:
     """How many hits each ray has in its segment, (N,) int32; as all_hits."""
-    return Asked(accel, origins, directions, t_min, t_max, threads).counts()
+    return Asked(accel, threads).of(origins, directions, t_min, t_max).counts()
 
 
 def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                threads: int | None = None) -> Hits:
     """The first k hits of each ray in order, as Hits of (N, k) arrays; what a ray has not is a miss. As all_hits."""
-    if isinstance(k, bool) or not hasattr(k, "__index__") or int(k) < 1:
-        raise InputError(f"k must be a whole number of 1 or more, got {shown(k)}")
-    asked = Asked(accel, origins, directions, t_min, t_max, threads)
-    t, u, v, prim_id = (row.reshape(asked.n, int(k)) for row in asked.rows(np.arange(asked.n + 1, dtype=np.int64) * int(k)))
+    k = as_integer(k, "k", 1, (1 << 31) - 1)
+    asked = Asked(accel, threads).of(origins, directions, t_min, t_max)
+    require(float(asked.n) * k * BYTES, f"{k} hits of each of {asked.n} rays")
+    t, u, v, prim_id = (row.reshape(asked.n, k) for row in asked.rows(np.arange(asked.n + 1, dtype=np.int64) * k))
     return Hits(t, u, v, prim_id)

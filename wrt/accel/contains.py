@@ -11,6 +11,7 @@ from wrt.accel.all_hits import Asked
 from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 from wrt.accel.rays import vectors
+from wrt.core.arrays import taken
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
 from wrt.kernels.ray_query import AT_EDGE, ON_SURFACE
@@ -32,23 +33,23 @@ def open_edges(geometry: Geometry) -> int:
 def contains(accel: Accelerator, points: Any, threads: int | None = None) -> np.ndarray:
     """Whether each of `points` is inside a closed mesh, (N,) bool. On the surface, to rounding, the answer is either.
 
-    points: (N, 3) real numbers, taken as float32. A ray from each crosses the surface an odd number of times or not. One that meets
-    an edge is sent again in another direction: what is left decides exactly, since of two triangles at an edge the watertight test
-    gives a ray to one. A point for which all of 32 rays meet edges goes with the most of them. Raises InputError where the mesh is
-    not closed, and as Accelerator.closest_hit does.
+    points: (N, 3) real numbers, taken as float32. A ray from each crosses the surface an odd number of times or not (so that
+    what is in two parts that overlap is outside). One that meets an edge is sent again in another direction: what is left decides
+    exactly, since of two triangles at an edge the watertight test gives a ray to one. A point for which all of 32 rays meet edges
+    goes with the most of them. Raises InputError where the mesh is not closed, and as Accelerator.closest_hit does.
     """
-    rows = vectors(points, "points", FARTHEST)
-    asked = Asked(accel, rows[:0], rows[:0], 0.0, np.inf, threads)  # of no rays: what the structure is, is checked first
+    asked = Asked(accel, threads)
+    rows = vectors(taken(points, "points"), "points", FARTHEST)
     geometry, count = _open_edges.get(accel, (None, 0))
-    if geometry is not accel.geometry:
-        count = open_edges(accel.geometry)
-        _open_edges[accel] = accel.geometry, count
+    if geometry is not asked.geometry:
+        count = open_edges(asked.geometry)
+        _open_edges[accel] = asked.geometry, count
     if count:
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces")
     inside = np.zeros(len(rows), bool)
-    if not len(accel.geometry.faces):
+    if not len(asked.geometry.faces):
         return inside
-    used = accel.geometry.vertices[accel.geometry.faces].reshape(-1, 3)
+    used = asked.geometry.vertices[asked.geometry.faces].reshape(-1, 3)
     left = np.nonzero(((rows >= used.min(axis=0)) & (rows <= used.max(axis=0))).all(axis=1))[0]
     votes = np.zeros(len(rows), np.int32)
     rng = np.random.default_rng(0)
@@ -56,11 +57,10 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> np.
         if not len(left):
             return inside
         directions = np.broadcast_to(rng.normal(size=3).astype(np.float32), (len(left), 3))
-        asked = Asked(accel, rows[left], directions, 0.0, np.inf, threads)
-        crossings = asked.counts(asked.cross)
+        crossings = asked.of(rows[left], directions).counts(asked.cross)
         again = crossings == AT_EDGE
         inside[left[~again]] = (crossings[~again] == ON_SURFACE) | (crossings[~again] % 2 == 1)
         left = left[again]
-        votes[left] += np.where(Asked(accel, rows[left], directions[again], 0.0, np.inf, threads).counts() % 2 == 1, 1, -1)
+        votes[left] += np.where(asked.of(rows[left], directions[again]).counts() % 2 == 1, 1, -1)
     inside[left] = votes[left] > 0
     return inside

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import zlib
 from typing import Any, NamedTuple
 
 from wrt.accel.structure import Structure, check_units
 from wrt.accel.structures import ACCELERATORS
+from wrt.core.checks import as_one
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
 from wrt.kernels.ray_query import QueryHit, QueryRay, make_ray_query, query_ray
@@ -30,22 +32,32 @@ class RayQuery(NamedTuple):
     next_hit: Any
 
 
-def ray_query(accel: Any = "bvh", *, triangle: str = "watertight", box: str = "conservative") -> RayQuery:
+def ray_query(accel: Any, *, triangle: str | None = None, box: str | None = None) -> RayQuery:
     """What a kernel needs to ask structures for hits, on the CPU and on CUDA.
 
     accel: a structure that the kernel is for, or for all of a kind its name in wrt.ACCELERATORS, with the intersection tests that
-    they are built with. Make the kernel with wrt.kernel: compiled by wp.kernel, it prints so and hits nothing. Raises InputError
-    for unknown names, and for structures over several meshes.
+    they are built with. Make the kernel with @wrt.kernel, which takes no arguments: where a kernel is compiled with fused
+    multiply-add, or gets a structure of another kind, it prints so once, and its rays hit nothing. Raises InputError for unknown
+    names, and for structures over several meshes.
     """
     structure = getattr(accel, "structure", None)
     if isinstance(accel, str):
+        units = Units(as_one(triangle or Units().triangle, str, "triangle"), as_one(box or Units().box, str, "box"))
         ACCELERATORS.check(accel)
-        check_units(triangle, box)
-        structure = Structure(ACCELERATORS[accel], Units(triangle, box))
-    if not isinstance(structure, Structure) or structure.units.instances or structure.units.spheres:
-        raise InputError("accel must be a structure over one mesh, or the name of one")
+        check_units(units.triangle, units.box)
+        structure = Structure(ACCELERATORS[accel], units)
+    elif triangle is not None or box is not None:
+        raise InputError("triangle and box belong to a structure's name; a structure has its own")
+    structure = require_one_mesh(structure, "accel must be a structure over one mesh, or the name of one")
     world, closest_hit, any_hit, next_hit = query_of(structure)
     return RayQuery(world, QueryRay, QueryHit, query_ray, closest_hit, any_hit, next_hit)
+
+
+def require_one_mesh(structure: Any, what: str) -> Structure:
+    """Raise InputError for what is no Structure, and where there are instances or spheres."""
+    if not isinstance(structure, Structure) or structure.units.instances or structure.units.spheres:
+        raise InputError(what)
+    return structure
 
 
 @made_once
@@ -53,11 +65,17 @@ def query_of(structure: Structure) -> tuple[Any, Any, Any, Any]:
     """make_ray_query of a structure."""
     resuming = structure._replace(units=structure.units._replace(resumes=True))
     return make_ray_query(structure.struct, structure.traversal(any_hit=False), structure.traversal(any_hit=True),
-                          resuming.traversal(any_hit=False))
+                          resuming.traversal(any_hit=False), kind_of(structure))
+
+
+def kind_of(structure: Structure) -> int:
+    """A number for the layout of a structure's records and for its triangle test."""
+    return zlib.crc32(f"{structure.accel.name} {structure.units.triangle}".encode()) & 0x7FFFFFFF
 
 
 def world_of(structure: Structure, data: Any, surfaces: Any) -> Any:
-    """A structure and what it is over as one record."""
-    world = query_of(structure)[0]()
+    """A structure and what it is over as one record. Raises InputError for one over several meshes."""
+    world = query_of(require_one_mesh(structure, "kernels of one's own ask structures over one mesh"))[0]()
+    world.kind = kind_of(structure)
     world.accel, world.surfaces = data, surfaces
     return world

@@ -307,8 +307,8 @@ def main() -> None:
         code = 2
     except SystemExit as error:
         code = error.code
-    if not code and (sys.getprofile() or sys.gettrace()):
-        sys.exit()  # who measures Python writes what he has when it ends
+    if sys.getprofile() or sys.gettrace():
+        sys.exit(code)  # who measures Python writes what he has when it ends
     _leave(code if isinstance(code, int) else 1 if code else 0)
 
 

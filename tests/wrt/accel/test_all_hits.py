@@ -109,8 +109,10 @@ def test_no_rays_and_no_triangles() -> None:
 
 @pytest.mark.parametrize("call, said", [
     (lambda accel, o: wrt.all_hits("bvh", o, o), "accel must be a structure over one mesh"),  # type: ignore[arg-type]
-    (lambda accel, o: wrt.first_hits(accel, 0, o, o), "k must be a whole number of 1 or more, got 0"),
-    (lambda accel, o: wrt.first_hits(accel, 1.5, o, o), "k must be a whole number of 1 or more, got 1.5"),  # type: ignore[arg-type]
+    (lambda accel, o: wrt.first_hits(accel, 0, o, o), "k must be 1 to 2147483647, got 0"),
+    (lambda accel, o: wrt.first_hits(accel, 2**60, o, o), "k must be 1 to 2147483647"),
+    (lambda accel, o: wrt.first_hits(accel, 2**31 - 1, np.ones((1 << 20, 3)), np.ones((1 << 20, 3))), "2147483647 hits of each of"),
+    (lambda accel, o: wrt.first_hits(accel, 1.5, o, o), "k must be a whole number, got 1.5"),  # type: ignore[arg-type]
     (lambda accel, o: wrt.all_hits(accel, o, o * np.nan), "directions must be finite"),
     (lambda accel, o: wrt.count_hits(accel, o, o[:1]), "directions must have as many rows as origins"),
     (lambda accel, o: wrt.count_hits(accel, o, o, t_min=-1.0), "t_min must not be NaN or below 0"),

@@ -52,6 +52,19 @@ def test_after_a_refit_it_is_the_new_mesh() -> None:
     assert wrt.contains(accel, points)[0]
 
 
+def test_points_of_another_library() -> None:
+    class Tensor:
+        array = np.array([[0.1, 0.2, 0.3], [0.0, 2.0, 0.0]], np.float32)
+
+        def __dlpack__(self, **options: object) -> object:
+            return self.array.__dlpack__(**options)  # type: ignore[arg-type]
+
+        def __dlpack_device__(self) -> tuple[int, int]:
+            return self.array.__dlpack_device__()
+
+    assert wrt.contains(wrt.build(shapes.icosphere(1)), Tensor()).tolist() == [True, False]
+
+
 def test_what_is_refused_and_what_is_empty() -> None:
     ball, none = wrt.build(shapes.icosphere(1)), np.zeros((0, 3))
     assert wrt.contains(ball, none).shape == (0,)

@@ -72,6 +72,26 @@ def test_a_kernel_that_fuses_says_so_and_hits_nothing(capfd: pytest.CaptureFixtu
     assert (t[0], prim_id[0], occluded[0]) == (np.inf, -1, False)
 
 
+def test_a_world_of_another_kind_is_told_and_hits_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    # Of the same size: Warp would take it as it is.
+    mesh = shapes.icosphere(1)
+    asked = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32), np.full(1, np.inf, np.float32)
+    kernel = make_kernel(wrt.ray_query("bvh2"), wrt.kernel)
+    assert np.isfinite(answers(kernel, wrt.build(mesh, "bvh2"), asked)[0][0])
+    assert np.isinf(answers(kernel, wrt.build(mesh, "bvh2", triangle="moeller_trumbore"), asked)[0][0])
+    ctypes.CDLL(None).fflush(None)
+    assert "accel.world is of another structure or triangle test" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("arguments, said", [
+    ({"triangle": ["watertight"]}, "triangle must be"), ({"box": "round"}, "no box test 'round'")])
+def test_tests_that_there_are_not(arguments: dict, said: str) -> None:
+    with pytest.raises(wrt.InputError, match=said):
+        wrt.ray_query("bvh", **arguments)
+    with pytest.raises(wrt.InputError, match="triangle and box belong to a structure's name"):
+        wrt.ray_query(wrt.build(shapes.icosphere(1)), **arguments)
+
+
 @pytest.mark.parametrize("accel, said", [("bvg", "no structure 'bvg'"), (3, "accel must be a structure over one mesh")])
 def test_what_is_refused(accel: object, said: str) -> None:
     with pytest.raises(wrt.InputError, match=said):
