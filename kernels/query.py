@@ -138,8 +138,8 @@ def hit_at(hits: HitArrays, i: int) -> Hit:
 
 
 @wp.func
-def put_hit(hits: HitArrays, i: int, hit: Hit, scale: float):
-    """scale: what t is multiplied by."""
+def put_hit(hits: HitArrays, i: Any, hit: Any, scale: float):
+    """i: int or int64; hit: a record with the fields of a Hit; scale: what t is multiplied by."""
     hits.t[i] = hit.t * scale
     hits.u[i] = hit.u
     hits.v[i] = hit.v

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.query import RayArrays, direction_scale, scaled_ray
+from wrt.kernels.query import HitArrays, RayArrays, direction_scale, put_hit, scaled_ray
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 
 
@@ -57,19 +57,13 @@ def fused() -> bool:
 
 
 @wp.func_native("""
-    static bool told = false;
-    if (!told) printf("wrt: a kernel that asks for hits must be made with wrt.kernel: fused multiply-add loses rays\\n");
-    told = true;
+    static const char* const why[] = {"a kernel that asks for hits must be made with wrt.kernel: fused multiply-add loses rays",
+                                      "accel.world is of another structure or triangle test than the kernel's wrt.ray_query"};
+    static bool told[2];
+    if (!told[reason]) printf("wrt: %s\\n", why[reason]);
+    told[reason] = true;
 """)
-def say_so() -> None: ...
-
-
-@wp.func_native("""
-    static bool told = false;
-    if (!told) printf("wrt: accel.world is of another structure or triangle test than the kernel's wrt.ray_query\\n");
-    told = true;
-""")
-def say_other() -> None: ...
+def say_once(reason: int) -> None: ...
 
 
 @wp.func
@@ -77,11 +71,8 @@ def traversed(ray: QueryRay, is_other: bool) -> Ray:
     """As the traversal units take it; a ray that hits nothing where the kernel is not compiled as it must be, and where the world
     is another one."""
     out = scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max)
-    if fused():
-        say_so()
-        out.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
-    if is_other:
-        say_other()
+    if is_other or fused():
+        say_once(wp.where(is_other, 1, 0))
         out.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
     return out
 
@@ -132,24 +123,14 @@ def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, 
     return World, closest_hit, any_hit, next_hit
 
 
-@wp.struct
-class HitRows:
-    """Hits in order: rows first[i] .. first[i + 1] - 1 are for those of ray i."""
-
-    first: wp.array(dtype=wp.int64)
-    t: wp.array(dtype=wp.float32)
-    u: wp.array(dtype=wp.float32)
-    v: wp.array(dtype=wp.float32)
-    prim_id: wp.array(dtype=wp.int32)
-
-
 ON_SURFACE, AT_EDGE = wp.constant(-1), wp.constant(-2)
 NEAR_EDGE = wp.constant(1e-6)  # in barycentric coordinates, where rounding puts a hit on an edge by 1e-7 beside it
 
 
 def make_hit_kernels(query: Any) -> tuple[Any, Any, Any]:
-    """count_hits: how many each ray has; write_hits: what they are; cross: how many there are of a closed surface, ON_SURFACE where
-    the ray begins there, or AT_EDGE where it meets an edge, at which a crossing is no crossing or two. query: of make_ray_query."""
+    """count_hits: how many each ray has; write_hits: what they are, those of ray i in rows first[i] .. first[i + 1] - 1; cross: how
+    many there are of a closed surface, ON_SURFACE where the ray begins there, or AT_EDGE where it meets an edge, at which a
+    crossing is no crossing or two. query: of make_ray_query."""
     world_struct, closest_hit, _, next_hit = query
 
     @wp.func
@@ -173,17 +154,14 @@ def make_hit_kernels(query: Any) -> tuple[Any, Any, Any]:
         counts[i] = n
 
     @kernel
-    def write_hits(world: world_struct, rays: RayArrays, rows: HitRows, start: int):
+    def write_hits(world: world_struct, rays: RayArrays, first: wp.array(dtype=wp.int64), hits: HitArrays, start: int):
         i = start + wp.tid()
         ray = loaded(rays, i)
-        at = rows.first[i]
-        end = rows.first[i + 1]
+        at = first[i]
+        end = first[i + 1]
         hit = closest_hit(world, ray)
         while at < end:
-            rows.t[at] = hit.t
-            rows.u[at] = hit.u
-            rows.v[at] = hit.v
-            rows.prim_id[at] = hit.prim_id
+            put_hit(hits, at, hit, 1.0)
             at += wp.int64(1)
             if hit.prim_id >= 0 and at < end:  # after a miss there are misses
                 hit = next_hit(world, ray, hit)

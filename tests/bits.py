@@ -13,29 +13,14 @@ from pathlib import Path
 import numpy as np
 
 import wrt
+from tests import device
 from tests.data import ROOT
-from tests.kernel_tools import floats, launch, zeros  # before warp: it silences Warp's banner
+from wrt.lab.device_check import called_library
 from wrt.scene import shapes
-
-import warp as wp  # isort: skip
 
 STORED = Path(__file__).with_suffix(".txt")
 SCENES = sorted((ROOT / "scenes").glob("*.toml"))
 RAYS = 20_000
-
-
-@wp.kernel(enable_backward=False)
-def call_library(x: wp.array(dtype=float), out: wp.array(dtype=float)):
-    i = wp.tid()
-    a = x[i]
-    unit = a / (1.0 + wp.abs(a))
-    out[7 * i] = wp.sin(a)
-    out[7 * i + 1] = wp.cos(a)
-    out[7 * i + 2] = wp.exp(a)
-    out[7 * i + 3] = wp.log(wp.abs(a))
-    out[7 * i + 4] = wp.pow(wp.abs(a), 1.0 + unit)
-    out[7 * i + 5] = wp.acos(unit)
-    out[7 * i + 6] = wp.atan2(a, unit + 2.0)
 
 
 def digest(*arrays: np.ndarray) -> str:
@@ -45,9 +30,7 @@ def digest(*arrays: np.ndarray) -> str:
 def library() -> str:
     """Digest of the C library's functions, over 50,000 arguments."""
     x = np.random.default_rng(0).normal(size=50_000).astype(np.float32) * np.float32(10.0)
-    out = zeros(7 * len(x))
-    launch(call_library, len(x), floats(x), out)
-    return digest(out.numpy())
+    return digest(called_library(x, device.NAME))
 
 
 def pixels(scene: Path) -> str:

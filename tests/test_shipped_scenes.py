@@ -13,6 +13,7 @@ import warp as wp
 
 import wrt
 from tests.data import ROOT
+from wrt.accel.all_hits import hit_kernels
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.cli.common import depth_hint
@@ -105,6 +106,7 @@ def test_the_other_kernels_compile_for_turing_and_hopper(tmp_path: Path) -> None
                 for name in ("bvh", "brute_force") for make in (closest_hit_kernel, any_hit_kernel)]
     kernels += [closest_hit_kernel(Structure(ACCELERATORS["bvh"], Units(triangle=name))) for name in RAY_TRIANGLE]
     kernels += [closest_hit_kernel(Structure(ACCELERATORS["bvh"], Units(box=name))) for name in RAY_AABB]
+    kernels += hit_kernels(Structure(ACCELERATORS["bvh"]))[:1]
     for kernel in kernels:
         binaries = wp.compile_aot_module(kernel.module, arch=[75, 90], module_dir=tmp_path)
         assert len(binaries) == 2

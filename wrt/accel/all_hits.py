@@ -11,16 +11,16 @@ import warp as wp
 
 from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
+from wrt.accel.batches import RAYS_PER_LAUNCH
 from wrt.accel.ray_query import query_of, require_one_mesh, world_of
 from wrt.accel.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
 from wrt.core.checks import as_integer, shown
 from wrt.core.device import launch, made_once, thread_count
 from wrt.core.memory import require
-from wrt.kernels.query import RayArrays
-from wrt.kernels.ray_query import HitRows, make_hit_kernels
+from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.ray_query import make_hit_kernels
 
-RAYS_PER_LAUNCH = 16384
 BYTES = 16  # of a hit
 
 
@@ -86,11 +86,10 @@ class Asked:
     def rows(self, first: np.ndarray) -> list[np.ndarray]:
         """t, u, v, prim_id of so many hits of each ray, misses where it has fewer."""
         empty = partial(wp.empty, int(first[-1]), device=self.device)
-        rows: Any = HitRows()
-        rows.first = wp.array(first, dtype=wp.int64, device=self.device)
-        rows.t, rows.u, rows.v, rows.prim_id = *(empty(dtype=wp.float32) for _ in range(3)), empty(dtype=wp.int32)
-        self.launch(self.write_hits, rows)
-        return [np.asarray(array.numpy()) for array in (rows.t, rows.u, rows.v, rows.prim_id)]
+        hits: Any = HitArrays()
+        hits.t, hits.u, hits.v, hits.prim_id = *(empty(dtype=wp.float32) for _ in range(3)), empty(dtype=wp.int32)
+        self.launch(self.write_hits, wp.array(first, dtype=wp.int64, device=self.device), hits)
+        return [np.asarray(array.numpy()) for array in (hits.t, hits.u, hits.v, hits.prim_id)]
 
 
 @made_once
