@@ -44,10 +44,10 @@ class TimeLeft:
 
 @contextmanager
 def progress_reporter(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
-    """A callback for `wrt.render(progress=...)` that writes to stderr; None where quiet."""
-    if quiet:
+    """A callback for `wrt.render(progress=...)` that writes to stderr; None where quiet, or where that is closed."""
+    if quiet or sys.stderr is None:  # print would then write among the data
         yield None
-    elif sys.stderr is not None and sys.stderr.isatty():
+    elif sys.stderr.isatty():
         with _bar() as report:
             yield report
     else:
