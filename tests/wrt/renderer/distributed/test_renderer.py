@@ -186,7 +186,11 @@ def test_an_interrupted_render_keeps_whole_tiles(where: str, threads: Executor) 
 
 
 def test_ctrl_c(threads: Executor) -> None:
-    film = render(SCENE, spp=1 << 16, size=(200, 150), executor=threads, progress=lambda _: os.kill(os.getpid(), signal.SIGINT))
+    def press(progress: Progress) -> None:
+        if progress.stage == "trace":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    film = render(SCENE, spp=1 << 16, size=(200, 150), executor=threads, progress=press)
     assert film.stats["interrupted"] and film.stats["signal"] == signal.SIGINT
 
 
