@@ -118,8 +118,8 @@ def replace_child(links: wp.array(dtype=Link), parent: int, old: int, new: int):
 
 
 @wp.func
-def refit_up(links: wp.array(dtype=Link), start: int):
-    """Boxes from a node up to the root, as long as they change."""
+def refit_up(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), start: int, scale: float):
+    """Boxes and areas from a node up to the root, as long as they change."""
     i = int(start)
     while i >= 0:
         link = links[i]
@@ -131,11 +131,13 @@ def refit_up(links: wp.array(dtype=Link), start: int):
             break
         links[i].lo = lo
         links[i].hi = hi
+        areas[i] = area_of(lo, hi, scale)
         i = link.parent
 
 
 @kernel
-def make_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), touched: wp.array(dtype=wp.uint8)):
+def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), moves: wp.array(dtype=Move),
+               touched: wp.array(dtype=wp.uint8), scale: float):
     """Make the moves in their order; one that touches a node that an earlier one changed is left for another round."""
     for m in range(moves.shape[0]):
         move = moves[m]
@@ -158,7 +160,7 @@ def make_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), touched
                 touched[grandparent] = wp.uint8(1)
                 touched[above] = wp.uint8(1)
                 replace_child(links, grandparent, parent, sibling)
-                refit_up(links, grandparent)
+                refit_up(links, areas, grandparent, scale)
                 above = links[move.target].parent
                 replace_child(links, above, move.target, parent)
                 links[parent].left = move.node
@@ -167,7 +169,8 @@ def make_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), touched
                 links[move.target].parent = parent
                 links[parent].lo = wp.min(links[move.node].lo, links[move.target].lo)
                 links[parent].hi = wp.max(links[move.node].hi, links[move.target].hi)
-                refit_up(links, above)
+                areas[parent] = area_of(links[parent].lo, links[parent].hi, scale)
+                refit_up(links, areas, above, scale)
 
 
 @wp.struct

@@ -14,6 +14,7 @@ BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Regi
     "binned": "wrt.accel.bvh.top_down:build_binned",
     "sweep": "wrt.accel.bvh.top_down:build_sweep",
     "sbvh": "wrt.accel.bvh.spatial:build_sbvh",
+    "refined": "wrt.accel.bvh.reinsertion:build_refined",
     "reinsertion": "wrt.accel.bvh.reinsertion:build_reinsertion",
     "median": "wrt.accel.bvh.top_down:build_median",
     "lbvh": "wrt.accel.bvh.top_down:build_lbvh",

@@ -38,7 +38,7 @@ class WideBvh(Accelerator):
     width: ClassVar[int]
     compressed: ClassVar[bool] = False
 
-    def _build(self, builder: str = "binned", max_leaf: int | None = None, cost_traversal: float = 1.0,
+    def _build(self, builder: str = "refined", max_leaf: int | None = None, cost_traversal: float = 1.0,
                cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
         max_leaf = self.width if max_leaf is None else max_leaf
         BvhOptions(builder, max_leaf, cost_traversal, cost_intersection)  # refuses what is out of range
