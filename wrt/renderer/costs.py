@@ -102,5 +102,5 @@ class CostCounter:
             if not go_on(sum(done)):
                 stopped.append(True)
 
-        self.each(work, self.prepared.tiles())
+        self.each(work, self.prepared.tiles(1))
         return None if stopped else out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
@@ -23,10 +24,11 @@ from wrt.renderer.options import Progress
 from wrt.renderer.plan import Plan
 from wrt.renderer.tiles import Rectangle, Work, corners, tiles
 from wrt.renderer.upload import DeviceScene, camera_struct, upload_scene
-from wrt.renderer.waves import Waves
+from wrt.renderer.waves import CAPACITY, Waves
 from wrt.scene.cameras import CameraKind
 
-TILE_SIZE = 32
+TILE_SIZE = 32  # the least on the CPU
+TILES_EACH = 8  # for each thread at least
 PREPARING = "wrt prepares"  # what the threads that compile and build are called
 PREPARING_REPORTED = 1.0  # seconds of compiling and building before `progress` hears of it
 
@@ -64,11 +66,17 @@ class Prepared:
                 "spheres": len(self.accel.geometry.spheres),
                 "accel": {"name": self.plan.options.accel, **asdict(self.accel.stats)}}
 
-    def tiles(self) -> Iterator[Rectangle]:
-        """What one launch traces: the whole crop on CUDA."""
+    def tiles(self, samples: int) -> Iterator[Rectangle]:
+        """What one launch traces, where each pixel takes so many samples: the whole crop on CUDA; on the CPU one or two waves, if
+        there are enough of them for all threads."""
         x0, y0, x1, y1 = self.plan.crop
-        side = max(x1 - x0, y1 - y0) if self.device.is_cuda else self.plan.options.tile_size or TILE_SIZE
-        return tiles(self.plan.crop, side)
+        side = TILE_SIZE
+        if self.device.is_cuda:
+            side = max(x1 - x0, y1 - y0)
+        elif self.waves is not None:
+            pixels = min(2 * CAPACITY / samples, self.plan.area / (TILES_EACH * self.threads))
+            side = 1 << int(0.5 * math.log2(max(pixels, TILE_SIZE**2)))
+        return tiles(self.plan.crop, side if self.device.is_cuda else self.plan.options.tile_size or side)
 
     def launch(self, film: DeviceFilm | AovFilm, accel: Any = None) -> Callable[[Work], int]:
         """A function that traces some work into the film, and gives its samples. accel: a record in place of the structure's."""

@@ -48,7 +48,7 @@ class Tracer(Protocol):
 
     def facts(self) -> dict[str, Any]: ...
 
-    def tiles(self) -> Iterable[Rectangle]: ...
+    def tiles(self, samples: int) -> Iterable[Rectangle]: ...
 
     def trace(self, film: DeviceFilm | AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps: ...
 
@@ -206,7 +206,7 @@ class Run:
 
     def _take(self, first: int, count: int) -> None:
         """Bring every pixel from `first` to `first + count` samples a group, where it has fewer."""
-        work, before = [Work(tile, first, count) for tile in self.tracer.tiles()], first * self.plan.area
+        work, before = [Work(tile, first, count) for tile in self.tracer.tiles(count)], first * self.plan.area
         if first < self.passes.most:  # of a resumed render
             samples = self.arrays.view(self.arrays.groups[0].samples)
             work, before = work_left(work, samples, self.plan.crop), int(samples.sum(dtype=np.int64))
@@ -214,7 +214,7 @@ class Run:
 
     def _take_aovs(self) -> None:
         arrays = AovFilm(self.plan.scene.settings, self.plan.crop, self.tracer.device)
-        work = [Work(tile, 0, 1) for tile in self.tracer.tiles()]
+        work = [Work(tile, 0, 1) for tile in self.tracer.tiles(1)]
         self._follow(arrays, work, lambda done: None)
         self.aov = {name: arrays.picture(name) for name in self.plan.options.aov}
 

@@ -26,7 +26,7 @@ from wrt.renderer.upload import camera_kind
 
 # Samples of a wave: so many that its launches cost little beside them, and so few that a core's cache holds what it works in. Fewer
 # where each has room for many paths or asks many lights: ROOM is for all of them together.
-CAPACITY, ROOM = 4096, 1 << 18
+CAPACITY, ROOM = 16384, 1 << 18
 World = tuple[Any, Any, Any, Any]  # the records of structure, surfaces, lighting and camera
 OF_CAMERA = ("camera", "lens", "blades", "filter", "independent")
 OF_CUTOUT = ("instances", "textures", "checkerboards", "cutout")

@@ -49,7 +49,7 @@ def row_of(name: str, ways: dict[str, Prepared], plan: Plan) -> Row:
         prepared = ways[way]
         film = films[way] = DeviceFilm(prepared.plan.scene.settings, prepared.plan.crop, prepared.device, seed=0)
         trace: Callable[[Work], int] = prepared.launch(film)
-        for rectangle in prepared.tiles():
+        for rectangle in prepared.tiles(plan.spp):
             trace(Work(rectangle, 0, plan.spp))
 
     seconds = alternate({way: partial(draw, way) for way in ways}, plan.runs, time.thread_time)

@@ -166,7 +166,7 @@ class Profiler:
         # The same samples three times over: only one film is looked at.
         self.films = [self.counter.film() for _ in range(3)]
         tiles: list[_Tile] = []
-        self.counter.each(lambda rectangle: tiles.append(self._count(rectangle)), self.prepared.tiles())
+        self.counter.each(lambda rectangle: tiles.append(self._count(rectangle)), self.prepared.tiles(1))
         tiles.sort(key=lambda tile: tile.rectangle[1::-1])
         total = sum(int(tile.used.sum(dtype=np.int64)) for tile in tiles)
         if total * BYTES_OF_RAY > 0.5 * free_memory(self.prepared.device):

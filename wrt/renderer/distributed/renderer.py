@@ -70,7 +70,8 @@ class DistributedRenderer:
     def facts(self) -> dict[str, Any]:
         return {**self.counts, "workers": dict(self.tiles_by)}
 
-    def tiles(self) -> Iterator[Rectangle]:
+    def tiles(self, samples: int) -> Iterator[Rectangle]:
+        """Large ones, whatever `samples` is: a call to a worker costs more than a wave."""
         low, high = SIDES["cuda" if self.plan.options.device.startswith("cuda") else "cpu"]
         side = math.ceil(math.sqrt(self.plan.area / (TILES_EACH * self.workers.slots())))
         return tiles(self.plan.crop, self.plan.options.tile_size or min(max(side, low), high))
