@@ -1,0 +1,63 @@
+"""What moving subtrees gains. That the trees are right is tested for every builder: tests/kernels/build/test_bvh2.py."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wrt.accel.build import build
+from wrt.accel.bvh import reinsertion
+from wrt.accel.bvh.builders import BvhOptions, build_binary
+from wrt.accel.bvh.reinsertion import EVERY_NODE, LARGEST_NODES, Effort, half_areas, links_of, optimized, scale_of
+from wrt.accel.geometry import Geometry
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import icosphere
+
+
+def room() -> Geometry:
+    """Small things everywhere, and large triangles through all of them, as in architecture."""
+    rng = np.random.default_rng(8)
+    ball = icosphere(2)
+    places, walls = rng.random((200, 1, 3)), rng.random((40, 3, 3))
+    vertices = np.concatenate([(0.01 * ball.vertices + places).reshape(-1, 3), walls.reshape(-1, 3)])
+    faces = (ball.faces + len(ball.vertices) * np.arange(200)[:, None, None]).reshape(-1, 3)
+    return Geometry.of(Mesh(vertices, np.concatenate([faces, len(vertices) - 120 + np.arange(120).reshape(-1, 3)])))
+
+
+@pytest.mark.parametrize("accel", ["bvh2", "bvh8"])
+def test_the_largest_boxes_bring_most_of_the_gain(accel: str) -> None:
+    binned, refined, every = (build(room(), accel, builder=name).stats.sah_cost for name in ("binned", "refined", "reinsertion"))
+    assert refined < 0.85 * binned and binned - refined > 0.75 * (binned - every)
+
+
+@pytest.mark.parametrize("effort", [EVERY_NODE, LARGEST_NODES], ids=["every", "largest"])
+def test_what_the_areas_fell_by_is_what_they_fell_by(effort: Effort) -> None:
+    """They are kept up to date move by move."""
+    tree = build_binary(room(), BvhOptions("binned", 1), 1)
+    before = links_of(tree)
+    links, _, fell = optimized(tree, effort, 1)
+    scale = scale_of(before)
+    areas = [half_areas(each, scale).sum(dtype=np.float64) for each in (before, links.numpy())]
+    assert fell == pytest.approx(1.0 - areas[1] / areas[0], rel=1e-4) and fell > 0.05
+
+
+def test_a_tree_that_cannot_gain_is_left_alone() -> None:
+    geometry = Geometry.of(icosphere(4))
+    refined, binned = (build_binary(geometry, BvhOptions(name), 1) for name in ("refined", "binned"))
+    assert np.array_equal(refined.nodes, binned.nodes) and np.array_equal(refined.order, binned.order)
+
+
+def test_a_tree_that_would_be_too_deep_takes_fewer_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = build_binary(room(), BvhOptions("binned", 1), 1)
+    depths = [int(optimized(tree, Effort(1.0, rounds, 0.0), 1)[1].depth.numpy()[0]) for rounds in (0, 1, 2, 4)]
+    assert depths[0] == tree.depth
+    for limit in sorted(set(depths)):
+        monkeypatch.setattr(reinsertion, "STACK_SIZE", limit)
+        found = int(optimized(tree, Effort(1.0, 4, 0.0), 1)[1].depth.numpy()[0])
+        allowed = [depth for depth in depths if depth <= limit]
+        assert found == (allowed[-1] if allowed else depths[0])
+
+
+def test_the_tree_is_the_same_for_any_number_of_threads() -> None:
+    one, two = (build_binary(room(), BvhOptions("refined"), threads) for threads in (1, 2))
+    assert np.array_equal(one.nodes, two.nodes) and np.array_equal(one.order, two.order)
