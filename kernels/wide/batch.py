@@ -32,20 +32,18 @@ from wrt.kernels.wide.packets import (
     TO_POP,
     WIDTH,
     Scratch,
-    begin,
     children,
     count_of,
     cull,
     lowest_of_all,
     make_set_up,
+    make_steps,
     meets,
-    pop,
     put_bits,
     put_number,
     put_slot,
     reaching,
     slot_at,
-    step,
     triangles,
     write_hits,
     write_occluded,
@@ -229,11 +227,12 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -
     return walk
 
 
-def make_interleaved(units: Units, test_row: Any) -> Any:
+def make_interleaved(units: Units, any_hit: bool, test_row: Any) -> Any:
     """Rays of several packets, each for itself, from the root. waiting: a bit for each; lane after lane, packet after packet."""
     struct = make_struct(units.triangle_test.record)
     size_of_row = row_size(units.triangle_test.record, WIDTH)
     call_in = make_call_in(units.triangle_test.record, WIDTH, False, LINES)
+    begin, step, pop = make_steps(any_hit)
 
     @wp.func
     def start(accel: struct, scratch: Scratch, slot: int, ray: int):
@@ -307,7 +306,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
     struct = make_struct(units.triangle_test.record)
     test_row = make_leaf_test(units, any_hit, accepts)
     walk_packet = make_packet_walk(units, any_hit, accepts, test_row)
-    interleaved = make_interleaved(units, test_row)
+    interleaved = make_interleaved(units, any_hit, test_row)
     set_up = make_set_up(rays_struct)
     write = write_occluded if any_hit else write_hits
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays

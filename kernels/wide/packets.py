@@ -5,7 +5,7 @@ bit: a test holds the two together. This file has the layouts that they work on;
 """
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -48,6 +48,7 @@ PACKET_SIZE = ROOT_ENTRIES + WIDTH * LANES  # a multiple of 16: where the first 
 # the node's references begin (LEVEL_REFERENCES), and the place on the level below to go on at (LEVEL_BELOW). Keys are sorted from
 # the near children to the far. A key is the distance, whose last four bits are replaced by the child's number + 8: four bits less
 # do not matter for an order. A child that is not met, and an end, has all bits, which is a NaN. The first level is an end alone.
+# For any hit, which needs no order, a level holds one mask of children in place of the keys, and the level below is the one before.
 LEVEL = 16
 LEVEL_REFERENCES, LEVEL_BELOW = WIDTH + 1, WIDTH + 2
 KEY_MASK = 2 * WIDTH - 1
@@ -135,22 +136,33 @@ def write_occluded(occluded: wp.array(dtype=wp.bool), first: int, count: int, pa
 # --- one ray of a packet, and its slot --------------------------------------------------------------------------------
 
 
-@wp.func_native(source("wide/ray_begin.h", **LAYOUT))
-def begin(nodes: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), ray: int, stacks: wp.array(dtype=wp.uint32),
-          bottom: int, slots: wp.array(dtype=wp.int32), slot: int) -> int:
-    """Put a ray into a slot, at the root's children; its stack begins at `bottom`. The reference that is next."""
+class Steps(NamedTuple):
+    """begin: put a ray into a slot, at the root's children; its stack begins at `bottom`. step: from a node to its next child; the
+    others become a level of the stack. Both give the reference that is next. pop: go to the next child on the stack, of those that
+    begin at or before t; whether there is one."""
+
+    begin: Any
+    step: Any
+    pop: Any
 
 
-@wp.func_native(source("wide/ray_step.h", **LAYOUT))
-def step(nodes: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint32),
-         slots: wp.array(dtype=wp.int32), slot: int) -> int:
-    """From a node to its nearest child; the others become a level of the stack. The reference that is next."""
+@cache
+def make_steps(any_hit: bool) -> Steps:
+    """The nearest child is next, or for any hit the last one."""
 
+    @wp.func_native(source("wide/ray_begin.h", ANY_HIT=int(any_hit), **LAYOUT))
+    def begin(nodes: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), ray: int, stacks: wp.array(dtype=wp.uint32),
+              bottom: int, slots: wp.array(dtype=wp.int32), slot: int) -> int: ...
 
-@wp.func_native(source("wide/ray_pop.h", **LAYOUT))
-def pop(nodes: wp.array(dtype=wp.float32), t: float, stacks: wp.array(dtype=wp.uint32), bottom: int,
-        slots: wp.array(dtype=wp.int32), slot: int) -> bool:
-    """Go to the next child on the stack that begins at or before t; whether there is one."""
+    @wp.func_native(source("wide/ray_step.h", ANY_HIT=int(any_hit), **LAYOUT))
+    def step(nodes: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint32),
+             slots: wp.array(dtype=wp.int32), slot: int) -> int: ...
+
+    @wp.func_native(source("wide/ray_pop.h", ANY_HIT=int(any_hit), **LAYOUT))
+    def pop(nodes: wp.array(dtype=wp.float32), t: float, stacks: wp.array(dtype=wp.uint32), bottom: int,
+            slots: wp.array(dtype=wp.int32), slot: int) -> bool: ...
+
+    return Steps(begin, step, pop)
 
 
 @wp.func_native(source("wide/ray_cull.h", **LAYOUT))

@@ -1,3 +1,25 @@
+#if ANY_HIT
+    // A level of a ray's stack from one node: the mask of the children that it meets and that are still to come, the last first: so
+    // they are ordered for any hit (wrt.accel.bvh.wide_tree).
+    const unsigned all = ROW_MASK(met);
+    const int place = words[SLOT_PLACE];
+    words[SLOT_LEFT] = 0;
+    if (all == 0) {
+        words[SLOT_PENDING] = TO_POP;
+        return 0;
+    }
+    const int child = 31 - __builtin_clz(all);
+    const unsigned rest = all ^ 1u << child;
+    int next;
+    __builtin_memcpy(&next, nodes.data + (long long)first + REFERENCES + child, sizeof(next));
+    unsigned* level = (unsigned*)stacks.data + place + LEVEL;
+    level[0] = rest;
+    level[LEVEL_REFERENCES] = first + REFERENCES;
+    words[SLOT_NEXT] = next;
+    words[SLOT_PLACE] = rest != 0 ? place + LEVEL : place;
+    words[SLOT_PENDING] = 0;
+    return next;
+#else
     // A level of a ray's stack from one node: `enter` of all its children and `met`, which of them the ray meets. A network sorts
     // their keys, so that the nearest comes first and what is not met last.
     typedef unsigned Keys __attribute__((ext_vector_type(WIDTH), aligned(4)));
@@ -29,3 +51,4 @@
     words[SLOT_PENDING] = n == 0 ? TO_POP : 0;
     words[SLOT_LEFT] = 0;
     return next;
+#endif

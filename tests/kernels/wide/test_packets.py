@@ -43,17 +43,45 @@ class Lanes:
     reaching: wp.array(dtype=wp.int32)
     begun: wp.array(dtype=wp.int32)
     walk: wp.array2d(dtype=wp.int32)
+    begun_any: wp.array(dtype=wp.int32)
+    walk_any: wp.array2d(dtype=wp.int32)
     candidates: wp.array(dtype=wp.int32)
 
 
 set_up = packets.make_set_up(RayArrays)
 
 
+def make_walk(any_hit):
+    begin, step, pop = packets.make_steps(any_hit)
+
+    @wp.func
+    def walk(nodes: wp.array(dtype=wp.float32), node: int, packet: wp.array(dtype=wp.float32), column: int, reach: float,
+             stacks: wp.array(dtype=wp.uint32), slots: wp.array(dtype=wp.int32), ray: int, begun: wp.array(dtype=wp.int32),
+             out: wp.array2d(dtype=wp.int32)):
+        """What is next at the root, and then in `node` after a step, and after one pop after another, or NOTHING."""
+        slot = ray * SLOT_SIZE
+        bottom = ray * STACK_WORDS
+        begin(nodes, packet, column, stacks, bottom, slots, slot)
+        begun[ray] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
+        slots[slot + 1] = node
+        slots[slot + 2] = bottom
+        step(nodes, packet, stacks, slots, slot)
+        out[ray, 0] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
+        goes_on = bool(True)
+        for k in range(WIDTH):
+            goes_on = goes_on and pop(nodes, reach, stacks, bottom, slots, slot)
+            out[ray, k + 1] = wp.where(goes_on, slots[slot + 1], NOTHING)
+
+    return walk
+
+
+walk, walk_any = make_walk(False), make_walk(True)
+
+
 @kernel
 def by_packets(rays: RayArrays, count: int, reach: float, nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32),
                packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint32), slots: wp.array(dtype=wp.int32), out: Lanes):
-    """Packet i with node i and row i, and a slot for each ray; rays beyond `count` of each packet are left out. walk: what is
-    next after a step, and after one pop after another, or NOTHING."""
+    """Packet i with node i and row i, and a slot for each ray; rays beyond `count` of each packet are left out."""
     i = wp.tid()
     base = PACKET_SIZE * i
     active = set_up(rays, LANES * i, count, LANE_PAD, packet, base)
@@ -65,18 +93,8 @@ def by_packets(rays: RayArrays, count: int, reach: float, nodes: wp.array(dtype=
         out.children[i] = packets.children(nodes, 64 * i, mask, packet, base)
     for j in range(LANES):
         ray = LANES * i + j
-        slot = ray * SLOT_SIZE
-        bottom = ray * STACK_WORDS
-        packets.begin(nodes, packet, base + j, stacks, bottom, slots, slot)
-        out.begun[ray] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
-        slots[slot + 1] = i
-        slots[slot + 2] = bottom
-        packets.step(nodes, packet, stacks, slots, slot)
-        out.walk[ray, 0] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
-        goes_on = bool(True)
-        for k in range(WIDTH):
-            goes_on = goes_on and packets.pop(nodes, reach, stacks, bottom, slots, slot)
-            out.walk[ray, k + 1] = wp.where(goes_on, slots[slot + 1], NOTHING)
+        walk(nodes, i, packet, base + j, reach, stacks, slots, ray, out.begun, out.walk)
+        walk_any(nodes, i, packet, base + j, reach, stacks, slots, ray, out.begun_any, out.walk_any)
         out.candidates[ray] = packets.cull(rows, 80 * i, 255, packet, base + j)
 
 
@@ -164,13 +182,15 @@ class Both:
         nodes, rows = floats(nodes.reshape(-1)), floats(rows.reshape(-1))
         lanes = Lanes()
         for name, length in (("state", n), ("meets", n), ("children", n), ("reaching", n), ("begun", n * LANES),
-                             ("candidates", n * LANES), ("walk", (n * LANES, WIDTH + 1))):
+                             ("begun_any", n * LANES), ("candidates", n * LANES), ("walk", (n * LANES, WIDTH + 1)),
+                             ("walk_any", (n * LANES, WIDTH + 1))):
             setattr(lanes, name, zeros(length, wp.int32))
         packet, stacks = zeros(n * PACKET_SIZE), zeros(n * LANES * STACK_WORDS, wp.uint32)
         launch(by_packets, n, self.rays, count, reach, nodes, rows, packet, stacks, zeros(n * LANES * SLOT_SIZE, wp.int32), lanes)
         self.state, self.meets, self.children, self.reaching = (
             getattr(lanes, name).numpy() for name in ("state", "meets", "children", "reaching"))
         self.begun, self.walk, self.candidates = (getattr(lanes, name).numpy() for name in ("begun", "walk", "candidates"))
+        self.begun_any, self.walk_any = lanes.begun_any.numpy(), lanes.walk_any.numpy()
         self.set_up = packet.numpy().reshape(n, PACKET_SIZE).copy()
         found = zeros(n, wp.int32)
         launch(triangles_by_packets, n, rows, lanes.state, any_hit, packet, found)
@@ -321,6 +341,18 @@ def test_a_step_and_pops_lead_from_the_near_to_the_far(name):
     entries = both.scalar.entries.numpy()[entered]
     begins = (entries.view(np.int32) & ~15).view(np.float32).astype(np.float64)
     assert (begins <= entries).all() and (begins >= entries * (1.0 - 2.0**-19) - 2.0**-144).all()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_any_hit_takes_all_children_from_the_last_to_the_first(name):
+    both = case(name)
+    entered = (both.scalar.entered.numpy()[:, None] >> np.arange(WIDTH) & 1).astype(bool)
+    order = np.argsort(np.where(entered, WIDTH - 1 - np.arange(WIDTH), WIDTH), axis=1)
+    expected = np.where(np.take_along_axis(entered, order, axis=1), order - 3, NOTHING)
+    some = entered.any(axis=1)
+    np.testing.assert_array_equal(both.begun_any, expected[:, 0])
+    np.testing.assert_array_equal(both.walk_any[some, :WIDTH], expected[some])
+    assert (both.walk_any[some, WIDTH] == NOTHING).all() and (both.walk_any[~some, 0] == NOTHING).all()
 
 
 @pytest.mark.parametrize("reach", [0.0, 0.5])
