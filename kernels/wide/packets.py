@@ -44,13 +44,12 @@ CHILD_RAYS = CHILD_ENTRY + WIDTH
 ROOT_ENTRIES = LANES * (CHILD_RAYS // LANES + 1)
 PACKET_SIZE = ROOT_ENTRIES + WIDTH * LANES  # a multiple of 16: where the first row begins at a cache line, all rows do
 
-# The stack of one ray is made of levels, one for each node on the way to where the ray is. A level holds eight keys, an end, where
-# the node's references begin (LEVEL_REFERENCES), and the place on the level below to go on at (LEVEL_BELOW). Keys are sorted from
-# the near children to the far. A key is the distance, whose last four bits are replaced by the child's number + 8: four bits less
-# do not matter for an order. A child that is not met, and an end, has all bits, which is a NaN. The first level is an end alone.
-# For any hit, which needs no order, a level holds one mask of children in place of the keys, and the level below is the one before.
+# The stack of one ray is made of levels, one for each node on the way to where the ray is that has children still to come. A level
+# holds eight keys, and where the node's references begin (LEVEL_REFERENCES). A key is the distance, whose last four bits are
+# replaced by the child's number + 8: four bits less do not matter for an order. A child that is not met, or was taken, has all
+# bits, which is a NaN. For any hit, which needs no order, one mask of children is in place of the keys. The first level is empty.
 LEVEL = 16
-LEVEL_REFERENCES, LEVEL_BELOW = WIDTH + 1, WIDTH + 2
+LEVEL_REFERENCES = WIDTH
 KEY_MASK = 2 * WIDTH - 1
 # Every level but the last has a child that is still to come, which a single ray's walk would have on its stack.
 STACK_WORDS = LEVEL * (STACK_SIZE + 2)
@@ -66,7 +65,7 @@ TO_POP = 1 << WIDTH
 LAYOUT = {
     "WIDTH": WIDTH, "LANES": LANES, "COHERENT": COHERENT, "AXIS_BITS": AXIS_BITS, "AXIS_MASK": (1 << AXIS_BITS) - 1,
     "REFUSED": REFUSED, "CHILD_ENTRY": CHILD_ENTRY, "CHILD_RAYS": CHILD_RAYS, "ROOT_ENTRIES": ROOT_ENTRIES, "LEVEL": LEVEL,
-    "LEVEL_REFERENCES": LEVEL_REFERENCES, "LEVEL_BELOW": LEVEL_BELOW, "KEY_MASK": KEY_MASK, "TO_POP": TO_POP,
+    "LEVEL_REFERENCES": LEVEL_REFERENCES, "KEY_MASK": KEY_MASK, "TO_POP": TO_POP,
     "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
     "PRIM_ID_ROW": size_of(Primitive) // 4 - 1, "NO_HIT": NO_HIT,
     "LARGEST": LARGEST, "FARTHEST": FARTHEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,

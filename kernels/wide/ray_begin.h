@@ -7,5 +7,4 @@
     const auto met = enter < (Row)(__builtin_inff());
     words[SLOT_RAY] = ray;
     words[SLOT_PLACE] = bottom;
-    ((unsigned*)stacks.data)[(long long)bottom] = ~0u;
     #include "ray_push.h"

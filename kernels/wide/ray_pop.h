@@ -10,17 +10,19 @@
     words[SLOT_PLACE] = level[0] != 0 ? place : place - LEVEL;
 #else
     // The next child that begins at or before t; whether there is one. Equal stays: a tie may have a lower prim_id there.
-    const unsigned* all = (const unsigned*)stacks.data;
+    typedef unsigned Keys __attribute__((ext_vector_type(WIDTH), aligned(4)));
     int place = words[SLOT_PLACE];
     unsigned key;
     for (;;) {
-        key = all[place];
-        if (__builtin_bit_cast(float, key & ~(unsigned)KEY_MASK) <= t) break;  // an end's bits are a NaN's
         if (place == bottom) return false;
-        place = all[(place & ~(LEVEL - 1)) + LEVEL_BELOW];
+        key = __builtin_reduce_min(*(const Keys*)((const unsigned*)stacks.data + place));
+        if (__builtin_bit_cast(float, key & ~(unsigned)KEY_MASK) <= t) break;  // where no child is left, the bits are a NaN's
+        place -= LEVEL;
     }
-    __builtin_memcpy(words + SLOT_NEXT, nodes.data + (long long)all[(place & ~(LEVEL - 1)) + LEVEL_REFERENCES] + (key & (WIDTH - 1)), 4);
-    words[SLOT_PLACE] = place + 1;
+    unsigned* level = (unsigned*)stacks.data + place;
+    level[key & (WIDTH - 1)] = ~0u;
+    __builtin_memcpy(words + SLOT_NEXT, nodes.data + (long long)level[LEVEL_REFERENCES] + (key & (WIDTH - 1)), 4);
+    words[SLOT_PLACE] = place;
 #endif
     words[SLOT_PENDING] = 0;
     return true;
