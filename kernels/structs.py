@@ -19,10 +19,26 @@ MODULE_OPTIONS = {"fuse_fp": False, "enable_backward": False}
 
 if TYPE_CHECKING:  # device code is not for type checkers: its annotations are Warp's
     from typing import no_type_check as kernel
+    from typing import no_type_check as noinline
 else:
     def kernel(function):
         """A Warp kernel in a module of its own, without fused multiply-add and without the code for gradients."""
         return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+
+    def noinline(function):
+        """A Warp function that is called, and not copied to where it is called."""
+        return wp.func(function, inline=False)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return true;
+#else
+    return false;
+#endif
+""")
+def on_cuda() -> bool:
+    """Where the same arithmetic has a faster form on one of the two."""
 
 
 def size_of(struct: Any) -> int:

@@ -83,6 +83,8 @@ def make_intersect(units: Units, accepts: Any = None) -> Any:
         prim_id = primitive.prim_id
         if wp.static(units.instances):
             prim_id = primitive.prim_id + probe.ray.first_prim
+        if prim_id + 1 == probe.ray.exclude_plus_one:  # first: a ray's own triangle, at its origin, is a hard case
+            return best
         hit = Hit()
         if wp.static(units.spheres):
             if prim_id >= surfaces.n_triangles:
@@ -95,8 +97,6 @@ def make_intersect(units: Units, accepts: Any = None) -> Any:
         if hit.prim_id == NO_HIT or not (hit.t >= probe.ray.t_min and hit.t <= best.t):
             return best
         if hit.t == best.t and prim_id > best.prim_id:
-            return best
-        if prim_id + 1 == probe.ray.exclude_plus_one:
             return best
         if wp.static(units.resumes):
             if hit.t == probe.ray.t_min and prim_id < probe.ray.slot:

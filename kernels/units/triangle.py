@@ -10,14 +10,16 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray
+from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray, noinline, on_cuda
 from wrt.kernels.units.box import FAR_PAD, BoxRay, box_pad, padded_hi, padded_lo, slab_interval
+from wrt.kernels.units.float_float import difference_of_products, pair_quotient, pair_sum, pair_times, rounds_to_one
 
 # How far clamping t to its box may move it through rounding: seven of them (wrt.lab.oracle.bounds), and one step of a denormal t.
 CLAMP_ROUNDING = wp.constant(7.0 * 2.0**-24)
 CLAMP_STEP = wp.constant(2.0**-149)
 # A ray that crosses an axis by less than this part of its way, or of its length, may have a shear that underflowed.
 SLOWEST = wp.constant(2.0**-120)
+U_SQUARED = 2.0**-48  # of float32's unit roundoff u
 
 
 @wp.struct
@@ -89,26 +91,18 @@ def outside(areas: Any) -> bool:
 
 
 @wp.func
-def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> Hit:
-    """Both sides count. The hit lies on the whole line: t may be negative. prim_id is 0 on a hit, else NO_HIT.
-
-    Products of two float32 are monotone, so an area's sign can only be wrong where it is 0, under- or overflows: most
-    triangles are refused in float32. For the others the areas are taken again in float64, where the products are exact: that
-    decides those cases, and seen nearly edge-on, where the areas cancel, it keeps the digits of t, u and v. A triangle that
-    is seen exactly edge-on is missed, and so are NaN coordinates: the record of a triangle without area has them, as corners
-    on a line may no longer be on one after their rounding here (wrt.accel.triangle_data.corners).
-
-    Domain: differences of coordinates below 2^127, and a direction whose longest component is between 2^-64 and 2^64
-    (kernels.query brings others there); beyond, rays may be lost. The error bounds are in wrt.lab.oracle.bounds.
-    """
+def no_triangle() -> Hit:
     hit = Hit()
-    hit.prim_id = NO_HIT
     hit.t = float(wp.inf)
-    a = seen(v0 - origin, shear)
-    b = seen(v1 - origin, shear)
-    c = seen(v2 - origin, shear)
-    if outside(edge_areas(a, b, c)):
-        return hit
+    hit.prim_id = NO_HIT
+    return hit
+
+
+@wp.func
+def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
+    """Where the z axis meets the triangle of sheared corners, in float64, where products of float32 are exact: the areas' signs
+    are exact, and seen nearly edge-on, where the areas cancel, t, u and v keep their digits."""
+    hit = no_triangle()
     areas = edge_areas(wp.vec3d(a), wp.vec3d(b), wp.vec3d(c))
     if outside(areas):
         return hit
@@ -117,11 +111,80 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
     if not (area < zero or area > zero):
         return hit
     z = areas[0] * wp.float64(a[2]) + areas[1] * wp.float64(b[2]) + areas[2] * wp.float64(c[2])
-    hit.t = float(z / area * wp.float64(shear.shear_z))
+    hit.t = float(z / area * wp.float64(shear_z))
     hit.u = float(areas[1] / area)
     hit.v = float(areas[2] / area)
     hit.prim_id = 0
     return hit
+
+
+@noinline
+def hard_crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
+    """`crossing`, for a GPU: all float64 of its traversals is in this function."""
+    return crossing(a, b, c, shear_z)
+
+
+@wp.func
+def sure_crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
+    """What `crossing` finds, to the last bit, without float64; prim_id is NO_HIT where that is not sure.
+
+    With w_i the exact areas, A their sum, Q the sum of their products' sizes and Z the farthest of |z|: an area is off by 3.1 u^2 Q
+    here, A by 9.2, the sum of w_i z_i by 12.2 Z and each quotient by 30 u^2 of itself. That is 43 u^2 Q / A for u and v and
+    56 u^2 Q / A Z |shear_z| for t; float64 is off by less than one of these u^2, and `rounds_to_one` takes one. Where nothing
+    that is nearer than 64 rounds otherwise, float64 has rounded to the same. The ranges of Q and Z keep what under- and overflows
+    out of this: products of a low part may lose 2^-150, but u^2 Q and u^2 Q Z are 2^-138 at least.
+    """
+    hit = no_triangle()
+    size = ((wp.abs(c[0] * b[1]) + wp.abs(c[1] * b[0])) + (wp.abs(a[0] * c[1]) + wp.abs(a[1] * c[0]))
+            + (wp.abs(b[0] * a[1]) + wp.abs(b[1] * a[0])))
+    far = wp.max(wp.abs(a[2]), wp.max(wp.abs(b[2]), wp.abs(c[2])))
+    w_0 = difference_of_products(c[0], b[1], c[1], b[0])
+    w_1 = difference_of_products(a[0], c[1], a[1], c[0])
+    w_2 = difference_of_products(b[0], a[1], b[1], a[0])
+    least = wp.static(4.0 * U_SQUARED) * size
+    if not ((w_0[0] > least and w_1[0] > least and w_2[0] > least) or (w_0[0] < -least and w_1[0] < -least and w_2[0] < -least)):
+        return hit
+    if not (size > wp.static(2.0**-60) and size < wp.static(2.0**60) and far > wp.static(2.0**-30) and far < wp.static(2.0**60)):
+        return hit
+    area = pair_sum(pair_sum(w_0, w_1), w_2)
+    inverse = 1.0 / area[0]
+    error = wp.static(64.0 * U_SQUARED) * size * wp.abs(inverse)
+    z = pair_sum(pair_sum(pair_times(w_0, a[2]), pair_times(w_1, b[2])), pair_times(w_2, c[2]))
+    t = pair_times(pair_quotient(z, area, inverse), shear_z)
+    u = pair_quotient(w_1, area, inverse)
+    v = pair_quotient(w_2, area, inverse)
+    if rounds_to_one(t, error * far * wp.abs(shear_z)) and rounds_to_one(u, error) and rounds_to_one(v, error):
+        hit.t = t[0]
+        hit.u = u[0]
+        hit.v = v[0]
+        hit.prim_id = 0
+    return hit
+
+
+@wp.func
+def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> Hit:
+    """Both sides count. The hit lies on the whole line: t may be negative. prim_id is 0 on a hit, else NO_HIT.
+
+    Products of two float32 are monotone, so an area's sign can only be wrong where it is 0, under- or overflows: most
+    triangles are refused in float32. For the others the areas are taken again in float64 (`crossing`). GPUs are slow at that: there
+    float-float arithmetic gives the same bits where it is sure of them, and float64 decides the hard cases alone. A triangle that
+    is seen exactly edge-on is missed, and so are NaN coordinates: the record of a triangle without area has them, as corners
+    on a line may no longer be on one after their rounding here (wrt.accel.triangle_data.corners).
+
+    Domain: differences of coordinates below 2^127, and a direction whose longest component is between 2^-64 and 2^64
+    (kernels.query brings others there); beyond, rays may be lost. The error bounds are in wrt.lab.oracle.bounds.
+    """
+    a = seen(v0 - origin, shear)
+    b = seen(v1 - origin, shear)
+    c = seen(v2 - origin, shear)
+    if outside(edge_areas(a, b, c)):
+        return no_triangle()
+    if on_cuda():
+        hit = sure_crossing(a, b, c, shear.shear_z)
+        if hit.prim_id == NO_HIT:
+            hit = hard_crossing(a, b, c, shear.shear_z)
+        return hit
+    return crossing(a, b, c, shear.shear_z)
 
 
 @wp.func
@@ -198,14 +261,6 @@ def ray_triangle(box: BoxRay, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: 
         hit.t = within_bounds(box, hit.t, lower(lower(v0, v1), v2), upper(upper(v0, v1), v2))
         if not wp.abs(hit.t) < wp.inf:
             hit.prim_id = NO_HIT
-    return hit
-
-
-@wp.func
-def no_triangle() -> Hit:
-    hit = Hit()
-    hit.t = float(wp.inf)
-    hit.prim_id = NO_HIT
     return hit
 
 

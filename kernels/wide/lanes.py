@@ -10,6 +10,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.native import source
+from wrt.kernels.structs import on_cuda
 from wrt.kernels.units.box import FAR_PAD, BoxRay
 from wrt.kernels.units.triangle import edge_areas, outside, sheared
 
@@ -37,16 +38,6 @@ class LaneRay:
     shear_x: float
     shear_y: float
     origin: wp.vec3
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return true;
-#else
-    return false;
-#endif
-""")
-def on_cuda() -> bool: ...
 
 
 @wp.func_native("""

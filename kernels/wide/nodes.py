@@ -13,8 +13,9 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.native import source
+from wrt.kernels.structs import on_cuda
 from wrt.kernels.units.box import RAY_AABB
-from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, on_cuda, row_type, value
+from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, row_type, value
 
 # The rows of planes. A low plane and the high plane of the same axis differ in the last bit of their numbers.
 PLANES = ("lo_x", "hi_x", "lo_y", "hi_y", "lo_z", "hi_z")

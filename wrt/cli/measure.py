@@ -20,15 +20,16 @@ def bench() -> None:
     """Measure: speed against error, and one method against another."""
 
 
-for plan in (plans.Visibility, plans.Units, plans.Peers, plans.Accel, plans.Bvh, plans.RtCore, plans.Pictures):
+for plan in (plans.Visibility, plans.Units, plans.Peers, plans.Accel, plans.Bvh, plans.RtCore, plans.Float64, plans.Pictures):
     measured(bench, plan)
 
 
 @bench.command()
-@click.option("--structures", type=Names(), default=("bvh2",), show_default=True, help="Closest-hit kernels to look at, by name")
+@click.option("--structures", type=Names(), default=("bvh", "bvh2"), show_default=True, help="Traversals to look at, by name")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def instructions(structures: tuple[str, ...], as_json: bool) -> None:
-    """The units in machine code for Turing: instructions of each box and triangle test; registers and code of traversals."""
+    """The units in machine code for Turing: instructions of each box and triangle test; registers, stack and code of
+    traversals, also for Hopper."""
     from wrt.accel.structures import ACCELERATORS
     from wrt.lab.bench.report import markdown
     from wrt.lab.rtcore import instructions as study
@@ -38,7 +39,8 @@ def instructions(structures: tuple[str, ...], as_json: bool) -> None:
     units, codes = study.units(), study.traversals(structures)
     Reporting(as_json=as_json).end(markdown(study.tables(units, codes)), {
         "units": [{"unit": each.unit, "test": each.test, "instructions": each.instructions, **each.classes} for each in units],
-        "traversals": {name: {"registers": code.registers, "stack": code.stack, "code_bytes": len(code.code), **code.classes()}
+        "traversals": {name: {"registers": code.registers, "stack": code.stack, "instructions": len(code.opcodes()),
+                              "code_bytes": len(code.code), **code.classes()}
                        for name, code in codes.items()}})
 
 

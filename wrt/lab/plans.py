@@ -190,6 +190,18 @@ class RtCore(Plan):
 
 
 @dataclass(frozen=True)
+class Float64(Plan):
+    """How many triangle tests, and of how many rays, need float64 where a GPU runs the watertight test on MESHES."""
+
+    COMMAND, STUDY = "bench float64", "wrt.lab.rtcore.hard_tests"
+    meshes: Sequence[Any] = the_meshes(MISSING)
+    kinds: Sequence[str] = the_kinds("primary", "diffuse")
+    rays: int = option(2**16, "Rays of each kind", (1, 2**22))
+    seed: int = option(0, "Other rays")
+    inside: bool = option(False, "The camera stands in the middle of the mesh's box, as in a room")
+
+
+@dataclass(frozen=True)
 class Pictures(Plan):
     """SCENES by waves of samples, as the CPU makes pictures, beside the loop of one ray: nanoseconds a sample on one thread, by
     turns, and pixels that differ (none may)."""

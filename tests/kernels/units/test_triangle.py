@@ -15,7 +15,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.triangle_data import LAYOUTS
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, kernel
 from wrt.kernels.units.box import box_ray
-from wrt.kernels.units.triangle import RAY_TRIANGLE, ray_triangle, triangle_ray, watertight
+from wrt.kernels.units.triangle import RAY_TRIANGLE, crossing, ray_triangle, seen, sure_crossing, triangle_ray, watertight
 
 # pbrt-v4, shapes_test, Triangle.BadCases: three collinear points and a ray that must miss them (published numbers).
 BAD_TRIANGLE = [[-1113.45459, -79.049614, -56.2431908], [-1113.45459, -87.0922699, -56.2431908],
@@ -409,6 +409,69 @@ def test_kernels_are_compiled_without_fused_multiply_add():
     launch(products_kernel, len(m), wp.array(m, dtype=wp.vec4, device=DEVICE), forth, back)
     assert np.array_equal(forth.numpy(), -back.numpy())
     assert np.array_equal(forth.numpy(), m[:, 0] * m[:, 1] - m[:, 2] * m[:, 3])
+
+
+# --- without float64 --------------------------------------------------------------------------------------------------
+
+
+@kernel
+def crossings_kernel(
+    origin: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    v0: wp.array(dtype=wp.vec3),
+    v1: wp.array(dtype=wp.vec3),
+    v2: wp.array(dtype=wp.vec3),
+    sure: wp.array(dtype=Hit),
+    exact: wp.array(dtype=Hit),
+):
+    i = wp.tid()
+    ray = Ray()
+    ray.direction = direction[i]
+    shear = triangle_ray(ray)
+    a = seen(v0[i] - origin[i], shear)
+    b = seen(v1[i] - origin[i], shear)
+    c = seen(v2[i] - origin[i], shear)
+    sure[i] = sure_crossing(a, b, c, shear.shear_z)
+    exact[i] = crossing(a, b, c, shear.shear_z)
+
+
+def without_float64(origin, direction, triangle):
+    """Which hits float-float arithmetic is sure of, (N,), and which there are; those that it is sure of have float64's bits."""
+    n = len(origin)
+    sure, exact = zeros(n, Hit), zeros(n, Hit)
+    triangle = np.asarray(triangle, np.float32)
+    launch(crossings_kernel, n, *(vec3s(a) for a in (origin, direction, *(triangle[:, i] for i in range(3)))), sure, exact)
+    sure, exact = sure.numpy(), exact.numpy()
+    told = is_hit(sure)
+    assert sure[told].tobytes() == exact[told].tobytes()
+    return told, is_hit(exact)
+
+
+def test_float_float_arithmetic_is_sure_of_all_but_hard_cases():
+    told, hit = without_float64(*aimed_rays(np.random.default_rng(13), 200_000, spread=0.2))
+    assert hit.sum() > 50_000 and 0 < (hit & ~told).sum() < 1e-3 * hit.sum()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_float_float_arithmetic_is_sure_of_has_the_bits_of_float64(seed):
+    """Wild triangles, at rays of all lengths and all scales, where much under- and overflows."""
+    origin, direction, triangle = adversarial_hits(np.random.default_rng(seed), 200_000)
+    told, hit = without_float64(origin, direction, triangle)
+    assert 20_000 < told.sum() < hit.sum() - 10_000
+    rng = np.random.default_rng(seed)
+    for exponents in ((-60, 60), (-120, 120)):
+        scale, length = np.exp2(rng.integers(*exponents, (2, len(origin), 1)))
+        with np.errstate(over="ignore"):
+            turned = rounded(direction * np.clip(length, 2.0**-60, 2.0**60))
+            given = rounded(origin * scale), turned, rounded(triangle * scale[:, None])
+        assert without_float64(*given)[0].sum() > 5000
+
+
+def test_through_an_edge_and_from_the_plane_are_hard_cases():
+    square = np.array([[-1.0, -1.0, 0.0], [3.0, -1.0, 0.0], [-1.0, 3.0, 0.0]])
+    origin = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 1.0], [0.0, 0.0, 0.0], [np.nan, 0.0, 1.0]])
+    told, hit = without_float64(origin, np.broadcast_to([0.0, 0.0, -1.0], (4, 3)), np.broadcast_to(square, (4, 3, 3)))
+    assert told.tolist() == [True, False, False, False] and hit.tolist()[:3] == [True, True, True]
 
 
 # --- every test in the table ------------------------------------------------------------------------------------------

@@ -1,4 +1,5 @@
-"""The units in machine code for Turing: instructions of a box test and of a triangle test, registers and code of traversals.
+"""The units in machine code for Turing: instructions of a box test and of a triangle test; registers, stack and code of
+traversals, also for Hopper.
 
 Read from the binary, without a GPU. The counts are static: of the code that there is, not of what a ray runs through.
 """
@@ -14,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.accel.structure import Structure, closest_hit_kernel
+from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start
 from wrt.core.errors import InputError
@@ -22,9 +23,11 @@ from wrt.kernels.study.unit_probes import make_box_probe, make_triangle_probe, n
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench.report import Columns, Part, Row, tabled
-from wrt.lab.rtcore.cubin import CLASSES, INSTRUCTION, KernelCode, read_cubin
+from wrt.lab.rtcore.cubin import CLASSES, KernelCode, read_cubin
 
 ARCH = 75
+ARCHS = (75, 90)  # of the traversals
+QUERIES = {"closest hit": closest_hit_kernel, "any hit": any_hit_kernel}
 FEW, MANY = 8, 16  # so many that the compiler holds the body once, and does not unroll the loop over the grid around it
 # What a kernel with a unit does to add up its own results: one addition for a box, three and a selection for a triangle. One that
 # only adds up what it reads has an addition for each number.
@@ -45,11 +48,11 @@ class UnitCode:
         return sum(self.classes.values())
 
 
-def compiled(kernel: Any) -> KernelCode:
-    """The kernel's machine code for Turing."""
+def compiled(kernel: Any, arch: int = ARCH) -> KernelCode:
+    """The kernel's machine code, by default for Turing."""
     start("cpu")
     with tempfile.TemporaryDirectory() as folder:
-        (binary,) = wp.compile_aot_module(kernel.module, arch=ARCH, module_dir=folder)
+        (binary,) = wp.compile_aot_module(kernel.module, arch=arch, module_dir=folder)
         (code,) = read_cubin(Path(binary).read_bytes()).values()
     return code
 
@@ -85,23 +88,25 @@ def units() -> list[UnitCode]:
 
 
 def traversals(names: Sequence[str]) -> dict[str, KernelCode]:
-    """The closest-hit kernel of each structure."""
-    return {name: compiled(closest_hit_kernel(Structure(ACCELERATORS[name]))) for name in names}
+    """The queries' kernels of each structure, for each of ARCHS."""
+    return {f"{name} {query}, sm_{arch}": compiled(make(Structure(ACCELERATORS[name])), arch)
+            for name in names for query, make in QUERIES.items() for arch in ARCHS}
 
 
 SOFTWARE_LEGEND = """\
-Static counts of the code that there is: the watertight test refuses most triangles before its fp64 part, which comes at 1/32 of the
-rate of fp32 on Turing. Fetching the box or the triangle, the stack and the loop are left out."""
+Static counts of the code that there is: the watertight test refuses most triangles early. Its fp64, at 1/32 of the rate of fp32 on
+Turing, is for hard cases and stands once in a kernel, in a function: the traversals count it, the unit only calls it. Fetching the
+box or the triangle, the stack and the loop are left out of the units."""
 
 
 def tables(units: Sequence[UnitCode], codes: dict[str, KernelCode]) -> list[Part]:
     shown = [name for name in (*CLASSES, "other") if any(abs(unit.classes[name]) > 0.01 for unit in units)]
-    lines = [(name, str(code.registers), str(code.stack), str(len(code.opcodes()) * INSTRUCTION),
+    lines = [(name, str(code.registers), str(code.stack), str(len(code.opcodes())),
               *(str(code.classes()[each]) for each in (*CLASSES, "other"))) for name, code in codes.items()]
     return [
         tabled({"unit": "{unit}", "test": "{test}", "instructions": lambda unit: f"{unit.instructions:.0f}",
                 **{name: f"{{classes[{name}]:.0f}}" for name in shown}}, units),
-        Part("", "", ("closest hit", "registers", "stack bytes", "code bytes", *CLASSES, "other"), lines),
+        Part("", "", ("traversal", "registers", "stack bytes", "instructions", *CLASSES, "other"), lines),
         Part("", SOFTWARE_LEGEND)]
 
 

@@ -1,0 +1,28 @@
+"""How the watertight test comes to its answer where a GPU runs it: by float32, by float-float arithmetic, or by float64."""
+
+import warp as wp
+
+from wrt.kernels.query import RayArrays, load_ray
+from wrt.kernels.structs import NO_HIT, Primitive, kernel
+from wrt.kernels.units.triangle import edge_areas, outside, seen, sure_crossing, triangle_ray
+
+REFUSED, SURE, HARD = 0, 1, 2
+
+
+@kernel
+def classify(primitives: wp.array(dtype=Primitive), rays: RayArrays, ray: wp.array(dtype=wp.int32),
+             primitive: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+    """Test i is of ray[i] against primitive[i]."""
+    i = wp.tid()
+    tested = load_ray(rays, ray[i])
+    shear = triangle_ray(tested)
+    corners = primitives[primitive[i]]
+    a = seen(corners.v0 - tested.origin, shear)
+    b = seen(corners.v1 - tested.origin, shear)
+    c = seen(corners.v2 - tested.origin, shear)
+    answer = int(HARD)
+    if outside(edge_areas(a, b, c)):
+        answer = int(REFUSED)
+    elif sure_crossing(a, b, c, shear.shear_z).prim_id != NO_HIT:
+        answer = int(SURE)
+    out[i] = answer

@@ -1,0 +1,71 @@
+"""`python -m wrt bench float64`: how often the triangle unit needs float64 where a GPU runs it.
+
+The triangle tests of closest-hit queries through bvh2 are recorded, and each is looked at again by itself. Runs on the CPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build
+from wrt.core.device import load_kernel, upload
+from wrt.io.mesh_file import as_mesh
+from wrt.kernels.query import RayArrays
+from wrt.kernels.structs import Primitive, size_of
+from wrt.kernels.study.hard_tests import HARD, REFUSED, classify
+from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.lab.bench.rays import RaySet, ray_sets
+from wrt.lab.bench.report import Columns, Part, Row, tabled
+from wrt.lab.bench.report import run as run
+from wrt.lab.plans import Float64 as Plan
+
+TITLE = "How often the triangle unit needs float64 on a GPU"
+COLUMNS: Columns = {
+    "mesh": "{mesh}", "rays": "{kind}", "tests a ray": lambda row: f"{row.tests / row.rays:.2f}",
+    "accepted in float32, a ray": lambda row: f"{row.accepted / row.rays:.2f}", "hard tests": "{hard}",
+    "of the tests": lambda row: f"{row.hard / max(row.tests, 1):.1e}", "of the rays": lambda row: f"{row.hard_rays / row.rays:.1e}"}
+LEGEND = """\
+Closest hits through bvh2. Of the tests that float32 does not refuse, float-float arithmetic is sure of the bits of most; the others
+are hard: they take float64. of the rays: those with a hard test or more."""
+
+
+def rows(plan: Plan) -> Iterator[Row]:
+    for mesh in map(as_mesh, plan.meshes):
+        accel = build(mesh, "bvh2")
+        sets = ray_sets(accel, plan.rays, plan.seed, plan.inside)
+        for kind in plan.kinds:
+            yield Row(mesh=Path(mesh.name or "mesh").name, kind=kind, **counted(accel, sets[kind]))
+
+
+def counted(accel: Accelerator, rays: RaySet) -> dict[str, int]:
+    """Of the triangle tests of all rays; accel: a bvh2 over triangles, on the CPU."""
+    counters = accel.closest_hit(rays.origins, rays.directions, t_max=rays.t_max, trace=True).counters
+    assert counters is not None
+    of_ray = np.repeat(np.arange(len(rays)), np.diff(counters.first))
+    tests = counters.address >= int(PRIMITIVE_SPACE)
+    of_ray, place = of_ray[tests], (counters.address[tests] - int(PRIMITIVE_SPACE)) // size_of(Primitive)
+    answers = classified(accel, rays, of_ray, place)
+    hard = answers == HARD
+    return {"rays": len(rays), "tests": len(answers), "accepted": int((answers != REFUSED).sum()), "hard": int(hard.sum()),
+            "hard_rays": len(np.unique(of_ray[hard]))}
+
+
+def classified(accel: Accelerator, rays: RaySet, of_ray: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """REFUSED, SURE or HARD of each test, (N,): ray number of_ray against record number `place`."""
+    given = RayArrays()
+    given.origin, given.direction = (upload(rows, wp.vec3, accel.device) for rows in (rays.origins, rays.directions))
+    given.t_min, given.t_max = wp.zeros(len(rays), device=accel.device), upload(rays.t_max, wp.float32, accel.device)
+    out = wp.zeros(len(of_ray), dtype=wp.int32, device=accel.device)
+    load_kernel(classify, accel.device)
+    numbers = [upload(each, wp.int32, accel.device) for each in (of_ray, place)]
+    wp.launch(classify, len(of_ray), [accel.data.primitives, given, *numbers, out], device=accel.device)
+    return out.numpy()
+
+
+def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
+    return [tabled(COLUMNS, rows)]
