@@ -71,10 +71,11 @@ class Function:
 @dataclass
 class Counts:
     """What has been asked of all devices. launches: by the kernel's name and the device's number; copies: "h2d", "d2h", "d2d" and
-    "p2p" (to another device); synchronisations: waits of the host for a device."""
+    "p2p" (to another device), and their bytes; synchronisations: waits of the host for a device."""
 
     launches: Counter[tuple[str, int]] = field(default_factory=Counter)
     copies: Counter[str] = field(default_factory=Counter)
+    bytes: Counter[str] = field(default_factory=Counter)
     synchronisations: int = 0
 
     def __str__(self) -> str:
@@ -221,6 +222,7 @@ class Gpus:
         self.check(f"{kind}: the source", address(of), size, other)
         with self.lock:
             self.counts.copies[kind] += 1
+            self.counts.bytes[kind] += size
         with self.memory.opened():
             ctypes.memmove(address(to), address(of), size)
         return True

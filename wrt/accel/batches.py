@@ -23,6 +23,7 @@ from wrt.kernels.wide.packets import Scratch
 # are not divided. A thread takes one part after another, about PARTS of them, so that all threads end at about the same time.
 FEWEST, MOST, PARTS = 8192, 131072, 8
 RAYS_PER_LAUNCH = 16384  # one at a time
+MOST_ON_GPU = 1 << 26  # rays from the host that are on a GPU at once: 2.7 GB with their hits; a kernel counts in int32
 SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
 
 
@@ -147,15 +148,19 @@ def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: 
 
 
 def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out: list[Any], device: Any) -> None:
-    """As Tracer.trace."""
-    there = [array if isinstance(array, wp.array) else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device)
-             for array in out]
-    hits = HitArrays()
-    for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
-        setattr(hits, name, array)
+    """As Tracer.trace. What is Warp's is traced in one launch; what comes from the host in parts of MOST_ON_GPU."""
     kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
-    inputs = [data, surfaces, rays_on(device, rays), hits if len(out) > 1 else there[0], 0]
-    wp.launch(kernel, dim=len(out[0]), inputs=inputs, device=device, record_tape=False)
-    for array, found in zip(out, there, strict=True):
-        if array is not found:
-            array[:] = found.numpy()
+    n = len(out[0])
+    part = n if rays.as_warp else MOST_ON_GPU
+    for first in range(0, n, max(part, 1)):
+        some = slice(first, min(first + part, n))
+        there = [array[some] if isinstance(array, wp.array)
+                 else wp.empty(some.stop - first, dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
+        hits = HitArrays()
+        for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
+            setattr(hits, name, array)
+        inputs = [data, surfaces, rays_on(device, rays if part == n else rays.part(some)), hits if len(out) > 1 else there[0], 0]
+        wp.launch(kernel, dim=some.stop - first, inputs=inputs, device=device, record_tape=False)
+        for array, found in zip(out, there, strict=True):
+            if not isinstance(array, wp.array):
+                array[some] = found.numpy()
