@@ -12,8 +12,8 @@ that leave their arrays (likewise) or read what nobody wrote (0xA5); what depend
 CUDA branches that do not compile, or say something else. It counts launches, copies and synchronisations.
 
 It does not find: what NVIDIA's compilers and driver do; speed; a wait that lacks (each call is done when it returns); races
-(threads run one after another). Warp's own CUDA code (Mesh, Bvh, sort, graphs) is not there. sin, pow, exp and the like are the
-host's, not NVIDIA's, whose last bits differ.
+(threads run one after another). A graph is what its capture recorded, and what cannot be captured is an error. Of Warp's own CUDA
+code only a sort is there (no Mesh, no Bvh). sin, pow, exp and the like are the host's, not NVIDIA's, whose last bits differ.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ import warp as wp
 from warp._src import context as warp_context
 
 from tests.virtual_gpu.compiler import SUFFIX
-from tests.virtual_gpu.driver import NAME, Core, Gpus, VirtualGpuError
+from tests.virtual_gpu.driver import NAME, Core, Gpus
+from tests.virtual_gpu.graphs import VirtualGpuError
 
 __all__ = ["NAME", "VirtualGpuError", "gpus", "install"]
 

@@ -278,6 +278,15 @@ def launch(kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -
     run_all([partial(job, first) for first in range(0, n, step or max(n, 1))], threads)
 
 
+def launch_on(device: Any, kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -> None:
+    """As `launch` on the CPU; on a GPU one launch over all of n."""
+    if device.is_cpu:
+        launch(kernel, n, *inputs, threads=threads, step=step)
+    elif n:
+        load_kernel(kernel, device)
+        wp.launch(kernel, dim=n, device=device, inputs=[0 if each is None else each for each in inputs], record_tape=False)
+
+
 def run_growing(begin: Callable[[Any], tuple[Callable[[], Any], Callable[[], Iterable[Any]]]], tasks: Iterable[Any],
                 threads: int) -> None:
     """Run all tasks, and those that come of them, on so many threads.
