@@ -55,7 +55,9 @@ def install(devices: int = 2, arch: int = 75, seed: int | None = 0, memory: int 
         """Here the names and the types of a kernel's arguments are known."""
         hooks = get_hooks(self, kernel)
         if self.device.is_cuda:
-            gpus().objects[hooks.forward].arguments = [(each.label, each.type) for each in kernel.adj.args]
+            function = gpus().objects[hooks.forward]
+            function.arguments = [(each.label, each.type) for each in kernel.adj.args]
+            function.dimensions = kernel.adj.kernel_dim
         return hooks
 
     def invoked(kernel: Any, hooks: Any, params: Any, adjoint: bool) -> Any:

@@ -57,11 +57,12 @@ RUN = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.POINTER(Grid))
 
 @dataclass
 class Function:
-    """A kernel that is loaded. arguments: their names and types, where Warp knows them."""
+    """A kernel that is loaded. arguments: their names and types, where Warp knows them; dimensions: of its launches."""
 
     name: str
     run: Any
     arguments: list[tuple[str, Any]] = field(default_factory=list)
+    dimensions: int = 1
 
 
 def arrays_of(name: str, kind: Any, at: int) -> Iterator[tuple[str, array_t, int]]:
@@ -173,12 +174,15 @@ class Gpus(Graphs):
     def alloc_device_default(self, context: int, size: int, *args: Any) -> int:
         at = self.memory.allocate(size, context - CONTEXT)
         if graph := self.active.get(context):
-            graph.kept.add(at)
+            graph.kept[at] = False
         return at
 
     def free_device_default(self, context: int, at: Any, *args: Any) -> None:
-        graphs = [each for each in (*self.active.values(), *self.objects.values()) if isinstance(each, Graph)]
-        if address(at) and not any(address(at) in graph.kept for graph in graphs):
+        for each in (*self.active.values(), *self.objects.values()):
+            if isinstance(each, Graph) and address(at) in each.kept:
+                each.kept[address(at)] = True
+                return
+        if address(at):
             self.memory.free(address(at))
 
     alloc_device_async, free_device_async = alloc_device_default, free_device_default
@@ -307,7 +311,7 @@ class Gpus(Graphs):
             z = -(-needed // (x * y))
         values, held = ctypes.cast(arguments, ctypes.POINTER(ctypes.c_void_p)), list[Any]()
         if self.active.get(context):
-            values, held = copied(values, (kind for _, kind in function.arguments))
+            values, held = copied(values, function.dimensions, (kind for _, kind in function.arguments))
         self.do(context, lambda: self.run(function, context, (x, y, z, threads), values, held))
         return 0
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import warp as wp
 from warp._src.codegen import Struct
 from warp._src.types import array_t, launch_bounds_t, matches_array_class, type_size_in_bytes
 
@@ -18,11 +19,12 @@ Call = Callable[[], Any]
 
 @dataclass
 class Graph:
-    """calls: what is to be done, in order; kept: memory that was taken while it was captured, which is its own."""
+    """calls: what is to be done, in order; kept: memory that was taken while it was captured, and whether the host has freed it,
+    which is done when the graph goes."""
 
     context: int
     calls: list[Call] = field(default_factory=list)
-    kept: set[int] = field(default_factory=set)
+    kept: dict[int, bool] = field(default_factory=dict)
 
 
 @dataclass
@@ -103,8 +105,9 @@ class Graphs:
         return True
 
     def cuda_graph_destroy(self, context: int, graph: Any) -> bool:
-        for at in self.objects.pop(graph.value).kept:
-            self.memory.free(at)
+        for at, freed in self.objects.pop(graph.value).kept.items():
+            if freed:
+                self.memory.free(at)
         return True
 
     def cuda_graph_exec_destroy(self, context: int, graph: Any) -> bool:
@@ -117,17 +120,17 @@ class Graphs:
         return address(stream)
 
 
-def copied(values: Any, kinds: Iterable[Any]) -> tuple[Any, list[Any]]:
-    """The arguments of a launch as they are now: CUDA copies them when it captures. kinds: types of the values behind the first,
-    the launch's bounds. Also what holds the copies."""
-    sizes = [ctypes.sizeof(launch_bounds_t), *map(size_of, kinds)]
+def copied(values: Any, dimensions: int, kinds: Iterable[Any]) -> tuple[Any, list[Any]]:
+    """The arguments of a launch as they are now: CUDA copies them when it captures. The first is the launch's bounds, of so many
+    dimensions; kinds: the types of the others. Also what holds the copies."""
+    sizes = [ctypes.sizeof(launch_bounds_t((1,) * dimensions)), *map(size_of, kinds)]
     held = [ctypes.create_string_buffer(ctypes.string_at(values[i], size), size) for i, size in enumerate(sizes)]
     return (ctypes.c_void_p * len(held))(*map(ctypes.addressof, held)), held
 
 
 def size_of(kind: Any) -> int:
     """Bytes of an argument of a kernel."""
-    if matches_array_class(kind):
+    if matches_array_class(kind, wp.array):
         return ctypes.sizeof(array_t)
     if isinstance(kind, Struct):
         return ctypes.sizeof(kind.ctype)

@@ -35,8 +35,9 @@ class DeviceGeometry(Geometry):
         if indices.device != points.device:
             raise InputError(f"indices must be on {points.device}, as points are, not on {indices.device}")
         indices = indices if indices.is_contiguous else indices.contiguous()
-        self._set(points, indices.view(wp.vec3i) if flat and len(indices) else wp.empty(0, wp.vec3i, device=points.device)
-                  if flat else indices, np.zeros((0, 4), np.float32))
+        if flat:
+            indices = indices.reshape((len(indices) // 3, 3)).view(wp.vec3i)
+        self._set(points, indices, np.zeros((0, 4), np.float32))
         outside = wp.zeros(1, dtype=wp.int32, device=points.device)
         launch_on(points.device, count_outside, len(self), self.indices, len(points), outside, None)
         if n := int(outside.numpy()[0]):
@@ -54,9 +55,9 @@ class DeviceGeometry(Geometry):
         return array if array.is_contiguous else array.contiguous()
 
     @staticmethod
-    def moved(points: Any, shape: Any, spheres: np.ndarray) -> DeviceGeometry:
-        """The triangles of a Shape between other points, and its spheres."""
-        return DeviceGeometry.__new__(DeviceGeometry)._set(points, shape.faces, spheres)
+    def moved(points: Any, indices: Any, spheres: np.ndarray) -> DeviceGeometry:
+        """Of arrays that were looked at before, with spheres; indices: (F,) of vec3i."""
+        return DeviceGeometry.__new__(DeviceGeometry)._set(points, indices, spheres)
 
     def __len__(self) -> int:
         return len(self.indices) + len(self.spheres)
