@@ -15,6 +15,8 @@ from tests import device
 from tests.data import ROOT
 from tests.virtual_gpu import gpus
 from wrt.accel import batches
+from wrt.core import device as core_device
+from wrt.core.errors import InputError
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
 from wrt.scene import shapes
@@ -77,9 +79,25 @@ def test_many_rays_of_numpy_are_traced_in_parts(monkeypatch: pytest.MonkeyPatch)
     ends = np.linspace(0.1, 2.0, N, dtype=np.float32)
     whole = accel.closest_hit(*some_rays(), 0.0, ends)
     monkeypatch.setattr(batches, "MOST_ON_GPU", 1000)
+    monkeypatch.setattr(batches, "FEWEST", 100)
     with asked() as query:
         parts = accel.closest_hit(*some_rays(), 0.0, ends)
     assert query.launches == 3
     for name in ("t", "u", "v", "prim_id"):
         assert getattr(parts, name).tobytes() == getattr(whole, name).tobytes()
     assert 0 < (whole.prim_id >= 0).sum() < N
+
+
+def test_what_does_not_fit_on_the_device_is_told_before_it_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = shapes.icosphere(2)
+    room = wp.get_device("cuda:0").free_memory
+    assert batches.rays_on_gpu(10, wp.get_device("cuda:0")) == batches.MOST_ON_GPU
+    monkeypatch.setattr(core_device, "SMALL", 0)
+    monkeypatch.setattr(gpus().memory, "limit", gpus().memory.limit - room + 30_000)
+    assert batches.rays_on_gpu(1 << 26, wp.get_device("cuda:0")) == batches.FEWEST
+    with pytest.raises(InputError, match=r"a bvh8 over 320 primitives takes 0 MiB of the memory of cuda:0; 0 MiB are free"):
+        wrt.build(mesh, "bvh8", device="cuda:0")
+    monkeypatch.setattr(gpus().memory, "limit", gpus().memory.limit + 30_000)
+    wrt.build(mesh, "bvh8", device="cuda:0")
+    with pytest.raises(InputError, match="a tree over 320 primitives takes 0 MiB of the memory of cuda:0"):
+        wrt.build(mesh, "bvh2", builder="lbvh", device="cuda:0")

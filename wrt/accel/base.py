@@ -24,7 +24,7 @@ from wrt.accel.rays import vectors
 from wrt.accel.store import save
 from wrt.accel.structure import Structure, check_options, check_units
 from wrt.core.arrays import to_numpy
-from wrt.core.device import start, thread_count, upload
+from wrt.core.device import require_on, start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
 from wrt.core.memory import require
@@ -47,6 +47,7 @@ class Accelerator(Queries, ABC):
     kernels: Any
     _options: Mapping[str, Any] = MappingProxyType({})  # that it was built with
     bytes_to_build: ClassVar[float] = 200.0  # of memory for each primitive, at the peak; measured, rounded up
+    bytes_on_device: ClassVar[float] = 120.0  # likewise, of a GPU's: stats.bytes
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
                  box: str = "conservative", **options: Any) -> None:
@@ -54,6 +55,7 @@ class Accelerator(Queries, ABC):
         check_options(self.name, self._build, options)
         self._options = options
         require(len(geometry) * self.bytes_to_build, f"a {self.name} over {len(geometry)} primitives")
+        require_on(self.device, len(geometry) * self.bytes_on_device, f"a {self.name} over {len(geometry)} primitives")
         begin = time.perf_counter()
         built = self._build(**options)
         self._take(built, begin, built.sah_cost)

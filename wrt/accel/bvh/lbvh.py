@@ -10,9 +10,13 @@ from wrt.accel.bvh.refit import Fitting, tree_of
 from wrt.accel.bvh.top_down import build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch_on, start
+from wrt.core.device import launch_on, require_on, start
+from wrt.core.errors import InputError
 from wrt.kernels.build import lbvh as kernels
 from wrt.kernels.traverse.bvh2 import Bvh2Node
+
+BYTES = 400.0  # of a GPU's memory for each primitive, at the peak: what is below, and as much as the keys for the sort
+MOST = 1 << 30  # the sort has room for two of each
 
 
 def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
@@ -28,6 +32,9 @@ def build_on(device: Any, shape: Any, options: BvhOptions, threads: int = 1) -> 
     """Bvh2Node records, the parent of each, the prim_id of each primitive of the leaves (Warp arrays on the device), and a Root,
     over a Shape of two primitives or more. Of a GPU nothing else comes to the host."""
     n = len(shape.faces) + len(shape.spheres)
+    if n >= MOST:
+        raise InputError(f"the builder lbvh takes fewer than {MOST} primitives, got {n}")
+    require_on(device, n * BYTES, f"a tree over {n} primitives")
     number_bits, bits = kernels.bits_of(n)
     fitting = Fitting(device, n, n - 1)
     fitting.find_bounds(shape, threads)
