@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import warp as wp
 
 import wrt
 from tests import device
+from tests.data import ROOT
 from tests.virtual_gpu import VirtualGpuError, gpus
 from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
@@ -88,6 +91,17 @@ def test_a_refit_and_a_query_are_captured_and_follow_the_points() -> None:
         for name in FIELDS:
             assert getattr(out, name).numpy().tobytes() == getattr(expected, name).tobytes()
         assert (expected.prim_id >= 0).any()
+
+
+def test_the_example_in_the_documentation() -> None:
+    page = (ROOT / "docs/acceleration.md").read_text(encoding="utf-8")
+    section = page[page.index("### On a GPU") :]
+    names = {"wrt": wrt, "mesh": BALL, "moved": 2.0 * BALL.vertices, "rays": np.random.default_rng(1).normal(size=(2, 50, 3))}
+    for block in re.findall(r"^```python\n(.*?)^```", section, re.DOTALL | re.MULTILINE):
+        exec(block, names)
+    origins, directions = names["rays"]
+    expected = wrt.build(wrt.Mesh(2.0 * BALL.vertices, BALL.faces), device="cpu").closest_hit(origins, directions)
+    assert names["hits"].t.numpy().tobytes() == expected.t.tobytes() and (expected.prim_id >= 0).any()
 
 
 def test_what_a_capture_of_ours_needs_first() -> None:

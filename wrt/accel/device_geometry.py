@@ -64,21 +64,26 @@ class DeviceGeometry(Geometry):
 
     @property
     def n_triangles(self) -> int:
+        """How many of the primitives are triangles."""
         return len(self.indices)
 
     @property
     def n_vertices(self) -> int:
+        """How many points there are."""
         return len(self.points)
 
     @property
     def vertices(self) -> np.ndarray:
+        """A copy of the points as they are now."""
         return np.asarray(self.points.numpy())
 
     @cached_property
     def faces(self) -> np.ndarray:
+        """A copy of the indices, (F, 3)."""
         return np.asarray(self.indices.numpy())
 
     def on(self, device: Any, faces: Any = None) -> Any:
+        """As Geometry.on; a copy only of what is on another device."""
         shape = Shape()
         shape.vertices, shape.faces = self.points.to(device), self.indices.to(device) if faces is None else faces
         shape.spheres = wp.array(self.spheres, dtype=wp.vec4, device=device)

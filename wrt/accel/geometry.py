@@ -46,6 +46,7 @@ class Geometry:
 
     @property
     def n_vertices(self) -> int:
+        """How many vertices there are."""
         return len(self.vertices)
 
     def digest(self) -> str:
