@@ -41,11 +41,15 @@ def assert_follows(accel: Accelerator, vertices: np.ndarray) -> None:
     np.testing.assert_array_equal(accel.geometry.vertices, vertices)
 
 
-@pytest.mark.parametrize("accel", ["bvh2", "bvh8", "grid"])
-def test_any_structure_is_built_over_it(accel: str) -> None:
+@pytest.mark.parametrize("name", ["bvh2", "bvh8", "bvh2_sphere", "grid"])
+def test_any_structure_is_built_over_it_and_follows_if_it_can(name: str) -> None:
     geometry = wrt.DeviceGeometry(there(BALL.vertices, wp.vec3), there(BALL.faces, wp.vec3i))
     assert len(geometry) == geometry.n_triangles == len(BALL.faces)
-    assert_follows(build(geometry, accel), BALL.vertices)
+    accel = build(geometry, name)
+    assert_follows(accel, BALL.vertices)
+    if name != "grid":
+        accel.refit(there(moved(0.4), wp.vec3))
+        assert_follows(accel, moved(0.4))
 
 
 @pytest.mark.parametrize("options", [{"builder": "lbvh"}, {"builder": "sbvh"}, {"triangle": "moeller_trumbore"}])
@@ -110,7 +114,7 @@ def test_refits_that_are_refused() -> None:
                            (there(BALL.faces, wp.vec3i), "vertices must be a Warp array"), (BALL.vertices, "must be a Warp array")):
         with pytest.raises(InputError, match=message):
             accel.refit(given, in_place=True)
-    for name, options in (("bvh8", {}), ("bvh2", {"triangle": "plane"})):
+    for name, options in (("bvh8", {}), ("bvh2_kdop", {}), ("bvh2", {"triangle": "plane"})):
         with pytest.raises(InputError, match="in place"):
             build(BALL, name, **options).refit(there(BALL.vertices, wp.vec3), in_place=True)
     assert_follows(accel, BALL.vertices)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
 from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -34,28 +35,40 @@ class InPlace(NamedTuple):
     shape: Any
 
 
-class Bvh2(Accelerator):
+class BinaryBvh(Accelerator):
     """Options: builder (a name in wrt.accel.bvh.builders.BVH_BUILDERS), max_leaf (1 to 64 primitives), cost_traversal and
     cost_intersection (of the SAH), split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
+
+    def _build(self, builder: str = "binned", max_leaf: int = 4, cost_traversal: float = 1.0,
+               cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
+        return self._by(BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget))
+
+    def _by(self, options: BvhOptions) -> Built:
+        tree = build_binary(self.geometry, options, self.threads)
+        return self._around(tree.nodes, tree.order, tree.leaves, tree.depth)
+
+    @abstractmethod
+    def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
+        """The structure over a tree with boxes: Bvh2Node records."""
+
+    def _check(self, built: Built) -> None:
+        check_binary(built.arrays["nodes"], len(built.order), kernels.STACK_SIZE)
+
+
+class Bvh2(BinaryBvh):
+    __doc__ = BinaryBvh.__doc__
 
     name = "bvh2"
     kernels = kernels
 
-    def _build(self, builder: str = "binned", max_leaf: int = 4, cost_traversal: float = 1.0,
-               cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
-        options = BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget)
-        if builder in DEVICE_BUILDERS and len(self.geometry) > 1:
-            nodes, parents, there, root = DEVICE_BUILDERS[builder](self.device, self._shape(), options, self.threads)
-            return Built({"nodes": nodes}, there, root.used, root.used + 1, root.height, root.sah_cost, parents)
-        tree = build_binary(self.geometry, options, self.threads)
-        return self._around(tree.nodes, tree.order, tree.leaves, tree.depth)
+    def _by(self, options: BvhOptions) -> Built:
+        if options.builder not in DEVICE_BUILDERS or len(self.geometry) < 2:
+            return super()._by(options)
+        nodes, parents, order, root = DEVICE_BUILDERS[options.builder](self.device, self._shape(), options, self.threads)
+        return Built({"nodes": nodes}, order, root.used, root.used + 1, root.height, root.sah_cost, parents)
 
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
-        """The structure over a tree with boxes: Bvh2Node records."""
         return Built({"nodes": nodes}, order, len(nodes), leaves, depth, sah_cost(nodes))
-
-    def _check(self, built: Built) -> None:
-        check_binary(built.arrays["nodes"], len(built.order), kernels.STACK_SIZE)
 
     def _shape(self) -> Any:
         """The geometry on the device. Its faces stay there for the next time."""

@@ -68,7 +68,7 @@ def test_the_device_builds_the_cpus_tree() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 5])
-@pytest.mark.parametrize("accel", ["bvh2", "bvh8"])
+@pytest.mark.parametrize("accel", ["bvh2", "bvh8", "bvh2_sphere", "bvh2_kdop"])
 def test_few_triangles(accel: str, n: int) -> None:
     geometry = geometry_at(places("anywhere", n), 3.0)
     origins = geometry.vertices.reshape(-1, 3, 3).mean(axis=1) + np.float32([0.0, 1.0, -1.0])
