@@ -1,7 +1,7 @@
 """wrt: a Whitted ray tracer on NVIDIA Warp, a model of the RT-core split, and a laboratory for both.
 
-Rays by themselves: load_mesh, Mesh, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits, first_hits,
-contains.
+Rays by themselves: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits,
+first_hits, contains.
 Rays from kernels of your own: kernel, ray_query.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from wrt.accel.build import build as build
     from wrt.accel.build import load_accel as load_accel
     from wrt.accel.contains import contains as contains
+    from wrt.accel.device_geometry import DeviceGeometry as DeviceGeometry
     from wrt.accel.ray_query import ray_query as ray_query
     from wrt.accel.structures import ACCELERATORS as ACCELERATORS
     from wrt.core.errors import InputError as InputError
@@ -69,6 +70,7 @@ _PUBLIC = {
     "wrt.accel.all_hits": ("all_hits", "count_hits", "first_hits"),
     "wrt.accel.build": ("build", "load_accel"),
     "wrt.accel.contains": ("contains",),
+    "wrt.accel.device_geometry": ("DeviceGeometry",),
     "wrt.accel.ray_query": ("ray_query",),
     "wrt.accel.structures": ("ACCELERATORS",),
     "wrt.core.errors": ("InputError", "SceneWarning"),

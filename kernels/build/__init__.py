@@ -1,1 +1,1 @@
-"""Inner loops of the builders that run on the host."""
+"""Inner loops of the builders: most run on the host, lbvh, fit and shape on any device."""

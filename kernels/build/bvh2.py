@@ -73,28 +73,6 @@ def choose_median(data: BuildData, task: BuildTask) -> int:
 
 
 @wp.func
-def choose_morton(data: BuildData, task: BuildTask) -> int:
-    """Where the highest bit in which the range's Morton codes differ turns from 0 to 1.
-
-    Lauterbach et al. 2009, "Fast BVH Construction on GPUs". Halved where the codes are the same, or the tree gets too deep.
-    """
-    half = task.begin + (task.end - task.begin) / 2
-    differ = data.codes[task.begin] ^ data.codes[task.end - 1]
-    if differ == wp.uint64(0) or task.depth + levels(task.end - task.begin) >= MAX_DEPTH:
-        return half
-    low = int(task.begin)
-    high = int(task.end - 1)
-    while low + 1 < high:  # codes[low] has the bit off, codes[high] on
-        middle = low + (high - low) / 2
-        # Below the highest bit of `differ` if and only if it shares that bit with the first.
-        if (data.codes[middle] ^ data.codes[task.begin]) <= (data.codes[middle] ^ data.codes[task.end - 1]):
-            low = middle
-        else:
-            high = middle
-    return high
-
-
-@wp.func
 def choose_sweep(data: BuildData, task: BuildTask) -> int:
     """The cheapest of all splits by the order of the centroids along an axis; the orders are kept by stable partition.
 
@@ -155,7 +133,6 @@ SPLIT = {
     "binned": split_binned,
     "sweep": split_at(choose_sweep),
     "median": split_at(choose_median),
-    "lbvh": split_at(choose_morton),
 }
 
 

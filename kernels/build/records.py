@@ -58,8 +58,8 @@ class BuildOptions:
 
 @wp.struct
 class BuildData:
-    """records: rearranged; codes: Morton codes of the records, ascending (LBVH); of the sweep: boxes: the records as they were,
-    order: for each axis, one after another, the boxes by centroid; area, left, scratch: room, one entry a record.
+    """records: rearranged; of the sweep: boxes: the records as they were, order: for each axis, one after another, the boxes by
+    centroid; area, left, scratch: room, one entry a record.
 
     Of spatial splits: boxes: room; left: which records are in leaves; corners: of triangle i from 3 i on (what is no triangle, a
     sphere, is cut by its box); min_overlap: the least overlap of an object split's sides for a spatial split to be tried, in units
@@ -69,7 +69,6 @@ class BuildData:
     records: wp.array(dtype=BuildRecord)
     nodes: wp.array(dtype=Bvh2Node)
     used: wp.array(dtype=wp.uint8)
-    codes: wp.array(dtype=wp.uint64)
     boxes: wp.array(dtype=BuildRecord)
     order: wp.array(dtype=wp.int32)
     area: wp.array(dtype=wp.float32)

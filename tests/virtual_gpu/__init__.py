@@ -12,8 +12,8 @@ that leave their arrays (likewise) or read what nobody wrote (0xA5); what depend
 CUDA branches that do not compile, or say something else. It counts launches, copies and synchronisations.
 
 It does not find: what NVIDIA's compilers and driver do; speed; a wait that lacks (each call is done when it returns); races
-(threads run one after another). Warp's own CUDA code (Mesh, Bvh, sort, graphs) is not there. sin, pow, exp and the like are the
-host's, not NVIDIA's, whose last bits differ.
+(threads run one after another). A graph is what its capture recorded, and what cannot be captured is an error. Of Warp's own CUDA
+code only a sort is there (no Mesh, no Bvh). sin, pow, exp and the like are the host's, not NVIDIA's, whose last bits differ.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ import warp as wp
 from warp._src import context as warp_context
 
 from tests.virtual_gpu.compiler import SUFFIX
-from tests.virtual_gpu.driver import NAME, Core, Gpus, VirtualGpuError
+from tests.virtual_gpu.driver import NAME, Core, Gpus
+from tests.virtual_gpu.graphs import VirtualGpuError
 
 __all__ = ["NAME", "VirtualGpuError", "gpus", "install"]
 
@@ -54,7 +55,9 @@ def install(devices: int = 2, arch: int = 75, seed: int | None = 0, memory: int 
         """Here the names and the types of a kernel's arguments are known."""
         hooks = get_hooks(self, kernel)
         if self.device.is_cuda:
-            gpus().objects[hooks.forward].arguments = [(each.label, each.type) for each in kernel.adj.args]
+            function = gpus().objects[hooks.forward]
+            function.arguments = [(each.label, each.type) for each in kernel.adj.args]
+            function.dimensions = kernel.adj.kernel_dim
         return hooks
 
     def invoked(kernel: Any, hooks: Any, params: Any, adjoint: bool) -> Any:

@@ -28,6 +28,7 @@ inline int __ffs(int mask) { return __builtin_ffs(mask); }
 inline int __popc(unsigned mask) { return __builtin_popcount(mask); }
 inline int __clz(int mask) { return mask ? __builtin_clz(mask) : 32; }
 inline float __int_as_float(int bits) { return __builtin_bit_cast(float, bits); }
+inline void __threadfence() {}
 inline int __float_as_int(float number) { return __builtin_bit_cast(int, number); }
 
 namespace virtual_gpu {

@@ -7,7 +7,6 @@ import ctypes
 import itertools
 import os
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -20,6 +19,7 @@ from warp._src.codegen import Struct
 from warp._src.types import array_t, matches_array_class, type_size_in_bytes
 
 from tests.virtual_gpu.compiler import SUFFIX, compile_module, entry
+from tests.virtual_gpu.graphs import Counts, Graph, Graphs, VirtualGpuError, address, copied
 from tests.virtual_gpu.memory import Memory
 
 CONTEXT = 1 << 8  # the handle of cuda:0's; cuda:1's is the next
@@ -37,13 +37,9 @@ CONSTANT: dict[str, Any] = {
         "cuda_device_get_pci_bus_id", "cuda_device_get_pci_device_id", "cuda_device_set_mempool_release_threshold",
         "cuda_is_peer_access_supported", "cuda_is_peer_access_enabled", "cuda_is_mempool_access_enabled", "cuda_stream_destroy",
         "cuda_stream_register", "cuda_stream_unregister", "cuda_stream_query", "cuda_stream_wait_event", "cuda_stream_wait_stream",
-        "cuda_stream_is_capturing", "cuda_stream_get_capture_id", "cuda_stream_get_priority", "cuda_event_destroy",
+        "cuda_stream_get_priority", "cuda_event_destroy",
         "cuda_event_query"), 0),
 }
-
-
-class VirtualGpuError(RuntimeError):
-    """What a GPU would answer with an error, later or never."""
 
 
 class Triple(ctypes.Structure):
@@ -61,37 +57,12 @@ RUN = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.POINTER(Grid))
 
 @dataclass
 class Function:
-    """A kernel that is loaded. arguments: their names and types, where Warp knows them."""
+    """A kernel that is loaded. arguments: their names and types, where Warp knows them; dimensions: of its launches."""
 
     name: str
     run: Any
     arguments: list[tuple[str, Any]] = field(default_factory=list)
-
-
-@dataclass
-class Counts:
-    """What has been asked of all devices. launches: by the kernel's name and the device's number; copies: "h2d", "d2h", "d2d" and
-    "p2p" (to another device); synchronisations: waits of the host for a device."""
-
-    launches: Counter[tuple[str, int]] = field(default_factory=Counter)
-    copies: Counter[str] = field(default_factory=Counter)
-    synchronisations: int = 0
-
-    def __str__(self) -> str:
-        copies = ", ".join(f"{n} {kind}" for kind, n in sorted(self.copies.items())) or "none"
-        return (f"{self.launches.total()} launches of {len(self.launches)} kernels, copies: {copies},"
-                f" {self.synchronisations} synchronisations")
-
-
-def address(pointer: Any) -> int:
-    """Of what Warp gives for a pointer: a number, ctypes' pointer, or a structure itself."""
-    if pointer is None or isinstance(pointer, int):
-        return pointer or 0
-    if hasattr(pointer, "_obj"):  # of ctypes.byref
-        return ctypes.addressof(pointer._obj)
-    if isinstance(pointer, ctypes.Structure | ctypes.Array):
-        return ctypes.addressof(pointer)
-    return ctypes.cast(pointer, ctypes.c_void_p).value or 0
+    dimensions: int = 1
 
 
 def arrays_of(name: str, kind: Any, at: int) -> Iterator[tuple[str, array_t, int]]:
@@ -114,7 +85,7 @@ def has_arrays(struct: Struct) -> bool:
                for each in struct.vars.values())
 
 
-class Gpus:
+class Gpus(Graphs):
     """devices: how many; arch: their compute capability, 75 for 7.5; seed: of the order of a grid's threads, None: as they are
     numbered; memory: bytes of each device."""
 
@@ -125,7 +96,7 @@ class Gpus:
         self.handles, self.objects = itertools.count(1 << 12), dict[int, Any]()
         self.local, self.lock = threading.local(), threading.Lock()
         self.at_work = [threading.Lock() for _ in range(devices)]
-        self.streams, self.times = dict[int, int](), dict[int, float]()
+        self.streams, self.times, self.active = dict[int, int](), dict[int, float](), dict[int, Graph]()
 
     # Devices, contexts, streams, events
 
@@ -191,6 +162,7 @@ class Gpus:
         return 1000.0 * (self.times[end] - self.times[begin])
 
     def cuda_context_synchronize(self, *args: Any) -> bool:
+        self.refuse("the host waits for a device")
         with self.lock:
             self.counts.synchronisations += 1
         return True
@@ -200,9 +172,16 @@ class Gpus:
     # Memory
 
     def alloc_device_default(self, context: int, size: int, *args: Any) -> int:
-        return self.memory.allocate(size, context - CONTEXT)
+        at = self.memory.allocate(size, context - CONTEXT)
+        if graph := self.active.get(context):
+            graph.kept[at] = False
+        return at
 
     def free_device_default(self, context: int, at: Any, *args: Any) -> None:
+        for each in (*self.active.values(), *self.objects.values()):
+            if isinstance(each, Graph) and address(at) in each.kept:
+                each.kept[address(at)] = True
+                return
         if address(at):
             self.memory.free(address(at))
 
@@ -221,42 +200,60 @@ class Gpus:
         self.check(f"{kind}: the source", address(of), size, other)
         with self.lock:
             self.counts.copies[kind] += 1
+            self.counts.bytes[kind] += size
         with self.memory.opened():
             ctypes.memmove(address(to), address(of), size)
         return True
 
     def memcpy_h2d(self, context: int, to: Any, of: Any, size: int, stream: Any) -> bool:
+        self.refuse("memory of the host is copied to a device")
         return self.copy("h2d", to, context - CONTEXT, of, None, size)
 
     def memcpy_d2h(self, context: int, to: Any, of: Any, size: int, stream: Any) -> bool:
+        self.refuse("memory of a device is copied to the host")
         return self.copy("d2h", to, None, of, context - CONTEXT, size)
 
     def memcpy_d2d(self, context: int, to: Any, of: Any, size: int, stream: Any) -> bool:
-        return self.copy("d2d", to, context - CONTEXT, of, context - CONTEXT, size)
+        to, of = address(to), address(of)
+        return bool(self.do(context, lambda: self.copy("d2d", to, context - CONTEXT, of, context - CONTEXT, size)))
 
     def memcpy_p2p(self, context: int, to: Any, other: int, of: Any, size: int, stream: Any) -> bool:
         return self.copy("p2p", to, context - CONTEXT, of, other - CONTEXT, size)
 
+    def write(self, what: str, context: int, at: Any, size: int, call: Callable[..., Any], *args: Any) -> Any:
+        """Let the host's function write to so many bytes of a device (0: not known)."""
+        def now() -> Any:
+            self.check(f"{what}: the target", address(at), size, context - CONTEXT)
+            with self.memory.opened():
+                return call(*args)
+
+        return self.do(context, now)
+
     def memset_device(self, context: int, at: Any, value: int, size: int, stream: Any) -> bool:
-        self.check("memset: the target", address(at), size, context - CONTEXT)
-        with self.memory.opened():
-            ctypes.memset(address(at), value, size)
-        return True
+        return bool(self.write("memset", context, at, size, ctypes.memset, address(at), value, size))
 
     def memtile_device(self, context: int, at: Any, value: Any, size: int, count: int) -> None:
-        self.check("fill: the target", address(at), size * count, context - CONTEXT)
-        with self.memory.opened():
-            self.real.wp_memtile_host(at, value, size, count)
+        tile = ctypes.create_string_buffer(ctypes.string_at(address(value), size), size)
+        self.write("fill", context, at, size * count, self.real.wp_memtile_host, at, tile, size, count)
 
     def array_fill_device(self, context: int, *args: Any) -> None:
+        self.refuse("an array with gaps is filled")
         with self.memory.opened():
             self.real.wp_array_fill_host(*args)
 
     def array_copy_device(self, context: int, *args: Any) -> bool:
+        self.refuse("an array with gaps is copied")
         with self.lock:
             self.counts.copies["d2d"] += 1
         with self.memory.opened():
             return bool(self.real.wp_array_copy_host(*args))
+
+    def radix_sort_pairs_uint64_device(self, keys: int, values: int, count: int, *args: Any) -> None:
+        context = self.current[-1]
+        if context is None:
+            raise VirtualGpuError("the sort works in the current context, and there is none (wp.Device.context_guard)")
+        self.check("sort: the values", values, 8 * count, context - CONTEXT)
+        self.write("sort", context, keys, 16 * count, self.real.wp_radix_sort_pairs_uint64_host, keys, values, count, *args)
 
     # Modules
 
@@ -312,16 +309,24 @@ class Gpus:
             x = min(needed, (1 << 24) // threads)
             y = min(-(-needed // x), 65535)
             z = -(-needed // (x * y))
+        values, held = ctypes.cast(arguments, ctypes.POINTER(ctypes.c_void_p)), list[Any]()
+        if self.active.get(context):
+            values, held = copied(values, function.dimensions, (kind for _, kind in function.arguments))
+        self.do(context, lambda: self.run(function, context, (x, y, z, threads), values, held))
+        return 0
+
+    def run(self, function: Function, context: int, size: tuple[int, int, int, int], values: Any, held: list[Any]) -> None:
+        """A grid of x, y, z blocks of so many threads. values: addresses of the arguments, the first of which is the launch's
+        bounds; held: what they are in, if it is not the caller's."""
+        x, y, z, threads = size
         with self.lock:
             order = None if self.random is None else self.random.permutation(x * y * z * threads).astype(np.uint32)
             self.counts.launches[function.name, context - CONTEXT] += 1
         grid = Grid(Triple(x, y, z), Triple(threads, 1, 1), None if order is None else order.ctypes.data)
         with self.at_work[context - CONTEXT], self.memory.opened():
-            values = ctypes.cast(arguments, ctypes.POINTER(ctypes.c_void_p))
             self.check_arguments(function.name, [(name, kind, values[i + 1]) for i, (name, kind) in enumerate(function.arguments)],
-                                 context - CONTEXT)  # the first value is the launch's bounds
-            function.run(address(arguments), grid)
-        return 0
+                                 context - CONTEXT)
+            function.run(ctypes.addressof(values) if held else address(values), grid)
 
     def check_arguments(self, kernel: str, arguments: Iterable[tuple[str, Any, int]], device: int | None) -> None:
         """Raise VirtualGpuError that names the array that the device, or the host (None), cannot reach. arguments: of each name,

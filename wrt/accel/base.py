@@ -6,24 +6,25 @@ import os
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import asdict
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
-from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES, AccelStats, Counters, Hits, Refit, room_for
-from wrt.accel.batches import trace_on_gpu, tracer
+from wrt.accel.answers import AccelStats, Refit
 from wrt.accel.built import Built, State
-from wrt.accel.counting import counted
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries import Queries
 from wrt.accel.ray_query import world_of
-from wrt.accel.rays import Rays, rays_of, vectors
+from wrt.accel.rays import vectors
 from wrt.accel.store import save
 from wrt.accel.structure import Structure, check_options, check_units
-from wrt.core.checks import shown
-from wrt.core.device import start, thread_count, upload
+from wrt.core.arrays import to_numpy
+from wrt.core.device import require_on, start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
 from wrt.core.memory import require
@@ -32,7 +33,7 @@ from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 
 
-class Accelerator(ABC):
+class Accelerator(Queries, ABC):
     """A structure over a geometry, on a device. Subclasses set `name` and `kernels`, and implement `_build`.
 
     Several threads may ask one structure at a time, and one of them may refit it: docs/acceleration.md, "Several threads".
@@ -44,13 +45,17 @@ class Accelerator(ABC):
 
     name: ClassVar[str]
     kernels: Any
+    _options: Mapping[str, Any] = MappingProxyType({})  # that it was built with
     bytes_to_build: ClassVar[float] = 200.0  # of memory for each primitive, at the peak; measured, rounded up
+    bytes_on_device: ClassVar[float] = 120.0  # likewise, of a GPU's: stats.bytes
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
                  box: str = "conservative", **options: Any) -> None:
         self._begin(geometry, device, threads, triangle, box)
         check_options(self.name, self._build, options)
+        self._options = options
         require(len(geometry) * self.bytes_to_build, f"a {self.name} over {len(geometry)} primitives")
+        require_on(self.device, len(geometry) * self.bytes_on_device, f"a {self.name} over {len(geometry)} primitives")
         begin = time.perf_counter()
         built = self._build(**options)
         self._take(built, begin, built.sah_cost)
@@ -73,10 +78,11 @@ class Accelerator(ABC):
         self.device = start(device)
         self._state = State(geometry)
         self._refitting = threading.Lock()
+        self._kept: dict[str, Any] = {}  # what refits go on using
         self.threads = thread_count(threads)
         self.structure = Structure(type(self), Units(triangle, box, len(geometry.spheres) > 0))
         self._surfaces = Surfaces()
-        self._surfaces.n_triangles = len(geometry.faces)
+        self._surfaces.n_triangles = geometry.n_triangles
         self._surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # the caller may change his
 
     @property
@@ -87,7 +93,8 @@ class Accelerator(ABC):
     @property
     def built(self) -> Built:
         """What the builder gave, or the last refit."""
-        return self._state.built
+        built: Built = self._state.built
+        return built.on_host()
 
     @property
     def data(self) -> Any:
@@ -123,25 +130,41 @@ class Accelerator(ABC):
         """The same tree around self.geometry, whose vertices have moved."""
         raise InputError(f"a {self.name} cannot follow vertices that move; build it again, or take bvh2")
 
-    def refit(self, vertices: np.ndarray, rebuild_at: float = np.inf) -> Refit:
-        """Follow vertices that have moved, (V, 3) float32, as many as before: boxes are fitted anew, the tree stays as it is.
+    def _moved(self, vertices: Any) -> Geometry:
+        """The geometry with other vertices. Raises InputError for what these cannot be."""
+        moved = vectors(to_numpy(vertices), "vertices").copy()
+        if moved.shape != (self.geometry.n_vertices, 3):
+            raise InputError(f"vertices must be {(self.geometry.n_vertices, 3)}, got {moved.shape}")
+        return Geometry(moved, self.geometry.faces, self.geometry.spheres)
+
+    def _refit_in_place(self, points: Any) -> None:
+        """As `refit`, in place."""
+        raise InputError(f"a {self.name} cannot be refitted in place; take bvh2")
+
+    def refit(self, vertices: Any, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
+        """Follow vertices that have moved, (V, 3) float32 or a Warp array (V,) of vec3, as many as before: boxes are fitted anew,
+        the tree stays as it is. bvh2 takes a Warp array where it is: of a GPU nothing comes to the host but the growth.
 
         It answers as exactly as a new one, but slower and slower as the motion mixes what was near. rebuild_at: build it anew
-        (with default options) where the SAH cost passes this multiple of what it was when built. Other threads may go on asking:
-        every query that begins before the refit ends answers of the old shape, all others of the new one. Raises InputError for
-        another shape or values that are not finite, and from structures that cannot be refitted.
+        (as it was built) where the SAH cost passes this multiple of what it was when built. Other threads may go on asking:
+        every query that begins before the refit ends answers of the old shape, all others of the new one.
+
+        in_place: from a Warp array on the structure's device into the arrays that there are, for a CUDA graph to capture: after a
+        first call no memory is taken, nothing copied and nothing waited for; the growth is not known (NaN), and no other thread
+        may ask meanwhile. Raises InputError for another shape or values that are not finite (of a Warp array on a GPU they are
+        not looked at), and from structures that cannot be refitted.
         """
-        moved = vectors(vertices, "vertices").copy()
-        if moved.shape != self.geometry.vertices.shape:
-            raise InputError(f"vertices must be {self.geometry.vertices.shape}, got {moved.shape}")
         with self._refitting:
             begin, before = time.perf_counter(), self._state
+            if in_place:
+                self._refit_in_place(vertices)
+                return Refit(time.perf_counter() - begin, float("nan"), False)
             beside = copy(self)  # has the new shape while others still ask for the old one
-            beside._state = State(replace(before.geometry, vertices=moved))
+            beside._state = State(self._moved(vertices))
             built, built_cost = beside._refit(before.built), before.built_cost
             growth = float(built.sah_cost) / float(built_cost) if built_cost > 0.0 else 1.0
             if rebuilt := growth > rebuild_at:
-                built = beside._build()
+                built = beside._build(**self._options)
                 built_cost = built.sah_cost
             beside._take(built, begin, built_cost)
             self._state = beside._state
@@ -161,7 +184,7 @@ class Accelerator(ABC):
         from wrt.accel.bvh.epo import end_point_overlap
 
         state = self._state
-        return end_point_overlap(self._children(state.built), state.geometry, self.threads)
+        return end_point_overlap(self._children(state.built.on_host()), state.geometry, self.threads)
 
     def _upload(self, built: Built) -> Any:
         data = self.structure.struct()
@@ -169,11 +192,14 @@ class Accelerator(ABC):
         for name, array in built.arrays.items():
             kind = types[name]
             is_array = isinstance(kind, wp.array)
-            setattr(data, name, upload(array, kind.dtype, self.device) if is_array else kind(*np.ravel(array)))
-        data.primitives = upload(self._primitives(built), types["primitives"].dtype, self.device)
+            setattr(data, name, self._there(array, kind.dtype) if is_array else kind(*np.ravel(array)))
+        data.primitives = self._there(self._primitives(built), types["primitives"].dtype)
         return data
 
-    def _primitives(self, built: Built) -> np.ndarray:
+    def _there(self, array: Any, dtype: Any) -> Any:
+        return array if isinstance(array, wp.array) else upload(array, dtype, self.device)
+
+    def _primitives(self, built: Built) -> Any:
         """What the struct's `primitives` holds: the triangle test's records, in the order of the leaves."""
         return self.geometry.primitives(self.structure.units, built.order, self.threads)
 
@@ -190,55 +216,6 @@ class Accelerator(ABC):
         units = self.structure.units
         return html_facts(type(self).__name__, {"primitives": len(self.geometry), "triangle test": units.triangle,
                                                 "box test": units.box, "device": str(self.device), **asdict(self.stats)})
-
-    def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-                    threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits | None = None) -> Hits:
-        """The closest hit of each ray in the closed segment [t_min, t_max]; at equal t the lowest prim_id.
-
-        Closed means that a surface through the origin is hit at t_min = 0; a t_min above 0 leaves it out. origins,
-        directions: (N, 3) real numbers, taken as float32; origins up to 1e37, so that differences are finite; directions finite,
-        not zero and of any length (where t would be beyond float32, there is no hit); t_min (>= 0), t_max: scalars or (N,).
-        float32 without gaps is read where it is, all else is copied part by part. Warp arrays are (N,) vec3, and of their values
-        only t_min and t_max are looked at, on the CPU. threads: 1 or more, or one a core. counters: count what each ray costs
-        (hits.counters); trace: also record what it fetches, which takes a second run. out: hits of as many rays, whose arrays take
-        the new ones (NumPy's, or Warp's if the rays are; they must not overlap with the rays' own).
-
-        Several threads may ask at a time, with or without counters, while another refits. There are no gradients: Warp arrays
-        that require them are refused while a wp.Tape records. Raises InputError that names the argument and what was expected;
-        what `out` holds is lost then.
-        """
-        threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
-        if not (out is None or isinstance(out, Hits)):
-            raise InputError(f"out must be Hits, got {shown(out)}")
-        given = None if out is None else [out.t, out.u, out.v, out.prim_id]
-        t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
-        return Hits(t, u, v, prim_id, _answer(self, rays, arrays, threads, trace if counters or trace else None))
-
-    def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-                threads: int | None = None, *, out: Any = None) -> Any:
-        """Whether each ray hits anything in its segment: (N,) bool, True where closest_hit finds a hit and nowhere else. Arguments
-        as in closest_hit; out: an array that takes the answer."""
-        threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
-        given = None if out is None else [out]
-        arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
-        _answer(self, rays, arrays, threads)
-        return arrays[0]
-
-
-def _answer(accel: Accelerator, rays: Rays, out: list[Any], threads: int, counting: bool | None = None) -> Counters | None:
-    """Write the answers to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a trace or without; None: not at all."""
-
-    def trace(structure: Structure, data: Any) -> None:
-        if accel.device.is_cuda:
-            trace_on_gpu(structure, data, accel._surfaces, rays, out, accel.device)
-        else:
-            tracer(structure, len(out) == 1).trace(data, accel._surfaces, rays, out, threads)
-
-    data = accel.data  # once: a refit may replace it meanwhile
-    if counting is None:
-        trace(accel.structure, data)
-        return None
-    return counted(trace, accel.structure, data, len(out[0]), accel.device, counting)
 
 
 def array_bytes(data: Any) -> int:

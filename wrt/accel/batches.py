@@ -14,7 +14,8 @@ from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES
 from wrt.accel.rays import Rays, rays_on
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.core.arrays import to_warp
-from wrt.core.device import empty_aligned, load_kernel, made_once, run_all
+from wrt.core.device import empty_aligned, free_memory, load_kernel, made_once, run_all
+from wrt.core.memory import SMALL as SMALL_BYTES
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Surfaces, fields_of
 from wrt.kernels.wide.packets import Scratch
@@ -23,6 +24,8 @@ from wrt.kernels.wide.packets import Scratch
 # are not divided. A thread takes one part after another, about PARTS of them, so that all threads end at about the same time.
 FEWEST, MOST, PARTS = 8192, 131072, 8
 RAYS_PER_LAUNCH = 16384  # one at a time
+MOST_ON_GPU = 1 << 26  # rays from the host that are on a GPU at once: 3 GB with their hits; a kernel counts in int32
+BYTES_OF_RAY = 48  # with its hit
 SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
 
 
@@ -146,16 +149,26 @@ def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: 
                 target[to] = source[rows]
 
 
+def rays_on_gpu(n: int, device: Any) -> int:
+    """How many rays from the host go there at once: no more than half of what is free has room for."""
+    most = MOST_ON_GPU if n * BYTES_OF_RAY <= SMALL_BYTES else min(MOST_ON_GPU, int(free_memory(device) / 2.0 / BYTES_OF_RAY))
+    return max(most, FEWEST)
+
+
 def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out: list[Any], device: Any) -> None:
-    """As Tracer.trace."""
-    there = [array if isinstance(array, wp.array) else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device)
-             for array in out]
-    hits = HitArrays()
-    for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
-        setattr(hits, name, array)
+    """As Tracer.trace. What is Warp's is traced in one launch; what comes from the host in parts of MOST_ON_GPU."""
     kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
-    inputs = [data, surfaces, rays_on(device, rays), hits if len(out) > 1 else there[0], 0]
-    wp.launch(kernel, dim=len(out[0]), inputs=inputs, device=device, record_tape=False)
-    for array, found in zip(out, there, strict=True):
-        if array is not found:
-            array[:] = found.numpy()
+    n = len(out[0])
+    part = n if rays.as_warp else rays_on_gpu(n, device)
+    for first in range(0, n, max(part, 1)):
+        some = slice(first, min(first + part, n))
+        there = [array[some] if isinstance(array, wp.array)
+                 else wp.empty(some.stop - first, dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
+        hits = HitArrays()
+        for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
+            setattr(hits, name, array)
+        inputs = [data, surfaces, rays_on(device, rays if part == n else rays.part(some)), hits if len(out) > 1 else there[0], 0]
+        wp.launch(kernel, dim=some.stop - first, inputs=inputs, device=device, record_tape=False)
+        for array, found in zip(out, there, strict=True):
+            if not isinstance(array, wp.array):
+                array[some] = found.numpy()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
+import warp as wp
 
 from wrt.accel.geometry import Geometry
 
@@ -15,14 +15,24 @@ class Built:
     """What a builder gives: arrays, one for each field of the structure's struct but `primitives` and `recorder`, records or
     rows of numbers (a field that is no array: a NumPy scalar or row); order: (R,) int32, the prim_id of each record of
     `primitives`, where one may stand more than once, unless cells share records: then there is an array `references` of their
-    indices; and what AccelStats tells of a tree."""
+    indices; and what AccelStats tells of a tree.
 
-    arrays: dict[str, np.ndarray]
-    order: np.ndarray
+    What was made on a device is there: then arrays and order are Warp's, and parents is the parent of each node."""
+
+    arrays: dict[str, Any]
+    order: Any
     nodes: int = 0
     leaves: int = 0
     depth: int = 0
     sah_cost: float = float("nan")
+    parents: Any = None
+
+    def on_host(self) -> Built:
+        """The same with NumPy arrays."""
+        if not isinstance(self.order, wp.array):
+            return self
+        return replace(self, arrays={name: array.numpy() for name, array in self.arrays.items()}, order=self.order.numpy(),
+                       parents=None)
 
     @property
     def references(self) -> int:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
+from typing import Any
 
 import numpy as np
+import warp as wp
 
 from wrt.accel.triangle_data import LAYOUTS
-from wrt.core.device import records, run_all
+from wrt.core.device import records, run_all, upload
+from wrt.kernels.build.shape import Shape
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST
 from wrt.scene.mesh import Mesh
@@ -41,12 +44,25 @@ class Geometry:
         """How many of the primitives are triangles: they come before the spheres."""
         return len(self.faces)
 
+    @property
+    def n_vertices(self) -> int:
+        """How many vertices there are."""
+        return len(self.vertices)
+
     def digest(self) -> str:
         """SHA-256 of the arrays: the same for the same geometry, whatever file it came from."""
         out = sha256()
         for array in (self.vertices, self.faces, self.spheres):
             out.update(f"{array.shape}{array.dtype.str}".encode() + np.ascontiguousarray(array).tobytes())
         return out.hexdigest()
+
+    def on(self, device: Any, faces: Any = None) -> Any:
+        """The same on a device (a Warp device): kernels.build.shape.Shape. faces: those that are there already."""
+        shape = Shape()
+        shape.vertices = upload(self.vertices, wp.vec3, device)
+        shape.faces = upload(self.faces, wp.vec3i, device) if faces is None else faces
+        shape.spheres = upload(self.spheres, wp.vec4, device)
+        return shape
 
     def bounds(self, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corner of every primitive's padded box, two (N, 3) float32."""

@@ -135,7 +135,7 @@ class Instances(Accelerator):
     def _build(self, *args: Any, **options: Any) -> Built:
         raise InputError("instances are built by wrt.build")
 
-    def refit(self, vertices: np.ndarray, rebuild_at: float = np.inf) -> Refit:
+    def refit(self, vertices: Any, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
         """Raises InputError: one array of vertices cannot say where instances go."""
         raise InputError("instances cannot follow vertices that move; build them again")
 

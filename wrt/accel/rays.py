@@ -30,6 +30,9 @@ class Rays(NamedTuple):
     def as_warp(self) -> bool:
         return isinstance(self.origins, wp.array)
 
+    def part(self, rows: slice) -> Rays:
+        return Rays(*(array[rows] for array in self))
+
     def on(self, device: Any) -> Rays:
         """The same, with Warp arrays of other devices copied to this one."""
         return Rays(*(array.to(device) if isinstance(array, wp.array) else array for array in self))
@@ -65,7 +68,17 @@ def rays_on(device: Any, rays: Rays) -> RayArrays:
     out = RayArrays()
     for name, array, dtype in zip(fields_of(RayArrays), rays.checked().on(device), (wp.vec3, wp.vec3, wp.float32, wp.float32),
                                   strict=True):
-        setattr(out, name, array if isinstance(array, wp.array) else upload(array, dtype, device))
+        if not isinstance(array, wp.array):
+            array = one_for_all(float(array[0]), len(array), device) if array.strides == (0,) else upload(array, dtype, device)
+        setattr(out, name, array)
+    return out
+
+
+def one_for_all(value: float, n: int, device: Any) -> Any:
+    """An array of n times the same number, which is there once: written by the device, so that a graph can capture it."""
+    one = wp.full(1, value, dtype=wp.float32, device=device)
+    out = wp.array(ptr=one.ptr, shape=(n,), strides=(0,), dtype=wp.float32, device=device)
+    out._ref = one  # it has no memory of its own
     return out
 
 

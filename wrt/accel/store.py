@@ -56,7 +56,7 @@ def check_target(path: str | os.PathLike[str]) -> None:
 def save(structure: Structure, state: State, path: str | os.PathLike[str]) -> None:
     """Write it whole or not at all. Raises InputError where the system refuses."""
     check_target(path)
-    units, built = structure.units, state.built
+    units, built = structure.units, state.built.on_host()
     rows = {name: np.ascontiguousarray(np.atleast_1d(array)) for name, array in built.arrays.items()}
     types = array_types(structure.accel, units.triangle)
     body = [rows[name].astype(types[name].base, copy=False).tobytes() for name in types]

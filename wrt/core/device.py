@@ -27,11 +27,12 @@ from wrt.core.address_space import LLVM, is_limited, require_warp, room_to_compi
 from wrt.core.checks import shown
 from wrt.core.compiler import first_with_headers, prepare_compiler
 from wrt.core.errors import InputError
-from wrt.core.memory import available
+from wrt.core.memory import SMALL, available, gib
 from wrt.core.seconds import loading
 from wrt.core.write_file import compiling
 
 MOST_HELPERS = 1 << 10
+MOST_ROWS = (1 << 31) - 1
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
 
 wp.config.log_level = wp.LOG_WARNING if hasattr(wp, "LOG_WARNING") else 30
@@ -118,6 +119,13 @@ def free_memory(device: Any) -> float:
     return float(device.free_memory) if device.is_cuda else max(available() - (LLVM if is_limited() else 0.0), 0.0)
 
 
+def require_on(device: Any, needed: float, what: str) -> None:
+    """Raise InputError, which tells both numbers, where `what` takes more bytes than a GPU has free. (Of the CPU's memory:
+    wrt.core.memory.require.)"""
+    if device.is_cuda and needed > SMALL and needed > (there := free_memory(device)):
+        raise InputError(f"{what} takes {gib(needed)} of the memory of {device}; {gib(there)} are free")
+
+
 class _Loaded:
     """On which devices (their names) a kernel is loaded; Warp would look at files again each time."""
 
@@ -180,7 +188,11 @@ def _require_room_to_compile(cache: Path) -> None:
 
 
 def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:
-    """A Warp array of `dtype` (a Warp type or struct) from rows of a NumPy array; on the CPU without a copy if it fits."""
+    """A Warp array of `dtype` (a Warp type or struct) from rows of a NumPy array; on the CPU without a copy if it fits. Raises
+    InputError for more rows than kernels, whose indices are int32, can reach; the bytes of a row do not count."""
+    if len(array) > MOST_ROWS:
+        raise InputError(f"{len(array)} rows of {dtype.__name__ if isinstance(dtype, type) else dtype.key} are more than an array"
+                         f" on a device can have, 2^31 - 1; a binary tree (bvh2) has the fewest")
     if hasattr(dtype, "numpy_dtype"):  # a struct
         array = np.ascontiguousarray(array)
     else:
@@ -276,6 +288,15 @@ def launch(kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -
         wp.launch(kernel, dim=min(step or n, n - first), device=cpu, inputs=[first if each is None else each for each in inputs])
 
     run_all([partial(job, first) for first in range(0, n, step or max(n, 1))], threads)
+
+
+def launch_on(device: Any, kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -> None:
+    """As `launch` on the CPU; on a GPU one launch over all of n."""
+    if device.is_cpu:
+        launch(kernel, n, *inputs, threads=threads, step=step)
+    elif n:
+        load_kernel(kernel, device)
+        wp.launch(kernel, dim=n, device=device, inputs=[0 if each is None else each for each in inputs], record_tape=False)
 
 
 def run_growing(begin: Callable[[Any], tuple[Callable[[], Any], Callable[[], Iterable[Any]]]], tasks: Iterable[Any],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,13 @@ class DeviceFilm:
             for name, array in {**shared, **own}.items():
                 setattr(film, name, array)
             self.groups.append(film)
+        self._read: dict[int, np.ndarray] | None = None  # what a snapshot has copied, by address
+
+    def snapshot(self) -> DeviceFilm:
+        """The same film to be read: of a GPU's arrays each is copied once, when it is first asked for."""
+        out = copy(self)
+        out._read = {}
+        return out
 
     def arrays(self) -> list[tuple[str, Any]]:
         """Everything that samples change, by name: the shared arrays, then those of each group."""
@@ -67,7 +75,11 @@ class DeviceFilm:
 
     def view(self, array: Any) -> np.ndarray:
         """A device array of one entry a pixel as (H, W) or (H, W, 3); on the CPU without a copy."""
-        pixels = array.numpy()
+        pixels = None if self._read is None else self._read.get(array.ptr)
+        if pixels is None:
+            pixels = array.numpy()
+            if self._read is not None:
+                self._read[array.ptr] = pixels
         return pixels.reshape(*self.shape, *pixels.shape[1:])
 
     def picture(self, array: Any) -> np.ndarray:
@@ -118,7 +130,7 @@ class DeviceFilm:
 
         inf where a pixel has no samples.
         """
-        return math.sqrt(float(self._over_groups()[1].mean()))
+        return math.sqrt(float(self.snapshot()._over_groups()[1].mean()))
 
     def _over_groups(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean of the groups' means and its estimated variance, (H, W, 3) float64, one group in memory at a time; the

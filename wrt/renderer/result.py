@@ -17,6 +17,7 @@ from wrt.scene.model import Scene
 def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray], seconds: dict[str, float],
             facts: dict[str, Any]) -> Film:
     """The film with its statistics. facts: of the scene, its structure and the run's end, which go into them as they are."""
+    arrays = arrays.snapshot()
     options, settings, samples = plan.options, plan.scene.settings, arrays.samples()
     total = max(int(samples.sum()), 1)
     rays = arrays.count("rays")
@@ -37,11 +38,15 @@ def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray
         "seconds": round(seconds["trace"], 3), "version": VERSION, "max_depth": settings.max_depth, "filter": settings.filter,
         "accel": options.accel, "device": ",".join(options.devices or [options.device]),
     }
-    return replace(film_so_far(plan, arrays), aov=aov, stats=stats, metadata=metadata)
+    return replace(_pixels(plan, arrays), aov=aov, stats=stats, metadata=metadata)
 
 
 def film_so_far(plan: Plan, arrays: DeviceFilm) -> Film:
     """The pixels alone."""
+    return _pixels(plan, arrays.snapshot())
+
+
+def _pixels(plan: Plan, arrays: DeviceFilm) -> Film:
     settings = plan.scene.settings
     return Film(*arrays.pixels_and_variance(), arrays.samples(), exposure=settings.exposure, tonemap=settings.tonemap)
 

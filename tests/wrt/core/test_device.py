@@ -235,3 +235,9 @@ def test_a_read_only_kernel_cache_without_the_kernel_is_one_message(tmp_path: Pa
     (cache,) = tmp_path.iterdir()
     assert done.stdout == f"{cache}: kernels cannot be compiled: Permission denied (WARP_CACHE_PATH names another folder)\n", done
     assert not list(cache.iterdir()) and done.stderr == ""
+
+
+def test_more_rows_than_an_index_reaches_are_refused() -> None:
+    rows = np.broadcast_to(np.zeros(3, np.float32), (1 << 31, 3))
+    with pytest.raises(InputError, match=r"2147483648 rows of vec3\w* are more than an array on a device can have"):
+        upload(rows, wp.vec3, "cpu")

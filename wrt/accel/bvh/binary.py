@@ -2,42 +2,142 @@
 
 from __future__ import annotations
 
+import time
+from abc import abstractmethod
+from copy import copy
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import warp as wp
 
 from wrt.accel.base import Accelerator
-from wrt.accel.built import Built
-from wrt.accel.bvh.builders import BvhOptions, build_binary, sah_cost
-from wrt.accel.bvh.refit import refit_nodes
+from wrt.accel.built import Built, State
+from wrt.accel.bvh.builders import DEVICE_BUILDERS, BvhOptions, build_binary, sah_cost
+from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
+from wrt.accel.device_geometry import DeviceGeometry
+from wrt.accel.geometry import Geometry
 from wrt.accel.store import check_binary
+from wrt.core.device import launch_on, upload
+from wrt.core.errors import InputError
+from wrt.kernels.build.shape import write_corners
+from wrt.kernels.structs import Primitive
 from wrt.kernels.traverse import bvh2 as kernels
 
+RECORDS_PER_JOB = 32768
 
-class Bvh2(Accelerator):
+
+class InPlace(NamedTuple):
+    """What refits in place work with: room; kernels.build.fit.Tree; the Shape that they copy the points into."""
+
+    fitting: Fitting
+    tree: Any
+    shape: Any
+
+
+class BinaryBvh(Accelerator):
     """Options: builder (a name in wrt.accel.bvh.builders.BVH_BUILDERS), max_leaf (1 to 64 primitives), cost_traversal and
     cost_intersection (of the SAH), split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
 
-    name = "bvh2"
-    kernels = kernels
-
     def _build(self, builder: str = "binned", max_leaf: int = 4, cost_traversal: float = 1.0,
                cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
-        options = BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget)
+        return self._by(BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget))
+
+    def _by(self, options: BvhOptions) -> Built:
         tree = build_binary(self.geometry, options, self.threads)
         return self._around(tree.nodes, tree.order, tree.leaves, tree.depth)
 
+    @abstractmethod
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         """The structure over a tree with boxes: Bvh2Node records."""
-        return Built({"nodes": nodes}, order, len(nodes), leaves, depth, sah_cost(nodes))
 
     def _check(self, built: Built) -> None:
         check_binary(built.arrays["nodes"], len(built.order), kernels.STACK_SIZE)
 
+
+class Bvh2(BinaryBvh):
+    __doc__ = BinaryBvh.__doc__
+
+    name = "bvh2"
+    kernels = kernels
+
+    def _by(self, options: BvhOptions) -> Built:
+        if options.builder not in DEVICE_BUILDERS or len(self.geometry) < 2:
+            return super()._by(options)
+        nodes, parents, order, root = DEVICE_BUILDERS[options.builder](self.device, self._shape(), options, self.threads)
+        return Built({"nodes": nodes}, order, root.used, root.used + 1, root.height, root.sah_cost, parents)
+
+    def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
+        return Built({"nodes": nodes}, order, len(nodes), leaves, depth, sah_cost(nodes))
+
+    def _shape(self) -> Any:
+        """The geometry on the device. Its faces stay there for the next time."""
+        shape = self.geometry.on(self.device, self._kept.get("faces"))
+        self._kept["faces"] = shape.faces
+        return shape
+
+    def _on_device(self, built: Built) -> Built:
+        """With arrays that are on the device, and the parents."""
+        nodes, order = built.arrays["nodes"], built.order
+        if not isinstance(order, wp.array):
+            nodes, order = upload(nodes.copy(), kernels.Bvh2Node, self.device), upload(order.copy(), wp.int32, self.device)
+        return replace(built, arrays={"nodes": nodes}, order=order,
+                       parents=parents_of(nodes) if built.parents is None else built.parents)
+
+    def _moved(self, vertices: Any) -> Geometry:
+        if not isinstance(vertices, wp.array):
+            return super()._moved(vertices)
+        points = wp.clone(self._points(vertices), device=self.device)
+        return DeviceGeometry.moved(points, self._shape().faces, self.geometry.spheres)
+
+    def _points(self, vertices: Any) -> Any:
+        points = DeviceGeometry.points_of(vertices, "vertices")
+        if len(points) != self.geometry.n_vertices:
+            raise InputError(f"vertices must be ({self.geometry.n_vertices},), got ({len(points)},)")
+        return points
+
     def _refit(self, built: Built) -> Built:
-        nodes = refit_nodes(built.arrays["nodes"], built.order, self.geometry)
-        return replace(built, arrays={"nodes": nodes}, sah_cost=sah_cost(nodes))
+        """On the device; to the host comes what the tree costs."""
+        built = self._on_device(built)
+        nodes = wp.clone(built.arrays["nodes"])
+        fitting = Fitting(self.device, len(self.geometry), len(nodes))
+        fitting.refit(tree_of(fitting, nodes, built.parents, built.order), self._shape(), self.threads)
+        return replace(built, arrays={"nodes": nodes}, sah_cost=fitting.root().sah_cost)
+
+    def _refit_in_place(self, points: Any) -> None:
+        points = self._points(points)
+        if points.device != self.device or self.structure.units.triangle_test.layout != "corners":
+            raise InputError(f"a refit in place is from a Warp array on {self.device}, for the watertight triangle test")
+        kept: InPlace | None = self._kept.get("in place")
+        if kept is None or kept.tree.nodes is not self.data.nodes:
+            if self.device.is_capturing:
+                raise InputError("refit in place once before a graph captures it: then what it works with is there")
+            kept = self._kept["in place"] = self._begin_in_place(points)
+        wp.copy(kept.shape.vertices, points)
+        kept.fitting.refit(kept.tree, kept.shape, self.threads)
+        self._write_corners(kept.shape, kept.tree.order, self.data.primitives)
+
+    def _begin_in_place(self, points: Any) -> InPlace:
+        """Arrays of its own for the structure, and what is kept beside them."""
+        built, spheres = self._on_device(self._state.built), self.geometry.spheres
+        built = replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])}, sah_cost=float("nan"))
+        beside = copy(self)
+        beside._state = State(DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres))
+        beside._take(built, time.perf_counter(), self._state.built_cost)
+        fitting, shape = Fitting(self.device, len(self.geometry), built.nodes), beside._shape()
+        self._state = beside._state
+        return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)
+
+    def _primitives(self, built: Built) -> Any:
+        """On the device where the order is there, and the triangle test reads corners."""
+        if not isinstance(built.order, wp.array) or self.structure.units.triangle_test.layout != "corners":
+            return super()._primitives(built.on_host())
+        out = wp.empty(len(built.order), dtype=Primitive, device=self.device)
+        self._write_corners(self._shape(), built.order, out)
+        return out
+
+    def _write_corners(self, shape: Any, order: Any, out: Any) -> None:
+        launch_on(self.device, write_corners, len(order), shape, order, out, None, threads=self.threads, step=RECORDS_PER_JOB)
 
     def _children(self, built: Built) -> Any:
         from wrt.accel.bvh.epo import children

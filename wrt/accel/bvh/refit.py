@@ -1,21 +1,88 @@
-"""Binary trees that follow their vertices."""
+"""Binary trees that follow their vertices, on any device (the kernels are kernels/build/fit.py)."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
+from wrt.accel.bvh.tree import half_areas
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch, start, upload
-from wrt.kernels.build.refit import refit
+from wrt.core.device import launch_on, start, upload
+from wrt.kernels.build import fit as kernels
+from wrt.kernels.build.records import BuildOptions
+from wrt.kernels.build.shape import bounds
 from wrt.kernels.traverse.bvh2 import Bvh2Node
+
+PRIMITIVES_PER_JOB = 32768
+
+
+class Root(NamedTuple):
+    """What the host asks of a whole tree. used: inner nodes; height: of these on the longest way; sah_cost: as in AccelStats."""
+
+    used: int
+    height: int
+    sah_cost: float
+
+
+@dataclass(eq=False)
+class Fitting:
+    """Room on a device to fit a tree of so many nodes around so many primitives: taken once, used as often as they move."""
+
+    device: Any
+    primitives: int
+    nodes: int
+
+    def __post_init__(self) -> None:
+        self.low, self.high = (wp.empty(self.primitives, dtype=wp.vec3, device=self.device) for _ in range(2))
+        self.arrived = wp.zeros(self.nodes, dtype=wp.int32, device=self.device)
+        self.below = wp.empty(self.nodes, dtype=kernels.Below, device=self.device)
+
+    def find_bounds(self, shape: Any, threads: int = 1) -> None:
+        """Of each primitive of a kernels.build.shape.Shape."""
+        launch_on(self.device, bounds, self.primitives, shape, self.low, self.high, None, threads=threads, step=PRIMITIVES_PER_JOB)
+
+    def fit(self, tree: Any, options: Any) -> None:
+        launch_on(self.device, kernels.fit, self.nodes, tree, options)
+
+    def refit(self, tree: Any, shape: Any, threads: int = 1) -> None:
+        """Only the boxes change. Boxes of spatial splits become those of the whole triangles. On a GPU two launches and nothing
+        else: a graph can capture them."""
+        self.find_bounds(shape, threads)
+        options = BuildOptions()
+        options.row = 1
+        self.fit(tree, options)
+
+    def root(self) -> Root:
+        """Of the tree that was fitted last."""
+        root = self.below[:1].numpy()[0]
+        area, plain = float(half_areas(root["lo"], root["hi"])), float(root["plain"])
+        return Root(int(root["used"]), int(root["height"]), plain / area if area > 0.0 else float(root["size"]))
+
+
+def tree_of(fitting: Fitting, nodes: Any, parents: Any, order: Any) -> Any:
+    """kernels.build.fit.Tree."""
+    tree = kernels.Tree()
+    tree.nodes, tree.parents, tree.order = nodes, parents, order
+    for name in ("low", "high", "arrived", "below"):
+        setattr(tree, name, getattr(fitting, name))
+    return tree
+
+
+def parents_of(nodes: Any) -> Any:
+    """Of each of Bvh2Node records on a device, there."""
+    parents = wp.empty(len(nodes), dtype=wp.int32, device=nodes.device)
+    launch_on(nodes.device, kernels.find_parents, len(nodes), nodes, parents)
+    return parents
 
 
 def refit_nodes(nodes: np.ndarray, order: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Copies of Bvh2Node records, a parent before its children, whose boxes fit the geometry as it is now; order: (R,) int32, the
-    prim_id of each primitive that the leaves name. Boxes of spatial splits become those of the whole triangles."""
+    """Copies of Bvh2Node records whose boxes fit the geometry as it is now; order: (R,) int32, the prim_id of each primitive that
+    the leaves name."""
     cpu = start("cpu")
-    lo, hi = geometry.bounds()
-    device_nodes = upload(nodes.copy(), Bvh2Node, cpu)
-    launch(refit, 1, device_nodes, upload(order.copy(), wp.int32, cpu), upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu))
-    return np.asarray(device_nodes.numpy()).copy()
+    there = upload(nodes.copy(), Bvh2Node, cpu)
+    fitting = Fitting(cpu, len(geometry), len(nodes))
+    fitting.refit(tree_of(fitting, there, parents_of(there), upload(order.copy(), wp.int32, cpu)), geometry.on(cpu))
+    return np.asarray(there.numpy()).copy()

@@ -26,14 +26,6 @@ def build_median(geometry: Geometry, options: BvhOptions, threads: int) -> Binar
     return split_ranges("median", primitive_records(geometry, threads), options, threads)
 
 
-def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Along a Morton curve (Lauterbach et al. 2009): the least work, and the worst tree but for the median's."""
-    lo, hi = geometry.bounds(threads)
-    codes = morton_codes(0.5 * lo + 0.5 * hi)
-    order = np.argsort(codes, kind="stable")
-    return split_ranges("lbvh", in_order(lo, hi, order), options, threads, codes=codes[order])
-
-
 def build_sweep(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """Full-sweep SAH: every split of a range by centroid, along all three axes."""
     lo, hi = geometry.bounds(threads)
@@ -59,22 +51,6 @@ def in_order(lo: np.ndarray, hi: np.ndarray, order: np.ndarray | None = None) ->
     build["prim_id"] = np.arange(len(lo)) if order is None else order
     build["lo"], build["hi"] = (lo, hi) if order is None else (lo[order], hi[order])
     return build
-
-
-def morton_codes(points: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 -> (N,) uint64: 21 bits of each coordinate, relative to the box of all that are finite."""
-    points = np.where(np.isfinite(points), points, 0.0).astype(np.float64)
-    low = points.min(axis=0, initial=np.inf)
-    extent = points.max(axis=0, initial=-np.inf) - low
-    cell = (points - low) * ((2.0**21 - 1.0) / np.where(extent > 0.0, extent, 1.0))
-    codes = np.zeros(len(points), np.uint64)
-    for axis in range(3):
-        bits = cell[:, axis].astype(np.uint64)
-        for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-                            (2, 0x1249249249249249)):
-            bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
-        codes |= bits << np.uint64(2 - axis)
-    return codes
 
 
 def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: int, **arrays: np.ndarray) -> BinaryTree:

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
-from wrt.accel.bvh.binary import Bvh2
+from wrt.accel.bvh.binary import BinaryBvh
 from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.refit import refit_nodes
 from wrt.accel.bvh.tree import expected_cost, root_area
@@ -27,12 +26,11 @@ NODES_PER_LAUNCH = 512
 SQRT_3 = np.float32(1.7320510)  # rounded up
 
 
-class Bvh2Sphere(Bvh2):
+class Bvh2Sphere(BinaryBvh):
     """Bounding spheres around the primitives' padded boxes. Options: those of bvh2."""
 
     name = "bvh2_sphere"
     kernels = traverse_bvh2_sphere
-    _children = Accelerator._children  # there is no end-point overlap of spheres
 
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         spheres = fit_spheres(nodes, order, self.geometry, self.threads)
@@ -50,7 +48,7 @@ class Bvh2Sphere(Bvh2):
         return self._around(boxes_around(built, there, self.geometry), built.order, built.leaves, built.depth)
 
 
-class Bvh2Kdop(Bvh2):
+class Bvh2Kdop(BinaryBvh):
     """14-DOPs: the boxes of bvh2, cut by eight planes askew. Options: those of bvh2.
 
     k-DOPs rather than oriented boxes: their planes are the same everywhere, so that they are fitted from the leaves up without a
@@ -60,7 +58,6 @@ class Bvh2Kdop(Bvh2):
     name = "bvh2_kdop"
     kernels = traverse_bvh2_kdop
     bytes_to_build = 300.0
-    _children = Accelerator._children
 
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         middle = middle_of(nodes)

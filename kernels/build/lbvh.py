@@ -1,0 +1,195 @@
+"""A binary BVH along a Morton curve, every node by a thread of its own, on the CPU and on CUDA.
+
+Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees": primitives are sorted by the Morton code
+of their middle, and each inner node finds by itself which range of them it holds and where that is split. Then `fit` makes boxes
+and leaves from the bottom up, and `emit` writes what is left, in the order of a walk.
+"""
+
+import warp as wp
+
+from wrt.kernels.build.fit import NO_PARENT, Below, Tree
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse.bvh2 import Bvh2Node
+
+PARTS = 1024  # of the primitives, whose middles are measured by a thread each
+MOST_BITS = 21  # of a coordinate
+KEY_BITS = 63
+
+
+def bits_of(n: int) -> tuple[int, int]:
+    """Of keys for n primitives: bits of the number of a primitive, and of each coordinate.
+
+    Keys are different from each other, so that a node for each bit is the longest way down: with one bit left, it fits on the
+    traversal's stack, wherever the primitives are. Many of them have fewer bits for a coordinate: 14 for a million.
+    """
+    number = max(n - 1, 1).bit_length()
+    return number, min(MOST_BITS, (KEY_BITS - number) // 3)
+
+
+@wp.func
+def middle_of(low: wp.vec3, high: wp.vec3) -> wp.vec3:
+    """0 where it is not finite."""
+    middle = 0.5 * low + 0.5 * high
+    return wp.where(wp.isfinite(middle), middle, wp.vec3(0.0, 0.0, 0.0))
+
+
+@kernel
+def measure(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3)):
+    """The box of every PARTS-th middle, from that of the thread on: ends[2 i], ends[2 i + 1]."""
+    i = wp.tid()
+    a = wp.vec3(wp.inf, wp.inf, wp.inf)
+    b = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    for j in range(i, low.shape[0], PARTS):
+        middle = middle_of(low[j], high[j])
+        a = wp.min(a, middle)
+        b = wp.max(b, middle)
+    ends[2 * i] = a
+    ends[2 * i + 1] = b
+
+
+@kernel
+def join(ends: wp.array(dtype=wp.vec3)):
+    """All of them into the first. One thread."""
+    a = ends[0]
+    b = ends[1]
+    for i in range(1, ends.shape[0] / 2):
+        a = wp.min(a, ends[2 * i])
+        b = wp.max(b, ends[2 * i + 1])
+    ends[0] = a
+    ends[1] = b
+
+
+@wp.func
+def spread(x: wp.uint64) -> wp.uint64:
+    """21 bits, with two places free after each."""
+    x = (x | (x << wp.uint64(32))) & wp.uint64(0x1F00000000FFFF)
+    x = (x | (x << wp.uint64(16))) & wp.uint64(0x1F0000FF0000FF)
+    x = (x | (x << wp.uint64(8))) & wp.uint64(0x100F00F00F00F00F)
+    x = (x | (x << wp.uint64(4))) & wp.uint64(0x10C30C30C30C30C3)
+    return (x | (x << wp.uint64(2))) & wp.uint64(0x1249249249249249)
+
+
+@wp.func
+def cell_of(x: float, begin: float, end: float, bits: int) -> wp.uint64:
+    extent = wp.float64(end) - wp.float64(begin)
+    last = wp.float64((1 << bits) - 1)
+    if extent <= wp.float64(0.0):
+        return wp.uint64(0)
+    return wp.uint64((wp.float64(x) - wp.float64(begin)) / extent * last)
+
+
+@kernel
+def write_keys(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3), number_bits: int,
+               bits: int, keys: wp.array(dtype=wp.uint64), order: wp.array(dtype=wp.int32), first: int):
+    """Of primitives first .. first + dim - 1: the Morton code of its middle, then its number."""
+    i = first + wp.tid()
+    middle = middle_of(low[i], high[i])
+    a = ends[0]
+    b = ends[1]
+    code = (spread(cell_of(middle[0], a[0], b[0], bits)) << wp.uint64(2)) | (
+        spread(cell_of(middle[1], a[1], b[1], bits)) << wp.uint64(1)) | spread(cell_of(middle[2], a[2], b[2], bits))
+    keys[i] = (code << wp.uint64(number_bits)) | wp.uint64(i)
+    order[i] = i
+
+
+@wp.func
+def differ(keys: wp.array(dtype=wp.uint64), n: int, i: int, j: int) -> wp.uint64:
+    """In which bits two keys differ; in the highest of all where there is no key j."""
+    if j < 0 or j >= n:
+        return wp.uint64(0x8000000000000000)
+    return keys[i] ^ keys[j]
+
+
+@wp.func
+def nearer(a: wp.uint64, b: wp.uint64) -> bool:
+    """Whether the highest bit of a is below that of b: the keys that differ in a have more in common."""
+    return a < b and a < (a ^ b)
+
+
+@kernel
+def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
+    """Inner nodes first .. first + dim - 1 over two or more ascending keys, one node less than these; a leaf is one primitive."""
+    i = first + wp.tid()
+    n = nodes.shape[0] + 1
+    # Node i begins or ends at key i: on the side where the neighbour has more in common with it.
+    after = differ(keys, n, i, i + 1)
+    before = differ(keys, n, i, i - 1)
+    d = wp.where(nearer(after, before), 1, -1)
+    outside = wp.where(d > 0, before, after)
+    most = int(2)
+    while most < n and nearer(differ(keys, n, i, i + most * d), outside):
+        most = most * 2
+    length = int(0)
+    step = most / 2
+    while step >= 1:
+        if nearer(differ(keys, n, i, i + (length + step) * d), outside):
+            length = length + step
+        step = step / 2
+    # The split: behind the last key that has more in common with key i than the other end has.
+    j = i + length * d
+    whole = differ(keys, n, i, j)
+    split = int(0)
+    step = length
+    while True:
+        step = (step + 1) / 2
+        if nearer(differ(keys, n, i, i + (split + step) * d), whole):
+            split = split + step
+        if step <= 1:
+            break
+    left = i + split * d + wp.min(d, 0)
+    node = Bvh2Node()
+    node.first_0 = left
+    node.first_1 = left + 1
+    if wp.min(i, j) == left:
+        node.count_0 = 1
+    else:
+        parents[left] = i
+    if wp.max(i, j) == left + 1:
+        node.count_1 = 1
+    else:
+        parents[left + 1] = i
+    nodes[i] = node
+    if i == 0:
+        parents[0] = NO_PARENT
+
+
+@kernel
+def emit(tree: Tree, nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
+    """Write what `fit` has left of nodes first .. first + dim - 1: a parent before its children, left before right.
+
+    A node's place is the number of nodes before it in that order: on the way to the root, each parent and each left sibling's.
+    """
+    i = first + wp.tid()
+    slot = int(0)
+    at = int(i)
+    while True:
+        if tree.below[at].used == 0:
+            return  # it is in a leaf
+        parent = tree.parents[at]
+        if parent == NO_PARENT:
+            break
+        slot = slot + 1
+        node = tree.nodes[parent]
+        if node.count_1 == 0 and node.first_1 == at and node.count_0 == 0:
+            slot = slot + tree.below[node.first_0].used
+        at = parent
+    node = tree.nodes[i]
+    left = Below()
+    if node.count_0 == 0:
+        left = tree.below[node.first_0]
+        if left.used == 0:
+            node.first_0 = node.first_0 + 1 - left.size  # its range ends where the split is
+            node.count_0 = left.size
+        else:
+            node.first_0 = slot + 1
+            parents[slot + 1] = slot
+    if node.count_1 == 0:
+        right = tree.below[node.first_1]
+        if right.used == 0:
+            node.count_1 = right.size
+        else:
+            node.first_1 = slot + 1 + left.used
+            parents[slot + 1 + left.used] = slot
+    nodes[slot] = node
+    if i == 0:
+        parents[0] = NO_PARENT

@@ -1,0 +1,157 @@
+"""Triangles and spheres on a device: the box of each, and the records that the watertight triangle test reads.
+
+Both have the bits of what the host makes (Geometry.write_bounds, the layout "corners"), so that a mesh that moves on a GPU need not
+travel to the host and back.
+"""
+
+import warp as wp
+
+from wrt.kernels.structs import Primitive, kernel
+from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
+from wrt.kernels.units.triangle import lower, upper
+
+SPLIT = wp.constant(wp.float64(2.0**27 + 1.0))  # Dekker's, for float64
+DOUBT = wp.constant(wp.float64(2.0**-50))  # as in wrt.scene.clean.corners_have_area
+Terms = wp.types.vector(16, wp.float64)
+
+
+@wp.struct
+class Shape:
+    """As wrt.accel.geometry.Geometry: the faces are primitives 0 .. F - 1, the spheres those after them."""
+
+    vertices: wp.array(dtype=wp.vec3)
+    faces: wp.array(dtype=wp.vec3i)
+    spheres: wp.array(dtype=wp.vec4)
+
+
+@kernel
+def bounds(shape: Shape, low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), first: int):
+    """The padded boxes of primitives first .. first + dim - 1; all of space where a number is not finite."""
+    i = first + wp.tid()
+    n = shape.faces.shape[0]
+    lo = wp.vec3()
+    hi = wp.vec3()
+    if i < n:
+        face = shape.faces[i]
+        a = shape.vertices[face[0]]
+        b = shape.vertices[face[1]]
+        c = shape.vertices[face[2]]
+        lo = lower(lower(a, b), c)
+        hi = upper(upper(a, b), c)
+        if not wp.isfinite(a + b + c):  # or a sum beyond float32: then a few boxes are larger than they must be
+            if not (wp.isfinite(a) and wp.isfinite(b) and wp.isfinite(c)):
+                lo = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+                hi = wp.vec3(wp.inf, wp.inf, wp.inf)
+    else:
+        s = shape.spheres[i - n]
+        lo = wp.vec3(s[0] - s[3], s[1] - s[3], s[2] - s[3])
+        hi = wp.vec3(s[0] + s[3], s[1] + s[3], s[2] + s[3])
+    pad = box_pad(lo, hi)
+    low[i] = padded_lo(lo, pad)
+    high[i] = padded_hi(hi, pad)
+
+
+@wp.func
+def two_sum(a: wp.float64, b: wp.float64) -> wp.vec2d:
+    """The sum as it is rounded, and what the rounding took (Knuth)."""
+    s = a + b
+    t = s - a
+    return wp.vec2d(s, (a - (s - t)) + (b - t))
+
+
+@wp.func
+def two_product(a: wp.float64, b: wp.float64) -> wp.vec2d:
+    """Likewise the product (Dekker)."""
+    p = a * b
+    c = SPLIT * a
+    a_high = c - (c - a)
+    a_low = a - a_high
+    c = SPLIT * b
+    b_high = c - (c - b)
+    b_low = b - b_high
+    return wp.vec2d(p, ((a_high * b_high - p) + a_high * b_low + a_low * b_high) + a_low * b_low)
+
+
+@wp.func
+def is_zero(terms: Terms) -> bool:
+    """Whether the exact sum is 0: Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic", grow-expansion."""
+    parts = Terms()
+    for n in range(16):
+        q = terms[n]
+        for k in range(n):
+            s = two_sum(q, parts[k])
+            q = s[0]
+            parts[k] = s[1]
+        parts[n] = q
+    zero = bool(True)
+    for n in range(16):
+        zero = zero and parts[n] == wp.float64(0.0)
+    return zero
+
+
+@wp.func
+def with_products(terms: Terms, place: int, e: wp.vec2d, f: wp.vec2d, sign: wp.float64) -> Terms:
+    """The exact product of two sums of two, as eight terms from `place` on."""
+    out = terms
+    for i in range(2):
+        for j in range(2):
+            p = two_product(e[i], f[j])
+            out[place + 4 * i + 2 * j] = sign * p[0]
+            out[place + 4 * i + 2 * j + 1] = sign * p[1]
+    return out
+
+
+@wp.func
+def exactly_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
+    """Whether component k of the cross product (b - a) x (c - a) is other than 0; i, j: the two axes beside k. Exact: all numbers
+    are multiples of 2^-298, and below 2^258."""
+    e_i = two_sum(wp.float64(b[i]), -wp.float64(a[i]))
+    e_j = two_sum(wp.float64(b[j]), -wp.float64(a[j]))
+    f_i = two_sum(wp.float64(c[i]), -wp.float64(a[i]))
+    f_j = two_sum(wp.float64(c[j]), -wp.float64(a[j]))
+    terms = with_products(Terms(), 0, e_i, f_j, wp.float64(1.0))
+    return not is_zero(with_products(terms, 8, e_j, f_i, wp.float64(-1.0)))
+
+
+@wp.func
+def surely_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
+    """The same in float64, False where that leaves a doubt."""
+    left = (wp.float64(b[i]) - wp.float64(a[i])) * (wp.float64(c[j]) - wp.float64(a[j]))
+    right = (wp.float64(b[j]) - wp.float64(a[j])) * (wp.float64(c[i]) - wp.float64(a[i]))
+    return not wp.abs(left - right) <= DOUBT * (wp.abs(left) + wp.abs(right))
+
+
+@wp.func
+def has_area(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
+    """Whether the corners are not on one line: as wrt.scene.clean.has_area. True where one is not finite."""
+    if surely_across(a, b, c, 1, 2) or surely_across(a, b, c, 2, 0) or surely_across(a, b, c, 0, 1):
+        return True
+    if not (wp.isfinite(a) and wp.isfinite(b) and wp.isfinite(c)):
+        return True
+    return exactly_across(a, b, c, 1, 2) or exactly_across(a, b, c, 2, 0) or exactly_across(a, b, c, 0, 1)
+
+
+@kernel
+def write_corners(shape: Shape, order: wp.array(dtype=wp.int32), out: wp.array(dtype=Primitive), first: int):
+    """Records first .. first + dim - 1 of the layout "corners"; order: the prim_id of each."""
+    i = first + wp.tid()
+    record = Primitive()
+    record.prim_id = order[i]
+    if record.prim_id < shape.faces.shape[0]:
+        face = shape.faces[record.prim_id]
+        record.v0 = shape.vertices[face[0]]
+        record.v1 = shape.vertices[face[1]]
+        record.v2 = shape.vertices[face[2]]
+        if not has_area(record.v0, record.v1, record.v2):
+            record.v0 = wp.vec3(wp.nan, wp.nan, wp.nan)
+    out[i] = record
+
+
+@kernel
+def count_outside(faces: wp.array(dtype=wp.vec3i), n_vertices: int, count: wp.array(dtype=wp.int32), first: int):
+    """How many of the faces name a vertex that there is not."""
+    face = faces[first + wp.tid()]
+    for k in range(3):
+        if face[k] < 0 or face[k] >= n_vertices:
+            wp.atomic_add(count, 0, 1)
+            return

@@ -1,0 +1,103 @@
+"""What a picture and a query ask of a GPU: launches, copies and waits, and how many bytes go between host and device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import wrt
+from tests import device
+from tests.data import ROOT
+from tests.virtual_gpu import gpus
+from wrt.accel import batches
+from wrt.core import device as core_device
+from wrt.core.errors import InputError
+from wrt.renderer.options import Options
+from wrt.renderer.renderer import Renderer
+from wrt.scene import shapes
+
+pytestmark = pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0")
+N = 3000
+PIXELS = 48 * 27
+FILM = 52 * PIXELS  # bytes
+
+
+@contextmanager
+def asked() -> Iterator[SimpleNamespace]:
+    """What the block asks of the devices."""
+    counts = gpus().counts
+    launches, copies, size, waits = counts.launches.copy(), counts.copies.copy(), counts.bytes.copy(), counts.synchronisations
+    out = SimpleNamespace()
+    yield out
+    out.launches, out.waits = (counts.launches - launches).total(), counts.synchronisations - waits
+    out.copies, out.bytes = dict(counts.copies - copies), dict(counts.bytes - size)
+
+
+def some_rays(n: int = N) -> tuple[np.ndarray, np.ndarray]:
+    origins = np.random.default_rng(0).normal(size=(n, 3)).astype(np.float32)
+    return origins, -origins
+
+
+def test_a_picture_is_a_launch_a_pass_and_comes_back_once() -> None:
+    renderer = Renderer(wrt.load_scene(ROOT / "scenes/spot.toml"), Options(device="cuda:0"))
+    renderer.aim(renderer.prepared.plan.camera, size=(48, 27), spp=16)
+    with asked() as picture:
+        renderer.run()
+    assert picture.launches == picture.waits == 5  # 1, 1, 2, 4 and 8 samples; not one a tile
+    assert picture.copies == {"h2d": 1, "d2h": 8}  # the filter's table; each array of the film, once
+    assert picture.bytes["d2h"] == FILM
+
+
+def test_rays_of_numpy_go_there_and_hits_come_back() -> None:
+    accel = wrt.build(shapes.icosphere(2), "bvh8", device="cuda:0")
+    with asked() as query:
+        accel.closest_hit(*some_rays())
+    assert (query.launches, query.waits, query.copies) == (1, 0, {"h2d": 2, "d2h": 4})
+    assert query.bytes == {"h2d": 24 * N, "d2h": 16 * N}  # of t_min and t_max nothing
+    with asked() as query:
+        accel.any_hit(*some_rays(), t_max=np.full(N, 0.5, np.float32))
+    assert query.bytes == {"h2d": 28 * N, "d2h": N} and query.launches == 1
+
+
+def test_rays_of_warp_stay_there() -> None:
+    accel = wrt.build(shapes.icosphere(2), "bvh8", device="cuda:0")
+    rays = [wp.array(array, dtype=wp.vec3, device="cuda:0") for array in some_rays()]
+    with asked() as query:
+        hits = accel.closest_hit(*rays, 0.25, 7.0)
+    assert (query.launches, query.waits, query.copies) == (1, 0, {})
+    expected = accel.closest_hit(*some_rays(), 0.25, 7.0)
+    assert hits.t.numpy().tobytes() == expected.t.tobytes() and (expected.prim_id >= 0).any()
+
+
+def test_many_rays_of_numpy_are_traced_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    accel = wrt.build(shapes.icosphere(2), "bvh8", device="cuda:0")
+    ends = np.linspace(0.1, 2.0, N, dtype=np.float32)
+    whole = accel.closest_hit(*some_rays(), 0.0, ends)
+    monkeypatch.setattr(batches, "MOST_ON_GPU", 1000)
+    monkeypatch.setattr(batches, "FEWEST", 100)
+    with asked() as query:
+        parts = accel.closest_hit(*some_rays(), 0.0, ends)
+    assert query.launches == 3
+    for name in ("t", "u", "v", "prim_id"):
+        assert getattr(parts, name).tobytes() == getattr(whole, name).tobytes()
+    assert 0 < (whole.prim_id >= 0).sum() < N
+
+
+def test_what_does_not_fit_on_the_device_is_told_before_it_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = shapes.icosphere(2)
+    room = wp.get_device("cuda:0").free_memory
+    assert batches.rays_on_gpu(10, wp.get_device("cuda:0")) == batches.MOST_ON_GPU
+    monkeypatch.setattr(core_device, "SMALL", 0)
+    monkeypatch.setattr(gpus().memory, "limit", gpus().memory.limit - room + 30_000)
+    assert batches.rays_on_gpu(1 << 26, wp.get_device("cuda:0")) == batches.FEWEST
+    with pytest.raises(InputError, match=r"a bvh8 over 320 primitives takes 0 MiB of the memory of cuda:0; 0 MiB are free"):
+        wrt.build(mesh, "bvh8", device="cuda:0")
+    monkeypatch.setattr(gpus().memory, "limit", gpus().memory.limit + 30_000)
+    wrt.build(mesh, "bvh8", device="cuda:0")
+    with pytest.raises(InputError, match="a tree over 320 primitives takes 0 MiB of the memory of cuda:0"):
+        wrt.build(mesh, "bvh2", builder="lbvh", device="cuda:0")

@@ -1,0 +1,128 @@
+"""CUDA graphs on a virtual GPU: what is captured is done when it is launched, and what cannot be captured is told."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import warp as wp
+
+import wrt
+from tests import device
+from tests.data import ROOT
+from tests.virtual_gpu import VirtualGpuError, gpus
+from wrt.accel.answers import Hits
+from wrt.accel.base import Accelerator
+from wrt.core.errors import InputError
+from wrt.scene.shapes import icosphere
+
+pytestmark = pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0")
+BALL = icosphere(2)
+FIELDS = "t", "u", "v", "prim_id"
+
+
+@wp.kernel(enable_backward=False)
+def add(x: wp.array(dtype=float), step: float):
+    x[wp.tid()] += step
+
+
+def test_a_launch_is_recorded_with_its_arguments_and_done_with_the_graph() -> None:
+    x, y = (wp.zeros(3, dtype=float, device="cuda:0") for _ in range(2))
+    wp.launch(add, 3, [x, 1.0], device="cuda:0")
+    before = gpus().counts.launches.total()
+    with wp.ScopedCapture("cuda:0") as capture:
+        for step in (2.0, 3.0):
+            wp.launch(add, 3, [x, step], device="cuda:0")
+        wp.copy(y, x)
+        room = wp.full(3, 7.0, dtype=float, device="cuda:0")  # of the graph's own memory
+        wp.launch(add, 3, [room, 1.0], device="cuda:0")
+    assert x.numpy().tolist() == [1.0] * 3 and gpus().counts.launches.total() == before
+    for expected in (6.0, 11.0):
+        wp.capture_launch(capture.graph)
+        assert x.numpy().tolist() == y.numpy().tolist() == [expected] * 3 and room.numpy().tolist() == [8.0] * 3
+    assert gpus().counts.launches.total() == before + 6
+
+
+@pytest.mark.parametrize(("what", "message"), [
+    (lambda x: x.numpy(), "memory of a device is copied to the host while a graph is captured"),
+    (lambda x: x.assign(np.ones(3, np.float32)), "memory of the host is copied to a device"),
+    (lambda x: wp.synchronize_stream(wp.get_device("cuda:0").stream), "Cannot synchronize stream while graph capture is active"),
+])
+def test_what_cannot_be_captured(what, message: str) -> None:
+    x = wp.zeros(3, dtype=float, device="cuda:0")
+    with pytest.raises(RuntimeError, match=message), wp.ScopedCapture("cuda:0"):
+        what(x)
+    wp.launch(add, 3, [x, 1.0], device="cuda:0")  # the capture has ended
+    assert x.numpy().tolist() == [1.0] * 3
+
+
+def test_a_graph_that_outlives_its_arrays_is_told() -> None:
+    x = wp.zeros(3, dtype=float, device="cuda:0")
+    with wp.ScopedCapture("cuda:0") as capture:
+        wp.launch(add, 3, [x, 1.0], device="cuda:0")
+    del x
+    with pytest.raises(VirtualGpuError, match="x must be 12 bytes on cuda:0, and is device memory that was freed"):
+        wp.capture_launch(capture.graph)
+
+
+def moving() -> tuple[Accelerator, wp.array, list[wp.array], Hits]:
+    accel = wrt.build(BALL, "bvh2", device="cuda:0")
+    rays = [wp.array(array, dtype=wp.vec3, device="cuda:0") for array in np.random.default_rng(1).normal(size=(2, 500, 3))]
+    return accel, wp.array(BALL.vertices, dtype=wp.vec3, device="cuda:0"), rays, accel.closest_hit(*rays)
+
+
+def test_a_refit_and_a_query_are_captured_and_follow_the_points() -> None:
+    accel, points, rays, out = moving()
+    accel.refit(points, in_place=True)
+    copies = gpus().counts.copies.copy()
+    with wp.ScopedCapture("cuda:0") as capture:
+        accel.refit(points, in_place=True)
+        accel.closest_hit(*rays, t_max=5.0, out=out)
+    assert gpus().counts.copies == copies
+    for scale in (1.5, 0.5):
+        points.assign(scale * BALL.vertices)
+        launches, copies = gpus().counts.launches.total(), gpus().counts.copies.copy()
+        wp.capture_launch(capture.graph)
+        assert gpus().counts.launches.total() == launches + 4  # boxes, tree, corners, rays
+        assert gpus().counts.copies - copies == {"d2d": 1}
+        expected = wrt.build(wrt.Mesh(np.float32(scale) * BALL.vertices, BALL.faces), "bvh2", device="cpu").closest_hit(
+            rays[0].numpy(), rays[1].numpy(), t_max=5.0)
+        for name in FIELDS:
+            assert getattr(out, name).numpy().tobytes() == getattr(expected, name).tobytes()
+        assert (expected.prim_id >= 0).any()
+
+
+def test_the_example_in_the_documentation() -> None:
+    page = (ROOT / "docs/acceleration.md").read_text(encoding="utf-8")
+    section = page[page.index("### On a GPU") :]
+    names = {"wrt": wrt, "mesh": BALL, "moved": 2.0 * BALL.vertices, "rays": np.random.default_rng(1).normal(size=(2, 50, 3))}
+    for block in re.findall(r"^```python\n(.*?)^```", section, re.DOTALL | re.MULTILINE):
+        exec(block, names)
+    origins, directions = names["rays"]
+    expected = wrt.build(wrt.Mesh(2.0 * BALL.vertices, BALL.faces), device="cpu").closest_hit(origins, directions)
+    assert names["hits"].t.numpy().tobytes() == expected.t.tobytes() and (expected.prim_id >= 0).any()
+
+
+def test_what_a_capture_of_ours_needs_first() -> None:
+    accel, points, _, _ = moving()
+    with pytest.raises(InputError, match="refit in place once before a graph captures it"), wp.ScopedCapture("cuda:0"):
+        accel.refit(points, in_place=True)
+    with pytest.raises(VirtualGpuError, match="while a graph is captured"), wp.ScopedCapture("cuda:0"):
+        accel.refit(points)
+    with pytest.raises(VirtualGpuError, match="copied to a device"), wp.ScopedCapture("cuda:0"):
+        accel.closest_hit(*np.ones((2, 5, 3), np.float32))
+
+
+def test_a_build_on_the_device_sends_nothing_back_but_what_the_tree_costs() -> None:
+    geometry = wrt.DeviceGeometry(wp.array(BALL.vertices, dtype=wp.vec3, device="cuda:0"),
+                                  wp.array(BALL.faces.reshape(-1), dtype=wp.int32, device="cuda:0"))
+    wrt.build(geometry, "bvh2", builder="lbvh", device="cuda:0")
+    counts = gpus().counts
+    launches, copies, size = counts.launches.copy(), counts.copies.copy(), counts.bytes.copy()
+    accel = wrt.build(geometry, "bvh2", builder="lbvh", device="cuda:0")
+    assert (counts.launches - launches).total() == 8 and (counts.bytes - size)["d2h"] == 56 and (counts.copies - copies)["d2h"] == 1
+    assert (counts.bytes - size)["h2d"] == 0
+    launches, copies, size = counts.launches.copy(), counts.copies.copy(), counts.bytes.copy()
+    accel.refit(geometry.points)
+    assert (counts.launches - launches).total() == 3 and (counts.bytes - size)["d2h"] == 56 and (counts.bytes - size)["h2d"] == 0

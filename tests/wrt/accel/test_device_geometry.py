@@ -1,0 +1,120 @@
+"""Triangles that are on a device: what is taken, and what follows them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import DEVICE  # isort: skip (starts Warp)
+import warp as wp
+
+import wrt
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build, load_accel
+from wrt.accel.geometry import Geometry
+from wrt.core.errors import InputError
+from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import icosphere
+
+BALL = icosphere(2)
+FIELDS = "t", "u", "v", "prim_id"
+RAYS = np.random.default_rng(1).normal(size=(2, 1000, 3)).astype(np.float32)
+
+
+def there(array: np.ndarray, kind: Any) -> Any:
+    return wp.array(array, dtype=kind, device=DEVICE)
+
+
+def moved(step: float) -> np.ndarray:
+    x, y, z = BALL.vertices.T
+    return np.stack([x + step * y * y, y, z * (1.0 + step)], axis=1).astype(np.float32)
+
+
+def assert_follows(accel: Accelerator, vertices: np.ndarray) -> None:
+    truth = build(Geometry(vertices, BALL.faces, np.zeros((0, 4), np.float32)), "brute_force").closest_hit(*RAYS)
+    hits = accel.closest_hit(*RAYS)
+    assert 0.2 < (truth.prim_id >= 0).mean() < 1.0
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(hits, name), getattr(truth, name))
+    np.testing.assert_array_equal(accel.geometry.vertices, vertices)
+
+
+@pytest.mark.parametrize("name", ["bvh2", "bvh8", "bvh2_sphere", "grid"])
+def test_any_structure_is_built_over_it_and_follows_if_it_can(name: str) -> None:
+    geometry = wrt.DeviceGeometry(there(BALL.vertices, wp.vec3), there(BALL.faces, wp.vec3i))
+    assert len(geometry) == geometry.n_triangles == len(BALL.faces)
+    accel = build(geometry, name)
+    assert_follows(accel, BALL.vertices)
+    if name != "grid":
+        accel.refit(there(moved(0.4), wp.vec3))
+        assert_follows(accel, moved(0.4))
+
+
+@pytest.mark.parametrize("options", [{"builder": "lbvh"}, {"builder": "sbvh"}, {"triangle": "moeller_trumbore"}])
+def test_points_are_followed_and_may_be_written_to(options: dict[str, str]) -> None:
+    accel = build(BALL, "bvh2", **options)
+    points = there(moved(0.4), wp.vec3)
+    done = accel.refit(points)
+    points.zero_()
+    assert done.growth > 1.0 and not done.rebuilt
+    if "triangle" not in options:
+        assert_follows(accel, moved(0.4))
+    other = build(BALL, "bvh2", **options)
+    assert other.refit(moved(0.4)).growth == done.growth
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(accel.closest_hit(*RAYS), name), getattr(other.closest_hit(*RAYS), name))
+    assert accel.refit(there(moved(-0.7), wp.vec3), rebuild_at=1.0).rebuilt
+    assert accel.stats.sah_cost == pytest.approx(build(accel.geometry, "bvh2", **options).stats.sah_cost)
+
+
+@pytest.mark.parametrize("builder", ["lbvh", "binned"])
+def test_in_place(builder: str) -> None:
+    accel = build(BALL, "bvh2", builder=builder)
+    points = there(moved(0.2), wp.vec3)
+    done = accel.refit(points, in_place=True)
+    assert np.isnan(done.growth) and np.isnan(accel.stats.sah_cost)
+    assert_follows(accel, moved(0.2))
+    data = accel.data
+    points.assign(moved(0.5))
+    assert_follows(accel, moved(0.2))  # until it is asked to
+    accel.refit(points, in_place=True)
+    assert accel.data is data
+    assert_follows(accel, moved(0.5))
+    assert accel.refit(moved(0.3)).growth > 0.5 and accel.data is not data  # and the other way again
+    assert_follows(accel, moved(0.3))
+    accel.refit(points, in_place=True)
+    assert_follows(accel, moved(0.5))
+
+
+def test_what_was_made_on_a_device_is_saved(tmp_path: Any) -> None:
+    accel = build(BALL, "bvh2", builder="lbvh")
+    accel.refit(there(moved(0.4), wp.vec3))
+    accel.save(tmp_path / "ball.accel")
+    assert_follows(load_accel(tmp_path / "ball.accel", Mesh(moved(0.4), BALL.faces)), moved(0.4))
+    assert accel.epo() > 0.0
+
+
+@pytest.mark.parametrize(("points", "indices", "message"), [
+    (BALL.vertices, BALL.faces, "points must be a Warp array"),
+    (there(BALL.vertices, wp.vec3), BALL.faces, "indices must be a Warp array"),
+    (there(BALL.vertices, wp.vec3), there(np.arange(4), wp.int32), "indices must be a Warp array"),
+    (there(BALL.vertices[:9], wp.vec3), there(BALL.faces, wp.vec3i), r"indices must be 0 to 8; \d+ triangles have others"),
+    (there(BALL.vertices, wp.vec3), there([-1, 0, 1], wp.int32), "1 triangles have others"),
+])
+def test_what_is_refused(points: Any, indices: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        wrt.DeviceGeometry(points, indices)
+
+
+def test_refits_that_are_refused() -> None:
+    accel = build(BALL, "bvh2")
+    for given, message in ((there(BALL.vertices[1:], wp.vec3), r"vertices must be \(162,\), got \(161,\)"),
+                           (there(BALL.faces, wp.vec3i), "vertices must be a Warp array"), (BALL.vertices, "must be a Warp array")):
+        with pytest.raises(InputError, match=message):
+            accel.refit(given, in_place=True)
+    for name, options in (("bvh8", {}), ("bvh2_kdop", {}), ("bvh2", {"triangle": "plane"})):
+        with pytest.raises(InputError, match="in place"):
+            build(BALL, name, **options).refit(there(BALL.vertices, wp.vec3), in_place=True)
+    assert_follows(accel, BALL.vertices)

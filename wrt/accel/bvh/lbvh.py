@@ -1,0 +1,57 @@
+"""The builder along a Morton curve, which works on any device (the kernels are kernels/build/lbvh.py)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from wrt.accel.bvh.refit import Fitting, tree_of
+from wrt.accel.bvh.top_down import build_options
+from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree
+from wrt.accel.geometry import Geometry
+from wrt.core.device import launch_on, require_on, start
+from wrt.core.errors import InputError
+from wrt.kernels.build import lbvh as kernels
+from wrt.kernels.traverse.bvh2 import Bvh2Node
+
+BYTES = 400.0  # of a GPU's memory for each primitive, at the peak: what is below, and as much as the keys for the sort
+MOST = 1 << 30  # the sort has room for two of each
+
+
+def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
+    """The least work, and the worst tree but for the median's."""
+    if len(geometry) <= 1:
+        return small_tree(*geometry.bounds())
+    cpu = start("cpu")
+    nodes, _, order, root = build_on(cpu, geometry.on(cpu), options, threads)
+    return BinaryTree(nodes.numpy().copy(), order.numpy().copy(), root.height)
+
+
+def build_on(device: Any, shape: Any, options: BvhOptions, threads: int = 1) -> tuple[Any, Any, Any, Any]:
+    """Bvh2Node records, the parent of each, the prim_id of each primitive of the leaves (Warp arrays on the device), and a Root,
+    over a Shape of two primitives or more. Of a GPU nothing else comes to the host."""
+    n = len(shape.faces) + len(shape.spheres)
+    if n >= MOST:
+        raise InputError(f"the builder lbvh takes fewer than {MOST} primitives, got {n}")
+    require_on(device, n * BYTES, f"a tree over {n} primitives")
+    number_bits, bits = kernels.bits_of(n)
+    fitting = Fitting(device, n, n - 1)
+    fitting.find_bounds(shape, threads)
+    ends = wp.empty(2 * min(kernels.PARTS, n), dtype=wp.vec3, device=device)
+    launch_on(device, kernels.measure, len(ends) // 2, fitting.low, fitting.high, ends)
+    launch_on(device, kernels.join, 1, ends)
+    keys, order = wp.empty(2 * n, dtype=wp.uint64, device=device), wp.empty(2 * n, dtype=wp.int32, device=device)
+    launch_on(device, kernels.write_keys, n, fitting.low, fitting.high, ends, number_bits, bits, keys, order, None)
+    with device.context_guard:  # the sort takes the current one
+        wp.utils.radix_sort_pairs(keys, order, n, number_bits, number_bits + 3 * bits)
+    nodes, parents = (wp.empty(n - 1, dtype=kind, device=device) for kind in (Bvh2Node, wp.int32))
+    launch_on(device, kernels.link, n - 1, keys, nodes, parents, None)
+    order = wp.clone(order[:n])
+    linked = tree_of(fitting, nodes, parents, order)
+    fitting.fit(linked, build_options(options))
+    out, out_parents = (wp.empty(n - 1, dtype=kind, device=device) for kind in (Bvh2Node, wp.int32))
+    launch_on(device, kernels.emit, n - 1, linked, out, out_parents, None)
+    root = fitting.root()
+    return wp.clone(out[: root.used]), wp.clone(out_parents[: root.used]), order, root
+

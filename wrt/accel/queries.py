@@ -1,0 +1,77 @@
+"""What a structure is asked by the host: rays as arrays, hits as arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES, Counters, Hits, room_for
+from wrt.accel.batches import trace_on_gpu, tracer
+from wrt.accel.counting import counted
+from wrt.accel.rays import Rays, rays_of
+from wrt.accel.structure import Structure
+from wrt.core.checks import shown
+from wrt.core.device import thread_count
+from wrt.core.errors import InputError
+
+
+class Queries:
+    """The part of Accelerator that answers. device: a Warp device; data: the Warp struct that kernels get."""
+
+    device: Any
+    structure: Structure
+    _surfaces: Any
+
+    @property
+    def data(self) -> Any:
+        raise NotImplementedError
+
+    def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
+                    threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits | None = None) -> Hits:
+        """The closest hit of each ray in the closed segment [t_min, t_max]; at equal t the lowest prim_id.
+
+        Closed means that a surface through the origin is hit at t_min = 0; a t_min above 0 leaves it out. origins,
+        directions: (N, 3) real numbers, taken as float32; origins up to 1e37, so that differences are finite; directions finite,
+        not zero and of any length (where t would be beyond float32, there is no hit); t_min (>= 0), t_max: scalars or (N,).
+        float32 without gaps is read where it is, all else is copied part by part. Warp arrays are (N,) vec3, and of their values
+        only t_min and t_max are looked at, on the CPU. threads: 1 or more, or one a core. counters: count what each ray costs
+        (hits.counters); trace: also record what it fetches, which takes a second run. out: hits of as many rays, whose arrays take
+        the new ones (NumPy's, or Warp's if the rays are; they must not overlap with the rays' own).
+
+        Several threads may ask at a time, with or without counters, while another refits. There are no gradients: Warp arrays
+        that require them are refused while a wp.Tape records. Raises InputError that names the argument and what was expected;
+        what `out` holds is lost then.
+        """
+        threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
+        if not (out is None or isinstance(out, Hits)):
+            raise InputError(f"out must be Hits, got {shown(out)}")
+        given = None if out is None else [out.t, out.u, out.v, out.prim_id]
+        t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
+        return Hits(t, u, v, prim_id, _answer(self, rays, arrays, threads, trace if counters or trace else None))
+
+    def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
+                threads: int | None = None, *, out: Any = None) -> Any:
+        """Whether each ray hits anything in its segment: (N,) bool, True where closest_hit finds a hit and nowhere else. Arguments
+        as in closest_hit; out: an array that takes the answer."""
+        threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
+        given = None if out is None else [out]
+        arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
+        _answer(self, rays, arrays, threads)
+        return arrays[0]
+
+
+def _answer(accel: Queries, rays: Rays, out: list[Any], threads: int, counting: bool | None = None) -> Counters | None:
+    """Write the answers to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a trace or without; None: not at all."""
+
+    def trace(structure: Structure, data: Any) -> None:
+        if accel.device.is_cuda:
+            trace_on_gpu(structure, data, accel._surfaces, rays, out, accel.device)
+        else:
+            tracer(structure, len(out) == 1).trace(data, accel._surfaces, rays, out, threads)
+
+    data = accel.data  # once: a refit may replace it meanwhile
+    if counting is None:
+        trace(accel.structure, data)
+        return None
+    return counted(trace, accel.structure, data, len(out[0]), accel.device, counting)
