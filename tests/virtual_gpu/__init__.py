@@ -12,8 +12,8 @@ that leave their arrays (likewise) or read what nobody wrote (0xA5); what depend
 CUDA branches that do not compile, or say something else. It counts launches, copies and synchronisations.
 
 It does not find: what NVIDIA's compilers and driver do; speed; a wait that lacks (each call is done when it returns); races
-(threads run one after another). Warp's own CUDA code (Mesh, Bvh, sort, graphs) is not there. sin, pow, exp and the like are the
-host's, not NVIDIA's, whose last bits differ.
+(threads run one after another). Warp's own CUDA code (Mesh, Bvh, sort, graphs) is not there. A kernel's sin, pow, exp and the like
+are the host's, not NVIDIA's, whose last bits differ; wrt's kernels have their own.
 """
 
 from __future__ import annotations
