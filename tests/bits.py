@@ -1,40 +1,53 @@
-"""The bits of shipped scenes' pixels and of hits: `python -m tests.bits` prints what tests/bits.txt holds.
-
-Pixels go through the C library's sin, cos, pow, exp, log, acos and atan2, whose last bits differ between libraries. So the
-first line is a digest of these functions: where it differs, the pixels below it may.
-"""
+"""The bits of shipped scenes' pixels and of hits: `python -m tests.bits` prints what tests/bits.txt holds."""
 
 from __future__ import annotations
 
 import math
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from tests.kernel_tools import DEVICE  # isort: skip (starts Warp)
+import warp as wp
 
 import wrt
 from tests import device
 from tests.data import ROOT
-from wrt.lab.device_check import called_library
+from wrt.core.device import load_kernel
+from wrt.renderer.options import Options
+from wrt.renderer.plan import plan_of
 from wrt.scene import shapes
 
 STORED = Path(__file__).with_suffix(".txt")
 SCENES = sorted((ROOT / "scenes").glob("*.toml"))
 RAYS = 20_000
+NAMES = {f"{name}{end}".encode() for end in ("", "f") for name in (
+    "acos", "asin", "atan", "atan2", "cbrt", "cos", "cosh", "exp", "exp2", "expm1", "hypot", "log", "log10", "log1p", "log2", "pow",
+    "sin", "sincos", "sinh", "tan", "tanh")}
 
 
 def digest(*arrays: np.ndarray) -> str:
     return sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:32]
 
 
-def library() -> str:
-    """Digest of the C library's functions, over 50,000 arguments."""
-    x = np.random.default_rng(0).normal(size=50_000).astype(np.float32) * np.float32(10.0)
-    return digest(called_library(x, device.NAME))
-
-
 def pixels(scene: Path) -> str:
     return digest(wrt.render(scene, size="64x36", spp=4, seed=3).pixels)
+
+
+def kernels(scene: Path) -> list[Any]:
+    """Those that `pixels` runs."""
+    found: list[Any] = plan_of(wrt.load_scene(scene), Options(device=device.NAME)).kernels
+    return found
+
+
+def library_calls(kernel: Any) -> set[str]:
+    """What a kernel's object file asks the C library for, of functions that each library rounds in its own way."""
+    load_kernel(kernel, DEVICE)
+    folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(None if DEVICE.is_cuda else 1)
+    (file,) = [path for path in folder.iterdir() if path.suffix in (".o", ".cubin")]
+    return set(map(bytes.decode, NAMES & set(file.read_bytes().split(b"\0"))))
 
 
 def hits(accel: str) -> str:
@@ -67,7 +80,6 @@ def stored() -> dict[str, str]:
 
 
 def main() -> None:
-    print("library", library())
     print("hits", hits("bvh"))
     for scene in SCENES:
         print(scene.stem, pixels(scene), flush=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -94,6 +95,24 @@ def test_kernels_import_downward_only_and_never_the_host_side(path: Path) -> Non
     own = {name for name in imports(path) if name.startswith("wrt.kernels.")}
     assert {folder(name, "wrt.kernels") for name in own} - {here} <= BELOW_KERNELS[here]
     assert {name.split(".")[0] for name in imports(path) - own} <= LIBRARIES_OF_KERNELS
+
+
+def test_kernels_call_nothing_whose_bits_are_the_compilers() -> None:
+    """The C library's functions, and what of Warp calls them; wrt.kernels.shade.elementary has the project's own."""
+    theirs = {"acos", "asin", "atan", "atan2", "cbrt", "cos", "cosh", "curlnoise", "erf", "erfc", "erfcinv", "erfinv", "exp", "log",
+              "log10", "log2", "noise", "pnoise", "poisson", "pow", "quat_from_axis_angle", "quat_rpy", "quat_slerp",
+              "quat_to_axis_angle", "randn", "sample_triangle", "sample_unit_disk", "sample_unit_hemisphere",
+              "sample_unit_hemisphere_surface", "sample_unit_ring", "sample_unit_sphere", "sample_unit_sphere_surface", "sin",
+              "sinh", "tan", "tanh"}
+    for path in KERNELS:
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "wp":
+                assert node.attr not in theirs, f"{path}: wp.{node.attr}"
+            elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):  # a power of constants is Python's
+                ast.literal_eval(ast.unparse(node.left)), ast.literal_eval(ast.unparse(node.right))
+        assert "warp" not in {node.module for node in ast.walk(tree(path)) if isinstance(node, ast.ImportFrom)}
+    for path in (ROOT / "kernels").rglob("*.h"):
+        assert not re.search(rf"\b({'|'.join(sorted(theirs))})f?\(", path.read_text()), path
 
 
 @pytest.mark.parametrize("path", KERNELS, ids=ids)

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from wrt.kernels.shade.elementary import acos, atan2, sin_cos
 from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, search_cdf, share_of_row
 from wrt.kernels.structs import Background
@@ -26,9 +27,8 @@ def gradient(b: Background, direction: wp.vec3) -> wp.vec3:
 @wp.func
 def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
     """Turned about +y, counter-clockwise seen from above."""
-    c = wp.cos(angle)
-    s = wp.sin(angle)
-    return wp.vec3(c * d[0] + s * d[2], d[1], c * d[2] - s * d[0])
+    sin, cos = sin_cos(angle)
+    return wp.vec3(cos * d[0] + sin * d[2], d[1], cos * d[2] - sin * d[0])
 
 
 @wp.func
@@ -42,8 +42,8 @@ def environment_pixel(b: Background, column: int, row: int) -> wp.vec3:
 def environment(b: Background, direction: wp.vec3) -> wp.vec3:
     """Bilinear look-up in the equirectangular picture; the unit direction is in world space."""
     d = rotate_y(direction, -b.rotation)
-    x = (0.5 + wp.atan2(d[0], -d[2]) / TWO_PI) * float(b.width) - 0.5
-    y = wp.acos(wp.clamp(d[1], -1.0, 1.0)) / PI * float(b.height) - 0.5
+    x = (0.5 + atan2(d[0], -d[2]) / TWO_PI) * float(b.width) - 0.5
+    y = acos(wp.clamp(d[1], -1.0, 1.0)) / PI * float(b.height) - 0.5
     column = int(wp.floor(x))
     row = int(wp.floor(y))
     fx = x - wp.floor(x)
@@ -66,9 +66,10 @@ def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
     u = 1.0 - (b.column_cdf[first + column] - xi[1]) / p_column
     theta = PI * (float(row) + wp.clamp(v, 0.0, 1.0)) / float(b.height)
     phi = TWO_PI * ((float(column) + wp.clamp(u, 0.0, 1.0)) / float(b.width) - 0.5)
-    sin_theta = wp.sin(theta)
+    sin_theta, cos_theta = sin_cos(theta)
+    sin_phi, cos_phi = sin_cos(phi)
     sample = LightSample()
-    local = wp.vec3(sin_theta * wp.sin(phi), wp.cos(theta), -sin_theta * wp.cos(phi))
+    local = wp.vec3(sin_theta * sin_phi, cos_theta, -sin_theta * cos_phi)
     sample.wi = rotate_y(local, b.rotation)
     density = p_row * p_column * float(b.width * b.height) / (TWO_PI * PI * wp.max(sin_theta, 1.0e-9))
     sample.weight = environment(b, sample.wi) / density

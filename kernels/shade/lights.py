@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, search_cdf, share_of_row, triangle
+from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, point_at, search_cdf, share_of_row, triangle
 from wrt.kernels.shade.surface import (
     Surface,
     make_place_of,
@@ -167,8 +167,8 @@ def sphere_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surfac
     sin_theta = wp.sqrt(wp.max(0.0, h * (2.0 - h)))
     axis = way / wp.sqrt(distance2)
     x = frame_x(axis)
-    phi = TWO_PI * xi[1]
-    sample.wi = wp.normalize((1.0 - h) * axis + sin_theta * (wp.cos(phi) * x + wp.sin(phi) * wp.cross(axis, x)))
+    around = sin_theta * point_at(TWO_PI * xi[1])
+    sample.wi = wp.normalize((1.0 - h) * axis + around[0] * x + around[1] * wp.cross(axis, x))
     # The near crossing with the sphere; pulled out by more than its rounding error.
     along = wp.dot(sample.wi, way)
     across = way - along * sample.wi

@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.shade.elementary import LOG_2, exp, power
 from wrt.kernels.shade.fresnel import fresnel_conductor, fresnel_dielectric, fresnel_schlick, fresnel_tint
 from wrt.kernels.shade.sampling import PI, ggx_normal, ggx_visible_share
 from wrt.kernels.shade.surface import Surface
@@ -39,8 +40,8 @@ def blinn_phong(n: wp.vec3, wi: wp.vec3, wo: wp.vec3, exponent: float) -> float:
     (e + 2)(e + 4) / (8 pi (2^(-e/2) + e)) cos^e (Akenine-Moeller et al. 2008, "Real-Time Rendering", 3rd ed., section 7.6).
     """
     h = wp.normalize(wi + wo)
-    scale = (exponent + 2.0) * (exponent + 4.0) / (8.0 * PI * (wp.pow(2.0, -0.5 * exponent) + exponent))
-    return scale * wp.pow(wp.max(0.0, wp.dot(n, h)), exponent)
+    scale = (exponent + 2.0) * (exponent + 4.0) / (8.0 * PI * (exp(-0.5 * LOG_2 * exponent) + exponent))
+    return scale * power(wp.max(0.0, wp.dot(n, h)), exponent)
 
 
 @wp.func

@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.native import source
+from wrt.kernels.shade.elementary import sin_cos
 
 # The constants of the hash, of the scramble, and what makes the seeds of a point's two numbers differ.
 HASH_1, HASH_2 = 0x21F0AAAD, 0xD35A2D97
@@ -125,6 +126,13 @@ def make_sample_2d(features: Any) -> Any:
 
 
 @wp.func
+def point_at(angle: float) -> wp.vec2:
+    """Of the unit circle."""
+    sin, cos = sin_cos(angle)
+    return wp.vec2(cos, sin)
+
+
+@wp.func
 def disk(xi: wp.vec2) -> wp.vec2:
     """The unit disk, uniformly, by concentric squares (Shirley and Chiu 1997)."""
     a = 2.0 * xi[0] - 1.0
@@ -132,10 +140,8 @@ def disk(xi: wp.vec2) -> wp.vec2:
     if a == 0.0 and b == 0.0:
         return wp.vec2(0.0, 0.0)
     if wp.abs(a) > wp.abs(b):
-        angle = PI / 4.0 * (b / a)
-        return wp.vec2(a * wp.cos(angle), a * wp.sin(angle))
-    angle = PI / 2.0 - PI / 4.0 * (a / b)
-    return wp.vec2(b * wp.cos(angle), b * wp.sin(angle))
+        return a * point_at(PI / 4.0 * (b / a))
+    return b * point_at(PI / 2.0 - PI / 4.0 * (a / b))
 
 
 @wp.func
@@ -146,10 +152,7 @@ def polygon(xi: wp.vec2, sides: int, rotation: float) -> wp.vec2:
     r = wp.sqrt(scaled - float(sector))
     step = TWO_PI / float(sides)
     a = rotation + step * float(sector)
-    b = a + step
-    wa = r * (1.0 - xi[1])
-    wb = r * xi[1]
-    return wp.vec2(wa * wp.cos(a) + wb * wp.cos(b), wa * wp.sin(a) + wb * wp.sin(b))
+    return (r * (1.0 - xi[1])) * point_at(a) + (r * xi[1]) * point_at(a + step)
 
 
 @wp.func
@@ -185,10 +188,10 @@ def ggx_normal(xi: wp.vec2, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
     x = frame_x(n)
     y = wp.cross(n, x)
     w = wp.normalize(wp.vec3(alpha * wp.dot(wo, x), alpha * wp.dot(wo, y), wp.dot(wo, n)))
-    phi = TWO_PI * xi[0]
     z = (1.0 - xi[1]) * (1.0 + w[2]) - w[2]
     r = wp.sqrt(wp.max(0.0, 1.0 - z * z))
-    h = wp.vec3(r * wp.cos(phi), r * wp.sin(phi), z) + w
+    p = r * point_at(TWO_PI * xi[0])
+    h = wp.vec3(p[0], p[1], z) + w
     return wp.normalize(alpha * h[0] * x + alpha * h[1] * y + wp.max(h[2], 1.0e-6) * n)
 
 

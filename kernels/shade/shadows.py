@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.shade.elementary import exp
 from wrt.kernels.shade.shading import BLEND
 from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Hit, Material, Ray, Surfaces
@@ -29,7 +30,7 @@ class Shadow:
 def attenuation(surfaces: Surfaces, medium: int, distance: float) -> wp.vec3:
     """Beer-Lambert over a distance in world units."""
     sigma = surfaces.materials[medium].absorption
-    return wp.vec3(wp.exp(-sigma[0] * distance), wp.exp(-sigma[1] * distance), wp.exp(-sigma[2] * distance))
+    return wp.vec3(exp(-sigma[0] * distance), exp(-sigma[1] * distance), exp(-sigma[2] * distance))
 
 
 @wp.func

@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.shade.elementary import acos, atan2
 from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x
 from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift
 
@@ -226,7 +227,7 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
         s.error = gamma(6.0) * (wp.vec3(sphere[3], sphere[3], sphere[3]) + wp.abs(center))
         if wp.static(uvs):
             n = s.geometric
-            s.uv = wp.vec2(0.5 + wp.atan2(-n[2], n[0]) / TWO_PI, wp.acos(wp.clamp(n[1], -1.0, 1.0)) / PI)
+            s.uv = wp.vec2(0.5 + atan2(-n[2], n[0]) / TWO_PI, acos(wp.clamp(n[1], -1.0, 1.0)) / PI)
         if wp.static(tangents):
             s.bitangent_sign = 1.0
             along_u = wp.vec3(s.geometric[2], 0.0, -s.geometric[0])

@@ -39,9 +39,9 @@ def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec
 @wp.func
 def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4:
     """Bilinear; a texel's colour is at its centre."""
-    # Texture coordinates beyond 1e6 have no digits left for a position within the picture.
-    x = wp.clamp(u, -1.0e6, 1.0e6) * float(texture.width) - 0.5
-    y = wp.clamp(v, -1.0e6, 1.0e6) * float(texture.height) - 0.5
+    # Beyond 2^24 no digits are left for a place between texels, and beyond 2^31 each device makes another integer of it.
+    x = wp.clamp(u * float(texture.width) - 0.5, -wp.static(2.0**30), wp.static(2.0**30))
+    y = wp.clamp(v * float(texture.height) - 0.5, -wp.static(2.0**30), wp.static(2.0**30))
     left = wrapped(int(wp.floor(x)), texture.width, texture.wrap_u)
     right = wrapped(int(wp.floor(x)) + 1, texture.width, texture.wrap_u)
     fx = x - wp.floor(x)
@@ -58,7 +58,8 @@ def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4
 
 @wp.func
 def checkerboard(texture: Texture, u: float, v: float) -> wp.vec4:
-    parity = (int(wp.floor(u)) + int(wp.floor(v))) & 1
+    end = wp.static(2.0**24)  # from here on all floats are even
+    parity = (int(wp.floor(wp.clamp(u, -end, end))) + int(wp.floor(wp.clamp(v, -end, end)))) & 1
     color = wp.where(parity == 0, texture.color_a, texture.color_b)
     return wp.vec4(color[0], color[1], color[2], 1.0)
 

@@ -21,7 +21,7 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_integer
 from wrt.core.device import load_kernel, run_all, start, thread_count
 from wrt.io.load import load_scene
-from wrt.kernels.study.library import LIBRARY, call_library
+from wrt.kernels.study.elementary import FUNCTIONS, call_functions
 from wrt.lab.bench.accel import BRUTE_FORCE_TESTS, answer
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled
@@ -53,8 +53,8 @@ COLUMNS: Columns = {"part": "{part}", "what": "{what}", "compared": "{count}", "
                     "where": lambda row: ", ".join(row.where[:4]) + (", ..." if len(row.where) > 4 else "")}
 SPEED: Columns = {"who": "{who}", "rays": "{kind}", "Mray/s": lambda row: spread(row.mrays), "wrt / it": "{first_over_it:.2f}"}
 LEGEND = """\
-compared: answers, whose bits must be those of the CPU; differ: those that are not, and where. A library function that differs is
-the compiler's, and pictures that call it differ in last bits. All else that differs is a fault: report it, with this table."""
+compared: answers, whose bits must be those of the CPU; differ: those that are not, and where. All that differs is a fault: report
+it, with this table."""
 TIMED = """\
 Rays and answers are on the device; median of the runs by turns, the middle half of them in brackets. wrt / it: how many times as
 fast wrt's default structure is."""
@@ -102,7 +102,7 @@ def rows(plan: Check, tell: Callable[[str], None]) -> Iterator[Row]:
     """What is compared, each as it is done. tell: what is done next."""
     tell("compiling")
     compile_all(plan)
-    yield from library_rows(plan)
+    yield from function_rows(plan)
     tell("hits")
     yield from hit_rows(plan)
     tell("hard cases")
@@ -121,18 +121,22 @@ def compile_all(plan: Check) -> None:
     run_all(jobs, thread_count(None))
 
 
-def library_rows(plan: Check) -> Iterator[Row]:
-    x = (10.0 * np.random.default_rng(0).normal(size=50_000)).astype(np.float32)
-    here, there = (called_library(x, device) for device in ("cpu", plan.device))
-    for i, name in enumerate(LIBRARY):
-        yield row("library", name, len(x), {"": different(here[:, i], there[:, i])})
+def function_rows(plan: Check) -> Iterator[Row]:
+    """Elementary functions of numbers as shading has them, and of any bits."""
+    rng = np.random.default_rng(0)
+    common = rng.normal(0.0, 4.0, size=(2, 50_000)).astype(np.float32)
+    x, y = np.concatenate([common, rng.integers(0, 2**32, size=common.shape, dtype=np.uint32).view(np.float32)], axis=1)
+    here, there = (called(x, y, device) for device in ("cpu", plan.device))
+    for i, name in enumerate(FUNCTIONS):
+        yield row("functions", name, len(x), {"": different(here[:, i], there[:, i])})
 
 
-def called_library(x: np.ndarray, name: str) -> np.ndarray:
+def called(x: np.ndarray, y: np.ndarray, name: str) -> np.ndarray:
     device = start(name)
-    out = wp.empty((len(x), len(LIBRARY)), dtype=wp.float32, device=device)
-    load_kernel(call_library, device)
-    wp.launch(call_library, len(x), [wp.array(x, dtype=wp.float32, device=device), out], device=device)
+    out = wp.empty((len(x), len(FUNCTIONS)), dtype=wp.float32, device=device)
+    load_kernel(call_functions, device)
+    given = [wp.array(each, dtype=wp.float32, device=device) for each in (x, y)]
+    wp.launch(call_functions, len(x), [*given, out], device=device)
     return out.numpy()
 
 

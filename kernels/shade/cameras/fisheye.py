@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.shade.elementary import sin_cos
 from wrt.kernels.shade.pixel_rays import no_ray
 from wrt.kernels.structs import Ray, make_ray
 
@@ -30,11 +31,11 @@ def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
     radius = wp.sqrt(x * x + y * y)
     if radius > 1.0:
         return no_ray()
-    angle = radius * camera.half_angle
+    sin, cos = sin_cos(radius * camera.half_angle)
     aside = 0.0
     if radius > 0.0:
-        aside = wp.sin(angle) / radius
-    direction = wp.cos(angle) * camera.forward + aside * (x * camera.right + y * camera.up)
+        aside = sin / radius
+    direction = cos * camera.forward + aside * (x * camera.right + y * camera.up)
     return make_ray(camera.origin, wp.normalize(direction))
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.shade.elementary import sin_cos
 from wrt.kernels.structs import Ray, make_ray
 
 
@@ -21,8 +22,10 @@ def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
     the same picture is seen in the same directions."""
     longitude = wp.TAU * (film[0] - 0.5)
     colatitude = wp.PI * film[1]
-    level = wp.sin(longitude) * camera.right + wp.cos(longitude) * camera.forward
-    return make_ray(camera.origin, wp.normalize(wp.sin(colatitude) * level + wp.cos(colatitude) * camera.up))
+    sin, cos = sin_cos(longitude)
+    level = sin * camera.right + cos * camera.forward
+    sin_down, cos_down = sin_cos(colatitude)
+    return make_ray(camera.origin, wp.normalize(sin_down * level + cos_down * camera.up))
 
 
 def make_camera_ray(features: Any = None) -> Any:

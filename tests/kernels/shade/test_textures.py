@@ -152,6 +152,16 @@ def test_coordinates_far_out_stay_within_the_picture(wrap):
     assert np.allclose(look_up(textures, 1, uv), 200 / 255.0, atol=1e-5)
 
 
+def test_coordinates_beyond_all_integers_keep_their_side():
+    # 1e6 times 4096 is no int32: devices make the largest or the smallest one of it, and the CPU took the left edge.
+    wide = np.zeros((2, 4096, 4), np.uint8)
+    wide[:, -1] = 255
+    uv = [[1e6, 0.5], [-1e6, 0.5], [3e38, 0.5], [-3e38, 0.5]]
+    assert look_up([Texture(wide, srgb=False, wrap=("clamp", "clamp"))], 0, uv)[:, 0].tolist() == [1.0, 0.0, 1.0, 0.0]
+    board = Checkerboard((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1.0)
+    assert look_up([board], 0, [[3e38, 0.5], [3e38, 1.5], [-5e9, 1.5]])[:, 0].tolist() == [1.0, 0.0, 0.0]
+
+
 def test_one_texel_picture():
     for wrap in ("repeat", "clamp", "mirror"):
         one = Texture(np.array([[[10, 20, 30, 40]]], np.uint8), srgb=False, wrap=(wrap, wrap))

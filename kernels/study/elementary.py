@@ -1,0 +1,21 @@
+"""The elementary functions over arrays, to be compared between devices and with what is exact."""
+
+import warp as wp
+
+from wrt.kernels.shade.elementary import acos, atan2, exp, power, sin_cos
+from wrt.kernels.structs import kernel
+
+FUNCTIONS = ("sin", "cos", "acos", "exp", "atan2", "power")
+
+
+@kernel
+def call_functions(x: wp.array(dtype=float), y: wp.array(dtype=float), out: wp.array2d(dtype=float)):
+    """A row of each pair: the functions in the order of FUNCTIONS, of x alone, or of (x, y)."""
+    i = wp.tid()
+    sin, cos = sin_cos(x[i])
+    out[i, 0] = sin
+    out[i, 1] = cos
+    out[i, 2] = acos(x[i])
+    out[i, 3] = exp(x[i])
+    out[i, 4] = atan2(x[i], y[i])
+    out[i, 5] = power(x[i], y[i])
