@@ -51,7 +51,7 @@ PACKET_SIZE = ROOT_ENTRIES + WIDTH * LANES  # a multiple of 16: where the first 
 LEVEL = 16
 LEVEL_REFERENCES = WIDTH
 KEY_MASK = 2 * WIDTH - 1
-# Every level but the last has a child that is still to come, which a single ray's walk would have on its stack.
+# A level is added for a node with two or more children that are met, for which a single ray's walk has an entry on its stack.
 STACK_WORDS = LEVEL * (STACK_SIZE + 2)
 
 # A slot is where one ray is under way. ray: its column in `packets`; next: the reference to go to; place: where its stack goes on;

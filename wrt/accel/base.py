@@ -46,7 +46,7 @@ class Accelerator(Queries, ABC):
     name: ClassVar[str]
     kernels: Any
     _options: Mapping[str, Any] = MappingProxyType({})  # that it was built with
-    bytes_to_build: ClassVar[float] = 200.0  # of memory for each primitive, at the peak; measured, rounded up
+    bytes_to_build: ClassVar[float] = 320.0  # of memory for each primitive, at the peak; measured, rounded up
     bytes_on_device: ClassVar[float] = 120.0  # likewise, of a GPU's: stats.bytes
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
@@ -76,7 +76,7 @@ class Accelerator(Queries, ABC):
     def _begin(self, geometry: Geometry, device: str, threads: int | None, triangle: str, box: str) -> None:
         check_units(triangle, box)
         self.device = start(device)
-        self._state = State(geometry)
+        self._state = State(geometry.kept())
         self._refitting = threading.Lock()
         self._kept: dict[str, Any] = {}  # what refits go on using
         self.threads = thread_count(threads)
@@ -98,7 +98,7 @@ class Accelerator(Queries, ABC):
 
     @property
     def data(self) -> Any:
-        """The Warp struct that kernels get. It is never written to: a refit makes another."""
+        """The Warp struct that kernels get. A refit makes another, but in place it writes to this one's arrays."""
         return self._state.data
 
     @property

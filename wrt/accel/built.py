@@ -41,9 +41,9 @@ class Built:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """All that a refit changes. It is replaced as a whole, and nothing in it is written to: whoever takes it once has parts that
-    belong together, whatever other threads do. data: the Warp struct that kernels get; built_cost: the SAH cost that growth is
-    measured against. Until the structure is built, there is a geometry and nothing else."""
+    """All that a refit changes. It is replaced as a whole, and nothing but a refit in place writes to what is in it: whoever takes
+    it once has parts that belong together, whatever other threads do. data: the Warp struct that kernels get; built_cost: the SAH
+    cost that growth is measured against. Until the structure is built, there is a geometry and nothing else."""
 
     geometry: Geometry
     built: Any = None

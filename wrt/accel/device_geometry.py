@@ -19,7 +19,7 @@ class DeviceGeometry(Geometry):
     """What wrt.build takes in place of a mesh. points: a Warp array (V,) of vec3; indices: of int32, three a triangle one after
     another, as wp.Mesh has them, or (F,) of vec3i. Both are used where they are; `vertices` and `faces` copy them to the host.
 
-    The structure keeps its own records: points may be written to afterwards (Accelerator.refit follows them). Of their values
+    A structure over it copies the points: they may be written to afterwards (Accelerator.refit follows them). Of their values
     nothing is looked at; a triangle with a point that is not finite is hit by no ray. Raises InputError for other arrays, and for
     indices that lead to no point.
     """
@@ -58,6 +58,16 @@ class DeviceGeometry(Geometry):
     def moved(points: Any, indices: Any, spheres: np.ndarray) -> DeviceGeometry:
         """Of arrays that were looked at before, with spheres; indices: (F,) of vec3i."""
         return DeviceGeometry.__new__(DeviceGeometry)._set(points, indices, spheres)
+
+    def kept(self) -> DeviceGeometry:
+        """With points that nobody else writes to."""
+        return DeviceGeometry.moved(wp.clone(self.points), self.indices, self.spheres)
+
+    def write_bounds(self, lo: np.ndarray, hi: np.ndarray, threads: int = 1) -> None:
+        """As Geometry's; around a triangle with a point that is no number, all of space, as kernels.build.shape has it."""
+        super().write_bounds(lo, hi, threads)
+        nowhere = np.isnan(lo).any(axis=1) | np.isnan(hi).any(axis=1)
+        lo[nowhere], hi[nowhere] = -np.inf, np.inf
 
     def __len__(self) -> int:
         return len(self.indices) + len(self.spheres)

@@ -64,6 +64,10 @@ class Geometry:
         shape.spheres = upload(self.spheres, wp.vec4, device)
         return shape
 
+    def kept(self) -> Geometry:
+        """What a structure goes on using: with nothing that others write to."""
+        return self
+
     def bounds(self, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corner of every primitive's padded box, two (N, 3) float32."""
         lo, hi = (np.empty((len(self), 3), np.float32) for _ in range(2))
@@ -81,7 +85,7 @@ class Geometry:
             spheres = self.spheres[max(first - n, 0) : max(first + RECORDS_PER_JOB - n, 0)]
             low, high = (np.concatenate([end(end(corners[0], corners[1]), corners[2]), spheres[:, :3] + sign * spheres[:, 3:]])
                          for end, sign in ((np.minimum, np.float32(-1.0)), (np.maximum, np.float32(1.0))))
-            with np.errstate(over="ignore"):  # near the end of float32 the padded box is all of space
+            with np.errstate(over="ignore", invalid="ignore"):  # near the end of float32 the padded box is all of space
                 x, y, z = (high - low).T
                 pad = np.float32(PAD_EXTENT) * np.maximum(np.maximum(x, y), z)[:, None] + np.float32(PAD_SMALLEST)
                 lo[some] = low - (pad + np.float32(PAD_COORDINATE) * np.abs(low))

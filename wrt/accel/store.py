@@ -117,6 +117,8 @@ def check_links(nodes: np.ndarray, empties: list[np.ndarray], n_primitives: int,
         first, count = nodes["first_" + side].astype(np.int64), nodes["count_" + side].astype(np.int64)
         leaf = count > 0
         inner = ~leaf & ~empty
+        if (empty & ((first != 0) | leaf)).any():  # nobody asks such a child's box: kernels look at `first` and `count`
+            raise InputError("is damaged: a child that does not exist leads somewhere")
         # A child stands behind its parent: no walk returns to where it was.
         if (count < 0).any() or (leaf & ((first < 0) | (first + count > n_primitives))).any() or (
                 inner & ((first <= np.arange(n)) | (first >= n))).any():

@@ -96,6 +96,34 @@ def test_what_was_made_on_a_device_is_saved(tmp_path: Any) -> None:
     assert accel.epo() > 0.0
 
 
+def test_points_may_be_written_to_before_it_is_saved(tmp_path: Any) -> None:
+    geometry = wrt.DeviceGeometry(there(BALL.vertices, wp.vec3), there(BALL.faces, wp.vec3i))
+    accel = build(geometry, "bvh2")
+    geometry.points.assign(moved(0.5))
+    accel.save(tmp_path / "ball.accel")
+    assert_follows(load_accel(tmp_path / "ball.accel", BALL), BALL.vertices)
+
+
+def test_what_a_refit_in_place_left_can_be_saved_and_grows(tmp_path: Any) -> None:
+    accel = build(BALL, "bvh2")
+    accel.refit(there(moved(0.2), wp.vec3), in_place=True)
+    accel.save(tmp_path / "ball.accel")
+    again = load_accel(tmp_path / "ball.accel", Mesh(moved(0.2), BALL.faces))
+    assert again.refit(np.random.default_rng(0).permutation(moved(0.2)), rebuild_at=1.2).rebuilt
+
+
+@pytest.mark.parametrize("name", ["grid", "octree", "kdtree", "bvh2", "bvh8"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_triangles_with_a_point_that_is_not_finite_are_hit_by_no_ray(name: str, value: float) -> None:
+    points = BALL.vertices.copy()
+    points[7] = value
+    found = build(wrt.DeviceGeometry(there(points, wp.vec3), there(BALL.faces, wp.vec3i)), name).closest_hit(*RAYS)
+    there_are = np.flatnonzero((BALL.faces != 7).all(axis=1))
+    truth = build(Mesh(BALL.vertices, BALL.faces[there_are]), "brute_force").closest_hit(*RAYS)
+    np.testing.assert_array_equal(found.t, truth.t)
+    np.testing.assert_array_equal(found.prim_id, np.where(truth.prim_id < 0, -1, there_are[truth.prim_id]))
+
+
 @pytest.mark.parametrize(("points", "indices", "message"), [
     (BALL.vertices, BALL.faces, "points must be a Warp array"),
     (there(BALL.vertices, wp.vec3), BALL.faces, "indices must be a Warp array"),
@@ -114,6 +142,10 @@ def test_refits_that_are_refused() -> None:
                            (there(BALL.faces, wp.vec3i), "vertices must be a Warp array"), (BALL.vertices, "must be a Warp array")):
         with pytest.raises(InputError, match=message):
             accel.refit(given, in_place=True)
+    if wp.get_device(DEVICE).is_cpu:
+        for in_place in (False, True):
+            with pytest.raises(InputError, match="vertices must be finite"):
+                accel.refit(there(np.full_like(BALL.vertices, np.nan), wp.vec3), in_place=in_place)
     for name, options in (("bvh8", {}), ("bvh2_kdop", {}), ("bvh2", {"triangle": "plane"})):
         with pytest.raises(InputError, match="in place"):
             build(BALL, name, **options).refit(there(BALL.vertices, wp.vec3), in_place=True)

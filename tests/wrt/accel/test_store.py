@@ -17,7 +17,7 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from wrt.accel.build import build, build_cached, load_accel
 from wrt.accel.geometry import Geometry
-from wrt.accel.store import MAGIC
+from wrt.accel.store import MAGIC, check_binary
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import DIGEST_BYTES
 from wrt.core.errors import InputError
@@ -132,6 +132,15 @@ def test_indices_are_checked_before_a_ray_follows_them(saved: Path, change) -> N
     edited(saved, change)
     with pytest.raises(InputError, match=r"ball\.accel"):
         load_accel(saved, BALL)
+
+
+def test_a_child_that_does_not_exist_leads_nowhere() -> None:
+    """A refit on a device looks at `first` and `count`, not at the box."""
+    nodes = build(wrt.Mesh(np.eye(3), np.array([[0, 1, 2]])), "bvh2").built.arrays["nodes"].copy()
+    check_binary(nodes, 1, 64)
+    nodes["first_1"][0] = 10**8
+    with pytest.raises(InputError, match="does not exist"):
+        check_binary(nodes, 1, 64)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import time
 from abc import abstractmethod
 from copy import copy
@@ -17,6 +19,7 @@ from wrt.accel.bvh.builders import DEVICE_BUILDERS, BvhOptions, build_binary, sa
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry
+from wrt.accel.rays import vectors
 from wrt.accel.store import check_binary
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
@@ -94,6 +97,8 @@ class Bvh2(BinaryBvh):
         points = DeviceGeometry.points_of(vertices, "vertices")
         if len(points) != self.geometry.n_vertices:
             raise InputError(f"vertices must be ({self.geometry.n_vertices},), got ({len(points)},)")
+        if points.device.is_cpu:
+            vectors(points.numpy(), "vertices")
         return points
 
     def _refit(self, built: Built) -> Built:
@@ -116,6 +121,14 @@ class Bvh2(BinaryBvh):
         wp.copy(kept.shape.vertices, points)
         kept.fitting.refit(kept.tree, kept.shape, self.threads)
         self._write_corners(kept.shape, kept.tree.order, self.data.primitives)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """As Accelerator.save. Of a tree that was refitted in place, what it costs is looked up first."""
+        built = self._state.built
+        if math.isnan(built.sah_cost):
+            cost = sah_cost(built.on_host().arrays["nodes"])
+            self._state = replace(self._state, built=replace(built, sah_cost=cost))
+        super().save(path)
 
     def _begin_in_place(self, points: Any) -> InPlace:
         """Arrays of its own for the structure, and what is kept beside them."""
