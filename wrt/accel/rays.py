@@ -69,7 +69,8 @@ def rays_on(device: Any, rays: Rays) -> RayArrays:
     for name, array, dtype in zip(fields_of(RayArrays), rays.checked().on(device), (wp.vec3, wp.vec3, wp.float32, wp.float32),
                                   strict=True):
         if not isinstance(array, wp.array):
-            array = one_for_all(float(array[0]), len(array), device) if array.strides == (0,) else upload(array, dtype, device)
+            array = (one_for_all(float(array[0]), len(array), device) if len(array) and array.strides == (0,)
+                         else upload(array, dtype, device))
         setattr(out, name, array)
     return out
 
