@@ -133,5 +133,6 @@ def _read(folder: Path, device: str, warp: str) -> Choice | None:
         reason = str(error)
     except (ValueError, RecursionError, TypeError, KeyError):
         reason = "is damaged"
-    warnings.warn(f"{path}: {reason}, and the default is used; `python -m wrt devices --tune` writes it anew", stacklevel=2)
+    warnings.warn(f"{path}: {reason}, and the default is used; `python -m wrt devices --tune --device NAME` writes it anew",
+                  stacklevel=2)
     return None
