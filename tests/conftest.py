@@ -1,6 +1,8 @@
 """What all tests start from."""
 
+import os
 import signal
+import tempfile
 from collections.abc import Callable
 
 import pytest
@@ -19,6 +21,9 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    folder = tempfile.TemporaryDirectory(prefix="wrt-tests-")  # what the user has tuned is not for tests
+    config.add_cleanup(folder.cleanup)
+    os.environ["WRT_CACHE_PATH"] = folder.name
     if config.getoption("--device") != "cpu":
         from tests import device
 

@@ -7,7 +7,7 @@ Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
 FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; ConstantBackground, GradientBackground,
 EnvironmentBackground.
-What a picture costs: profile. What goes wrong: InputError, SceneWarning.
+What a picture costs: profile. What is fastest on a device: tune. What goes wrong: InputError, SceneWarning.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from wrt.io.mesh_file import load_mesh as load_mesh
     from wrt.kernels.structs import kernel as kernel
     from wrt.lab.rtcore.profiler import profile as profile
+    from wrt.lab.tune import tune as tune
     from wrt.picture.film import Film as Film
     from wrt.renderer.options import Options as Options
     from wrt.renderer.options import Progress as Progress
@@ -78,6 +79,7 @@ _PUBLIC = {
     "wrt.io.mesh_file": ("load_mesh",),
     "wrt.kernels.structs": ("kernel",),
     "wrt.lab.rtcore.profiler": ("profile",),
+    "wrt.lab.tune": ("tune",),
     "wrt.picture.film": ("Film",),
     "wrt.renderer.options": ("Options", "Progress"),
     "wrt.renderer.pixel_rays": ("camera_rays",),

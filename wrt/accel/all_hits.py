@@ -16,7 +16,7 @@ from wrt.accel.ray_query import query_of, require_one_mesh, world_of
 from wrt.accel.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
 from wrt.core.checks import as_integer, shown
-from wrt.core.device import launch, made_once, thread_count
+from wrt.core.device import launch_on, made_once, thread_count
 from wrt.core.memory import require
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.ray_query import make_hit_kernels
@@ -72,10 +72,7 @@ class Asked:
         return self
 
     def launch(self, kernel: Any, *inputs: Any) -> None:
-        if self.device.is_cpu:
-            launch(kernel, self.n, self.world, self.rays, *inputs, None, threads=self.threads, step=RAYS_PER_LAUNCH)
-        else:
-            wp.launch(kernel, dim=self.n, inputs=[self.world, self.rays, *inputs, 0], device=self.device)
+        launch_on(self.device, kernel, self.n, self.world, self.rays, *inputs, None, threads=self.threads, step=RAYS_PER_LAUNCH)
 
     def counts(self, kernel: Any = None) -> np.ndarray:
         """A number for each ray, of `count_hits` or `cross`."""

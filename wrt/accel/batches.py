@@ -14,7 +14,7 @@ from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES
 from wrt.accel.rays import Rays, rays_on
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.core.arrays import to_warp
-from wrt.core.device import empty_aligned, free_memory, load_kernel, made_once, run_all
+from wrt.core.device import empty_aligned, free_memory, launch_on, load_kernel, made_once, run_all
 from wrt.core.memory import SMALL as SMALL_BYTES
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Surfaces, fields_of
@@ -167,8 +167,8 @@ def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out
         hits = HitArrays()
         for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
             setattr(hits, name, array)
-        inputs = [data, surfaces, rays_on(device, rays if part == n else rays.part(some)), hits if len(out) > 1 else there[0], 0]
-        wp.launch(kernel, dim=some.stop - first, inputs=inputs, device=device, record_tape=False)
+        given = rays_on(device, rays if part == n else rays.part(some))
+        launch_on(device, kernel, some.stop - first, data, surfaces, given, hits if len(out) > 1 else there[0], None)
         for array, found in zip(out, there, strict=True):
             if not isinstance(array, wp.array):
                 array[some] = found.numpy()

@@ -14,7 +14,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import InstancedGeometry, Instances
 from wrt.accel.store import check_target, read
-from wrt.accel.structures import ACCELERATORS
+from wrt.accel.structures import ACCELERATORS, chosen
 from wrt.core.checks import as_one
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
@@ -32,12 +32,13 @@ def build(mesh: Mesh | Geometry | InstancedGeometry | str | os.PathLike[str], ac
     """An acceleration structure over a mesh, ready for `closest_hit` and `any_hit`.
 
     mesh: a Mesh, a Geometry, or the path of a mesh file; over an InstancedGeometry it is a tree over structures of
-    the kind, one for each mesh. accel: a name in ACCELERATORS. options: `triangle` and `box`, the intersection tests (names in
-    wrt.kernels.units.triangle.RAY_TRIANGLE and wrt.kernels.units.box.RAY_AABB), and the structure's own (see its class). Raises
+    the kind, one for each mesh. accel: a name in ACCELERATORS; "bvh" is bvh8, or what `wrt.tune` has kept for the device.
+    options: `triangle` and `box`, the intersection tests (names in wrt.kernels.units.triangle.RAY_TRIANGLE and
+    wrt.kernels.units.box.RAY_AABB), and the structure's own (see its class). Raises
     InputError that names the argument.
     """
     ACCELERATORS.check(as_one(accel, str, "accel"))
-    kind, device = ACCELERATORS[accel], as_one(device, str, "device")
+    kind = ACCELERATORS[chosen(accel, as_one(device, str, "device"))]
     if isinstance(mesh, InstancedGeometry):
         return Instances(kind, mesh, device, threads, **options)
     structure: Accelerator = kind(geometry_of(mesh), device=device, threads=threads, **options)
@@ -57,9 +58,9 @@ def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: s
                  threads: int | None = None, **options: Any) -> Accelerator:
     """As `build`, but from `folder` where the same geometry was built with the same options before; else it is built, and left
     there. A damaged file there is written anew. Raises InputError as `build` does, and where the folder cannot be written."""
-    geometry = geometry_of(mesh)
-    chosen = {name: value for name, value in options.items() if name != "progress"}
-    key = json.dumps([geometry.digest(), accel, chosen, VERSION], sort_keys=True)
+    geometry, accel = geometry_of(mesh), chosen(accel, device)
+    given = {name: value for name, value in options.items() if name != "progress"}
+    key = json.dumps([geometry.digest(), accel, given, VERSION], sort_keys=True)
     path = Path(folder) / f"{sha256(key.encode()).hexdigest()[:32]}.accel"
     if path.is_file():
         with contextlib.suppress(InputError):  # a damaged one is replaced below

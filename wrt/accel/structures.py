@@ -6,9 +6,10 @@ from __future__ import annotations
 from typing import Any
 
 from wrt.core.registry import Registry
+from wrt.core.tuned import DEFAULT, choice_for
 
 ACCELERATORS: Registry[type[Any]] = Registry("structure", {
-    "bvh": "wrt.accel.bvh.wide:Bvh8",  # the default: the best one there is
+    "bvh": "wrt.accel.bvh.wide:Bvh8",  # the default, unless the device is tuned (`chosen`)
     "bvh2": "wrt.accel.bvh.binary:Bvh2",
     "bvh4": "wrt.accel.bvh.wide:Bvh4",
     "bvh8": "wrt.accel.bvh.wide:Bvh8",
@@ -21,3 +22,17 @@ ACCELERATORS: Registry[type[Any]] = Registry("structure", {
     "grid": "wrt.accel.cells.grid:Grid",
     "octree": "wrt.accel.cells.octree:Octree",
 })
+
+
+def meant(accel: str) -> str:
+    """The name of what a name stands for: "bvh" is another name of the default."""
+    return DEFAULT.accel if accel == "bvh" else accel
+
+
+def chosen(accel: str, device: str) -> str:
+    """As `meant`, where "bvh" is what the device is tuned for (wrt.tune). Raises InputError where there is no such device."""
+    if accel != "bvh":
+        return accel
+    from wrt.core.device import start
+
+    return choice_for(start(device)).accel

@@ -1,4 +1,4 @@
-"""The command that tells what there is to compute on, and whether it computes as it should: `devices`."""
+"""The command that tells what there is to compute on, whether it computes as it should, and what is fastest on it: `devices`."""
 
 from __future__ import annotations
 
@@ -13,18 +13,34 @@ from wrt.core.errors import InputError
 @click.command()
 @click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit, and measure its speed; exit code 1 where"
                                             " a bit differs. Minutes, as all kernels are compiled")
-@click.option("--device", help="To check: cuda:0, ...  [default: cuda:0]")
+@click.option("--tune", "tunes", is_flag=True, help="Find the structure and the block size that are fastest on a device, and keep"
+                                                    " them for it: --accel bvh then means that structure. The bits stay the same")
+@click.option("--device", help="To check or to tune: cuda:0, ...  [default: cuda:0]")
 @click.option("--scene", "scenes", type=click.Path(path_type=Path), multiple=True,
               help="To check by, repeatable  [default: those that ship with wrt]")
 @click.option("--rays", type=int, help="To check by, of each kind for each mesh and structure  [default: 20000]")
 @shared("quiet", "as_json")
-def devices(check: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool, as_json: bool) -> None:
-    """List the devices that Warp can compute on, or check one."""
+def devices(check: bool, tunes: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool,
+            as_json: bool) -> None:
+    """List the devices that Warp can compute on, check one, or tune wrt for one."""
     from wrt.core.device import describe_devices
 
+    if check and tunes:
+        raise InputError("--check and --tune are two commands: give one")
     if not check:
-        if scenes or device is not None or rays is not None:
-            raise InputError("--device, --scene and --rays belong to --check")
+        if scenes or rays is not None or (device is not None and not tunes):
+            raise InputError("--device, --scene and --rays belong to --check, and --device to --tune")
+    if tunes:
+        from wrt.lab.tune import tune
+
+        with warnings_reported(quiet):
+            tuning = tune(device or "cuda:0")
+        if as_json:
+            say_json(tuning.as_dict())
+        else:
+            click.echo(tuning.text())
+        return
+    if not check:
         lines = describe_devices()
         if as_json:
             say_json({"devices": lines})

@@ -29,6 +29,7 @@ from wrt.core.compiler import first_with_headers, prepare_compiler
 from wrt.core.errors import InputError
 from wrt.core.memory import SMALL, available, gib
 from wrt.core.seconds import loading
+from wrt.core.tuned import choice_for, kept
 from wrt.core.write_file import compiling
 
 MOST_HELPERS = 1 << 10
@@ -107,10 +108,20 @@ def start(device: str) -> Any:
 def describe_devices() -> list[str]:
     """One line a device: its name for `--device`, and what it is."""
     start("cpu")
-    lines = [f"cpu: {wp.get_device('cpu').name or 'CPU'}, {thread_count(None)} threads"]
+    lines = [f"cpu: {wp.get_device('cpu').name or 'CPU'}, {thread_count(None)} threads{_tuned(wp.get_device('cpu'))}"]
     for device in wp.get_cuda_devices():
-        lines.append(f"{device.alias}: {device.name}, {device.total_memory / 2**30:.0f} GiB, sm_{device.arch}")
+        lines.append(f"{device.alias}: {device.name}, {device.total_memory / 2**30:.0f} GiB, sm_{device.arch}{_tuned(device)}")
     return lines
+
+
+def _tuned(device: Any) -> str:
+    choice = kept(device)
+    return f", tuned: {choice.accel}" + (f" in blocks of {choice.block_dim}" if device.is_cuda else "") if choice else ""
+
+
+def block_dim(device: Any) -> int:
+    """Threads of a block of a launch: on the CPU one; the module's default block size would be compiled for nothing."""
+    return 1 if device.is_cpu else choice_for(device).block_dim
 
 
 def free_memory(device: Any) -> float:
@@ -127,10 +138,10 @@ def require_on(device: Any, needed: float, what: str) -> None:
 
 
 class _Loaded:
-    """On which devices (their names) a kernel is loaded; Warp would look at files again each time."""
+    """On which devices (their names) and with which blocks a kernel is loaded; Warp would look at files again each time."""
 
     def __init__(self) -> None:
-        self.devices: set[str] = set()
+        self.devices: set[tuple[str, int]] = set()
         self.lock = threading.Lock()
 
 
@@ -140,19 +151,17 @@ _loaded: WeakKeyDictionary[Any, _Loaded] = WeakKeyDictionary()
 def load_kernel(kernel: Any, device: Any) -> None:
     """Compile a kernel, or take it from the cache, before threads launch it. One thread compiles it; others that ask wait.
 
-    The CPU launches with blocks of one thread; the module's default block size would be compiled for nothing. Raises InputError
-    where the cache's folder has no room or cannot be written to.
+    Raises InputError where the cache's folder has no room or cannot be written to.
     """
-    loaded = _loaded.get(kernel) or _loaded.setdefault(kernel, _Loaded())
-    if device.alias not in loaded.devices:
+    loaded, place = _loaded.get(kernel) or _loaded.setdefault(kernel, _Loaded()), (device.alias, block_dim(device))
+    if place not in loaded.devices:
         with loaded.lock:
-            if device.alias not in loaded.devices:
-                _load(kernel, device)
-                loaded.devices.add(device.alias)
+            if place not in loaded.devices:
+                _load(kernel, device, place[1])
+                loaded.devices.add(place)
 
 
-def _load(kernel: Any, device: Any) -> None:
-    block_dim = 1 if device.is_cpu else None
+def _load(kernel: Any, device: Any, block_dim: int) -> None:
     with loading(), _cache_told():
         cache, name = Path(wp.config.kernel_cache_dir), kernel.module.get_module_identifier(block_dim)
         compiled = ("*.o",) if device.is_cpu else ("*.cubin", "*.ptx")
@@ -291,12 +300,13 @@ def launch(kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -
 
 
 def launch_on(device: Any, kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -> None:
-    """As `launch` on the CPU; on a GPU one launch over all of n."""
+    """As `launch` on the CPU; on a GPU one launch over all of n, in blocks of as many threads as the device is tuned for."""
     if device.is_cpu:
         launch(kernel, n, *inputs, threads=threads, step=step)
     elif n:
         load_kernel(kernel, device)
-        wp.launch(kernel, dim=n, device=device, inputs=[0 if each is None else each for each in inputs], record_tape=False)
+        wp.launch(kernel, dim=n, device=device, inputs=[0 if each is None else each for each in inputs], record_tape=False,
+                  block_dim=block_dim(device))
 
 
 def run_growing(begin: Callable[[Any], tuple[Callable[[], Any], Callable[[], Iterable[Any]]]], tasks: Iterable[Any],

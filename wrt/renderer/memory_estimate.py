@@ -36,7 +36,7 @@ def require_memory(plan: Plan, device: Any) -> None:
     x0, y0, x1, y1 = plan.crop
     pixel = BYTES_OF_FILM + BYTES_OF_GROUP * (plan.groups - 1) + (BYTES_OF_AOVS if plan.options.aov else 0)
     film = plan.area * (pixel + BYTES_OF_RESULT) + bytes_of_waves(plan)
-    scene = bytes_of_scene(plan.scene, ACCELERATORS[plan.options.accel], plan.meshes)
+    scene = bytes_of_scene(plan.scene, ACCELERATORS[plan.accel], plan.meshes)
     free = free_memory(device)
     if film + scene > max(free, SMALL):
         raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {gib(film)} of memory, its scene {gib(scene)};"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from wrt.accel.structure import Structure
-from wrt.accel.structures import ACCELERATORS
+from wrt.accel.structures import ACCELERATORS, chosen, meant
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
 from wrt.kernels import structs
@@ -38,13 +38,15 @@ def aov_kernel(features: Features, structure: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """meshes: the id()s of those that are kept once (wrt.renderer.instancing); structure: what the kernels are made for, a
+    """accel: the structure's name, where the options may say "bvh"; meshes: the id()s of those that are kept once
+    (wrt.renderer.instancing); structure: what the kernels are made for, a
     Structure or one with a log before it (wrt.renderer.costs); crop: x0, y0, x1, y1 in pixels; deepest: the bounces that the
     kernels have room for."""
 
     scene: Scene
     options: Options
     camera: CameraKind
+    accel: str
     meshes: frozenset[int]
     features: Features
     structure: Any
@@ -114,12 +116,15 @@ class Plan:
 
 
 def plan_of(scene: Scene, options: Options) -> Plan:
-    """Raises InputError for a camera or a crop that there is not."""
+    """What the device is tuned for is for renders of this process alone: a checkpoint and other workers may go on elsewhere. Raises
+    InputError for a camera or a crop that there is not."""
+    alone = options.checkpoint is None and options.executor is None
+    accel = chosen(options.accel, options.device) if alone else meant(options.accel)
     camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
     meshes = instanced_meshes(scene, options.instancing)
     features = features_of(scene, camera, meshes)
     units = Units(options.triangle, options.box, features.spheres, instances=features.instances)
-    return Plan(scene, options, camera, meshes, features, Structure(ACCELERATORS[options.accel], units),
+    return Plan(scene, options, camera, accel, meshes, features, Structure(ACCELERATORS[accel], units),
                 _crop(scene.settings, options), scene.settings.max_depth)
 
 

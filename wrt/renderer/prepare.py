@@ -11,11 +11,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build, reports_progress
-from wrt.core.device import load_kernel, thread_count
+from wrt.core.device import launch_on, load_kernel, thread_count
 from wrt.core.seconds import Span, counted_once, loads_since
 from wrt.kernels import structs
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
@@ -64,7 +63,7 @@ class Prepared:
         """Counts of the scene and its structure."""
         return {"triangles": self.accel.geometry.n_triangles, "stored_triangles": len(self.arrays.world.faces),
                 "spheres": len(self.accel.geometry.spheres),
-                "accel": {"name": self.plan.options.accel, **asdict(self.accel.stats)}}
+                "accel": {"name": self.plan.accel, **asdict(self.accel.stats)}}
 
     def tiles(self, samples: int) -> Iterator[Rectangle]:
         """What one launch traces, where each pixel takes so many samples: the whole crop on CUDA; on the CPU one or two waves, if
@@ -96,7 +95,7 @@ class Prepared:
             tile.x, tile.y, tile.width, height = work.rectangle
             tile.first_sample, tile.n_samples = work.first, work.n
             for arguments in groups:
-                wp.launch(kernel, dim=tile.width * height, inputs=[*arguments, tile], device=self.device)
+                launch_on(self.device, kernel, tile.width * height, *arguments, tile)
             return work.total
 
         return trace
@@ -189,9 +188,9 @@ class _Preparation:
         self.arrays = upload_scene(self.plan.scene, self.device, self.plan.meshes)
         uploaded = time.perf_counter()
         chosen = {"triangle": options.triangle, "box": options.box, **options.accel_options}
-        if reports_progress(options.accel):
+        if reports_progress(self.plan.accel):
             chosen = {"progress": self._built, **chosen}
-        self.accel = build(self.arrays.world.geometry, options.accel, options.device, self.threads, **chosen)
+        self.accel = build(self.arrays.world.geometry, self.plan.accel, options.device, self.threads, **chosen)
         self.spans = {"upload": [(begin, uploaded)], "build": [(uploaded, time.perf_counter())]}
 
     def _built(self, fraction: float) -> None:

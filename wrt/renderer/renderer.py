@@ -63,7 +63,7 @@ class Renderer:
             return {"structure": "rebuilt" if refit["rebuilt"] else "refitted", "seconds": refit["seconds"],
                     "growth": refit["growth"]}
         options = plan.options
-        accel = build(geometry, options.accel, options.device, old.threads, triangle=options.triangle, box=options.box,
+        accel = build(geometry, plan.accel, options.device, old.threads, triangle=options.triangle, box=options.box,
                       **options.accel_options)
         self.prepared = replace(self.prepared, accel=accel)
         return {"structure": "rebuilt", "seconds": accel.stats.build_seconds, "growth": float("nan")}

@@ -109,7 +109,7 @@ class DistributedRenderer:
 
 def workers_for(plan: Plan) -> Workers:
     """Those that the plan's options name."""
-    scene, options = replace(plan.scene, cameras=(plan.camera,)), replace(plan.options, camera=None)
+    scene, options = replace(plan.scene, cameras=(plan.camera,)), replace(plan.options, camera=None, accel=plan.accel)
     if options.devices is not None:
         return DeviceWorkers(scene, options)
     key, package = packaged(scene, options, plan.kernels_hash())

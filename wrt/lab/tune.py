@@ -1,0 +1,113 @@
+"""`wrt.tune`: which structure and which blocks are fastest on the device at hand."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.core.checks import as_one
+from wrt.core.device import start, thread_count
+from wrt.core.errors import InputError
+from wrt.core.tuned import BLOCK_DIMS, DEFAULT, STRUCTURES, Choice, keep, place_for, using
+from wrt.lab.bench.rays import RaySet, ray_sets
+from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled
+from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.bench.visibility import terrain
+from wrt.lab.hard_cases.contestants import Own
+
+CELLS = 320  # a side of the terrain: 204,800 triangles, of which no GPU's first cache holds much
+KINDS = ("primary", "shadow", "diffuse")  # what a picture asks
+FAST, SLOW = 1 << 20, 1 << 15  # rays on CUDA, and on the CPU
+FEWEST, MOST = 3, 100  # runs
+MARGIN = 1.03  # so much faster than the default is what is chosen instead: less may be noise
+COLUMNS: Columns = {"structure": "{accel}", "block": "{block}", "rays": "{kind}", "Mray/s": lambda row: spread(row.mrays),
+                    "times as fast as the default": "{speed:.2f}"}
+LEGEND = """\
+Rays and answers are on the device; median of the runs by turns, the middle half of them in brackets. The last column: the geometric
+mean over the kinds of rays."""
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """choice: what is kept, in `path`; speeds: of every choice that was measured, over the default's; rows: the measurements."""
+
+    choice: Choice
+    path: Path
+    machine: str
+    speeds: Mapping[Choice, float]
+    rows: list[Row]
+
+    def text(self) -> str:
+        block = "" if self.rows[0].block == "" else f" in blocks of {self.choice.block_dim} threads"
+        found = f"Chosen: {self.choice.accel}{block}, kept in {self.path}; without that file it is the default again."
+        return markdown([tabled(COLUMNS, self.rows, "Tuning", f"Machine: {self.machine}\n\n{found}\n\n{LEGEND}")])
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"machine": self.machine, "choice": asdict(self.choice), "path": str(self.path),
+                "rows": [row.as_dict() for row in self.rows]}
+
+
+def tune(device: str, seconds: float = 1.0, clock: Callable[[], float] = time.perf_counter) -> Tuning:
+    """Measure the structures of STRUCTURES, then on CUDA the winner in blocks of other sizes, for so many seconds in all (after
+    compiling and building, which take longer), and keep the best for this kind of device: "bvh" then means that structure.
+
+    Hits and pixels have the same bits whatever is chosen; what a picture's stats tell of nodes and seconds changes. Raises
+    InputError where there is no such device, and where the choice cannot be kept.
+    """
+    there = start(as_one(device, str, "device"))
+    if not as_one(seconds, (int, float), "seconds") > 0.0:
+        raise InputError(f"seconds must be more than 0, got {seconds}")
+    place_for(there)  # where nothing can be kept, that is told before anything is measured
+    geometry = Geometry.of(terrain(CELLS))
+    rays = ray_sets(build(geometry, DEFAULT.accel, device), FAST if there.is_cuda else SLOW)
+    phases = 2 if there.is_cuda else 1
+    measured = measure([Choice(accel) for accel in STRUCTURES], geometry, rays, there, seconds / phases, clock)
+    rows, speeds = measured
+    best = fastest(speeds)
+    if there.is_cuda:
+        others = [DEFAULT, *(Choice(best.accel, block) for block in BLOCK_DIMS)]
+        measured = measure(list(dict.fromkeys(others)), geometry, rays, there, seconds / phases, clock)
+        rows, speeds = rows + measured[0], speeds | measured[1]
+        best = fastest(measured[1])
+    return Tuning(best, keep(there, best), machine_line(f"Warp {wp.__version__}", device=device), speeds, rows)
+
+
+def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet], device: Any, seconds: float,
+            clock: Callable[[], float]) -> tuple[list[Row], dict[Choice, float]]:
+    """The first choice is the default."""
+    jobs: dict[tuple[Choice, str], Callable[[], None]] = {}
+    for accel in dict.fromkeys(choice.accel for choice in choices):
+        own = Own(structure=accel, device=device.alias)
+        own.prepare(geometry)
+        for kind in KINDS:
+            search = own.search(rays[kind], thread_count(None))
+            jobs |= {(choice, kind): partial(ask, choice, search, device) for choice in choices if choice.accel == accel}
+    once = sum(float(taken.sum()) for taken in alternate(jobs, 1, clock).values())
+    taken = alternate(jobs, min(max(int(seconds / once), FEWEST), MOST), clock)
+    middle = {key: float(np.median(each)) for key, each in taken.items()}
+    speeds = {choice: float(np.exp(np.mean([np.log(middle[choices[0], kind] / middle[choice, kind]) for kind in KINDS])))
+              for choice in choices}
+    rows = [Row(accel=choice.accel, block=choice.block_dim if device.is_cuda else "", kind=kind, rays=len(rays[kind]),
+                mrays=(len(rays[kind]) / each / 1e6).tolist(), speed=speeds[choice]) for (choice, kind), each in taken.items()]
+    return rows, speeds
+
+
+def fastest(speeds: Mapping[Choice, float]) -> Choice:
+    """speeds: over the default's."""
+    best = max(speeds, key=lambda choice: speeds[choice])
+    return best if speeds[best] >= MARGIN else DEFAULT
+
+
+def ask(choice: Choice, search: Callable[[], Any], device: Any) -> None:
+    with using(device, choice):
+        search()
+        wp.synchronize_device(device)
