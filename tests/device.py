@@ -10,8 +10,8 @@ from typing import Any
 NAME = "cpu"
 IS_VIRTUAL = False
 # Where functions have "cpu" as their default device.
-MODULES = ("wrt.accel.base", "wrt.accel.build", "wrt.accel.instances", "wrt.accel.store", "wrt.renderer.compile",
-           "wrt.renderer.options", "wrt.lab.bench.rasterizer", "wrt.lab.plans")
+MODULES = ("wrt.accel.base", "wrt.accel.build", "wrt.accel.instances", "wrt.accel.store", "wrt.compat.trimesh",
+           "wrt.renderer.compile", "wrt.renderer.options", "wrt.lab.bench.rasterizer", "wrt.lab.plans")
 
 
 def use(name: str, *, real: bool = False, seed: int = 0) -> None:
@@ -41,6 +41,8 @@ def _set_default(function: FunctionType, name: str) -> None:
     names = code.co_varnames[code.co_argcount - len(values) : code.co_argcount]
     function.__defaults__ = tuple(name if (each, value) == ("device", "cpu") else value
                                   for each, value in zip(names, values, strict=True)) or None
+    if (function.__kwdefaults__ or {}).get("device") == "cpu":
+        function.__kwdefaults__["device"] = name
 
 
 def _set_option(command: Any, name: str) -> None:

@@ -1,0 +1,260 @@
+"""trimesh's ray class, answered by wrt.
+
+>>> from wrt.compat.trimesh import RayMeshIntersector
+>>> mesh.ray = RayMeshIntersector(mesh)                 # mesh.contains and the rest of trimesh ask it from now on
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from trimesh.caching import Cache, cache_decorator
+from trimesh.ray.ray_util import contains_points
+
+from wrt.accel.all_hits import all_hits, first_hits
+from wrt.accel.answers import Hits
+from wrt.accel.build import build
+from wrt.accel.contains import contains, open_edges
+from wrt.core.errors import InputError
+from wrt.kernels.query import FARTHEST
+from wrt.scene.mesh import Mesh
+
+if TYPE_CHECKING:
+    import trimesh
+
+AWAY = 4.0  # radii of a mesh; what is farther from it is brought near before it is rounded to float32
+FEW = 4  # hits that most rays have fewer of: one walk finds each, where all_hits takes two
+CLOSE_TO_1 = 2.0**-23  # by which u + v in float32 may miss 1 at the edge opposite of corner 0
+
+
+class RayMeshIntersector:
+    """As trimesh.ray.ray_pyembree.RayMeshIntersector, and with the keywords of ray_triangle's. docs/compat.md has what differs.
+
+    geometry: a trimesh.Trimesh; when it changes, the next query builds anew. scale_to_box: also find very large and very small
+    meshes, whose coordinates or areas are beyond float32. device, threads: as in wrt.build.
+
+    A method takes ray_origins and ray_directions, (N, 3) each, in the mesh's units; directions of any length. A ray that is not
+    finite or has no direction hits nothing. Hits are decided watertight in float32, relative to the mesh, and located in float64.
+    Raises InputError, a ValueError, for other shapes.
+    """
+
+    def __init__(self, geometry: trimesh.Trimesh, scale_to_box: bool = True, *, device: str = "cpu",
+                 threads: int | None = None) -> None:
+        self.mesh = geometry
+        self._options: dict[str, Any] = {"scale_to_box": scale_to_box, "device": device, "threads": threads}
+        self._cache = Cache(id_function=self.mesh.__hash__)
+
+    @cache_decorator
+    def _placed(self) -> _Placed:
+        """Made again when the mesh has changed."""
+        return _Placed(self.mesh.vertices, self.mesh.faces, **self._options)
+
+    def intersects_id(self, ray_origins: Any, ray_directions: Any, multiple_hits: bool = True, max_hits: int = 100,
+                      return_locations: bool = False) -> tuple[np.ndarray, ...]:
+        """Faces that are hit, (M,) int64, and by which ray, (M,) int64; return_locations: also where, (M, 3) float64.
+
+        First hits in the order of the rays, then second ones ...; multiple_hits: more than the first; max_hits: of a ray, at
+        most. At an edge or a corner, a surface is hit once.
+        """
+        origins, directions = _rays(ray_origins, ray_directions)
+        placed, most = self._placed, max_hits if multiple_hits else min(max_hits, 1)
+        ray, face, u, v = placed.every_hit(origins, directions) if most > 1 else placed.first_hit(origins, directions)
+        number = _ranks(ray)
+        order = np.argsort(number, kind="stable")
+        order = order[:np.searchsorted(number[order], most)]
+        ray, face = ray[order], face[order]
+        if not return_locations:
+            return face, ray
+        corners = self.mesh.vertices.view(np.ndarray)[self.mesh.faces.view(np.ndarray)[face]]
+        return face, ray, located(corners, origins[ray], directions[ray], u[order], v[order])
+
+    def intersects_location(self, ray_origins: Any, ray_directions: Any, multiple_hits: bool = True,
+                            max_hits: int = 100) -> tuple[np.ndarray, ...]:
+        """As intersects_id: where, (M, 3) float64; by which ray, and which faces, (M,) int64 each."""
+        face, ray, where = self.intersects_id(ray_origins, ray_directions, multiple_hits, max_hits, return_locations=True)
+        return where, ray, face
+
+    def intersects_first(self, ray_origins: Any, ray_directions: Any) -> np.ndarray:
+        """The face that each ray hits first, the lowest of several at the same distance; -1: none. (N,) int32."""
+        origins, directions = _rays(ray_origins, ray_directions)
+        out = np.full(len(origins), -1, np.int32)
+        ray, face, _, _ = self._placed.first_hit(origins, directions)
+        out[ray] = face
+        return out
+
+    def intersects_any(self, ray_origins: Any, ray_directions: Any) -> np.ndarray:
+        """Whether each ray hits anything, (N,) bool."""
+        return self._placed.any_hit(*_rays(ray_origins, ray_directions))
+
+    def contains_points(self, points: Any) -> np.ndarray:
+        """Whether each of `points`, (N, 3), is inside: (N,) bool, by wrt.contains. Where the mesh is not closed, by trimesh's
+        own rule (both directions of a line agree), from the hits of this class."""
+        points = np.asarray(points, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"points must be (N, 3), got {points.shape}")
+        if not self._placed.closed and len(self.mesh.faces):
+            return contains_points(self, points)
+        return self._placed.contains(points)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"mesh": self.mesh, "_options": self._options}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._cache = Cache(id_function=self.mesh.__hash__)
+
+    def __copy__(self) -> RayMeshIntersector:
+        return type(self)(self.mesh, **self._options)
+
+    def __deepcopy__(self, memo: Any) -> RayMeshIntersector:
+        return self.__copy__()
+
+
+class _Placed:
+    """A structure over a mesh in a place where float32 serves it best: near 0 (not moved where it is there already, so that no
+    vertex is rounded more than it must be), and of a size near 1, by a power of two.
+
+    A face with a corner that is not finite is hit no more, as one without area; all keep their numbers.
+    """
+
+    def __init__(self, vertices: Any, faces: Any, scale_to_box: bool, device: str, threads: int | None) -> None:
+        vertices, faces = np.array(vertices, np.float64), np.array(faces, np.int64).reshape(-1, 3)
+        faces[~np.isfinite(vertices).all(axis=1)[faces].all(axis=1)] = 0
+        unused = np.ones(len(vertices), bool)
+        unused[faces[faces.any(axis=1)]] = False
+        used = vertices[~unused] if not unused.all() else np.zeros((1, 3))
+        self.low, self.high = used.min(axis=0), used.max(axis=0)
+        half = (self.high / 2 - self.low / 2).max()
+        self.shift = np.where(np.abs(used).max() > AWAY * half, self.low / 2 + self.high / 2, 0.0)
+        self.exponent = -int(np.frexp(half)[1]) if scale_to_box else 0
+        vertices[unused] = self.low
+        self.accel = build(Mesh(self.moved(vertices), faces), device=device, threads=threads)
+        self.threads = threads
+        box = self.moved(np.stack([self.low, self.high]))
+        self.center, self.radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
+
+    @cached_property
+    def closed(self) -> bool:
+        return open_edges(self.accel.geometry) == 0
+
+    def moved(self, points: np.ndarray) -> np.ndarray:
+        return np.ldexp(points - self.shift, self.exponent)
+
+    def asked(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
+        """Rays as the structure takes them, and which they are of those given (None: all): those that can hit something.
+
+        What begins far away begins at the mesh instead, in float64: rounding would have moved it aside.
+        """
+        with np.errstate(all="ignore"):
+            origins = self.moved(origins)
+            longest = np.abs(directions).max(axis=1, initial=0.0)
+            if not (longest.min(initial=1.0) > 2.0**-30 and longest.max(initial=1.0) < 2.0**30):
+                directions = np.ldexp(directions, -np.frexp(longest)[1][:, None])
+            to_center = self.center - origins
+            far = np.flatnonzero(np.einsum("ij,ij->i", to_center, to_center) > (AWAY * self.radius) ** 2)
+            if len(far):
+                unit = directions[far] / np.linalg.norm(directions[far], axis=1)[:, None]
+                ahead = np.einsum("ij,ij->i", to_center[far], unit) - 2.0 * self.radius
+                origins[far] += unit * np.maximum(ahead, 0.0)[:, None]
+            good = (np.abs(origins).max(axis=1, initial=0.0) <= FARTHEST) & (longest > 0.0) & (longest < np.inf)  # False for NaN
+        if good.all():
+            return None, origins.astype(np.float32), directions.astype(np.float32)
+        rows = np.flatnonzero(good)
+        return rows, origins[rows].astype(np.float32), directions[rows].astype(np.float32)
+
+    def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+        """ray, face, u, v of each hit."""
+        rows, origins, directions = self.asked(origins, directions)
+        hits: Hits = self.accel.closest_hit(origins, directions, threads=self.threads)
+        hit = np.flatnonzero(hits.prim_id >= 0)
+        return _of(rows, hit), hits.prim_id[hit].astype(np.int64), hits.u[hit], hits.v[hit]
+
+    def every_hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The same of all hits, those of a ray together and in order."""
+        rows, origins, directions = self.asked(origins, directions)
+        few = first_hits(self.accel, FEW, origins, directions, threads=self.threads)
+        many = np.flatnonzero(few.prim_id[:, -1] >= 0)
+        few.prim_id[many] = -1
+        ray, column = np.nonzero(few.prim_id >= 0)
+        found = [ray, *(array[ray, column] for array in (few.prim_id, few.u, few.v))]
+        if len(many):
+            more = all_hits(self.accel, origins[many], directions[many], threads=self.threads)
+            found = [np.concatenate(pair) for pair in zip(found, (many[more.ray_id], more.prim_id, more.u, more.v), strict=True)]
+            order = np.argsort(found[0], kind="stable")
+            found = [array[order] for array in found]
+        kept = self._each_surface_once(*found)
+        ray, face, u, v = (array[kept] for array in found)
+        return _of(rows, ray), face.astype(np.int64), u, v
+
+    def any_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        out = np.zeros(len(origins), bool)
+        rows, origins, directions = self.asked(origins, directions)
+        out[slice(None) if rows is None else rows] = self.accel.any_hit(origins, directions, threads=self.threads)
+        return out
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        out = ((points >= self.low) & (points <= self.high)).all(axis=1)
+        out[out] = contains(self.accel, self.moved(points[out]), threads=self.threads)
+        return out
+
+    def _each_surface_once(self, rays: np.ndarray, faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray | slice:
+        """Which hits to keep of those through an edge or a corner, where each face around it is hit.
+
+        Faces of one surface differ in where the edge begins, or, around a corner, in the corner that comes next. Where several
+        agree in that, there are as many surfaces. Corners with the same coordinates are one.
+        """
+        aside = np.stack([1.0 - u - v <= CLOSE_TO_1, u == 0.0, v == 0.0], axis=1)  # of corner 0, 1, 2
+        rows = np.flatnonzero(aside.any(axis=1))
+        ray, aside = rays[rows], aside[rows]
+        shared = np.isin(ray, ray[1:][ray[1:] == ray[:-1]])
+        rows, ray, aside = rows[shared], ray[shared], aside[shared]
+        if not len(rows):
+            return slice(None)
+        geometry = self.accel.geometry
+        corners = geometry.vertices[geometry.faces[faces[rows]]] + np.float32(0.0)  # -0 is 0
+        place = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
+        at_corner, row = aside.sum(axis=1) > 1, np.arange(len(rows))
+        k = np.where(at_corner, np.argmin(aside, axis=1), np.argmax(aside, axis=1))  # what is hit, or opposite of the edge that is
+        corner, start, end = (place[row, (k + i) % 3] for i in range(3))
+        ends = [np.where(at_corner, corner, end_of(start, end)) for end_of in (np.minimum, np.maximum)]
+        surface = _ranks(np.unique(np.stack([ray, *ends, start], axis=1), axis=0, return_inverse=True)[1].reshape(-1))
+        first = np.unique(np.stack([ray, *ends, surface], axis=1), axis=0, return_index=True)[1]
+        kept = np.ones(len(rays), bool)
+        kept[rows] = False
+        kept[rows[first]] = True
+        return np.flatnonzero(kept)
+
+
+def located(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Where rays hit triangles (M, 3, 3), in float64 (Moeller, Trumbore 1997). u, v: float32's, for rays that pass in float64."""
+    a = corners[:, 0]
+    e, f, s = corners[:, 1] - a, corners[:, 2] - a, origins - a
+    with np.errstate(all="ignore"):
+        p, q = np.cross(directions, f), np.cross(s, e)
+        det = np.einsum("ij,ij->i", e, p)
+        x, y = np.einsum("ij,ij->i", s, p) / det, np.einsum("ij,ij->i", directions, q) / det
+        on = (x >= 0.0) & (y >= 0.0) & (x + y <= 1.0)  # False for NaN
+    return a + np.where(on, x, u)[:, None] * e + np.where(on, y, v)[:, None] * f
+
+
+def _rays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray]:
+    out = [np.asarray(rays, dtype=np.float64) for rays in (origins, directions)]
+    origins, directions = (rays.reshape(0, 3) if rays.shape == (0,) else rays for rays in out)
+    if origins.ndim != 2 or origins.shape[1] != 3 or origins.shape != directions.shape:
+        raise InputError(f"ray_origins and ray_directions must be (N, 3) both, got {origins.shape} and {directions.shape}")
+    return origins, directions
+
+
+def _ranks(groups: np.ndarray) -> np.ndarray:
+    """How many before each are of its group: (M,) integers."""
+    order = np.argsort(groups, kind="stable")
+    sizes = np.unique(groups, return_counts=True)[1]
+    out = np.empty(len(groups), np.int64)
+    out[order] = np.arange(len(groups)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return out
+
+
+def _of(rows: np.ndarray | None, ray: np.ndarray) -> np.ndarray:
+    return ray if rows is None else rows[ray]
