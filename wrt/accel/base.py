@@ -17,6 +17,7 @@ from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES, AccelStats, Counters, Hi
 from wrt.accel.batches import trace_on_gpu, tracer
 from wrt.accel.built import Built, State
 from wrt.accel.counting import counted
+from wrt.accel.flatten import World
 from wrt.accel.geometry import Geometry
 from wrt.accel.ray_query import world_of
 from wrt.accel.rays import Rays, rays_of, vectors
@@ -44,6 +45,7 @@ class Accelerator(ABC):
 
     name: ClassVar[str]
     kernels: Any
+    attributes: World | None = None  # what wrt.build knows of the primitives beyond the geometry: normals, uvs, materials, objects
     bytes_to_build: ClassVar[float] = 200.0  # of memory for each primitive, at the peak; measured, rounded up
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
@@ -212,7 +214,9 @@ class Accelerator(ABC):
             raise InputError(f"out must be Hits, got {shown(out)}")
         given = None if out is None else [out.t, out.u, out.v, out.prim_id]
         t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
-        return Hits(t, u, v, prim_id, _answer(self, rays, arrays, threads, trace if counters or trace else None))
+        state = self._state  # once: a refit may replace it meanwhile
+        costs = _answer(self, state.data, rays, arrays, threads, trace if counters or trace else None)
+        return Hits(t, u, v, prim_id, costs, (self, state, rays))
 
     def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                 threads: int | None = None, *, out: Any = None) -> Any:
@@ -221,12 +225,14 @@ class Accelerator(ABC):
         threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
         given = None if out is None else [out]
         arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
-        _answer(self, rays, arrays, threads)
+        _answer(self, self.data, rays, arrays, threads)
         return arrays[0]
 
 
-def _answer(accel: Accelerator, rays: Rays, out: list[Any], threads: int, counting: bool | None = None) -> Counters | None:
-    """Write the answers to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a trace or without; None: not at all."""
+def _answer(accel: Accelerator, data: Any, rays: Rays, out: list[Any], threads: int,
+            counting: bool | None = None) -> Counters | None:
+    """Write the answers of `data`, the structure as it was once, to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a
+    trace or without; None: not at all."""
 
     def trace(structure: Structure, data: Any) -> None:
         if accel.device.is_cuda:
@@ -234,7 +240,6 @@ def _answer(accel: Accelerator, rays: Rays, out: list[Any], threads: int, counti
         else:
             tracer(structure, len(out) == 1).trace(data, accel._surfaces, rays, out, threads)
 
-    data = accel.data  # once: a refit may replace it meanwhile
     if counting is None:
         trace(accel.structure, data)
         return None
