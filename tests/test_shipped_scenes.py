@@ -14,6 +14,7 @@ import warp as wp
 import wrt
 from tests.data import ROOT
 from wrt.accel.all_hits import hit_kernels
+from wrt.accel.instancing import instanced_meshes
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.cli.common import depth_hint
@@ -22,7 +23,6 @@ from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.renderer.features import Features, features_of
-from wrt.renderer.instancing import instanced_meshes
 from wrt.renderer.plan import aov_kernel, render_kernel
 from wrt.scene.cameras import CAMERAS
 from wrt.scene.model import Scene

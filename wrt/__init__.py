@@ -1,7 +1,7 @@
 """wrt: a Whitted ray tracer on NVIDIA Warp, a model of the RT-core split, and a laboratory for both.
 
 Rays by themselves: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits,
-first_hits, contains.
+first_hits, contains, visible.
 Rays from kernels of your own: kernel, ray_query.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from wrt.accel.device_geometry import DeviceGeometry as DeviceGeometry
     from wrt.accel.ray_query import ray_query as ray_query
     from wrt.accel.structures import ACCELERATORS as ACCELERATORS
+    from wrt.accel.visible import visible as visible
     from wrt.core.errors import InputError as InputError
     from wrt.core.errors import SceneWarning as SceneWarning
     from wrt.io.load import load_scene as load_scene
@@ -74,6 +75,7 @@ _PUBLIC = {
     "wrt.accel.device_geometry": ("DeviceGeometry",),
     "wrt.accel.ray_query": ("ray_query",),
     "wrt.accel.structures": ("ACCELERATORS",),
+    "wrt.accel.visible": ("visible",),
     "wrt.core.errors": ("InputError", "SceneWarning"),
     "wrt.io.load": ("load_scene",),
     "wrt.io.mesh_file": ("load_mesh",),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from wrt.accel.hit_points import HitPoints
 from wrt.core.arrays import to_numpy, to_warp
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
@@ -78,16 +79,17 @@ class Counters:
 
 
 @dataclass(frozen=True, eq=False)
-class Hits:
+class Hits(HitPoints):
     """t: (N,) float32, in units of |direction|, inf on a miss; prim_id: (N,) int32, -1 on a miss; u, v: (N,) float32:
     the point is (1 - u - v) v0 + u v1 + v v2 (0 on a miss and on spheres). NumPy arrays, or Warp's if the rays were.
-    counters: what each ray cost, where that was asked for."""
+    counters: what each ray cost, where that was asked for. source: what the points, normals and ids are computed from."""
 
     t: Any
     u: Any
     v: Any
     prim_id: Any
     counters: Counters | None = None
+    source: Any = None
 
     def __len__(self) -> int:
         return len(self.t)

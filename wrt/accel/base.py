@@ -17,6 +17,7 @@ import warp as wp
 
 from wrt.accel.answers import AccelStats, Refit
 from wrt.accel.built import Built, State
+from wrt.accel.flatten import World
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries import Queries
 from wrt.accel.ray_query import world_of
@@ -48,6 +49,7 @@ class Accelerator(Queries, ABC):
     _options: Mapping[str, Any] = MappingProxyType({})  # that it was built with
     bytes_to_build: ClassVar[float] = 320.0  # of memory for each primitive, at the peak; measured, rounded up
     bytes_on_device: ClassVar[float] = 120.0  # likewise, of a GPU's: stats.bytes
+    attributes: World | None = None  # what wrt.build knows of the primitives beyond the geometry: normals, uvs, materials, objects
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
                  box: str = "conservative", **options: Any) -> None:

@@ -11,15 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from wrt.accel.base import Accelerator
+from wrt.accel.flatten import World, world_of, world_over
 from wrt.accel.geometry import Geometry
-from wrt.accel.instances import InstancedGeometry, Instances
+from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.instances import Instances
+from wrt.accel.instancing import instanced_meshes
 from wrt.accel.store import check_target, read
 from wrt.accel.structures import ACCELERATORS, chosen
-from wrt.core.checks import as_one
+from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
-from wrt.io.mesh_file import mesh_of
+from wrt.io.load import LOADERS, load_scene
+from wrt.io.mesh_file import load_mesh
 from wrt.scene.mesh import Mesh
+from wrt.scene.model import Scene
 
 
 def reports_progress(accel: str) -> bool:
@@ -27,54 +32,87 @@ def reports_progress(accel: str) -> bool:
     return accel in ACCELERATORS and "progress" in signature(ACCELERATORS[accel]._build).parameters
 
 
-def build(mesh: Mesh | Geometry | InstancedGeometry | str | os.PathLike[str], accel: str = "bvh", device: str = "cpu",
-          threads: int | None = None, **options: Any) -> Accelerator:
-    """An acceleration structure over a mesh, ready for `closest_hit` and `any_hit`.
+def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | None = None, **options: Any) -> Accelerator:
+    """An acceleration structure over a mesh or a scene, ready for `closest_hit` and `any_hit`.
 
-    mesh: a Mesh, a Geometry, or the path of a mesh file; over an InstancedGeometry it is a tree over structures of
-    the kind, one for each mesh. accel: a name in ACCELERATORS; "bvh" is bvh8, or what `wrt.tune` has kept for the device.
-    options: `triangle` and `box`, the intersection tests (names in wrt.kernels.units.triangle.RAY_TRIANGLE and
-    wrt.kernels.units.box.RAY_AABB), and the structure's own (see its class). Raises
-    InputError that names the argument.
+    mesh: a Mesh, a Scene, the path of a mesh or scene file, a trimesh mesh or scene, or a pair (vertices, faces); or a Geometry.
+    Of a scene, prim_ids count the faces of its objects in their order, then the spheres; meshes that several objects show are kept
+    once where that saves much, as in pictures. Over those, and over an InstancedGeometry, it is a tree over structures of the kind,
+    one for each mesh. accel: a name in ACCELERATORS; "bvh" is bvh8, or what `wrt.tune` has kept for the device. options: `triangle`
+    and `box`, the intersection tests (names in wrt.kernels.units.triangle.RAY_TRIANGLE and wrt.kernels.units.box.RAY_AABB), and the
+    structure's own (see its class). Raises InputError that names the argument.
     """
     ACCELERATORS.check(as_one(accel, str, "accel"))
     kind = ACCELERATORS[chosen(accel, as_one(device, str, "device"))]
-    if isinstance(mesh, InstancedGeometry):
-        return Instances(kind, mesh, device, threads, **options)
-    structure: Accelerator = kind(geometry_of(mesh), device=device, threads=threads, **options)
+    world = None if isinstance(mesh, Geometry | InstancedGeometry) else world_given(mesh)  # of a geometry nothing more is known
+    geometry = mesh if world is None else world.geometry
+    structure: Accelerator
+    if isinstance(geometry, InstancedGeometry):
+        structure = Instances(kind, geometry, device, threads, **options)
+    else:
+        structure = kind(geometry, device=device, threads=threads, **options)
+    structure.attributes = world
     return structure
 
 
-def load_accel(path: str | os.PathLike[str], mesh: Mesh | Geometry | str | os.PathLike[str], device: str = "cpu",
-               threads: int | None = None) -> Accelerator:
-    """The structure that Accelerator.save or `wrt build` wrote to `path`, over the same mesh (or the path of its file).
+def load_accel(path: str | os.PathLike[str], mesh: Any, device: str = "cpu", threads: int | None = None) -> Accelerator:
+    """The structure that Accelerator.save or `wrt build` wrote to `path`, over the same mesh: as in `build`.
 
     Raises InputError for a file that is missing, foreign, damaged, of another version or over another mesh.
     """
-    return read(path, geometry_of(mesh), as_one(device, str, "device"), threads)
+    world = world_given(mesh)
+    structure = read(path, one_geometry(world), as_one(device, str, "device"), threads)
+    structure.attributes = world
+    return structure
 
 
 def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: str = "bvh", device: str = "cpu",
                  threads: int | None = None, **options: Any) -> Accelerator:
     """As `build`, but from `folder` where the same geometry was built with the same options before; else it is built, and left
     there. A damaged file there is written anew. Raises InputError as `build` does, and where the folder cannot be written."""
-    geometry, accel = geometry_of(mesh), chosen(accel, device)
+    world, accel = world_given(mesh), chosen(accel, device)
+    geometry = one_geometry(world)
     given = {name: value for name, value in options.items() if name != "progress"}
     key = json.dumps([geometry.digest(), accel, given, VERSION], sort_keys=True)
     path = Path(folder) / f"{sha256(key.encode()).hexdigest()[:32]}.accel"
     if path.is_file():
         with contextlib.suppress(InputError):  # a damaged one is replaced below
-            return read(path, geometry, device, threads)
+            structure = read(path, geometry, device, threads)
+            structure.attributes = world
+            return structure
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be made: {error.strerror}", folder) from error
     check_target(path)
     structure = build(geometry, accel, device, threads, **options)
+    structure.attributes = world
     structure.save(path)
     return structure
 
 
-def geometry_of(mesh: Mesh | Geometry | str | os.PathLike[str]) -> Geometry:
-    """Raises InputError for what is no mesh, and for a file that cannot be read."""
-    return mesh if isinstance(mesh, Geometry) else Geometry.of(mesh_of(mesh))
+def world_given(mesh: Any) -> World:
+    """What a structure is to be over: as in `build`. Raises InputError for anything else, and for a file that cannot be read."""
+    if isinstance(mesh, str | os.PathLike) and Path(os.fsdecode(mesh)).suffix.lower() in LOADERS:
+        mesh = load_scene(mesh)
+    elif isinstance(mesh, str | os.PathLike):
+        mesh = load_mesh(mesh)
+    elif isinstance(mesh, tuple) and len(mesh) == 2:
+        mesh = Mesh(*mesh)
+    elif type(mesh).__module__.split(".")[0] == "trimesh":
+        mesh = Mesh.from_trimesh(mesh)
+    if isinstance(mesh, Scene):
+        return world_of(mesh, instanced_meshes(mesh))
+    if isinstance(mesh, Mesh):
+        return world_over(Geometry.of(mesh), mesh.normals, mesh.uvs)
+    if isinstance(mesh, Geometry | InstancedGeometry):
+        return world_over(mesh)
+    raise InputError("mesh must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, or a pair"
+                     f" (vertices, faces), got {shown(mesh)}")
+
+
+def one_geometry(world: World) -> Geometry:
+    """Raises InputError where there are instances."""
+    if not isinstance(world.geometry, Geometry):
+        raise InputError("a scene with instances has no structure in a file")
+    return world.geometry

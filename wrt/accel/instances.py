@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from wrt.accel.built import Built, State
 from wrt.accel.bvh.top_down import in_order, split_ranges
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions
 from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.structure import Structure, check_units
 from wrt.core.device import records, start, thread_count, upload
 from wrt.core.errors import InputError
@@ -28,58 +28,6 @@ ROUNDOFF = 2.0**-24
 SLACK = 32.0 * ROUNDOFF  # see kernels.traverse.instances.enter
 BOXES = 1 << 22  # box transforms that finding the instances' own boxes may take
 ALIGNMENT = 64  # bytes, between the addresses of structures
-
-
-@dataclass(frozen=True, eq=False)
-class NumberedGeometry(Geometry):
-    """A geometry whose primitives have numbers of their own in the scene: numbers (N,) int32, ascending."""
-
-    numbers: np.ndarray
-
-    def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
-        if order is not None and len(order) > len(self):
-            return self.primitives(units, None, threads)[order]
-        out = super().primitives(units, order, threads)
-        out["prim_id"] = self.numbers[out["prim_id"]]
-        return out
-
-
-@dataclass(frozen=True, eq=False)
-class InstancedGeometry:
-    """Geometries placed in the world. parts: each in its own space; of a mesh, primitives are numbered from 0, and an instance
-    adds its own first_prim. part: (I,) int, the part of each instance; to_world: (I, 3, 4) float64, affine and invertible;
-    first_prim: (I,) int. n_triangles: of all instances together; spheres, numbered behind them, are those of part 0."""
-
-    parts: tuple[Geometry, ...]
-    part: np.ndarray
-    to_world: np.ndarray
-    first_prim: np.ndarray
-    n_triangles: int
-
-    @property
-    def spheres(self) -> np.ndarray:
-        """(S, 4) float32, as in Geometry; none of them is an instance."""
-        return self.parts[0].spheres
-
-    def __len__(self) -> int:
-        return self.n_triangles + len(self.spheres)
-
-    @property
-    def to_local(self) -> np.ndarray:
-        """(I, 3, 4) float64: the inverse of to_world."""
-        linear = np.linalg.inv(self.to_world[:, :, :3])
-        return np.concatenate([linear, -(linear @ self.to_world[:, :, 3:])], axis=2)
-
-
-def place(*meshes: tuple[Geometry, np.ndarray]) -> InstancedGeometry:
-    """Instances of geometries without spheres, each a pair of a geometry and its (4, 4) or (3, 4) transform to the world.
-    The same geometry given twice is one part."""
-    parts = {id(geometry): geometry for geometry, _ in meshes}
-    index = {key: i for i, key in enumerate(parts)}
-    counts = np.array([len(geometry.faces) for geometry, _ in meshes], np.int64)
-    return InstancedGeometry(tuple(parts.values()), np.array([index[id(geometry)] for geometry, _ in meshes], np.int32),
-                             np.array([matrix[:3] for _, matrix in meshes], np.float64).reshape(-1, 3, 4),
-                             np.concatenate([[0], np.cumsum(counts)[:-1]]), int(counts.sum()))
 
 
 class Instances(Accelerator):

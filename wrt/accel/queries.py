@@ -8,6 +8,7 @@ import numpy as np
 
 from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES, Counters, Hits, room_for
 from wrt.accel.batches import trace_on_gpu, tracer
+from wrt.accel.built import State
 from wrt.accel.counting import counted
 from wrt.accel.rays import Rays, rays_of
 from wrt.accel.structure import Structure
@@ -17,15 +18,12 @@ from wrt.core.errors import InputError
 
 
 class Queries:
-    """The part of Accelerator that answers. device: a Warp device; data: the Warp struct that kernels get."""
+    """The part of Accelerator that answers. device: a Warp device."""
 
     device: Any
     structure: Structure
     _surfaces: Any
-
-    @property
-    def data(self) -> Any:
-        raise NotImplementedError
+    _state: State
 
     def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                     threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits | None = None) -> Hits:
@@ -48,7 +46,9 @@ class Queries:
             raise InputError(f"out must be Hits, got {shown(out)}")
         given = None if out is None else [out.t, out.u, out.v, out.prim_id]
         t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
-        return Hits(t, u, v, prim_id, _answer(self, rays, arrays, threads, trace if counters or trace else None))
+        state = self._state  # once: a refit may replace it meanwhile
+        costs = _answer(self, state.data, rays, arrays, threads, trace if counters or trace else None)
+        return Hits(t, u, v, prim_id, costs, (self, state, rays))
 
     def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                 threads: int | None = None, *, out: Any = None) -> Any:
@@ -57,12 +57,13 @@ class Queries:
         threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
         given = None if out is None else [out]
         arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
-        _answer(self, rays, arrays, threads)
+        _answer(self, self._state.data, rays, arrays, threads)
         return arrays[0]
 
 
-def _answer(accel: Queries, rays: Rays, out: list[Any], threads: int, counting: bool | None = None) -> Counters | None:
-    """Write the answers to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a trace or without; None: not at all."""
+def _answer(accel: Queries, data: Any, rays: Rays, out: list[Any], threads: int, counting: bool | None = None) -> Counters | None:
+    """Write the answers of `data`, the structure as it was once, to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a trace
+    or without; None: not at all."""
 
     def trace(structure: Structure, data: Any) -> None:
         if accel.device.is_cuda:
@@ -70,7 +71,6 @@ def _answer(accel: Queries, rays: Rays, out: list[Any], threads: int, counting: 
         else:
             tracer(structure, len(out) == 1).trace(data, accel._surfaces, rays, out, threads)
 
-    data = accel.data  # once: a refit may replace it meanwhile
     if counting is None:
         trace(accel.structure, data)
         return None

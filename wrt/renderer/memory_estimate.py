@@ -8,13 +8,13 @@ from __future__ import annotations
 from typing import Any
 
 from wrt.accel.base import Accelerator
+from wrt.accel.instancing import is_instance
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.address_space import told_limit
 from wrt.core.device import free_memory, thread_count
 from wrt.core.errors import InputError
 from wrt.core.memory import SMALL, gib
 from wrt.renderer.film_arrays import BYTES_OF_FILM, BYTES_OF_GROUP
-from wrt.renderer.instancing import is_instance
 from wrt.renderer.plan import Plan
 from wrt.renderer.waves import capacity
 from wrt.scene.backgrounds import EnvironmentBackground
@@ -57,7 +57,7 @@ def bytes_of_waves(plan: Plan) -> float:
 
 def bytes_of_scene(scene: Scene, accel: type[Accelerator], kept_once: frozenset[int] = frozenset()) -> float:
     """Bytes that the scene's arrays and its structure take at most while they are made, beside the scene itself. kept_once: the
-    id()s of the meshes that are (wrt.renderer.instancing)."""
+    id()s of the meshes that are (wrt.accel.instancing)."""
     meshes = {id(thing.mesh): thing.mesh for thing in scene.objects if is_instance(thing, kept_once)}
     copied = [thing.mesh for thing in scene.objects if not is_instance(thing, kept_once)]
     every = [*meshes.values(), *copied]

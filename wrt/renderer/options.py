@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from wrt.accel.instancing import INSTANCING
 from wrt.accel.structure import check_units
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_choice, as_integer, as_names, as_one, as_path, as_tuple, did_you_mean, shown
 from wrt.core.device import start, thread_count
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
-from wrt.renderer.instancing import INSTANCING
 from wrt.scene.cameras import CameraKind
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
@@ -57,7 +57,7 @@ class Progress:
 class Options:
     """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once (None: chosen); never
     change a pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always
-    taken. instancing: which meshes that several objects share are kept once (wrt.renderer.instancing).
+    taken. instancing: which meshes that several objects share are kept once (wrt.accel.instancing).
 
     devices: several of this machine, of one kind ("cuda:0", "cuda:1"), that share the tiles, in place of `device`. executor: a
     concurrent.futures.Executor or a dask.distributed.Client whose workers trace the tiles on their `device` (docs/cluster.md);

@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import dataclass, replace
 from typing import Any
 
+from wrt.accel.instancing import instanced_meshes
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS, chosen, meant
 from wrt.core.device import made_once
@@ -15,7 +16,6 @@ from wrt.kernels.shade import render as kernels
 from wrt.kernels.traverse.common import Units
 from wrt.renderer.features import Features, features_of
 from wrt.renderer.film_arrays import GROUPS
-from wrt.renderer.instancing import instanced_meshes
 from wrt.renderer.options import Options
 from wrt.renderer.upload import camera_kind
 from wrt.renderer.waves import WaveKernels, wave_kernels
@@ -39,7 +39,7 @@ def aov_kernel(features: Features, structure: Any) -> Any:
 @dataclass(frozen=True, eq=False)
 class Plan:
     """accel: the structure's name, where the options may say "bvh"; meshes: the id()s of those that are kept once
-    (wrt.renderer.instancing); structure: what the kernels are made for, a
+    (wrt.accel.instancing); structure: what the kernels are made for, a
     Structure or one with a log before it (wrt.renderer.costs); crop: x0, y0, x1, y1 in pixels; deepest: the bounces that the
     kernels have room for."""
 

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from wrt.accel.flatten import World, world_of
+from wrt.accel.hit_points import instance_records
 from wrt.core.device import records, upload
 from wrt.core.errors import InputError, SceneWarning
 from wrt.kernels import structs
 from wrt.kernels.shade import backgrounds, lights, materials, textures
-from wrt.renderer.flatten import Placed, World, world_of
 from wrt.scene.backgrounds import Background
 from wrt.scene.cameras import CameraKind
 from wrt.scene.materials import ALPHA_MODES, Checkerboard, Material, Texture, kinds_that_use
@@ -190,19 +191,6 @@ class DeviceScene:
     lighting: Any
 
 
-def instance_records(placed: Placed) -> np.ndarray:
-    out = records(structs.Instance, len(placed.first_prim))
-    for name in ("first_prim", "first_face", "first_material", "material_step"):
-        out[name] = getattr(placed, name)
-    linear = placed.to_world[:, :, :3]
-    inverse = np.linalg.inv(linear)
-    inverse /= np.abs(inverse).max(axis=(1, 2), keepdims=True)  # a factor changes no direction, and its square is a float32
-    for i, axis in enumerate("xyz"):
-        out[f"world_{axis}"], out[f"normal_{axis}"] = placed.to_world[:, i], inverse[:, i]
-    out["handedness"] = np.where(np.linalg.det(linear) < 0.0, -1.0, 1.0)
-    return out
-
-
 def tell_left_out(scene: Scene) -> None:
     """A SceneWarning for what a picture leaves out. Raises InputError where the scene cannot be rendered."""
     require_size(scene)
@@ -222,7 +210,7 @@ def tell_left_out(scene: Scene) -> None:
 
 
 def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()) -> DeviceScene:
-    """Put a scene on a device (a Warp device); meshes: the id()s of those that are kept once (wrt.renderer.instancing). Raises
+    """Put a scene on a device (a Warp device); meshes: the id()s of those that are kept once (wrt.accel.instancing). Raises
     InputError where the scene cannot be rendered."""
     tell_left_out(scene)
     world = world_of(scene, meshes)

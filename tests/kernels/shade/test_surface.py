@@ -9,9 +9,9 @@ from tests.kernel_tools import DEVICE, directions, floats, ints, launch, rounded
 import warp as wp
 
 from wrt.accel.build import build
+from wrt.accel.flatten import world_mesh
 from wrt.kernels.shade.surface import Surface, make_surface_at, next_away, spawn_point
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
-from wrt.renderer.flatten import world_mesh
 from wrt.renderer.upload import upload_scene
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh

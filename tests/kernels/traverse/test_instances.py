@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.kernel_tools import rounded, unit
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
-from wrt.accel.instances import InstancedGeometry, NumberedGeometry, place
+from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry, place
 from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.scene.shapes import icosphere, torus

@@ -15,8 +15,11 @@ from tests.data import data_path
 from tests.gltf_files import GltfFile
 from tests.kernel_tools import DEVICE
 from wrt.accel.build import build
+from wrt.accel.flatten import world_mesh
 from wrt.accel.geometry import Geometry
-from wrt.accel.instances import Instances, place
+from wrt.accel.instanced_geometry import place
+from wrt.accel.instances import Instances
+from wrt.accel.instancing import instanced_meshes
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import upload
@@ -28,8 +31,6 @@ from wrt.kernels.traverse.common import Units
 from wrt.lab.bench.rasterizer import Rasterizer
 from wrt.lab.bench.visibility_check import compare
 from wrt.picture.film import Film
-from wrt.renderer.flatten import world_mesh
-from wrt.renderer.instancing import instanced_meshes
 from wrt.renderer.upload import upload_scene
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera

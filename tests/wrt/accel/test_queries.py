@@ -24,10 +24,11 @@ def test_a_path_is_built_as_its_mesh_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ((None,), "mesh must be a Mesh or the path of a mesh file, got None"),
-    ((np.zeros((3, 3)),), r"mesh must be a Mesh .*, got an array \(3, 3\) of float64"),
-    ((wrt.Scene(),), "mesh must be .*, got a Scene"), (("nothing.ply",), "nothing.ply: no such file"),
-    (("scene.toml",), "scene.toml: is no mesh file"), ((wrt.Mesh(np.eye(3), [[0, 1, 2]]), 5), "accel must be a str, got 5"),
+    ((None,), "mesh must be a Mesh, a Scene, the path of a mesh or scene file, .*, got None"),
+    ((np.zeros((3, 3)),), r"mesh must be a Mesh, .*, got an array \(3, 3\) of float64"),
+    (((np.eye(3),),), "mesh must be .* a pair .vertices, faces., got"), ((wrt.Camera(),), "mesh must be .*, got a Camera"),
+    (("nothing.glb",), "nothing.glb: no such file"), (("nothing.ply",), "nothing.ply: no such file"),
+    (("scene.toml",), "scene.toml: no such file"), ((wrt.Mesh(np.eye(3), [[0, 1, 2]]), 5), "accel must be a str, got 5"),
     ((wrt.Mesh(np.eye(3), [[0, 1, 2]]), "bvh", 5), "device must be a str, got 5"),
 ], ids=str)
 def test_anything_else_is_refused_by_name(arguments: tuple[Any, ...], message: str) -> None:

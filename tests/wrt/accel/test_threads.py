@@ -18,7 +18,8 @@ from wrt.accel.base import Accelerator
 from wrt.accel.batches import RAYS_PER_LAUNCH
 from wrt.accel.build import build, load_accel
 from wrt.accel.geometry import Geometry
-from wrt.accel.instances import Instances, place
+from wrt.accel.instanced_geometry import place
+from wrt.accel.instances import Instances
 from wrt.accel.store import array_types
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import load_kernel, made_once, start

@@ -13,9 +13,9 @@ import pytest
 
 from tests.data import data_path
 from tests.gltf_files import one_triangle
+from wrt.accel.flatten import world_mesh
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.load import load_scene, schema
-from wrt.renderer.flatten import world_mesh
 from wrt.scene.backgrounds import EnvironmentBackground, GradientBackground
 from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
 from wrt.scene.materials import CONDUCTORS, Checkerboard, Texture

@@ -13,9 +13,9 @@ import pytest
 
 from tests.data import ROOT
 from wrt.accel.build import build
+from wrt.accel.instancing import instanced_meshes
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
-from wrt.renderer.instancing import instanced_meshes
 from wrt.renderer.memory_estimate import BYTES_OF_SKY, BYTES_OF_TEXEL, bytes_of_scene
 from wrt.renderer.options import Options
 from wrt.renderer.render import render

@@ -9,9 +9,9 @@ import pytest
 
 from tests.kernel_tools import DEVICE, unit  # isort: skip (starts Warp)
 
+from wrt.accel.flatten import world_mesh
 from wrt.core.errors import InputError, SceneWarning
 from wrt.kernels.shade import lights
-from wrt.renderer.flatten import world_mesh
 from wrt.renderer.upload import (
     LUMINANCE,
     MAX_MESH_LIGHTS,

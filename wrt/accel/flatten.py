@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from wrt.accel.geometry import Geometry
-from wrt.accel.instances import InstancedGeometry, NumberedGeometry
+from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
+from wrt.accel.instancing import is_instance
 from wrt.core.errors import InputError
-from wrt.renderer.instancing import is_instance
 from wrt.scene.clean import flip_collinear
 from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.model import Object, Scene
@@ -35,11 +35,12 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """All shapes of a scene. prim_id counts the faces of all objects in their order, then the spheres.
+    """All shapes of a scene, or a mesh by itself. prim_id counts the faces of all objects in their order, then the spheres.
 
     geometry: what is hit; vertices (V, 3), faces (F, 3), normals (V, 3) or None, uvs (V, 2), the last two zero where an object
-    has none; prim_material: index into the scene's materials. Without `placed`, all is in world space and numbered as
-    primitives are; with it, meshes with several places are there once, in their own space.
+    has none, uvs (0, 2) where a mesh by itself has none; prim_material: index into the scene's materials. Without `placed`, all
+    is in world space and numbered as primitives are; with it, meshes with several places are there once, in their own space.
+    objects: the first prim_id of each object, and behind them of each sphere; None where there is no scene.
     """
 
     geometry: Geometry | InstancedGeometry
@@ -49,6 +50,7 @@ class World:
     uvs: np.ndarray
     prim_material: np.ndarray
     placed: Placed | None = None
+    objects: np.ndarray | None = None
 
     def materials(self, prim_id: np.ndarray) -> np.ndarray:
         """The material of each primitive, (N,) int32."""
@@ -73,8 +75,36 @@ class World:
 
 
 def world_of(scene: Scene, meshes: frozenset[int] = frozenset()) -> World:
-    """The world of a scene; meshes: the id()s of those that are kept once (wrt.renderer.instancing)."""
+    """The world of a scene; meshes: the id()s of those that are kept once (wrt.accel.instancing)."""
     return instanced_world(scene, meshes) if meshes else world_mesh(scene)
+
+
+def world_over(geometry: Geometry | InstancedGeometry, normals: np.ndarray | None = None, uvs: np.ndarray | None = None) -> World:
+    """The world of what is no scene: a mesh by itself, whose normals and uvs are given, or instances of meshes without."""
+    material = np.zeros(0, np.int32)
+    uvs = np.zeros((0, 2), np.float32) if uvs is None else uvs
+    if isinstance(geometry, Geometry):
+        return World(geometry, geometry.vertices, geometry.faces, normals, uvs, material)
+    first_vertex = np.cumsum([0, *(len(part.vertices) for part in geometry.parts)])
+    first_face = np.cumsum([0, *(len(part.faces) for part in geometry.parts)])
+    nothing = np.zeros(len(geometry.part), np.int64)
+    return World(geometry, np.concatenate([part.vertices for part in geometry.parts]),
+                 np.concatenate([part.faces + np.int32(first) for part, first in zip(geometry.parts, first_vertex, strict=False)]),
+                 None, uvs, material, Placed(geometry.first_prim, first_face[geometry.part], nothing, nothing, geometry.to_world))
+
+
+def placed_now(world: World, geometry: Geometry | InstancedGeometry) -> Placed | None:
+    """world.placed, with the instances where they are now in a geometry that began as the world's."""
+    if world.placed is None or not isinstance(geometry, InstancedGeometry):
+        return None
+    to_world = world.placed.to_world.copy()
+    to_world[run_of(world.placed, geometry)] = geometry.to_world[geometry.is_placed]
+    return replace(world.placed, to_world=to_world)
+
+
+def run_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:
+    """The run of each instance that is placed (InstancedGeometry.is_placed); one without primitives has none of its own."""
+    return np.searchsorted(placed.first_prim, geometry.first_prim[geometry.is_placed], side="right") - 1
 
 
 def world_mesh(scene: Scene) -> World:
@@ -87,7 +117,7 @@ def world_mesh(scene: Scene) -> World:
     _require_room(len(joined.vertices), len(joined.faces))
     geometry = Geometry(joined.vertices, joined.faces, _spheres(scene))
     return World(geometry, joined.vertices, joined.faces, joined.normals if _is_smooth(scene) else None, joined.uvs,
-                 np.concatenate([joined.material, _sphere_materials(scene, index)]))
+                 np.concatenate([joined.material, _sphere_materials(scene, index)]), objects=_first_prims(scene))
 
 
 def instanced_world(scene: Scene, meshes: frozenset[int]) -> World:
@@ -149,11 +179,17 @@ def _placed_world(scene: Scene, index: dict[int, int], parts: dict[int, _Joined]
                  np.concatenate([part.faces + np.int32(first) for part, first in zip(joined, first_vertex, strict=False)]),
                  np.concatenate([part.normals for part in joined]) if _is_smooth(scene) else None,
                  np.concatenate([part.uvs for part in joined]), prim_material,
-                 Placed(columns[0], columns[1], columns[2], columns[3], np.array([run[4] for run in runs], np.float64)))
+                 Placed(columns[0], columns[1], columns[2], columns[3], np.array([run[4] for run in runs], np.float64)),
+                 _first_prims(scene))
 
 
 def _is_smooth(scene: Scene) -> bool:
     return any(thing.mesh.normals is not None for thing in scene.objects)
+
+
+def _first_prims(scene: Scene) -> np.ndarray:
+    counts = [*(len(thing.mesh.faces) for thing in scene.objects), *(1 for _ in scene.spheres)]
+    return np.cumsum([0, *counts])[:-1]
 
 
 def _spheres(scene: Scene) -> np.ndarray:

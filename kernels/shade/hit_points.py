@@ -1,0 +1,343 @@
+"""From hits to what is there, for rays by themselves: points with their error bounds, normals, texture coordinates, ids.
+
+The point is where the ray as it is given (float32) meets the triangle's plane (its corners as they are given, and for an instance
+its float64 map): float64, with a running bound of its rounding (Higham 2002, section 3.3), and rounded to float32 at the end.
+Barycentric coordinates, which kernels.shade.surface starts from, carry the error of u and v, which needles make large.
+"""
+
+import warp as wp
+
+from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.shade.sampling import PI, TWO_PI
+from wrt.kernels.shade.surface import Place, triangle_point, world_normal
+from wrt.kernels.structs import Instance, Surfaces, kernel
+
+U32 = wp.constant(wp.float64(2.0**-24))  # unit roundoffs
+U64 = wp.constant(wp.float64(2.0**-53))
+SAFETY = wp.constant(wp.float64(1.0 + 2.0**-20))  # for the rounding of the bounds themselves, to float32 at last
+SMALLEST = wp.constant(wp.float64(2.0**-149))  # of float32
+
+
+@wp.struct
+class HitPlaces:
+    """One row a hit, each array filled unless it has length 0. point, error (a bound for each axis), normal, shading: in the world;
+    a miss is NaN, and -1 among the ids."""
+
+    point: wp.array(dtype=wp.vec3)
+    error: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+    shading: wp.array(dtype=wp.vec3)
+    uv: wp.array(dtype=wp.vec2)
+    object: wp.array(dtype=wp.int32)
+    instance: wp.array(dtype=wp.int32)
+    material: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Numbering:
+    """first_prim: of each object and each sphere, in their order; instance: the number of each of Surfaces.instances."""
+
+    first_prim: wp.array(dtype=wp.int32)
+    instance: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Found:
+    """A point and a bound for each axis, and the normal of its plane, of any length."""
+
+    point: wp.vec3d
+    error: wp.vec3d
+    normal: wp.vec3d
+
+
+@wp.func
+def double(v: wp.vec3) -> wp.vec3d:
+    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
+
+
+@wp.func
+def single(v: wp.vec3d) -> wp.vec3:
+    return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
+
+
+@wp.func
+def longest(v: wp.vec3d) -> wp.float64:
+    return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
+
+
+@wp.func
+def mapped(i: Instance, p: wp.vec3d, w: wp.float64) -> wp.vec3d:
+    q = wp.vec4d(p[0], p[1], p[2], w)
+    return wp.vec3d(wp.dot(i.world_x, q), wp.dot(i.world_y, q), wp.dot(i.world_z, q))
+
+
+@wp.func
+def mapped_size(i: Instance, p: wp.vec3d) -> wp.vec3d:
+    """The sums of the absolute terms of `mapped`, which its rounding is in proportion to."""
+    q = wp.vec4d(wp.abs(p[0]), wp.abs(p[1]), wp.abs(p[2]), wp.float64(1.0))
+    return wp.vec3d(wp.dot(wp.abs(i.world_x), q), wp.dot(wp.abs(i.world_y), q), wp.dot(wp.abs(i.world_z), q))
+
+
+@wp.func
+def cross_size(a: wp.vec3d, b: wp.vec3d) -> wp.vec3d:
+    """wp.cross with all terms added; a, b >= 0."""
+    return wp.vec3d(a[1] * b[2] + a[2] * b[1], a[2] * b[0] + a[0] * b[2], a[0] * b[1] + a[1] * b[0])
+
+
+@wp.func
+def on_plane(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, off: wp.vec3d, origin: wp.vec3d, direction: wp.vec3d) -> Found:
+    """Where a line meets the plane through three corners, which are known but for `off`, per axis.
+
+    Where rounding leaves open whether it meets it at all, the error is infinite or NaN.
+    """
+    out = Found()
+    e1 = v1 - v0
+    e2 = v2 - v0
+    out.normal = wp.cross(e1, e2)
+    # An edge is off by two corners and its own rounding; a component of the normal has products of two, and three roundings.
+    slack = wp.float64(2.0) * off + U64 * wp.max(wp.abs(e1), wp.abs(e2))
+    size = cross_size(wp.abs(e1), wp.abs(e2))
+    normal_error = cross_size(slack, wp.abs(e1) + wp.abs(e2) + slack) + wp.float64(4.0) * U64 * size
+
+    to_plane = v0 - origin
+    to_plane_error = off + U64 * wp.abs(to_plane)
+    height = wp.dot(out.normal, to_plane)
+    height_error = (wp.dot(normal_error, wp.abs(to_plane) + to_plane_error) + wp.dot(wp.abs(out.normal), to_plane_error)
+                    + wp.float64(4.0) * U64 * wp.dot(wp.abs(out.normal), wp.abs(to_plane)))
+    slope = wp.dot(out.normal, direction)
+    slope_error = wp.dot(normal_error + wp.float64(4.0) * U64 * wp.abs(out.normal), wp.abs(direction))
+    if not wp.abs(slope) > wp.float64(2.0) * slope_error:
+        out.error = wp.vec3d(wp.float64(wp.inf), wp.float64(wp.inf), wp.float64(wp.inf))
+        return out
+    t = height / slope
+    t_error = (height_error + wp.abs(t) * slope_error) / (wp.abs(slope) - slope_error) + wp.float64(2.0) * U64 * wp.abs(t)
+    way = t * direction
+    out.point = origin + way
+    out.error = t_error * wp.abs(direction) + wp.float64(2.0) * U64 * (wp.abs(origin) + wp.abs(way))
+    return out
+
+
+@wp.func
+def drawn_in(found: Found, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> Found:
+    """A point that is beside the triangle is moved onto it, and its error grows by as much: a ray that is given to one of two
+    triangles at an edge, or grazes an outline, may pass it by, to rounding, and then meet its plane far away."""
+    e1 = v1 - v0
+    e2 = v2 - v0
+    way = found.point - v0
+    square = wp.dot(found.normal, found.normal)
+    u = wp.dot(found.normal, wp.cross(way, e2)) / square
+    v = wp.dot(found.normal, wp.cross(e1, way)) / square
+    if u >= wp.float64(0.0) and v >= wp.float64(0.0) and u + v <= wp.float64(1.0):
+        return found
+    u = wp.max(u, wp.float64(0.0))
+    v = wp.max(v, wp.float64(0.0))
+    over = wp.max(u + v, wp.float64(1.0))
+    out = found
+    out.point = v0 + (u / over) * e1 + (v / over) * e2
+    out.error = found.error + wp.abs(found.point - out.point)
+    return out
+
+
+@wp.func
+def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp.vec3d, direction: wp.vec3d) -> Found:
+    """The point on a face; its normal is on the outside, also of a mirrored instance."""
+    face = surfaces.faces[place.face]
+    v0 = double(surfaces.vertices[face[0]])
+    v1 = double(surfaces.vertices[face[1]])
+    v2 = double(surfaces.vertices[face[2]])
+    middle = double(triangle_point(surfaces, place.face, u, v))
+    off = wp.vec3d()
+    side = wp.float64(1.0)
+    if place.instance >= 0:
+        instance = surfaces.instances[place.instance]
+        size = wp.max(wp.max(mapped_size(instance, v0), mapped_size(instance, v1)), mapped_size(instance, v2))
+        off = wp.float64(5.0) * U64 * size
+        v0 = mapped(instance, v0, wp.float64(1.0))
+        v1 = mapped(instance, v1, wp.float64(1.0))
+        v2 = mapped(instance, v2, wp.float64(1.0))
+        middle = mapped(instance, middle, wp.float64(1.0))
+        side = wp.float64(instance.handedness)
+    found = drawn_in(on_plane(v0, v1, v2, off, origin, direction), v0, v1, v2)
+    found.normal = side * found.normal
+    # A hit on a plane that the ray runs along, to rounding: all that is known of it is that it is on the triangle.
+    reach = wp.max(wp.max(wp.abs(v0 - middle), wp.abs(v1 - middle)), wp.abs(v2 - middle)) + off
+    if not longest(found.error) <= longest(reach):
+        found.point = middle
+        found.error = reach
+    return found
+
+
+@wp.func
+def on_sphere(sphere: wp.vec4, t: float, origin: wp.vec3d, direction: wp.vec3d) -> Found:
+    """The point of the line's two that is on t's side of their middle."""
+    center = wp.vec3d(wp.float64(sphere[0]), wp.float64(sphere[1]), wp.float64(sphere[2]))
+    radius = wp.float64(sphere[3])
+    unit = direction / longest(direction)
+    unit = unit / wp.length(unit)
+    way = origin - center
+    along = -wp.dot(way, unit)
+    foot = way + along * unit  # the line's point that is nearest to the centre
+    foot_error = wp.float64(16.0) * U64 * wp.length(way)
+    square = radius * radius - wp.dot(foot, foot)
+    square_error = foot_error * (wp.float64(2.0) * wp.length(foot) + foot_error) + wp.float64(8.0) * U64 * radius * radius
+    half = wp.sqrt(wp.max(square, wp.float64(0.0)))
+    # Of two roots of numbers d apart, the difference is at most sqrt(d), and at most d over either.
+    half_error = wp.sqrt(square_error)
+    if half > half_error:
+        half_error = square_error / half
+    if wp.float64(t) * wp.dot(direction, unit) < along:
+        half = -half
+    out = Found()
+    out.normal = foot + half * unit
+    out.point = center + out.normal
+    error = half_error + foot_error + wp.float64(8.0) * U64 * radius
+    out.error = wp.vec3d(error, error, error) + U64 * wp.abs(out.point)
+    return out
+
+
+@wp.func
+def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometric: wp.vec3) -> wp.vec3:
+    """Interpolated, on the outside; the geometric one where the corners have none."""
+    face = surfaces.faces[place.face]
+    n0 = surfaces.normals[face[0]]
+    n1 = surfaces.normals[face[1]]
+    n2 = surfaces.normals[face[2]]
+    if place.instance >= 0:
+        instance = surfaces.instances[place.instance]
+        n0 = world_normal(instance, n0)
+        n1 = world_normal(instance, n1)
+        n2 = world_normal(instance, n2)
+    n = (1.0 - u - v) * n0 + u * n1 + v * n2
+    length = wp.length(n)
+    if not length > 0.0:
+        return geometric
+    return wp.where(wp.dot(n, geometric) < 0.0, -n, n) / length
+
+
+@wp.func
+def last_from(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
+    """The last row that does not begin behind prim_id; rows without primitives have the next one's beginning."""
+    low = int(0)
+    high = int(first.shape[0])
+    while high - low > 1:
+        middle = (low + high) / 2
+        if first[middle] <= prim_id:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@wp.func
+def place_of(surfaces: Surfaces, prim_id: int) -> Place:
+    """As kernels.shade.surface.make_place_of, with instances or without (instance = -1); material -1 where there are none."""
+    place = Place()
+    place.face = prim_id
+    place.instance = -1
+    index = prim_id
+    if surfaces.instances.shape[0] > 0:
+        low = int(0)
+        high = int(surfaces.instances.shape[0])
+        while high - low > 1:
+            middle = (low + high) / 2
+            if surfaces.instances[middle].first_prim <= prim_id:
+                low = middle
+            else:
+                high = middle
+        run = surfaces.instances[low]
+        place.instance = low
+        place.face = run.first_face + prim_id - run.first_prim
+        index = run.first_material + run.material_step * (prim_id - run.first_prim)
+    place.material = -1
+    if index < surfaces.prim_material.shape[0]:
+        place.material = surfaces.prim_material[index]
+    return place
+
+
+@wp.func
+def put_miss(out: HitPlaces, i: int):
+    nothing = wp.vec3(wp.nan, wp.nan, wp.nan)
+    if out.point.shape[0] > 0:
+        out.point[i] = nothing
+    if out.error.shape[0] > 0:
+        out.error[i] = nothing
+    if out.normal.shape[0] > 0:
+        out.normal[i] = nothing
+    if out.shading.shape[0] > 0:
+        out.shading[i] = nothing
+    if out.uv.shape[0] > 0:
+        out.uv[i] = wp.vec2(wp.nan, wp.nan)
+    if out.object.shape[0] > 0:
+        out.object[i] = -1
+    if out.instance.shape[0] > 0:
+        out.instance[i] = -1
+    if out.material.shape[0] > 0:
+        out.material[i] = -1
+
+
+@wp.func
+def put_ids(surfaces: Surfaces, numbering: Numbering, place: Place, prim_id: int, out: HitPlaces, i: int):
+    if out.object.shape[0] > 0:
+        out.object[i] = last_from(numbering.first_prim, prim_id)
+    if out.instance.shape[0] > 0:
+        out.instance[i] = numbering.instance[place.instance]
+    if out.material.shape[0] > 0:
+        out.material[i] = place.material
+
+
+@wp.func
+def put_point(found: Found, out: HitPlaces, i: int):
+    point = single(found.point)
+    if out.point.shape[0] > 0:
+        out.point[i] = point
+    if out.error.shape[0] > 0:
+        least = wp.vec3d(SMALLEST, SMALLEST, SMALLEST)
+        out.error[i] = single(SAFETY * (found.error + U32 * wp.abs(found.point)) + least)
+
+
+@wp.func
+def put_interpolated(surfaces: Surfaces, place: Place, u: float, v: float, normal: wp.vec3, out: HitPlaces, i: int):
+    if out.shading.shape[0] > 0:
+        out.shading[i] = shading_normal(surfaces, place, u, v, normal)
+    if out.uv.shape[0] > 0:
+        face = surfaces.faces[place.face]
+        out.uv[i] = (1.0 - u - v) * surfaces.uvs[face[0]] + u * surfaces.uvs[face[1]] + v * surfaces.uvs[face[2]]
+
+
+@wp.func
+def put_interpolated_on_sphere(normal: wp.vec3, out: HitPlaces, i: int):
+    if out.shading.shape[0] > 0:
+        out.shading[i] = normal
+    if out.uv.shape[0] > 0:
+        out.uv[i] = wp.vec2(0.5 + wp.atan2(-normal[2], normal[0]) / TWO_PI, wp.acos(wp.clamp(normal[1], -1.0, 1.0)) / PI)
+
+
+@kernel
+def hit_places(surfaces: Surfaces, numbering: Numbering, rays: RayArrays, hits: HitArrays, out: HitPlaces, first: int):
+    """Hits of rays first .. first + dim - 1. A prim_id that is none of the surfaces' is a miss."""
+    i = first + wp.tid()
+    prim_id = hits.prim_id[i]
+    count = surfaces.n_triangles + surfaces.spheres.shape[0]
+    if prim_id < 0 or prim_id >= count:
+        put_miss(out, i)
+        return
+    place = place_of(surfaces, prim_id)
+    put_ids(surfaces, numbering, place, prim_id, out, i)
+    if out.point.shape[0] + out.error.shape[0] + out.normal.shape[0] + out.shading.shape[0] + out.uv.shape[0] == 0:
+        return
+    origin = double(rays.origin[i])
+    direction = double(rays.direction[i])
+    if prim_id >= surfaces.n_triangles:
+        on_ball = on_sphere(surfaces.spheres[prim_id - surfaces.n_triangles], hits.t[i], origin, direction)
+        put_point(on_ball, out, i)
+        normal = single(wp.normalize(on_ball.normal))
+        if out.normal.shape[0] > 0:
+            out.normal[i] = normal
+        put_interpolated_on_sphere(normal, out, i)
+    else:
+        found = on_triangle(surfaces, place, hits.u[i], hits.v[i], origin, direction)
+        put_point(found, out, i)
+        normal = single(wp.normalize(found.normal / longest(found.normal)))
+        if out.normal.shape[0] > 0:
+            out.normal[i] = normal
+        put_interpolated(surfaces, place, hits.u[i], hits.v[i], normal, out, i)

@@ -1,0 +1,182 @@
+"""Pairs of points that see each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import wrt
+from tests.kernel_tools import DEVICE, cpu_only, vec3s
+from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import place
+from wrt.core.arrays import to_numpy
+from wrt.scene import shapes
+
+
+def pairs(n: int = 20_000, scale: float = 1.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return tuple(np.float32(scale * 1.5 * rng.normal(size=(n, 3))) for _ in range(2))  # type: ignore[return-value]
+
+
+def soup(seed: int = 0) -> wrt.Mesh:
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-1.0, 1.0, (60, 1, 3)) + 0.4 * rng.normal(size=(60, 3, 3))
+    return wrt.Mesh(corners.reshape(-1, 3), np.arange(180).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_between_points_in_space_it_is_what_testing_every_triangle_says(seed: int) -> None:
+    """Plücker coordinates in float64: pairs that are nearer to an edge than rounding are left out."""
+    mesh, (a, b) = soup(seed), pairs(2000, seed=seed)
+    p, q = a.astype(np.float64)[:, None], b.astype(np.float64)[:, None]
+    v = mesh.vertices[mesh.faces].astype(np.float64)
+
+    def volume(*corners: np.ndarray) -> np.ndarray:
+        return np.einsum("...i,...i->...", np.cross(corners[1] - corners[0], corners[2] - corners[0]), corners[3] - corners[0])
+
+    ends = np.stack([volume(v[:, 0], v[:, 1], v[:, 2], p), -volume(v[:, 0], v[:, 1], v[:, 2], q)])
+    sides = np.stack([volume(p, q, v[:, i], v[:, (i + 1) % 3]) for i in range(3)])
+    meets = (ends > 0).all(axis=0) | (ends < 0).all(axis=0)
+    meets &= (sides > 0).all(axis=0) | (sides < 0).all(axis=0)
+    clear = (np.abs(np.concatenate([ends, sides])) > 1e-4).all(axis=(0, 2))
+    seen = wrt.visible(wrt.build(mesh), a, b)
+    assert seen.dtype == bool and clear.mean() > 0.8
+    assert np.array_equal(seen[clear], ~meets.any(axis=1)[clear]) and 0.2 < seen.mean() < 0.9
+
+
+@pytest.mark.parametrize("name", ["bvh", "bvh2"])
+def test_whoever_is_seen_sees(name: str) -> None:
+    """Also of points on the surface, of pairs that touch edges and corners, and with the triangles told."""
+    mesh = soup()
+    accel = wrt.build(mesh, name)
+    a, b = pairs()
+    at = np.random.default_rng(1).integers(0, len(mesh.vertices), len(a))
+    a[::3], b[1::5] = mesh.vertices[at[::3]], mesh.vertices[at[::-1][1::5]]
+    b[::7] = a[::7]
+    assert np.array_equal(wrt.visible(accel, a, b), wrt.visible(accel, b, a))
+    on_a, on_b = at // 3, at[::-1] // 3
+    known = wrt.visible(accel, a, b, on_a, on_b, threads=1)
+    assert np.array_equal(known, wrt.visible(accel, b, a, on_b, on_a, threads=2))
+    assert known[::7].all() and 0.1 < known.mean() < 0.9
+
+
+def test_points_on_a_convex_surface_see_all_outside_that_is_in_front_of_them() -> None:
+    """Each point is a hit's, and the other end is in front of its triangle's plane, often along it: nothing may be in the way."""
+    ball = shapes.icosphere(3)
+    for offset in (0.0, 3000.0):
+        mesh = wrt.Mesh(ball.vertices + np.float32(offset), ball.faces)
+        accel = wrt.build(mesh)
+        rng = np.random.default_rng(2)
+        origin = np.float32(3.0 * rng.normal(size=(20_000, 3)) + offset)
+        at = rng.integers(0, len(mesh.vertices), 20_000)
+        hits = accel.closest_hit(origin, np.float32(mesh.vertices[at] - origin))
+        hit = hits.prim_id >= 0
+        point, normal, on = hits.point[hit], hits.normal[hit].astype(np.float64), hits.prim_id[hit]
+        angle = 10.0 ** rng.uniform(-2.0, 0.0, (len(on), 1))
+        along = np.cross(normal, rng.normal(size=normal.shape))
+        other = np.float32(point + 2.0 * along + 2.0 * angle * normal)
+        way = other.astype(np.float64) - point
+        # In front of the faces around, too: of a convex body these are all that matter.
+        height = np.einsum("ij,ij->i", way, normal) / np.linalg.norm(way, axis=1)
+        front = (height > 0.15) if offset == 0.0 else height > 0.3
+        assert front.sum() > 1000 and wrt.visible(accel, point, other, on)[front].all()
+        behind = np.float32(point - 0.5 * normal)
+        assert wrt.visible(accel, point, behind, on)[np.linalg.norm(behind - offset, axis=1) < 0.9].all()  # from within, too
+        assert not wrt.visible(accel, behind, other, None, None)[front].any()
+
+
+def test_along_a_floor_of_many_triangles() -> None:
+    """From points on it, as hits give them, nothing of the same plane is in the way, at any angle."""
+    n, rng = 24, np.random.default_rng(3)
+    x, y = np.meshgrid(np.linspace(-40.0, 60.0, n), np.linspace(-30.0, 70.0, n))
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    vertices = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3) @ turn.T
+    corner = np.arange(n * n).reshape(n, n)
+    faces = np.concatenate([np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:]], axis=-1).reshape(-1, 3),
+                            np.stack([corner[:-1, :-1], corner[1:, 1:], corner[1:, :-1]], axis=-1).reshape(-1, 3)])
+    accel = wrt.build((vertices, faces))
+    above = rng.uniform(-20.0, 40.0, (5000, 3)) * [1.0, 1.0, 0.0] + [0.0, 0.0, 5.0]
+    hits = accel.closest_hit(above @ turn.T, (rng.normal(size=(5000, 3)) * [1.0, 1.0, 0.1] - [0.0, 0.0, 1.0]) @ turn.T)
+    hit = hits.prim_id >= 0
+    lamp = rng.uniform(-20.0, 40.0, (int(hit.sum()), 3)) * [1.0, 1.0, 0.0] + [0.0, 0.0, 1e-3]
+    lamp = np.float32(lamp @ turn.T)
+    assert hit.sum() > 3000 and not wrt.visible(accel, hits.point[hit], lamp).all()
+    assert wrt.visible(accel, hits.point[hit], lamp, hits.prim_id[hit]).all()
+
+
+def test_the_ends_are_left_out() -> None:
+    accel = wrt.build(shapes.quad())  # z = 0
+    a, b = np.float32([[0.1, 0.2, 0.0]]), np.float32([[0.3, 0.1, 2.0]])
+    for p, q, seen in ((a, b, True), (-b, a, True), (-b, b, False), (a, a, True), (b, b, True),
+                       (b, b * [1, 1, 0.5], True), (a + np.float32([0, 0, 1e-3]), -b, False)):
+        assert wrt.visible(accel, p, q).tolist() == [seen] == wrt.visible(accel, q, p).tolist()
+    assert wrt.visible(accel, np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
+
+
+def test_only_the_triangle_that_is_told_is_not_in_the_way() -> None:
+    wall = shapes.quad()
+    vertices = np.concatenate([wall.vertices, wall.vertices + np.float32([0, 0, 1e-6])])
+    two = wrt.Mesh(vertices, np.concatenate([wall.faces, wall.faces + 4]))
+    accel = wrt.build(two)
+    a, b = np.float32([[0.2, 0.1, 0.0]]), np.float32([[0.2, 0.1, 1.0]])
+    on = accel.closest_hit(a - np.float32([0, 0, 1]), [[0, 0, 1]]).prim_id
+    first, second = int(on[0]), int(on[0]) + 2
+    assert wrt.visible(accel, a - np.float32([0, 0, 1]), b, [first]).tolist() == [False]
+    assert wrt.visible(accel, a - np.float32([0, 0, 1]), b, [first], [second]).tolist() == [True]
+
+
+def test_spheres_and_instances_are_in_the_way() -> None:
+    ball = Geometry(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.float32([[0, 0, 0, 1]]))
+    moved = np.eye(4)
+    moved[0, 3] = 5.0
+    box = Geometry.of(shapes.box())
+    a, b = np.float32([[0, 0, 3], [5, 0, 3]]), np.float32([[0, 0, -3], [5, 0, -3]])
+    assert wrt.visible(wrt.build(ball), a, b).tolist() == [False, True]
+    b[0] += [9.0, 9.0, 0.0]
+    assert wrt.visible(wrt.build(place((box, moved), (box, np.diag([2.0, 2.0, 2.0, 1.0])))), a, b).tolist() == [True, False]
+
+
+def test_arrays_of_warp_and_arrays_that_are_given() -> None:
+    accel, (a, b) = wrt.build(soup()), pairs(3000)
+    on = np.arange(3000, dtype=np.int32) % 61 - 1
+    seen, known = wrt.visible(accel, a, b), wrt.visible(accel, a, b, on)
+    for expected, ids in ((seen, None), (known, wp.array(on, dtype=wp.int32, device=DEVICE))):
+        array = wp.zeros(3000, dtype=wp.bool, device=DEVICE)
+        assert wrt.visible(accel, vec3s(a), vec3s(b), ids, out=array) is array
+        assert np.array_equal(to_numpy(array), expected)
+    taken = np.zeros(3000, bool)
+    assert wrt.visible(accel, a.tolist(), b.astype(np.float64), out=taken) is taken and np.array_equal(taken, seen)
+
+
+@cpu_only
+def test_warp_arrays_on_the_cpu_are_looked_at() -> None:
+    with pytest.raises(wrt.InputError, match="b must be finite"):
+        wrt.visible(wrt.build(soup()), vec3s(np.zeros((1, 3))), vec3s([[0.0, np.nan, 0.0]]))
+
+
+@pytest.mark.parametrize("a, b, more, said", [
+    ([[np.nan, 0, 0]], [[0, 0, 1]], {}, "a must be finite; row 0"),
+    ([[0, 0, 0]], [[0, 0, np.inf]], {}, "b must be finite; row 0"),
+    ([[0, 0, 0]], [[0, 0, 1], [0, 0, 2]], {}, r"b must have as many rows as a \(1\), got 2"),
+    ([0, 0, 0], [[0, 0, 1]], {}, r"a must be \(N, 3\)"),
+    ([[0, 0, 2e37]], [[0, 0, 1]], {}, "a must be within 1e.37"),
+    ([[0, 0, 0]], [[0, 0, 1]], {"on_a": [60]}, "on_a must be -1 to 59; row 0 is 60"),
+    ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0.5]}, "on_b must be .1,. whole numbers"),
+    ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0, 1]}, "on_b must be .1,. whole numbers"),
+    ([[0, 0, 0]], [[0, 0, 1]], {"out": np.zeros(2, bool)}, "out must be a NumPy array"),
+    ([[0, 0, 0]], [[0, 0, 1]], {"threads": 0}, "threads must be 1 or more"),
+])
+def test_what_is_refused(a: Any, b: Any, more: dict[str, Any], said: str) -> None:
+    with pytest.raises(wrt.InputError, match=said):
+        wrt.visible(wrt.build(soup()), a, b, **more)
+
+
+def test_what_takes_no_prim_ids() -> None:
+    points = np.zeros((1, 3))
+    with pytest.raises(wrt.InputError, match="accel must be a structure"):
+        wrt.visible("bvh", points, points)  # type: ignore[arg-type]
+    with pytest.raises(wrt.InputError, match="on_a and on_b are for structures over one mesh"):
+        wrt.visible(wrt.build(place((Geometry.of(shapes.box()), np.eye(4)))), points, points, [0])

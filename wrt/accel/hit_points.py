@@ -1,0 +1,171 @@
+"""What hits know beyond t, u, v and prim_id: points with error bounds, normals, texture coordinates, ids. Computed when asked."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.built import State
+from wrt.accel.flatten import Placed, World, placed_now, run_of, world_over
+from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.rays import Rays, rays_on
+from wrt.core.arrays import to_warp
+from wrt.core.device import launch, records, thread_count, upload
+from wrt.core.errors import InputError
+from wrt.kernels import structs
+from wrt.kernels.query import HitArrays
+from wrt.kernels.shade.hit_points import HitPlaces, Numbering, hit_places
+from wrt.kernels.structs import fields_of
+
+HITS_PER_LAUNCH = 65536
+
+
+class Surroundings(NamedTuple):
+    """What a structure was over on a device when it was asked: as the kernel takes it, and where it is from."""
+
+    world: World
+    surfaces: Any
+    numbering: Any
+
+
+_surroundings: WeakKeyDictionary[State, Surroundings] = WeakKeyDictionary()
+
+
+class HitPoints:
+    """Properties of hits that a structure gave. Each is computed anew each time, from the arrays of the hits and of the rays, which
+    are kept and not copied: leave them as they were until then. Arrays are of NumPy, or of Warp if the hits are.
+
+    Raises InputError where the hits are not closest_hit's, or what is asked for is not there.
+    """
+
+    t: Any
+    u: Any
+    v: Any
+    prim_id: Any
+    source: tuple[Any, State, Rays] | None
+
+    @property
+    def point(self) -> Any:
+        """(N, 3) float32: where each ray as it is given meets its primitive, in the world, to point_error; NaN on a miss.
+
+        It is of the ray and not of u and v, whose rounding needles make large: float64, rounded once. Where the ray passes its
+        triangle by, to rounding, the point is moved onto the triangle, and the error is as large as the move; where it runs along,
+        the point is that of u and v, and the error the triangle's size.
+        """
+        return self._filled("point")
+
+    @property
+    def point_error(self) -> Any:
+        """(N, 3) float32: no component of `point` is farther off than this; most often half a float32 step. NaN on a miss."""
+        return self._filled("error")
+
+    @property
+    def normal(self) -> Any:
+        """(N, 3) float32: unit normal of the flat triangle, on the side from which it is counter-clockwise (of a sphere: outwards),
+        whatever side the ray comes from; NaN on a miss."""
+        return self._filled("normal")
+
+    @property
+    def shading_normal(self) -> Any:
+        """(N, 3) float32: the normals that the mesh had when the structure was built, interpolated, of unit length, on the side of
+        `normal`; the same as `normal` where there are none. NaN on a miss."""
+        return self._filled("shading")
+
+    @property
+    def uv(self) -> Any:
+        """(N, 2) float32: texture coordinates interpolated, (0, 0) the top left of a picture; in a scene (0, 0) where an object has
+        none. NaN on a miss."""
+        return self._filled("uv")
+
+    @property
+    def object(self) -> Any:
+        """(N,) int32: index into scene.objects, and behind them into scene.spheres; -1 on a miss."""
+        return self._filled("object")
+
+    @property
+    def instance(self) -> Any:
+        """(N,) int32: row of accel.geometry.to_world; -1 on a miss."""
+        return self._filled("instance")
+
+    @property
+    def material(self) -> Any:
+        """(N,) int32: index into scene.materials; -1 on a miss."""
+        return self._filled("material")
+
+    def _filled(self, name: str) -> Any:
+        if self.source is None:
+            raise InputError("these hits do not know their rays: only those of closest_hit have points, normals and ids")
+        accel, state, rays = self.source
+        world, surfaces, numbering = surroundings(accel, state)
+        if name == "shading" and world.normals is None:
+            name = "normal"
+        _require(world, name)
+        n, device = len(self.t), accel.device
+        out: Any = HitPlaces()
+        setattr(out, name, array := wp.empty(n, dtype=fields_of(HitPlaces)[name].type.dtype, device=device))
+        hits: Any = HitArrays()
+        for each in fields_of(HitArrays):
+            setattr(hits, each, to_warp(getattr(self, each)).to(device))
+        inputs = [surfaces, numbering, rays_on(device, rays), hits, out]
+        if device.is_cpu:
+            launch(hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
+        else:
+            wp.launch(hit_places, dim=n, inputs=[*inputs, 0], device=device, record_tape=False)
+        return array if isinstance(self.t, wp.array) else array.numpy()
+
+
+def _require(world: World, name: str) -> None:
+    """Raise InputError where hits in this world have no such thing."""
+    if name == "uv" and not len(world.uvs):
+        raise InputError("the mesh has no texture coordinates (uvs)")
+    if name == "instance" and not isinstance(world.geometry, InstancedGeometry):
+        raise InputError("the structure has no instances")
+    if name in ("object", "material") and world.objects is None:
+        raise InputError(f"the structure is not over a scene: there is no {name}")
+
+
+def surroundings(accel: Any, state: State) -> Surroundings:
+    """Of a structure in a state of it, on its device: made once."""
+    if state in _surroundings:
+        return _surroundings[state]
+    geometry: Any = state.geometry
+    world, device, surfaces = accel.attributes or world_over(geometry), accel.device, structs.Surfaces()
+    placed = placed_now(world, geometry)
+    surfaces.n_triangles = geometry.n_triangles
+    surfaces.vertices = upload(geometry.vertices if placed is None else world.vertices, wp.vec3, device)
+    surfaces.faces = upload(world.faces, wp.vec3i, device)
+    surfaces.normals = upload(np.zeros((1, 3)) if world.normals is None else world.normals, wp.vec3, device)
+    surfaces.uvs = upload(world.uvs, wp.vec2, device)
+    surfaces.spheres = accel._surfaces.spheres
+    surfaces.prim_material = upload(world.prim_material, wp.int32, device)
+    numbering = Numbering()
+    if world.objects is not None:
+        numbering.first_prim = upload(world.objects, wp.int32, device)
+    if placed is not None:
+        surfaces.instances = upload(instance_records(placed), structs.Instance, device)
+        numbering.instance = upload(_instance_of(placed, geometry), wp.int32, device)
+    return _surroundings.setdefault(state, Surroundings(world, surfaces, numbering))
+
+
+def _instance_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:
+    """Which instance each run of primitives is; those that are joined are all of the first, and spheres too."""
+    out = np.zeros(len(placed.first_prim), np.int32)
+    out[run_of(placed, geometry)] = np.nonzero(geometry.is_placed)[0]
+    return out
+
+
+def instance_records(placed: Placed) -> np.ndarray:
+    """As kernels.structs.Instance."""
+    out = records(structs.Instance, len(placed.first_prim))
+    for name in ("first_prim", "first_face", "first_material", "material_step"):
+        out[name] = getattr(placed, name)
+    linear = placed.to_world[:, :, :3]
+    inverse = np.linalg.inv(linear)
+    inverse /= np.abs(inverse).max(axis=(1, 2), keepdims=True)  # a factor changes no direction, and its square is a float32
+    for i, axis in enumerate("xyz"):
+        out[f"world_{axis}"], out[f"normal_{axis}"] = placed.to_world[:, i], inverse[:, i]
+    out["handedness"] = np.where(np.linalg.det(linear) < 0.0, -1.0, 1.0)
+    return out

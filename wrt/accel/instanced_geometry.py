@@ -1,0 +1,67 @@
+"""Meshes that stand in several places: each kept once in its own space, with a transform to the world for each place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wrt.accel.geometry import Geometry
+from wrt.kernels.traverse.common import Units
+
+
+@dataclass(frozen=True, eq=False)
+class NumberedGeometry(Geometry):
+    """A geometry whose primitives have numbers of their own in the scene: numbers (N,) int32, ascending."""
+
+    numbers: np.ndarray
+
+    def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
+        if order is not None and len(order) > len(self):
+            return self.primitives(units, None, threads)[order]
+        out = super().primitives(units, order, threads)
+        out["prim_id"] = self.numbers[out["prim_id"]]
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class InstancedGeometry:
+    """Geometries placed in the world. parts: each in its own space; of a mesh, primitives are numbered from 0, and an instance
+    adds its own first_prim. part: (I,) int, the part of each instance; to_world: (I, 3, 4) float64, affine and invertible;
+    first_prim: (I,) int. n_triangles: of all instances together; spheres, numbered behind them, are those of part 0."""
+
+    parts: tuple[Geometry, ...]
+    part: np.ndarray
+    to_world: np.ndarray
+    first_prim: np.ndarray
+    n_triangles: int
+
+    @property
+    def spheres(self) -> np.ndarray:
+        """(S, 4) float32, as in Geometry; none of them is an instance."""
+        return self.parts[0].spheres
+
+    def __len__(self) -> int:
+        return self.n_triangles + len(self.spheres)
+
+    @property
+    def is_placed(self) -> np.ndarray:
+        """(I,) bool: False of what was joined in the world, and has no transform of its own."""
+        return np.array([not isinstance(self.parts[part], NumberedGeometry) for part in self.part], bool)
+
+    @property
+    def to_local(self) -> np.ndarray:
+        """(I, 3, 4) float64: the inverse of to_world."""
+        linear = np.linalg.inv(self.to_world[:, :, :3])
+        return np.concatenate([linear, -(linear @ self.to_world[:, :, 3:])], axis=2)
+
+
+def place(*meshes: tuple[Geometry, np.ndarray]) -> InstancedGeometry:
+    """Instances of geometries without spheres, each a pair of a geometry and its (4, 4) or (3, 4) transform to the world.
+    The same geometry given twice is one part."""
+    parts = {id(geometry): geometry for geometry, _ in meshes}
+    index = {key: i for i, key in enumerate(parts)}
+    counts = np.array([len(geometry.faces) for geometry, _ in meshes], np.int64)
+    return InstancedGeometry(tuple(parts.values()), np.array([index[id(geometry)] for geometry, _ in meshes], np.int32),
+                             np.array([matrix[:3] for _, matrix in meshes], np.float64).reshape(-1, 3, 4),
+                             np.concatenate([[0], np.cumsum(counts)[:-1]]), int(counts.sum()))

@@ -1,0 +1,108 @@
+"""Pairs of points that see each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.all_hits import first_hits
+from wrt.accel.answers import ANY_HIT_TYPES, room_for
+from wrt.accel.base import Accelerator
+from wrt.accel.hit_points import surroundings
+from wrt.accel.ray_query import require_one_mesh
+from wrt.accel.rays import vectors
+from wrt.core.arrays import check_no_gradients, real_numbers, taken, to_numpy
+from wrt.core.checks import shown
+from wrt.core.device import launch, thread_count, upload
+from wrt.core.errors import InputError
+from wrt.kernels.query import FARTHEST, RayArrays
+from wrt.kernels.shade.segments import see, segments
+from wrt.kernels.structs import Surfaces
+
+PAIRS_PER_LAUNCH = 65536
+
+
+def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = None, threads: int | None = None, *,
+            out: Any = None) -> Any:
+    """Whether the open segment between each point of `a` and that of `b` meets nothing, (N,) bool.
+
+    a, b: (N, 3) real numbers, taken as float32, or Warp arrays of vec3; the answer is the same with a and b exchanged, to the bit.
+    What is nearer to an end than 3.8e-6 of the pair's largest coordinate is not seen: a surface that the point lies on, to
+    rounding; points nearer to each other than twice that always see each other, a point itself too. Along a surface that is not
+    enough. on_a, on_b: (N,) prim_ids of triangles on which the points lie (hits.prim_id of hits.point), -1 for none: these are
+    not in the way, and the point is moved off their plane by its rounding, as a shadow ray of a picture is (structures over one
+    mesh). threads, out: as in any_hit. Raises InputError that names the argument; of Warp arrays on a GPU no values are looked at,
+    and what is not finite sees nothing.
+    """
+    if not isinstance(accel, Accelerator):
+        raise InputError(f"accel must be a structure (wrt.build), got {shown(accel)}")
+    threads, device = thread_count(threads), accel.device
+    check_no_gradients(a=a, b=b)
+    p, q = (_points(value, name, device) for value, name in ((a, "a"), (b, "b")))
+    n, as_warp = len(p), isinstance(taken(a, "a"), wp.array)
+    if len(q) != n:
+        raise InputError(f"b must have as many rows as a ({n}), got {len(q)}")
+    array = room_for(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None)[0]
+    state, known, surfaces = accel._state, on_a is not None or on_b is not None, Surfaces()
+    if known:
+        require_one_mesh(accel.structure, "on_a and on_b are for structures over one mesh")
+        surfaces = surroundings(accel, state).surfaces
+    ids = [_prim_ids(value, name, n, len(accel.geometry.faces)) if known else np.zeros(0, np.int32)
+           for value, name in ((on_a, "on_a"), (on_b, "on_b"))]
+
+    def run(kernel: Any, *inputs: Any) -> None:
+        if device.is_cpu:
+            launch(kernel, n, *inputs, None, threads=threads, step=PAIRS_PER_LAUNCH)
+        else:
+            wp.launch(kernel, dim=n, inputs=[*inputs, 0], device=device, record_tape=False)
+
+    rays: Any = RayArrays()
+    rays.origin, rays.direction = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(2))
+    rays.t_min, rays.t_max = (wp.empty(n, dtype=wp.float32, device=device) for _ in range(2))
+    run(segments, surfaces, p, q, *(upload(each, wp.int32, device) for each in ids), rays)
+    given = rays.origin, rays.direction, rays.t_min, rays.t_max
+    seen = accel.any_hit(*given, threads=threads)
+    run(see, p, q, seen)
+    answer = np.array(to_numpy(seen)) if known else seen
+    if known:
+        _without(accel, given, ids, answer, threads)
+    if as_warp:
+        array.assign(answer)
+    else:
+        array[:] = to_numpy(answer)
+    return array
+
+
+def _without(accel: Accelerator, rays: tuple[Any, ...], ids: list[np.ndarray], seen: np.ndarray, threads: int) -> None:
+    """Let those see each other, too, between whom there is nothing but the two triangles on which they lie."""
+    origin, way, t_min, t_max = (each.numpy() for each in rays)
+    rows = np.nonzero(~seen & (t_max > 0.0))[0]
+    prim_id = first_hits(accel, 3, origin[rows], way[rows], t_min[rows], t_max[rows], threads).prim_id
+    seen[rows] = ((prim_id < 0) | (prim_id == ids[0][rows, None]) | (prim_id == ids[1][rows, None])).all(axis=1)
+
+
+def _points(value: Any, name: str, device: Any) -> Any:
+    """As a Warp array on the device. Raises InputError that names the argument."""
+    value = taken(value, name)
+    if isinstance(value, wp.array):
+        if value.dtype != wp.vec3 or value.ndim != 1:
+            raise InputError(f"{name} must be (N,) vec3, got {value.shape} {value.dtype.__name__}")
+        if value.device.is_cpu:
+            vectors(value.numpy(), name, FARTHEST)
+        return (value if value.is_contiguous else value.contiguous()).to(device)
+    return upload(vectors(value, name, FARTHEST), wp.vec3, device)
+
+
+def _prim_ids(value: Any, name: str, n: int, count: int) -> np.ndarray:
+    """(N,) int32, -1 for each where there are none. Raises InputError that names the argument."""
+    if value is None:
+        return np.full(n, -1, np.int32)
+    array = real_numbers(to_numpy(value), name, f"({n},) prim_ids")
+    if array.shape != (n,) or array.dtype.kind not in "iu":
+        raise InputError(f"{name} must be ({n},) whole numbers, got {shown(array)}")
+    if n and not (array.min() >= -1 and array.max() < count):
+        row = int(np.argmax((array < -1) | (array >= count)))
+        raise InputError(f"{name} must be -1 to {count - 1}; row {row} is {array[row]}")
+    return array.astype(np.int32)
