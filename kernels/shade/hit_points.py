@@ -8,6 +8,7 @@ Barycentric coordinates, which kernels.shade.surface starts from, carry the erro
 import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.shade.elementary import acos, atan2
 from wrt.kernels.shade.sampling import PI, TWO_PI
 from wrt.kernels.shade.surface import Place, triangle_point, world_normal
 from wrt.kernels.structs import Instance, Surfaces, kernel
@@ -309,7 +310,7 @@ def put_interpolated_on_sphere(normal: wp.vec3, out: HitPlaces, i: int):
     if out.shading.shape[0] > 0:
         out.shading[i] = normal
     if out.uv.shape[0] > 0:
-        out.uv[i] = wp.vec2(0.5 + wp.atan2(-normal[2], normal[0]) / TWO_PI, wp.acos(wp.clamp(normal[1], -1.0, 1.0)) / PI)
+        out.uv[i] = wp.vec2(0.5 + atan2(-normal[2], normal[0]) / TWO_PI, acos(wp.clamp(normal[1], -1.0, 1.0)) / PI)
 
 
 @kernel
