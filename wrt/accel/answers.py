@@ -91,6 +91,10 @@ class Hits(HitPoints):
     counters: Counters | None = None
     source: Any = None
 
+    def __reduce__(self) -> Any:
+        """In a file or in another process they know their rays no more."""
+        return Hits, (self.t, self.u, self.v, self.prim_id, self.counters)
+
     def __len__(self) -> int:
         return len(self.t)
 

@@ -128,9 +128,10 @@ def _require(world: World, name: str) -> None:
 
 
 def surroundings(accel: Any, state: State) -> Surroundings:
-    """Of a structure in a state of it, on its device: made once."""
+    """Of a structure in a state of it, on its device: made once, unless refits in place change it."""
     if state in _surroundings:
         return _surroundings[state]
+    changes = bool(np.isnan(state.built.sah_cost))
     geometry: Any = state.geometry
     world, device, surfaces = accel.attributes or world_over(geometry), accel.device, structs.Surfaces()
     placed = placed_now(world, geometry)
@@ -147,7 +148,8 @@ def surroundings(accel: Any, state: State) -> Surroundings:
     if placed is not None:
         surfaces.instances = upload(instance_records(placed), structs.Instance, device)
         numbering.instance = upload(_instance_of(placed, geometry), wp.int32, device)
-    return _surroundings.setdefault(state, Surroundings(world, surfaces, numbering))
+    made = Surroundings(world, surfaces, numbering)
+    return made if changes else _surroundings.setdefault(state, made)
 
 
 def _instance_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:

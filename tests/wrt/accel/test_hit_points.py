@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from decimal import Decimal, localcontext
 from fractions import Fraction
 from typing import Any
@@ -17,6 +18,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.hit_points import HitPoints
 from wrt.accel.instanced_geometry import place
 from wrt.core.arrays import to_numpy
+from wrt.core.errors import InputError
 from wrt.scene import shapes
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene, Sphere
@@ -251,6 +253,24 @@ def test_hits_are_of_the_shape_that_was_asked() -> None:
     accel.refit(2.0 * ball.vertices)
     after = accel.closest_hit(origin, direction)
     assert abs(np.linalg.norm(before.point) - 1.0) < 0.03 and abs(np.linalg.norm(after.point) - 2.0) < 0.06
+
+
+def test_after_refits_in_place_points_are_of_the_last_shape() -> None:
+    ball = shapes.icosphere(2)
+    accel, points = wrt.build(ball, "bvh2"), vec3s(ball.vertices)
+    for size in (1.5, 2.0):
+        points.assign((size * ball.vertices).astype(np.float32))
+        accel.refit(points, in_place=True)
+        hits = accel.closest_hit([[0.1, 0.2, 5.0]], [[0.0, 0.0, -1.0]])
+        assert hits.point[0, 2] == pytest.approx(5.0 - hits.t[0], abs=1e-5) and hits.point[0, 2] > 0.9 * size
+
+
+def test_hits_can_be_pickled() -> None:
+    hits = wrt.build(shapes.icosphere(1)).closest_hit([[0.1, 0.2, 5.0]], [[0.0, 0.0, -1.0]])
+    again = pickle.loads(pickle.dumps(hits))
+    assert again.t == hits.t and again.prim_id == hits.prim_id
+    with pytest.raises(InputError, match="do not know their rays"):
+        _ = again.point
 
 
 def test_what_is_not_there() -> None:
