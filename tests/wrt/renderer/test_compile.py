@@ -23,7 +23,7 @@ def test_a_render_finds_its_kernels_loaded(monkeypatch: pytest.MonkeyPatch) -> N
     asked: list[Any] = []
     monkeypatch.setattr(prepare, "load_kernel", lambda kernel, target: asked.append(kernel))
     render(scene, aov=tuple(OF_AOVS))
-    assert len(asked) == len(names) and all("cpu" in device._loaded[kernel].devices for kernel in asked)
+    assert len(asked) == len(names) and all("cpu" in dict(device._loaded[kernel].devices) for kernel in asked)
 
 
 def test_queries_of_a_structure_and_wrong_names() -> None:
