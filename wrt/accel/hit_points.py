@@ -131,7 +131,7 @@ def surroundings(accel: Any, state: State) -> Surroundings:
     """Of a structure in a state of it, on its device: made once, unless refits in place change it."""
     if state in _surroundings:
         return _surroundings[state]
-    changes = bool(np.isnan(state.built.sah_cost))
+    changes = state.built is not None and bool(np.isnan(state.built.sah_cost))  # instances are only moved to another state
     geometry: Any = state.geometry
     world, device, surfaces = accel.attributes or world_over(geometry), accel.device, structs.Surfaces()
     placed = placed_now(world, geometry)
