@@ -8,9 +8,7 @@ Barycentric coordinates, which kernels.shade.surface starts from, carry the erro
 import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.shade.elementary import acos, atan2
-from wrt.kernels.shade.sampling import PI, TWO_PI
-from wrt.kernels.shade.surface import Place, triangle_point, world_normal
+from wrt.kernels.shade.surface import Place, instance_at, sphere_uv, triangle_point, world_normal
 from wrt.kernels.structs import Instance, Surfaces, kernel
 
 U32 = wp.constant(wp.float64(2.0**-24))  # unit roundoffs
@@ -237,16 +235,8 @@ def place_of(surfaces: Surfaces, prim_id: int) -> Place:
     place.instance = -1
     index = prim_id
     if surfaces.instances.shape[0] > 0:
-        low = int(0)
-        high = int(surfaces.instances.shape[0])
-        while high - low > 1:
-            middle = (low + high) / 2
-            if surfaces.instances[middle].first_prim <= prim_id:
-                low = middle
-            else:
-                high = middle
-        run = surfaces.instances[low]
-        place.instance = low
+        place.instance = instance_at(surfaces, prim_id)
+        run = surfaces.instances[place.instance]
         place.face = run.first_face + prim_id - run.first_prim
         index = run.first_material + run.material_step * (prim_id - run.first_prim)
     place.material = -1
@@ -310,7 +300,7 @@ def put_interpolated_on_sphere(normal: wp.vec3, out: HitPlaces, i: int):
     if out.shading.shape[0] > 0:
         out.shading[i] = normal
     if out.uv.shape[0] > 0:
-        out.uv[i] = wp.vec2(0.5 + atan2(-normal[2], normal[0]) / TWO_PI, acos(wp.clamp(normal[1], -1.0, 1.0)) / PI)
+        out.uv[i] = sphere_uv(normal)
 
 
 @kernel

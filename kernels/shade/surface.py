@@ -61,6 +61,26 @@ class Place:
     instance: int
 
 
+@wp.func
+def instance_at(surfaces: Surfaces, prim_id: int) -> int:
+    """The last instance that does not begin behind a primitive: the one that it is of."""
+    low = int(0)
+    high = int(surfaces.instances.shape[0])
+    while high - low > 1:
+        middle = (low + high) / 2
+        if surfaces.instances[middle].first_prim <= prim_id:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@wp.func
+def sphere_uv(n: wp.vec3) -> wp.vec2:
+    """Longitude and latitude of a unit normal, in a picture that goes round the sphere once."""
+    return wp.vec2(0.5 + atan2(-n[2], n[0]) / TWO_PI, acos(wp.clamp(n[1], -1.0, 1.0)) / PI)
+
+
 def make_place_of(instances: bool) -> Any:
     """From a prim_id to its data."""
 
@@ -68,17 +88,9 @@ def make_place_of(instances: bool) -> Any:
     def place_of(surfaces: Surfaces, prim_id: int) -> Place:
         place = Place()
         if wp.static(instances):
-            low = int(0)
-            high = int(surfaces.instances.shape[0])
-            while high - low > 1:  # the last one that does not begin behind it
-                middle = (low + high) / 2
-                if surfaces.instances[middle].first_prim <= prim_id:
-                    low = middle
-                else:
-                    high = middle
-            instance = surfaces.instances[low]
+            place.instance = instance_at(surfaces, prim_id)
+            instance = surfaces.instances[place.instance]
             local = prim_id - instance.first_prim
-            place.instance = low
             place.face = instance.first_face + local
             place.material = surfaces.prim_material[instance.first_material + instance.material_step * local]
         else:
@@ -226,8 +238,7 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
         s.point = center + sphere[3] * s.geometric
         s.error = gamma(6.0) * (wp.vec3(sphere[3], sphere[3], sphere[3]) + wp.abs(center))
         if wp.static(uvs):
-            n = s.geometric
-            s.uv = wp.vec2(0.5 + atan2(-n[2], n[0]) / TWO_PI, acos(wp.clamp(n[1], -1.0, 1.0)) / PI)
+            s.uv = sphere_uv(s.geometric)
         if wp.static(tangents):
             s.bitangent_sign = 1.0
             along_u = wp.vec3(s.geometric[2], 0.0, -s.geometric[0])

@@ -13,7 +13,7 @@ from wrt.accel.flatten import Placed, World, placed_now, run_of, world_over
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.rays import Rays, rays_on
 from wrt.core.arrays import to_warp
-from wrt.core.device import launch, records, thread_count, upload
+from wrt.core.device import launch_on, records, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.kernels import structs
 from wrt.kernels.query import HitArrays
@@ -110,10 +110,7 @@ class HitPoints:
         for each in fields_of(HitArrays):
             setattr(hits, each, to_warp(getattr(self, each)).to(device))
         inputs = [surfaces, numbering, rays_on(device, rays), hits, out]
-        if device.is_cpu:
-            launch(hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
-        else:
-            wp.launch(hit_places, dim=n, inputs=[*inputs, 0], device=device, record_tape=False)
+        launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
         return array if isinstance(self.t, wp.array) else array.numpy()
 
 

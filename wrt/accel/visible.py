@@ -15,7 +15,7 @@ from wrt.accel.ray_query import require_one_mesh
 from wrt.accel.rays import vectors
 from wrt.core.arrays import check_no_gradients, real_numbers, taken, to_numpy
 from wrt.core.checks import shown
-from wrt.core.device import launch, thread_count, upload
+from wrt.core.device import launch_on, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST, RayArrays
 from wrt.kernels.shade.segments import see, segments
@@ -53,10 +53,7 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
            for value, name in ((on_a, "on_a"), (on_b, "on_b"))]
 
     def run(kernel: Any, *inputs: Any) -> None:
-        if device.is_cpu:
-            launch(kernel, n, *inputs, None, threads=threads, step=PAIRS_PER_LAUNCH)
-        else:
-            wp.launch(kernel, dim=n, inputs=[*inputs, 0], device=device, record_tape=False)
+        launch_on(device, kernel, n, *inputs, None, threads=threads, step=PAIRS_PER_LAUNCH)
 
     rays: Any = RayArrays()
     rays.origin, rays.direction = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(2))
