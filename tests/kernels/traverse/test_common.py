@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.kernel_tools import directions, floats, ints, launch, rounded, unit, vec3s, zeros  # isort: skip
+from tests.structures import FAMILIES, STRUCTURES, families_first  # isort: skip
 import warp as wp
 
 from wrt.accel.build import build
@@ -20,7 +21,6 @@ from wrt.kernels.units.box import RAY_AABB
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
-STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
 TREES = [name for name in STRUCTURES if name != "brute_force"]
 WITH_LEAVES = [name for name in TREES if "max_leaf" in signature(ACCELERATORS[name]._build).parameters]
 NO_SPHERES = np.zeros((0, 4), np.float32)
@@ -156,7 +156,8 @@ def test_leaf_size_does_not_matter(name, max_leaf):
 
 # Kernels with and without spheres are two: those with are compiled for the default box test, and for all in one structure.
 @pytest.mark.parametrize("kind, box, name", [
-    (kind, box, name) for kind in ("none", "one", "two", "one_sphere", "mixed") for box in RAY_AABB for name in TREES
+    pytest.param(kind, box, name, marks=[] if box == Units().box or name in FAMILIES else pytest.mark.slow)
+    for kind in ("none", "one", "two", "one_sphere", "mixed") for box in RAY_AABB for name in TREES
     if box == Units().box or name == "bvh2" or kind in ("none", "one", "two")])
 def test_any_box_test_ends_and_hardly_loses_a_ray(kind, box, name):
     # A small tree has empty boxes, which no test may enter; the looser tests may lose a ray in an edge, and no more.
@@ -363,7 +364,7 @@ def test_the_excluded_triangle_is_not_hit(name):
         assert np.array_equal(hits.t.numpy()[chosen], expected.t)
 
 
-@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize("name", families_first())
 def test_refused_hits_let_the_ray_on(name):
     rng = np.random.default_rng(9)
     geometry = soup(rng, 40, 0.5)

@@ -11,6 +11,7 @@ import warp as wp
 from tests.data import data_path
 from tests.kernel_tools import rounded
 from tests.rewalk import PRIMITIVE_BYTES, REWALK, rays
+from tests.structures import STRUCTURES, families_first
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.structure import Structure
@@ -25,7 +26,6 @@ from wrt.lab.rtcore.cubin import read_cubin
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
-STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
 NAMES = ("nodes", "boxes", "box_operations", "primitives", "leaves", "pushes", "pops", "stack")
 
 
@@ -98,7 +98,7 @@ def test_no_rays_cost_nothing(name):
     assert len(counters.counts) == len(counters.address) == 0
 
 
-@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize("name", families_first())
 def test_counting_off_leaves_nothing_in_the_machine_code(name, monkeypatch, tmp_path):
     """For Turing, it is that of a source whose counters do nothing, to the last byte."""
 

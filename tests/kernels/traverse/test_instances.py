@@ -7,14 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.kernel_tools import rounded, unit
+from tests.structures import STRUCTURES
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry, place
-from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.scene.shapes import icosphere, torus
 
-STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
 NO_SPHERES = np.zeros((0, 4), np.float32)
 NODE_BYTES = Bvh2Node.numpy_dtype()["itemsize"]
 

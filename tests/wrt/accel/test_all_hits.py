@@ -10,12 +10,11 @@ import warp as wp
 
 import wrt
 from tests.kernel_tools import floats, launch, vec3s, zeros
-from wrt.accel.structures import ACCELERATORS
+from tests.structures import STRUCTURES
 from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
 from wrt.kernels.traverse.common import Units
 from wrt.scene import shapes
 
-STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
 CAPACITY = 64
 
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
+from tests.structures import STRUCTURES
 from wrt.accel.build import build, build_cached, load_accel
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import MAGIC, check_binary
@@ -23,7 +24,6 @@ from wrt.core.checked_file import DIGEST_BYTES
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere
 
-STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()})
 BALL = icosphere(2)
 
 
@@ -55,7 +55,7 @@ def test_a_round_trip_changes_nothing(name: str, geometry: str, tmp_path: Path) 
     g = {"triangles": Geometry.of(BALL), "spheres": Geometry(BALL.vertices, BALL.faces, np.array([[0, 0, 2, 0.5]], np.float32)),
          "one": Geometry(BALL.vertices, BALL.faces[:1], np.zeros((0, 4), np.float32)),
          "none": Geometry(BALL.vertices, BALL.faces[:0], np.zeros((0, 4), np.float32))}[geometry]
-    before = build(g, name, triangle="moeller_trumbore")
+    before = build(g, name, **({"triangle": "moeller_trumbore"} if name == "bvh2" else {}))
     before.save(tmp_path / "x.accel")
     after = load_accel(tmp_path / "x.accel", g)
     assert type(after) is type(before) and after.structure == before.structure
