@@ -108,8 +108,8 @@ class Units(Plan):
 
 @dataclass(frozen=True)
 class Peers(Plan):
-    """wrt beside Embree (robust and fast) and Warp's mesh_query_ray: the same rays by turns, on one thread and on all, with ratios
-    and answers that differ.
+    """wrt beside Embree (robust, fast, in packets) and Warp's mesh_query_ray: the same rays by turns, on one thread and on all,
+    with ratios and answers that differ.
 
     MESHES: mesh files; without any, a sphere.
     """
@@ -117,7 +117,8 @@ class Peers(Plan):
     COMMAND, STUDY = "bench peers", "wrt.lab.bench.peers"
     meshes: Sequence[Any] = the_meshes()
     structures: Sequence[str] = option(("bvh",), "Of wrt, by name; ratios are of the first", of=STRUCTURES)
-    rivals: Sequence[str] = option((), "embree, embree_fast, warp, open3d  [default: those that are installed]",
+    rivals: Sequence[str] = option((), "embree, embree_fast, embree16, embree16_incoherent, warp, open3d  [default: "
+                                   "those that are installed]",
                                    of=("rival", "wrt.lab.hard_cases.contestants:PEERS"))
     kinds: Sequence[str] = the_kinds()
     rays: int = option(100_000, "Rays of each kind", (1, 2**28))
@@ -286,7 +287,7 @@ class Stability(Plan):
     cases: Sequence[str] = option((), "", form="argument")
     rays: int = option(10_000, "Rays of each case, for the default", (1, 2**40))
     sample: int = option(10_000, "How many of them the oracle judges, and the other tests and peers get", (1, 2**40))
-    peers: bool = option(False, "Also Embree (robust and fast), Warp's mesh_query_ray and Open3D, where installed")
+    peers: bool = option(False, "Also Embree (robust, fast, in packets), Warp's mesh_query_ray and Open3D, where installed")
     seed: int = option(0, "Other rays")
     threads: int | None = the_threads("Threads for the rays beyond the sample  [default: all cores]")
     runs: int = option(7, "Runs of each for the speed, by turns", (1, 1000))

@@ -14,6 +14,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
+from wrt.core.registry import Registry
 from wrt.lab.bench.rays import RaySet
 
 
@@ -117,7 +118,7 @@ class Embree(Peer):
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
         out = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
         prim_id = out["primID"].astype(np.int32)
-        return _cut(out["tfar"], prim_id, out["u"], out["v"], t_min, t_max)
+        return cut(out["tfar"], prim_id, out["u"], out["v"], t_min, t_max)
 
     def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
         o, d = np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)
@@ -160,7 +161,7 @@ class WarpMesh(Peer):
         t, u, v, prim_id = (array.numpy() for array in self.search(RaySet("", origins, directions, np.ones(len(origins))), 1)())
         length = np.linalg.norm(directions.astype(np.float64), axis=1)
         # Warp's u and v belong to the first two corners; wrt's to the last two.
-        return _cut((t / length).astype(np.float32), prim_id, v, 1.0 - u - v, t_min, t_max)
+        return cut((t / length).astype(np.float32), prim_id, v, 1.0 - u - v, t_min, t_max)
 
     def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
         """Warp wants unit directions, and its any-hit query a length beside them."""
@@ -209,7 +210,7 @@ class Open3D(Peer):
         told = {name: array.numpy() for name, array in self.scene.cast_rays(self.tensor(rays), nthreads=1).items()}
         prim_id = np.where(told["primitive_ids"] == self.none, -1, told["primitive_ids"].astype(np.int64)).astype(np.int32)
         u, v = told["primitive_uvs"].T
-        return _cut(told["t_hit"], prim_id, u, v, t_min, t_max)
+        return cut(told["t_hit"], prim_id, u, v, t_min, t_max)
 
     def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
         bundle = self.tensor(np.concatenate([rays.origins, rays.directions], axis=1))
@@ -218,7 +219,8 @@ class Open3D(Peer):
         return lambda: self.scene.cast_rays(bundle, nthreads=threads)
 
 
-def _cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min: Any, t_max: Any) -> Hits:
+def cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min: Any, t_max: Any) -> Hits:
+    """Hits of which those beyond the segment are none."""
     outside = (prim_id < 0) | ~((t >= t_min) & (t <= t_max))
     return Hits(np.where(outside, np.float32(np.inf), t), np.where(outside, 0, u), np.where(outside, 0, v),
                 np.where(outside, np.int32(-1), prim_id))
@@ -232,4 +234,11 @@ def own_algorithms() -> list[Own]:
     return [Own(triangle) for triangle in RAY_TRIANGLE] + [Own(box=box) for box in RAY_AABB if box != "conservative"]
 
 
-PEERS: dict[str, type[Peer]] = {"embree": Embree, "embree_fast": EmbreeFast, "warp": WarpMesh, "open3d": Open3D}
+PEERS: Registry[type[Peer]] = Registry("rival", {
+    "embree": f"{__name__}:Embree",
+    "embree_fast": f"{__name__}:EmbreeFast",
+    "embree16": "wrt.lab.hard_cases.embree_packets:EmbreePackets",
+    "embree16_incoherent": "wrt.lab.hard_cases.embree_packets:EmbreeIncoherentPackets",
+    "warp": f"{__name__}:WarpMesh",
+    "open3d": f"{__name__}:Open3D",
+})
