@@ -101,7 +101,7 @@ def test_kernels_compile_for_turing_and_some_for_hopper(path: Path, tmp_path: Pa
         assert [Path(binary).stat().st_size > 10_000 for binary in binaries] == [True] * len(archs)
 
 
-def test_the_other_kernels_compile_for_turing_and_hopper(tmp_path: Path) -> None:
+def test_the_other_kernels_compile_for_turing_and_one_for_hopper(tmp_path: Path) -> None:
     start("cpu")
     variant = Features(spheres=True, textures=True, smooth=True, cutout=True)
     kernels = [aov_kernel(variant, Structure(ACCELERATORS["bvh"], Units(spheres=True)))]
@@ -110,6 +110,6 @@ def test_the_other_kernels_compile_for_turing_and_hopper(tmp_path: Path) -> None
     kernels += [closest_hit_kernel(Structure(ACCELERATORS["bvh"], Units(triangle=name))) for name in RAY_TRIANGLE]
     kernels += [closest_hit_kernel(Structure(ACCELERATORS["bvh"], Units(box=name))) for name in RAY_AABB]
     kernels += hit_kernels(Structure(ACCELERATORS["bvh"]))[:1]
-    for kernel in kernels:
-        binaries = wp.compile_aot_module(kernel.module, arch=[75, 90], module_dir=tmp_path)
-        assert len(binaries) == 2
+    for i, kernel in enumerate(kernels):
+        archs = [75] if i else [75, 90]
+        assert len(wp.compile_aot_module(kernel.module, arch=archs, module_dir=tmp_path)) == len(archs)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.kernel_tools import rounded, unit
-from tests.structures import STRUCTURES
+from tests.structures import families_first
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry, place
@@ -91,7 +91,7 @@ def crowd_expected(part):
     return origins, directions, 0.0, np.inf, whole
 
 
-@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize("name", families_first())
 def test_the_closest_of_what_each_structure_says_to_the_last_bit(name):
     accel = build(crowd(), name)
     for part in (False, True):

@@ -10,7 +10,7 @@ import warp as wp
 
 import wrt
 from tests.kernel_tools import floats, launch, vec3s, zeros
-from tests.structures import STRUCTURES
+from tests.structures import families_first
 from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
 from wrt.kernels.traverse.common import Units
 from wrt.scene import shapes
@@ -53,7 +53,7 @@ def one_by_one(mesh: wrt.Mesh, asked: tuple[Any, ...]) -> list[list[tuple[float,
     return [sorted(zip(t[row].tolist(), prim_id[row].tolist(), strict=True)) for row in rows]
 
 
-@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize("name", families_first())
 def test_the_first_hits_are_those_of_testing_all(name: str) -> None:
     rng = np.random.default_rng(0)
     mesh = soup(rng)
