@@ -10,6 +10,7 @@ import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays, direction_scale, put_hit, scaled_ray
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
+from wrt.kernels.units.triangle import is_crossed, seen, triangle_ray
 
 
 @wp.struct
@@ -123,14 +124,18 @@ def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, 
     return World, closest_hit, any_hit, next_hit
 
 
-ON_SURFACE, AT_EDGE = wp.constant(-1), wp.constant(-2)
-NEAR_EDGE = wp.constant(1e-6)  # in barycentric coordinates, where rounding puts a hit on an edge by 1e-7 beside it
+@wp.func
+def crosses(surfaces: Surfaces, ray: Ray, prim_id: int) -> bool:
+    """Whether a ray goes through a triangle that it hits, or only touches it: units.triangle.is_crossed."""
+    shear = triangle_ray(ray)
+    face = surfaces.faces[prim_id]
+    return is_crossed(seen(surfaces.vertices[face[0]] - ray.origin, shear), seen(surfaces.vertices[face[1]] - ray.origin, shear),
+                      seen(surfaces.vertices[face[2]] - ray.origin, shear))
 
 
-def make_hit_kernels(query: Any) -> tuple[Any, Any, Any]:
-    """count_hits: how many each ray has; write_hits: what they are, those of ray i in rows first[i] .. first[i + 1] - 1; cross: how
-    many there are of a closed surface, ON_SURFACE where the ray begins there, or AT_EDGE where it meets an edge, at which a
-    crossing is no crossing or two. query: of make_ray_query."""
+def make_hit_kernels(query: Any) -> tuple[Any, Any]:
+    """count_hits: how many each ray has; write_hits: what they are, those of ray i in rows first[i] .. first[i + 1] - 1. crossings:
+    only those where it crosses a triangle; then surfaces has vertices and faces. query: of make_ray_query."""
     world_struct, closest_hit, _, next_hit = query
 
     @wp.func
@@ -142,43 +147,37 @@ def make_hit_kernels(query: Any) -> tuple[Any, Any, Any]:
         ray.t_max = rays.t_max[i]
         return ray
 
+    @wp.func
+    def counts(surfaces: Surfaces, ray: QueryRay, hit: QueryHit, crossings: bool) -> bool:
+        if not crossings:
+            return True
+        return crosses(surfaces, scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max), hit.prim_id)
+
     @kernel
-    def count_hits(world: world_struct, rays: RayArrays, counts: wp.array(dtype=wp.int32), start: int):
+    def count_hits(world: world_struct, rays: RayArrays, crossings: bool, counted: wp.array(dtype=wp.int32), start: int):
         i = start + wp.tid()
         ray = loaded(rays, i)
         hit = closest_hit(world, ray)
         n = int(0)
         while hit.prim_id >= 0:
-            n += 1
+            if counts(world.surfaces, ray, hit, crossings):
+                n += 1
             hit = next_hit(world, ray, hit)
-        counts[i] = n
+        counted[i] = n
 
     @kernel
-    def write_hits(world: world_struct, rays: RayArrays, first: wp.array(dtype=wp.int64), hits: HitArrays, start: int):
+    def write_hits(world: world_struct, rays: RayArrays, crossings: bool, first: wp.array(dtype=wp.int64), hits: HitArrays,
+                   start: int):
         i = start + wp.tid()
         ray = loaded(rays, i)
         at = first[i]
         end = first[i + 1]
         hit = closest_hit(world, ray)
         while at < end:
-            put_hit(hits, at, hit, 1.0)
-            at += wp.int64(1)
+            if hit.prim_id < 0 or counts(world.surfaces, ray, hit, crossings):
+                put_hit(hits, at, hit, 1.0)
+                at += wp.int64(1)
             if hit.prim_id >= 0 and at < end:  # after a miss there are misses
                 hit = next_hit(world, ray, hit)
 
-    @kernel
-    def cross(world: world_struct, rays: RayArrays, crossings: wp.array(dtype=wp.int32), start: int):
-        i = start + wp.tid()
-        ray = loaded(rays, i)
-        hit = closest_hit(world, ray)
-        n = int(0)
-        if hit.prim_id >= 0 and hit.t == 0.0:
-            n = ON_SURFACE
-        while hit.prim_id >= 0 and n >= 0:
-            n += 1
-            if wp.min(wp.min(hit.u, hit.v), 1.0 - hit.u - hit.v) < NEAR_EDGE:
-                n = AT_EDGE
-            hit = next_hit(world, ray, hit)
-        crossings[i] = n
-
-    return count_hits, write_hits, cross
+    return count_hits, write_hits

@@ -91,6 +91,32 @@ def outside(areas: Any) -> bool:
 
 
 @wp.func
+def inside_edge(area: wp.float64, start: wp.vec3, end: wp.vec3, winding: wp.float64) -> bool:
+    """Whether the z axis is on the triangle's side of the edge from start to end, where its area is; if it is on the edge, whether
+    it would be with the axis moved to (e, e^2), e > 0 and as small as one likes."""
+    zero = wp.float64(0.0)
+    side = wp.where(winding < zero, -area, area)
+    if side == zero:
+        along = start[1] - end[1]
+        if along == 0.0:
+            along = end[0] - start[0]
+        return wp.where(winding < zero, -along, along) > 0.0
+    return side > zero
+
+
+@wp.func
+def is_crossed(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
+    """Whether the z axis, moved aside as little as that, meets the triangle of sheared corners.
+
+    It then meets no edge and no corner: of the triangles around one, those count that a line beside it crosses. Symbolic
+    perturbation: Edelsbrunner and Muecke 1990, "Simulation of Simplicity"."""
+    areas = edge_areas(wp.vec3d(a), wp.vec3d(b), wp.vec3d(c))
+    winding = areas[0] + areas[1] + areas[2]
+    return (inside_edge(areas[0], c, b, winding) and inside_edge(areas[1], a, c, winding)
+            and inside_edge(areas[2], b, a, winding))
+
+
+@wp.func
 def no_triangle() -> Hit:
     hit = Hit()
     hit.t = float(wp.inf)

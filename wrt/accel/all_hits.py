@@ -12,10 +12,11 @@ import warp as wp
 from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
 from wrt.accel.batches import RAYS_PER_LAUNCH
+from wrt.accel.hit_points import surroundings
 from wrt.accel.ray_query import query_of, require_one_mesh, world_of
 from wrt.accel.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
-from wrt.core.checks import as_integer, shown
+from wrt.core.checks import as_integer, as_one, shown
 from wrt.core.device import launch_on, made_once, thread_count
 from wrt.core.memory import require
 from wrt.kernels.query import HitArrays, RayArrays
@@ -58,12 +59,14 @@ class Asked:
     n = 0
     rays: RayArrays
 
-    def __init__(self, accel: Accelerator, threads: int | None) -> None:
+    def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
         structure = require_one_mesh(getattr(accel, "structure", None),
                                      f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
         self.threads, self.device, state = thread_count(threads), accel.device, accel._state
-        self.geometry, self.world = state.geometry, world_of(structure, state.data, accel._surfaces)
-        self.count_hits, self.write_hits, self.cross = hit_kernels(structure)
+        self.geometry, self.crossings = state.geometry, as_one(crossings, bool, "crossings")
+        surfaces = surroundings(accel, state).surfaces if crossings else accel._surfaces
+        self.world = world_of(structure, state.data, surfaces)
+        self.count_hits, self.write_hits = hit_kernels(structure)
 
     def of(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Asked:
         """Raises InputError that names the argument."""
@@ -72,12 +75,13 @@ class Asked:
         return self
 
     def launch(self, kernel: Any, *inputs: Any) -> None:
-        launch_on(self.device, kernel, self.n, self.world, self.rays, *inputs, None, threads=self.threads, step=RAYS_PER_LAUNCH)
+        asked = self.world, self.rays, self.crossings
+        launch_on(self.device, kernel, self.n, *asked, *inputs, None, threads=self.threads, step=RAYS_PER_LAUNCH)
 
-    def counts(self, kernel: Any = None) -> np.ndarray:
-        """A number for each ray, of `count_hits` or `cross`."""
+    def counts(self) -> np.ndarray:
+        """Of the hits of each ray."""
         counts = wp.zeros(self.n, dtype=wp.int32, device=self.device)
-        self.launch(kernel or self.count_hits, counts)
+        self.launch(self.count_hits, counts)
         return np.asarray(counts.numpy())
 
     def rows(self, first: np.ndarray) -> list[np.ndarray]:
@@ -90,35 +94,37 @@ class Asked:
 
 
 @made_once
-def hit_kernels(structure: Structure) -> tuple[Any, Any, Any]:
+def hit_kernels(structure: Structure) -> tuple[Any, Any]:
     return make_hit_kernels(query_of(structure))
 
 
 def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-             threads: int | None = None) -> AllHits:
+             threads: int | None = None, crossings: bool = False) -> AllHits:
     """Every hit of each ray in its segment, in order. Arguments as in Accelerator.closest_hit; the answer is of NumPy.
 
-    None is lost and none is there twice: a ray through an edge hits both triangles there, at a corner all of them. A hit takes one
-    walk from the root, and the count another; each walk tests all that is hit at the same t. Raises InputError, also where memory
-    does not suffice.
+    None is lost and none is there twice: a ray through an edge hits both triangles there, at a corner all of them. crossings: only
+    where the ray goes through, as if it stood aside of edges and corners by as little as one likes: where a surface goes on, one
+    triangle of them, and none or two at an outline. So it crosses a closed surface an even number of times from outside to outside,
+    with the watertight test exactly. A hit takes one walk from the root, and the count another; each walk tests all that is hit at
+    the same t. Raises InputError, also where memory does not suffice.
     """
-    asked = Asked(accel, threads).of(origins, directions, t_min, t_max)
+    asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
     first = np.concatenate([[0], np.cumsum(asked.counts(), dtype=np.int64)])
     require(float(first[-1]) * BYTES, f"{first[-1]} hits")
     return AllHits(first, *asked.rows(first))
 
 
 def count_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-               threads: int | None = None) -> np.ndarray:
+               threads: int | None = None, crossings: bool = False) -> np.ndarray:
     """How many hits each ray has in its segment, (N,) int32; as all_hits."""
-    return Asked(accel, threads).of(origins, directions, t_min, t_max).counts()
+    return Asked(accel, threads, crossings).of(origins, directions, t_min, t_max).counts()
 
 
 def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-               threads: int | None = None) -> Hits:
+               threads: int | None = None, crossings: bool = False) -> Hits:
     """The first k hits of each ray in order, as Hits of (N, k) arrays; what a ray has not is a miss. As all_hits."""
     k = as_integer(k, "k", 1, (1 << 31) - 1)
-    asked = Asked(accel, threads).of(origins, directions, t_min, t_max)
+    asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
     require(float(asked.n) * k * BYTES, f"{k} hits of each of {asked.n} rays")
     t, u, v, prim_id = (row.reshape(asked.n, k) for row in asked.rows(np.arange(asked.n + 1, dtype=np.int64) * k))
     return Hits(t, u, v, prim_id)

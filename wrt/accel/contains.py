@@ -14,9 +14,7 @@ from wrt.accel.rays import vectors
 from wrt.core.arrays import taken
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
-from wrt.kernels.ray_query import AT_EDGE, ON_SURFACE
 
-ROUNDS = 32  # directions that are tried
 _open_edges: WeakKeyDictionary[Accelerator, tuple[Geometry, int]] = WeakKeyDictionary()
 
 
@@ -33,12 +31,11 @@ def open_edges(geometry: Geometry) -> int:
 def contains(accel: Accelerator, points: Any, threads: int | None = None) -> np.ndarray:
     """Whether each of `points` is inside a closed mesh, (N,) bool. On the surface, to rounding, the answer is either.
 
-    points: (N, 3) real numbers, taken as float32. A ray from each crosses the surface an odd number of times or not (so that
-    what is in two parts that overlap is outside). One that meets an edge is sent again in another direction: what is left decides
-    exactly, since of two triangles at an edge the watertight test gives a ray to one. A point for which all of 32 rays meet edges
-    goes with the most of them. Raises InputError where the mesh is not closed, and as Accelerator.closest_hit does.
+    points: (N, 3) real numbers, taken as float32. A ray from each crosses the surface an odd number of times or not (so that what
+    is in two parts that overlap is outside); with the watertight test that is exact for every direction (all_hits, crossings).
+    Raises InputError where the mesh is not closed, and as Accelerator.closest_hit does.
     """
-    asked = Asked(accel, threads)
+    asked = Asked(accel, threads, crossings=True)
     rows = vectors(taken(points, "points"), "points", FARTHEST)
     geometry, count = _open_edges.get(accel, (None, 0))
     if geometry is not asked.geometry:
@@ -46,21 +43,15 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> np.
         _open_edges[accel] = asked.geometry, count
     if count:
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces")
+    return odd_crossings(asked, rows)
+
+
+def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
+    """As `contains`, of (N, 3) float32 and a mesh that may be open: then it depends on the rays' direction, that is on `seed`."""
     inside = np.zeros(len(rows), bool)
-    if not len(asked.geometry.faces):
-        return inside
-    used = asked.geometry.vertices[asked.geometry.faces].reshape(-1, 3)
-    left = np.nonzero(((rows >= used.min(axis=0)) & (rows <= used.max(axis=0))).all(axis=1))[0]
-    votes = np.zeros(len(rows), np.int32)
-    rng = np.random.default_rng(0)
-    for _ in range(ROUNDS):
-        if not len(left):
-            return inside
-        directions = np.broadcast_to(rng.normal(size=3).astype(np.float32), (len(left), 3))
-        crossings = asked.of(rows[left], directions).counts(asked.cross)
-        again = crossings == AT_EDGE
-        inside[left[~again]] = (crossings[~again] == ON_SURFACE) | (crossings[~again] % 2 == 1)
-        left = left[again]
-        votes[left] += np.where(asked.of(rows[left], directions[again]).counts() % 2 == 1, 1, -1)
-    inside[left] = votes[left] > 0
+    if len(asked.geometry.faces):
+        used = asked.geometry.vertices[asked.geometry.faces].reshape(-1, 3)
+        within = np.nonzero(((rows >= used.min(axis=0)) & (rows <= used.max(axis=0))).all(axis=1))[0]
+        direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
+        inside[within] = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts() % 2 == 1
     return inside
