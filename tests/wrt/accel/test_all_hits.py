@@ -196,7 +196,7 @@ def test_on_real_meshes_the_oracle_finds_the_same(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in HARD_CASES if "not_finite" not in name])
 def test_on_hard_cases_the_oracle_finds_the_same(name: str) -> None:
-    case = generate(name, 1000, seed=5)
+    case = generate(name, 2 if name == "G_fan_vertices" else 1000, seed=5)  # at whose vertex are 20,000 triangles: a walk each
     if len(getattr(case.geometry, "spheres", ())):
         pytest.skip("all_hits asks structures over one mesh, without spheres")
     judged(case)
