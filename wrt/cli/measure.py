@@ -21,7 +21,7 @@ def bench() -> None:
 
 
 for plan in (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, plans.Accel, plans.Bvh, plans.RtCore, plans.Float64,
-             plans.Pictures):
+             plans.Pictures, plans.Closed):
     measured(bench, plan)
 
 

@@ -161,6 +161,22 @@ class HardCases(Plan):
 
 
 @dataclass(frozen=True)
+class Closed(Plan):
+    """Closed meshes: which points are inside, and rays through corners and edges, which cross them an even number of times; Open3D
+    and trimesh beside it, where installed.
+
+    MESHES: closed mesh files, beside seven meshes that are made.
+    """
+
+    COMMAND, STUDY = "bench closed", "wrt.lab.bench.closed"
+    meshes: Sequence[Any] = the_meshes()
+    points: int = option(10_000, "Points of each mesh", (1, 2**28))
+    rays: int = option(10_000, "Rays of each mesh", (1, 2**28))
+    others: int = option(10_000, "How many the others get at most (trimesh without Embree: a hundredth); 0: none", (0, 2**28))
+    seed: int = option(0, "Other points and rays")
+
+
+@dataclass(frozen=True)
 class Accel(Plan):
     """Structure against structure: time to build, memory, steps and time to search, and answers that differ (none may).
 
