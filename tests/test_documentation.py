@@ -44,7 +44,7 @@ SLOW = {  # run by `pytest -m slow`
     "bench rtcore": ("--rays", "500",), "bench units": ("--rays", "500", "--runs", "1"),
     "bench error": ("--size", "16x9", "--max-spp", "2", "--repeats", "3", "--reference-spp", "4", "--knobs", "max_depth"),
     "bench bvh": ("--rays", "500", "--builds", "1", "--runs", "1", "--builders", "sweep"), "bench instructions": (),
-    "bench float64": ("--rays", "500"),
+    "bench float64": ("--rays", "500"), "bench hard-cases": ("--rays", "5"),
     "bench mitsuba": ("--size", "16x9", "--spp", "1", "--repeats", "3", "--starts", "0"),
 }
 
@@ -180,7 +180,8 @@ def test_a_slow_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path
 # --- Python -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/usage.md", "docs/compat.md", "docs/long_renders.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/usage.md", "docs/compat.md", "docs/long_renders.md", "docs/sensors.md",
+                                  "docs/testing.md"])
 def test_python_runs(page: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import wrt
 
@@ -211,7 +212,7 @@ def functions_of(thing: Any) -> Iterator[tuple[str, Any]]:
 
 
 @pytest.mark.parametrize("module", ["wrt", "wrt.accel.base", "wrt.accel.answers", "wrt.accel.geometry", "wrt.accel.build",
-                                    "wrt.compat.trimesh"])
+                                    "wrt.compat.trimesh", "wrt.sensors", "wrt.testing"])
 def test_everything_public_says_what_it_is(module: str) -> None:
     silent = []
     public = importlib.import_module(module)

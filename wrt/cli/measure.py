@@ -20,7 +20,8 @@ def bench() -> None:
     """Measure: speed against error, and one method against another."""
 
 
-for plan in (plans.Visibility, plans.Units, plans.Peers, plans.Accel, plans.Bvh, plans.RtCore, plans.Float64, plans.Pictures):
+for plan in (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, plans.Accel, plans.Bvh, plans.RtCore, plans.Float64,
+             plans.Pictures, plans.Closed):
     measured(bench, plan)
 
 

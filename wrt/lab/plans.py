@@ -141,6 +141,43 @@ class Peers(Plan):
 
 
 @dataclass(frozen=True)
+class HardCases(Plan):
+    """The hard cases against wrt and other ray libraries: rays lost, invented and given to a wrong triangle, and errors of t.
+
+    CASES: names such as E_grid, or the letters of groups; without any, all.
+    """
+
+    COMMAND, STUDY = "bench hard-cases", "wrt.lab.hard_cases.comparison"
+    cases: Sequence[str] = option((), "", form="argument")
+    libraries: Sequence[str] = option((), "Which: wrt, embree ... (a wrong name lists them)  [default: all that are installed]",
+                                      of=("library", "wrt.lab.hard_cases.libraries:LIBRARIES"))
+    rays: int = option(1000, "Rays of each case", (1, 2**40))
+    seed: int = option(0, "Other rays")
+
+    def __post_init__(self) -> None:
+        from wrt.lab.hard_cases.cases import chosen
+
+        super().__post_init__()
+        chosen(self.cases)
+
+
+@dataclass(frozen=True)
+class Closed(Plan):
+    """Closed meshes: which points are inside, and rays through corners and edges, which cross them an even number of times; Open3D
+    and trimesh beside it, where installed.
+
+    MESHES: closed mesh files, beside seven meshes that are made.
+    """
+
+    COMMAND, STUDY = "bench closed", "wrt.lab.bench.closed"
+    meshes: Sequence[Any] = the_meshes()
+    points: int = option(10_000, "Points of each mesh", (1, 2**28))
+    rays: int = option(10_000, "Rays of each mesh", (1, 2**28))
+    others: int = option(10_000, "How many the others get at most (trimesh without Embree: a hundredth); 0: none", (0, 2**28))
+    seed: int = option(0, "Other points and rays")
+
+
+@dataclass(frozen=True)
 class Accel(Plan):
     """Structure against structure: time to build, memory, steps and time to search, and answers that differ (none may).
 

@@ -13,7 +13,7 @@ value, and else beside it by at most 2^-24 of its distance per axis.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -25,8 +25,8 @@ from wrt.lab.hard_cases import open as outside
 from wrt.lab.hard_cases.common import AIMS, ASK, HIT, MISS, HardCase, Seed
 from wrt.lab.hard_cases.judge import Verdict, check, judge, judge_all_hits, judge_next
 
-__all__ = ["ASK", "HARD_CASES", "HIT", "MISS", "HardCase", "Verdict", "check", "chunks", "generate", "judge",
-           "judge_all_hits", "judge_next"]
+__all__ = ["ASK", "HARD_CASES", "HIT", "MISS", "HardCase", "Verdict", "check", "chosen", "chunks", "fewer",
+           "generate", "judge", "judge_all_hits", "judge_next"]
 
 HARD_CASES: dict[str, Callable[[np.random.Generator, int], HardCase]] = {
     **{f"A_{place}_{aim}": partial(inside.dense_sphere, position=place, aim=aim)
@@ -63,6 +63,7 @@ HARD_CASES: dict[str, Callable[[np.random.Generator, int], HardCase]] = {
     "I_rays_not_finite": outside.rays_not_finite,
     "I_mesh_not_finite": outside.mesh_not_finite,
 }
+COSTLY = {"G_fan": 100}  # 10,000 triangles at one vertex are all tested: so many times fewer rays
 
 
 def generate(name: str, n: int, seed: Seed = 0) -> HardCase:
@@ -78,3 +79,19 @@ def chunks(name: str, n: int, seed: int = 0, chunk: int = 2**18) -> Iterator[Har
     others the same object."""
     for first in range(0, n, chunk):
         yield generate(name, min(chunk, n - first), (seed, first // chunk))
+
+
+def chosen(cases: Sequence[str]) -> list[str]:
+    """Names of cases from names and letters of groups. Raises InputError where there is none of that name."""
+    names: list[str] = []
+    for case in cases or list(HARD_CASES):
+        found = [name for name in HARD_CASES if name == case or name.split("_")[0] == case]
+        if not found:
+            require_known(case, HARD_CASES, "hard case")
+        names += found
+    return names
+
+
+def fewer(name: str, rays: int) -> int:
+    """How many rays a case gets where the others get `rays`."""
+    return max(1, rays // next((divisor for start, divisor in COSTLY.items() if name.startswith(start)), 1))

@@ -128,14 +128,16 @@ CLAIM = np.dtype([("row", np.int64), ("t", np.float64), ("prim_id", np.int64), (
 def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool = True) -> Verdict:
     """The verdict on closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.answers.Hits).
 
-    lowest: of triangles that are the same, the one with the lowest prim_id must be told: wrt's own rule, not a peer's.
+    lowest: of triangles that are the same, the one with the lowest prim_id must be told: wrt's own rule, not a peer's. Where u
+    and v are None, errors of t are measured only: the bounds are those of wrt's test.
 
     Every claimed hit is held against its own primitive, exactly. The oracle is asked about every ray that claims to miss
     where it is not known to have to hit, and, whether something nearer was left out, about `asked` claimed hits (case.asked
     if None), chosen at random, the same ones each time.
     """
     reference = reference_of(case.geometry)
-    t, u, v, prim_id = (np.asarray(getattr(hits, name)) for name in ("t", "u", "v", "prim_id"))
+    t, u, v, prim_id = (None if value is None else np.asarray(value) for value in (hits.t, hits.u, hits.v, hits.prim_id))
+    assert t is not None and prim_id is not None
     reported = prim_id >= 0
     verdict, possible = _plain_faults(case, t, prim_id, reference.finite)
     rows = np.flatnonzero(possible & (case.expected != MISS))
@@ -173,11 +175,10 @@ def _plain_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np
     return verdict, possible
 
 
-def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[np.ndarray, ...],
-            verdict: Verdict) -> Any:
+def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[Any, ...], verdict: Verdict) -> Any:
     """Hold claimed hits against the primitives that they name: false hits, and the errors of t, u and v."""
-    t, u, v = (x[rows].astype(np.float64) for x in said[:3])
-    prim_id = said[3][rows]
+    u, v = (None if x is None else x[rows].astype(np.float64) for x in said[1:3])
+    t, prim_id = said[0][rows].astype(np.float64), said[3][rows]
     exact_t, exact_u, exact_v = np.empty((3, len(rows)))
     bound = np.full((3, len(rows)), np.inf)
     sound, hit = np.zeros((2, len(rows)), bool)
@@ -204,9 +205,10 @@ def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[
     ulp = np.spacing(np.minimum(np.abs(exact_t[known]), 3e38).astype(np.float32)).astype(np.float64)
     over = np.zeros(len(rows), bool)
     over[known] |= verdict.t.add(np.abs(t - exact_t)[known], ulp, bound[0, known], hit[known])
-    over[known] |= verdict.u.add(np.abs(u - exact_u)[known], 2.0**-24, bound[1, known], hit[known])
-    over[known] |= verdict.v.add(np.abs(v - exact_v)[known], 2.0**-24, bound[2, known], hit[known])
-    verdict.wrong("", case, rows[over], "t, u or v is off by more than the derived bound", said[3])
+    if u is not None and v is not None:
+        over[known] |= verdict.u.add(np.abs(u - exact_u)[known], 2.0**-24, bound[1, known], hit[known])
+        over[known] |= verdict.v.add(np.abs(v - exact_v)[known], 2.0**-24, bound[2, known], hit[known])
+        verdict.wrong("", case, rows[over], "t, u or v is off by more than the derived bound", said[3])
     return np.rec.fromarrays([rows, t, prim_id, bound[0], sound, hit], dtype=CLAIM)
 
 

@@ -16,7 +16,6 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.structure import Structure
-from wrt.core.checks import require_known
 from wrt.core.device import load_kernel, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import HitList, make_all_hits_kernel
@@ -28,7 +27,19 @@ from wrt.lab.bench.report import Columns, tabled, tables_page
 from wrt.lab.bench.report import Row as Line
 from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
 from wrt.lab.bench.timing import alternate, quartiles
-from wrt.lab.hard_cases.cases import ASK, HARD_CASES, HardCase, Verdict, check, chunks, generate, judge, judge_all_hits, judge_next
+from wrt.lab.hard_cases.cases import (
+    ASK,
+    HardCase,
+    Verdict,
+    check,
+    chosen,
+    chunks,
+    fewer,
+    generate,
+    judge,
+    judge_all_hits,
+    judge_next,
+)
 from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own, own_algorithms
 from wrt.lab.plans import Stability as Plan
 from wrt.renderer.distributed.installed import DIGEST
@@ -40,7 +51,6 @@ ALL_HITS_RAYS = 2000
 SPEED_RAYS = 200_000
 ASKED = 2000  # of a rival's claimed hits in one case: is anything nearer? Of the default's, all are asked
 CHUNK = 2**18
-COSTLY = {"G_fan": 100}  # 10,000 triangles at one vertex are all tested: so many times fewer rays
 
 def unless_refused(form: str) -> Callable[[Any], str]:
     return lambda row: form.format_map(vars(row)) if row.refused is None else ""
@@ -155,17 +165,6 @@ def case_row(name: str, algorithm: str, plan: Plan) -> Row | None:
     return run_case(name, fewer(name, min(plan.sample, plan.rays)), known[algorithm], plan.seed)
 
 
-def chosen(cases: Sequence[str]) -> list[str]:
-    """Names of cases from names and letters of groups. Raises InputError where there is none of that name."""
-    names: list[str] = []
-    for case in cases or list(HARD_CASES):
-        found = [name for name in HARD_CASES if name == case or name.split("_")[0] == case]
-        if not found:
-            require_known(case, HARD_CASES, "hard case")
-        names += found
-    return names
-
-
 def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row | None:
     """One case, judged by the oracle; None where the algorithm cannot take it (peers: spheres, input not finite, and
     segments that begin after the origin)."""
@@ -189,11 +188,6 @@ def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row |
             if not len(case.geometry.spheres) and len(case.geometry) * ALL_HITS_RAYS <= ALL_HITS_TESTS:
                 row.verdict += _judge_all(algorithm, case)
     return row
-
-
-def fewer(name: str, rays: int) -> int:
-    """How many rays a case gets where the others get `rays`."""
-    return max(1, rays // next((divisor for start, divisor in COSTLY.items() if name.startswith(start)), 1))
 
 
 def run_more(name: str, plan: Plan, progress: Callable[[str], None]) -> tuple[Verdict, int]:

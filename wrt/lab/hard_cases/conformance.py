@@ -1,0 +1,184 @@
+"""The hard cases put to any library's closest hit, as a function of arrays: who loses rays, ray by ray, by the oracle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from wrt.accel.answers import Hits
+from wrt.core.checks import as_integer
+from wrt.core.errors import InputError
+from wrt.core.html import html_table
+from wrt.lab.bench.report import Columns, Row, cells, table
+from wrt.lab.hard_cases.cases import HARD_CASES, HardCase, Verdict, chosen, chunks, fewer, judge
+
+ClosestHit = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Any]
+NOT_ASKED = ("C_spheres", "H_exact_ends")  # not of triangles, and rays that begin after their origin
+COLUMNS: Columns = {"case": "{case}", "rays": "{rays}", "lost": "{lost}", "invented": "{invented}",
+                    "wrong triangle": "{wrong_triangle}", "t ulp": "{t_ulp:.3g}", "": lambda row: row.told}
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a library says of one case. lost: rays that must hit and are said to miss; invented: hits of a triangle that the ray
+    passes by more than float32's rounding, or that are not on the ray; wrong_triangle: a nearer hit was left out. t_ulp: the
+    largest error of t, in float32 steps of the exact one. raised: the error, where it raised one; refused: it did so for input that
+    is not finite, which is right. examples: the first rays that are wrong, and why."""
+
+    case: str
+    rays: int
+    lost: int = 0
+    invented: int = 0
+    wrong_triangle: int = 0
+    t_ulp: float = 0.0
+    raised: str = ""
+    refused: bool = False
+    examples: tuple[dict[str, Any], ...] = ()
+
+    @property
+    def wrong(self) -> int:
+        """Rays lost, invented or given to a wrong triangle."""
+        return self.lost + self.invented + self.wrong_triangle
+
+    @property
+    def ok(self) -> bool:
+        """None is wrong, and nothing was raised but for input that is not finite."""
+        return not (self.wrong or (self.raised and not self.refused))
+
+    @property
+    def told(self) -> str:
+        """Of what was raised."""
+        return "refused" if self.refused else self.raised
+
+    def __str__(self) -> str:
+        counted = f"{self.lost} lost, {self.invented} invented, {self.wrong_triangle} of a wrong triangle"
+        lines = [f"{self.case}: of {self.rays} rays {counted}{f'; {self.told}' if self.told else ''}"]
+        lines += ["  ray {row}: {why}; said: triangle {prim_id}; origin {origin}, direction {direction}".format_map(ray)
+                  for ray in self.examples]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Report:
+    """The results of all cases; `print` shows the table."""
+
+    results: tuple[Result, ...]
+
+    @property
+    def ok(self) -> bool:
+        """No ray lost, invented or given to a wrong triangle, and no error but for input that is not finite."""
+        return all(result.ok for result in self.results)
+
+    @property
+    def total(self) -> Result:
+        """The sums, and the largest error of t."""
+        counts = {name: sum(getattr(result, name) for result in self.results)
+                  for name in ("rays", "lost", "invented", "wrong_triangle")}
+        return Result("all", **counts, t_ulp=max((result.t_ulp for result in self.results), default=0.0))
+
+    def _lines(self) -> list[list[str]]:
+        return [cells(COLUMNS, Row(**vars(result), told=result.told)) for result in (*self.results, self.total)]
+
+    def __str__(self) -> str:
+        return table(tuple(COLUMNS), self._lines())
+
+    def _repr_html_(self) -> str:
+        return html_table("Hard cases", tuple(COLUMNS), self._lines(), most=None)
+
+
+class Case:
+    """One hard case: some meshes with rays, `rays` in all, made when they are first asked for. name: of wrt.testing.CASES."""
+
+    def __init__(self, name: str, rays: int = 1000, seed: int = 0) -> None:
+        self.name, *more = chosen([name])
+        if more:
+            raise InputError(f"{name} is a group of cases: {self.name}, {', '.join(more)}")
+        if self.name in NOT_ASKED:
+            raise InputError(f"{name} is not for a closest hit on triangles without t_min")
+        self.rays, self.seed = fewer(name, as_integer(rays, "rays", 1, 1 << 40)), seed
+
+    @cached_property
+    def parts(self) -> list[HardCase]:
+        """The meshes with their rays: geometry.vertices, geometry.faces, origins, directions."""
+        return list(chunks(self.name, self.rays, self.seed))
+
+    @property
+    def about(self) -> str:
+        """What is hard in it."""
+        return self.parts[0].notes
+
+    def result(self, closest_hit: ClosestHit) -> Result:
+        """Ask closest_hit, which `hard_cases` describes, and judge what it says. What it raises is a part of the result."""
+        return self._judged(closest_hit, keep_errors=True)
+
+    def check(self, closest_hit: ClosestHit) -> None:
+        """Raise AssertionError that shows the rays where closest_hit loses one, invents one or gives one to a wrong triangle.
+        What it raises itself goes through, but for input that is not finite, which it may refuse."""
+        result = self._judged(closest_hit, keep_errors=False)
+        if not result.ok:
+            raise AssertionError(f"{result}\n({self.about})")
+
+    def _judged(self, closest_hit: ClosestHit, keep_errors: bool) -> Result:
+        verdict = Verdict()
+        for part in self.parts:
+            geometry = part.geometry
+            try:
+                said = closest_hit(geometry.vertices.copy(), geometry.faces.copy(), part.origins.copy(), part.directions.copy())
+            except Exception as error:
+                if not (part.refused or keep_errors):
+                    raise
+                said = f"{type(error).__name__}: {error}".splitlines()[0][:100]
+                return Result(self.name, self.rays, raised=said, refused=part.refused)
+            verdict += judge(part, _segment(part, *_answer(said, len(part))), lowest=False)
+        return Result(self.name, verdict.rays, verdict.misses, verdict.false_hits, verdict.wrong_prim, verdict.t.largest,
+                      examples=tuple(verdict.examples))
+
+    def __repr__(self) -> str:
+        return self.name
+
+
+def case_names(cases: Sequence[str] = ()) -> list[str]:
+    """Those of names and letters of groups; without any, all that a closest hit on triangles can be asked."""
+    return [name for name in chosen(cases or list(HARD_CASES)) if name not in NOT_ASKED]
+
+
+def results(closest_hit: ClosestHit, cases: Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Iterator[Result]:
+    """As `hard_cases`, each result as it is there."""
+    for name in case_names(cases):
+        yield Case(name, rays, seed).result(closest_hit)
+
+
+def hard_cases(closest_hit: ClosestHit, cases: Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Report:
+    """Put the hard cases to a ray library: how many rays it loses, invents and gives to a wrong triangle.
+
+    closest_hit(vertices, faces, origins, directions) gets (V, 3) float32, (F, 3) int32, (N, 3) float32 and (N, 3) float32; the
+    directions have any length. It returns t and prim_id, (N,) each, as a pair or as attributes: the distance in units of
+    |direction|, and which face is hit, -1 where none is; t counts only where one is. Of faces at the same distance any is right.
+
+    cases: names, or letters of their groups; without any, all. rays: of each case. seed: other rays. Raises InputError for a name
+    that is none, and where closest_hit returns something else.
+    """
+    return Report(tuple(results(closest_hit, cases, rays, seed)))
+
+
+def _answer(said: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    if hasattr(said, "prim_id") and hasattr(said, "t"):
+        said = said.t, said.prim_id
+    try:
+        t, prim_id = (np.asarray(each) for each in said)
+    except (TypeError, ValueError):
+        raise InputError(f"closest_hit must return t and prim_id, got {type(said).__name__}") from None
+    if t.shape != (n,) or prim_id.shape != (n,) or prim_id.dtype.kind not in "iu":
+        raise InputError(f"closest_hit must return t ({n},) and prim_id ({n},) of integers, got {t.shape} and {prim_id.shape} of "
+                         f"{prim_id.dtype}")
+    return t.astype(np.float64), prim_id.astype(np.int64)
+
+
+def _segment(part: HardCase, t: np.ndarray, prim_id: np.ndarray) -> Any:
+    """As a query with the case's t_max would have it: the closest hit, where it lies within."""
+    beyond = (prim_id >= 0) & (t > part.t_max)
+    return replace(Hits(t, None, None, prim_id), prim_id=np.where(beyond, -1, prim_id))

@@ -1,0 +1,102 @@
+"""Ray libraries as one function each: closest_hit(vertices, faces, origins, directions) -> t, prim_id."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from wrt.accel.build import build
+from wrt.core.errors import InputError
+from wrt.lab.hard_cases.common import surface
+from wrt.lab.hard_cases.conformance import ClosestHit
+from wrt.lab.hard_cases.contestants import Embree, EmbreeFast, Open3D, Peer, WarpMesh
+from wrt.lab.mitsuba.process import PATH_VARIABLE, llvm_library
+from wrt.lab.mitsuba.translate import mitsuba
+
+TRIMESH_RAYS = 64  # at once: it tests all triangles in a box around each ray
+
+Answer = tuple[np.ndarray, np.ndarray]
+
+
+def own(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Any:
+    return build((vertices, faces)).closest_hit(origins, directions)
+
+
+def peer(kind: type[Peer], vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Any:
+    """One that `bench peers` knows."""
+    who = kind()
+    who.prepare(surface(vertices, faces))
+    return who.closest(origins, directions)
+
+
+def mitsuba_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Answer:
+    """By its variant llvm_ad_rgb, which asks Embree."""
+    os.environ.setdefault(PATH_VARIABLE, llvm_library())
+    with mitsuba("llvm_ad_rgb") as mi:
+        mesh = mi.Mesh("mesh", len(vertices), len(faces))
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), faces.ravel().astype(np.uint32)
+        parameters.update()
+        scene = mi.load_dict({"type": "scene", "mesh": mesh})
+        rays = mi.Ray3f(mi.Point3f(origins.T.copy()), mi.Vector3f(directions.T.copy()))
+        hits = scene.ray_intersect_preliminary(rays)
+        return np.array(hits.t), np.where(np.array(hits.is_valid()), np.array(hits.prim_index).astype(np.int64), -1)
+
+
+def trimesh_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Answer:
+    """By its own class, float64 in NumPy, and not by the one that asks Embree."""
+    import trimesh
+    from trimesh.ray.ray_triangle import RayMeshIntersector
+
+    ask = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
+    t, prim_id = np.full(len(origins), np.inf), np.full(len(origins), -1)
+    for first in range(0, len(origins), TRIMESH_RAYS):
+        o, d = (rays[first:first + TRIMESH_RAYS].astype(np.float64) for rays in (origins, directions))
+        face, ray, where = ask.intersects_id(o, d, multiple_hits=False, return_locations=True)
+        if len(ray):
+            t[first + ray] = ((where - o[ray]) * d[ray]).sum(axis=1) / (d[ray] ** 2).sum(axis=1)
+            prim_id[first + ray] = face
+    return t, prim_id
+
+
+@dataclass(frozen=True)
+class Library:
+    """needs: the packages that it imports."""
+
+    name: str
+    closest_hit: ClosestHit
+    needs: Sequence[str] = ()
+
+    @property
+    def missing(self) -> list[str]:
+        return [package for package in self.needs if importlib.util.find_spec(package) is None]
+
+
+LIBRARIES = {
+    "wrt": Library("wrt", own),
+    "embree": Library("Embree, robust", partial(peer, Embree), ["embreex"]),
+    "embree_fast": Library("Embree, fast", partial(peer, EmbreeFast), ["embreex"]),
+    "open3d": Library("Open3D", partial(peer, Open3D), ["open3d"]),
+    "warp": Library("Warp", partial(peer, WarpMesh)),
+    "mitsuba": Library("Mitsuba", mitsuba_closest, ["mitsuba"]),
+    "trimesh": Library("trimesh", trimesh_closest, ["rtree"]),
+}
+
+
+def usable(name: str) -> str:
+    """Why a library cannot be asked here; empty where it can."""
+    missing = LIBRARIES[name].missing
+    if missing:
+        return f"not installed: {', '.join(missing)}"
+    if name == "mitsuba":
+        try:
+            llvm_library()
+        except InputError as error:
+            return str(error)
+    return ""

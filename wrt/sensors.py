@@ -1,0 +1,144 @@
+"""Sensors as arrays of rays, and what they see as pictures: cameras by their intrinsics, and LiDARs.
+
+>>> sensor = wrt.sensors.pinhole(K, (640, 480), camera_to_world)
+>>> hits = accel.closest_hit(sensor.origins, sensor.directions)
+>>> depth, faces = sensor.depth(hits), sensor.picture(hits.prim_id)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from wrt.core.checks import as_array, as_integer, as_size, shown
+from wrt.core.errors import InputError
+from wrt.scene.values import as_number, as_transform
+
+__all__ = ["Sensor", "pinhole", "raster_lidar", "rotating_lidar", "with_range_noise"]
+
+TURN = 2.0 * np.pi
+RIGID = 1e-5  # by which a pose's axes may miss unit length and right angles
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """origins, directions: (N, 3) float32 in world space, row by row of its pictures; shape: how many rows and columns these have;
+    axis: (3,) float64, the unit direction along which it measures depth."""
+
+    origins: np.ndarray
+    directions: np.ndarray
+    shape: tuple[int, int]
+    axis: np.ndarray
+
+    def picture(self, values: Any) -> np.ndarray:
+        """(rows, columns, ...): one value a ray, such as hits.prim_id, hits.object, hits.instance or hits.normal. Raises InputError
+        where there are not as many."""
+        values = values.numpy() if hasattr(values, "numpy") else np.asarray(values)
+        if values.shape[:1] != (len(self.origins),):
+            raise InputError(f"values must be one a ray, ({len(self.origins)}, ...), got {values.shape}")
+        return values.reshape(*self.shape, *values.shape[1:])
+
+    def range(self, hits: Any) -> np.ndarray:
+        """(rows, columns) float32: distances from the sensor in scene units, inf on a miss."""
+        return self._scaled(hits, np.linalg.norm(self.directions.astype(np.float64), axis=1))
+
+    def depth(self, hits: Any) -> np.ndarray:
+        """(rows, columns) float32: distances along the sensor's axis in scene units (of a camera the z of its frame, as in depth
+        pictures), inf on a miss; below 0 behind it."""
+        return self._scaled(hits, self.directions.astype(np.float64) @ self.axis)
+
+    def _scaled(self, hits: Any, factor: np.ndarray) -> np.ndarray:
+        t = self.picture(hits.t).astype(np.float64)
+        scaled = np.where(np.isfinite(t), t, 0.0) * factor.reshape(self.shape)
+        return np.where(np.isfinite(t), scaled, np.inf).astype(np.float32)
+
+
+def pinhole(intrinsics: Any, size: tuple[int, int] | str, pose: Any = None) -> Sensor:
+    """A ray through the centre of each pixel, row by row from the top left.
+
+    intrinsics: K, (3, 3) in pixels, as OpenCV has it: x to the right, y down, z forward; (0, 0) is the centre of the top left
+    pixel, and the middle of a picture is at (width - 1) / 2. The point (x, y, z) of the camera's frame is seen at K (x, y, z) / z.
+    size: width and height, or "640x480". pose: (4, 4), from the camera's frame to the world, rotation and translation. Directions
+    have z = 1 in the camera's frame: a hit's t is its depth. Lenses' distortion is not modelled. Raises InputError.
+    """
+    k = as_array(intrinsics, np.float64, "intrinsics")
+    if k.shape != (3, 3) or not np.isfinite(k).all() or not np.array_equal(k[2], [0.0, 0.0, 1.0]) or k[1, 0] != 0.0:
+        raise InputError(f"intrinsics must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {k.tolist()}")
+    if not (k[0, 0] > 0.0 and k[1, 1] > 0.0):
+        raise InputError(f"intrinsics: focal lengths must be above 0, got {k[0, 0]:g} and {k[1, 1]:g}")
+    width, height = as_size(size)
+    y = (np.arange(height)[:, None] - k[1, 2]) / k[1, 1]
+    x = (np.arange(width)[None, :] - k[0, 2] - k[0, 1] * y) / k[0, 0]
+    return _sensor(np.stack(np.broadcast_arrays(x, y, 1.0), axis=-1), pose, axis=2)
+
+
+def rotating_lidar(elevations: Any, steps: int, pose: Any = None, start: float = 0.0, turn: float = TURN) -> Sensor:
+    """A ring of rays for each elevation: a picture of len(elevations) rows and `steps` columns.
+
+    elevations: (rows,) angles above the plane that the sensor turns in, radians. start, turn: the azimuth of the first column and
+    how far `steps` columns turn, radians, counter-clockwise seen from above; column i is at start + i turn / steps. In the sensor's
+    frame x is forward (azimuth 0), y left and z up. pose: (4, 4), from that frame to the world. Directions have unit length: t is
+    the range. Raises InputError.
+    """
+    rows = as_array(elevations, np.float64, "elevations")
+    if rows.ndim != 1 or not len(rows) or not (np.abs(rows) <= 0.5 * np.pi).all():
+        raise InputError("elevations must be one or more angles, -pi/2 to pi/2 radians")
+    steps = as_integer(steps, "steps", 1, 1 << 24)
+    azimuths = as_number(start, "start") + as_number(turn, "turn") * np.arange(steps) / steps
+    return _sensor(_spherical(azimuths[None, :], rows[:, None]), pose, axis=0)
+
+
+def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: Any = None) -> Sensor:
+    """A solid-state LiDAR: rays at equal steps of azimuth and of elevation, row by row from the top left.
+
+    fov: the angles from the first column to the last and from the first row to the last, radians; size: columns and rows, or
+    "240x80". Frame, pose and directions as of rotating_lidar. Raises InputError.
+    """
+    width, height = as_size(size)
+    angles = as_array(fov, np.float64, "fov")
+    if angles.shape != (2,):
+        raise InputError(f"fov must be two angles, got {shown(fov)}")
+    across, up = (as_number(angle, "fov", low=0.0) for angle in angles.tolist())
+    if across > TURN or up > np.pi:
+        raise InputError(f"fov must be at most 2 pi across and pi up, got {across:g} and {up:g}")
+    azimuths, elevations = (0.5 * angle * np.linspace(1.0, -1.0, n) if n > 1 else np.zeros(1)
+                            for angle, n in ((across, width), (up, height)))
+    return _sensor(_spherical(azimuths[None, :], elevations[:, None]), pose, axis=0)
+
+
+def with_range_noise(ranges: Any, seed: int, constant: float = 0.0, proportional: float = 0.0, dropout: float = 0.0) -> np.ndarray:
+    """Ranges as a sensor measures them, float32 of the same shape; the same for the same seed and shape.
+
+    Each is normally distributed around the true one r, with the deviation sqrt(constant^2 + (proportional r)^2), and not below 0;
+    with probability `dropout` it is lost (inf). What is a miss (inf) stays one. Each element has noise of its own, whatever the
+    others are. constant: scene units. Raises InputError.
+    """
+    ranges = as_array(ranges, np.float64, "ranges")
+    constant, proportional = (as_number(value, name, low=0.0) for value, name in ((constant, "constant"),
+                                                                                (proportional, "proportional")))
+    if not 0.0 <= as_number(dropout, "dropout") <= 1.0:
+        raise InputError(f"dropout must be 0 to 1, got {dropout:g}")
+    rng = np.random.default_rng(as_integer(seed, "seed", 0, (1 << 63) - 1))
+    normal, lost = rng.standard_normal(ranges.shape), rng.random(ranges.shape) < dropout
+    there = np.isfinite(ranges) & ~lost
+    r = np.where(there, ranges, 0.0)
+    return np.where(there, np.maximum(r + np.hypot(constant, proportional * r) * normal, 0.0), np.inf).astype(np.float32)
+
+
+def _spherical(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
+    """(rows, columns, 3) unit vectors, x forward, y left, z up."""
+    level = np.cos(elevation)
+    return np.stack(np.broadcast_arrays(level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=-1)
+
+
+def _sensor(directions: np.ndarray, pose: Any, axis: int) -> Sensor:
+    """directions: (rows, columns, 3) in the sensor's frame; axis: of that frame, along which it measures depth."""
+    matrix = as_transform(np.eye(4) if pose is None else pose, "pose")
+    rotation = matrix[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0.0:
+        raise InputError("pose must be a rotation and a translation")
+    turned = (directions.reshape(-1, 3) @ rotation.T).astype(np.float32)
+    origins = np.tile(matrix[:3, 3].astype(np.float32), (len(turned), 1))
+    return Sensor(origins, turned, (directions.shape[0], directions.shape[1]), rotation[:, axis].copy())
