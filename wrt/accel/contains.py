@@ -46,13 +46,18 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> np.
         _open_edges[accel] = asked.geometry, count
     if count:
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces")
+    return odd_crossings(asked, rows)
+
+
+def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
+    """As `contains`, of (N, 3) float32 and a mesh that may be open: then it depends on the rays' direction, that is on `seed`."""
     inside = np.zeros(len(rows), bool)
     if not len(asked.geometry.faces):
         return inside
     used = asked.geometry.vertices[asked.geometry.faces].reshape(-1, 3)
     left = np.nonzero(((rows >= used.min(axis=0)) & (rows <= used.max(axis=0))).all(axis=1))[0]
     votes = np.zeros(len(rows), np.int32)
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     for _ in range(ROUNDS):
         if not len(left):
             return inside
