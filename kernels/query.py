@@ -107,6 +107,42 @@ def make_any_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
     return any_hit
 
 
+@wp.struct
+class Worlds:
+    """id: the world of each ray, a row each, or with a stride of 0 one for all; root: of each world's tree."""
+
+    id: wp.array(dtype=wp.int32)
+    root: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def load_ray_of_world(rays: RayArrays, worlds: Worlds, i: int) -> Ray:
+    """As load_ray; of a world that is none, a ray that hits nothing."""
+    ray = load_ray(rays, i)
+    world = worlds.id[i]
+    if world >= 0 and world < worlds.root.shape[0]:
+        ray.first_prim = worlds.root[world]
+    else:
+        ray.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
+    return ray
+
+
+def make_worlds_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
+    """As closest_hit or any_hit, each ray in its own world. out: HitArrays, or for any hit an array of bool."""
+    out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
+
+    @kernel
+    def trace_worlds(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, worlds: Worlds, out: out_type, first: int):
+        i = first + wp.tid()
+        hit = traverse(accel, surfaces, load_ray_of_world(rays, worlds, i))
+        if wp.static(any_hit):
+            out[i] = hit.prim_id >= 0
+        else:
+            put_hit(out, i, hit, direction_scale(rays.direction[i]))
+
+    return trace_worlds
+
+
 @wp.func
 def queued_ray(queue: Queue, i: int) -> Ray:
     ray = Ray()

@@ -76,7 +76,8 @@ class Ray:
     `make_ray` makes one that meets all that is before its origin. Ray() is all zeros: its segment ends where it begins, and
     t_max has to be set. exclude_plus_one: 1 + the prim_id of a triangle that is not hit, because the ray starts on it (a plane is
     crossed once); 0: none is left out. slot: the row of the counters that this ray adds to, where they are compiled in.
-    first_prim: what an instance adds to its primitives' numbers, where there are instances.
+    first_prim: what an instance adds to its primitives' numbers, where there are instances; above them, the node that a walk begins
+    at, the root of the ray's world.
     """
 
     origin: wp.vec3

@@ -181,13 +181,13 @@ def make_build_ranges(split: Any, place: Any = None) -> Any:
     def build_ranges(data: BuildData, tasks: wp.array(dtype=BuildTask), options: BuildOptions, stop_size: int,
                      left_over: wp.array(dtype=BuildTask), n_left_over: wp.array(dtype=wp.int32),
                      max_depth: wp.array(dtype=wp.int32)):
-        """Build the subtree of one task, down to ranges of at most stop_size records, which are listed in left_over.
+        """Build the subtree of each task, down to ranges of at most stop_size records, which are listed in left_over.
 
         Every task has two records or more. Inner nodes of a range with room for n have the slots slot .. slot + n - 2 to
         themselves; those that stay free are squeezed out by the host. A whole subtree (stop_size 0) takes the first of them.
         """
         stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=BuildTask)
-        stack[0] = tasks[0]
+        stack[0] = tasks[wp.tid()]
         size = int(1)
         slot = int(stack[0].slot)
         while size > 0:

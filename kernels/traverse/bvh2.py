@@ -52,12 +52,14 @@ def make_struct(record: Any) -> Any:
 class Volumes(NamedTuple):
     """A kind of bounding volume: struct: of the structure; node: of a node, with first_0, count_0, first_1 and count_1 as in
     Bvh2Node; set_up(accel, probe): what the test needs of a ray; enter(what, node, t_max): the distances at which the ray enters
-    both children (vec2), inf where it misses, never beyond a hit in them."""
+    both children (vec2), inf where it misses, never beyond a hit in them; root(ray): the node that the walk begins at, where that
+    is not node 0 for all."""
 
     struct: Any
     node: Any
     set_up: Any
     enter: Any
+    root: Any = None
 
 
 @cache
@@ -87,7 +89,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
     the triangle test, where a leaf holds structures, which count for themselves."""
     probe_of = make_probe(units)
     intersect = make_intersect(units, accepts)
-    struct, set_up, enter = volumes.struct, volumes.set_up, volumes.enter
+    struct, set_up, enter, root = volumes.struct, volumes.set_up, volumes.enter, volumes.root
     fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(volumes.node))
 
     @wp.func
@@ -102,6 +104,8 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
         stack_t = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
         size = int(0)
         first = int(0)
+        if wp.static(root is not None):
+            first = root(ray)
         count = int(0)
         while True:
             if count > 0:

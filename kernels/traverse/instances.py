@@ -31,8 +31,8 @@ class Placement:
 
 @cache
 def make_struct(bottom: Any) -> Any:
-    """Two levels over structures of this kind: nodes[0] is the root, whose leaves are rows of `placements`. slack: see `enter`;
-    bases: where each structure begins in the space of addresses."""
+    """Two levels over structures of this kind. nodes: of a tree for each world, whose leaves are rows of `placements`; slack: see
+    `enter`; bases: where each structure begins in the space of addresses."""
 
     @wp.struct
     class Instances:
@@ -122,7 +122,8 @@ def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
 
 
 def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any) -> Any:
-    """The closest hit, or any, among all placed structures. bottom: the lower level's traversal, made with these units."""
+    """The closest hit, or any, among all structures placed in the world whose root is ray.first_prim. bottom: the lower level's
+    traversal, made with these units."""
     struct = make_struct(bottom_struct)
 
     @wp.func
@@ -154,5 +155,9 @@ def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any)
         return wp.vec2(enter(ray.box, node.lo_0, node.hi_0, ray.slack, t_max),
                        enter(ray.box, node.lo_1, node.hi_1, ray.slack, t_max))
 
-    volumes = Volumes(struct, Bvh2Node, set_up, enter_both)
+    @wp.func
+    def root(ray: Ray) -> int:
+        return ray.first_prim
+
+    volumes = Volumes(struct, Bvh2Node, set_up, enter_both, root)
     return make_binary_traversal(units._replace(instances=False), volumes, any_hit, visit=visit)

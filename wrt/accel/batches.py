@@ -12,7 +12,7 @@ from warp._src.types import array_t  # what a kernel gets for an array; a Warp a
 
 from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES
 from wrt.accel.rays import Rays, rays_on
-from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
+from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, free_memory, launch_on, load_kernel, made_once, run_all
 from wrt.core.memory import SMALL as SMALL_BYTES
@@ -172,3 +172,19 @@ def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out
         for array, found in zip(out, there, strict=True):
             if not isinstance(array, wp.array):
                 array[some] = found.numpy()
+
+
+def trace_worlds(structure: Structure, data: Any, surfaces: Any, rays: Rays, worlds: Any, out: list[Any], device: Any,
+                 threads: int) -> None:
+    """Write the answers to arrays, each ray in its own world (wrt.accel.worlds.WorldIds); on a GPU in one launch."""
+    n = len(out[0])
+    there = [to_warp(array) if device.is_cpu or isinstance(array, wp.array)
+             else wp.empty(n, dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
+    hits: Any = HitArrays()
+    for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
+        setattr(hits, name, array)
+    launch_on(device, worlds_kernel(structure, len(out) == 1), n, data, surfaces, rays_on(device, rays), worlds.arrays,
+              hits if len(out) > 1 else there[0], None, threads=threads, step=RAYS_PER_LAUNCH)
+    for array, found in zip(out, there, strict=True):
+        if not isinstance(array, wp.array) and device.is_cuda:
+            array[:] = found.numpy()

@@ -18,6 +18,7 @@ from wrt.accel.instances import Instances
 from wrt.accel.instancing import instanced_meshes
 from wrt.accel.store import check_target, read
 from wrt.accel.structures import ACCELERATORS, chosen
+from wrt.accel.worlds import worlds_over
 from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
@@ -38,13 +39,19 @@ def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | Non
     mesh: a Mesh, a Scene, the path of a mesh or scene file, a trimesh mesh or scene, or a pair (vertices, faces); or a Geometry.
     Of a scene, prim_ids count the faces of its objects in their order, then the spheres; meshes that several objects show are kept
     once where that saves much, as in pictures. Over those, and over an InstancedGeometry, it is a tree over structures of the kind,
-    one for each mesh. accel: a name in ACCELERATORS; "bvh" is bvh8, or what `wrt.tune` has kept for the device. options: `triangle`
-    and `box`, the intersection tests (names in wrt.kernels.units.triangle.RAY_TRIANGLE and wrt.kernels.units.box.RAY_AABB), and the
-    structure's own (see its class). Raises InputError that names the argument.
+    one for each mesh.
+
+    A list of meshes and scenes without spheres: each is a world, and a ray sees the one that its query names (`world`). prim_ids
+    count the faces of a world; each object is an instance, which can be moved (Instances.move); each mesh is kept once.
+
+    accel: a name in ACCELERATORS; "bvh" is bvh8, or what `wrt.tune` has kept for the device. options: `triangle` and `box`, the
+    intersection tests (names in wrt.kernels.units.triangle.RAY_TRIANGLE and wrt.kernels.units.box.RAY_AABB), and the structure's
+    own (see its class). Raises InputError that names the argument.
     """
     ACCELERATORS.check(as_one(accel, str, "accel"))
     kind = ACCELERATORS[chosen(accel, as_one(device, str, "device"))]
-    world = None if isinstance(mesh, Geometry | InstancedGeometry) else world_given(mesh)  # of a geometry nothing more is known
+    world = (worlds_over([shape_given(each) for each in mesh]) if isinstance(mesh, list)
+             else None if isinstance(mesh, Geometry | InstancedGeometry) else world_given(mesh))  # of a geometry no more is known
     geometry = mesh if world is None else world.geometry
     structure: Accelerator
     if isinstance(geometry, InstancedGeometry):
@@ -92,7 +99,17 @@ def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: s
 
 
 def world_given(mesh: Any) -> World:
-    """What a structure is to be over: as in `build`. Raises InputError for anything else, and for a file that cannot be read."""
+    """What a structure is to be over: as in `build`, but no list. Raises InputError for what is none, and for a bad file."""
+    if isinstance(mesh, Geometry | InstancedGeometry):
+        return world_over(mesh)
+    mesh = shape_given(mesh)
+    if isinstance(mesh, Scene):
+        return world_of(mesh, instanced_meshes(mesh))
+    return world_over(Geometry.of(mesh), mesh.normals, mesh.uvs)
+
+
+def shape_given(mesh: Any) -> Mesh | Scene:
+    """As world_given, but for geometries."""
     if isinstance(mesh, str | os.PathLike) and Path(os.fsdecode(mesh)).suffix.lower() in LOADERS:
         mesh = load_scene(mesh)
     elif isinstance(mesh, str | os.PathLike):
@@ -101,12 +118,8 @@ def world_given(mesh: Any) -> World:
         mesh = Mesh(*mesh)
     elif type(mesh).__module__.split(".")[0] == "trimesh":
         mesh = Mesh.from_trimesh(mesh)
-    if isinstance(mesh, Scene):
-        return world_of(mesh, instanced_meshes(mesh))
-    if isinstance(mesh, Mesh):
-        return world_over(Geometry.of(mesh), mesh.normals, mesh.uvs)
-    if isinstance(mesh, Geometry | InstancedGeometry):
-        return world_over(mesh)
+    if isinstance(mesh, Scene | Mesh):
+        return mesh
     raise InputError("mesh must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, or a pair"
                      f" (vertices, faces), got {shown(mesh)}")
 

@@ -12,6 +12,7 @@ from wrt.accel.built import State
 from wrt.accel.flatten import Placed, World, placed_now, run_of, world_over
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.rays import Rays, rays_on
+from wrt.accel.worlds import WorldIds
 from wrt.core.arrays import to_warp
 from wrt.core.device import launch_on, records, thread_count, upload
 from wrt.core.errors import InputError
@@ -45,7 +46,7 @@ class HitPoints:
     u: Any
     v: Any
     prim_id: Any
-    source: tuple[Any, State, Rays] | None
+    source: tuple[Any, State, Rays, WorldIds | None] | None
 
     @property
     def point(self) -> Any:
@@ -98,7 +99,7 @@ class HitPoints:
     def _filled(self, name: str) -> Any:
         if self.source is None:
             raise InputError("these hits do not know their rays: only those of closest_hit have points, normals and ids")
-        accel, state, rays = self.source
+        accel, state, rays, worlds = self.source
         world, surfaces, numbering = surroundings(accel, state)
         if name == "shading" and world.normals is None:
             name = "normal"
@@ -109,6 +110,8 @@ class HitPoints:
         hits: Any = HitArrays()
         for each in fields_of(HitArrays):
             setattr(hits, each, to_warp(getattr(self, each)).to(device))
+        if worlds is not None:
+            hits.prim_id = upload(worlds.numbered(self.prim_id), wp.int32, device)
         inputs = [surfaces, numbering, rays_on(device, rays), hits, out]
         launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
         return array if isinstance(self.t, wp.array) else array.numpy()

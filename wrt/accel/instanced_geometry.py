@@ -28,13 +28,32 @@ class NumberedGeometry(Geometry):
 class InstancedGeometry:
     """Geometries placed in the world. parts: each in its own space; of a mesh, primitives are numbered from 0, and an instance
     adds its own first_prim. part: (I,) int, the part of each instance; to_world: (I, 3, 4) float64, affine and invertible;
-    first_prim: (I,) int. n_triangles: of all instances together; spheres, numbered behind them, are those of part 0."""
+    first_prim: (I,) int. n_triangles: of all instances together; spheres, numbered behind them, are those of part 0.
+    worlds: (W + 1,) int: world w has instances worlds[w] .. worlds[w + 1] - 1; None: all are in one."""
 
     parts: tuple[Geometry, ...]
     part: np.ndarray
     to_world: np.ndarray
     first_prim: np.ndarray
     n_triangles: int
+    worlds: np.ndarray | None = None
+
+    @property
+    def first_instance(self) -> np.ndarray:
+        """(W + 1,) int64: of each world, and behind them the number of instances."""
+        return np.array([0, len(self.part)] if self.worlds is None else self.worlds, np.int64)
+
+    @property
+    def world_first_prim(self) -> np.ndarray:
+        """(W,) int64: the first of each world's primitives among those of all."""
+        if self.worlds is None:
+            return np.zeros(1, np.int64)
+        return np.append(self.first_prim, self.n_triangles)[self.worlds[:-1]]
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """(I,) int64: first_prim of each instance in its world, where primitives are numbered from 0."""
+        return self.first_prim - np.repeat(self.world_first_prim, np.diff(self.first_instance))
 
     @property
     def spheres(self) -> np.ndarray:
@@ -52,8 +71,13 @@ class InstancedGeometry:
     @property
     def to_local(self) -> np.ndarray:
         """(I, 3, 4) float64: the inverse of to_world."""
-        linear = np.linalg.inv(self.to_world[:, :, :3])
-        return np.concatenate([linear, -(linear @ self.to_world[:, :, 3:])], axis=2)
+        return inverse_of(self.to_world)
+
+
+def inverse_of(matrices: np.ndarray) -> np.ndarray:
+    """Of affine maps (I, 3, 4), in float64."""
+    linear = np.linalg.inv(matrices[:, :, :3])
+    return np.concatenate([linear, -(linear @ matrices[:, :, 3:])], axis=2)
 
 
 def place(*meshes: tuple[Geometry, np.ndarray]) -> InstancedGeometry:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,22 +13,20 @@ import warp as wp
 from wrt.accel.answers import AccelStats, Refit
 from wrt.accel.base import Accelerator, array_bytes
 from wrt.accel.built import Built, State
-from wrt.accel.bvh.top_down import in_order, split_ranges
-from wrt.accel.bvh.tree import BinaryTree, BvhOptions
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of
+from wrt.accel.instancing import MAX_SPREAD
 from wrt.accel.structure import Structure, check_units
-from wrt.core.device import records, start, thread_count, upload
+from wrt.accel.top_level import BOXES, MOVED_BOXES, build_top, part_boxes, refit_top, spread_of, world_boxes
+from wrt.core.arrays import real_numbers
+from wrt.core.checks import shown
+from wrt.core.device import start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import seconds_without_loads
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
-from wrt.kernels.units.box import PAD_COORDINATE
+from wrt.scene.values import MAX_REACH
 
-ROUNDOFF = 2.0**-24
-SLACK = 32.0 * ROUNDOFF  # see kernels.traverse.instances.enter
-BOXES = 1 << 22  # box transforms that finding the instances' own boxes may take
 ALIGNMENT = 64  # bytes, between the addresses of structures
 
 
@@ -43,6 +43,7 @@ class Instances(Accelerator):
         check_units(triangle, box)
         begin = time.perf_counter()
         self.device = start(device)
+        self._refitting, self._kept = threading.Lock(), {}
         self._state = State(geometry)  # type: ignore[arg-type]  # it has what a Geometry is asked for here
         self.threads = thread_count(threads)
         self.structure = Structure(kind, Units(triangle, box, len(geometry.spheres) > 0, instances=True))
@@ -54,38 +55,67 @@ class Instances(Accelerator):
 
     def _place(self, begin: float) -> None:
         """The upper level around the structures as they are."""
+        geometry: Any = self.geometry
         # As they are now: a Warp array of structs holds addresses, and does not keep what a refit would replace.
         self._placed = [bottom._state for bottom in self.bottoms]
-        tree = top_tree(self.geometry, self.bottoms, self.threads)  # type: ignore[arg-type]
-        data = self._upload_top(tree)
+        self._bottoms = wp.array([state.data for state in self._placed], dtype=self.structure.bottom, device=self.device)
+        boxes = part_boxes(geometry, self.bottoms, BOXES)
+        self._top = build_top(geometry, *world_boxes(geometry, np.arange(len(geometry.part)), boxes))
+        self._take_top(geometry, begin, self._top.cost)
+        self.roots = upload(self._top.roots, wp.int32, self.device)
+
+    def _take_top(self, geometry: Any, begin: float, built_cost: float) -> None:
+        """Answer from now on as the upper level is now."""
+        top, data = self._top, self.structure.struct()
+        sizes = np.array([top.nodes.nbytes, *(state.stats.bytes for state in self._placed)], np.int64)
+        data.nodes = upload(top.nodes, data._cls.vars["nodes"].type.dtype, self.device)
+        data.placements = upload(top.placements, Placement, self.device)
+        data.bottoms, data.slack = self._bottoms, top.slack
+        data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)
         stats = [state.stats for state in self._placed]
         told = AccelStats(
-            seconds_without_loads(begin), len(tree.nodes) + sum(s.nodes for s in stats), tree.leaves + sum(s.leaves for s in stats),
-            tree.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
+            seconds_without_loads(begin), len(top.nodes) + sum(s.nodes for s in stats), top.leaves + sum(s.leaves for s in stats),
+            top.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
             array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
-        self._state = State(self.geometry, None, data, told)
+        self._state = State(geometry, None, data, told, built_cost)
 
-    def _upload_top(self, tree: BinaryTree) -> Any:
-        geometry: Any = self.geometry
-        data = self.structure.struct()
-        rows = records(Placement, len(tree.order))
-        rows["bottom"], rows["first_prim"] = geometry.part[tree.order], geometry.first_prim[tree.order]
-        to_local = geometry.to_local[tree.order]
-        rows["local_x"], rows["local_y"], rows["local_z"] = to_local[:, 0], to_local[:, 1], to_local[:, 2]
-        sizes = np.array([tree.nodes.nbytes, *(state.stats.bytes for state in self._placed)], np.int64)
-        data.nodes = upload(tree.nodes, data._cls.vars["nodes"].type.dtype, self.device)
-        data.placements = upload(rows, Placement, self.device)
-        data.bottoms = wp.array([state.data for state in self._placed], dtype=self.structure.bottom, device=self.device)
-        data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)
-        data.slack = slack(geometry)
-        return data
+    def move(self, instance: Any, matrix: Any, rebuild_at: float = np.inf) -> Refit:
+        """Put an instance in another place, or several at once: boxes of the upper level are fitted anew, its trees stay as they
+        are, and the meshes are not touched.
+
+        instance: a row of geometry.to_world, as hits.instance tells it (over worlds, row geometry.first_instance[w] + k is object k
+        of world w), or (R,) of them, none twice; matrix: to the world, (4, 4) or (R, 4, 4), affine. The hits are those of a
+        structure that is built anew, to the last bit. rebuild_at, and what other threads may do meanwhile: as in refit; growth is
+        that of the upper level. Raises InputError for other shapes and rows, for what is not an instance, and for matrices that
+        flatten or shear more than wrt.build takes for instances.
+        """
+        with self._refitting:
+            begin, before = time.perf_counter(), self._state
+            geometry: Any = before.geometry
+            rows, matrices = moves(geometry, instance, matrix)
+            to_world = geometry.to_world.copy()
+            to_world[rows] = matrices
+            geometry = replace(geometry, to_world=to_world)
+            if "boxes" not in self._kept:
+                self._kept["boxes"] = part_boxes(geometry, self.bottoms, MOVED_BOXES)
+            low, high = world_boxes(geometry, rows, self._kept["boxes"])
+            if not (np.maximum(np.abs(low), np.abs(high))[low[:, 0] <= high[:, 0]] <= MAX_REACH).all():
+                raise InputError(f"matrix puts an instance farther than {MAX_REACH:g} from the origin")
+            top, cost = refit_top(self._top, geometry, rows, low, high), before.built_cost
+            growth = top.cost / cost if cost > 0.0 else 1.0
+            if rebuilt := growth > rebuild_at:
+                top = build_top(geometry, top.low, top.high)
+                cost = top.cost
+            self._top = top
+            self._take_top(geometry, begin, cost)
+            return Refit(self.stats.build_seconds, growth, rebuilt)
 
     def _build(self, *args: Any, **options: Any) -> Built:
         raise InputError("instances are built by wrt.build")
 
     def refit(self, vertices: Any, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
         """Raises InputError: one array of vertices cannot say where instances go."""
-        raise InputError("instances cannot follow vertices that move; build them again")
+        raise InputError("instances cannot follow vertices that move; move them, or build them again")
 
     def save(self, path: Any) -> None:
         """Raises InputError: files hold one structure."""
@@ -97,50 +127,27 @@ class Instances(Accelerator):
                 f"{len(self.bottoms)} {self.structure.accel.name}, {s.bytes / 1e6:.1f} MB, built in {s.build_seconds:.3f} s)")
 
 
-def slack(geometry: InstancedGeometry) -> float:
-    """The part of the distance by which boxes are widened: see kernels.traverse.instances.enter."""
-    spread = np.abs(geometry.to_world[:, :, :3]) @ np.abs(geometry.to_local[:, :, :3])
-    return float(np.float32(SLACK * spread.sum(axis=2).max(initial=1.0)))
-
-
-def top_tree(geometry: InstancedGeometry, bottoms: list[Accelerator], threads: int) -> BinaryTree:
-    lo, hi = world_boxes(geometry, bottoms)
-    return split_ranges("binned", in_order(lo, hi), BvhOptions(max_leaf=1), threads)
-
-
-def world_boxes(geometry: InstancedGeometry, bottoms: list[Accelerator]) -> tuple[np.ndarray, np.ndarray]:
-    """The box of each instance, two (I, 3) float32: of the boxes of its primitives, transformed, and rounded outwards.
-
-    A box around a transformed mesh would do for most hits; but t is held to the box of the primitive that is hit, which may
-    stand out of the mesh.
-    """
-    lo, hi = np.full((len(geometry.part), 3), np.inf, np.float32), np.full((len(geometry.part), 3), -np.inf, np.float32)
-    groups = max(BOXES // max(len(geometry.part), 1), 8)
-    for index, bottom in enumerate(bottoms):
-        chosen = np.nonzero(geometry.part == index)[0]
-        low, high = grouped_boxes(geometry.parts[index], bottom.built.order, groups)
-        if not len(low):
-            continue
-        center, half = 0.5 * (low + high), 0.5 * (high - low)
-        for i in chosen:
-            linear, offset = geometry.to_world[i, :, :3], geometry.to_world[i, :, 3]
-            middle, reach = center @ linear.T + offset, half @ np.abs(linear).T
-            lo[i], hi[i] = rounded_out((middle - reach).min(axis=0), (middle + reach).max(axis=0))
-    return lo, hi
-
-
-def grouped_boxes(geometry: Geometry, order: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes, no more than about `groups`, two (G, 3) float64, that together hold all boxes of a geometry. order: of prim_ids,
-    so that neighbours are near."""
-    low, high = (corner.astype(np.float64) for corner in geometry.bounds())
-    if len(low) <= groups:
-        return low, high
-    first = np.arange(0, len(order), -(-len(order) // groups))
-    return np.minimum.reduceat(low[order], first), np.maximum.reduceat(high[order], first)
-
-
-def rounded_out(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners in float64 to float32, outwards, with room for the rounding of the origin's coordinates."""
-    pad = 2.0 * PAD_COORDINATE * np.maximum(np.abs(low), np.abs(high))
-    return np.nextafter((low - pad).astype(np.float32), np.float32(-np.inf)), \
-        np.nextafter((high + pad).astype(np.float32), np.float32(np.inf))
+def moves(geometry: InstancedGeometry, instance: Any, matrix: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The arguments of Instances.move as (R,) rows and (R, 3, 4) float64. Raises InputError that names the argument."""
+    rows = np.asarray(instance)
+    if rows.ndim > 1 or (rows.dtype.kind not in "iu" and rows.size):
+        raise InputError(f"instance must be a whole number, or (R,) of them, got {shown(instance)}")
+    matrices = real_numbers(matrix, "matrix", f"{(*rows.shape, 4, 4)}").astype(np.float64)
+    if matrices.shape not in ((*rows.shape, 4, 4), (*rows.shape, 3, 4)):
+        raise InputError(f"matrix must be {(*rows.shape, 4, 4)}, got {matrices.shape}")
+    if matrices.shape[-2] == 4 and (matrices[..., 3, :] != [0.0, 0.0, 0.0, 1.0]).any():
+        raise InputError("matrix must be affine: its last row 0, 0, 0, 1")
+    rows, matrices = rows.reshape(-1).astype(np.int64), matrices[..., :3, :].reshape(-1, 3, 4)
+    if len(rows) and not (rows.min() >= 0 and rows.max() < len(geometry.part)):
+        raise InputError(f"instance must be 0 to {len(geometry.part) - 1}")
+    if len(np.unique(rows)) < len(rows):
+        raise InputError("instance has a row twice")
+    if not geometry.is_placed[rows].all():
+        raise InputError(f"instance {rows[np.argmin(geometry.is_placed[rows])]} is all that has no place of its own, and no matrix")
+    with np.errstate(all="ignore"):
+        linear = matrices[:, :, :3]
+        good = np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(np.linalg.det(linear)) > 0.0)
+        good[good] = spread_of(matrices[good], inverse_of(matrices[good])) <= MAX_SPREAD
+    if not good.all():
+        raise InputError(f"matrix must be finite and flatten nothing; that of instance {rows[np.argmin(good)]} is or does not")
+    return rows, matrices

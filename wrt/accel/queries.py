@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES, Counters, Hits, room_for
-from wrt.accel.batches import trace_on_gpu, tracer
+from wrt.accel.batches import trace_on_gpu, trace_worlds, tracer
 from wrt.accel.built import State
 from wrt.accel.counting import counted
 from wrt.accel.rays import Rays, rays_of
 from wrt.accel.structure import Structure
+from wrt.accel.worlds import WorldIds, worlds_asked
 from wrt.core.checks import shown
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError
@@ -26,7 +27,8 @@ class Queries:
     _state: State
 
     def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-                    threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits | None = None) -> Hits:
+                    threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits | None = None,
+                    world: Any = None) -> Hits:
         """The closest hit of each ray in the closed segment [t_min, t_max]; at equal t the lowest prim_id.
 
         Closed means that a surface through the origin is hit at t_min = 0; a t_min above 0 leaves it out. origins,
@@ -35,7 +37,8 @@ class Queries:
         float32 without gaps is read where it is, all else is copied part by part. Warp arrays are (N,) vec3, and of their values
         only t_min and t_max are looked at, on the CPU. threads: 1 or more, or one a core. counters: count what each ray costs
         (hits.counters); trace: also record what it fetches, which takes a second run. out: hits of as many rays, whose arrays take
-        the new ones (NumPy's, or Warp's if the rays are; they must not overlap with the rays' own).
+        the new ones (NumPy's, or Warp's if the rays are; they must not overlap with the rays' own). world: over several worlds,
+        which one each ray sees, a number or (N,) int (a Warp array is not looked at; a ray of a world that is none hits nothing).
 
         Several threads may ask at a time, with or without counters, while another refits. There are no gradients: Warp arrays
         that require them are refused while a wp.Tape records. Raises InputError that names the argument and what was expected;
@@ -47,26 +50,31 @@ class Queries:
         given = None if out is None else [out.t, out.u, out.v, out.prim_id]
         t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
         state = self._state  # once: a refit may replace it meanwhile
-        costs = _answer(self, state.data, rays, arrays, threads, trace if counters or trace else None)
-        return Hits(t, u, v, prim_id, costs, (self, state, rays))
+        worlds = worlds_asked(self, state.geometry, world, len(t))
+        costs = _answer(self, state.data, rays, arrays, threads, worlds, trace if counters or trace else None)
+        return Hits(t, u, v, prim_id, costs, (self, state, rays, worlds))
 
     def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-                threads: int | None = None, *, out: Any = None) -> Any:
+                threads: int | None = None, *, out: Any = None, world: Any = None) -> Any:
         """Whether each ray hits anything in its segment: (N,) bool, True where closest_hit finds a hit and nowhere else. Arguments
         as in closest_hit; out: an array that takes the answer."""
         threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
         given = None if out is None else [out]
         arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
-        _answer(self, self._state.data, rays, arrays, threads)
+        state = self._state
+        _answer(self, state.data, rays, arrays, threads, worlds_asked(self, state.geometry, world, len(arrays[0])))
         return arrays[0]
 
 
-def _answer(accel: Queries, data: Any, rays: Rays, out: list[Any], threads: int, counting: bool | None = None) -> Counters | None:
+def _answer(accel: Queries, data: Any, rays: Rays, out: list[Any], threads: int, worlds: WorldIds | None = None,
+            counting: bool | None = None) -> Counters | None:
     """Write the answers of `data`, the structure as it was once, to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a trace
     or without; None: not at all."""
 
     def trace(structure: Structure, data: Any) -> None:
-        if accel.device.is_cuda:
+        if worlds is not None:
+            trace_worlds(structure, data, accel._surfaces, rays, worlds, out, accel.device, threads)
+        elif accel.device.is_cuda:
             trace_on_gpu(structure, data, accel._surfaces, rays, out, accel.device)
         else:
             tracer(structure, len(out) == 1).trace(data, accel._surfaces, rays, out, threads)

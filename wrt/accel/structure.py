@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, get_type_hints
 from wrt.core.checks import accepts
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
-from wrt.kernels.query import make_any_hit_kernel, make_closest_hit_kernel
+from wrt.kernels.query import make_any_hit_kernel, make_closest_hit_kernel, make_worlds_kernel
 from wrt.kernels.traverse import instances as traverse_instances
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import RAY_AABB
@@ -80,3 +80,8 @@ def closest_hit_kernel(structure: Structure) -> Any:
 @made_once
 def any_hit_kernel(structure: Structure) -> Any:
     return make_any_hit_kernel(structure.struct, structure.traversal(any_hit=True))
+
+
+@made_once
+def worlds_kernel(structure: Structure, any_hit: bool) -> Any:
+    return make_worlds_kernel(structure.struct, structure.traversal(any_hit=any_hit), any_hit)

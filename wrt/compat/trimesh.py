@@ -13,10 +13,10 @@ import numpy as np
 from trimesh.caching import Cache, cache_decorator
 from trimesh.ray.ray_util import contains_points
 
-from wrt.accel.all_hits import all_hits, first_hits
 from wrt.accel.answers import Hits
 from wrt.accel.build import build
 from wrt.accel.contains import contains, open_edges
+from wrt.compat.surfaces import every_hit, ranks
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
 from wrt.scene.mesh import Mesh
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     import trimesh
 
 AWAY = 4.0  # radii of a mesh; what is farther from it is brought near before it is rounded to float32
-FEW = 4  # hits that most rays have fewer of: one walk finds each, where all_hits takes two
-CLOSE_TO_1 = 2.0**-23  # by which u + v in float32 may miss 1 at the edge opposite of corner 0
 
 
 class RayMeshIntersector:
@@ -61,7 +59,7 @@ class RayMeshIntersector:
         origins, directions = _rays(ray_origins, ray_directions)
         placed, most = self._placed, max_hits if multiple_hits else min(max_hits, 1)
         ray, face, u, v = placed.every_hit(origins, directions) if most > 1 else placed.first_hit(origins, directions)
-        number = _ranks(ray)
+        number = ranks(ray)
         order = np.argsort(number, kind="stable")
         order = order[:np.searchsorted(number[order], most)]
         ray, face = ray[order], face[order]
@@ -174,18 +172,7 @@ class _Placed:
     def every_hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
         """The same of all hits, those of a ray together and in order."""
         rows, origins, directions = self.asked(origins, directions)
-        few = first_hits(self.accel, FEW, origins, directions, threads=self.threads)
-        many = np.flatnonzero(few.prim_id[:, -1] >= 0)
-        few.prim_id[many] = -1
-        ray, column = np.nonzero(few.prim_id >= 0)
-        found = [ray, *(array[ray, column] for array in (few.prim_id, few.u, few.v))]
-        if len(many):
-            more = all_hits(self.accel, origins[many], directions[many], threads=self.threads)
-            found = [np.concatenate(pair) for pair in zip(found, (many[more.ray_id], more.prim_id, more.u, more.v), strict=True)]
-            order = np.argsort(found[0], kind="stable")
-            found = [array[order] for array in found]
-        kept = self._each_surface_once(*found)
-        ray, face, u, v = (array[kept] for array in found)
+        ray, face, _, u, v = every_hit(self.accel, origins, directions, self.threads)
         return _of(rows, ray), face.astype(np.int64), u, v
 
     def any_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -198,33 +185,6 @@ class _Placed:
         out = ((points >= self.low) & (points <= self.high)).all(axis=1)
         out[out] = contains(self.accel, self.moved(points[out]), threads=self.threads)
         return out
-
-    def _each_surface_once(self, rays: np.ndarray, faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray | slice:
-        """Which hits to keep of those through an edge or a corner, where each face around it is hit.
-
-        Faces of one surface differ in where the edge begins, or, around a corner, in the corner that comes next. Where several
-        agree in that, there are as many surfaces. Corners with the same coordinates are one.
-        """
-        aside = np.stack([1.0 - u - v <= CLOSE_TO_1, u == 0.0, v == 0.0], axis=1)  # of corner 0, 1, 2
-        rows = np.flatnonzero(aside.any(axis=1))
-        ray, aside = rays[rows], aside[rows]
-        shared = np.isin(ray, ray[1:][ray[1:] == ray[:-1]])
-        rows, ray, aside = rows[shared], ray[shared], aside[shared]
-        if not len(rows):
-            return slice(None)
-        geometry = self.accel.geometry
-        corners = geometry.vertices[geometry.faces[faces[rows]]] + np.float32(0.0)  # -0 is 0
-        place = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
-        at_corner, row = aside.sum(axis=1) > 1, np.arange(len(rows))
-        k = np.where(at_corner, np.argmin(aside, axis=1), np.argmax(aside, axis=1))  # what is hit, or opposite of the edge that is
-        corner, start, end = (place[row, (k + i) % 3] for i in range(3))
-        ends = [np.where(at_corner, corner, end_of(start, end)) for end_of in (np.minimum, np.maximum)]
-        surface = _ranks(np.unique(np.stack([ray, *ends, start], axis=1), axis=0, return_inverse=True)[1].reshape(-1))
-        first = np.unique(np.stack([ray, *ends, surface], axis=1), axis=0, return_index=True)[1]
-        kept = np.ones(len(rays), bool)
-        kept[rows] = False
-        kept[rows[first]] = True
-        return np.flatnonzero(kept)
 
 
 def located(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -245,15 +205,6 @@ def _rays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray]:
     if origins.ndim != 2 or origins.shape[1] != 3 or origins.shape != directions.shape:
         raise InputError(f"ray_origins and ray_directions must be (N, 3) both, got {origins.shape} and {directions.shape}")
     return origins, directions
-
-
-def _ranks(groups: np.ndarray) -> np.ndarray:
-    """How many before each are of its group: (M,) integers."""
-    order = np.argsort(groups, kind="stable")
-    sizes = np.unique(groups, return_counts=True)[1]
-    out = np.empty(len(groups), np.int64)
-    out[order] = np.arange(len(groups)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return out
 
 
 def _of(rows: np.ndarray | None, ray: np.ndarray) -> np.ndarray:

@@ -12,7 +12,8 @@ import pytest
 import trimesh
 
 import wrt
-from wrt.compat.trimesh import FEW, RayMeshIntersector
+from wrt.compat.surfaces import FEW
+from wrt.compat.trimesh import RayMeshIntersector
 from wrt.scene import shapes
 
 DOWN = np.array([[0.0, 0.0, -1.0]])

@@ -1,0 +1,170 @@
+"""Instances that move: the answers of a structure that is built anew, to the last bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.wrt.accel.test_threads import at_a_time
+from wrt.accel.build import build
+from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry, place
+from wrt.accel.instances import Instances
+from wrt.core.errors import InputError
+from wrt.scene.shapes import icosphere, torus
+
+
+def matrices(n: int, seed: int) -> np.ndarray:
+    """(n, 4, 4): turned, stretched, some mirrored, moved."""
+    rng = np.random.default_rng(seed)
+    out = np.tile(np.eye(4), (n, 1, 1))
+    out[:, :3, :3] = Rotation.random(n, random_state=seed).as_matrix() * (10.0 ** rng.uniform(-0.4, 0.2, (n, 1, 3)))
+    out[::3, :3, 0] *= -1.0
+    out[:, :3, 3] = rng.normal(scale=3.0, size=(n, 3))
+    return out
+
+
+def crowd(n: int = 24) -> InstancedGeometry:
+    ball, ring = Geometry.of(icosphere(2)), Geometry.of(torus(segments=12, tube_segments=8))
+    return place(*((ring if i % 3 else ball, matrix) for i, matrix in enumerate(matrices(n, 1))))
+
+
+def structure(kind: str = "bvh2", geometry: InstancedGeometry | None = None) -> Instances:
+    accel = build(geometry or crowd(), kind)
+    assert isinstance(accel, Instances)
+    return accel
+
+
+def rays(n: int = 3000) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(5)
+    origins = rng.normal(scale=8.0, size=(n, 3)).astype(np.float32)
+    return origins, (rng.normal(scale=3.0, size=(n, 3)) - origins).astype(np.float32)
+
+
+def answers(accel: Any) -> tuple[bytes, ...]:
+    hits = accel.closest_hit(*rays())
+    assert 0.3 < (hits.prim_id >= 0).mean() < 1.0
+    return *(array.tobytes() for array in (hits.t, hits.u, hits.v, hits.prim_id)), accel.any_hit(*rays()).tobytes()
+
+
+def anew(accel: Instances, kind: str = "bvh2") -> Instances:
+    geometry: Any = accel.geometry
+    return structure(kind, geometry)
+
+
+@pytest.mark.parametrize("kind", ["bvh2", "bvh8"])
+def test_hits_are_those_of_a_new_structure(kind: str) -> None:
+    accel, places = structure(kind), matrices(24, 2)
+    seen = {answers(accel)}
+    for some in (3, [0], [1, 23, 7], slice(None)):
+        rows = np.arange(24)[some]
+        accel.move(rows, places[some])
+        assert np.array_equal(accel.geometry.to_world[rows], places[some][..., :3, :])  # type: ignore[attr-defined]
+        seen.add(answers(accel))
+        assert answers(accel) == answers(anew(accel, kind))
+    accel.move([4, 5], places[[8, 8]])  # three in one place: the lowest prim_id is hit
+    assert answers(accel) == answers(anew(accel, kind)) not in seen and len(seen) == 5
+
+
+def test_trees_are_fitted_and_where_that_costs_too_much_built_anew() -> None:
+    accel, far = structure(), crowd().to_world.copy()
+    order = accel._top.order.copy()
+    assert accel.move(2, far[2]).growth == pytest.approx(1.0, abs=0.02)
+    far[:, :, 3] = np.random.default_rng(3).permutation(far[:, :, 3])
+    fitted = accel.move(np.arange(24), far)
+    assert fitted.growth > 1.3 and not fitted.rebuilt and np.array_equal(accel._top.order, order)
+    before = answers(accel)
+    rebuilt = accel.move(0, far[0], rebuild_at=1.2)
+    assert rebuilt.rebuilt and not np.array_equal(accel._top.order, order) and answers(accel) == before
+    assert accel.move(0, far[0]).growth == 1.0
+    assert accel.stats.nodes == structure().stats.nodes and accel.stats.bytes == structure().stats.bytes
+
+
+def test_points_of_hits_are_where_the_instance_is_and_was() -> None:
+    accel = structure()
+    before = accel.closest_hit(*rays())
+    point, instance = before.point, before.instance
+    accel.move(np.arange(24), matrices(24, 4))
+    after = accel.closest_hit(*rays())
+    for hits in (before, after):
+        hit = hits.prim_id >= 0
+        expected = rays()[0][hit] + hits.t[hit, None] * np.float64(rays()[1][hit])
+        assert np.abs(hits.point[hit] - expected).max() < 1e-4
+    assert np.array_equal(before.point, point, equal_nan=True) and np.array_equal(before.instance, instance)
+    assert np.abs(after.normal[after.prim_id >= 0] - anew(accel).closest_hit(*rays()).normal[after.prim_id >= 0]).max() == 0.0
+
+
+def test_nothing_to_move_and_one_that_is_alone() -> None:
+    accel = structure()
+    before = answers(accel)
+    accel.move([], np.zeros((0, 4, 4)))
+    assert answers(accel) == before
+    one = structure(geometry=place((Geometry.of(icosphere(3)), np.eye(4))))
+    down = np.float32([[0.1, 0.2, 9.0]]), np.float32([[0.0, 0.0, -1.0]])
+    near, matrix = one.closest_hit(*down).t, np.eye(4)
+    matrix[2, 3] = 2.0
+    one.move(0, matrix)
+    assert one.closest_hit(*down).t == pytest.approx(near - 2.0, abs=1e-6)
+
+
+def with_a_part_in_the_world() -> Instances:
+    placed = crowd(3)
+    world = NumberedGeometry(*(np.zeros(shape, dtype) for shape, dtype in (((3, 3), "f4"), ((1, 3), "i4"), ((0, 4), "f4"))),
+                             np.array([placed.n_triangles], np.int32))
+    return structure(geometry=InstancedGeometry((world, *placed.parts), np.append(0, placed.part + 1),
+                                                np.concatenate([np.eye(4)[None, :3], placed.to_world]),
+                                                np.append(0, placed.first_prim), placed.n_triangles + 1))
+
+
+@pytest.mark.parametrize("instance, matrix, told", [
+    (3, np.zeros(3), r"matrix must be \(4, 4\), got \(3,\)"),
+    ([1, 2], np.eye(4), r"matrix must be \(2, 4, 4\), got \(4, 4\)"),
+    (3, "no", r"matrix must be \(4, 4\) of real numbers"),
+    (4, np.eye(4), "instance must be 0 to 3"), (-1, np.eye(4), "instance must be 0 to 3"),
+    (0.5, np.eye(4), "instance must be a whole number"), ([2, 2], np.tile(np.eye(4), (2, 1, 1)), "instance has a row twice"),
+    (0, np.eye(4), "instance 0 is all that has no place of its own"),
+    (1, np.diag([1.0, 1.0, 0.0, 1.0]), "flatten nothing; that of instance 1"),
+    (1, np.full((3, 4), np.nan), "matrix must be finite"), (1, 2.0 * np.eye(4), "matrix must be affine"),
+    (1, np.diag([1e25, 1e25, 1e25, 1.0]), "farther than 1e"),
+])
+def test_what_is_refused_changes_nothing(instance: Any, matrix: Any, told: str) -> None:
+    accel = with_a_part_in_the_world()
+    state = accel._state
+    with pytest.raises(InputError, match=told):
+        accel.move(instance, matrix)
+    assert accel._state is state
+
+
+def test_structures_without_instances_say_what_can_be_moved() -> None:
+    with pytest.raises(InputError, match="instances cannot follow vertices that move; move them"):
+        structure().refit(np.zeros((3, 3)))
+
+
+def test_moved_by_turns_while_others_ask() -> None:
+    """Every answer is of one place or the other."""
+    accel, places = structure(), [matrices(24, seed) for seed in (2, 3)]
+    known: list[tuple[bytes, ...]] = []
+    for place_of in places:
+        accel.move(np.arange(24), place_of)
+        known.append(answers(accel)[:4])
+    ended: list[bool] = []
+
+    def flip() -> None:
+        while not ended:
+            for place_of in places:
+                accel.move(np.arange(24), place_of)
+
+    def ask() -> None:
+        try:
+            for _ in range(30):
+                assert answers(accel)[:4] in known
+        finally:
+            ended.append(True)
+
+    jobs: list[Callable[[], None]] = [flip, flip, ask]
+    at_a_time(*jobs)
+    assert known[0] != known[1]

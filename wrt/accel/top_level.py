@@ -1,0 +1,180 @@
+"""The upper level of instances: for each world a binary tree over those in it, all in one array of nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.base import Accelerator
+from wrt.accel.bvh.top_down import build_options, in_order
+from wrt.accel.bvh.tree import BvhOptions, half_areas, squeeze
+from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of
+from wrt.core.device import launch, records, start, upload
+from wrt.kernels.build import bvh2 as build_bvh2
+from wrt.kernels.build import fit
+from wrt.kernels.build.records import BuildData, BuildOptions, BuildTask
+from wrt.kernels.traverse.bvh2 import Bvh2Node
+from wrt.kernels.traverse.instances import Placement
+from wrt.kernels.units.box import PAD_COORDINATE
+
+ROUNDOFF = 2.0**-24
+SLACK = 32.0 * ROUNDOFF  # see kernels.traverse.instances.enter
+BOXES = 1 << 22  # box transforms that finding the instances' own boxes may take
+MOVED_BOXES = 1 << 18  # the same where some are moved, which happens often; their boxes are a little larger
+MATRICES = 1 << 17  # box transforms at a time
+
+Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
+
+
+@dataclass(frozen=True, eq=False)
+class TopLevel:
+    """nodes: (N,) Bvh2Node records, each world's tree with its root first; roots: (W,), where these are; parents: (N,) int32, -1
+    for a root; order: (I,) int32, the instance of each leaf; depth: of the deepest; low, high: (I, 3) float32, the boxes of the
+    instances; spread: (I,), see `spread_of`; placements: (I,) records in the order of the leaves."""
+
+    nodes: np.ndarray
+    roots: np.ndarray
+    parents: np.ndarray
+    order: np.ndarray
+    depth: int
+    low: np.ndarray
+    high: np.ndarray
+    spread: np.ndarray
+    placements: np.ndarray
+
+    @property
+    def leaves(self) -> int:
+        return len(self.order)
+
+    @property
+    def slack(self) -> float:
+        """The part of the distance by which boxes are widened: see kernels.traverse.instances.enter."""
+        return float(np.float32(SLACK * self.spread.max(initial=1.0)))
+
+    @property
+    def cost(self) -> float:
+        """The sum of the surfaces of all boxes, each over that of its tree's root."""
+        areas = np.stack([half_areas(self.nodes["lo_" + side], self.nodes["hi_" + side]) for side in "01"])
+        of_root = [end(self.nodes[name + "_0"], self.nodes[name + "_1"])[self.roots]
+                   for name, end in (("lo", np.minimum), ("hi", np.maximum))]
+        whole = np.repeat(half_areas(*of_root), np.diff([*self.roots, len(self.nodes)]))
+        return float((areas.sum(axis=0)[whole > 0.0] / whole[whole > 0.0]).sum())
+
+
+def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) -> TopLevel:
+    """low, high: of each instance's box."""
+    first = geometry.first_instance
+    nodes, order, roots, depth = split_worlds(low, high, first)
+    parents = np.full(len(nodes), fit.NO_PARENT, np.int32)
+    for side in "01":
+        inner = np.flatnonzero((nodes["count_" + side] == 0) & (nodes["first_" + side] > 0))
+        parents[nodes["first_" + side][inner]] = inner
+    rows = np.arange(len(order))
+    top = TopLevel(nodes, roots, parents, order, depth, low, high, np.empty(len(order)), records(Placement, len(order)))
+    return write_placements(top, geometry, rows)
+
+
+def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """nodes, order, roots, depth of trees over rows first[w] .. first[w + 1] - 1 of boxes, by binned SAH."""
+    cpu, count, n = start("cpu"), np.diff(first), len(low)
+    # A tree takes as many slots as it has boxes, or one where it has none.
+    slot = np.cumsum([0, *np.maximum(count, 1)])
+    nodes = records(Bvh2Node, int(slot[-1]))
+    used = np.zeros(len(nodes), np.uint8)
+    for side in "01":
+        nodes["lo_" + side], nodes["hi_" + side] = np.inf, -np.inf
+    used[slot[:-1][count < 2]] = 1
+    alone, many = np.flatnonzero(count == 1), np.flatnonzero(count > 1)
+    for name, value in (("lo_0", low[first[alone]]), ("hi_0", high[first[alone]]), ("first_0", first[alone]), ("count_0", 1)):
+        nodes[name][slot[alone]] = value
+    tasks = records(BuildTask, len(many))
+    tasks["begin"], tasks["end"], tasks["slot"], tasks["parent"] = first[many], first[many + 1], slot[many], -1
+    data: Any = BuildData()
+    arrays = {"records": in_order(low, high), "nodes": nodes, "used": used}
+    for name, array in arrays.items():
+        setattr(data, name, upload(array, data._cls.vars[name].type.dtype, cpu))
+    depth, none = wp.zeros(1, dtype=wp.int32, device=cpu), wp.zeros(1, dtype=wp.int32, device=cpu)
+    launch(build_bvh2.make_build_ranges(build_bvh2.SPLIT["binned"]), len(tasks), data, upload(tasks, BuildTask, cpu),
+           build_options(BvhOptions(max_leaf=1)), 0, wp.empty(1, dtype=BuildTask, device=cpu), none, depth)
+    used = data.used.numpy() != 0
+    order = data.records.numpy()["prim_id"].copy() if n else np.zeros(0, np.int32)
+    return squeeze(data.nodes.numpy(), used), order, (np.cumsum(used) - 1)[slot[:-1]].astype(np.int32), int(depth.numpy()[0]) + 1
+
+
+def write_placements(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray) -> TopLevel:
+    """With what the kernels need of those instances, and their spread."""
+    place = np.empty(len(top.order), np.int64)
+    place[top.order] = np.arange(len(top.order))
+    placements, spread = top.placements.copy(), top.spread.copy()
+    to_local = inverse_of(geometry.to_world[rows])
+    spread[rows] = spread_of(geometry.to_world[rows], to_local)
+    out = placements[place[rows]]
+    out["bottom"], out["first_prim"] = geometry.part[rows], geometry.numbers[rows]
+    out["local_x"], out["local_y"], out["local_z"] = to_local[:, 0], to_local[:, 1], to_local[:, 2]
+    placements[place[rows]] = out
+    return replace(top, placements=placements, spread=spread)
+
+
+def spread_of(to_world: np.ndarray, to_local: np.ndarray) -> np.ndarray:
+    """How much rounding in a mesh's own space may grow on its way to the world: max sum of a row of |A| |A^-1|, (I,)."""
+    return np.asarray((np.abs(to_world[:, :, :3]) @ np.abs(to_local[:, :, :3])).sum(axis=2).max(axis=1, initial=1.0))
+
+
+def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> TopLevel:
+    """The same trees where those instances, no row twice, have moved; low, high: their boxes."""
+    cpu, tree, options = start("cpu"), fit.Tree(), BuildOptions()
+    all_low, all_high = top.low.copy(), top.high.copy()
+    all_low[rows], all_high[rows] = low, high
+    options.row = 1
+    tree.nodes, tree.parents = upload(top.nodes.copy(), Bvh2Node, cpu), upload(top.parents, wp.int32, cpu)
+    tree.order = upload(top.order, wp.int32, cpu)
+    tree.low, tree.high = upload(all_low, wp.vec3, cpu), upload(all_high, wp.vec3, cpu)
+    tree.arrived = wp.zeros(len(top.nodes), dtype=wp.int32, device=cpu)
+    tree.below = wp.empty(len(top.nodes), dtype=fit.Below, device=cpu)
+    launch(fit.fit, len(top.nodes), tree, options)
+    return write_placements(replace(top, nodes=tree.nodes.numpy(), low=all_low, high=all_high), geometry, rows)
+
+
+def world_boxes(geometry: InstancedGeometry, rows: np.ndarray, boxes: list[Boxes]) -> tuple[np.ndarray, np.ndarray]:
+    """The box of each of those instances, two (R, 3) float32: of the boxes of its primitives, transformed, and rounded outwards.
+
+    A box around a transformed mesh would do for most hits; but t is held to the box of the primitive that is hit, which may
+    stand out of the mesh.
+    """
+    lo, hi = np.full((len(rows), 3), np.inf, np.float32), np.full((len(rows), 3), -np.inf, np.float32)
+    for index, (center, half) in enumerate(boxes):
+        chosen = np.flatnonzero(geometry.part[rows] == index) if len(center) else np.zeros(0, np.int64)
+        step = max(MATRICES // max(len(center), 1), 1)
+        for some in (chosen[first : first + step] for first in range(0, len(chosen), step)):
+            linear, offset = geometry.to_world[rows[some], :, :3].transpose(0, 2, 1), geometry.to_world[rows[some], None, :, 3]
+            middle, reach = center @ linear + offset, half @ np.abs(linear)
+            lo[some], hi[some] = rounded_out((middle - reach).min(axis=1), (middle + reach).max(axis=1))
+    return lo, hi
+
+
+def part_boxes(geometry: InstancedGeometry, bottoms: list[Accelerator], most: int) -> list[Boxes]:
+    """Boxes that hold those of each part's primitives, so that all instances together have about `most`, but 8 each."""
+    groups = max(most // max(len(geometry.part), 1), 8)
+    corners = [grouped_boxes(part, bottom.built.order, groups) for part, bottom in zip(geometry.parts, bottoms, strict=True)]
+    return [(0.5 * (low + high), 0.5 * (high - low)) for low, high in corners]
+
+
+def grouped_boxes(geometry: Geometry, order: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes, no more than about `groups`, two (G, 3) float64, that together hold all boxes of a geometry. order: of prim_ids,
+    so that neighbours are near."""
+    low, high = (corner.astype(np.float64) for corner in geometry.bounds())
+    if len(low) <= groups:
+        return low, high
+    first = np.arange(0, len(order), -(-len(order) // groups))
+    return np.minimum.reduceat(low[order], first), np.maximum.reduceat(high[order], first)
+
+
+def rounded_out(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners in float64 to float32, outwards, with room for the rounding of the origin's coordinates."""
+    pad = 2.0 * PAD_COORDINATE * np.maximum(np.abs(low), np.abs(high))
+    return np.nextafter((low - pad).astype(np.float32), np.float32(-np.inf)), \
+        np.nextafter((high + pad).astype(np.float32), np.float32(np.inf))

@@ -1,0 +1,255 @@
+"""Open3D's ray casting scene, answered by wrt.
+
+>>> from wrt.compat.open3d import RaycastingScene          # in place of open3d.t.geometry.RaycastingScene
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any, ClassVar
+
+import numpy as np
+
+from wrt.accel.all_hits import Asked
+from wrt.accel.base import Accelerator
+from wrt.accel.build import build
+from wrt.accel.contains import odd_crossings
+from wrt.compat.surfaces import every_hit
+from wrt.core.checks import as_integer, shown
+from wrt.core.errors import InputError
+from wrt.kernels.query import FARTHEST
+from wrt.scene.mesh import Mesh
+
+MOST_SAMPLES = 1 << 16
+
+
+class Array(np.ndarray):
+    """A NumPy array with the methods by which a program takes Open3D's tensors to NumPy."""
+
+    def numpy(self) -> np.ndarray:
+        return self.view(np.ndarray)
+
+    def cpu(self) -> Array:
+        return self
+
+
+class RaycastingScene:
+    """As open3d.t.geometry.RaycastingScene; docs/compat.md has what differs.
+
+    rays: (..., 6), origin and direction of any length; query_points: (..., 3); tensors or arrays of real numbers, as float32. A
+    ray or a point that is not finite hits nothing, nor does a direction of 0. Answers are Open3D's tensors where the program has
+    imported open3d, as there, and else NumPy arrays. nthreads: 0 for one a core. device: "cpu" or "cuda:0", also as Open3D writes
+    it. Raises InputError, a ValueError, that names the argument.
+    """
+
+    INVALID_ID: ClassVar[int] = 0xFFFFFFFF
+
+    def __init__(self, nthreads: int = 0, device: Any = "CPU:0") -> None:
+        name = str(device).lower()
+        self._device, self._threads = "cpu" if name == "cpu:0" else name, _threads(nthreads)
+        self._meshes: list[tuple[np.ndarray, np.ndarray]] = []
+        self._built: tuple[Accelerator, np.ndarray] | None = None
+
+    def add_triangles(self, vertex_positions: Any = None, triangle_indices: Any = None, mesh: Any = None) -> int:
+        """Add a mesh, whose geometry ID is given back: (V, 3) positions and (F, 3) indices, or what has them (a TriangleMesh of
+        Open3D, a wrt.Mesh, a trimesh.Trimesh). Copied. What is built follows at the next query."""
+        if mesh is None and triangle_indices is None:
+            mesh = vertex_positions
+        if mesh is not None:
+            vertex_positions, triangle_indices = _arrays_of(mesh)
+        vertices, faces = np.array(_numpy(vertex_positions), np.float32), np.array(_numpy(triangle_indices), np.int64)
+        for array, name in ((vertices, "vertex_positions"), (faces, "triangle_indices")):
+            if array.ndim != 2 or array.shape[1] != 3:
+                raise InputError(f"{name} must be (N, 3), got {array.shape}")
+        if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
+            raise InputError(f"triangle_indices must be 0 to {len(vertices) - 1}")
+        bad = np.logical_not(np.isfinite(vertices).all(axis=1))
+        faces[bad[faces].any(axis=1)] = 0  # hit no more, and all keep their numbers
+        vertices[bad] = 0.0
+        self._meshes.append((vertices, faces))
+        self._built = None
+        return len(self._meshes) - 1
+
+    def cast_rays(self, rays: Any, nthreads: int = 0) -> dict[str, Any]:
+        """The first hit of each ray, of several at the same distance that of the lowest IDs: t_hit (...), inf on a miss;
+        geometry_ids and primitive_ids (...) uint32, INVALID_ID on a miss; primitive_uvs (..., 2) and primitive_normals (..., 3), 0
+        on a miss."""
+        accel, _ = self._scene()
+        shape, good, origins, directions = _asked_rays(rays)
+        hits = accel.closest_hit(origins, directions, threads=_threads(nthreads))
+        geometry_ids, primitive_ids = self._ids(hits.prim_id)
+        found = {"t_hit": hits.t, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
+                 "primitive_uvs": np.stack([hits.u, hits.v], axis=1),
+                 "primitive_normals": np.where(hits.prim_id[:, None] >= 0, hits.normal, np.float32(0.0))}
+        missed = {"t_hit": np.inf, "geometry_ids": self.INVALID_ID, "primitive_ids": self.INVALID_ID}
+        return {name: _answer(_spread(array, good, missed.get(name, 0.0)), shape) for name, array in found.items()}
+
+    def test_occlusions(self, rays: Any, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Any:
+        """Whether each ray hits anything between tnear and tfar, (...) bool."""
+        accel, _ = self._scene()
+        shape, good, origins, directions = _asked_rays(rays)
+        found = accel.any_hit(origins, directions, tnear, tfar, threads=_threads(nthreads))
+        return _answer(_spread(found, good, False), shape)
+
+    def count_intersections(self, rays: Any, nthreads: int = 0) -> Any:
+        """How many surfaces each ray crosses, (...) int32; one that it meets at an edge or a corner counts once."""
+        shape, good, origins, directions = _asked_rays(rays)
+        ray, *_ = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
+        return _answer(_spread(np.bincount(ray, minlength=len(origins)).astype(np.int32), good, 0), shape)
+
+    def list_intersections(self, rays: Any, nthreads: int = 0) -> dict[str, Any]:
+        """What count_intersections counts, M together, those of a ray in the order of t: ray_splits (N + 1,), those of ray i are
+        rows ray_splits[i] to ray_splits[i + 1]; ray_ids, geometry_ids, primitive_ids (M,), uint32 all; t_hit (M,); primitive_uvs
+        (M, 2)."""
+        shape, good, origins, directions = _asked_rays(rays)
+        ray, face, t, u, v = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
+        rows = ray if good is None else np.flatnonzero(good)[ray]
+        splits = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=math.prod(shape)))])
+        geometry_ids, primitive_ids = self._ids(face)
+        found = {"ray_splits": splits.astype(np.uint32), "ray_ids": rows.astype(np.uint32), "t_hit": t,
+                 "geometry_ids": geometry_ids, "primitive_ids": primitive_ids, "primitive_uvs": np.stack([u, v], axis=1)}
+        return {name: _answer(array, array.shape[:1]) for name, array in found.items()}
+
+    def compute_occupancy(self, query_points: Any, nthreads: int = 0, nsamples: int = 1) -> Any:
+        """1.0 for points inside, 0.0 for others, (...) float32: whether a ray from the point crosses the surfaces an odd number of
+        times. Where these are closed, one ray decides exactly (wrt.contains), and where not, most of `nsamples`, an odd number."""
+        shape, good, points = _asked_points(query_points)
+        return _answer(_spread(self._inside(points, nthreads, nsamples).astype(np.float32), good, 0.0), shape)
+
+    @staticmethod
+    def create_rays_pinhole(*given: Any, **named: Any) -> Any:
+        """Rays through the pixels' centers, (height_px, width_px, 6) float32, in rows along the camera's x axis, one after another
+        along y: (intrinsic_matrix, extrinsic_matrix, width_px, height_px), (3, 3) and world to camera (4, 4); or
+        (fov_deg, center, eye, up, width_px, height_px), the field of view along x, what is looked at, and from where. There, y is
+        up, as in Open3D: a picture made of the rows as they are stands on its head."""
+        make = _rays_looking_at if len(given) + len(named) == 6 else _rays_of_matrices
+        rays = make(*given, **named)
+        return _answer(rays.reshape(-1, 6), rays.shape[:2])
+
+    def _scene(self) -> tuple[Accelerator, np.ndarray]:
+        """The structure over all meshes, and the first prim_id of each."""
+        if self._built is None:
+            vertices, faces = [np.zeros((1, 3), np.float32)], [np.zeros((0, 3), np.int64)]
+            for positions, indices in self._meshes:
+                faces.append(indices + sum(map(len, vertices)))
+                vertices.append(positions)
+            first = np.cumsum([0, *(len(indices) for _, indices in self._meshes)])[:-1]
+            mesh = Mesh(np.concatenate(vertices), np.concatenate(faces))
+            self._built = build(mesh, device=self._device, threads=self._threads), first
+        return self._built
+
+    def _ids(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """geometry_ids and primitive_ids."""
+        first = self._scene()[1]
+        if not len(first):
+            return (np.full(len(prim_id), self.INVALID_ID, np.uint32),) * 2
+        mesh = np.searchsorted(first, prim_id, side="right") - 1
+        ids = np.where(prim_id >= 0, [mesh, prim_id - first[mesh]], self.INVALID_ID).astype(np.uint32)
+        return ids[0], ids[1]
+
+    def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
+        if as_integer(nsamples, "nsamples", 1, MOST_SAMPLES) % 2 == 0:
+            raise InputError(f"nsamples must be odd, got {nsamples}")
+        asked = Asked(self._scene()[0], _threads(nthreads))
+        votes = np.zeros(len(points), np.int32)
+        for seed in range(nsamples):
+            votes += odd_crossings(asked, points, seed)
+        return np.asarray(2 * votes > nsamples)
+
+
+def _threads(nthreads: int) -> int | None:
+    return as_integer(nthreads, "nthreads", 0, (1 << 31) - 1) or None
+
+
+def _numpy(value: Any) -> Any:
+    """Of tensors the array; all else as it is."""
+    return value.cpu().numpy() if hasattr(value, "cpu") else value
+
+
+def _arrays_of(mesh: Any) -> tuple[Any, Any]:
+    """Positions and indices of a mesh of another library."""
+    if hasattr(mesh, "vertex"):
+        return mesh.vertex.positions, mesh.triangle.indices
+    for name in ("faces", "triangles"):
+        if hasattr(mesh, "vertices") and hasattr(mesh, name):
+            return mesh.vertices, getattr(mesh, name)
+    raise InputError(f"mesh must have vertices and triangles, got {shown(mesh)}")
+
+
+def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarray]:
+    """The leading shape, and (N, width) float32."""
+    try:
+        with np.errstate(over="ignore"):
+            array = np.asarray(_numpy(value)).astype(np.float32, copy=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be (..., {width}) real numbers, got {shown(value)}") from error
+    if array.ndim < 1 or array.shape[-1] != width:
+        raise InputError(f"{name} must be (..., {width}), got {array.shape}")
+    return array.shape[:-1], array.reshape(-1, width)
+
+
+def _asked_rays(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:
+    """The leading shape, which rays can hit something (None: all), and origins and directions of these."""
+    shape, rays = _rows(value, "rays", 6)
+    longest = np.abs(rays[:, 3:]).max(axis=1, initial=0.0)
+    good = (np.abs(rays[:, :3]).max(axis=1, initial=0.0) <= FARTHEST) & (longest > 0.0) & (longest < np.inf)  # False for NaN
+    if good.all():
+        return shape, None, rays[:, :3], rays[:, 3:]
+    return shape, good, rays[good, :3], rays[good, 3:]
+
+
+def _asked_points(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
+    """The same of points."""
+    shape, points = _rows(value, "query_points", 3)
+    good = np.abs(points).max(axis=1, initial=0.0) <= FARTHEST
+    return (shape, None, points) if good.all() else (shape, good, points[good])
+
+
+def _spread(array: np.ndarray, good: np.ndarray | None, missing: Any) -> np.ndarray:
+    """Rows of what was asked, among `missing` for what was not."""
+    if good is None:
+        return array
+    out = np.full((len(good), *array.shape[1:]), missing, array.dtype)
+    out[good] = array
+    return out
+
+
+def _answer(array: np.ndarray, shape: tuple[int, ...]) -> Any:
+    """With the leading shape of the question."""
+    array = np.ascontiguousarray(array).reshape((*shape, *array.shape[1:]))
+    open3d = sys.modules.get("open3d")
+    return array.view(Array) if open3d is None else open3d.core.Tensor.from_numpy(array)
+
+
+def _rays_of_matrices(intrinsic_matrix: Any, extrinsic_matrix: Any, width_px: int, height_px: int) -> np.ndarray:
+    """See RaycastingScene.create_rays_pinhole."""
+    inverse = np.linalg.inv(_matrix(intrinsic_matrix, "intrinsic_matrix", (3, 3)))
+    to_camera = _matrix(extrinsic_matrix, "extrinsic_matrix", (4, 4))
+    x, y = np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
+    to_world = to_camera[:3, :3].T
+    rays = np.empty((height_px, width_px, 6), np.float32)
+    rays[..., :3] = -to_world @ to_camera[:3, 3]
+    rays[..., 3:] = np.stack([x, y, np.ones_like(x)], axis=-1) @ (to_world @ inverse).T
+    return rays
+
+
+def _rays_looking_at(fov_deg: float, center: Any, eye: Any, up: Any, width_px: int, height_px: int) -> np.ndarray:
+    """See RaycastingScene.create_rays_pinhole."""
+    center, eye, up = (_matrix(value, name, (3,)) for value, name in ((center, "center"), (eye, "eye"), (up, "up")))
+    focal = 0.5 * width_px / math.tan(math.radians(0.5 * fov_deg))
+    z = center - eye
+    x = np.cross(up, z)
+    z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
+    to_camera = np.eye(4)
+    to_camera[:3, :3] = x, np.cross(z, x), z
+    to_camera[:3, 3] = -to_camera[:3, :3] @ eye
+    to_picture = [[focal, 0.0, 0.5 * width_px], [0.0, focal, 0.5 * height_px], [0.0, 0.0, 1.0]]
+    return _rays_of_matrices(to_picture, to_camera, width_px, height_px)
+
+
+def _matrix(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(_numpy(value), np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(f"{name} must be {shape} finite numbers, got {shown(value)}")
+    return array
