@@ -18,6 +18,7 @@ from wrt.accel.instances import Instances
 from wrt.accel.instancing import instanced_meshes
 from wrt.accel.store import check_target, read
 from wrt.accel.structures import ACCELERATORS, chosen
+from wrt.core.arrays import is_tensor, taken, to_numpy
 from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
@@ -98,7 +99,9 @@ def world_given(mesh: Any) -> World:
     elif isinstance(mesh, str | os.PathLike):
         mesh = load_mesh(mesh)
     elif isinstance(mesh, tuple) and len(mesh) == 2:
-        mesh = Mesh(*mesh)
+        vertices, faces = (to_numpy(taken(each, name, None)) if is_tensor(each) else each
+                           for each, name in zip(mesh, ("vertices", "faces"), strict=True))
+        mesh = Mesh(vertices, faces)
     elif type(mesh).__module__.split(".")[0] == "trimesh":
         mesh = Mesh.from_trimesh(mesh)
     if isinstance(mesh, Scene):

@@ -6,12 +6,14 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import warp as wp
 
 from wrt.accel.all_hits import Asked
 from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 from wrt.accel.rays import vectors
-from wrt.core.arrays import taken
+from wrt.core.arrays import returned, taken, to_numpy
+from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
 from wrt.kernels.ray_query import AT_EDGE, ON_SURFACE
@@ -30,7 +32,7 @@ def open_edges(geometry: Geometry) -> int:
     return int((count % 2 == 1).sum())
 
 
-def contains(accel: Accelerator, points: Any, threads: int | None = None) -> np.ndarray:
+def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any:
     """Whether each of `points` is inside a closed mesh, (N,) bool. On the surface, to rounding, the answer is either.
 
     points: (N, 3) real numbers, taken as float32. A ray from each crosses the surface an odd number of times or not (so that
@@ -38,8 +40,13 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> np.
     exactly, since of two triangles at an edge the watertight test gives a ray to one. A point for which all of 32 rays meet edges
     goes with the most of them. Raises InputError where the mesh is not closed, and as Accelerator.closest_hit does.
     """
+    rows, give = vectors(to_numpy(taken(points, "points")), "points", FARTHEST), returned(points)
     asked = Asked(accel, threads)
-    rows = vectors(taken(points, "points"), "points", FARTHEST)
+    inside = _contains(asked, accel, rows)
+    return inside if give is None else give(upload(inside, wp.bool, asked.device))
+
+
+def _contains(asked: Asked, accel: Accelerator, rows: np.ndarray) -> np.ndarray:
     geometry, count = _open_edges.get(accel, (None, 0))
     if geometry is not asked.geometry:
         count = open_edges(asked.geometry)
@@ -57,10 +64,10 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> np.
         if not len(left):
             return inside
         directions = np.broadcast_to(rng.normal(size=3).astype(np.float32), (len(left), 3))
-        crossings = asked.of(rows[left], directions).counts(asked.cross)
+        crossings = asked.of(rows[left], directions).counts(asked.cross).numpy()
         again = crossings == AT_EDGE
         inside[left[~again]] = (crossings[~again] == ON_SURFACE) | (crossings[~again] % 2 == 1)
         left = left[again]
-        votes[left] += np.where(asked.of(rows[left], directions[again]).counts() % 2 == 1, 1, -1)
+        votes[left] += np.where(asked.of(rows[left], directions[again]).counts().numpy() % 2 == 1, 1, -1)
     inside[left] = votes[left] > 0
     return inside
