@@ -2,7 +2,7 @@
 
 Rays by themselves: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits,
 first_hits, contains, visible.
-Rays from kernels of your own: kernel, ray_query.
+Rays from kernels of your own: kernel, ray_query. Gradients: Hits.gradients, wrt.torch, wrt.jax.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
 FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; ConstantBackground, GradientBackground,
@@ -96,6 +96,7 @@ _PUBLIC = {
     "wrt.scene.settings": ("Settings",),
     "wrt.viewer.notebook": ("LiveView", "side_by_side"),
 }
+_FOR_LIBRARIES = ("torch", "jax")  # modules of that name
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names}
 __all__ = ["__version__", *_HOME]
 
@@ -130,6 +131,8 @@ def _imported(module: str) -> Any:
 
 
 def __getattr__(name: str) -> Any:
+    if name in _FOR_LIBRARIES:
+        return importlib.import_module(f"wrt.{name}")
     if name in _HOME:
         if _HOME[name] != "wrt.core.errors":
             importlib.import_module("wrt.core.address_space").require_modules()

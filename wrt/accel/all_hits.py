@@ -16,6 +16,7 @@ from wrt.accel.hit_points import surroundings
 from wrt.accel.ray_query import query_of, require_one_mesh, world_of
 from wrt.accel.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
+from wrt.core.arrays import returned, to_numpy, to_warp
 from wrt.core.checks import as_integer, as_one, shown
 from wrt.core.device import launch_on, made_once, thread_count
 from wrt.core.memory import require
@@ -28,26 +29,28 @@ BYTES = 16  # of a hit
 @dataclass(frozen=True, eq=False)
 class AllHits:
     """Those of ray i are rows first[i] to first[i + 1] of t, u, v (float32) and prim_id (int32), in the order of t and, where that
-    is equal, of prim_id; first: (N + 1,) int64."""
+    is equal, of prim_id; first: (N + 1,) int64. NumPy arrays; torch's or JAX's if the rays were."""
 
-    first: np.ndarray
-    t: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
-    prim_id: np.ndarray
+    first: Any
+    t: Any
+    u: Any
+    v: Any
+    prim_id: Any
 
     def __len__(self) -> int:
         return len(self.first) - 1
 
     @property
-    def counts(self) -> np.ndarray:
+    def counts(self) -> Any:
         """(N,) int64."""
-        return np.diff(self.first)
+        return self.first[1:] - self.first[:-1]
 
     @property
-    def ray_id(self) -> np.ndarray:
+    def ray_id(self) -> Any:
         """The ray of each hit, (len(t),) int64."""
-        return np.repeat(np.arange(len(self)), self.counts)
+        ray_id = np.repeat(np.arange(len(self)), to_numpy(self.counts))
+        give = returned(self.first)
+        return ray_id if give is None else give(wp.array(ray_id, dtype=wp.int64, device=to_warp(self.first).device))
 
     def __repr__(self) -> str:
         return f"AllHits({len(self)} rays, {len(self.t)} hits)"
@@ -58,6 +61,7 @@ class Asked:
 
     n = 0
     rays: RayArrays
+    give: Any = to_numpy  # what answers become, which are Warp's
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
         structure = require_one_mesh(getattr(accel, "structure", None),
@@ -72,25 +76,27 @@ class Asked:
         """Raises InputError that names the argument."""
         rays = rays_of(origins, directions, t_min, t_max)
         self.n, self.rays = len(rays.origins), rays_on(self.device, rays)
+        self.give = returned(origins, directions) or to_numpy
         return self
 
     def launch(self, kernel: Any, *inputs: Any) -> None:
         asked = self.world, self.rays, self.crossings
         launch_on(self.device, kernel, self.n, *asked, *inputs, None, threads=self.threads, step=RAYS_PER_LAUNCH)
 
-    def counts(self) -> np.ndarray:
-        """Of the hits of each ray."""
+    def counts(self) -> Any:
+        """Of the hits of each ray: a Warp array."""
         counts = wp.zeros(self.n, dtype=wp.int32, device=self.device)
         self.launch(self.count_hits, counts)
-        return np.asarray(counts.numpy())
+        return counts
 
-    def rows(self, first: np.ndarray) -> list[np.ndarray]:
-        """t, u, v, prim_id of so many hits of each ray, misses where it has fewer."""
+    def rows(self, first: np.ndarray) -> list[Any]:
+        """first, t, u, v, prim_id of so many hits of each ray, misses where it has fewer: Warp arrays."""
         empty = partial(wp.empty, int(first[-1]), device=self.device)
         hits: Any = HitArrays()
         hits.t, hits.u, hits.v, hits.prim_id = *(empty(dtype=wp.float32) for _ in range(3)), empty(dtype=wp.int32)
-        self.launch(self.write_hits, wp.array(first, dtype=wp.int64, device=self.device), hits)
-        return [np.asarray(array.numpy()) for array in (hits.t, hits.u, hits.v, hits.prim_id)]
+        begin = wp.array(first, dtype=wp.int64, device=self.device)
+        self.launch(self.write_hits, begin, hits)
+        return [begin, hits.t, hits.u, hits.v, hits.prim_id]
 
 
 @made_once
@@ -100,7 +106,8 @@ def hit_kernels(structure: Structure) -> tuple[Any, Any]:
 
 def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
              threads: int | None = None, crossings: bool = False) -> AllHits:
-    """Every hit of each ray in its segment, in order. Arguments as in Accelerator.closest_hit; the answer is of NumPy.
+    """Every hit of each ray in its segment, in order. Arguments as in Accelerator.closest_hit; the answer is of NumPy, or of
+    torch or JAX if the rays are.
 
     None is lost and none is there twice: a ray through an edge hits both triangles there, at a corner all of them. crossings: only
     where the ray goes through, as if it stood aside of edges and corners by as little as one likes: where a surface goes on, one
@@ -109,15 +116,16 @@ def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0
     the same t. Raises InputError, also where memory does not suffice.
     """
     asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
-    first = np.concatenate([[0], np.cumsum(asked.counts(), dtype=np.int64)])
+    first = np.concatenate([[0], np.cumsum(asked.counts().numpy(), dtype=np.int64)])
     require(float(first[-1]) * BYTES, f"{first[-1]} hits")
-    return AllHits(first, *asked.rows(first))
+    return AllHits(*map(asked.give, asked.rows(first)))
 
 
 def count_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-               threads: int | None = None, crossings: bool = False) -> np.ndarray:
+               threads: int | None = None, crossings: bool = False) -> Any:
     """How many hits each ray has in its segment, (N,) int32; as all_hits."""
-    return Asked(accel, threads, crossings).of(origins, directions, t_min, t_max).counts()
+    asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
+    return asked.give(asked.counts())
 
 
 def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
@@ -126,5 +134,6 @@ def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min:
     k = as_integer(k, "k", 1, (1 << 31) - 1)
     asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
     require(float(asked.n) * k * BYTES, f"{k} hits of each of {asked.n} rays")
-    t, u, v, prim_id = (row.reshape(asked.n, k) for row in asked.rows(np.arange(asked.n + 1, dtype=np.int64) * k))
+    rows = asked.rows(np.arange(asked.n + 1, dtype=np.int64) * k)[1:]
+    t, u, v, prim_id = (asked.give(row.reshape((asked.n, k))) for row in rows)
     return Hits(t, u, v, prim_id)

@@ -10,8 +10,9 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.hit_points import HitPoints
-from wrt.core.arrays import to_numpy, to_warp
+from wrt.core.arrays import taken, to_numpy, to_warp
 from wrt.core.checks import shown
+from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts, html_table
 
@@ -81,7 +82,7 @@ class Counters:
 @dataclass(frozen=True, eq=False)
 class Hits(HitPoints):
     """t: (N,) float32, in units of |direction|, inf on a miss; prim_id: (N,) int32, -1 on a miss; u, v: (N,) float32:
-    the point is (1 - u - v) v0 + u v1 + v v2 (0 on a miss and on spheres). NumPy arrays, or Warp's if the rays were.
+    the point is (1 - u - v) v0 + u v1 + v v2 (0 on a miss and on spheres). NumPy arrays; Warp's, torch's or JAX's if the rays were.
     counters: what each ray cost, where that was asked for. source: what the points, normals and ids are computed from."""
 
     t: Any
@@ -111,22 +112,26 @@ class Hits(HitPoints):
 
     def numpy(self) -> Hits:
         """The same with NumPy arrays; of hits on the CPU they share the memory."""
-        return self._each(to_numpy)
+        return self.each(to_numpy)
 
     def warp(self) -> Hits:
         """The same with Warp arrays; of hits on the CPU they share the memory."""
-        return self._each(to_warp)
+        return self.each(to_warp)
 
-    def _each(self, convert: Callable[[Any], Any]) -> Hits:
+    def each(self, convert: Callable[[Any], Any]) -> Hits:
+        """The same with each of the four arrays converted."""
         return replace(self, **{name: convert(getattr(self, name)) for name in ("t", "u", "v", "prim_id")})
 
 
-def room_for(types: dict[str, Any], given: list[Any] | None, n: int, device: Any) -> list[Any]:
+def room_for(types: dict[str, Any], given: list[Any] | None, n: int, device: Any, shared: bool = False) -> list[Any]:
     """Where n answers go: an array of each type, of Warp on a device, or of NumPy (None); those that are given, if there are some.
-    Raises InputError that calls one by its name in `types` where it does not fit."""
+    shared: with another library: JAX would copy what does not begin with a cache line. Raises InputError that calls one by its
+    name in `types` where it does not fit."""
     if given is None:
-        return [np.empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
+        empty = empty_aligned if shared else np.empty
+        return [empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
                 for dtype in types.values()]
+    given = [taken(array, name, None) for name, array in zip(types, given, strict=True)]
     for (name, dtype), array in zip(types.items(), given, strict=True):
         if device is None:
             fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray

@@ -8,7 +8,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -24,7 +24,7 @@ from wrt.accel.ray_query import world_of
 from wrt.accel.rays import vectors
 from wrt.accel.store import save
 from wrt.accel.structure import Structure, check_options, check_units
-from wrt.core.arrays import to_numpy
+from wrt.core.arrays import check_no_gradients, taken, to_numpy
 from wrt.core.device import require_on, start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
@@ -144,21 +144,25 @@ class Accelerator(Queries, ABC):
         raise InputError(f"a {self.name} cannot be refitted in place; take bvh2")
 
     def refit(self, vertices: Any, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
-        """Follow vertices that have moved, (V, 3) float32 or a Warp array (V,) of vec3, as many as before: boxes are fitted anew,
-        the tree stays as it is. bvh2 takes a Warp array where it is: of a GPU nothing comes to the host but the growth.
+        """Follow vertices that have moved, (V, 3) float32 (a tensor, too) or a Warp array (V,) of vec3, as many as before: boxes
+        are fitted anew, the tree stays as it is. bvh2 takes a Warp array where it is: of a GPU nothing comes to the host but the
+        growth.
 
         It answers as exactly as a new one, but slower and slower as the motion mixes what was near. rebuild_at: build it anew
         (as it was built) where the SAH cost passes this multiple of what it was when built. Other threads may go on asking:
-        every query that begins before the refit ends answers of the old shape, all others of the new one.
+        every query that begins before the refit ends answers of the old shape, all others of the new one. While a wp.Tape records,
+        hits after it have gradients in a Warp array that requires them.
 
         in_place: from a Warp array on the structure's device into the arrays that there are, for a CUDA graph to capture: after a
         first call no memory is taken, nothing copied and nothing waited for; the growth is not known (NaN), and no other thread
         may ask meanwhile. Raises InputError for another shape or values that are not finite (of a Warp array on a GPU they are
         not looked at), and from structures that cannot be refitted.
         """
+        vertices = taken(vertices, "vertices")
         with self._refitting:
             begin, before = time.perf_counter(), self._state
             if in_place:
+                check_no_gradients("a refit in place", vertices=vertices)
                 self._refit_in_place(vertices)
                 return Refit(time.perf_counter() - begin, float("nan"), False)
             beside = copy(self)  # has the new shape while others still ask for the old one
@@ -169,7 +173,8 @@ class Accelerator(Queries, ABC):
                 built = beside._build(**self._options)
                 built_cost = built.sah_cost
             beside._take(built, begin, built_cost)
-            self._state = beside._state
+            followed = vertices if isinstance(vertices, wp.array) and vertices.requires_grad else None
+            self._state = replace(beside._state, followed=followed)
             return Refit(beside.stats.build_seconds, growth, rebuilt)
 
     def _children(self, built: Built) -> Any:

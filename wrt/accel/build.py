@@ -19,6 +19,7 @@ from wrt.accel.instancing import instanced_meshes
 from wrt.accel.store import check_target, read
 from wrt.accel.structures import ACCELERATORS, chosen
 from wrt.accel.worlds import worlds_over
+from wrt.core.arrays import is_tensor, taken, to_numpy
 from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
@@ -115,7 +116,9 @@ def shape_given(mesh: Any) -> Mesh | Scene:
     elif isinstance(mesh, str | os.PathLike):
         mesh = load_mesh(mesh)
     elif isinstance(mesh, tuple) and len(mesh) == 2:
-        mesh = Mesh(*mesh)
+        vertices, faces = (to_numpy(taken(each, name, None)) if is_tensor(each) else each
+                           for each, name in zip(mesh, ("vertices", "faces"), strict=True))
+        mesh = Mesh(vertices, faces)
     elif type(mesh).__module__.split(".")[0] == "trimesh":
         mesh = Mesh.from_trimesh(mesh)
     if isinstance(mesh, Scene | Mesh):

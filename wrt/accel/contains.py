@@ -6,12 +6,14 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import warp as wp
 
 from wrt.accel.all_hits import Asked
 from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 from wrt.accel.rays import vectors
-from wrt.core.arrays import taken
+from wrt.core.arrays import returned, taken, to_numpy
+from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
 
@@ -28,22 +30,23 @@ def open_edges(geometry: Geometry) -> int:
     return int((count % 2 == 1).sum())
 
 
-def contains(accel: Accelerator, points: Any, threads: int | None = None) -> np.ndarray:
+def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any:
     """Whether each of `points` is inside a closed mesh, (N,) bool. On the surface, to rounding, the answer is either.
 
     points: (N, 3) real numbers, taken as float32. A ray from each crosses the surface an odd number of times or not (so that what
     is in two parts that overlap is outside); with the watertight test that is exact for every direction (all_hits, crossings).
     Raises InputError where the mesh is not closed, and as Accelerator.closest_hit does.
     """
+    rows, give = vectors(to_numpy(taken(points, "points")), "points", FARTHEST), returned(points)
     asked = Asked(accel, threads, crossings=True)
-    rows = vectors(taken(points, "points"), "points", FARTHEST)
     geometry, count = _open_edges.get(accel, (None, 0))
     if geometry is not asked.geometry:
         count = open_edges(asked.geometry)
         _open_edges[accel] = asked.geometry, count
     if count:
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces")
-    return odd_crossings(asked, rows)
+    inside = odd_crossings(asked, rows)
+    return inside if give is None else give(upload(inside, wp.bool, asked.device))
 
 
 def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -53,5 +56,6 @@ def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
         used = asked.geometry.vertices[asked.geometry.faces].reshape(-1, 3)
         within = np.nonzero(((rows >= used.min(axis=0)) & (rows <= used.max(axis=0))).all(axis=1))[0]
         direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
-        inside[within] = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts() % 2 == 1
+        counts = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts()
+        inside[within] = counts.numpy() % 2 == 1
     return inside

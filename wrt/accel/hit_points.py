@@ -10,10 +10,12 @@ import warp as wp
 
 from wrt.accel.built import State
 from wrt.accel.flatten import Placed, World, placed_now, run_of, world_over
+from wrt.accel.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
 from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.ray_query import require_one_mesh
 from wrt.accel.rays import Rays, rays_on
 from wrt.accel.worlds import WorldIds
-from wrt.core.arrays import to_warp
+from wrt.core.arrays import returned, to_warp
 from wrt.core.device import launch_on, records, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.kernels import structs
@@ -37,7 +39,7 @@ _surroundings: WeakKeyDictionary[State, Surroundings] = WeakKeyDictionary()
 
 class HitPoints:
     """Properties of hits that a structure gave. Each is computed anew each time, from the arrays of the hits and of the rays, which
-    are kept and not copied: leave them as they were until then. Arrays are of NumPy, or of Warp if the hits are.
+    are kept and not copied: leave them as they were until then. Arrays are of the library that the hits are of.
 
     Raises InputError where the hits are not closest_hit's, or what is asked for is not there.
     """
@@ -96,10 +98,27 @@ class HitPoints:
         """(N,) int32: index into scene.materials; -1 on a miss."""
         return self._filled("material")
 
-    def _filled(self, name: str) -> Any:
+    def gradients(self, t: Any = None, u: Any = None, v: Any = None, point: Any = None) -> Gradients:
+        """Derivatives of a number, such as a sum of squares to be made small, by vertices, origins and directions at fixed prim_id,
+        from its derivatives by these hits, (N,) and (N, 3); of misses they are not looked at (wrt.accel.gradients.adjoint).
+
+        Raises InputError for other shapes, and where the structure is not over one mesh.
+        """
+        accel, state, rays, _ = self._source()
+        require_one_mesh(accel.structure, ONE_MESH)
+        found = adjoint(state.geometry, rays.origins, rays.directions, self.prim_id, Cotangents(t, u, v, point))
+        give = returned(self.t)
+        return found if give is None else Gradients(*map(give, found))
+
+    def _source(self) -> tuple[Any, State, Rays, WorldIds | None]:
         if self.source is None:
             raise InputError("these hits do not know their rays: only those of closest_hit have points, normals and ids")
-        accel, state, rays, worlds = self.source
+        return self.source
+
+    def _filled(self, name: str) -> Any:
+        accel, state, rays, worlds = self._source()
+        if name in ("error", "normal", "shading", "uv"):
+            check_recorded(self, name)
         world, surfaces, numbering = surroundings(accel, state)
         if name == "shading" and world.normals is None:
             name = "normal"
@@ -114,7 +133,12 @@ class HitPoints:
             hits.prim_id = upload(worlds.numbered(self.prim_id), wp.int32, device)
         inputs = [surfaces, numbering, rays_on(device, rays), hits, out]
         launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
-        return array if isinstance(self.t, wp.array) else array.numpy()
+        if isinstance(self.t, wp.array):
+            if name == "point":
+                record(self, point=array)
+            return array
+        give = returned(self.t)
+        return array.numpy() if give is None else give(array)
 
 
 def _require(world: World, name: str) -> None:

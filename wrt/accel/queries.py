@@ -10,9 +10,11 @@ from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES, Counters, Hits, room_for
 from wrt.accel.batches import trace_on_gpu, trace_worlds, tracer
 from wrt.accel.built import State
 from wrt.accel.counting import counted
+from wrt.accel.gradients import record
 from wrt.accel.rays import Rays, rays_of
 from wrt.accel.structure import Structure
 from wrt.accel.worlds import WorldIds, worlds_asked
+from wrt.core.arrays import recording, returned
 from wrt.core.checks import shown
 from wrt.core.device import thread_count
 from wrt.core.errors import InputError
@@ -40,30 +42,35 @@ class Queries:
         the new ones (NumPy's, or Warp's if the rays are; they must not overlap with the rays' own). world: over several worlds,
         which one each ray sees, a number or (N,) int (a Warp array is not looked at; a ray of a world that is none hits nothing).
 
-        Several threads may ask at a time, with or without counters, while another refits. There are no gradients: Warp arrays
-        that require them are refused while a wp.Tape records. Raises InputError that names the argument and what was expected;
-        what `out` holds is lost then.
+        Several threads may ask at a time, with or without counters, while another refits. While a wp.Tape records, t, u, v and
+        hits.point have gradients at fixed prim_id (wrt.accel.gradients.adjoint) in Warp arrays that require them: origins,
+        directions, and the vertices of the last refit. What came in as tensors of torch or JAX goes out as such. Raises InputError
+        that names the argument and what was expected; what `out` holds is lost then.
         """
-        threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
+        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max, True), returned(origins, directions)
         if not (out is None or isinstance(out, Hits)):
             raise InputError(f"out must be Hits, got {shown(out)}")
         given = None if out is None else [out.t, out.u, out.v, out.prim_id]
-        t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
+        t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None,
+                                                give is not None)
         state = self._state  # once: a refit may replace it meanwhile
         worlds = worlds_asked(self, state.geometry, world, len(t))
         costs = _answer(self, state.data, rays, arrays, threads, worlds, trace if counters or trace else None)
-        return Hits(t, u, v, prim_id, costs, (self, state, rays, worlds))
+        hits = Hits(t, u, v, prim_id, costs, (self, state, rays, worlds))
+        if recording() is not None:
+            record(hits, t=t, u=u, v=v)
+        return hits if give is None else hits.each(give)
 
     def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                 threads: int | None = None, *, out: Any = None, world: Any = None) -> Any:
         """Whether each ray hits anything in its segment: (N,) bool, True where closest_hit finds a hit and nowhere else. Arguments
         as in closest_hit; out: an array that takes the answer."""
-        threads, rays = thread_count(threads), rays_of(origins, directions, t_min, t_max)
+        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max), returned(origins, directions)
         given = None if out is None else [out]
-        arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None)
+        arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None, give is not None)
         state = self._state
         _answer(self, state.data, rays, arrays, threads, worlds_asked(self, state.geometry, world, len(arrays[0])))
-        return arrays[0]
+        return arrays[0] if give is None else give(arrays[0])
 
 
 def _answer(accel: Queries, data: Any, rays: Rays, out: list[Any], threads: int, worlds: WorldIds | None = None,

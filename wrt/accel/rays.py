@@ -48,9 +48,10 @@ class Rays(NamedTuple):
         return Rays(origins, directions, _checked_ends(self.t_min, "t_min"), _checked_ends(self.t_max, "t_max"))
 
 
-def rays_of(origins: Any, directions: Any, t_min: Any, t_max: Any) -> Rays:
-    """The arguments of Accelerator.closest_hit, whose shapes and kinds are checked. Raises InputError that names the argument."""
-    check_no_gradients(origins=origins, directions=directions, t_min=t_min, t_max=t_max)
+def rays_of(origins: Any, directions: Any, t_min: Any, t_max: Any, gradients: bool = False) -> Rays:
+    """The arguments of Accelerator.closest_hit, whose shapes and kinds are checked. gradients: whether origins and directions may
+    require them. Raises InputError that names the argument."""
+    check_no_gradients(t_min=t_min, t_max=t_max, **({} if gradients else {"origins": origins, "directions": directions}))
     origins, directions = taken(origins, "origins"), taken(directions, "directions")
     if isinstance(origins, wp.array) or isinstance(directions, wp.array):
         if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in (origins, directions)):
@@ -84,11 +85,13 @@ def one_for_all(value: float, n: int, device: Any) -> Any:
 
 
 def _segment_ends(value: Any, n: int, name: str) -> Any:
+    if type(value) is not float:  # most are
+        value = taken(value, name, wp.float32)
     if isinstance(value, wp.array):
         if value.dtype != wp.float32 or value.shape != (n,):
             raise InputError(f"{name} must be ({n},) float32, got {value.shape} {value.dtype.__name__}")
         return value
-    if type(value) is not float:  # most are
+    if type(value) is not float:
         array = real_numbers(value, name, f"a number or ({n},)")
         if array.ndim > 1 or (array.ndim == 1 and len(array) != n):
             raise InputError(f"{name} must be a number or ({n},), got {array.shape}")

@@ -13,7 +13,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.hit_points import surroundings
 from wrt.accel.ray_query import require_one_mesh
 from wrt.accel.rays import vectors
-from wrt.core.arrays import check_no_gradients, real_numbers, taken, to_numpy
+from wrt.core.arrays import check_no_gradients, real_numbers, returned, taken, to_numpy
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, thread_count, upload
 from wrt.core.errors import InputError
@@ -33,18 +33,18 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
     rounding; points nearer to each other than twice that always see each other, a point itself too. Along a surface that is not
     enough. on_a, on_b: (N,) prim_ids of triangles on which the points lie (hits.prim_id of hits.point), -1 for none: these are
     not in the way, and the point is moved off their plane by its rounding, as a shadow ray of a picture is (structures over one
-    mesh). threads, out: as in any_hit. Raises InputError that names the argument; of Warp arrays on a GPU no values are looked at,
-    and what is not finite sees nothing.
+    mesh). threads, out and the answer's library: as in any_hit. Raises InputError that names the argument; of Warp arrays on a GPU
+    no values are looked at, and what is not finite sees nothing.
     """
     if not isinstance(accel, Accelerator):
         raise InputError(f"accel must be a structure (wrt.build), got {shown(accel)}")
     threads, device = thread_count(threads), accel.device
     check_no_gradients(a=a, b=b)
     p, q = (_points(value, name, device) for value, name in ((a, "a"), (b, "b")))
-    n, as_warp = len(p), isinstance(taken(a, "a"), wp.array)
+    n, as_warp, give = len(p), isinstance(taken(a, "a"), wp.array), returned(a, b)
     if len(q) != n:
         raise InputError(f"b must have as many rows as a ({n}), got {len(q)}")
-    array = room_for(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None)[0]
+    array = room_for(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None, give is not None)[0]
     state, known, surfaces = accel._state, on_a is not None or on_b is not None, Surfaces()
     if known:
         require_one_mesh(accel.structure, "on_a and on_b are for structures over one mesh")
@@ -69,7 +69,7 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
         array.assign(answer)
     else:
         array[:] = to_numpy(answer)
-    return array
+    return array if give is None else give(array)
 
 
 def _without(accel: Accelerator, rays: tuple[Any, ...], ids: list[np.ndarray], seen: np.ndarray, threads: int) -> None:
@@ -96,7 +96,7 @@ def _prim_ids(value: Any, name: str, n: int, count: int) -> np.ndarray:
     """(N,) int32, -1 for each where there are none. Raises InputError that names the argument."""
     if value is None:
         return np.full(n, -1, np.int32)
-    array = real_numbers(to_numpy(value), name, f"({n},) prim_ids")
+    array = real_numbers(to_numpy(taken(value, name, None)), name, f"({n},) prim_ids")
     if array.shape != (n,) or array.dtype.kind not in "iu":
         raise InputError(f"{name} must be ({n},) whole numbers, got {shown(array)}")
     if n and not (array.min() >= -1 and array.max() < count):

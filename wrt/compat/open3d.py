@@ -151,7 +151,7 @@ class RaycastingScene:
     def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
         if as_integer(nsamples, "nsamples", 1, MOST_SAMPLES) % 2 == 0:
             raise InputError(f"nsamples must be odd, got {nsamples}")
-        asked = Asked(self._scene()[0], _threads(nthreads))
+        asked = Asked(self._scene()[0], _threads(nthreads), crossings=True)
         votes = np.zeros(len(points), np.int32)
         for seed in range(nsamples):
             votes += odd_crossings(asked, points, seed)

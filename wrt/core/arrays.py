@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ REAL = "iufO"  # NumPy's kinds of real numbers, and objects such as fractions: n
 
 def to_numpy(array: Any) -> np.ndarray:
     """A NumPy array of the same memory; a copy only of what is on a GPU."""
+    array = taken(array, "an array", None)
     return array.numpy() if isinstance(array, wp.array) else np.asarray(array)
 
 
@@ -26,6 +29,8 @@ def to_warp(array: Any, dtype: Any = None) -> Any:
 
     dtype: a Warp type, such as vec3 for arrays of three columns; None: the array's own.
     """
+    if not isinstance(array, np.ndarray):
+        array = taken(array, "an array", dtype)
     if isinstance(array, wp.array):
         return array
     array = np.ascontiguousarray(array)
@@ -52,23 +57,56 @@ def float32(array: np.ndarray) -> np.ndarray:
         return np.require(array, np.float32, ["C", "A"])
 
 
-def check_no_gradients(**arrays: Any) -> None:
-    """Raise InputError that names the Warp array of which a tape would wait for gradients: there are none."""
-    for name, array in arrays.items() if context.runtime.tape is not None else ():
+def recording() -> Any:
+    """The wp.Tape that records, or None."""
+    return context.runtime.tape
+
+
+def check_no_gradients(what: str = "this", **arrays: Any) -> None:
+    """Raise InputError that names the Warp array in which a tape would wait for gradients of `what`, which has none."""
+    for name, array in arrays.items() if recording() is not None else ():
         if isinstance(array, wp.array) and array.requires_grad:
-            raise InputError(f"{name} requires gradients and a wp.Tape is recording, but wrt has no gradients: ask outside of the"
-                             f" tape, or give wp.clone({name}, requires_grad=False)")
+            raise InputError(f"{name} requires gradients and a wp.Tape is recording, but {what} has none (t, u, v and point of"
+                             f" closest_hit have, in origins, directions and vertices): ask outside of the tape, or give"
+                             f" wp.clone({name}, requires_grad=False)")
 
 
-def taken(value: Any, name: str) -> Any:
-    """What somebody gives for an array of vectors: NumPy and Warp arrays, and what has no `__dlpack__`, as they are; other
-    tensors as an array of the same memory, NumPy's on the CPU and Warp's of vec3 on a GPU. Raises InputError that calls it
-    `name` where a tensor does not share its memory."""
-    if isinstance(value, np.ndarray | wp.array) or not hasattr(value, "__dlpack__"):
+def is_tensor(value: Any) -> bool:
+    """Whether it is another library's array, which shares its memory by DLPack."""
+    return not isinstance(value, np.ndarray | wp.array) and hasattr(value, "__dlpack__")
+
+
+def on_cpu(tensor: Any) -> bool:
+    """Whether the memory of a tensor is the host's."""
+    return bool(tensor.__dlpack_device__()[0] == DLPACK_CPU)
+
+
+def taken(value: Any, name: str, dtype: Any = wp.vec3) -> Any:
+    """What somebody gives for an array: tensors as an array of the same memory, NumPy's on the CPU and on a GPU Warp's of `dtype`
+    (None: the tensor's own); all else as it is. Raises InputError that calls it `name` where a tensor does not share its memory."""
+    if not is_tensor(value):
         return value
     try:
-        if value.__dlpack_device__()[0] == DLPACK_CPU:
+        if on_cpu(value):
             return np.from_dlpack(value)
-        return wp.from_dlpack(value, dtype=wp.vec3)
-    except (BufferError, TypeError, RuntimeError, ValueError) as error:
-        raise InputError(f"{name}: {shown(value)} does not share its memory: {error}") from error
+        return wp.from_dlpack(value, dtype=dtype)
+    except (BufferError, TypeError, RuntimeError, ValueError, AttributeError) as error:  # the last: JAX's, under jit
+        raise InputError(f"{name}: {shown(value)} does not share its memory: {error} (closest_hit of wrt.torch and of"
+                         f" wrt.jax has gradients)") from error
+
+
+def returned(*given: Any) -> Callable[[Any], Any] | None:
+    """What makes an array of NumPy or Warp a tensor of the library whose tensor is the first among `given`, without a copy (one of
+    a GPU comes to the CPU if that tensor is there); None where there is no tensor, or its library is not known to make some."""
+    for value in given:
+        if is_tensor(value):
+            has_namespace = hasattr(value, "__array_namespace__")  # the array API's way; torch has none
+            module = type(value).__module__.partition(".")[0]
+            home: Any = value.__array_namespace__() if has_namespace else sys.modules.get(module)
+            return partial(_given_to, home.from_dlpack, on_cpu(value)) if hasattr(home, "from_dlpack") else None
+    return None
+
+
+def _given_to(from_dlpack: Callable[[Any], Any], to_cpu: bool, array: Any) -> Any:
+    """On the CPU an array of NumPy, which knows all of the protocol's versions."""
+    return from_dlpack(to_numpy(array) if to_cpu or not isinstance(array, wp.array) or array.device.is_cpu else array)

@@ -210,9 +210,9 @@ def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
 
 
-def empty_aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+def empty_aligned(shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
     """An array in memory that begins where a cache line does."""
-    size = prod(shape) * np.dtype(dtype).itemsize
+    size = (shape if isinstance(shape, int) else prod(shape)) * np.dtype(dtype).itemsize
     memory = np.empty(size + 64, np.uint8)
     first = -memory.ctypes.data % 64
     return memory[first : first + size].view(dtype).reshape(shape)
@@ -294,7 +294,8 @@ def launch(kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -
     load_kernel(kernel, cpu)
 
     def job(first: int) -> None:
-        wp.launch(kernel, dim=min(step or n, n - first), device=cpu, inputs=[first if each is None else each for each in inputs])
+        wp.launch(kernel, dim=min(step or n, n - first), device=cpu, inputs=[first if each is None else each for each in inputs],
+                  record_tape=False)
 
     run_all([partial(job, first) for first in range(0, n, step or max(n, 1))], threads)
 

@@ -33,6 +33,27 @@ class Tensor:
         return self.array.__dlpack_device__()
 
 
+class Library:
+    """What the array API asks of a library, so far as wrt asks it: its tensors say where from_dlpack is."""
+
+    class Tensor(Tensor):
+        def __array_namespace__(self, **options: Any) -> Any:
+            return Library
+
+        def __len__(self) -> int:
+            return len(self.array)
+
+        def __getitem__(self, rows: slice) -> Any:
+            return Library.Tensor(self.array[rows])
+
+        def __sub__(self, other: Any) -> Any:
+            return Library.Tensor(self.array - other.array)
+
+    @staticmethod
+    def from_dlpack(array: Any) -> Any:
+        return Library.Tensor(np.from_dlpack(array))
+
+
 def address(array: Any) -> int:
     return int(array.ptr if isinstance(array, wp.array) else array.__array_interface__["data"][0])
 
@@ -90,6 +111,31 @@ def test_rays_are_not_copied() -> None:
                                 (to_warp(ORIGINS, wp.vec3), to_warp(DIRECTIONS, wp.vec3))):
         rays = rays_on(accel.device, rays_of(origins, directions, 0.0, np.inf))
         assert (address(rays.origin), address(rays.direction)) == (address(ORIGINS), address(DIRECTIONS))
+
+
+def test_what_comes_in_as_tensors_goes_out_as_such() -> None:
+    accel, near = wrt.build(box()), np.float32([[0.1, 0.2, 0.3]] * 5)
+    o, d, p = (Library.Tensor(array) for array in (ORIGINS, DIRECTIONS, near))
+    hits, of_numpy = accel.closest_hit(o, d), accel.closest_hit(ORIGINS, DIRECTIONS)
+    found, all_of_numpy, ones = wrt.all_hits(accel, o, d), wrt.all_hits(accel, ORIGINS, DIRECTIONS), np.ones(5)
+    answers = {
+        "t": (hits.t, of_numpy.t), "prim_id": (hits.prim_id, of_numpy.prim_id), "point": (hits.point, of_numpy.point),
+        "normal": (hits.normal, of_numpy.normal), "first": (found.first, all_of_numpy.first), "all t": (found.t, all_of_numpy.t),
+        "gradients": (hits.gradients(t=ones).vertices, of_numpy.gradients(t=ones).vertices),
+        "ray_id": (found.ray_id, all_of_numpy.ray_id), "any_hit": (accel.any_hit(o, d), of_numpy.prim_id >= 0),
+        "count_hits": (wrt.count_hits(accel, o, d), all_of_numpy.counts),
+        "first_hits": (wrt.first_hits(accel, 1, o, d).t, of_numpy.t[:, None]),
+        "contains": (wrt.contains(accel, p), np.full(5, True)), "visible": (wrt.visible(accel, p, o), np.full(5, False)),
+        "t_max": (accel.closest_hit(ORIGINS, d, t_max=Library.Tensor(np.full(5, 2.0))).t, np.full(5, np.inf)),
+    }
+    for name, (ours, expected) in answers.items():
+        assert isinstance(ours, Library.Tensor), name
+        np.testing.assert_array_equal(ours.array, expected, err_msg=name)
+    assert hits.t.array.ctypes.data % 64 == 0  # else JAX copies it
+    accel.closest_hit(d, o, out=hits)
+    np.testing.assert_array_equal(hits.t.array, accel.closest_hit(DIRECTIONS, ORIGINS).t)
+    accel.refit(Library.Tensor(2.0 * accel.geometry.vertices))
+    assert wrt.build((Library.Tensor(box().vertices), Library.Tensor(box().faces))).geometry.faces.shape == (12, 3)
 
 
 def test_a_tensor_that_is_not_shared_is_told() -> None:

@@ -1,0 +1,56 @@
+"""wrt.jax: the adjoint as a custom derivative, also under jit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wrt
+from tests.wrt.accel.test_gradients import cotangents, rays
+from wrt.core.errors import InputError
+from wrt.scene import shapes
+
+jax = pytest.importorskip("jax", reason="wrt does not need jax: the extra jax brings it")
+
+
+def test_the_adjoint_as_it_is_and_compiled() -> None:
+    rng = np.random.default_rng(0)
+    ball, accel, given = shapes.icosphere(2), wrt.build(shapes.icosphere(2)), cotangents(rng, 300)
+    leaves = (np.float32(1.3) * ball.vertices, *rays(rng, 300))
+
+    def loss(*leaves: Any) -> Any:
+        found = wrt.jax.closest_hit(accel, *leaves)
+        hit = found.prim_id >= 0
+        return sum(jax.numpy.where(hit if part.ndim == 1 else hit[:, None], weight * part, 0.0).sum()
+                   for weight, part in zip(given, found, strict=False))
+
+    hits = wrt.build((leaves[0], ball.faces)).closest_hit(*leaves[1:])
+    expected = hits.gradients(*(np.float32(each) for each in given))
+    assert 30 < (hits.prim_id >= 0).sum() < 270
+    for derivative in (jax.grad(loss, (0, 1, 2)), jax.jit(jax.grad(loss, (0, 1, 2)))):
+        for ours, true in zip(derivative(*leaves), expected, strict=True):
+            np.testing.assert_allclose(ours, true, rtol=2e-6, atol=2e-6 * np.abs(true).max())
+
+
+def test_values_and_batches() -> None:
+    accel, (origins, directions) = wrt.build(shapes.icosphere(2)), rays(np.random.default_rng(1), 100)
+    hits = accel.closest_hit(origins, directions, t_max=5.0)
+    found = jax.jit(lambda o: wrt.jax.closest_hit(accel, None, o, directions, t_max=5.0))(origins)
+    batch = jax.vmap(lambda o: wrt.jax.closest_hit(accel, None, o, directions, t_max=5.0))(np.stack([origins, origins]))
+    for name in ("t", "u", "v", "prim_id", "point"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(hits, name))
+        np.testing.assert_array_equal(getattr(batch, name)[1], getattr(hits, name))
+    with pytest.raises(InputError, match=r"must both be \(N, 3\)"):
+        wrt.jax.closest_hit(accel, None, origins, directions[:, :2])
+
+
+def test_arrays_in_arrays_out() -> None:
+    accel, (o, d) = wrt.build(shapes.icosphere(2)), map(jax.numpy.asarray, rays(np.random.default_rng(2), 100))
+    hits = accel.closest_hit(o, d)
+    for each in (hits.t, hits.prim_id, hits.point, accel.any_hit(o, d), wrt.all_hits(accel, o, d).t, wrt.visible(accel, o, d)):
+        assert isinstance(each, jax.Array)
+    np.testing.assert_array_equal(hits.t, accel.closest_hit(np.asarray(o), np.asarray(d)).t)
+    with pytest.raises(InputError, match=r"origins: .*wrt.jax"):
+        jax.jit(lambda o: accel.closest_hit(o, d).t)(o)

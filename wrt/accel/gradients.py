@@ -1,0 +1,169 @@
+"""Derivatives of closest hits in closed form: one adjoint, for NumPy, wp.Tape, torch and JAX."""
+
+from __future__ import annotations
+
+import importlib
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.geometry import Geometry
+from wrt.accel.ray_query import require_one_mesh
+from wrt.core.arrays import check_no_gradients, float32, recording, to_numpy
+from wrt.core.checks import shown
+from wrt.core.device import run_all, thread_count
+from wrt.core.errors import InputError
+
+ONE_MESH = "only hits of a structure over one mesh, without spheres, have gradients"
+HITS_PER_JOB = 8192  # so that what is between stays in the cache
+
+
+class Gradients(NamedTuple):
+    """Derivatives of a number by what hits come from: vertices (V, 3), origins (N, 3), directions (N, 3), all float64."""
+
+    vertices: Any
+    origins: Any
+    directions: Any
+
+
+class HitTensors(NamedTuple):
+    """Of the closest hits: t, u, v (N,) float32 and prim_id (N,) int32 as Accelerator.closest_hit gives them, and point (N, 3)
+    float32, as Hits.point (NaN on a miss)."""
+
+    t: Any
+    u: Any
+    v: Any
+    point: Any
+    prim_id: Any
+
+
+class Cotangents(NamedTuple):
+    """Derivatives of a number by hits: (N,) each, point (N, 3); None: it does not depend on them."""
+
+    t: Any = None
+    u: Any = None
+    v: Any = None
+    point: Any = None
+
+    def rows(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 3) float64 by t, u, v, and (N, 3) by the point. Raises InputError for other shapes."""
+        tuv, point = np.zeros((n, 3)), np.zeros((n, 3))
+        targets = tuv[:, 0], tuv[:, 1], tuv[:, 2], point
+        for name, given, target in zip(self._fields, self, targets, strict=True):
+            if given is not None:
+                array = to_numpy(given)
+                if array.shape != target.shape or array.dtype.kind not in "iuf":
+                    raise InputError(f"{name} must be {target.shape} of real numbers, got {shown(array)}")
+                target[:] = array
+        return tuv, point
+
+
+def adjoint(geometry: Geometry, origins: Any, directions: Any, prim_id: Any, cotangents: Cotangents,
+            threads: int | None = None) -> Gradients:
+    """Derivatives of a number by vertices, origins and directions, at fixed prim_id, from its derivatives by hits.
+
+    A hit solves o + t d = (1 - u - v) v0 + u v1 + v v2. With M = [d, v0 - v1, v0 - v2] that is M (t, u, v) = v0 - o, and what
+    moves either side by x moves (t, u, v) by M^-1 x. So one vector a ray, lambda = M^-T (dL/dt, dL/du, dL/dv), has it all: the
+    corners get their weights of it, the origin -lambda, the direction -t lambda; the point o + t d adds its own.
+
+    All is float64, t, u and v too. The sum at a vertex is taken in the order of the rays, whatever the threads: it has the same
+    bits each time. A miss has no part in it, and no derivatives; nor has a ray that runs along its triangle's plane, to the last
+    bit of float64, or meets a triangle without area. (Nearly along it they are right and large: they grow as 1 / cos of the
+    angle to the normal.) How outlines move is not in it: prim_id is fixed.
+    """
+    prim_id, o, d = to_numpy(prim_id), float32(to_numpy(origins)), float32(to_numpy(directions))  # as they were traced
+    vertices, faces = geometry.vertices, geometry.faces
+    n = len(prim_id)
+    given, by_point = cotangents.rows(n)
+    out = Gradients(np.zeros((len(vertices), 3)), np.zeros((n, 3)), np.zeros((n, 3)))
+    rows = np.flatnonzero((prim_id >= 0) & (prim_id < len(faces)))
+    corners = faces[prim_id[rows]]
+    by_corner = np.empty((3, len(rows), 3))
+
+    def work(first: int) -> None:
+        some = slice(first, first + HITS_PER_JOB)
+        ray = rows[some]
+        way, place, point, tuv = (columns(array[ray]) for array in (d, o, by_point, given))
+        v0, v1, v2 = (columns(vertices[corners[some, i]]) for i in range(3))
+        inverse, exists = inverse_rows(way, v1 - v0, v2 - v0)
+        t, u, v = (inverse * (v0 - place)).sum(axis=1)
+        tuv[0] += (point * way).sum(axis=0)
+        at_hit = (inverse * tuv[:, None]).sum(axis=0)  # lambda
+        at_origin = np.where(exists, point - at_hit, 0.0)
+        out.origins[ray], out.directions[ray] = at_origin.T, (t * at_origin).T
+        for axis in range(3):
+            by_corner[axis, some] = np.stack([(1.0 - u - v) * at_hit[axis], u * at_hit[axis], v * at_hit[axis]], axis=1)
+
+    run_all([partial(work, first) for first in range(0, len(rows), HITS_PER_JOB)], thread_count(threads))
+    for axis in range(3):
+        out.vertices[:, axis] = np.bincount(corners.reshape(-1), by_corner[axis].reshape(-1), len(vertices))
+    return out
+
+
+def hits_of(accel: Any, vertices: Any, rays: tuple[Any, ...], rebuild_at: float) -> Any:
+    """Hits of closest_hit, once the structure has followed the vertices (None, or as they are: it stays). rays: its arguments.
+
+    Raises InputError that names the argument.
+    """
+    require_one_mesh(getattr(accel, "structure", None), f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
+    if vertices is not None and not np.array_equal(float32(to_numpy(vertices)), accel.geometry.vertices):
+        accel.refit(vertices, rebuild_at)
+    return accel.closest_hit(*rays)
+
+
+def library(name: str, module: str = "") -> Any:
+    """A library that wrt does not need. Raises InputError that says how to get it, where it is not there."""
+    try:
+        return importlib.import_module(module or name)
+    except ImportError as error:
+        raise InputError(f'wrt.{name} needs {name} ({error}): pip install "wrt[{name}]"') from error
+
+
+def record(hits: Any, **outputs: Any) -> None:
+    """Let a wp.Tape that records have gradients of Warp arrays of `hits`, given by their names in Cotangents, in origins,
+    directions and the array that the structure's last refit followed: those of them that require gradients."""
+    (accel, state, rays, _), tape = hits.source, recording()
+    leaves = Gradients(state.followed, rays.origins, rays.directions)
+    wanted = [array for array in leaves if isinstance(array, wp.array) and array.requires_grad]
+    if tape is None or not wanted:
+        return
+    require_one_mesh(accel.structure, ONE_MESH)
+    for array in outputs.values():
+        array.requires_grad = True
+
+    def backward() -> None:
+        found = hits.gradients(**{name: array.grad for name, array in outputs.items()})
+        for array, values in zip(leaves, found, strict=True):
+            if any(array is each for each in wanted):
+                array.grad.assign(np.float32(array.grad.numpy() + values))
+
+    tape.record_func(backward, [*wanted, *outputs.values()])
+
+
+def check_recorded(hits: Any, name: str) -> None:
+    """Raise InputError where a tape would wait for gradients of what has none."""
+    _, state, rays, _ = hits.source
+    given = {"vertices": state.followed, "origins": rays.origins, "directions": rays.directions}
+    check_no_gradients(f"hits.{name}", **given)
+
+
+def columns(rows: np.ndarray) -> np.ndarray:
+    """(N, 3) as (3, N) float64."""
+    return np.ascontiguousarray(rows.T, np.float64)
+
+
+def inverse_rows(d: np.ndarray, e1: np.ndarray, e2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of [d, -e1, -e2]^-1, (3, 3, N), 0 where there is none, and where there is one (N,)."""
+    adjugate = np.stack([_cross(e1, e2), _cross(d, e2), _cross(e1, d)])
+    with np.errstate(all="ignore"):
+        inverse = adjugate / (d * adjugate[0]).sum(axis=0)
+    exists = np.isfinite(inverse).all(axis=(0, 1))
+    inverse[..., ~exists] = 0.0
+    return inverse, exists
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of columns; np.cross takes longer."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

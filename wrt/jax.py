@@ -1,0 +1,66 @@
+"""Closest hits with gradients for JAX: `wrt.jax.closest_hit`."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from wrt.accel.geometry import Geometry
+from wrt.accel.gradients import Cotangents, HitTensors, adjoint, hits_of, library
+from wrt.core.errors import InputError
+
+
+def closest_hit(accel: Any, vertices: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf, *,
+                rebuild_at: float = 2.0) -> HitTensors:
+    """As wrt.torch.closest_hit, for arrays of JAX, also in jax.jit, jax.grad and jax.vmap: a callback on the host asks the
+    structure, which is a constant there. (JAX wraps an error that the callback raises.)"""
+    jnp = library("jax", "jax.numpy")
+    given = (jnp.asarray(each) for each in (() if vertices is None else (vertices,)) + (origins, directions))
+    *shape, o, d = (each.astype(np.float32) if each.dtype.kind in "iu" else each for each in given)
+    if o.shape != d.shape or o.shape[1:] != (3,):
+        raise InputError(f"origins and directions must both be (N, 3), got {o.shape} and {d.shape}")
+    ends = (jnp.asarray(each, np.float32) for each in (t_min, t_max))
+    return _function()(accel, rebuild_at, *shape or [None], o, d, *ends)
+
+
+@cache
+def _function() -> Any:
+    """With a custom derivative, of arrays: vertices (or None), origins, directions, t_min and t_max."""
+    jax = library("jax")
+
+    def on_host(function: Any, shapes: Any, *arrays: Any) -> Any:
+        return jax.pure_callback(lambda *each: function(*jax.tree.map(np.asarray, each)), shapes, *arrays, vmap_method="sequential")
+
+    def closest_hit(accel: Any, rebuild_at: float, vertices: Any, *rays: Any) -> HitTensors:
+        def ask(vertices: Any, *rays: Any) -> HitTensors:
+            hits = hits_of(accel, vertices, rays, rebuild_at)
+            return HitTensors(hits.t, hits.u, hits.v, hits.point, hits.prim_id)
+
+        n = len(rays[0])
+        one, three, index = (jax.ShapeDtypeStruct(*each) for each in (((n,), np.float32), ((n, 3), np.float32), ((n,), np.int32)))
+        return on_host(ask, HitTensors(one, one, one, three, index), vertices, *rays)
+
+    def forward(accel: Any, rebuild_at: float, *given: Any) -> tuple[HitTensors, Any]:
+        hits = closest_hit(accel, rebuild_at, *given)
+        return hits, (*given, hits.prim_id)
+
+    def backward(accel: Any, rebuild_at: float, kept: Any, cotangents: HitTensors) -> Any:
+        vertices, origins, directions, *ends, prim_id = kept
+        leaves = vertices, origins, directions
+
+        def ask(leaves: Any, prim_id: Any, cotangents: Any) -> Any:
+            vertices, origins, directions = leaves
+            shape = accel.geometry
+            if vertices is not None:
+                shape = Geometry(vertices.astype(np.float32), shape.faces, shape.spheres)
+            found = adjoint(shape, origins, directions, prim_id, Cotangents(*cotangents))
+            return tuple(leaf if leaf is None else each.astype(leaf.dtype) for each, leaf in zip(found, leaves, strict=True))
+
+        shapes = jax.tree.map(lambda each: jax.ShapeDtypeStruct(each.shape, each.dtype), leaves)
+        return *on_host(ask, shapes, leaves, prim_id, cotangents[:4]), *(each * 0.0 for each in ends)
+
+    function = jax.custom_vjp(closest_hit, nondiff_argnums=(0, 1))
+    function.defvjp(forward, backward)
+    return function

@@ -1,0 +1,48 @@
+"""Closest hits with gradients for torch: `wrt.torch.closest_hit`."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from wrt.accel.gradients import Cotangents, HitTensors, adjoint, hits_of, library
+
+
+def closest_hit(accel: Any, vertices: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf, *,
+                rebuild_at: float = 2.0) -> HitTensors:
+    """The closest hit of each ray, with gradients of t, u, v and point at fixed prim_id in vertices, origins and directions.
+
+    accel: a structure over one mesh, which follows `vertices`, (V, 3), where they are not those it has (Accelerator.refit, as
+    rebuild_at is); None: it stays. All else as in Accelerator.closest_hit: tensors of torch, on the CPU or a GPU, taken as float32.
+    Gradients (wrt.accel.gradients.adjoint) are computed in float64 on the CPU, and have the same bits each time; those of a miss
+    are 0. There are no second derivatives. Raises InputError that names the argument, and where torch is not installed.
+    """
+    torch = library("torch")
+    given = (each if each is None else torch.as_tensor(each) for each in (vertices, origins, directions))
+    return HitTensors(*_function().apply(accel, rebuild_at, t_min, t_max, *given))
+
+
+@cache
+def _function() -> Any:
+    torch = library("torch")
+
+    def forward(ctx: Any, accel: Any, rebuild_at: float, t_min: Any, t_max: Any, *given: Any) -> tuple[Any, ...]:
+        vertices, *rays = (each if each is None else each.detach() for each in given)
+        hits = hits_of(accel, vertices, (*rays, t_min, t_max), rebuild_at)
+        ctx.geometry = hits.source[1].geometry
+        ctx.leaves = [each if each is None else (each.device, each.dtype) for each in given]
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(hits.prim_id)
+        ctx.save_for_backward(*rays, hits.prim_id)  # torch tells if one was written to meanwhile
+        return hits.t, hits.u, hits.v, hits.point, hits.prim_id
+
+    def backward(ctx: Any, *cotangents: Any) -> tuple[Any, ...]:
+        origins, directions, prim_id = ctx.saved_tensors
+        found = adjoint(ctx.geometry, origins, directions, prim_id, Cotangents(*cotangents[:4]))
+        leaves = zip(found, ctx.leaves, strict=True)
+        return None, None, None, None, *(leaf and torch.from_numpy(each).to(*leaf) for each, leaf in leaves)
+
+    methods = {"forward": forward, "backward": torch.autograd.function.once_differentiable(backward)}
+    return type("ClosestHit", (torch.autograd.Function,), {name: staticmethod(each) for name, each in methods.items()})
