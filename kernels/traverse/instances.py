@@ -155,4 +155,5 @@ def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any)
                        enter(ray.box, node.lo_1, node.hi_1, ray.slack, t_max))
 
     volumes = Volumes(struct, Bvh2Node, set_up, enter_both)
-    return make_binary_traversal(units._replace(instances=False), volumes, any_hit, visit=visit)
+    # The lower walk may have its stack in shared memory, and this one goes on behind it.
+    return make_binary_traversal(units._replace(instances=False, stack="local"), volumes, any_hit, visit=visit)

@@ -9,6 +9,7 @@
 
 #define __global__
 #define __device__
+#define __shared__ static  // one thread runs after another: each finds what it wrote itself
 #define __forceinline__ inline
 #define __launch_bounds__(...)
 
