@@ -18,6 +18,7 @@ from wrt.kernels.units.box import BoxRay
 
 # Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
 STACK_SIZE = 64
+ENTRY = 12  # bytes
 
 
 @wp.struct
@@ -91,8 +92,8 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
     struct, set_up, enter = volumes.struct, volumes.set_up, volumes.enter
     fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(volumes.node))
     # Where a child begins and its t, and how many primitives it has.
-    new_keys, shared_keys, put_key, key_at = make_stack(units.stack, STACK_SIZE, wp.uint64)
-    new_counts, shared_counts, put_count, count_at = make_stack(units.stack, STACK_SIZE, wp.int32)
+    new_keys, shared_keys, put_key, key_at = make_stack(units.stack, STACK_SIZE, wp.uint64, ENTRY)
+    new_counts, shared_counts, put_count, count_at = make_stack(units.stack, STACK_SIZE, wp.int32, ENTRY)
 
     @wp.func
     def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:

@@ -1,7 +1,7 @@
 """The stack of a walk. On the CPU, and with the place "local" on CUDA, it is a vector of the thread's own. With the place "shared",
-CUDA has its first SHORT entries in the memory that a block's threads share, and only what is above them in that vector.
+CUDA has its first entries in the memory that a block's threads share, and only what is above them in that vector.
 
-Most rays never have more than SHORT (docs/acceleration.md, "Structure and blocks on a GPU"). Aila and Laine 2009,
+Most rays never have more (docs/acceleration.md, "Structure and blocks on a GPU"). Aila and Laine 2009,
 "Understanding the Efficiency of Ray Traversal on GPUs"; Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs
 Through Compressed Wide BVHs".
 """
@@ -14,7 +14,7 @@ import warp as wp
 from wrt.kernels.native import source
 
 PLACES = ("local", "shared")
-SHORT = 8
+SHARED = 64  # bytes of a thread there: with more, a T4 would hold fewer warps
 
 
 class Stack(NamedTuple):
@@ -38,10 +38,11 @@ def make_uninitialized(length: int, dtype: Any) -> Any:
 
 
 @cache
-def make_stack(place: str, size: int, dtype: Any) -> Stack:
-    """A stack of `size` numbers of that type. One place and type have one piece of shared memory."""
+def make_stack(place: str, size: int, dtype: Any, entry_bytes: int) -> Stack:
+    """A stack of `size` numbers of that type, alone or beside others, with which an entry has so many bytes. One place and type
+    have one piece of shared memory."""
     vector = wp.types.vector(size, dtype)
-    names: dict[str, Any] = {"SHORT": SHORT if place == "shared" else 0, "TYPE": f"wp::{dtype.__name__}"}
+    names: dict[str, Any] = {"SHORT": SHARED // entry_bytes if place == "shared" else 0, "TYPE": f"wp::{dtype.__name__}"}
 
     @wp.func_native(source("traverse/stack_shared.h", **names))
     def shared() -> wp.uint64: ...

@@ -134,7 +134,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compre
     call_in = make_call_in(record, width, compressed, 2)
     references = first_reference(width, compressed)
     unit = 1 if compressed else width  # of primitives, in which references count
-    new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64)
+    new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
 
     @wp.func
     def child(accel: struct, at: int) -> int:
