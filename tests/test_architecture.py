@@ -36,7 +36,7 @@ BELOW_KERNELS = {
     "native": set(),
     "structs": set(),
     "units": {"structs"},
-    "traverse": {"units", "structs"},
+    "traverse": {"native", "units", "structs"},
     "query": {"traverse", "units", "structs"},
     "ray_query": {"query", "traverse", "units", "structs"},
     "wide": {"native", "query", "traverse", "units", "structs"},

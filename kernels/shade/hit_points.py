@@ -128,8 +128,8 @@ def drawn_in(found: Found, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> Found:
     v = wp.dot(found.normal, wp.cross(e1, way)) / square
     if u >= wp.float64(0.0) and v >= wp.float64(0.0) and u + v <= wp.float64(1.0):
         return found
-    u = wp.max(u, wp.float64(0.0))
-    v = wp.max(v, wp.float64(0.0))
+    u = wp.max(wp.float64(0.0), u)  # in this order 0 comes of -0 on the CPU as on CUDA
+    v = wp.max(wp.float64(0.0), v)
     over = wp.max(u + v, wp.float64(1.0))
     out = found
     out.point = v0 + (u / over) * e1 + (v / over) * e2

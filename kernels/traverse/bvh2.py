@@ -13,10 +13,12 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, add_counts, make_counters
+from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
 from wrt.kernels.units.box import BoxRay
 
 # Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
 STACK_SIZE = 64
+ENTRY = 12  # bytes
 
 
 @wp.struct
@@ -91,6 +93,9 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
     intersect = make_intersect(units, accepts)
     struct, set_up, enter, root = volumes.struct, volumes.set_up, volumes.enter, volumes.root
     fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(volumes.node))
+    # Where a child begins and its t, and how many primitives it has.
+    new_keys, shared_keys, put_key, key_at = make_stack(units.stack, STACK_SIZE, wp.uint64, ENTRY)
+    new_counts, shared_counts, put_count, count_at = make_stack(units.stack, STACK_SIZE, wp.int32, ENTRY)
 
     @wp.func
     def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
@@ -99,9 +104,10 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
         best = no_hit(ray)
         end = best.t
         counts = Counts()
-        stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
-        stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
-        stack_t = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
+        keys = new_keys()
+        first_keys = shared_keys()
+        sizes = new_counts()
+        first_sizes = shared_counts()
         size = int(0)
         first = int(0)
         if wp.static(root is not None):
@@ -136,9 +142,9 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
                     swap = bool(False)
                     if wp.static(ordered):
                         swap = t_1 < t_0
-                    stack_first[size] = wp.where(swap, node.first_0, node.first_1)
-                    stack_count[size] = wp.where(swap, node.count_0, node.count_1)
-                    stack_t[size] = wp.where(swap, t_0, t_1)
+                    key = key_of(wp.where(swap, t_0, t_1), wp.where(swap, node.first_0, node.first_1))
+                    put_key(keys, first_keys, size, key)
+                    put_count(sizes, first_sizes, size, wp.where(swap, node.count_0, node.count_1))
                     size = size + 1
                     counts = push(counts, size)
                     first = wp.where(swap, node.first_1, node.first_0)
@@ -157,9 +163,10 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
             while size > 0 and not found:
                 size = size - 1
                 counts.pops += 1
-                if stack_t[size] <= end:
-                    first = stack_first[size]
-                    count = stack_count[size]
+                key = key_at(keys, first_keys, size)
+                if t_of(key) <= end:
+                    first = reference_of(key)
+                    count = count_at(sizes, first_sizes, size)
                     found = True
             if not found:
                 break

@@ -13,7 +13,8 @@ from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay, triangle_ray
 class Units(NamedTuple):
     """What a traversal unit is made of: names in RAY_TRIANGLE and RAY_AABB, whether there are spheres, whether it counts, whether
     it walks instances (Ray.first_prim is then added to each prim_id), and whether it goes on behind a hit: at t_min, only
-    primitives from Ray.slot on are hit. Spheres have two hits, and cannot be gone on from."""
+    primitives from Ray.slot on are hit. Spheres have two hits, and cannot be gone on from. stack: in kernels.traverse.stack.PLACES,
+    for those who look there."""
 
     triangle: str = "watertight"
     box: str = "conservative"
@@ -21,6 +22,7 @@ class Units(NamedTuple):
     counters: bool = False
     instances: bool = False
     resumes: bool = False
+    stack: str = "local"
 
     @property
     def triangle_test(self) -> Any:

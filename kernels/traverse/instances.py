@@ -160,4 +160,5 @@ def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any)
         return ray.first_prim
 
     volumes = Volumes(struct, Bvh2Node, set_up, enter_both, root)
-    return make_binary_traversal(units._replace(instances=False), volumes, any_hit, visit=visit)
+    # The lower walk may have its stack in shared memory, and this one goes on behind it.
+    return make_binary_traversal(units._replace(instances=False, stack="local"), volumes, any_hit, visit=visit)

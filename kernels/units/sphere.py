@@ -35,8 +35,8 @@ def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
         return hit  # the origin is on the sphere and the line touches it there
     far = float(q / a)
     near = float((wp.dot(f, f) - r * r) / q)
-    t_0 = wp.min(near, far)
-    t_1 = wp.max(near, far)
+    t_0 = wp.where(near <= far, near, far)  # wp.min and wp.max of 0 and -0 are another one on CUDA than on the CPU
+    t_1 = wp.where(near >= far, near, far)
     # The corners of a small sphere's box are rounded by a good part of its radius: only the padded box surely contains it.
     extent = wp.vec3(radius, radius, radius)
     interval = padded_interval(box, center - extent, center + extent)

@@ -14,6 +14,7 @@ import warp as wp
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect
+from wrt.kernels.traverse.stack import key_of, make_uninitialized, reference_of, t_of
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
 from wrt.kernels.wide.nodes import ROW_PADS, far_pad, first_reference, node_size
@@ -52,14 +53,10 @@ from wrt.kernels.wide.references import leaf_count, leaf_first
 from wrt.kernels.wide.traverse import (
     STACK_SIZE,
     WideTraversal,
-    key_of,
     make_call_in,
     make_gather,
     make_struct,
-    make_uninitialized,
-    reference_of,
     row_size,
-    t_of,
 )
 
 NODE = node_size(WIDTH, False)

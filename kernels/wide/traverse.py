@@ -18,6 +18,7 @@ from wrt.kernels.query import LARGEST
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
 from wrt.kernels.units.triangle import component
 from wrt.kernels.wide.lanes import LaneRay, bits, lowest, make_cull, prefetch
 from wrt.kernels.wide.nodes import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, far_pad, first_reference, make_children, node_size
@@ -45,35 +46,6 @@ def make_struct(record: Any) -> Any:
 def row_size(record: Any, width: int) -> int:
     """Numbers of a row of primitives."""
     return record.numpy_dtype()["itemsize"] // 4 * width
-
-
-@cache
-def make_uninitialized(length: int, dtype: Any) -> Any:
-    """A vector of whatever memory holds: Warp sets every new one to 0, and of a stack's 512 bytes most rays use a few."""
-
-    @wp.func_native(source("wide/uninitialized.h", TYPE=f"wp::vec_t<{length}, wp::{dtype.__name__}>"))
-    def uninitialized() -> wp.types.vector(length, dtype): ...
-
-    return uninitialized
-
-
-empty_stack = make_uninitialized(STACK_SIZE, wp.uint64)
-
-
-@wp.func
-def key_of(t: float, reference: int) -> wp.uint64:
-    """An entry of the stack: sorted by t, which is never below 0 nor -0."""
-    return (wp.uint64(wp.cast(t, wp.uint32)) << wp.uint64(32)) | wp.uint64(wp.cast(reference, wp.uint32))
-
-
-@wp.func
-def reference_of(key: wp.uint64) -> int:
-    return wp.cast(wp.uint32(key & wp.uint64(0xFFFFFFFF)), wp.int32)
-
-
-@wp.func
-def t_of(key: wp.uint64) -> float:
-    return wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)
 
 
 @wp.func
@@ -162,6 +134,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compre
     call_in = make_call_in(record, width, compressed, 2)
     references = first_reference(width, compressed)
     unit = 1 if compressed else width  # of primitives, in which references count
+    new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
 
     @wp.func
     def child(accel: struct, at: int) -> int:
@@ -220,7 +193,8 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compre
         best = no_hit(ray)
         best.t = wp.where(best.t < LARGEST, best.t, LARGEST)  # a box that is entered at infinity is not entered
         counts = Counts()
-        stack = empty_stack()
+        stack = new_stack()
+        shared = shared_stack()
         size = int(0)
         reference = int(0)
         while True:
@@ -245,18 +219,18 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compre
                         mask = mask & (mask - 1)
                         key = key_of(t[lane], child(accel, first + lane))
                         if wp.static(any_hit):
-                            stack[size] = near
+                            put(stack, shared, size, near)
                             near = key
                         else:
                             far = wp.max(near, key)
                             near = wp.min(near, key)
                             # Not sorted, but the farthest so far is deeper than this one: most nodes have two or three.
                             if size > begin:
-                                under = stack[size - 1]
-                                stack[size] = wp.min(far, under)
-                                stack[size - 1] = wp.max(far, under)
+                                under = get(stack, shared, size - 1)
+                                put(stack, shared, size, wp.min(far, under))
+                                put(stack, shared, size - 1, wp.max(far, under))
                             else:
-                                stack[size] = far
+                                put(stack, shared, size, far)
                         size = size + 1
                         counts = push(counts, size)
                     reference = reference_of(near)
@@ -266,7 +240,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compre
             while size > 0 and not found:
                 size = size - 1
                 counts = count_pop(counts)
-                key = stack[size]
+                key = get(stack, shared, size)
                 if t_of(key) <= best.t:
                     reference = reference_of(key)
                     found = True

@@ -9,7 +9,8 @@ and Warp's Python finds `cuda:0`, `cuda:1` ... So the host code for CUDA and the
 It finds: a kernel that gets an array of another device, of the host (or on the CPU, of a device) or a freed one: VirtualGpuError
 names the argument; other host code that reads device memory (a segmentation fault: pages are closed while no kernel runs); kernels
 that leave their arrays (likewise) or read what nobody wrote (0xA5); what depends on the order of threads (it is random, by a seed);
-CUDA branches that do not compile, or say something else. It counts launches, copies and synchronisations.
+CUDA branches that do not compile, or say something else; the signs of zeros by fminf and fmaxf. It counts
+launches, copies and synchronisations.
 
 It does not find: what NVIDIA's compilers and driver do; speed; a wait that lacks (each call is done when it returns); races
 (threads run one after another). A graph is what its capture recorded, and what cannot be captured is an error. Of Warp's own CUDA

@@ -9,6 +9,7 @@
 
 #define __global__
 #define __device__
+#define __shared__ static  // one thread runs after another: each finds what it wrote itself
 #define __forceinline__ inline
 #define __launch_bounds__(...)
 
@@ -30,6 +31,42 @@ inline int __clz(int mask) { return mask ? __builtin_clz(mask) : 32; }
 inline float __int_as_float(int bits) { return __builtin_bit_cast(float, bits); }
 inline void __threadfence() {}
 inline int __float_as_int(float number) { return __builtin_bit_cast(int, number); }
+
+// CUDA's fminf and fmaxf take -0 for less than 0, and Warp's form for the CPU takes the first of two that are equal.
+namespace wp {
+template <class T> inline T cuda_min(T a, T b) { return min(a, b); }
+template <class T> inline T cuda_max(T a, T b) { return max(a, b); }
+inline float cuda_min(float a, float b) { return a == b && __builtin_signbit(b) ? b : min(a, b); }
+inline float cuda_max(float a, float b) { return a == b && !__builtin_signbit(b) ? b : max(a, b); }
+inline double cuda_min(double a, double b) { return a == b && __builtin_signbit(b) ? b : min(a, b); }
+inline double cuda_max(double a, double b) { return a == b && !__builtin_signbit(b) ? b : max(a, b); }
+template <unsigned N, class T> inline vec_t<N, T> cuda_min(vec_t<N, T> a, vec_t<N, T> b)
+{
+    for (unsigned i = 0; i < N; ++i) a[i] = cuda_min(a[i], b[i]);
+    return a;
+}
+template <unsigned N, class T> inline vec_t<N, T> cuda_max(vec_t<N, T> a, vec_t<N, T> b)
+{
+    for (unsigned i = 0; i < N; ++i) a[i] = cuda_max(a[i], b[i]);
+    return a;
+}
+template <unsigned N, class T> inline T cuda_min(vec_t<N, T> a)
+{
+    T out = a[0];
+    for (unsigned i = 1; i < N; ++i) out = cuda_min(out, a[i]);
+    return out;
+}
+template <unsigned N, class T> inline T cuda_max(vec_t<N, T> a)
+{
+    T out = a[0];
+    for (unsigned i = 1; i < N; ++i) out = cuda_max(out, a[i]);
+    return out;
+}
+template <class T> inline T cuda_clamp(T x, T a, T b) { return cuda_min(cuda_max(a, x), b); }
+}
+#define min cuda_min
+#define max cuda_max
+#define clamp cuda_clamp
 
 namespace virtual_gpu {
 

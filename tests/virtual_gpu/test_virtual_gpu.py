@@ -70,6 +70,35 @@ def number(out: wp.array(dtype=int)):
     out[wp.tid()] = wp.tid()
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ int mine[WP_TILE_BLOCK_DIM];
+    mine[threadIdx.x] = i;
+    return mine[threadIdx.x];
+#else
+    return -1;
+#endif
+""")
+def through_shared_memory(i: int) -> int: ...
+
+
+@wp.kernel(enable_backward=False)
+def share(out: wp.array(dtype=int)):
+    out[wp.tid()] = through_shared_memory(wp.tid())
+
+
+@wp.kernel(enable_backward=False)
+def bound(x: wp.array(dtype=float), y: wp.array(dtype=float), out: wp.array2d(dtype=float)):
+    i = wp.tid()
+    out[i, 0] = wp.min(x[i], y[i])
+    out[i, 1] = wp.max(x[i], y[i])
+    out[i, 2] = float(wp.min(wp.float64(x[i]), wp.float64(y[i])))
+    out[i, 3] = wp.max(wp.vec2(x[i], y[i]))
+    out[i, 4] = wp.min(wp.vec2(x[i], 1.0), wp.vec2(y[i], 1.0))[0]
+    out[i, 5] = wp.clamp(y[i], x[i], 1.0)
+    out[i, 6] = float(wp.max(int(x[i]), 7))
+
+
 def noted(n: int = 300) -> list[wp.array]:
     arrays = [wp.zeros(shape, dtype=int, device="cuda:0") for shape in (1, 2, n, (n, 3))]
     wp.launch(note, (n, 3), arrays, device="cuda:0")
@@ -209,3 +238,22 @@ def test_what_a_gpu_alone_could_do_is_refused() -> None:
 def test_binaries_for_real_gpus_are_still_nvidias(tmp_path: Path) -> None:
     binary = Path(wp.compile_aot_module(wave.module, arch=75, module_dir=tmp_path)[0])
     assert binary.suffix == ".cubin" and binary.read_bytes()[18:20] == b"\xbe\x00"  # EM_CUDA, the machine of an ELF file
+
+
+def test_threads_of_a_block_have_shared_memory() -> None:
+    out = wp.zeros(200, dtype=int, device="cuda:0")
+    wp.launch(share, 200, [out], device="cuda:0", block_dim=64)
+    assert (out.numpy() == np.arange(200)).all()
+
+
+def test_of_two_zeros_the_less_is_the_negative_one() -> None:
+    """As CUDA's fminf and fmaxf have it, and not Warp's form for the CPU."""
+    values = np.array([[0.0, -0.0], [-0.0, 0.0], [2.0, 3.0], [np.nan, 1.0], [1.0, np.nan]], np.float32)
+    x, y = (wp.array(np.ascontiguousarray(values[:, i]), dtype=float, device="cuda:0") for i in (0, 1))
+    out = wp.zeros((5, 7), dtype=float, device="cuda:0")
+    wp.launch(bound, 5, [x, y, out], device="cuda:0")
+    found = out.numpy()
+    for row, low, high, held in zip(found, (-0.0, -0.0, 2.0, 1.0, 1.0), (0.0, 0.0, 3.0, 1.0, 1.0), (0.0, 0.0, 1.0, 1.0, 1.0),
+                                    strict=True):
+        assert row[:6].tobytes() == np.array([low, high, low, high, low, held], np.float32).tobytes()
+    assert (found[:, 6] == 7.0).all()

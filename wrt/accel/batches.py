@@ -13,6 +13,7 @@ from warp._src.types import array_t  # what a kernel gets for an array; a Warp a
 from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES
 from wrt.accel.rays import Rays, rays_on
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
+from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, free_memory, launch_on, load_kernel, made_once, run_all
 from wrt.core.memory import SMALL as SMALL_BYTES
@@ -157,6 +158,7 @@ def rays_on_gpu(n: int, device: Any) -> int:
 
 def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out: list[Any], device: Any) -> None:
     """As Tracer.trace. What is Warp's is traced in one launch; what comes from the host in parts of MOST_ON_GPU."""
+    structure = structure._replace(units=structure.units._replace(stack=stack_on(device.alias)))
     kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
     n = len(out[0])
     part = n if rays.as_warp else rays_on_gpu(n, device)

@@ -36,3 +36,13 @@ def chosen(accel: str, device: str) -> str:
     from wrt.core.device import start
 
     return choice_for(start(device)).accel
+
+
+def stack_on(device: str, *, tuned: bool = True) -> str:
+    """In kernels.traverse.stack.PLACES, where kernels for a device have their stacks: what the device is tuned for, or with
+    tuned=False, which asks no device, the default. Raises InputError where there is no such device."""
+    if device == "cpu":
+        return "local"  # a CPU's threads have no other
+    from wrt.core.device import start
+
+    return (choice_for(start(device)) if tuned else DEFAULT).stack

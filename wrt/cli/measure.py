@@ -40,9 +40,11 @@ def instructions(structures: tuple[str, ...], as_json: bool) -> None:
     units, codes = study.units(), study.traversals(structures)
     Reporting(as_json=as_json).end(markdown(study.tables(units, codes)), {
         "units": [{"unit": each.unit, "test": each.test, "instructions": each.instructions, **each.classes} for each in units],
-        "traversals": {name: {"registers": code.registers, "stack": code.stack, "instructions": len(code.opcodes()),
-                              "code_bytes": len(code.code), **code.classes()}
-                       for name, code in codes.items()}})
+        "traversals": [{"structure": name, "query": query, "stack": stack, "arch": arch, "registers": code.registers,
+                        "local_bytes": code.stack, "shared_bytes": code.shared,
+                        "warps": study.resident_warps(code, arch, study.DEFAULT.block_dim), "instructions": len(code.opcodes()),
+                        "code_bytes": len(code.code), **code.classes()}
+                       for (name, query, stack, arch), code in codes.items()]})
 
 
 @click.command()

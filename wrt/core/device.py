@@ -116,7 +116,8 @@ def describe_devices() -> list[str]:
 
 def _tuned(device: Any) -> str:
     choice = kept(device)
-    return f", tuned: {choice.accel}" + (f" in blocks of {choice.block_dim}" if device.is_cuda else "") if choice else ""
+    launches = f" in blocks of {choice.block_dim}, stack {choice.stack}" if choice and device.is_cuda else ""
+    return f", tuned: {choice.accel}{launches}" if choice else ""
 
 
 def block_dim(device: Any) -> int:

@@ -28,15 +28,17 @@ from wrt.core.write_file import check_writable, replacing
 # What there is to choose from.
 STRUCTURES = ("bvh8", "bvh2", "bvh4", "bvh8c")
 BLOCK_DIMS = (64, 32, 128, 256)
+STACKS = ("shared", "local")  # kernels.traverse.stack.PLACES
 
 
 @dataclass(frozen=True)
 class Choice:
-    """accel: the structure that "bvh" means; block_dim: threads of a block of a CUDA launch. Why these are the default:
-    docs/acceleration.md, "Structure and blocks on a GPU"."""
+    """accel: the structure that "bvh" means; block_dim: threads of a block of a CUDA launch; stack: where bvh2 and the wide BVHs
+    have the first entries of theirs on CUDA. Why these are the default: docs/acceleration.md, "Structure and blocks on a GPU"."""
 
     accel: str = STRUCTURES[0]
     block_dim: int = BLOCK_DIMS[0]
+    stack: str = STACKS[0]
 
 
 DEFAULT = Choice()
@@ -125,8 +127,9 @@ def _read(folder: Path, device: str, warp: str) -> Choice | None:
         return None
     try:
         found = json.loads(read_file(path))
-        choice = Choice(found["accel"], operator.index(found["block_dim"]))
-        if found == _content(described, choice) and choice.accel in STRUCTURES and choice.block_dim in BLOCK_DIMS:
+        choice = Choice(found["accel"], operator.index(found["block_dim"]), found["stack"])
+        known = choice.accel in STRUCTURES and choice.block_dim in BLOCK_DIMS and choice.stack in STACKS
+        if known and found == _content(described, choice):
             return choice
         reason = "is no choice for this device"
     except InputError as error:

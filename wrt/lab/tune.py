@@ -1,4 +1,4 @@
-"""`wrt.tune`: which structure and which blocks are fastest on the device at hand."""
+"""`wrt.tune`: which structure, which blocks and which place for the stack are fastest on the device at hand."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from wrt.accel.geometry import Geometry
 from wrt.core.checks import as_one
 from wrt.core.device import start, thread_count
 from wrt.core.errors import InputError
-from wrt.core.tuned import BLOCK_DIMS, DEFAULT, STRUCTURES, Choice, keep, place_for, using
+from wrt.core.tuned import BLOCK_DIMS, DEFAULT, STACKS, STRUCTURES, Choice, keep, place_for, using
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled
 from wrt.lab.bench.timing import alternate, spread
@@ -29,8 +29,8 @@ KINDS = ("primary", "shadow", "diffuse")  # what a picture asks
 FAST, SLOW = 1 << 20, 1 << 15  # rays on CUDA, and on the CPU
 FEWEST, MOST = 3, 100  # runs
 MARGIN = 1.03  # so much faster than the default is what is chosen instead: less may be noise
-COLUMNS: Columns = {"structure": "{accel}", "block": "{block}", "rays": "{kind}", "Mray/s": lambda row: spread(row.mrays),
-                    "times as fast as the default": "{speed:.2f}"}
+COLUMNS: Columns = {"structure": "{accel}", "block": "{block}", "stack": "{stack}", "rays": "{kind}",
+                    "Mray/s": lambda row: spread(row.mrays), "times as fast as the default": "{speed:.2f}"}
 LEGEND = """\
 Rays and answers are on the device; median of the runs by turns, the middle half of them in brackets. The last column: the geometric
 mean over the kinds of rays."""
@@ -47,7 +47,7 @@ class Tuning:
     rows: list[Row]
 
     def text(self) -> str:
-        block = "" if self.rows[0].block == "" else f" in blocks of {self.choice.block_dim} threads"
+        block = "" if self.rows[0].block == "" else f" in blocks of {self.choice.block_dim} threads, stack {self.choice.stack}"
         found = f"Chosen: {self.choice.accel}{block}, kept in {self.path}; without that file it is the default again."
         return markdown([tabled(COLUMNS, self.rows, "Tuning", f"Machine: {self.machine}\n\n{found}\n\n{LEGEND}")])
 
@@ -57,8 +57,9 @@ class Tuning:
 
 
 def tune(device: str, seconds: float = 1.0, clock: Callable[[], float] = time.perf_counter) -> Tuning:
-    """Measure the structures of STRUCTURES, then on CUDA the winner in blocks of other sizes, for so many seconds in all (after
-    compiling and building, which take longer), and keep the best for this kind of device: "bvh" then means that structure.
+    """Measure the structures of STRUCTURES, then on CUDA the winner in blocks of other sizes and with its stack in either place,
+    for so many seconds in all (after compiling and building, which take longer), and keep the best for this kind of device: "bvh"
+    then means that structure.
 
     Hits and pixels have the same bits whatever is chosen; what a picture's stats tell of nodes and seconds changes. Raises
     InputError where there is no such device, and where the choice cannot be kept.
@@ -74,7 +75,7 @@ def tune(device: str, seconds: float = 1.0, clock: Callable[[], float] = time.pe
     rows, speeds = measured
     best = fastest(speeds)
     if there.is_cuda:
-        others = [DEFAULT, *(Choice(best.accel, block) for block in BLOCK_DIMS)]
+        others = [DEFAULT, *(Choice(best.accel, block, stack) for block in BLOCK_DIMS for stack in STACKS)]
         measured = measure(list(dict.fromkeys(others)), geometry, rays, there, seconds / phases, clock)
         rows, speeds = rows + measured[0], speeds | measured[1]
         best = fastest(measured[1])
@@ -96,7 +97,8 @@ def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet
     middle = {key: float(np.median(each)) for key, each in taken.items()}
     speeds = {choice: float(np.exp(np.mean([np.log(middle[choices[0], kind] / middle[choice, kind]) for kind in KINDS])))
               for choice in choices}
-    rows = [Row(accel=choice.accel, block=choice.block_dim if device.is_cuda else "", kind=kind, rays=len(rays[kind]),
+    rows = [Row(accel=choice.accel, block=choice.block_dim if device.is_cuda else "",
+                stack=choice.stack if device.is_cuda else "", kind=kind, rays=len(rays[kind]),
                 mrays=(len(rays[kind]) / each / 1e6).tolist(), speed=speeds[choice]) for (choice, kind), each in taken.items()]
     return rows, speeds
 

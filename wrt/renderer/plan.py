@@ -8,7 +8,7 @@ from typing import Any
 
 from wrt.accel.instancing import instanced_meshes
 from wrt.accel.structure import Structure
-from wrt.accel.structures import ACCELERATORS, chosen, meant
+from wrt.accel.structures import ACCELERATORS, chosen, meant, stack_on
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
 from wrt.kernels import structs
@@ -123,7 +123,8 @@ def plan_of(scene: Scene, options: Options) -> Plan:
     camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
     meshes = instanced_meshes(scene, options.instancing)
     features = features_of(scene, camera, meshes)
-    units = Units(options.triangle, options.box, features.spheres, instances=features.instances)
+    units = Units(options.triangle, options.box, features.spheres, instances=features.instances,
+                  stack=stack_on(options.device, tuned=alone))
     return Plan(scene, options, camera, accel, meshes, features, Structure(ACCELERATORS[accel], units),
                 _crop(scene.settings, options), scene.settings.max_depth)
 

@@ -213,3 +213,9 @@ def test_nan_misses():
         assert np.isinf(run(np.array([0.0, 0.0, -5.0]) + bad, [0.0, 0.0, 1.0], np.zeros(3), 1.0))[0]
         assert np.isinf(run([0.0, 0.0, -5.0], np.array([0.0, 0.0, 1.0]) + bad, np.zeros(3), 1.0))[0]
         assert np.isinf(run([0.0, 0.0, -5.0], [0.0, 0.0, 1.0], bad, 1.0))[0]
+
+
+def test_the_sign_of_zero_is_the_same_on_every_device() -> None:
+    """Inside a tiny sphere both crossings are rounded to 0, the one behind to -0."""
+    t = run((5e-39, 0.0, 0.0), (2.0**64, 0.0, 0.0), (0.0, 0.0, 0.0), 1e-38)
+    assert t[0] == 0.0 and not np.signbit(t[0])

@@ -13,9 +13,9 @@ import pytest
 
 from wrt.core import tuned
 from wrt.core.errors import InputError
-from wrt.core.tuned import BLOCK_DIMS, DEFAULT, STRUCTURES, Choice, cache_folder, choice_for, keep, kept, using
+from wrt.core.tuned import BLOCK_DIMS, DEFAULT, STACKS, STRUCTURES, Choice, cache_folder, choice_for, keep, kept, using
 
-OTHER = Choice("bvh2", 128)
+OTHER = Choice("bvh2", 128, "local")
 
 
 def gpu(name: str = "A", arch: int = 75, alias: str = "cuda:0") -> Any:
@@ -29,7 +29,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_choice_is_kept_for_devices_of_a_kind() -> None:
-    assert kept(gpu()) is None and choice_for(gpu()) == DEFAULT == Choice("bvh8", 64)
+    assert kept(gpu()) is None and choice_for(gpu()) == DEFAULT == Choice("bvh8", 64, "shared")
     keep(gpu(), OTHER)
     assert kept(gpu()) == OTHER == choice_for(gpu(alias="cuda:1"))
     for device in (gpu("B"), gpu(arch=90), SimpleNamespace(name="A", alias="cpu", is_cuda=False)):
@@ -50,7 +50,8 @@ def test_another_version_has_nothing_kept(module: str, monkeypatch: pytest.Monke
 def test_the_file_is_small_and_says_what_it_is_for(folder: Path) -> None:
     path = keep(gpu(), OTHER)
     assert list(folder.iterdir()) == [path] and path.stat().st_size < 300
-    assert json.loads(path.read_text()).items() >= {"device": "A, sm_75", "accel": "bvh2", "block_dim": 128}.items()
+    expected = {"device": "A, sm_75", "accel": "bvh2", "block_dim": 128, "stack": "local"}
+    assert json.loads(path.read_text()).items() >= expected.items()
 
 
 def test_it_is_written_whole_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,7 +69,8 @@ def test_it_is_written_whole_or_not_at_all(folder: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("content", [
     "", "{", "[]", "7", "[" * 100_000, '{"accel": "bvh4", "block_dim": 64}', {"accel": "grid"}, {"accel": ["bvh4"]},
-    {"block_dim": 96}, {"block_dim": 64.0}, {"block_dim": None}, {"device": "B, sm_75"}, {"more": 1}],
+    {"block_dim": 96}, {"block_dim": 64.0}, {"block_dim": None}, {"stack": "heap"}, {"stack": 0}, {"device": "B, sm_75"},
+    {"more": 1}],
     ids=lambda content: str(content)[:24])
 def test_a_file_that_is_no_choice_is_told_once_and_not_used(content: Any) -> None:
     """content: all of it, or what is different in it."""
@@ -120,6 +122,7 @@ def test_where_caches_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
 
 def test_the_default_is_among_what_is_measured() -> None:
     from wrt.accel.structures import ACCELERATORS, meant
+    from wrt.kernels.traverse.stack import PLACES
 
-    assert DEFAULT == Choice(STRUCTURES[0], BLOCK_DIMS[0])
+    assert DEFAULT == Choice(STRUCTURES[0], BLOCK_DIMS[0], STACKS[0]) and set(STACKS) == set(PLACES)
     assert ACCELERATORS["bvh"] is ACCELERATORS[meant("bvh")] and set(STRUCTURES) <= ACCELERATORS.keys()

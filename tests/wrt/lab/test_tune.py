@@ -14,7 +14,7 @@ import warp as wp
 import wrt
 from tests import device
 from tests.command_line import wrt as run
-from wrt.accel.structures import chosen
+from wrt.accel.structures import chosen, stack_on
 from wrt.core.device import block_dim, describe_devices, launch_on, start
 from wrt.core.errors import InputError
 from wrt.core.tuned import DEFAULT, Choice, kept, using
@@ -27,7 +27,7 @@ from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene
 
-Costs = dict[tuple[str, int], float]  # seconds of a query, by structure and block; 1 where nothing is said
+Costs = dict[Choice, float]  # seconds of a query; 1 where nothing is said
 RAYS = np.zeros((9, 3), np.float32) + np.array([0.1, 0.2, 5.0], np.float32), np.full((9, 3), -1.0, np.float32) * (0.0, 0.0, 1.0)
 
 
@@ -44,7 +44,7 @@ def tuned_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Costs
 
         def slow(choice: Choice, search: Any, there: Any) -> None:
             ask(choice, search, there)
-            now[0] += costs.get((choice.accel, choice.block_dim), 1.0)
+            now[0] += costs.get(choice, 1.0)
 
         monkeypatch.setattr(tuning, "ask", slow)
         return tune(device.NAME, clock=lambda: now[0])
@@ -56,10 +56,11 @@ def test_the_fastest_is_kept_and_taken(tuned_by: Callable[[Costs], Any]) -> None
     there = start(device.NAME)
     before = wrt.build(shapes.icosphere(2)).closest_hit(*RAYS)
     assert chosen("bvh", device.NAME) == "bvh8" and kept(there) is None
-    tuning_of = tuned_by({("bvh2", 64): 0.5, ("bvh2", 32): 0.25})
-    block = 32 if there.is_cuda else 64
-    assert tuning_of.choice == Choice("bvh2", block) == kept(there) and tuning_of.path.is_file()
-    assert tuning_of.speeds[DEFAULT] == 1.0 and tuning_of.speeds[Choice("bvh2", block)] == (4.0 if there.is_cuda else 2.0)
+    tuning_of = tuned_by({Choice("bvh2"): 0.5, Choice("bvh2", 32): 0.4, Choice("bvh2", 32, "local"): 0.25})
+    best = Choice("bvh2", 32, "local") if there.is_cuda else Choice("bvh2")
+    assert tuning_of.choice == best == kept(there) and tuning_of.path.is_file()
+    assert tuning_of.speeds[DEFAULT] == 1.0 and tuning_of.speeds[best] == (4.0 if there.is_cuda else 2.0)
+    assert stack_on(device.NAME) == "local" and stack_on("cuda:0", tuned=False) == "shared"
     assert block_dim(there) == (32 if there.is_cuda else 1)
     assert chosen("bvh", device.NAME) == "bvh2" and chosen("bvh4", device.NAME) == "bvh4"
     assert any(line.startswith(f"{device.NAME}: ") and ", tuned: bvh2" in line for line in describe_devices())
@@ -74,20 +75,21 @@ def test_the_fastest_is_kept_and_taken(tuned_by: Callable[[Costs], Any]) -> None
 
 
 def test_what_is_not_clearly_faster_is_not_taken(tuned_by: Callable[[Costs], Any]) -> None:
-    assert tuned_by({("bvh2", 64): 0.98, ("bvh2", 32): 0.98, ("bvh8", 32): 0.98}).choice == DEFAULT
+    assert tuned_by({Choice("bvh2"): 0.98, Choice("bvh2", 32): 0.98, Choice("bvh8", 32): 0.98}).choice == DEFAULT
 
 
 def test_pictures_take_it_where_they_end_here(tuned_by: Callable[[Costs], Any], tmp_path: Path) -> None:
     scene = Scene(objects=(Object(shapes.icosphere(1), (Material(),)),), cameras=(Camera(),))
-    tuned_by({("bvh2", 64): 0.5})
+    tuned_by({Choice("bvh2"): 0.5, Choice("bvh2", 64, "local"): 0.1})
 
     def plan(**options: Any) -> Any:
         return plan_of(scene, Options(device=device.NAME, **options))
 
     assert plan().accel == "bvh2" == plan().structure.accel.name
-    assert plan(accel="bvh4").accel == "bvh4"
+    assert plan(accel="bvh4").accel == "bvh4" and plan().structure.units.stack == "local"
     # A checkpoint may be gone on with by another device.
-    assert plan(checkpoint=tmp_path / "a.checkpoint").accel == "bvh8"
+    alone = plan(checkpoint=tmp_path / "a.checkpoint")
+    assert alone.accel == "bvh8" and alone.structure.units.stack == ("shared" if start(device.NAME).is_cuda else "local")
 
 
 def test_the_command(tuned_by: Callable[[Costs], Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

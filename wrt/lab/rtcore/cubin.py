@@ -40,12 +40,13 @@ _REGISTERS, _FRAME = 0x2F, 0x11  # entries of .nv.info: registers a thread, byte
 @dataclass(frozen=True)
 class KernelCode:
     """name: the kernel's; code: its instructions; registers: a thread; stack: bytes a thread of local memory for arrays and
-    spills."""
+    spills; shared: bytes a block of the memory that its threads share."""
 
     name: str
     code: bytes
     registers: int
     stack: int
+    shared: int = 0
 
     def opcodes(self) -> list[int]:
         """The operation of each instruction, without what stands behind the end: a branch to itself, and padding."""
@@ -94,7 +95,9 @@ def _read(data: bytes) -> dict[str, KernelCode]:
         if name.startswith(".text."):
             kernel = name.removeprefix(".text.")
             number = labels.index(kernel)
-            out[kernel] = KernelCode(kernel, content(section), facts.get((_REGISTERS, number), 0), facts.get((_FRAME, number), 0))
+            shared = by_name.get(f".nv.shared.{kernel}")
+            out[kernel] = KernelCode(kernel, content(section), facts.get((_REGISTERS, number), 0), facts.get((_FRAME, number), 0),
+                                     shared[5] if shared else 0)
     return out
 
 

@@ -19,7 +19,9 @@ from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start
 from wrt.core.errors import InputError
+from wrt.core.tuned import DEFAULT, STACKS
 from wrt.kernels.study.unit_probes import make_box_probe, make_triangle_probe, numbers_of
+from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench.report import Columns, Part, Row, tabled
@@ -27,6 +29,8 @@ from wrt.lab.rtcore.cubin import CLASSES, KernelCode, read_cubin
 
 ARCH = 75
 ARCHS = (75, 90)  # of the traversals
+REGISTERS = 65536  # of an SM, in four parts; a warp gets them by 256
+SMS = {75: (64 << 10, 16, 32), 90: (228 << 10, 32, 64)}  # by architecture: shared bytes, blocks and warps that an SM has room for
 QUERIES = {"closest hit": closest_hit_kernel, "any hit": any_hit_kernel}
 FEW, MANY = 8, 16  # so many that the compiler holds the body once, and does not unroll the loop over the grid around it
 # What a kernel with a unit does to add up its own results: one addition for a box, three and a selection for a triangle. One that
@@ -48,13 +52,27 @@ class UnitCode:
         return sum(self.classes.values())
 
 
-def compiled(kernel: Any, arch: int = ARCH) -> KernelCode:
-    """The kernel's machine code, by default for Turing."""
+def compiled(kernel: Any, arch: int = ARCH, block_dim: int | None = None) -> KernelCode:
+    """The kernel's machine code, by default for Turing and Warp's own blocks."""
     start("cpu")
-    with tempfile.TemporaryDirectory() as folder:
-        (binary,) = wp.compile_aot_module(kernel.module, arch=arch, module_dir=folder)
-        (code,) = read_cubin(Path(binary).read_bytes()).values()
+    options = kernel.module.options
+    before = options["block_dim"]
+    options["block_dim"] = block_dim or before
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            (binary,) = wp.compile_aot_module(kernel.module, arch=arch, module_dir=folder)
+            (code,) = read_cubin(Path(binary).read_bytes()).values()
+    finally:
+        options["block_dim"] = before
     return code
+
+
+def resident_warps(code: KernelCode, arch: int, block_dim: int) -> int:
+    """How many warps an SM holds at a time: what registers, shared memory and blocks leave room for."""
+    shared, blocks, most = SMS[arch]
+    warps = block_dim // 32
+    by_registers = 4 * (REGISTERS // 4 // (-(-code.registers * 32 // 256) * 256))
+    return warps * min(by_registers // warps, shared // max(code.shared, 1), blocks, most // warps)
 
 
 def of_one(few: KernelCode, many: KernelCode) -> dict[str, float]:
@@ -87,10 +105,10 @@ def units() -> list[UnitCode]:
     return [box_unit(test) for test in RAY_AABB] + [triangle_unit(test) for test in RAY_TRIANGLE]
 
 
-def traversals(names: Sequence[str]) -> dict[str, KernelCode]:
-    """The queries' kernels of each structure, for each of ARCHS."""
-    return {f"{name} {query}, sm_{arch}": compiled(make(Structure(ACCELERATORS[name])), arch)
-            for name in names for query, make in QUERIES.items() for arch in ARCHS}
+def traversals(names: Sequence[str]) -> dict[tuple[str, str, str, int], KernelCode]:
+    """The queries' kernels in the default's blocks, by structure, query, place of the stack and architecture."""
+    return {(name, query, stack, arch): compiled(make(Structure(ACCELERATORS[name], Units(stack=stack))), arch, DEFAULT.block_dim)
+            for name in names for query, make in QUERIES.items() for stack in STACKS for arch in ARCHS}
 
 
 SOFTWARE_LEGEND = """\
@@ -99,14 +117,16 @@ Turing, is for hard cases and stands once in a kernel, in a function: the traver
 box or the triangle, the stack and the loop are left out of the units."""
 
 
-def tables(units: Sequence[UnitCode], codes: dict[str, KernelCode]) -> list[Part]:
+def tables(units: Sequence[UnitCode], codes: dict[tuple[str, str, str, int], KernelCode]) -> list[Part]:
     shown = [name for name in (*CLASSES, "other") if any(abs(unit.classes[name]) > 0.01 for unit in units)]
-    lines = [(name, str(code.registers), str(code.stack), str(len(code.opcodes())),
-              *(str(code.classes()[each]) for each in (*CLASSES, "other"))) for name, code in codes.items()]
+    lines = [(name, query, stack, f"sm_{arch}", str(code.registers), str(code.stack), str(code.shared),
+              str(resident_warps(code, arch, DEFAULT.block_dim)), str(len(code.opcodes())),
+              *(str(code.classes()[each]) for each in (*CLASSES, "other"))) for (name, query, stack, arch), code in codes.items()]
     return [
         tabled({"unit": "{unit}", "test": "{test}", "instructions": lambda unit: f"{unit.instructions:.0f}",
                 **{name: f"{{classes[{name}]:.0f}}" for name in shown}}, units),
-        Part("", "", ("traversal", "registers", "stack bytes", "instructions", *CLASSES, "other"), lines),
+        Part("", "", ("traversal", "query", "stack", "for", "registers", "local bytes", "shared bytes of a block", "warps of an SM",
+                      "instructions", *CLASSES, "other"), lines),
         Part("", SOFTWARE_LEGEND)]
 
 

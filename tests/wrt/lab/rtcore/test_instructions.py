@@ -7,11 +7,15 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from wrt.accel.structure import Structure, closest_hit_kernel
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
+from wrt.kernels.traverse.common import Units
+from wrt.kernels.traverse.stack import PLACES, SHARED
 from wrt.lab.bench.report import markdown, tabled
 from wrt.lab.rtcore import instructions
-from wrt.lab.rtcore.cubin import CLASSES, OPERATIONS, read_cubin
-from wrt.lab.rtcore.instructions import SOFTWARE, UnitCode, box_unit, compiled, of_one, software, tables
+from wrt.lab.rtcore.cubin import CLASSES, OPERATIONS, KernelCode, read_cubin
+from wrt.lab.rtcore.instructions import SOFTWARE, UnitCode, box_unit, compiled, of_one, resident_warps, software, tables
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -66,3 +70,20 @@ def test_software_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     row = software("made", 100.0, 5.0, 0.5)
     assert row.instructions == 4000.0 and row.rays_per_second == pytest.approx(28 * 128 * 1.582e9 / 8000.0)
     assert row.share == pytest.approx(8000.0 / 5154.0, rel=1e-3) and "8000" in markdown([tabled(SOFTWARE, [row])])
+
+
+@pytest.mark.parametrize(("registers", "shared", "arch", "block", "warps"), [
+    (80, 0, 75, 64, 24), (80, 0, 75, 256, 24), (72, 0, 75, 64, 28), (72, 0, 75, 256, 24), (84, 0, 75, 64, 20), (80, 0, 90, 64, 24),
+    (16, 0, 75, 32, 16), (16, 0, 75, 64, 32), (16, 0, 90, 32, 32), (16, 0, 90, 64, 64), (80, 4352, 75, 64, 24),
+    (80, 6400, 75, 64, 20), (80, 6400, 90, 64, 24)])
+def test_warps_of_an_sm_by_hand(registers: int, shared: int, arch: int, block: int, warps: int) -> None:
+    assert resident_warps(KernelCode("", b"", registers, 0, shared), arch, block) == warps
+
+
+def test_what_a_stack_in_shared_memory_costs() -> None:
+    """Neither registers nor warps; the memory that it is given; some instructions."""
+    here, there = (compiled(closest_hit_kernel(Structure(ACCELERATORS["bvh"], Units(stack=place))), 75, 64) for place in PLACES)
+    assert PLACES == ("local", "shared") and here.operations()["LDS"] == 0 < there.operations()["LDS"]
+    assert there.shared - here.shared == 64 * SHARED and there.stack == here.stack
+    assert resident_warps(there, 75, 64) == resident_warps(here, 75, 64) >= 24
+    assert len(there.opcodes()) < 1.03 * len(here.opcodes()) and there.operations()["LD"] == there.operations()["ST"] == 0

@@ -1,0 +1,88 @@
+"""The stack of a walk, wherever it is: what is put is what is there, each thread has its own, and walks have the same answers."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests import device
+from tests.kernel_tools import DEVICE
+
+from wrt.accel.build import build  # isort: skip (starts Warp)
+import warp as wp
+
+from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import place
+from wrt.core.device import launch_on
+from wrt.core.tuned import STACKS, Choice, using
+from wrt.kernels.structs import kernel
+from wrt.kernels.traverse.bvh2 import ENTRY
+from wrt.kernels.traverse.stack import PLACES, SHARED, make_stack
+from wrt.scene.mesh import Mesh
+
+SIZE, THREADS, BLOCK = 64, 192, 64
+
+
+@cache
+def make_probe_kernel(where: str) -> Any:
+    new, shared_entries, put, get = make_stack(where, SIZE, wp.uint64, 8)
+
+    @kernel
+    def probe(out: wp.array2d(dtype=wp.uint64), place_of: wp.array(dtype=wp.uint64), first: int):
+        i = first + wp.tid()
+        entries = new()
+        shared = shared_entries()
+        for j in range(SIZE):
+            put(entries, shared, j, wp.uint64(1000 * i + j))
+        put(entries, shared, 3, wp.uint64(7))
+        place_of[i] = shared
+        for j in range(SIZE):
+            out[i, SIZE - 1 - j] = get(entries, shared, SIZE - 1 - j)
+
+    return probe
+
+
+@pytest.mark.parametrize("where", PLACES)
+def test_what_is_put_is_there_and_each_thread_has_its_own(where: str) -> None:
+    out = wp.zeros((THREADS, SIZE), dtype=wp.uint64, device=DEVICE)
+    places = wp.zeros(THREADS, dtype=wp.uint64, device=DEVICE)
+    with using(DEVICE, Choice(block_dim=BLOCK)):
+        launch_on(DEVICE, make_probe_kernel(where), THREADS, out, places, None)
+    expected = 1000 * np.arange(THREADS)[:, None] + np.arange(SIZE)
+    expected[:, 3] = 7
+    assert (out.numpy() == expected).all()
+    # Threads run one after another on a virtual GPU, and would not see that they write to each other's entries: where these are is
+    # read. The first of all threads of a block lie side by side, and the next ones behind them.
+    first = places.numpy().reshape(-1, BLOCK).astype(np.int64)
+    if DEVICE.is_cuda and where == "shared":
+        assert (first - first[:, :1] == 8 * np.arange(BLOCK)).all() and (first > 0).all()
+    else:
+        assert (first == 0).all()
+
+
+@pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0: the CPU has one place")
+@pytest.mark.parametrize(("name", "entry", "instances"), [("bvh8", 8, False), ("bvh2", ENTRY, False), ("bvh2", ENTRY, True)])
+def test_walks_have_the_same_answers_wherever_the_stack_is(name: str, entry: int, instances: bool) -> None:
+    """Among triangles that overlap, so that stacks become deeper than shared memory has room for; of instances' two walks both are
+    under way at a time."""
+    rng = np.random.default_rng(5)
+    corners = (rng.normal(size=(800, 1, 3)) * (0.3, 0.3, 4.0) + rng.normal(size=(800, 3, 3))).astype(np.float32)
+    mesh = Geometry.of(Mesh(corners.reshape(-1, 3), np.arange(2400, dtype=np.int32).reshape(-1, 3)))
+    turned = np.diag([1.0, -1.0, 0.5, 1.0])
+    world: Any = place((mesh, np.eye(4)), (mesh, turned), (mesh, turned @ np.diag([0.9, 1.0, -2.0, 1.0]))) if instances else mesh
+    origins = (rng.normal(size=(300, 3)) * 0.5 - (0.0, 0.0, 20.0)).astype(np.float32)
+    rays = origins, (rng.normal(size=(300, 3)) * 0.02 + (0.0, 0.0, 1.0)).astype(np.float32)
+    ends = rng.uniform(5.0, 30.0, 300).astype(np.float32)
+    here, there = (build(world, name, device=each) for each in ("cpu", "cuda:0"))
+    hits, occluded = here.closest_hit(*rays), here.any_hit(*rays, 0.0, ends)
+    deepest = np.asarray(here.closest_hit(*rays, counters=True).counters.stack)
+    assert (hits.prim_id >= 0).any() and occluded.any() and not occluded.all() and (deepest > SHARED // entry).mean() > 0.1
+    for stack in STACKS:
+        with using(there.device, Choice(stack=stack)):
+            found = there.closest_hit(*rays)
+            assert (there.any_hit(*rays, 0.0, ends) == occluded).all()
+        for field in ("t", "u", "v", "prim_id"):
+            assert getattr(found, field).tobytes() == getattr(hits, field).tobytes()
