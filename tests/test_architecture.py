@@ -39,6 +39,7 @@ BELOW_KERNELS = {
     "traverse": {"native", "units", "structs"},
     "query": {"traverse", "units", "structs"},
     "ray_query": {"query", "traverse", "units", "structs"},
+    "winding": {"structs"},
     "wide": {"native", "query", "traverse", "units", "structs"},
     "shade": {"native", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},

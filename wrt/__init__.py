@@ -1,7 +1,7 @@
 """wrt: a Whitted ray tracer on NVIDIA Warp, a model of the RT-core split, and a laboratory for both.
 
 Rays by themselves: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits,
-first_hits, contains, visible.
+first_hits, contains, winding_number, visible.
 Rays from kernels of your own: kernel, ray_query. Gradients: Hits.gradients, wrt.torch, wrt.jax.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from wrt.accel.ray_query import ray_query as ray_query
     from wrt.accel.structures import ACCELERATORS as ACCELERATORS
     from wrt.accel.visible import visible as visible
+    from wrt.accel.winding import winding_number as winding_number
     from wrt.core.errors import InputError as InputError
     from wrt.core.errors import SceneWarning as SceneWarning
     from wrt.io.load import load_scene as load_scene
@@ -76,6 +77,7 @@ _PUBLIC = {
     "wrt.accel.ray_query": ("ray_query",),
     "wrt.accel.structures": ("ACCELERATORS",),
     "wrt.accel.visible": ("visible",),
+    "wrt.accel.winding": ("winding_number",),
     "wrt.core.errors": ("InputError", "SceneWarning"),
     "wrt.io.load": ("load_scene",),
     "wrt.io.mesh_file": ("load_mesh",),

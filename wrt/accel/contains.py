@@ -44,7 +44,8 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any
         count = open_edges(asked.geometry)
         _open_edges[accel] = asked.geometry, count
     if count:
-        raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces")
+        raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces"
+                         "; wrt.winding_number tells what is mostly inside")
     inside = odd_crossings(asked, rows)
     return inside if give is None else give(upload(inside, wp.bool, asked.device))
 

@@ -1,0 +1,70 @@
+"""How often surfaces wind around points: the sum of the solid angles of all triangles, over 4 pi."""
+
+import warp as wp
+
+from wrt.kernels.structs import Surfaces, kernel
+
+FEW, MANY = wp.constant(wp.float64(2.0**-900)), wp.constant(wp.float64(2.0**900))  # where a product is made of size 1 again
+
+
+@wp.struct
+class Turns:
+    """A sum of angles in [-pi, pi]: the product of unit-like complex numbers re + i im, and the whole turns that its argument has
+    lost. No function of the C library, whose last bits differ, is needed until the end."""
+
+    re: wp.float64
+    im: wp.float64
+    whole: wp.float64
+
+
+@wp.func
+def corner(surfaces: Surfaces, vertex: int, point: wp.vec3) -> wp.vec3d:
+    v = surfaces.vertices[vertex]
+    return wp.vec3d(wp.float64(v[0]) - wp.float64(point[0]), wp.float64(v[1]) - wp.float64(point[1]),
+                    wp.float64(v[2]) - wp.float64(point[2]))
+
+
+@wp.func
+def turned(turns: Turns, re: wp.float64, im: wp.float64) -> Turns:
+    """With the angle of one more number added."""
+    zero = wp.float64(0.0)
+    if re == zero and im == zero:  # the point is on an edge
+        return turns
+    out = Turns()
+    out.re = turns.re * re - turns.im * im
+    out.im = turns.re * im + turns.im * re
+    out.whole = turns.whole
+    if turns.im >= zero and im >= zero and out.im < zero:
+        out.whole = turns.whole + wp.float64(1.0)
+    if turns.im < zero and im < zero and out.im >= zero:
+        out.whole = turns.whole - wp.float64(1.0)
+    size = wp.max(wp.abs(out.re), wp.abs(out.im))
+    if size < FEW or size > MANY:
+        out.re = out.re / size
+        out.im = out.im / size
+    return out
+
+
+@kernel
+def wind(surfaces: Surfaces, points: wp.array(dtype=wp.vec3), turns: wp.array(dtype=wp.vec3d), first: int):
+    """re, im and whole turns of half the solid angles together. The angle of one: van Oosterom and Strackee 1983, "The Solid Angle
+    of a Plane Triangle"; a point at a corner has none of that triangle."""
+    i = first + wp.tid()
+    point = points[i]
+    one = wp.float64(1.0)
+    total = Turns()
+    total.re = one
+    for face in range(surfaces.n_triangles):
+        abc = surfaces.faces[face]
+        a = corner(surfaces, abc[0], point)
+        b = corner(surfaces, abc[1], point)
+        c = corner(surfaces, abc[2], point)
+        size_a = wp.length(a)
+        size_b = wp.length(b)
+        size_c = wp.length(c)
+        size = size_a * size_b * size_c
+        if size > wp.float64(0.0):
+            part = one / size
+            re = one + (wp.dot(a, b) * size_c + wp.dot(b, c) * size_a + wp.dot(c, a) * size_b) * part
+            total = turned(total, re, wp.dot(a, wp.cross(b, c)) * part)
+    turns[i] = wp.vec3d(total.re, total.im, total.whole)
