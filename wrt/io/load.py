@@ -16,6 +16,7 @@ from wrt.core.checks import as_path, shown
 from wrt.core.errors import InputError, SceneWarning, at
 from wrt.core.files import read_file, require_file
 from wrt.core.memory import require
+from wrt.core.packages import needed_by
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh
 from wrt.io.toml.limits import look_at
 from wrt.scene.defaults import stage
@@ -63,15 +64,17 @@ def as_scene(value: Scene | Mesh | str | os.PathLike[str]) -> Scene:
 
 def schema() -> dict[str, Any]:
     """The JSON Schema (draft 2020-12) of TOML scene files."""
-    from wrt.io.toml.schema import scene_table
+    with needed_by("the schema of TOML scenes"):
+        from wrt.io.toml.schema import scene_table
 
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {"$schema": dialect, **scene_table().model_json_schema(), "title": "wrt scene"}
 
 
 def _load_toml(path: Path) -> Scene:
-    from wrt.io.toml.build import build
-    from wrt.io.toml.report import check
+    with needed_by("a TOML scene"):
+        from wrt.io.toml.build import build
+        from wrt.io.toml.report import check
 
     data = _parse(path)
     return _staged(build(check(data, path), path), path)

@@ -13,6 +13,7 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.memory import require
+from wrt.core.packages import needed_by
 
 # Pillow has others, such as EPS, that run programs or have no place here.
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF")
@@ -77,7 +78,8 @@ def size_of(data: bytes, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
 @contextmanager
 def _opened(data: bytes, formats: tuple[str, ...], bytes_of_pixel: float = BYTES_OF_PIXEL) -> Iterator[Any]:
     """The picture, whose pixels are decoded when they are asked for."""
-    from PIL import Image, UnidentifiedImageError
+    with needed_by("a picture in a file"):
+        from PIL import Image, UnidentifiedImageError
 
     Image.init()
     try:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from wrt.core.packages import needed_by
 from wrt.picture.tonemap import encode_srgb
 
 INK, PALE = (30, 30, 30), (110, 110, 110)
@@ -57,7 +58,8 @@ def heatmap(values: np.ndarray, title: str, top: float | None = None) -> np.ndar
     """The picture, (H, W, 3) uint8, of values (h, w) of 0 or more, row 0 on top; 0 is the first colour. What is beyond the scale
     gets the last one, and the title tells the largest value. top: where the scale ends, so that several pictures can have one
     (None: `top_of`)."""
-    from PIL import Image, ImageDraw
+    with needed_by("a heat map"):
+        from PIL import Image, ImageDraw
 
     scale = max(1, -(-LEAST // values.shape[1]))
     height, width = values.shape[0] * scale, values.shape[1] * scale

@@ -22,6 +22,7 @@ from wrt.core import write_file
 from wrt.core.errors import InputError, SceneWarning
 from wrt.core.files import open_regular, read_file
 from wrt.core.memory import require
+from wrt.core.packages import needed_by
 from wrt.core.write_file import replacing
 from wrt.picture.decode import FORMATS as FORMATS_READ
 from wrt.picture.decode import check_size, decode_png16, decode_rgba8, size_of
@@ -95,7 +96,8 @@ def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapp
     to 2^24 (OpenEXR has integer channels, but OpenImageIO's Python binding rounds them where others are float); beyond
     that a SceneWarning says so. Raises InputError as write_image does.
     """
-    import OpenImageIO as oiio
+    with needed_by("an EXR or HDR picture, or one of 16 bits,"):
+        import OpenImageIO as oiio
 
     arrays = list(channels.values())
     height, width = arrays[0].shape
@@ -116,7 +118,8 @@ def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapp
 
 def _write_oiio(path: PathLike, spec: Any, rows: Callable[[int, int], np.ndarray], header: bytes = b"") -> None:
     """Write rows y0 to y1, (y1 - y0, W, C) float32, in bands; `header` is put in behind the file's first line."""
-    import OpenImageIO as oiio
+    with needed_by("an EXR or HDR picture, or one of 16 bits,"):
+        import OpenImageIO as oiio
 
     with replacing(path) as temporary:
         out = oiio.ImageOutput.create(str(temporary))
@@ -151,7 +154,8 @@ def _write_exr(path: PathLike, pixels: np.ndarray, bits: int, exposure: float, t
 
 def _write_hdr(path: PathLike, pixels: np.ndarray, bits: int, exposure: float, tonemap: str,
                metadata: Mapping[str, Any]) -> None:
-    import OpenImageIO as oiio
+    with needed_by("an EXR or HDR picture, or one of 16 bits,"):
+        import OpenImageIO as oiio
 
     _warn_replaced(path, ~(np.isfinite(pixels) & (pixels >= 0.0)), "negative, NaN or infinite, which .hdr cannot hold")
     held = np.clip(np.nan_to_num(pixels, nan=0.0, posinf=1e38, neginf=0.0), 0.0, 1e38)
@@ -291,7 +295,8 @@ def _opened(path: PathLike) -> Iterator[Any]:
         raise InputError(f"cannot be read: {error.strerror or error}", path) from error
     if not first.startswith(_MAGIC[Path(path).suffix.lower()]):
         raise InputError(f"cannot be read as an image: it is no {Path(path).suffix.lower()} file", path)
-    import OpenImageIO as oiio
+    with needed_by("an EXR or HDR picture, or one of 16 bits,"):
+        import OpenImageIO as oiio
 
     oiio.attribute("try_all_readers", 0)
     source = oiio.ImageInput.open(os.fspath(path))

@@ -13,6 +13,7 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.memory import require
+from wrt.core.packages import needed_by
 from wrt.picture.tonemap import encode_srgb, tone_map
 
 RELMSE_EPS = 0.01
@@ -171,7 +172,8 @@ def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER
     pixels_per_degree: of the visual angle. Source: Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom, Fairchild, "FLIP: A
     Difference Evaluator for Alternating Images", HPG 2020, as OpenImageIO computes it.
     """
-    import OpenImageIO as oiio
+    with needed_by("FLIP"):
+        import OpenImageIO as oiio
 
     def buffer(image: np.ndarray) -> oiio.ImageBuf:
         out = oiio.ImageBuf(oiio.ImageSpec(image.shape[1], image.shape[0], 3, "float"))
@@ -232,7 +234,8 @@ def _heat(share: np.ndarray) -> np.ndarray:
 
 def _bar(width: int, limit: float) -> np.ndarray:
     """(BAR_HEIGHT, width, 3) uint8: the colours from -limit to limit over a line of numbers, where that has room."""
-    from PIL import Image, ImageDraw
+    with needed_by("a scale"):
+        from PIL import Image, ImageDraw
 
     colors = np.zeros((BAR_HEIGHT, width, 3), np.uint8)
     colors[: BAR_HEIGHT // 2] = _heat(np.linspace(-1.0, 1.0, width))[None]

@@ -12,6 +12,7 @@ import numpy as np
 
 from wrt.core.checks import as_integer
 from wrt.core.errors import InputError
+from wrt.core.packages import needed_by
 from wrt.core.write_file import check_writable, replacing
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
@@ -109,7 +110,8 @@ def frame_path(folder: Path, number: int, frames: int) -> Path:
 def save_movie(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> None:
     """Pictures, (H, W, 3) uint8 each, as one file that plays round and round: .gif (256 colours a frame, dithered, hundredths of
     a second) or .png, .apng (all colours). Written whole or not at all. Raises InputError where the system refuses."""
-    from PIL import Image
+    with needed_by("a movie"):
+        from PIL import Image
 
     kind = MOVIES[Path(path).suffix.lower()]
     pictures = [Image.fromarray(frame) for frame in frames]

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from wrt.core.packages import needed_by
+
 if TYPE_CHECKING:
     from wrt.renderer.options import Progress
 
@@ -66,9 +68,10 @@ def _while_there_is_a_terminal(report: Callable[[Progress], None]) -> Callable[[
 
 @contextmanager
 def _bar() -> Iterator[Callable[[Progress], None]]:
-    from rich.console import Console
-    from rich.progress import BarColumn, TaskProgressColumn, TextColumn
-    from rich.progress import Progress as RichProgress
+    with needed_by("a progress bar"):
+        from rich.console import Console
+        from rich.progress import BarColumn, TaskProgressColumn, TextColumn
+        from rich.progress import Progress as RichProgress
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
     bar = RichProgress(*columns, console=Console(stderr=True), transient=True)

@@ -11,6 +11,7 @@ import numpy as np
 from wrt.core.checks import LARGEST, as_array, shown
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
+from wrt.core.packages import needed_by
 
 if TYPE_CHECKING:
     import trimesh
@@ -81,7 +82,8 @@ class Mesh:
         uvs are taken where there are some; smooth: also its vertex normals. Faces without area stay, and are never hit. Raises
         InputError for anything else, and as Mesh does.
         """
-        import trimesh
+        with needed_by("a mesh of trimesh"):
+            import trimesh
 
         if isinstance(mesh, trimesh.Scene):
             mesh = mesh.to_mesh()
@@ -96,7 +98,8 @@ class Mesh:
     def to_trimesh(self) -> trimesh.Trimesh:
         """The same as a trimesh mesh, to repair, simplify or write in its formats: vertices and faces in the same order,
         normals and uvs where there are some."""
-        import trimesh
+        with needed_by("a mesh of trimesh"):
+            import trimesh
 
         visual = None if self.uvs is None else trimesh.visual.TextureVisuals(uv=self.uvs * (1.0, -1.0) + (0.0, 1.0))
         return trimesh.Trimesh(self.vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False)

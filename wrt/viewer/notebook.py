@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError
+from wrt.core.packages import needed_by
 from wrt.picture.film import Film
 from wrt.renderer.options import Progress
 from wrt.renderer.progress import COMPILING, describe
@@ -68,7 +69,8 @@ def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, sc
 
     No pixel is mixed with another: scale, a whole number, repeats each. Raises InputError for no pictures, or wrong arrays.
     """
-    from PIL import Image, ImageDraw
+    with needed_by("a notebook's picture"):
+        from PIL import Image, ImageDraw
 
     from wrt.picture.heatmap import INK, font
 

@@ -22,6 +22,7 @@ from wrt.core.checks import short
 from wrt.core.errors import InputError, at
 from wrt.core.files import read_file
 from wrt.core.memory import require
+from wrt.core.packages import needed_by
 from wrt.io.gltf.schema import read_as
 
 GLB_MAGIC = b"glTF"
@@ -91,7 +92,8 @@ class Document:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        import pygltflib
+        with needed_by("a glTF file"):
+            import pygltflib
 
         self.path = Path(path)
         raw, self._binary = _read_container(self.path)
