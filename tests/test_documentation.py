@@ -180,7 +180,7 @@ def test_a_slow_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path
 # --- Python -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/usage.md", "docs/compat.md", "docs/long_renders.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/usage.md", "docs/compat.md", "docs/gradients.md", "docs/long_renders.md"])
 def test_python_runs(page: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import wrt
 
@@ -211,7 +211,7 @@ def functions_of(thing: Any) -> Iterator[tuple[str, Any]]:
 
 
 @pytest.mark.parametrize("module", ["wrt", "wrt.accel.base", "wrt.accel.answers", "wrt.accel.geometry", "wrt.accel.build",
-                                    "wrt.compat.trimesh"])
+                                    "wrt.accel.gradients", "wrt.compat.trimesh", "wrt.torch", "wrt.jax"])
 def test_everything_public_says_what_it_is(module: str) -> None:
     silent = []
     public = importlib.import_module(module)
