@@ -180,8 +180,8 @@ def test_a_slow_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path
 # --- Python -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/usage.md", "docs/compat.md", "docs/long_renders.md", "docs/sensors.md",
-                                  "docs/testing.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/usage.md", "docs/compat.md", "docs/gradients.md", "docs/long_renders.md",
+                                  "docs/sensors.md", "docs/testing.md"])
 def test_python_runs(page: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import wrt
 
@@ -212,7 +212,7 @@ def functions_of(thing: Any) -> Iterator[tuple[str, Any]]:
 
 
 @pytest.mark.parametrize("module", ["wrt", "wrt.accel.base", "wrt.accel.answers", "wrt.accel.geometry", "wrt.accel.build",
-                                    "wrt.compat.trimesh", "wrt.sensors", "wrt.testing"])
+                                    "wrt.accel.gradients", "wrt.compat.trimesh", "wrt.torch", "wrt.jax", "wrt.sensors", "wrt.testing"])
 def test_everything_public_says_what_it_is(module: str) -> None:
     silent = []
     public = importlib.import_module(module)

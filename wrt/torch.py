@@ -29,7 +29,7 @@ def _function() -> Any:
     torch = library("torch")
 
     def forward(ctx: Any, accel: Any, rebuild_at: float, t_min: Any, t_max: Any, *given: Any) -> tuple[Any, ...]:
-        vertices, *rays = (each if each is None else each.detach() for each in given)
+        vertices, *rays = (each if each is None else each.detach().float().contiguous() for each in given)
         hits = hits_of(accel, vertices, (*rays, t_min, t_max), rebuild_at)
         ctx.geometry = hits.source[1].geometry
         ctx.leaves = [each if each is None else (each.device, each.dtype) for each in given]

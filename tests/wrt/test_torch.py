@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from typing import Any
@@ -103,3 +104,15 @@ def test_tensors_in_tensors_out() -> None:
     accel.refit(2.0 * torch.tensor(accel.geometry.vertices))
     with pytest.raises(InputError, match=r"requires? grad.*wrt.torch"):
         accel.closest_hit(o.clone().requires_grad_(), d)
+
+
+def test_what_the_page_says_runs() -> None:
+    torch = pytest.importorskip("torch", reason=MISSING.format("torch"))
+    page = (ROOT / "docs" / "gradients.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```py\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    mesh, (origins, directions) = shapes.icosphere(2), map(torch.tensor, rays(np.random.default_rng(10), 50))
+    names = {"wrt": wrt, "torch": torch, "mesh": mesh, "accel": wrt.build(mesh), "origins": origins, "directions": directions,
+             "points": origins, "vertices": torch.tensor(mesh.vertices)}
+    for block in blocks:
+        exec(block, names)
+    assert len(blocks) == 2 and isinstance(names["inside"], torch.Tensor) and names["vertices"].grad.abs().max() > 0.0

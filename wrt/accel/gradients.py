@@ -47,17 +47,21 @@ class Cotangents(NamedTuple):
     v: Any = None
     point: Any = None
 
-    def rows(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 3) float64 by t, u, v, and (N, 3) by the point. Raises InputError for other shapes."""
-        tuv, point = np.zeros((n, 3)), np.zeros((n, 3))
-        targets = tuv[:, 0], tuv[:, 1], tuv[:, 2], point
-        for name, given, target in zip(self._fields, self, targets, strict=True):
-            if given is not None:
-                array = to_numpy(given)
-                if array.shape != target.shape or array.dtype.kind not in "iuf":
-                    raise InputError(f"{name} must be {target.shape} of real numbers, got {shown(array)}")
-                target[:] = array
-        return tuv, point
+    def checked(self, n: int) -> Cotangents:
+        """The same as NumPy arrays. Raises InputError for other shapes."""
+        arrays = [given if given is None else to_numpy(given) for given in self]
+        for name, array in zip(self._fields, arrays, strict=True):
+            shape = (n, 3) if name == "point" else (n,)
+            if array is not None and (array.shape != shape or array.dtype.kind not in "iuf"):
+                raise InputError(f"{name} must be {shape} of real numbers, got {shown(array)}")
+        return Cotangents(*arrays)
+
+    def at(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By t, u and v, and by the point, two (3, len(rows)) float64."""
+        by_tuv = np.zeros((3, len(rows)))
+        for target, given in zip(by_tuv, self[:3], strict=True):
+            target[:] = 0.0 if given is None else given[rows]
+        return by_tuv, np.zeros((3, 1)) if self.point is None else columns(self.point[rows])
 
 
 def adjoint(geometry: Geometry, origins: Any, directions: Any, prim_id: Any, cotangents: Cotangents,
@@ -76,7 +80,7 @@ def adjoint(geometry: Geometry, origins: Any, directions: Any, prim_id: Any, cot
     prim_id, o, d = to_numpy(prim_id), float32(to_numpy(origins)), float32(to_numpy(directions))  # as they were traced
     vertices, faces = geometry.vertices, geometry.faces
     n = len(prim_id)
-    given, by_point = cotangents.rows(n)
+    given = cotangents.checked(n)
     out = Gradients(np.zeros((len(vertices), 3)), np.zeros((n, 3)), np.zeros((n, 3)))
     rows = np.flatnonzero((prim_id >= 0) & (prim_id < len(faces)))
     corners = faces[prim_id[rows]]
@@ -85,13 +89,14 @@ def adjoint(geometry: Geometry, origins: Any, directions: Any, prim_id: Any, cot
     def work(first: int) -> None:
         some = slice(first, first + HITS_PER_JOB)
         ray = rows[some]
-        way, place, point, tuv = (columns(array[ray]) for array in (d, o, by_point, given))
+        way, place = columns(d[ray]), columns(o[ray])
+        by_tuv, by_point = given.at(ray)
         v0, v1, v2 = (columns(vertices[corners[some, i]]) for i in range(3))
         inverse, exists = inverse_rows(way, v1 - v0, v2 - v0)
         t, u, v = (inverse * (v0 - place)).sum(axis=1)
-        tuv[0] += (point * way).sum(axis=0)
-        at_hit = (inverse * tuv[:, None]).sum(axis=0)  # lambda
-        at_origin = np.where(exists, point - at_hit, 0.0)
+        by_tuv[0] += (by_point * way).sum(axis=0)
+        at_hit = (inverse * by_tuv[:, None]).sum(axis=0)  # lambda
+        at_origin = np.where(exists, by_point - at_hit, 0.0)
         out.origins[ray], out.directions[ray] = at_origin.T, (t * at_origin).T
         for axis in range(3):
             by_corner[axis, some] = np.stack([(1.0 - u - v) * at_hit[axis], u * at_hit[axis], v * at_hit[axis]], axis=1)

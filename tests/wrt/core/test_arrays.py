@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 
 import wrt
+from tests.device import NAME as DEVICE
 from wrt.accel.answers import Hits
 from wrt.accel.rays import rays_of, rays_on
 from wrt.core.arrays import to_numpy, to_warp
@@ -136,6 +137,50 @@ def test_what_comes_in_as_tensors_goes_out_as_such() -> None:
     np.testing.assert_array_equal(hits.t.array, accel.closest_hit(DIRECTIONS, ORIGINS).t)
     accel.refit(Library.Tensor(2.0 * accel.geometry.vertices))
     assert wrt.build((Library.Tensor(box().vertices), Library.Tensor(box().faces))).geometry.faces.shape == (12, 3)
+
+
+class OnDevice:
+    """A library whose tensors are on the device that tests run on."""
+
+    class Tensor:
+        def __init__(self, array: Any) -> None:
+            self.array = array
+
+        def __dlpack__(self, **options: Any) -> Any:
+            on_cpu = self.array.device.is_cpu  # where NumPy knows the protocol's newer versions, and so that it may write
+            return self.array.numpy().__dlpack__(**options) if on_cpu else self.array.__dlpack__(stream=options["stream"])
+
+        def __dlpack_device__(self) -> Any:
+            return self.array.__dlpack_device__()
+
+        def __len__(self) -> int:
+            return len(self.array)
+
+        def __array_namespace__(self, **options: Any) -> Any:
+            return OnDevice
+
+    @staticmethod
+    def from_dlpack(array: Any) -> Any:
+        return OnDevice.Tensor(wp.from_dlpack(array))
+
+
+def test_tensors_on_a_device_stay_there() -> None:
+    accel, expected = wrt.build(box()), wrt.build(box(), device="cpu").closest_hit(ORIGINS, DIRECTIONS)
+    o, d = (OnDevice.Tensor(wp.array(array, device=DEVICE)) for array in (ORIGINS, DIRECTIONS))
+    end = OnDevice.Tensor(wp.full(5, 100.0, dtype=wp.float32, device=DEVICE))
+    hits = accel.closest_hit(o, d, t_max=end)
+    answers = {"t": (hits.t, expected.t), "prim_id": (hits.prim_id, expected.prim_id), "point": (hits.point, expected.point),
+               "any_hit": (accel.any_hit(o, d), expected.prim_id >= 0),
+               "all": (wrt.all_hits(accel, o, d).first, [0, 2, 2, 2, 4, 6]),
+               "contains": (wrt.contains(accel, o), np.full(5, False)), "visible": (wrt.visible(accel, o, o), np.full(5, True))}
+    for name, (ours, true) in answers.items():
+        assert isinstance(ours, OnDevice.Tensor) and str(ours.array.device) == DEVICE, name
+        np.testing.assert_array_equal(ours.array.numpy(), true, err_msg=name)
+    by = hits.gradients(t=OnDevice.Tensor(wp.ones(5, dtype=wp.float32, device=DEVICE)))
+    np.testing.assert_array_equal(by.origins.array.numpy(), expected.gradients(t=np.ones(5)).origins)
+    again = accel.closest_hit(o, OnDevice.Tensor(wp.array(-DIRECTIONS, device=DEVICE)), out=hits)
+    assert again.t.array.ptr == hits.t.array.ptr
+    np.testing.assert_array_equal(hits.prim_id.array.numpy() >= 0, [False, True, False, False, False])
 
 
 def test_a_tensor_that_is_not_shared_is_told() -> None:
