@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from wrt.core.checks import as_integer
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.lab.bench.report import Columns, Row, cells, table
-from wrt.lab.hard_cases.cases import HARD_CASES, HardCase, Verdict, chosen, chunks, fewer, judge
+from wrt.lab.hard_cases.cases import HARD_CASES, HardCase, Verdict, chosen, chunks, fewer, generate, judge
 
 ClosestHit = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Any]
 NOT_ASKED = ("C_spheres", "H_exact_ends")  # not of triangles, and rays that begin after their origin
@@ -91,7 +90,7 @@ class Report:
 
 
 class Case:
-    """One hard case: some meshes with rays, `rays` in all, made when they are first asked for. name: of wrt.testing.CASES."""
+    """One hard case: meshes with rays, `rays` in all, made each time when they are asked for. name: of wrt.testing.CASES."""
 
     def __init__(self, name: str, rays: int = 1000, seed: int = 0) -> None:
         self.name, *more = chosen([name])
@@ -101,15 +100,15 @@ class Case:
             raise InputError(f"{name} is not for a closest hit on triangles without t_min")
         self.rays, self.seed = fewer(name, as_integer(rays, "rays", 1, 1 << 40)), seed
 
-    @cached_property
-    def parts(self) -> list[HardCase]:
-        """The meshes with their rays: geometry.vertices, geometry.faces, origins, directions."""
-        return list(chunks(self.name, self.rays, self.seed))
+    @property
+    def parts(self) -> Iterator[HardCase]:
+        """The meshes with their rays: geometry.vertices, geometry.faces, origins, directions; one, but for very many rays."""
+        return chunks(self.name, self.rays, self.seed)
 
     @property
     def about(self) -> str:
         """What is hard in it."""
-        return self.parts[0].notes
+        return generate(self.name, 1).notes
 
     def result(self, closest_hit: ClosestHit) -> Result:
         """Ask closest_hit, which `hard_cases` describes, and judge what it says. What it raises is a part of the result."""

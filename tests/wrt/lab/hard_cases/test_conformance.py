@@ -34,7 +34,7 @@ def test_wrt_loses_nothing() -> None:
 
 def test_each_fault_is_counted() -> None:
     case = Case("B_jittered_uniform", 100)
-    part = case.parts[0]
+    part = next(case.parts)
     right = own(part.geometry.vertices, part.geometry.faces, part.origins, part.directions)
 
     def with_faults(*_: np.ndarray) -> Any:
