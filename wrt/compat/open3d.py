@@ -14,6 +14,7 @@ import numpy as np
 from wrt.accel.all_hits import Asked
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build
+from wrt.accel.closest_points import closest_points
 from wrt.accel.contains import odd_crossings
 from wrt.compat.surfaces import every_hit
 from wrt.core.checks import as_integer, shown
@@ -45,7 +46,7 @@ class RaycastingScene:
 
     INVALID_ID: ClassVar[int] = 0xFFFFFFFF
 
-    def __init__(self, nthreads: int = 0, device: Any = "CPU:0") -> None:
+    def __init__(self, nthreads: int = 0, device: Any = "cpu") -> None:
         name = str(device).lower()
         self._device, self._threads = "cpu" if name == "cpu:0" else name, _threads(nthreads)
         self._meshes: list[tuple[np.ndarray, np.ndarray]] = []
@@ -111,6 +112,30 @@ class RaycastingScene:
                  "geometry_ids": geometry_ids, "primitive_ids": primitive_ids, "primitive_uvs": np.stack([u, v], axis=1)}
         return {name: _answer(array, array.shape[:1]) for name, array in found.items()}
 
+    def compute_closest_points(self, query_points: Any, nthreads: int = 0) -> dict[str, Any]:
+        """The point of the meshes that is closest to each (wrt.closest_points): points (..., 3), geometry_ids and primitive_ids
+        (...) uint32, primitive_uvs (..., 2), primitive_normals (..., 3). INVALID_ID and 0 where there is none."""
+        shape, good, points = _asked_points(query_points)
+        accel = self._scene()[0]
+        found = closest_points(accel, points, _threads(nthreads))
+        geometry_ids, primitive_ids = self._ids(found.prim_id)
+        answers = {"points": found.point, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
+                   "primitive_uvs": np.stack([found.u, found.v], axis=1), "primitive_normals": _normals(accel, found.prim_id)}
+        missed = {"geometry_ids": self.INVALID_ID, "primitive_ids": self.INVALID_ID}
+        return {name: _answer(_spread(array, good, missed.get(name, 0.0)), shape) for name, array in answers.items()}
+
+    def compute_distance(self, query_points: Any, nthreads: int = 0) -> Any:
+        """The distance of each point to the meshes, (...) float32; inf where there are none, and of what is no point NaN."""
+        shape, good, points = _asked_points(query_points)
+        return _answer(_spread(closest_points(self._scene()[0], points, _threads(nthreads)).distance, good, np.nan), shape)
+
+    def compute_signed_distance(self, query_points: Any, nthreads: int = 0, nsamples: int = 1) -> Any:
+        """compute_distance, below 0 where compute_occupancy is 1."""
+        shape, good, points = _asked_points(query_points)
+        inside = self._inside(points, nthreads, nsamples)
+        distance = closest_points(self._scene()[0], points, _threads(nthreads)).distance
+        return _answer(_spread(np.where(inside, -distance, distance), good, np.nan), shape)
+
     def compute_occupancy(self, query_points: Any, nthreads: int = 0, nsamples: int = 1) -> Any:
         """1.0 for points inside, 0.0 for others, (...) float32: whether a ray from the point crosses the surfaces an odd number of
         times. Where these are closed, one ray decides exactly (wrt.contains), and where not, most of `nsamples`, an odd number."""
@@ -136,7 +161,7 @@ class RaycastingScene:
                 vertices.append(positions)
             first = np.cumsum([0, *(len(indices) for _, indices in self._meshes)])[:-1]
             mesh = Mesh(np.concatenate(vertices), np.concatenate(faces))
-            self._built = build(mesh, device=self._device, threads=self._threads), first
+            self._built = build(mesh, "bvh8", device=self._device, threads=self._threads), first
         return self._built
 
     def _ids(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -187,6 +212,15 @@ def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarra
     if array.ndim < 1 or array.shape[-1] != width:
         raise InputError(f"{name} must be (..., {width}), got {array.shape}")
     return array.shape[:-1], array.reshape(-1, width)
+
+
+def _normals(accel: Accelerator, prim_id: np.ndarray) -> np.ndarray:
+    """Of faces that have area, (N, 3) float32; 0 where prim_id is -1."""
+    out, hit = np.zeros((len(prim_id), 3), np.float32), np.flatnonzero(prim_id >= 0)
+    a, b, c = (accel.geometry.vertices[accel.geometry.faces[prim_id[hit], i]].astype(np.float64) for i in range(3))
+    normal = np.cross(b - a, c - a)
+    out[hit] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    return out
 
 
 def _asked_rays(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:
