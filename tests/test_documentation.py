@@ -211,7 +211,7 @@ def functions_of(thing: Any) -> Iterator[tuple[str, Any]]:
 
 
 @pytest.mark.parametrize("module", ["wrt", "wrt.accel.base", "wrt.accel.answers", "wrt.accel.geometry", "wrt.accel.build",
-                                    "wrt.compat.trimesh"])
+                                    "wrt.accel.instances", "wrt.compat.open3d", "wrt.compat.trimesh"])
 def test_everything_public_says_what_it_is(module: str) -> None:
     silent = []
     public = importlib.import_module(module)
