@@ -10,7 +10,7 @@ from typing import Any
 NAME = "cpu"
 IS_VIRTUAL = False
 # Where functions have "cpu" as their default device.
-MODULES = ("wrt.accel.base", "wrt.accel.build", "wrt.accel.instances", "wrt.accel.store", "wrt.compat.trimesh",
+MODULES = ("wrt.accel.base", "wrt.accel.build", "wrt.accel.instances", "wrt.accel.store", "wrt.compat.open3d", "wrt.compat.trimesh",
            "wrt.renderer.compile", "wrt.renderer.options", "wrt.lab.bench.rasterizer", "wrt.lab.plans")
 
 

@@ -213,7 +213,8 @@ def functions_of(thing: Any) -> Iterator[tuple[str, Any]]:
 
 
 @pytest.mark.parametrize("module", ["wrt", "wrt.accel.base", "wrt.accel.answers", "wrt.accel.geometry", "wrt.accel.build",
-                                    "wrt.accel.gradients", "wrt.compat.trimesh", "wrt.torch", "wrt.jax", "wrt.sensors", "wrt.testing"])
+                                    "wrt.accel.gradients", "wrt.accel.instances", "wrt.compat.open3d", "wrt.compat.trimesh",
+                                    "wrt.torch", "wrt.jax", "wrt.sensors", "wrt.testing"])
 def test_everything_public_says_what_it_is(module: str) -> None:
     silent = []
     public = importlib.import_module(module)

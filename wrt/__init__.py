@@ -1,7 +1,7 @@
 """wrt: a Whitted ray tracer on NVIDIA Warp, a model of the RT-core split, and a laboratory for both.
 
 Rays by themselves: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits,
-first_hits, contains, winding_number, visible.
+first_hits, contains, winding_number, visible; closest_points, signed_distance.
 Rays from kernels of your own: kernel, ray_query. Gradients: Hits.gradients, wrt.torch, wrt.jax.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from wrt.accel.all_hits import first_hits as first_hits
     from wrt.accel.build import build as build
     from wrt.accel.build import load_accel as load_accel
+    from wrt.accel.closest_points import closest_points as closest_points
+    from wrt.accel.closest_points import signed_distance as signed_distance
     from wrt.accel.contains import contains as contains
     from wrt.accel.device_geometry import DeviceGeometry as DeviceGeometry
     from wrt.accel.ray_query import ray_query as ray_query
@@ -72,6 +74,7 @@ if TYPE_CHECKING:
 _PUBLIC = {
     "wrt.accel.all_hits": ("all_hits", "count_hits", "first_hits"),
     "wrt.accel.build": ("build", "load_accel"),
+    "wrt.accel.closest_points": ("closest_points", "signed_distance"),
     "wrt.accel.contains": ("contains",),
     "wrt.accel.device_geometry": ("DeviceGeometry",),
     "wrt.accel.ray_query": ("ray_query",),

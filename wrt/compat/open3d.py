@@ -14,6 +14,7 @@ import numpy as np
 from wrt.accel.all_hits import Asked
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build
+from wrt.accel.closest_points import closest_points
 from wrt.accel.contains import odd_crossings
 from wrt.compat.surfaces import every_hit
 from wrt.core.checks import as_integer, shown
@@ -28,9 +29,11 @@ class Array(np.ndarray):
     """A NumPy array with the methods by which a program takes Open3D's tensors to NumPy."""
 
     def numpy(self) -> np.ndarray:
+        """The same memory as a plain array."""
         return self.view(np.ndarray)
 
     def cpu(self) -> Array:
+        """Itself."""
         return self
 
 
@@ -45,11 +48,11 @@ class RaycastingScene:
 
     INVALID_ID: ClassVar[int] = 0xFFFFFFFF
 
-    def __init__(self, nthreads: int = 0, device: Any = "CPU:0") -> None:
+    def __init__(self, nthreads: int = 0, device: Any = "cpu") -> None:
         name = str(device).lower()
         self._device, self._threads = "cpu" if name == "cpu:0" else name, _threads(nthreads)
         self._meshes: list[tuple[np.ndarray, np.ndarray]] = []
-        self._built: tuple[Accelerator, np.ndarray] | None = None
+        self._built: tuple[Accelerator, np.ndarray, np.ndarray] | None = None
 
     def add_triangles(self, vertex_positions: Any = None, triangle_indices: Any = None, mesh: Any = None) -> int:
         """Add a mesh, whose geometry ID is given back: (V, 3) positions and (F, 3) indices, or what has them (a TriangleMesh of
@@ -75,19 +78,19 @@ class RaycastingScene:
         """The first hit of each ray, of several at the same distance that of the lowest IDs: t_hit (...), inf on a miss;
         geometry_ids and primitive_ids (...) uint32, INVALID_ID on a miss; primitive_uvs (..., 2) and primitive_normals (..., 3), 0
         on a miss."""
-        accel, _ = self._scene()
+        accel, _, normals = self._scene()
         shape, good, origins, directions = _asked_rays(rays)
         hits = accel.closest_hit(origins, directions, threads=_threads(nthreads))
         geometry_ids, primitive_ids = self._ids(hits.prim_id)
         found = {"t_hit": hits.t, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
                  "primitive_uvs": np.stack([hits.u, hits.v], axis=1),
-                 "primitive_normals": np.where(hits.prim_id[:, None] >= 0, hits.normal, np.float32(0.0))}
+                 "primitive_normals": normals[hits.prim_id]}
         missed = {"t_hit": np.inf, "geometry_ids": self.INVALID_ID, "primitive_ids": self.INVALID_ID}
         return {name: _answer(_spread(array, good, missed.get(name, 0.0)), shape) for name, array in found.items()}
 
     def test_occlusions(self, rays: Any, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Any:
         """Whether each ray hits anything between tnear and tfar, (...) bool."""
-        accel, _ = self._scene()
+        accel = self._scene()[0]
         shape, good, origins, directions = _asked_rays(rays)
         found = accel.any_hit(origins, directions, tnear, tfar, threads=_threads(nthreads))
         return _answer(_spread(found, good, False), shape)
@@ -111,6 +114,30 @@ class RaycastingScene:
                  "geometry_ids": geometry_ids, "primitive_ids": primitive_ids, "primitive_uvs": np.stack([u, v], axis=1)}
         return {name: _answer(array, array.shape[:1]) for name, array in found.items()}
 
+    def compute_closest_points(self, query_points: Any, nthreads: int = 0) -> dict[str, Any]:
+        """The point of the meshes that is closest to each (wrt.closest_points): points (..., 3), geometry_ids and primitive_ids
+        (...) uint32, primitive_uvs (..., 2), primitive_normals (..., 3). INVALID_ID and 0 where there is none."""
+        shape, good, points = _asked_points(query_points)
+        accel, _, normals = self._scene()
+        found = closest_points(accel, points, _threads(nthreads))
+        geometry_ids, primitive_ids = self._ids(found.prim_id)
+        answers = {"points": found.point, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
+                   "primitive_uvs": np.stack([found.u, found.v], axis=1), "primitive_normals": normals[found.prim_id]}
+        missed = {"geometry_ids": self.INVALID_ID, "primitive_ids": self.INVALID_ID}
+        return {name: _answer(_spread(array, good, missed.get(name, 0.0)), shape) for name, array in answers.items()}
+
+    def compute_distance(self, query_points: Any, nthreads: int = 0) -> Any:
+        """The distance of each point to the meshes, (...) float32; inf where there are none, and of what is no point NaN."""
+        shape, good, points = _asked_points(query_points)
+        return _answer(_spread(closest_points(self._scene()[0], points, _threads(nthreads)).distance, good, np.nan), shape)
+
+    def compute_signed_distance(self, query_points: Any, nthreads: int = 0, nsamples: int = 1) -> Any:
+        """compute_distance, below 0 where compute_occupancy is 1."""
+        shape, good, points = _asked_points(query_points)
+        inside = self._inside(points, nthreads, nsamples)
+        distance = closest_points(self._scene()[0], points, _threads(nthreads)).distance
+        return _answer(_spread(np.where(inside, -distance, distance), good, np.nan), shape)
+
     def compute_occupancy(self, query_points: Any, nthreads: int = 0, nsamples: int = 1) -> Any:
         """1.0 for points inside, 0.0 for others, (...) float32: whether a ray from the point crosses the surfaces an odd number of
         times. Where these are closed, one ray decides exactly (wrt.contains), and where not, most of `nsamples`, an odd number."""
@@ -127,8 +154,8 @@ class RaycastingScene:
         rays = make(*given, **named)
         return _answer(rays.reshape(-1, 6), rays.shape[:2])
 
-    def _scene(self) -> tuple[Accelerator, np.ndarray]:
-        """The structure over all meshes, and the first prim_id of each."""
+    def _scene(self) -> tuple[Accelerator, np.ndarray, np.ndarray]:
+        """The structure over all meshes; the first prim_id of each; the unit normals of all faces, at the end 0 for -1."""
         if self._built is None:
             vertices, faces = [np.zeros((1, 3), np.float32)], [np.zeros((0, 3), np.int64)]
             for positions, indices in self._meshes:
@@ -136,7 +163,7 @@ class RaycastingScene:
                 vertices.append(positions)
             first = np.cumsum([0, *(len(indices) for _, indices in self._meshes)])[:-1]
             mesh = Mesh(np.concatenate(vertices), np.concatenate(faces))
-            self._built = build(mesh, device=self._device, threads=self._threads), first
+            self._built = build(mesh, "bvh8", device=self._device, threads=self._threads), first, _normals(mesh)
         return self._built
 
     def _ids(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -187,6 +214,15 @@ def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarra
     if array.ndim < 1 or array.shape[-1] != width:
         raise InputError(f"{name} must be (..., {width}), got {array.shape}")
     return array.shape[:-1], array.reshape(-1, width)
+
+
+def _normals(mesh: Mesh) -> np.ndarray:
+    """See RaycastingScene._scene."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0.0)
+    return np.concatenate([unit, np.zeros((1, 3))]).astype(np.float32)
 
 
 def _asked_rays(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:

@@ -79,6 +79,12 @@ def test_shapes_and_types(shape: tuple[int, ...]) -> None:
     assert listed.primitive_uvs.shape == (2 * n, 2) and listed.geometry_ids.tolist() == [0] * 2 * n
     occupied = scene.compute_occupancy(rays[..., :3]).numpy()
     assert occupied.shape == shape and occupied.dtype == np.float32 and not occupied.any()
+    closest = numpy(scene.compute_closest_points(rays[..., :3]))
+    for name, tail, kind in (("points", (3,), "f4"), ("geometry_ids", (), "u4"), ("primitive_ids", (), "u4"),
+                             ("primitive_uvs", (2,), "f4"), ("primitive_normals", (3,), "f4")):
+        assert getattr(closest, name).shape == shape + tail and getattr(closest, name).dtype == np.dtype(kind)
+    for distance in (scene.compute_distance(rays[..., :3]), scene.compute_signed_distance(rays[..., :3])):
+        assert distance.numpy().shape == shape and (distance.numpy() == 8.5).all() and distance.numpy().dtype == np.float32
 
 
 def test_segments_of_occlusion() -> None:
@@ -133,6 +139,23 @@ def test_points_inside() -> None:
     open_box.update_faces(np.arange(12) != 3)
     inside = scene_of(open_box).compute_occupancy(np.full((1, 3), 0.1), nsamples=15).numpy()
     assert inside.tolist() == [1.0]  # most rays meet a face
+
+
+def test_closest_points_and_distances() -> None:
+    high = BOX.copy()
+    high.apply_translation([0.0, 0.0, 3.0])
+    scene = scene_of(BOX, high)
+    points = np.float32([[0.1, 0.2, 0.4], [0.1, 0.2, 2.0], [1.5, 0.2, 0.1], [np.nan, 0.0, 0.0]])
+    found = numpy(scene.compute_closest_points(points))
+    np.testing.assert_allclose(found.points[:3], [[0.1, 0.2, 0.5], [0.1, 0.2, 2.5], [0.5, 0.2, 0.1]], atol=1e-6)
+    assert found.geometry_ids.tolist() == [0, 1, 0, NONE] and found.primitive_ids[3] == NONE
+    assert (found.primitive_ids[:3] < 12).all()
+    np.testing.assert_allclose(found.primitive_normals, [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(scene.compute_distance(points).numpy(), [0.1, 0.5, 1.0, np.nan], rtol=1e-5)
+    np.testing.assert_allclose(scene.compute_signed_distance(points, nsamples=3).numpy(), [-0.1, 0.5, 1.0, np.nan], rtol=1e-5)
+    empty = RaycastingScene()
+    assert np.isinf(empty.compute_distance(points[:1]).numpy()[0])
+    assert empty.compute_closest_points(points[:1])["geometry_ids"].numpy()[0] == NONE
 
 
 def test_meshes_of_others_are_taken_and_copied() -> None:
@@ -208,8 +231,12 @@ def test_open3d_says_the_same() -> None:
     origins = rng.normal(size=(40, 50, 3))
     rays = o3d.core.Tensor(np.concatenate([origins, rng.uniform(-1, 1, (40, 50, 3)) - origins], axis=2).astype(np.float32))
     pairs = [(mine.cast_rays(rays), other.cast_rays(rays)), (mine.list_intersections(rays), other.list_intersections(rays))]
+    points = rays[:, :, :3]
+    pairs += [({name: each[name] for name in ("points", "geometry_ids")} for each in  # at an edge either face is right
+               (mine.compute_closest_points(points), other.compute_closest_points(points)))]
     pairs += [({"": getattr(mine, name)(given)}, {"": getattr(other, name)(given)}) for name, given in (
-        ("test_occlusions", rays), ("count_intersections", rays), ("compute_occupancy", rays[:, :, :3]))]
+        ("test_occlusions", rays), ("count_intersections", rays), ("compute_occupancy", points),
+        ("compute_distance", points), ("compute_signed_distance", points))]
     looking = (60.0, [0, 0, 0], [1, 2, 3], [0, 1, 0], 32, 24)
     extrinsic = np.array([[0, 1, 0, 3], [-1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1.0]])
     matrices = np.array([[40, 0, 16], [0, 41, 12], [0, 0, 1.0]]), extrinsic

@@ -1,0 +1,215 @@
+"""Closest points: a walk over a wide BVH by distance instead of along a ray.
+
+A point's distance to a triangle is float64's (Ericson 2005, "Real-Time Collision Detection", section 5.1, has the problem), held to
+that of the triangle's padded box: as rounding never turns an order round, no box on the way is farther than the triangle in it, and
+which triangle is the nearest does not depend on the tree.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from wrt.kernels.structs import Primitive, kernel
+from wrt.kernels.traverse.stack import key_of, make_uninitialized, reference_of, t_of
+from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
+from wrt.kernels.units.triangle import lower, upper
+from wrt.kernels.wide.lanes import bits
+from wrt.kernels.wide.nodes import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, first_reference, make_plane, node_size
+from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
+from wrt.kernels.wide.traverse import STACK_SIZE, make_gather, make_struct, row_size
+
+empty_stack = make_uninitialized(STACK_SIZE, wp.uint64)
+NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # no entry of a stack: more than any
+
+
+@wp.struct
+class Nearest:
+    """A point on a triangle, and the square of its distance; prim_id = -1: there is none yet."""
+
+    d2: wp.float64
+    point: wp.vec3d
+    u: wp.float64
+    v: wp.float64
+    prim_id: int
+
+
+@wp.struct
+class PointArrays:
+    """One closest point a row; where there is none, distance = inf, prim_id = -1, and the rest 0."""
+
+    distance: wp.array(dtype=wp.float32)
+    point: wp.array(dtype=wp.vec3)
+    u: wp.array(dtype=wp.float32)
+    v: wp.array(dtype=wp.float32)
+    prim_id: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def wide_vector(v: wp.vec3) -> wp.vec3d:
+    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
+
+
+@wp.func
+def squared_distance(p: wp.vec3, lo: wp.vec3, hi: wp.vec3) -> wp.float64:
+    """From a point to a box, 0 within."""
+    out = wp.float64(0.0)
+    for axis in range(3):
+        x = wp.float64(p[axis])
+        d = wp.max(wp.max(wp.float64(lo[axis]) - x, x - wp.float64(hi[axis])), wp.float64(0.0))
+        out = out + d * d
+    return out
+
+
+@wp.func
+def before(a: wp.vec3d, b: wp.vec3d) -> bool:
+    """An order of points."""
+    if a[0] != b[0]:
+        return a[0] < b[0]
+    if a[1] != b[1]:
+        return a[1] < b[1]
+    return a[2] < b[2]
+
+
+@wp.func
+def along_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d) -> wp.float64:
+    """Where between two points the closest one to p is: 0 at a, 1 at b."""
+    edge = b - a
+    t = wp.dot(p - a, edge) / wp.dot(edge, edge)
+    return wp.max(wp.min(t, wp.float64(1.0)), wp.float64(0.0))
+
+
+@wp.func
+def nearer_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, best: Nearest, corner_a: int, corner_b: int) -> Nearest:
+    """The nearer of `best` and the edge between two corners, which is the same for both triangles at it."""
+    turned = before(b, a)
+    start = wp.where(turned, b, a)
+    end = wp.where(turned, a, b)
+    t = along_edge(p, start, end)
+    point = start + t * (end - start)
+    if t == wp.float64(1.0):
+        point = end
+    d = p - point
+    d2 = wp.dot(d, d)
+    if not d2 < best.d2:
+        return best
+    out = Nearest()
+    out.d2 = d2
+    out.point = point
+    s = wp.where(turned, wp.float64(1.0) - t, t)
+    out.u = wp.where(corner_a == 1, wp.float64(1.0) - s, wp.where(corner_b == 1, s, wp.float64(0.0)))
+    out.v = wp.where(corner_a == 2, wp.float64(1.0) - s, wp.where(corner_b == 2, s, wp.float64(0.0)))
+    return out
+
+
+@wp.func
+def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
+    """The closest point of a triangle: within it where the point is above it, else on one of its edges. Where corners are NaN (a
+    triangle without area), d2 is infinite."""
+    p = wide_vector(point)
+    a = wide_vector(triangle.v0)
+    b = wide_vector(triangle.v1)
+    c = wide_vector(triangle.v2)
+    out = Nearest()
+    out.d2 = wp.float64(wp.inf)
+    if wp.isnan(triangle.v0[0]):
+        return out
+    ab = b - a
+    ac = c - a
+    ap = p - a
+    normal = wp.cross(ab, ac)
+    area = wp.dot(normal, normal)
+    v = wp.dot(wp.cross(ab, ap), normal)
+    u = wp.dot(wp.cross(ap, ac), normal)
+    if u > wp.float64(0.0) and v > wp.float64(0.0) and u + v < area:
+        out.u = u / area
+        out.v = v / area
+        height = wp.dot(ap, normal)
+        out.d2 = height * height / area
+        out.point = a + out.u * ab + out.v * ac
+        return out
+    out = nearer_edge(p, a, b, out, 0, 1)
+    out = nearer_edge(p, b, c, out, 1, 2)
+    return nearer_edge(p, c, a, out, 2, 0)
+
+
+@wp.func
+def nearer(p: wp.vec3, triangle: Primitive, best: Nearest) -> Nearest:
+    """The nearer of `best` and this triangle; of equal ones the lower prim_id."""
+    lo = lower(lower(triangle.v0, triangle.v1), triangle.v2)
+    hi = upper(upper(triangle.v0, triangle.v1), triangle.v2)
+    pad = box_pad(lo, hi)
+    found = on_triangle(p, triangle)
+    found.d2 = wp.max(found.d2, squared_distance(p, padded_lo(lo, pad), padded_hi(hi, pad)))
+    found.prim_id = triangle.prim_id
+    if found.d2 < best.d2 or (found.d2 == best.d2 and best.prim_id >= 0 and found.prim_id < best.prim_id):
+        return found
+    return best
+
+
+@cache
+def make_closest_point_kernel(width: int, compressed: bool) -> Any:
+    """Points first .. first + dim - 1 against a tree whose primitives are corners."""
+    struct, gather = make_struct(Primitive), make_gather(Primitive, width)
+    plane, exists = make_plane(width, compressed)
+    size_of_node, references = node_size(width, compressed), first_reference(width, compressed)
+    unit = 1 if compressed else width  # of primitives, in which references count
+
+    @wp.func
+    def nearest_in_leaf(accel: struct, reference: int, p: wp.vec3, best: Nearest) -> Nearest:
+        begin = leaf_first(reference) * unit
+        for i in range(begin, begin + leaf_count(reference)):
+            row = i / width
+            best = nearer(p, gather(accel.primitives, row * wp.static(row_size(Primitive, width)) + i - row * width), best)
+        return best
+
+    @wp.func
+    def closest_point(accel: struct, p: wp.vec3) -> Nearest:
+        best = Nearest()
+        best.d2 = wp.float64(wp.inf)
+        best.prim_id = -1
+        stack = empty_stack()
+        size = int(0)
+        reference = int(0)
+        while True:
+            near = wp.uint64(NOTHING)
+            if reference < 0:
+                best = nearest_in_leaf(accel, reference, p, best)
+            else:
+                first = reference * wp.static(size_of_node)
+                for j in range(width):
+                    child = bits(accel.nodes, first + references + j)
+                    if child != EMPTY and exists(accel.nodes, first, j):
+                        lo = wp.vec3(plane(accel.nodes, first, LO_X, j), plane(accel.nodes, first, LO_Y, j),
+                                     plane(accel.nodes, first, LO_Z, j))
+                        hi = wp.vec3(plane(accel.nodes, first, HI_X, j), plane(accel.nodes, first, HI_Y, j),
+                                     plane(accel.nodes, first, HI_Z, j))
+                        d2 = squared_distance(p, lo, hi)
+                        if d2 <= best.d2:
+                            key = key_of(float(d2), child)
+                            far = wp.max(near, key)
+                            near = wp.min(near, key)
+                            if far != NOTHING:
+                                stack[size] = far
+                                size = size + 1
+            # The nearest child at once; else pop. What is farther than the best is dropped; equal stays: see `nearer`.
+            while near == NOTHING and size > 0:
+                size = size - 1
+                if t_of(stack[size]) <= float(best.d2):
+                    near = stack[size]
+            if near == NOTHING:
+                break
+            reference = reference_of(near)
+        return best
+
+    @kernel
+    def closest_points(accel: struct, points: wp.array(dtype=wp.vec3), out: PointArrays, first: int):
+        i = first + wp.tid()
+        found = closest_point(accel, points[i])
+        out.distance[i] = float(wp.sqrt(found.d2))
+        out.point[i] = wp.vec3(float(found.point[0]), float(found.point[1]), float(found.point[2]))
+        out.u[i] = float(found.u)
+        out.v[i] = float(found.v)
+        out.prim_id[i] = found.prim_id
+
+    return closest_points

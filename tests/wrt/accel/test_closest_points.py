@@ -1,0 +1,140 @@
+"""Closest points against float64, and the same ones whatever the tree."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+import wrt
+from wrt.scene.shapes import icosphere, torus
+
+
+def oracle(mesh: Any, points: np.ndarray) -> np.ndarray:
+    """Distance to each triangle, (N, F) in long double: that to its plane where the point is above it, else that to its sides."""
+    p = points.astype(np.longdouble)[:, None]
+    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.longdouble) for i in range(3))
+    normal = np.cross(b - a, c - a)
+    above, nearest = np.ones((len(points), len(a)), bool), np.full((len(points), len(a)), np.longdouble(np.inf))
+    for start, end in ((a, b), (b, c), (c, a)):
+        edge = end - start
+        above &= (np.cross(edge, p - start) * normal).sum(axis=2) >= 0
+        t = np.clip(((p - start) * edge).sum(axis=2) / (edge * edge).sum(axis=1), 0, 1)
+        nearest = np.minimum(nearest, np.linalg.norm((p - start - t[..., None] * edge).astype(float), axis=2))
+    height = np.abs(((p - a) * normal).sum(axis=2)) / np.sqrt((normal * normal).sum(axis=1))
+    return np.where(above, height, nearest)
+
+
+def slenderness(mesh: Any) -> float:
+    """How much longer than high a triangle is at most."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
+    longest = np.max([np.linalg.norm(edge, axis=1) for edge in (b - a, c - b, a - c)], axis=0)
+    return float((longest / np.linalg.norm(np.cross((b - a) / longest[:, None], c - a), axis=1)).max())
+
+
+def around(mesh: Any, n: int, seed: int = 0) -> np.ndarray:
+    """Points within, on, near and far from a mesh, above corners and sides too."""
+    rng = np.random.default_rng(seed)
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    out = rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, (n, 3))
+    out[: n // 8] = mesh.vertices[rng.integers(0, len(mesh.vertices), n // 8)]
+    corners = mesh.vertices[mesh.faces[rng.integers(0, len(mesh.faces), n // 4)]]
+    out[n // 8 : n // 8 + n // 4] = (corners * rng.dirichlet((0.3, 0.3, 0.3), n // 4)[..., None]).sum(axis=1)
+    out[-8:] += 100.0 * (high - low)
+    return out.astype(np.float32)
+
+
+def needles() -> wrt.Mesh:
+    rng = np.random.default_rng(1)
+    corners = rng.normal(size=(200, 1, 3)) + np.float64([1.0, 1.0, 1e-5])[None, :, None] * rng.normal(size=(200, 3, 3))
+    corners[:, 2] = corners[:, 0] + 0.5 * (corners[:, 1] - corners[:, 0]) + 1e-5 * rng.normal(size=(200, 3))
+    return wrt.Mesh(corners.reshape(-1, 3), np.arange(600).reshape(-1, 3))
+
+
+def turned(mesh: wrt.Mesh, scale: float, *far: float) -> wrt.Mesh:
+    matrix = scale * Rotation.random(random_state=3).as_matrix()
+    return wrt.Mesh(mesh.vertices @ matrix.T + np.float64(far or 0.0), mesh.faces)
+
+
+MESHES = {"ball": icosphere(2), "ring": turned(torus(segments=16, tube_segments=8), 0.7, 3.0, -2.0, 1.0), "needles": needles(),
+          "tiny": turned(icosphere(1), 1e-28), "huge": turned(icosphere(1), 1e27), "far": turned(icosphere(1), 1.0, 1e4, 0.0, 1e4)}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_distances_are_those_of_float64(name: str) -> None:
+    mesh = MESHES[name]
+    points, coordinates = around(mesh, 600), np.abs(mesh.vertices).max()
+    rounding = 1e-15 * coordinates * slenderness(mesh)
+    found, distances = wrt.closest_points(wrt.build(mesh, "bvh8"), points), oracle(mesh, points)
+    error = np.abs(found.distance - distances.min(axis=1))
+    assert (error <= 2.0**-23 * distances.min(axis=1) + rounding).all()
+    own = np.take_along_axis(distances, found.prim_id[:, None].astype(np.int64), axis=1)[:, 0]
+    assert (own <= distances.min(axis=1) * (1 + 1e-9) + rounding).all()
+    corners = mesh.vertices[mesh.faces[found.prim_id]].astype(np.float64)
+    weights = np.stack([1.0 - found.u - found.v, found.u, found.v], axis=1).astype(np.float64)
+    size = np.abs(corners - corners[:, :1]).max(axis=(1, 2), initial=0.0)
+    assert np.abs((corners * weights[..., None]).sum(axis=1) - found.point).max() < 4e-7 * (coordinates + size.max())
+    apart = np.linalg.norm(found.point.astype(np.float64) - points, axis=1)
+    assert (np.abs(apart - found.distance) <= 2.0**-22 * (coordinates + found.distance)).all()
+    assert (weights >= -1e-7).all() and found.point.dtype == np.float32 and found.prim_id.dtype == np.int32
+
+
+def test_every_tree_says_the_same() -> None:
+    for name in ("ring", "needles"):
+        mesh, points = MESHES[name], around(MESHES[name], 2000, 5)
+        answers = set()
+        for kind, options in (("bvh8", {}), ("bvh8", {"builder": "median", "max_leaf": 3}), ("bvh4", {}), ("bvh8c", {})):
+            found = wrt.closest_points(wrt.build(mesh, kind, **options), points, threads=1)
+            answers.add(tuple(array.tobytes() for array in (found.distance, found.point, found.u, found.v, found.prim_id)))
+        assert len(answers) == 1
+
+
+def test_of_equal_ones_the_lowest_is_told() -> None:
+    """Above every corner and every edge of a ball, from without: all faces there are at the same distance."""
+    ball = icosphere(2)
+    found = wrt.closest_points(wrt.build(ball, "bvh8"), 2.0 * ball.vertices)
+    first = np.array([np.flatnonzero((ball.faces == i).any(axis=1)).min() for i in range(len(ball.vertices))])
+    assert np.array_equal(found.prim_id, first) and np.array_equal(found.point, ball.vertices)
+    edges, face = np.sort(ball.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), np.repeat(np.arange(len(ball.faces)), 3)
+    edges, first = np.unique(edges, axis=0, return_index=True)
+    above = wrt.closest_points(wrt.build(ball, "bvh8"), ball.vertices[edges].sum(axis=1))
+    assert np.array_equal(above.prim_id, face[first])
+    twice = wrt.Mesh(ball.vertices, np.concatenate([ball.faces, ball.faces[::-1]]))
+    points = around(ball, 500)
+    mine, other = (wrt.closest_points(wrt.build(mesh, "bvh8"), points) for mesh in (ball, twice))
+    assert (other.prim_id < len(ball.faces)).all() and np.array_equal(mine.prim_id, other.prim_id)
+
+
+def test_signed_distances() -> None:
+    box = wrt.build(wrt.Mesh.from_trimesh(trimesh.creation.box()), "bvh8")
+    found = wrt.signed_distance(box, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.4], [0.0, 0.0, 2.0], [1.5, 1.5, 0.0]])
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, [-0.5, -0.1, 1.5, np.sqrt(2.0)], rtol=1e-6)
+
+
+def test_faces_without_area_are_left_out() -> None:
+    mesh = wrt.Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 5, 0], [1, 5, 0], [0, 6, 0]], [[0, 1, 2], [0, 0, 1], [3, 4, 5]])
+    found = wrt.closest_points(wrt.build(mesh, "bvh8"), [[1.0, 0.0, 0.0]])
+    assert found.prim_id.tolist() == [2] and found.point.tolist() == [[1.0, 5.0, 0.0]] and found.distance.tolist() == [5.0]
+
+
+def test_no_faces_and_no_points() -> None:
+    empty = wrt.build((np.zeros((1, 3)), np.zeros((0, 3), np.int32)), "bvh8")
+    found = wrt.closest_points(empty, np.zeros((2, 3)))
+    assert np.isinf(found.distance).all() and found.prim_id.tolist() == [-1, -1] and not found.point.any()
+    assert len(wrt.closest_points(wrt.build(icosphere(1), "bvh8"), np.zeros((0, 3)))) == 0
+
+
+def test_what_is_refused() -> None:
+    ball = icosphere(1)
+    for accel, points, told in (
+            (wrt.build(ball, "kdtree"), np.zeros((1, 3)), "bvh4, bvh8 or bvh8c with the watertight triangle test, not of a kdtree"),
+            (wrt.build(ball, "bvh8", triangle="plane"), np.zeros((1, 3)), "bvh8 with 'plane'"),
+            (wrt.build([ball]), np.zeros((1, 3)), "accel must be a structure over one mesh"), (5, np.zeros((1, 3)), "got 5"),
+            (wrt.build(ball), np.zeros((1, 2)), r"points must be \(N, 3\)"),
+            (wrt.build(ball), [[np.nan, 0, 0]], "points must be finite")):
+        with pytest.raises(wrt.InputError, match=told):
+            wrt.closest_points(accel, points)  # type: ignore[arg-type]
