@@ -17,6 +17,7 @@ from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
 
+_bounds: WeakKeyDictionary[Geometry, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
 _open_edges: WeakKeyDictionary[Accelerator, tuple[Geometry, int]] = WeakKeyDictionary()
 
 
@@ -28,6 +29,15 @@ def open_edges(geometry: Geometry) -> int:
     edges = edges[edges[:, 0] != edges[:, 1]]
     _, count = np.unique(edges, axis=0, return_counts=True)
     return int((count % 2 == 1).sum())
+
+
+def used_bounds(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner of all faces, of which there is one or more."""
+    if geometry in _bounds:
+        return _bounds[geometry]
+    used = geometry.vertices[geometry.faces].reshape(-1, 3)
+    found = used.min(axis=0), used.max(axis=0)
+    return _bounds.setdefault(geometry, found) if type(geometry) is Geometry else found  # others may be written to
 
 
 def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any:
@@ -54,8 +64,8 @@ def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
     """As `contains`, of (N, 3) float32 and a mesh that may be open: then it depends on the rays' direction, that is on `seed`."""
     inside = np.zeros(len(rows), bool)
     if len(asked.geometry.faces):
-        used = asked.geometry.vertices[asked.geometry.faces].reshape(-1, 3)
-        within = np.nonzero(((rows >= used.min(axis=0)) & (rows <= used.max(axis=0))).all(axis=1))[0]
+        low, high = used_bounds(asked.geometry)
+        within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
         direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
         counts = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts()
         inside[within] = counts.numpy() % 2 == 1

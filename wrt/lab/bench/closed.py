@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.all_hits import AllHits, all_hits
+from wrt.accel.all_hits import AllHits, all_hits, count_hits
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.contains import contains, open_edges
@@ -38,9 +38,8 @@ COLUMNS: Columns = {"what": "{what}", "mesh": "{mesh}", "triangles": "{triangles
 LEGEND = """\
 inside: points in the mesh's box, a third of them beside a corner by one of the directions in which wrt, trimesh and Open3D ask;
 wrong: otherwise than exact arithmetic on rays that meet no edge; touching: of those, points within 1e-6 of the mesh's size of it.
-crossings: rays from outside at corners and at edges, through the mesh; wrong: an odd number. wrt's all_hits tells all faces at an
-edge or a corner: they are one crossing where the ray goes through the surface, and none where it touches the outline (touching),
-where nothing is held against the others. us each: microseconds a point, or a hit."""
+crossings: rays from outside at corners and at edges, through the mesh; wrong: an odd number. wrt: count_hits with crossings. Rays
+that touch an outline (touching) are not held against the others, who may see it once. us each: microseconds a point, or a crossing."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
@@ -57,7 +56,7 @@ def rows(plan: Plan) -> Iterator[Row]:
         for who, n in asked(plan, plan.rays):
             count = CROSSINGS[who](geometry) if who in CROSSINGS else None
             (count or partial(all_hits, accel))(np.full((2, 3), 9.0, np.float32), np.ones((2, 3), np.float32))
-            yield Row(what="crossings", who=who, **known, **odd(geometry, accel, count, n, plan.seed))
+            yield Row(what="crossings", who=who, **known, **crossed(geometry, accel, count, n, plan.seed))
 
 
 def made() -> list[Mesh]:
@@ -136,9 +135,10 @@ def distances(geometry: Geometry, points: np.ndarray) -> np.ndarray:
 # --- crossings --------------------------------------------------------------------------------------------------------
 
 
-def odd(geometry: Geometry, accel: Accelerator, count: Callable[..., Any] | None, n: int, seed: int) -> dict[str, Any]:
-    """All rays begin and end outside. count: how many hits another library has for each; None: wrt. Rays that touch an outline are
-    counted, and not held against others, who may see it once."""
+def crossed(geometry: Geometry, accel: Accelerator, count: Callable[..., Any] | None, n: int, seed: int) -> dict[str, Any]:
+    """All rays begin and end outside. count: how many hits another library has for each; None: wrt's crossings. Rays that touch an
+    outline are counted, and not held against others, who may see it once."""
+    own = partial(count_hits, accel, crossings=True)
     rng, wrong, touching, hits, seconds = np.random.default_rng(seed), 0, 0, 0, 0.0
     low, high = (bound.astype(np.float64) for bound in (geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)))
     for first in range(0, n, CHUNK):
@@ -147,15 +147,11 @@ def odd(geometry: Geometry, accel: Accelerator, count: Callable[..., Any] | None
         at = np.where(np.arange(size)[:, None] % 2 == 0, *(targets(geometry, rng, size, aim) for aim in ("vertices", "edges")))
         directions = (at - origins).astype(np.float32)
         begin = perf_counter()
-        found = all_hits(accel, origins, directions)
-        mine, (crossings, touches) = perf_counter() - begin, crossings_of(geometry, found, directions)
-        touching, counted = touching + int((touches > 0).sum()), len(found.t)
-        if count is not None:
-            begin = perf_counter()
-            crossings = np.asarray(count(origins, directions))
-            mine, counted = perf_counter() - begin, int(crossings.sum())
-            crossings[touches > 0] = 0
-        seconds, hits, wrong = seconds + mine, hits + counted, wrong + int((crossings % 2 == 1).sum())
+        crossings = np.asarray((count or own)(origins, directions))
+        seconds, hits = seconds + perf_counter() - begin, hits + int(crossings.sum())
+        touches = crossings_of(geometry, all_hits(accel, origins, directions), directions)[1] > 0
+        touching += int(touches.sum())
+        wrong += int((crossings % 2 == 1)[~touches | (count is None)].sum())
     return {"asked": n, "wrong": wrong, "touching": touching, "hits": hits, "microseconds": 1e6 * seconds / max(hits, 1)}
 
 
