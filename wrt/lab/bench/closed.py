@@ -39,7 +39,8 @@ LEGEND = """\
 inside: points in the mesh's box, a third of them beside a corner by one of the directions in which wrt, trimesh and Open3D ask;
 wrong: otherwise than exact arithmetic on rays that meet no edge; touching: of those, points within 1e-6 of the mesh's size of it.
 crossings: rays from outside at corners and at edges, through the mesh; wrong: an odd number. wrt: count_hits with crossings. Rays
-that touch an outline (touching) are not held against the others, who may see it once. us each: microseconds a point, or crossing."""
+that touch an outline (touching) are not held against the others, who may see it once. us each: microseconds a point, or a crossing.
+"""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
