@@ -213,7 +213,7 @@ def test_choices_come_from_the_schema() -> None:
     (["bench", "accel", "box.obj", "--structures", "gird"], "no structure 'gird'; did you mean 'grid'?"),
     (["profile", "box.obj", "--gpu", "rtx2080"], "no GPU 'rtx2080'; did you mean 'rtx2080ti'?"),
     (["rendr"], "No such command 'rendr'; did you mean 'render'? there is animate, bench, "),
-    (["bench", "foo"], "No such command 'foo'; there is accel, bvh, error, "),
+    (["bench", "foo"], "No such command 'foo'; there is accel, bvh, closed, "),
 ])
 def test_a_wrong_name_is_answered_with_the_nearest_and_all(arguments: list[str], message: str) -> None:
     result = run(*arguments)
