@@ -6,7 +6,6 @@ from wrt.kernels.native import source
 from wrt.kernels.query import HitArrays
 from wrt.kernels.structs import kernel
 
-
 # rtcore_common.h, rtcore_ray.h; FLUSH: of the MXCSR, denormals that come in and that go out.
 LAYOUT = {"LANES": 16, "ALIGNMENT": 64, "NONE": 0xFFFFFFFF, "COHERENT": 1 << 16, "FLUSH": 0x8040}
 
