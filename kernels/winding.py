@@ -63,7 +63,7 @@ def wind(surfaces: Surfaces, points: wp.array(dtype=wp.vec3), turns: wp.array(dt
         size_b = wp.length(b)
         size_c = wp.length(c)
         size = size_a * size_b * size_c
-        if size > wp.float64(0.0):
+        if size > wp.float64(0.0) and size < wp.float64(wp.inf):
             part = one / size
             re = one + (wp.dot(a, b) * size_c + wp.dot(b, c) * size_a + wp.dot(c, a) * size_b) * part
             total = turned(total, re, wp.dot(a, wp.cross(b, c)) * part)

@@ -59,7 +59,7 @@ def _function() -> Any:
             return tuple(leaf if leaf is None else each.astype(leaf.dtype) for each, leaf in zip(found, leaves, strict=True))
 
         shapes = jax.tree.map(lambda each: jax.ShapeDtypeStruct(each.shape, each.dtype), leaves)
-        return *on_host(ask, shapes, leaves, prim_id, cotangents[:4]), *(each * 0.0 for each in ends)
+        return *on_host(ask, shapes, leaves, prim_id, cotangents[:4]), *map(jax.numpy.zeros_like, ends)
 
     function = jax.custom_vjp(closest_hit, nondiff_argnums=(0, 1))
     function.defvjp(forward, backward)

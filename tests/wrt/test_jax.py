@@ -34,6 +34,12 @@ def test_the_adjoint_as_it_is_and_compiled() -> None:
             np.testing.assert_allclose(ours, true, rtol=2e-6, atol=2e-6 * np.abs(true).max())
 
 
+def test_the_ends_of_a_segment_have_derivatives_of_zero() -> None:
+    accel, (o, d) = wrt.build(shapes.icosphere(2)), rays(np.random.default_rng(3), 20)
+    by_end = jax.grad(lambda end: wrt.jax.closest_hit(accel, None, o, d, t_max=end).u.sum())(np.full(20, np.inf, np.float32))
+    np.testing.assert_array_equal(by_end, np.zeros(20))
+
+
 def test_values_and_batches() -> None:
     accel, (origins, directions) = wrt.build(shapes.icosphere(2)), rays(np.random.default_rng(1), 100)
     hits = accel.closest_hit(origins, directions, t_max=5.0)

@@ -89,6 +89,19 @@ def test_values_dtypes_and_misses() -> None:
         wrt.torch.closest_hit(ball, None, origins, directions)
 
 
+def test_vertices_that_are_written_to_are_followed() -> None:
+    torch = pytest.importorskip("torch", reason=MISSING.format("torch"))
+    ball, (o, d) = shapes.icosphere(2), map(torch.tensor, rays(np.random.default_rng(11), 50))
+    for build in (lambda own: wrt.build((own, ball.faces)), lambda own: wrt.build((own.numpy(), ball.faces))):
+        vertices = torch.tensor(ball.vertices)
+        accel = build(vertices)
+        for _ in range(2):
+            vertices += 0.1
+            found = wrt.torch.closest_hit(accel, vertices, o, d)
+            expected = wrt.build((vertices.clone(), ball.faces)).closest_hit(o, d)
+            assert (expected.prim_id >= 0).any() and torch.equal(found.t, expected.t)
+
+
 def test_tensors_in_tensors_out() -> None:
     torch = pytest.importorskip("torch", reason=MISSING.format("torch"))
     accel, (o, d) = wrt.build(shapes.icosphere(2)), map(torch.tensor, rays(np.random.default_rng(9), 100))

@@ -66,10 +66,10 @@ class Asked:
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
         structure = require_one_mesh(getattr(accel, "structure", None),
                                      f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
-        self.threads, self.device, state = thread_count(threads), accel.device, accel._state
-        self.geometry, self.crossings = state.geometry, as_one(crossings, bool, "crossings")
-        surfaces = surroundings(accel, state).surfaces if crossings else accel._surfaces
-        self.world = world_of(structure, state.data, surfaces)
+        self.threads, self.device, self.state = thread_count(threads), accel.device, accel._state
+        self.crossings = as_one(crossings, bool, "crossings")
+        surfaces = surroundings(accel, self.state).surfaces if crossings else accel._surfaces
+        self.world = world_of(structure, self.state.data, surfaces)
         self.count_hits, self.write_hits = hit_kernels(structure)
 
     def of(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Asked:

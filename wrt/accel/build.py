@@ -10,6 +10,8 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from wrt.accel.base import Accelerator
 from wrt.accel.flatten import World, world_of, world_over
 from wrt.accel.geometry import Geometry
@@ -116,7 +118,7 @@ def shape_given(mesh: Any) -> Mesh | Scene:
     elif isinstance(mesh, str | os.PathLike):
         mesh = load_mesh(mesh)
     elif isinstance(mesh, tuple) and len(mesh) == 2:
-        vertices, faces = (to_numpy(taken(each, name, None)) if is_tensor(each) else each
+        vertices, faces = (np.array(to_numpy(taken(each, name, None))) if is_tensor(each) else each  # it may be written to
                            for each, name in zip(mesh, ("vertices", "faces"), strict=True))
         mesh = Mesh(vertices, faces)
     elif type(mesh).__module__.split(".")[0] == "trimesh":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,6 @@ from wrt.accel.base import Accelerator
 from wrt.accel.contains import contains
 from wrt.accel.ray_query import require_one_mesh
 from wrt.accel.rays import vectors
-from wrt.core.arrays import taken, to_numpy
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, thread_count, upload
 from wrt.core.errors import InputError
@@ -58,7 +58,7 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
         raise InputError("closest points are asked of a bvh4, bvh8 or bvh8c with the watertight triangle test, not of a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
     data, device = accel._state.data, accel.device
-    rows = vectors(to_numpy(taken(points, "points")), "points", FARTHEST)
+    rows = vectors(points, "points", FARTHEST)
     n, out = len(rows), PointArrays()
     for name, field in fields_of(PointArrays).items():
         setattr(out, name, wp.empty(n, dtype=field.type.dtype, device=device))
@@ -69,6 +69,7 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
 
 def signed_distance(accel: Accelerator, points: Any, threads: int | None = None) -> np.ndarray:
     """The distance of each point to a closed mesh, (N,) float32, below 0 inside. As closest_points and wrt.contains."""
+    accel = copy(accel)  # which a refit meanwhile leaves as it is
     inside = contains(accel, points, threads)
     distance = closest_points(accel, points, threads).distance
     return np.where(inside, -distance, distance)

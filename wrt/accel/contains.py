@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -10,21 +11,34 @@ import warp as wp
 
 from wrt.accel.all_hits import Asked
 from wrt.accel.base import Accelerator
+from wrt.accel.built import State
 from wrt.accel.geometry import Geometry
 from wrt.accel.rays import vectors
-from wrt.core.arrays import returned, taken, to_numpy
+from wrt.core.arrays import returned
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
 
-_bounds: WeakKeyDictionary[Geometry, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
-_open_edges: WeakKeyDictionary[Accelerator, tuple[Geometry, int]] = WeakKeyDictionary()
+T = TypeVar("T")
+
+_bounds: WeakKeyDictionary[State, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
+_open_edges: WeakKeyDictionary[State, int] = WeakKeyDictionary()
+
+
+def found(kept: WeakKeyDictionary[State, T], state: State, find: Callable[[Geometry], T]) -> T:
+    """What `find` says of the geometry, asked once, unless refits in place change it."""
+    if state.changes:
+        return find(state.geometry)
+    if state not in kept:
+        kept[state] = find(state.geometry)
+    return kept[state]
 
 
 def open_edges(geometry: Geometry) -> int:
-    """Edges with an odd number of faces; corners with the same coordinates are one. 0: the mesh is closed."""
+    """Edges with an odd number of faces; corners with the same coordinates are one. 0: the mesh is closed. Faces with
+    a corner that is not finite, which no ray hits, are left out."""
     _, corner = np.unique(geometry.vertices + np.float32(0.0), axis=0, return_inverse=True)  # -0 is 0
-    faces = corner.reshape(-1)[geometry.faces]
+    faces = corner.reshape(-1)[geometry.faces[np.isfinite(geometry.vertices).all(axis=1)[geometry.faces].all(axis=1)]]
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges = edges[edges[:, 0] != edges[:, 1]]
     _, count = np.unique(edges, axis=0, return_counts=True)
@@ -33,11 +47,8 @@ def open_edges(geometry: Geometry) -> int:
 
 def used_bounds(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest corner of all faces, of which there is one or more."""
-    if geometry in _bounds:
-        return _bounds[geometry]
     used = geometry.vertices[geometry.faces].reshape(-1, 3)
-    found = used.min(axis=0), used.max(axis=0)
-    return _bounds.setdefault(geometry, found) if type(geometry) is Geometry else found  # others may be written to
+    return used.min(axis=0), used.max(axis=0)
 
 
 def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any:
@@ -47,13 +58,9 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any
     is in two parts that overlap is outside); with the watertight test that is exact for every direction (all_hits, crossings).
     Raises InputError where the mesh is not closed, and as Accelerator.closest_hit does.
     """
-    rows, give = vectors(to_numpy(taken(points, "points")), "points", FARTHEST), returned(points)
+    rows, give = vectors(points, "points", FARTHEST), returned(points)
     asked = Asked(accel, threads, crossings=True)
-    geometry, count = _open_edges.get(accel, (None, 0))
-    if geometry is not asked.geometry:
-        count = open_edges(asked.geometry)
-        _open_edges[accel] = asked.geometry, count
-    if count:
+    if count := found(_open_edges, asked.state, open_edges):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces"
                          "; wrt.winding_number tells what is mostly inside")
     inside = odd_crossings(asked, rows)
@@ -63,8 +70,8 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any
 def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
     """As `contains`, of (N, 3) float32 and a mesh that may be open: then it depends on the rays' direction, that is on `seed`."""
     inside = np.zeros(len(rows), bool)
-    if len(asked.geometry.faces):
-        low, high = used_bounds(asked.geometry)
+    if asked.state.geometry.n_triangles:
+        low, high = found(_bounds, asked.state, used_bounds)
         within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
         direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
         counts = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts()

@@ -113,8 +113,10 @@ def hits_of(accel: Any, vertices: Any, rays: tuple[Any, ...], rebuild_at: float)
     Raises InputError that names the argument.
     """
     require_one_mesh(getattr(accel, "structure", None), f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
-    if vertices is not None and not np.array_equal(float32(to_numpy(vertices)), accel.geometry.vertices):
-        accel.refit(vertices, rebuild_at)
+    if vertices is not None:
+        now, followed = to_numpy(vertices), accel.geometry.vertices
+        if np.may_share_memory(now, followed) or not np.array_equal(float32(now), followed):  # shared: perhaps written to
+            accel.refit(vertices, rebuild_at)
     return accel.closest_hit(*rays)
 
 
@@ -131,10 +133,12 @@ def record(hits: Any, **outputs: Any) -> None:
     directions and the array that the structure's last refit followed: those of them that require gradients."""
     (accel, state, rays, _), tape = hits.source, recording()
     leaves = Gradients(state.followed, rays.origins, rays.directions)
-    wanted = [array for array in leaves if isinstance(array, wp.array) and array.requires_grad]
+    wanted = [array for array in leaves if isinstance(array, wp.array) and array.requires_grad and array.size]
     if tape is None or not wanted:
         return
     require_one_mesh(accel.structure, ONE_MESH)
+    if not rays.as_warp:
+        raise InputError("a wp.Tape is recording, with gradients in vertices: give rays as Warp arrays, or ask outside of it")
     for array in outputs.values():
         array.requires_grad = True
 

@@ -155,7 +155,6 @@ def surroundings(accel: Any, state: State) -> Surroundings:
     """Of a structure in a state of it, on its device: made once, unless refits in place change it."""
     if state in _surroundings:
         return _surroundings[state]
-    changes = state.built is not None and bool(np.isnan(state.built.sah_cost))  # instances are only moved to another state
     geometry: Any = state.geometry
     world, device, surfaces = accel.attributes or world_over(geometry), accel.device, structs.Surfaces()
     placed = placed_now(world, geometry)
@@ -173,7 +172,7 @@ def surroundings(accel: Any, state: State) -> Surroundings:
         surfaces.instances = upload(instance_records(placed), structs.Instance, device)
         numbering.instance = upload(_instance_of(placed, geometry), wp.int32, device)
     made = Surroundings(world, surfaces, numbering)
-    return made if changes else _surroundings.setdefault(state, made)
+    return made if state.changes else _surroundings.setdefault(state, made)
 
 
 def _instance_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:

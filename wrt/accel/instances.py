@@ -129,7 +129,7 @@ class Instances(Accelerator):
 
 def moves(geometry: InstancedGeometry, instance: Any, matrix: Any) -> tuple[np.ndarray, np.ndarray]:
     """The arguments of Instances.move as (R,) rows and (R, 3, 4) float64. Raises InputError that names the argument."""
-    rows = np.asarray(instance)
+    rows = real_numbers(instance, "instance", "a whole number, or (R,)")
     if rows.ndim > 1 or (rows.dtype.kind not in "iu" and rows.size):
         raise InputError(f"instance must be a whole number, or (R,) of them, got {shown(instance)}")
     matrices = real_numbers(matrix, "matrix", f"{(*rows.shape, 4, 4)}").astype(np.float64)

@@ -96,7 +96,7 @@ def _prim_ids(value: Any, name: str, n: int, count: int) -> np.ndarray:
     """(N,) int32, -1 for each where there are none. Raises InputError that names the argument."""
     if value is None:
         return np.full(n, -1, np.int32)
-    array = real_numbers(to_numpy(taken(value, name, None)), name, f"({n},) prim_ids")
+    array = real_numbers(value, name, f"({n},) prim_ids")
     if array.shape != (n,) or array.dtype.kind not in "iu":
         raise InputError(f"{name} must be ({n},) whole numbers, got {shown(array)}")
     if n and not (array.min() >= -1 and array.max() < count):

@@ -38,12 +38,14 @@ def to_warp(array: Any, dtype: Any = None) -> Any:
 
 
 def real_numbers(value: Any, name: str, shape: str) -> np.ndarray:
-    """An array of what somebody gives as real numbers: arrays of integers or floats of any size as they are, lists, scalars;
-    objects as float32. Raises InputError that calls it `name`, and says that `shape` was expected."""
+    """An array of what somebody gives as real numbers: arrays and tensors of integers or floats of any size as they are, lists,
+    scalars; objects as float32; what is on a GPU is copied. Raises InputError that calls it `name`, and says that `shape` was
+    expected."""
     if "numpy.ma" in sys.modules and isinstance(value, np.ma.MaskedArray):  # else there is none, and that module takes long
         raise InputError(f"{name} must not be a masked array: its mask would be ignored; leave masked rows out, or fill them")
+    value = taken(value, name, None)
     try:
-        array = np.asarray(value)
+        array = value.numpy() if isinstance(value, wp.array) else np.asarray(value)
         if array.dtype.kind in REAL:
             return float32(array) if array.dtype.kind == "O" else array
     except (TypeError, ValueError, OverflowError):

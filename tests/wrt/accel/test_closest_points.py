@@ -121,6 +121,21 @@ def test_faces_without_area_are_left_out() -> None:
     assert found.prim_id.tolist() == [2] and found.point.tolist() == [[1.0, 5.0, 0.0]] and found.distance.tolist() == [5.0]
 
 
+def test_a_signed_distance_is_of_one_shape_whatever_is_refitted_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = icosphere(2)
+    accel = wrt.build(ball, "bvh8")
+    expected = wrt.signed_distance(accel, np.zeros((1, 3)))
+
+    def contains(*asked: Any) -> Any:
+        inside = wrt.contains(*asked)
+        accel.refit(3.0 * ball.vertices)
+        return inside
+
+    monkeypatch.setattr("wrt.accel.closest_points.contains", contains)
+    assert wrt.signed_distance(accel, np.zeros((1, 3))) == expected < -0.9
+    assert wrt.signed_distance(accel, np.zeros((1, 3))) < 2.0 * expected
+
+
 def test_no_faces_and_no_points() -> None:
     empty = wrt.build((np.zeros((1, 3)), np.zeros((0, 3), np.int32)), "bvh8")
     found = wrt.closest_points(empty, np.zeros((2, 3)))

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+import warp as wp
 
 import wrt
+from tests.device import NAME as DEVICE
 from wrt.scene import shapes
 
 
@@ -52,6 +57,42 @@ def test_after_a_refit_it_is_the_new_mesh() -> None:
     assert wrt.contains(accel, points)[0]
 
 
+def points_of(array: np.ndarray) -> Any:
+    return wp.array(array, dtype=wp.vec3, device=DEVICE)
+
+
+def test_a_mesh_that_a_refit_in_place_opens_is_open() -> None:
+    box = shapes.box()
+    corners = box.vertices[box.faces].reshape(-1, 3)
+    accel = wrt.build((corners, np.arange(36).reshape(-1, 3)), "bvh2", DEVICE)
+    for scale in (1.0, 3.0):  # bounds, too, are those of now
+        accel.refit(points_of(scale * corners), in_place=True)
+        assert wrt.contains(accel, [[0.1, 0.2, 0.3], [0.6, 0.0, 0.0]]).tolist() == [True, scale == 3.0]
+    corners[:3] += np.float32(0.1)
+    accel.refit(points_of(corners), in_place=True)
+    with pytest.raises(wrt.InputError, match="6 edges have an odd number of faces"):
+        wrt.contains(accel, [[0.1, 0.2, 0.3]])
+
+
+def test_after_saving_a_refit_in_place_is_followed(tmp_path: Path) -> None:
+    ball = shapes.icosphere(2)
+    accel = wrt.build(ball, "bvh2", DEVICE)
+    for scale in (1.0, 2.0):
+        accel.refit(points_of(scale * ball.vertices), in_place=True)
+        accel.save(tmp_path / "ball.accel")
+        assert wrt.contains(accel, [[0.0, 1.5, 0.1]])[0] == (scale == 2.0)
+        assert round(wrt.winding_number(accel, [[0.0, 1.5, 0.1]])[0], 6) == (scale == 2.0)
+
+
+def test_a_mesh_with_a_corner_that_is_no_number_is_open() -> None:
+    ball = shapes.icosphere(1)
+    ball_points = ball.vertices.copy()
+    ball_points[7, 1] = np.nan
+    faces = wp.array(ball.faces.reshape(-1), dtype=wp.int32, device=DEVICE)
+    with pytest.raises(wrt.InputError, match="the mesh is not closed"):
+        wrt.contains(wrt.build(wrt.DeviceGeometry(points_of(ball_points), faces), "bvh2", DEVICE), [[0.0, 0.0, 0.0]])
+
+
 def test_points_of_another_library() -> None:
     class Tensor:
         array = np.array([[0.1, 0.2, 0.3], [0.0, 2.0, 0.0]], np.float32)
@@ -73,6 +114,8 @@ def test_what_is_refused_and_what_is_empty() -> None:
     for accel, points, said in ((flat, [[0.0, 0.0, 0.0]], "the mesh is not closed: 4 edges"),
                                 (ball, [[0.0, np.nan, 0.0]], "points must be finite"),
                                 (ball, [0.0, 1.0], r"points must be \(N, 3\)"),
+                                (ball, [[0.0, 1.0, 2.0], [0.0]], r"points must be \(N, 3\) of real numbers"),
+                                (ball, np.ma.zeros((1, 3)), "points must not be a masked array"),
                                 ("bvh", [[0.0, 0.0, 0.0]], "accel must be a structure over one mesh")):
         with pytest.raises(wrt.InputError, match=said):
             wrt.contains(accel, points)  # type: ignore[arg-type]

@@ -123,6 +123,7 @@ def with_a_part_in_the_world() -> Instances:
 @pytest.mark.parametrize("instance, matrix, told", [
     (3, np.zeros(3), r"matrix must be \(4, 4\), got \(3,\)"),
     ([1, 2], np.eye(4), r"matrix must be \(2, 4, 4\), got \(4, 4\)"),
+    ([[1], [1, 2]], np.eye(4), "instance must be a whole number"),
     (3, "no", r"matrix must be \(4, 4\) of real numbers"),
     (4, np.eye(4), "instance must be 0 to 3"), (-1, np.eye(4), "instance must be 0 to 3"),
     (0.5, np.eye(4), "instance must be a whole number"), ([2, 2], np.tile(np.eye(4), (2, 1, 1)), "instance has a row twice"),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 
 import wrt
+from tests.device import NAME as DEVICE
 from wrt.scene import shapes
 
 
@@ -48,6 +50,17 @@ def test_an_open_mesh_is_told_by_half() -> None:
     square = wrt.build(shapes.quad((-1.0, -1.0, 0.0), (2.0, 0.0, 0.0), (0.0, 2.0, 0.0)))
     below, above = wrt.winding_number(square, [[0.0, 0.0, -1e-6], [0.0, 0.0, 1e-6]])
     assert below == pytest.approx(0.5, abs=1e-5) and above == pytest.approx(-0.5, abs=1e-5)
+
+
+def test_triangles_with_a_corner_that_is_not_finite_are_left_out() -> None:
+    ball = shapes.icosphere(1)
+    faces = wp.array(ball.faces.reshape(-1), dtype=wp.int32, device=DEVICE)
+    expected = wrt.winding_number(wrt.build((ball.vertices, ball.faces[(ball.faces != 7).all(axis=1)])), [[0.1, 0.2, 0.3]])
+    for value in (np.nan, np.inf):
+        points = ball.vertices.copy()
+        points[7, 1] = value
+        accel = wrt.build(wrt.DeviceGeometry(wp.array(points, dtype=wp.vec3, device=DEVICE), faces), "bvh2", DEVICE)
+        assert wrt.winding_number(accel, [[0.1, 0.2, 0.3]]) == pytest.approx(expected, abs=1e-12)
 
 
 def test_corners_nothing_and_what_is_refused() -> None:

@@ -12,9 +12,11 @@ import warp as wp
 import wrt
 from tests.kernel_tools import DEVICE
 from tests.wrt.accel.test_move import matrices
+from tests.wrt.core.test_arrays import Library, OnDevice
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import place
 from wrt.accel.instances import Instances
+from wrt.core.arrays import to_numpy
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import icosphere, torus
@@ -114,6 +116,13 @@ def test_arrays_of_warp_whose_worlds_are_not_looked_at() -> None:
     hits = structure().closest_hit(*given, world=wp.array(ids, dtype=wp.int32, device=DEVICE))
     assert isinstance(hits.t, wp.array) and bits(hits, ~bad) == bits(expected, ~bad)
     assert (hits.numpy().prim_id[bad] == -1).all()
+    for library in (Library, OnDevice):
+        arrays = [library.Tensor(array.numpy() if library is Library else array)  # type: ignore[attr-defined]
+                  for array in (*given, wp.array(world, dtype=wp.int32, device=DEVICE))]
+        of_tensors = structure().closest_hit(*arrays[:2], world=arrays[2])
+        assert isinstance(of_tensors.t, library.Tensor)  # type: ignore[attr-defined]
+        for name in ("t", "instance"):
+            np.testing.assert_array_equal(to_numpy(getattr(of_tensors, name)), getattr(expected, name))
     again = structure().closest_hit(*given, world=world, out=hits)
     assert again.t is hits.t and bits(again) == bits(expected)
 

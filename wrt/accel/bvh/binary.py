@@ -20,7 +20,7 @@ from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry
 from wrt.accel.rays import vectors
-from wrt.accel.store import check_binary
+from wrt.accel.store import check_binary, save
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build.shape import write_corners
@@ -124,11 +124,11 @@ class Bvh2(BinaryBvh):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """As Accelerator.save. Of a tree that was refitted in place, what it costs is looked up first."""
-        built = self._state.built
-        if math.isnan(built.sah_cost):
-            cost = sah_cost(built.on_host().arrays["nodes"])
-            self._state = replace(self._state, built=replace(built, sah_cost=cost))
-        super().save(path)
+        state = self._state
+        if math.isnan(state.built.sah_cost):
+            cost = sah_cost(state.built.on_host().arrays["nodes"])
+            state = replace(state, built=replace(state.built, sah_cost=cost))
+        save(self.structure, state, path)
 
     def _begin_in_place(self, points: Any) -> InPlace:
         """Arrays of its own for the structure, and what is kept beside them."""
@@ -138,7 +138,7 @@ class Bvh2(BinaryBvh):
         beside._state = State(DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres))
         beside._take(built, time.perf_counter(), self._state.built_cost)
         fitting, shape = Fitting(self.device, len(self.geometry), built.nodes), beside._shape()
-        self._state = beside._state
+        self._state = replace(beside._state, changes=True)
         return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)
 
     def _primitives(self, built: Built) -> Any:
