@@ -21,10 +21,10 @@ from wrt.accel.flatten import World
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries import Queries
 from wrt.accel.ray_query import world_of
-from wrt.accel.rays import vectors
+from wrt.accel.rays import host_vectors
 from wrt.accel.store import save
 from wrt.accel.structure import Structure, check_options, check_units
-from wrt.core.arrays import check_no_gradients, taken, to_numpy
+from wrt.core.arrays import check_no_gradients, taken
 from wrt.core.device import require_on, start, thread_count, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
@@ -134,7 +134,7 @@ class Accelerator(Queries, ABC):
 
     def _moved(self, vertices: Any) -> Geometry:
         """The geometry with other vertices. Raises InputError for what these cannot be."""
-        moved = vectors(to_numpy(vertices), "vertices").copy()
+        moved = host_vectors(vertices, "vertices").copy()
         if moved.shape != (self.geometry.n_vertices, 3):
             raise InputError(f"vertices must be {(self.geometry.n_vertices, 3)}, got {moved.shape}")
         return Geometry(moved, self.geometry.faces, self.geometry.spheres)

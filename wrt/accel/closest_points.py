@@ -11,8 +11,7 @@ import warp as wp
 from wrt.accel.base import Accelerator
 from wrt.accel.contains import contains
 from wrt.accel.ray_query import require_one_mesh
-from wrt.accel.rays import vectors
-from wrt.core.arrays import taken, to_numpy
+from wrt.accel.rays import host_vectors
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, thread_count, upload
 from wrt.core.errors import InputError
@@ -58,7 +57,7 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
         raise InputError("closest points are asked of a bvh4, bvh8 or bvh8c with the watertight triangle test, not of a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
     data, device = accel._state.data, accel.device
-    rows = vectors(to_numpy(taken(points, "points")), "points", FARTHEST)
+    rows = host_vectors(points, "points", FARTHEST)
     n, out = len(rows), PointArrays()
     for name, field in fields_of(PointArrays).items():
         setattr(out, name, wp.empty(n, dtype=field.type.dtype, device=device))
@@ -69,6 +68,7 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
 
 def signed_distance(accel: Accelerator, points: Any, threads: int | None = None) -> np.ndarray:
     """The distance of each point to a closed mesh, (N,) float32, below 0 inside. As closest_points and wrt.contains."""
+    points = host_vectors(points, "points", FARTHEST)  # else what is inside would be a tensor, of a GPU perhaps
     inside = contains(accel, points, threads)
     distance = closest_points(accel, points, threads).distance
     return np.where(inside, -distance, distance)

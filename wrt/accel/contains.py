@@ -11,8 +11,8 @@ import warp as wp
 from wrt.accel.all_hits import Asked
 from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
-from wrt.accel.rays import vectors
-from wrt.core.arrays import returned, taken, to_numpy
+from wrt.accel.rays import host_vectors
+from wrt.core.arrays import returned
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
@@ -47,7 +47,7 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any
     is in two parts that overlap is outside); with the watertight test that is exact for every direction (all_hits, crossings).
     Raises InputError where the mesh is not closed, and as Accelerator.closest_hit does.
     """
-    rows, give = vectors(to_numpy(taken(points, "points")), "points", FARTHEST), returned(points)
+    rows, give = host_vectors(points, "points", FARTHEST), returned(points)
     asked = Asked(accel, threads, crossings=True)
     geometry, count = _open_edges.get(accel, (None, 0))
     if geometry is not asked.geometry:

@@ -139,6 +139,12 @@ def vectors(value: Any, name: str, most: float = float(np.finfo(np.float32).max)
     return array
 
 
+def host_vectors(value: Any, name: str, most: float = float(np.finfo(np.float32).max)) -> np.ndarray:
+    """As `vectors`, also of Warp's arrays and of tensors, on any device."""
+    value = taken(value, name)
+    return vectors(value.numpy() if isinstance(value, wp.array) else value, name, most)
+
+
 def _check_not_zero(directions: np.ndarray) -> None:
     zero = directions[:, 0] == 0.0
     if zero.any():

@@ -10,8 +10,8 @@ import warp as wp
 from wrt.accel.base import Accelerator
 from wrt.accel.hit_points import surroundings
 from wrt.accel.ray_query import require_one_mesh
-from wrt.accel.rays import vectors
-from wrt.core.arrays import returned, taken, to_numpy
+from wrt.accel.rays import host_vectors
+from wrt.core.arrays import returned
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, thread_count, upload
 from wrt.kernels.query import FARTHEST
@@ -27,10 +27,10 @@ def winding_number(accel: Accelerator, points: Any, threads: int | None = None) 
     to 1e-9, more where parts overlap, and -1 where they face inwards; of an open one it goes over from one to the other, so that
     above 0.5 is mostly inside (Jacobson, Kavan and Sorkine-Hornung 2013, "Robust Inside-Outside Segmentation Using Generalized
     Winding Numbers"). On a triangle it is between its two sides. Every triangle is looked at: a point takes as long as the mesh is
-    large, some 40 ns a triangle. Raises InputError as wrt.contains does.
+    large, some 40 ns a triangle. Raises InputError as closest_points does.
     """
     require_one_mesh(getattr(accel, "structure", None), f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
-    rows, give, device = vectors(to_numpy(taken(points, "points")), "points", FARTHEST), returned(points), accel.device
+    rows, give, device = host_vectors(points, "points", FARTHEST), returned(points), accel.device
     turns = wp.empty(len(rows), dtype=wp.vec3d, device=device)
     launch_on(device, wind, len(rows), surroundings(accel, accel._state).surfaces, upload(rows, wp.vec3, device), turns, None,
               threads=thread_count(threads), step=POINTS_PER_LAUNCH)
