@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from wrt.core.arrays import to_numpy
 from wrt.core.checks import as_array, as_integer, as_size, shown
 from wrt.core.errors import InputError
 from wrt.scene.values import as_number, as_transform
@@ -35,7 +36,7 @@ class Sensor:
     def picture(self, values: Any) -> np.ndarray:
         """(rows, columns, ...): one value a ray, such as hits.prim_id, hits.object, hits.instance or hits.normal. Raises InputError
         where there are not as many."""
-        values = values.numpy() if hasattr(values, "numpy") else np.asarray(values)
+        values = to_numpy(values)
         if values.shape[:1] != (len(self.origins),):
             raise InputError(f"values must be one a ray, ({len(self.origins)}, ...), got {values.shape}")
         return values.reshape(*self.shape, *values.shape[1:])
@@ -50,6 +51,8 @@ class Sensor:
         return self._scaled(hits, self.directions.astype(np.float64) @ self.axis)
 
     def _scaled(self, hits: Any, factor: np.ndarray) -> np.ndarray:
+        if not hasattr(hits, "t"):
+            raise InputError(f"hits must be those of closest_hit, got {shown(hits)}")
         t = self.picture(hits.t).astype(np.float64)
         scaled = np.where(np.isfinite(t), t, 0.0) * factor.reshape(self.shape)
         return np.where(np.isfinite(t), scaled, np.inf).astype(np.float32)
@@ -115,7 +118,7 @@ def with_range_noise(ranges: Any, seed: int, constant: float = 0.0, proportional
     with probability `dropout` it is lost (inf). What is a miss (inf) stays one. Each element has noise of its own, whatever the
     others are. constant: scene units. Raises InputError.
     """
-    ranges = as_array(ranges, np.float64, "ranges")
+    shape, ranges = np.shape(ranges), as_array(ranges, np.float64, "ranges")
     constant, proportional = (as_number(value, name, low=0.0) for value, name in ((constant, "constant"),
                                                                                 (proportional, "proportional")))
     if not 0.0 <= as_number(dropout, "dropout") <= 1.0:
@@ -124,7 +127,8 @@ def with_range_noise(ranges: Any, seed: int, constant: float = 0.0, proportional
     normal, lost = rng.standard_normal(ranges.shape), rng.random(ranges.shape) < dropout
     there = np.isfinite(ranges) & ~lost
     r = np.where(there, ranges, 0.0)
-    return np.where(there, np.maximum(r + np.hypot(constant, proportional * r) * normal, 0.0), np.inf).astype(np.float32)
+    noisy = np.where(there, np.maximum(r + np.hypot(constant, proportional * r) * normal, 0.0), np.inf)
+    return as_array(noisy, np.float32, "ranges").reshape(shape)
 
 
 def _spherical(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
@@ -139,6 +143,9 @@ def _sensor(directions: np.ndarray, pose: Any, axis: int) -> Sensor:
     rotation = matrix[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0.0:
         raise InputError("pose must be a rotation and a translation")
-    turned = (directions.reshape(-1, 3) @ rotation.T).astype(np.float32)
-    origins = np.tile(matrix[:3, 3].astype(np.float32), (len(turned), 1))
+    with np.errstate(over="ignore"):
+        turned = (directions.reshape(-1, 3) @ rotation.T).astype(np.float32)
+        origins = np.tile(matrix[:3, 3].astype(np.float32), (len(turned), 1))
+    if not (np.isfinite(turned).all() and np.isfinite(origins).all()):
+        raise InputError("rays of this sensor and pose are beyond float32")
     return Sensor(origins, turned, (directions.shape[0], directions.shape[1]), rotation[:, axis].copy())

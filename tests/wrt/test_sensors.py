@@ -117,6 +117,7 @@ def test_noise_repeats_and_is_each_elements_own() -> None:
     other[0, 0], other[1, 2] = np.inf, 1.0
     same = with_range_noise(other, 3, 0.1, dropout=0.2) == noisy
     assert same.sum() >= 22 and same[2:].all()
+    assert with_range_noise(5.0, 0).shape == () and with_range_noise(1e300, 0) == np.inf
     assert np.array_equal(with_range_noise(ranges, 0), ranges) and (with_range_noise(np.zeros(1000), 0, 1.0) >= 0.0).all()
 
 
@@ -135,6 +136,9 @@ def test_noise_repeats_and_is_each_elements_own() -> None:
     (lambda: with_range_noise([1.0], 0, -1.0), "constant must be"),
     (lambda: with_range_noise([1.0], 0, dropout=1.5), "dropout must be 0 to 1"),
     (lambda: with_range_noise([1.0], -1), "seed must be 0 to"),
+    (lambda: pinhole(np.diag([1e-40, 1.0, 1.0]), (4, 4)), "beyond float32"),
+    (lambda: pinhole(K, (4, 4), [[1, 0, 0, 1e39], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "beyond float32"),
+    (lambda: pinhole(K, (4, 4)).depth(np.zeros(16)), r"hits must be those of closest_hit, got an array \(16,\)"),
     (lambda: pinhole(K, (4, 4)).picture(np.zeros(3)), r"values must be one a ray, \(16, ...\), got \(3,\)"),
 ])
 def test_what_is_refused(call: Any, said: str) -> None:

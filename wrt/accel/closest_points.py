@@ -70,6 +70,7 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
 def signed_distance(accel: Accelerator, points: Any, threads: int | None = None) -> np.ndarray:
     """The distance of each point to a closed mesh, (N,) float32, below 0 inside. As closest_points and wrt.contains."""
     accel = copy(accel)  # which a refit meanwhile leaves as it is
+    points = vectors(points, "points", FARTHEST)  # else what is inside would be a tensor, of a GPU perhaps
     inside = contains(accel, points, threads)
     distance = closest_points(accel, points, threads).distance
     return np.where(inside, -distance, distance)

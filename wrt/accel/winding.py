@@ -27,7 +27,7 @@ def winding_number(accel: Accelerator, points: Any, threads: int | None = None) 
     to 1e-9, more where parts overlap, and -1 where they face inwards; of an open one it goes over from one to the other, so that
     above 0.5 is mostly inside (Jacobson, Kavan and Sorkine-Hornung 2013, "Robust Inside-Outside Segmentation Using Generalized
     Winding Numbers"). On a triangle it is between its two sides. Every triangle is looked at: a point takes as long as the mesh is
-    large, some 40 ns a triangle. Raises InputError as wrt.contains does.
+    large, some 40 ns a triangle. Raises InputError as closest_points does.
     """
     require_one_mesh(getattr(accel, "structure", None), f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
     rows, give, device = vectors(points, "points", FARTHEST), returned(points), accel.device

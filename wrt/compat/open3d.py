@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
+from contextlib import suppress
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,12 +18,15 @@ from wrt.accel.build import build
 from wrt.accel.closest_points import closest_points
 from wrt.accel.contains import odd_crossings
 from wrt.compat.surfaces import every_hit
+from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
 from wrt.scene.mesh import Mesh
+from wrt.scene.values import LARGEST, as_number
 
 MOST_SAMPLES = 1 << 16
+WIDEST = 1 << 15  # pixels
 
 
 class Array(np.ndarray):
@@ -61,13 +65,18 @@ class RaycastingScene:
             mesh = vertex_positions
         if mesh is not None:
             vertex_positions, triangle_indices = _arrays_of(mesh)
-        vertices, faces = np.array(_numpy(vertex_positions), np.float32), np.array(_numpy(triangle_indices), np.int64)
+        vertices = float32(_numbers(vertex_positions, "vertex_positions", "(N, 3)")).copy()
+        indices = _numbers(triangle_indices, "triangle_indices", "(N, 3)")
+        with np.errstate(invalid="ignore"):
+            faces = indices.astype(np.int64)
         for array, name in ((vertices, "vertex_positions"), (faces, "triangle_indices")):
             if array.ndim != 2 or array.shape[1] != 3:
                 raise InputError(f"{name} must be (N, 3), got {array.shape}")
-        if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
-            raise InputError(f"triangle_indices must be 0 to {len(vertices) - 1}")
+        if not ((faces == indices) & (faces >= 0) & (faces < len(vertices))).all():
+            raise InputError(f"triangle_indices must be 0 to {len(vertices) - 1}, whole numbers")
         bad = np.logical_not(np.isfinite(vertices).all(axis=1))
+        if (np.abs(vertices[~bad]) > LARGEST).any():
+            raise InputError(f"vertex_positions must be at most {LARGEST:g}")
         faces[bad[faces].any(axis=1)] = 0  # hit no more, and all keep their numbers
         vertices[bad] = 0.0
         self._meshes.append((vertices, faces))
@@ -189,15 +198,20 @@ def _threads(nthreads: int) -> int | None:
     return as_integer(nthreads, "nthreads", 0, (1 << 31) - 1) or None
 
 
-def _numpy(value: Any) -> Any:
-    """Of tensors the array; all else as it is."""
-    return value.cpu().numpy() if hasattr(value, "cpu") else value
+def _numbers(value: Any, name: str, shape: str) -> np.ndarray:
+    """An array of real numbers, also of a tensor."""
+    try:
+        value = value.cpu().numpy() if hasattr(value, "cpu") else value
+    except (RuntimeError, TypeError) as error:  # torch's, of one that requires gradients, or has a type that NumPy has not
+        raise InputError(f"{name}: {error}") from error
+    return real_numbers(value, name, shape)
 
 
 def _arrays_of(mesh: Any) -> tuple[Any, Any]:
     """Positions and indices of a mesh of another library."""
     if hasattr(mesh, "vertex"):
-        return mesh.vertex.positions, mesh.triangle.indices
+        with suppress(KeyError):  # Open3D's, of a mesh without any
+            return mesh.vertex.positions, mesh.triangle.indices
     for name in ("faces", "triangles"):
         if hasattr(mesh, "vertices") and hasattr(mesh, name):
             return mesh.vertices, getattr(mesh, name)
@@ -206,14 +220,10 @@ def _arrays_of(mesh: Any) -> tuple[Any, Any]:
 
 def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarray]:
     """The leading shape, and (N, width) float32."""
-    try:
-        with np.errstate(over="ignore"):
-            array = np.asarray(_numpy(value)).astype(np.float32, copy=False)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be (..., {width}) real numbers, got {shown(value)}") from error
+    array = _numbers(value, name, f"(..., {width})")
     if array.ndim < 1 or array.shape[-1] != width:
         raise InputError(f"{name} must be (..., {width}), got {array.shape}")
-    return array.shape[:-1], array.reshape(-1, width)
+    return array.shape[:-1], float32(array.reshape(-1, width))
 
 
 def _normals(mesh: Mesh) -> np.ndarray:
@@ -260,7 +270,11 @@ def _answer(array: np.ndarray, shape: tuple[int, ...]) -> Any:
 
 def _rays_of_matrices(intrinsic_matrix: Any, extrinsic_matrix: Any, width_px: int, height_px: int) -> np.ndarray:
     """See RaycastingScene.create_rays_pinhole."""
-    inverse = np.linalg.inv(_matrix(intrinsic_matrix, "intrinsic_matrix", (3, 3)))
+    width_px, height_px = (as_integer(size, name, 0, WIDEST) for size, name in ((width_px, "width_px"), (height_px, "height_px")))
+    try:
+        inverse = np.linalg.inv(_matrix(intrinsic_matrix, "intrinsic_matrix", (3, 3)))
+    except np.linalg.LinAlgError as error:
+        raise InputError("intrinsic_matrix must have an inverse") from error
     to_camera = _matrix(extrinsic_matrix, "extrinsic_matrix", (4, 4))
     x, y = np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
     to_world = to_camera[:3, :3].T
@@ -273,9 +287,13 @@ def _rays_of_matrices(intrinsic_matrix: Any, extrinsic_matrix: Any, width_px: in
 def _rays_looking_at(fov_deg: float, center: Any, eye: Any, up: Any, width_px: int, height_px: int) -> np.ndarray:
     """See RaycastingScene.create_rays_pinhole."""
     center, eye, up = (_matrix(value, name, (3,)) for value, name in ((center, "center"), (eye, "eye"), (up, "up")))
-    focal = 0.5 * width_px / math.tan(math.radians(0.5 * fov_deg))
+    if not 0.0 < as_number(fov_deg, "fov_deg") < 180.0:
+        raise InputError(f"fov_deg must be between 0 and 180, got {fov_deg:g}")
+    focal = 0.5 * as_integer(width_px, "width_px", 0, WIDEST) / math.tan(math.radians(0.5 * fov_deg))
     z = center - eye
     x = np.cross(up, z)
+    if not x.any():
+        raise InputError("center must not be eye, nor in the direction of up from it")
     z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
     to_camera = np.eye(4)
     to_camera[:3, :3] = x, np.cross(z, x), z
@@ -285,7 +303,7 @@ def _rays_looking_at(fov_deg: float, center: Any, eye: Any, up: Any, width_px: i
 
 
 def _matrix(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.asarray(_numpy(value), np.float64)
+    array = _numbers(value, name, str(shape)).astype(np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(f"{name} must be {shape} finite numbers, got {shown(value)}")
     return array

@@ -17,6 +17,7 @@ from wrt.accel.answers import Hits
 from wrt.accel.build import build
 from wrt.accel.contains import contains, open_edges
 from wrt.compat.surfaces import every_hit, ranks
+from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
 from wrt.scene.mesh import Mesh
@@ -200,7 +201,8 @@ def located(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray, u:
 
 
 def _rays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray]:
-    out = [np.asarray(rays, dtype=np.float64) for rays in (origins, directions)]
+    named = {"ray_origins": origins, "ray_directions": directions}
+    out = [np.asarray(real_numbers(rays, name, "(N, 3)"), np.float64) for name, rays in named.items()]
     origins, directions = (rays.reshape(0, 3) if rays.shape == (0,) else rays for rays in out)
     if origins.ndim != 2 or origins.shape[1] != 3 or origins.shape != directions.shape:
         raise InputError(f"ray_origins and ray_directions must be (N, 3) both, got {origins.shape} and {directions.shape}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -141,6 +143,31 @@ def test_no_faces_and_no_points() -> None:
     found = wrt.closest_points(empty, np.zeros((2, 3)))
     assert np.isinf(found.distance).all() and found.prim_id.tolist() == [-1, -1] and not found.point.any()
     assert len(wrt.closest_points(wrt.build(icosphere(1), "bvh8"), np.zeros((0, 3)))) == 0
+
+
+class OnGpu:
+    """A tensor that NumPy cannot read by itself, as torch's of a GPU."""
+
+    def __init__(self, array: np.ndarray) -> None:
+        self.__dlpack__, self.__dlpack_device__ = array.__dlpack__, array.__dlpack_device__
+
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+
+def test_signed_distances_of_a_tensor_are_numpys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, OnGpu.__module__.partition(".")[0], SimpleNamespace(from_dlpack=OnGpu))
+    ball, points = wrt.build(icosphere(1)), np.float32([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
+    assert isinstance(wrt.contains(ball, OnGpu(points)), OnGpu)
+    assert np.array_equal(wrt.signed_distance(ball, OnGpu(points)), wrt.signed_distance(ball, points))
+
+
+@pytest.mark.parametrize("ask", [wrt.closest_points, wrt.signed_distance, wrt.contains, wrt.winding_number,
+                                 lambda accel, points: accel.refit(points)])
+def test_masked_points_are_refused(ask: Any) -> None:
+    ball = icosphere(1)
+    with pytest.raises(wrt.InputError, match="must not be a masked array"):
+        ask(wrt.build(ball), np.ma.masked_array(ball.vertices, ball.vertices > 0.5))
 
 
 def test_what_is_refused() -> None:

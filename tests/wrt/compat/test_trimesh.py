@@ -178,6 +178,9 @@ def test_rays_that_are_none_hit_nothing_and_directions_have_any_length() -> None
     for wrong in (origins[:3], origins[0], origins[:, :2]):
         with pytest.raises(wrt.InputError, match=r"ray_origins and ray_directions must be \(N, 3\) both"):
             ray.intersects_first(wrong, directions)
+    for numbers in ("rays", [[1j, 0, 0]]):
+        with pytest.raises(wrt.InputError, match=r"ray_directions must be \(N, 3\) of real numbers"):
+            ray.intersects_first(origins[:1], numbers)
     assert [array.shape for array in ray.intersects_location([], [])] == [(0, 3), (0,), (0,)]
 
 

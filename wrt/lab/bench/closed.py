@@ -75,8 +75,9 @@ def asked(plan: Plan, n: int) -> Iterator[tuple[str, int]]:
     yield "wrt", n
     needs = {"Open3D": "open3d", "trimesh, Embree": "embreex", "trimesh": "rtree"}
     for name, package in needs.items():
-        if plan.others and importlib.util.find_spec(package) is not None:
-            yield name, min(n, plan.others // (100 if name == "trimesh" else 1))
+        most = plan.others // (100 if name == "trimesh" else 1)
+        if most and importlib.util.find_spec(package) is not None:
+            yield name, min(n, most)
 
 
 # --- points -----------------------------------------------------------------------------------------------------------
@@ -247,6 +248,7 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
     for what, who in dict.fromkeys((row.what, row.who) for row in rows):
         mine = [row for row in rows if (row.what, row.who) == (what, who)]
         counts = {name: sum(getattr(row, name) for row in mine) for name in ("asked", "wrong", "touching")}
-        each = sum(row.microseconds * row.asked for row in mine) / counts["asked"]
+        found = [row.hits if what == "crossings" else row.asked for row in mine]  # what the seconds are divided by
+        each = sum(row.microseconds * n for row, n in zip(mine, found, strict=True)) / max(sum(found), 1)
         total.append(Row(what=what, mesh="all", triangles="", who=who, **counts, microseconds=each))
     return [tabled(COLUMNS, total, "All meshes"), tabled(COLUMNS, rows, "By mesh")]

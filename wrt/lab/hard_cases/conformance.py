@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.answers import Hits
-from wrt.core.checks import as_integer
+from wrt.core.checks import as_integer, as_tuple
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.lab.bench.report import Columns, Row, cells, table
@@ -93,12 +93,10 @@ class Case:
     """One hard case: meshes with rays, `rays` in all, made each time when they are asked for. name: of wrt.testing.CASES."""
 
     def __init__(self, name: str, rays: int = 1000, seed: int = 0) -> None:
-        self.name, *more = chosen([name])
+        self.name, *more = case_names([name])
         if more:
             raise InputError(f"{name} is a group of cases: {self.name}, {', '.join(more)}")
-        if self.name in NOT_ASKED:
-            raise InputError(f"{name} is not for a closest hit on triangles without t_min")
-        self.rays, self.seed = fewer(name, as_integer(rays, "rays", 1, 1 << 40)), seed
+        self.rays, self.seed = fewer(name, as_integer(rays, "rays", 1, 1 << 40)), as_integer(seed, "seed", 0, 1 << 63)
 
     @property
     def parts(self) -> Iterator[HardCase]:
@@ -140,18 +138,22 @@ class Case:
         return self.name
 
 
-def case_names(cases: Sequence[str] = ()) -> list[str]:
-    """Those of names and letters of groups; without any, all that a closest hit on triangles can be asked."""
+def case_names(cases: str | Sequence[str] = ()) -> list[str]:
+    """Those of names and letters of groups; without any, all that a closest hit on triangles can be asked. Raises InputError for a
+    name that is none of these."""
+    cases = as_tuple(cases, str, "cases")
+    for name in set(cases).intersection(NOT_ASKED):
+        raise InputError(f"{name} is not for a closest hit on triangles without t_min")
     return [name for name in chosen(cases or list(HARD_CASES)) if name not in NOT_ASKED]
 
 
-def results(closest_hit: ClosestHit, cases: Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Iterator[Result]:
+def results(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Iterator[Result]:
     """As `hard_cases`, each result as it is there."""
     for name in case_names(cases):
         yield Case(name, rays, seed).result(closest_hit)
 
 
-def hard_cases(closest_hit: ClosestHit, cases: Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Report:
+def hard_cases(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Report:
     """Put the hard cases to a ray library: how many rays it loses, invents and gives to a wrong triangle.
 
     closest_hit(vertices, faces, origins, directions) gets (V, 3) float32, (F, 3) int32, (N, 3) float32 and (N, 3) float32; the
@@ -171,9 +173,9 @@ def _answer(said: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
         t, prim_id = (np.asarray(each) for each in said)
     except (TypeError, ValueError):
         raise InputError(f"closest_hit must return t and prim_id, got {type(said).__name__}") from None
-    if t.shape != (n,) or prim_id.shape != (n,) or prim_id.dtype.kind not in "iu":
-        raise InputError(f"closest_hit must return t ({n},) and prim_id ({n},) of integers, got {t.shape} and {prim_id.shape} of "
-                         f"{prim_id.dtype}")
+    if t.shape != (n,) or prim_id.shape != (n,) or t.dtype.kind not in "iuf" or prim_id.dtype.kind not in "iu":
+        raise InputError(f"closest_hit must return t ({n},) of real numbers and prim_id ({n},) of integers, got {t.shape} of "
+                         f"{t.dtype} and {prim_id.shape} of {prim_id.dtype}")
     return t.astype(np.float64), prim_id.astype(np.int64)
 
 

@@ -10,6 +10,7 @@ from tests.command_line import wrt as run
 from wrt.accel.contains import open_edges
 from wrt.accel.geometry import Geometry
 from wrt.lab.bench import closed
+from wrt.lab.bench.report import Row
 from wrt.lab.oracle.oracle import Reference
 from wrt.scene import shapes
 
@@ -93,3 +94,16 @@ def test_others_are_asked(who: str) -> None:
     points = np.float32([[0.1, 0.2, 0.3], [0.1, 2.0, 0.2]])  # Open3D counts both triangles at an edge
     assert np.asarray(closed.INSIDE[who](geometry)(points)).tolist() == [True, False]
     assert np.asarray(closed.CROSSINGS[who](geometry)(points * 10.0, -points)).tolist() == [2, 2]
+
+
+def test_who_is_asked_nothing_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda package: package)
+    plan = closed.Plan(others=99)
+    assert dict(closed.asked(plan, 1000)) == {"wrt": 1000, "Open3D": 99, "trimesh, Embree": 99}
+    assert dict(closed.asked(closed.Plan(others=500), 1000))["trimesh"] == 5
+
+
+def test_the_time_of_all_is_by_crossing() -> None:
+    known = {"what": "crossings", "mesh": "", "triangles": 1, "who": "wrt", "asked": 100, "wrong": 0, "touching": 0}
+    rows = [Row(**known, hits=100, microseconds=1.0), Row(**known, hits=300, microseconds=3.0)]
+    assert "2.50" in str(closed.parts(rows, closed.Plan())[0])

@@ -32,6 +32,10 @@ def test_wrt_loses_nothing() -> None:
     assert [cell.strip() for cell in str(report).splitlines()[-1].split("|")[1:6]] == ["all", "400", "0", "0", "0"]
 
 
+def test_one_name_needs_no_list() -> None:
+    assert [result.case for result in hard_cases(own, "D_published", rays=5).results] == ["D_published"]
+
+
 def test_each_fault_is_counted() -> None:
     case = Case("B_jittered_uniform", 100)
     part = next(case.parts)
@@ -118,8 +122,12 @@ def test_all_cases_of_triangles_are_asked() -> None:
     (lambda: Case("C_spheres"), "C_spheres is not for a closest hit on triangles"),
     (lambda: Case("E_grid", 0), "rays must be 1 to"),
     (lambda: hard_cases(lambda *_: None, ["E_grid"], 5), "must return t and prim_id, got NoneType"),
-    (lambda: hard_cases(lambda *_: (np.zeros(4), np.zeros(5, int)), ["E_grid"], 5), r"t \(5,\) and prim_id \(5,\) of integers"),
+    (lambda: hard_cases(lambda *_: (np.zeros(4), np.zeros(5, int)), ["E_grid"], 5), r"t \(5,\) of real numbers and prim_id"),
     (lambda: hard_cases(lambda *_: (np.zeros(5), np.zeros(5)), ["E_grid"], 5), "got .* of float64"),
+    (lambda: hard_cases(lambda *_: (np.full(5, "far"), np.zeros(5, int)), "E_grid", 5), "got .* of <U3"),
+    (lambda: hard_cases(own, ["E_grid", "C_spheres"]), "C_spheres is not for a closest hit"),
+    (lambda: hard_cases(own, 3), "cases: each must be a str, got 3"),  # type: ignore[arg-type]
+    (lambda: hard_cases(own, "E_grid", seed=-1), "seed must be 0 to"),
 ])
 def test_what_is_refused(call: Any, said: str) -> None:
     with pytest.raises(InputError, match=said):
