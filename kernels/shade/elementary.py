@@ -112,7 +112,7 @@ def sin_cos(x: float) -> tuple[float, float]:
     else:
         return nan(), nan()
     z = r * r
-    s = r - (less - r * z * (SIN_1 + z * (SIN_2 + z * SIN_3)))
+    s = wp.where(x == 0.0, x, r - (less - r * z * (SIN_1 + z * (SIN_2 + z * SIN_3))))  # the sine of -0 is -0
     half = 0.5 * z
     c = 1.0 - half
     c = c + (((1.0 - c) - half) + (z * z * (COS_1 + z * (COS_2 + z * COS_3)) + r * less))

@@ -80,6 +80,11 @@ def test_every_4099th_float_of_one_argument(name: str) -> None:
         assert error_in_ulp(float(called(x)[name][0]), exactly(name, x)) == pytest.approx(worst, abs=1e-5)
 
 
+def test_zeros_keep_their_sign() -> None:
+    found = called([0.0, -0.0])
+    assert np.signbit(found["sin"]).tolist() == [False, True] and found["cos"].tolist() == found["exp"].tolist() == [1.0, 1.0]
+
+
 @pytest.mark.slow  # minutes
 @pytest.mark.parametrize("name", ONE)
 def test_all_floats_of_one_argument(name: str) -> None:
