@@ -10,6 +10,7 @@ import warp as wp
 
 import wrt
 from tests.device import NAME as DEVICE
+from tests.kernel_tools import cpu_only
 from wrt.accel.answers import Hits
 from wrt.accel.rays import rays_of, rays_on
 from wrt.core.arrays import to_numpy, to_warp
@@ -106,6 +107,7 @@ def test_rays_come_from_any_library() -> None:
     assert isinstance(on_warp.t, wp.array) and same(on_warp, expected)
 
 
+@cpu_only
 def test_rays_are_not_copied() -> None:
     accel = wrt.build(box())
     for origins, directions in ((ORIGINS, DIRECTIONS), (Tensor(ORIGINS), Tensor(DIRECTIONS)),
