@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,7 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
     """
     if not isinstance(accel, Accelerator):
         raise InputError(f"accel must be a structure (wrt.build), got {shown(accel)}")
+    accel = copy(accel)  # which a refit meanwhile leaves as it is
     threads, device = thread_count(threads), accel.device
     check_no_gradients(a=a, b=b)
     p, q = (_points(value, name, device) for value, name in ((a, "a"), (b, "b")))
