@@ -19,9 +19,7 @@ class Turns:
 
 @wp.func
 def corner(surfaces: Surfaces, vertex: int, point: wp.vec3) -> wp.vec3d:
-    v = surfaces.vertices[vertex]
-    return wp.vec3d(wp.float64(v[0]) - wp.float64(point[0]), wp.float64(v[1]) - wp.float64(point[1]),
-                    wp.float64(v[2]) - wp.float64(point[2]))
+    return wp.vec3d(surfaces.vertices[vertex]) - wp.vec3d(point)
 
 
 @wp.func

@@ -50,16 +50,6 @@ class Found:
 
 
 @wp.func
-def double(v: wp.vec3) -> wp.vec3d:
-    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
-
-
-@wp.func
-def single(v: wp.vec3d) -> wp.vec3:
-    return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
-
-
-@wp.func
 def longest(v: wp.vec3d) -> wp.float64:
     return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
 
@@ -141,10 +131,10 @@ def drawn_in(found: Found, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> Found:
 def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp.vec3d, direction: wp.vec3d) -> Found:
     """The point on a face; its normal is on the outside, also of a mirrored instance."""
     face = surfaces.faces[place.face]
-    v0 = double(surfaces.vertices[face[0]])
-    v1 = double(surfaces.vertices[face[1]])
-    v2 = double(surfaces.vertices[face[2]])
-    middle = double(triangle_point(surfaces, place.face, u, v))
+    v0 = wp.vec3d(surfaces.vertices[face[0]])
+    v1 = wp.vec3d(surfaces.vertices[face[1]])
+    v2 = wp.vec3d(surfaces.vertices[face[2]])
+    middle = wp.vec3d(triangle_point(surfaces, place.face, u, v))
     off = wp.vec3d()
     side = wp.float64(1.0)
     if place.instance >= 0:
@@ -278,12 +268,12 @@ def put_ids(surfaces: Surfaces, numbering: Numbering, place: Place, prim_id: int
 
 @wp.func
 def put_point(found: Found, out: HitPlaces, i: int):
-    point = single(found.point)
+    point = wp.vec3(found.point)
     if out.point.shape[0] > 0:
         out.point[i] = point
     if out.error.shape[0] > 0:
         least = wp.vec3d(SMALLEST, SMALLEST, SMALLEST)
-        out.error[i] = single(SAFETY * (found.error + U32 * wp.abs(found.point)) + least)
+        out.error[i] = wp.vec3(SAFETY * (found.error + U32 * wp.abs(found.point)) + least)
 
 
 @wp.func
@@ -316,19 +306,19 @@ def hit_places(surfaces: Surfaces, numbering: Numbering, rays: RayArrays, hits: 
     put_ids(surfaces, numbering, place, prim_id, out, i)
     if out.point.shape[0] + out.error.shape[0] + out.normal.shape[0] + out.shading.shape[0] + out.uv.shape[0] == 0:
         return
-    origin = double(rays.origin[i])
-    direction = double(rays.direction[i])
+    origin = wp.vec3d(rays.origin[i])
+    direction = wp.vec3d(rays.direction[i])
     if prim_id >= surfaces.n_triangles:
         on_ball = on_sphere(surfaces.spheres[prim_id - surfaces.n_triangles], hits.t[i], origin, direction)
         put_point(on_ball, out, i)
-        normal = single(wp.normalize(on_ball.normal))
+        normal = wp.vec3(wp.normalize(on_ball.normal))
         if out.normal.shape[0] > 0:
             out.normal[i] = normal
         put_interpolated_on_sphere(normal, out, i)
     else:
         found = on_triangle(surfaces, place, hits.u[i], hits.v[i], origin, direction)
         put_point(found, out, i)
-        normal = single(wp.normalize(found.normal / longest(found.normal)))
+        normal = wp.vec3(wp.normalize(found.normal / longest(found.normal)))
         if out.normal.shape[0] > 0:
             out.normal[i] = normal
         put_interpolated(surfaces, place, hits.u[i], hits.v[i], normal, out, i)

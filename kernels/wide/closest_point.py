@@ -46,11 +46,6 @@ class PointArrays:
 
 
 @wp.func
-def wide_vector(v: wp.vec3) -> wp.vec3d:
-    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
-
-
-@wp.func
 def squared_distance(p: wp.vec3, lo: wp.vec3, hi: wp.vec3) -> wp.float64:
     """From a point to a box, 0 within."""
     out = wp.float64(0.0)
@@ -106,10 +101,10 @@ def nearer_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, best: Nearest, corner_a: 
 def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
     """The closest point of a triangle: within it where the point is above it, else on one of its edges. Where corners are NaN (a
     triangle without area), d2 is infinite."""
-    p = wide_vector(point)
-    a = wide_vector(triangle.v0)
-    b = wide_vector(triangle.v1)
-    c = wide_vector(triangle.v2)
+    p = wp.vec3d(point)
+    a = wp.vec3d(triangle.v0)
+    b = wp.vec3d(triangle.v1)
+    c = wp.vec3d(triangle.v2)
     out = Nearest()
     out.d2 = wp.float64(wp.inf)
     if wp.isnan(triangle.v0[0]):
@@ -207,7 +202,7 @@ def make_closest_point_kernel(width: int, compressed: bool) -> Any:
         i = first + wp.tid()
         found = closest_point(accel, points[i])
         out.distance[i] = float(wp.sqrt(found.d2))
-        out.point[i] = wp.vec3(float(found.point[0]), float(found.point[1]), float(found.point[2]))
+        out.point[i] = wp.vec3(found.point)
         out.u[i] = float(found.u)
         out.v[i] = float(found.v)
         out.prim_id[i] = found.prim_id

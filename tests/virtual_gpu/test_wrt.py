@@ -19,9 +19,9 @@ import warp as wp
 import wrt
 from tests import bits, device
 from tests.data import ROOT
+from tests.structures import STRUCTURES as ALL
 from tests.virtual_gpu import gpus
 from wrt.accel.build import build
-from wrt.accel.structures import ACCELERATORS
 from wrt.core.arrays import to_numpy
 from wrt.core.errors import InputError
 from wrt.scene import shapes
@@ -29,7 +29,7 @@ from wrt.scene import shapes
 pytestmark = pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0")
 PICTURE = {"spp": 2, "size": (48, 27), "seed": 5}
 SCENE = ROOT / "scenes" / "spot.toml"
-STRUCTURES = sorted({kind.name for kind in ACCELERATORS.values()} - {"brute_force"})
+STRUCTURES = [name for name in ALL if name != "brute_force"]
 QUICK = ("bvh8", "kdtree")
 
 

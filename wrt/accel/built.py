@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import warp as wp
 
 from wrt.accel.geometry import Geometry
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,3 +57,10 @@ class State:
     built_cost: float = float("nan")
     followed: Any = None
     changes: bool = False
+
+
+def once(kept: WeakKeyDictionary[State, T], state: State, make: Callable[[], T]) -> T:
+    """What `make` gives for a state of a structure: made once, unless refits in place change it."""
+    if state in kept:
+        return kept[state]
+    return make() if state.changes else kept.setdefault(state, make())

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -11,7 +11,7 @@ import warp as wp
 
 from wrt.accel.all_hits import Asked
 from wrt.accel.base import Accelerator
-from wrt.accel.built import State
+from wrt.accel.built import State, once
 from wrt.accel.geometry import Geometry
 from wrt.accel.rays import vectors
 from wrt.core.arrays import returned
@@ -19,19 +19,8 @@ from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
 
-T = TypeVar("T")
-
 _bounds: WeakKeyDictionary[State, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
 _open_edges: WeakKeyDictionary[State, int] = WeakKeyDictionary()
-
-
-def found(kept: WeakKeyDictionary[State, T], state: State, find: Callable[[Geometry], T]) -> T:
-    """What `find` says of the geometry, asked once, unless refits in place change it."""
-    if state.changes:
-        return find(state.geometry)
-    if state not in kept:
-        kept[state] = find(state.geometry)
-    return kept[state]
 
 
 def open_edges(geometry: Geometry) -> int:
@@ -60,7 +49,7 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any
     """
     rows, give = vectors(points, "points", FARTHEST), returned(points)
     asked = Asked(accel, threads, crossings=True)
-    if count := found(_open_edges, asked.state, open_edges):
+    if count := once(_open_edges, asked.state, partial(open_edges, asked.state.geometry)):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces"
                          "; wrt.winding_number tells what is mostly inside")
     inside = odd_crossings(asked, rows)
@@ -71,7 +60,7 @@ def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
     """As `contains`, of (N, 3) float32 and a mesh that may be open: then it depends on the rays' direction, that is on `seed`."""
     inside = np.zeros(len(rows), bool)
     if asked.state.geometry.n_triangles:
-        low, high = found(_bounds, asked.state, used_bounds)
+        low, high = once(_bounds, asked.state, partial(used_bounds, asked.state.geometry))
         within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
         direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
         counts = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import State
+from wrt.accel.built import State, once
 from wrt.accel.flatten import Placed, World, placed_now, run_of, world_over
 from wrt.accel.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
 from wrt.accel.instanced_geometry import InstancedGeometry
@@ -152,9 +153,11 @@ def _require(world: World, name: str) -> None:
 
 
 def surroundings(accel: Any, state: State) -> Surroundings:
-    """Of a structure in a state of it, on its device: made once, unless refits in place change it."""
-    if state in _surroundings:
-        return _surroundings[state]
+    """Of a structure in a state of it, on its device."""
+    return once(_surroundings, state, partial(_surroundings_of, accel, state))
+
+
+def _surroundings_of(accel: Any, state: State) -> Surroundings:
     geometry: Any = state.geometry
     world, device, surfaces = accel.attributes or world_over(geometry), accel.device, structs.Surfaces()
     placed = placed_now(world, geometry)
@@ -171,8 +174,7 @@ def surroundings(accel: Any, state: State) -> Surroundings:
     if placed is not None:
         surfaces.instances = upload(instance_records(placed), structs.Instance, device)
         numbering.instance = upload(_instance_of(placed, geometry), wp.int32, device)
-    made = Surroundings(world, surfaces, numbering)
-    return made if state.changes else _surroundings.setdefault(state, made)
+    return Surroundings(world, surfaces, numbering)
 
 
 def _instance_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:

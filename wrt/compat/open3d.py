@@ -94,8 +94,7 @@ class RaycastingScene:
         found = {"t_hit": hits.t, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
                  "primitive_uvs": np.stack([hits.u, hits.v], axis=1),
                  "primitive_normals": normals[hits.prim_id]}
-        missed = {"t_hit": np.inf, "geometry_ids": self.INVALID_ID, "primitive_ids": self.INVALID_ID}
-        return {name: _answer(_spread(array, good, missed.get(name, 0.0)), shape) for name, array in found.items()}
+        return _answers(found, good, shape)
 
     def test_occlusions(self, rays: Any, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Any:
         """Whether each ray hits anything between tnear and tfar, (...) bool."""
@@ -132,8 +131,7 @@ class RaycastingScene:
         geometry_ids, primitive_ids = self._ids(found.prim_id)
         answers = {"points": found.point, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
                    "primitive_uvs": np.stack([found.u, found.v], axis=1), "primitive_normals": normals[found.prim_id]}
-        missed = {"geometry_ids": self.INVALID_ID, "primitive_ids": self.INVALID_ID}
-        return {name: _answer(_spread(array, good, missed.get(name, 0.0)), shape) for name, array in answers.items()}
+        return _answers(answers, good, shape)
 
     def compute_distance(self, query_points: Any, nthreads: int = 0) -> Any:
         """The distance of each point to the meshes, (...) float32; inf where there are none, and of what is no point NaN."""
@@ -259,6 +257,12 @@ def _spread(array: np.ndarray, good: np.ndarray | None, missing: Any) -> np.ndar
     out = np.full((len(good), *array.shape[1:]), missing, array.dtype)
     out[good] = array
     return out
+
+
+def _answers(found: dict[str, np.ndarray], good: np.ndarray | None, shape: tuple[int, ...]) -> dict[str, Any]:
+    """Each with what it has for a miss."""
+    missed = {"t_hit": np.inf, "geometry_ids": RaycastingScene.INVALID_ID, "primitive_ids": RaycastingScene.INVALID_ID}
+    return {name: _answer(_spread(array, good, missed.get(name, 0.0)), shape) for name, array in found.items()}
 
 
 def _answer(array: np.ndarray, shape: tuple[int, ...]) -> Any:

@@ -9,10 +9,10 @@ import pytest
 
 import wrt
 from tests.data import data_path
+from tests.structures import STRUCTURES as ALL
 from wrt.accel.answers import Hits
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
-from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.lab.hard_cases.cases import HARD_CASES, HardCase, generate
 
@@ -20,7 +20,7 @@ SMALL = ["meshes/small/suzanne.obj", "meshes/small/cow.obj", "meshes/small/teapo
          "odd/busted.STL", "odd/ADIS16480.STL", "odd/capsule.obj"]
 LARGE = ["meshes/medium/rocker-arm.obj", "meshes/medium/stanford_bunny.ply", "meshes/medium/sponza_dabrovic.obj"]
 LARGEST = ["meshes/large/conference_331k.ply", "meshes/large/dragon_871k.ply"]
-STRUCTURES = sorted({cls.name for cls in ACCELERATORS.values()} - {"brute_force"})
+STRUCTURES = [name for name in ALL if name != "brute_force"]
 HARD = ["D_without_area_wide", "D_huge", "D_tiny", "E_grid", "F_slivers", "F_edge_on", "H_exact_ends", "I_underflow", "I_denormal",
         "I_tiny_components"]
 TESTS = 60_000_000  # ray-triangle tests that brute force may take in the quick run

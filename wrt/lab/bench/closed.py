@@ -56,7 +56,7 @@ def rows(plan: Plan) -> Iterator[Row]:
             yield Row(what="inside", who=who, **known, **points_wrong(geometry, reference, answer, n, plan.seed))
         for who, n in asked(plan, plan.rays):
             count = CROSSINGS[who](geometry) if who in CROSSINGS else None
-            (count or partial(all_hits, accel))(np.full((2, 3), 9.0, np.float32), np.ones((2, 3), np.float32))
+            (count or own_crossings(accel))(np.full((2, 3), 9.0, np.float32), np.ones((2, 3), np.float32))
             yield Row(what="crossings", who=who, **known, **crossed(geometry, accel, count, n, plan.seed))
 
 
@@ -140,7 +140,6 @@ def distances(geometry: Geometry, points: np.ndarray) -> np.ndarray:
 def crossed(geometry: Geometry, accel: Accelerator, count: Callable[..., Any] | None, n: int, seed: int) -> dict[str, Any]:
     """All rays begin and end outside. count: how many hits another library has for each; None: wrt's crossings. Rays that touch an
     outline are counted, and not held against others, who may see it once."""
-    own = partial(count_hits, accel, crossings=True)
     rng, wrong, touching, hits, seconds = np.random.default_rng(seed), 0, 0, 0, 0.0
     low, high = (bound.astype(np.float64) for bound in (geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)))
     for first in range(0, n, CHUNK):
@@ -149,12 +148,16 @@ def crossed(geometry: Geometry, accel: Accelerator, count: Callable[..., Any] | 
         at = np.where(np.arange(size)[:, None] % 2 == 0, *(targets(geometry, rng, size, aim) for aim in ("vertices", "edges")))
         directions = (at - origins).astype(np.float32)
         begin = perf_counter()
-        crossings = np.asarray((count or own)(origins, directions))
+        crossings = np.asarray((count or own_crossings(accel))(origins, directions))
         seconds, hits = seconds + perf_counter() - begin, hits + int(crossings.sum())
         touches = crossings_of(geometry, all_hits(accel, origins, directions), directions)[1] > 0
         touching += int(touches.sum())
         wrong += int((crossings % 2 == 1)[~touches | (count is None)].sum())
     return {"asked": n, "wrong": wrong, "touching": touching, "hits": hits, "microseconds": 1e6 * seconds / max(hits, 1)}
+
+
+def own_crossings(accel: Accelerator) -> Callable[..., Any]:
+    return partial(count_hits, accel, crossings=True)
 
 
 def crossings_of(geometry: Geometry, found: AllHits, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

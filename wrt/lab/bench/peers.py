@@ -4,7 +4,6 @@ turns, on one thread and on all of them."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from time import perf_counter, thread_time
@@ -19,7 +18,7 @@ from wrt.core.device import run_all, thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.accel import timing, warm_up
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled
+from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled, versions
 from wrt.lab.bench.report import run as run
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own
@@ -114,13 +113,7 @@ def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
 
 
 def machine(plan: Plan) -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    versions = []
-    for package in ("warp-lang", "embreex", "open3d"):
-        with suppress(PackageNotFoundError):
-            versions.append(f"{package} {version(package)}")
-    return machine_line(f"{' and '.join(map(str, thread_counts(plan)))} used", ", ".join(versions),
+    return machine_line(f"{' and '.join(map(str, thread_counts(plan)))} used", versions("warp-lang", "embreex", "open3d"),
                         f"{plan.runs} runs of {plan.rays} rays by turns")
 
 

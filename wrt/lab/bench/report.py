@@ -6,6 +6,7 @@ import importlib
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -29,6 +30,17 @@ def machine_line(used: str = "", *more: str, device: str = "cpu") -> str:
     line = next((line for line in describe_devices() if line.startswith(f"{device}:")), device)
     load = "" if math.isnan(load_average()) else f"load average {load_average():.1f} at the start"
     return "; ".join([", ".join(filter(None, [line, used, load])), f"wrt {wrt.__version__}", *more])
+
+
+def versions(*packages: str) -> str:
+    """Of those that are installed."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    told = []
+    for package in packages:
+        with suppress(PackageNotFoundError):
+            told.append(f"{package} {version(package)}")
+    return ", ".join(told)
 
 
 def load_average() -> float:

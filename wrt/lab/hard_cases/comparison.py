@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from statistics import median
 
-from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, machine_line
+from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, machine_line, versions
 from wrt.lab.hard_cases.conformance import COLUMNS as OF_A_CASE
 from wrt.lab.hard_cases.conformance import results
 from wrt.lab.hard_cases.libraries import LIBRARIES, usable
@@ -37,11 +35,7 @@ def line(row: Row) -> str:
 
 
 def machine(plan: Plan) -> str:
-    versions = []
-    for package in ("warp-lang", "embreex", "open3d", "mitsuba", "trimesh"):
-        with suppress(PackageNotFoundError):
-            versions.append(f"{package} {version(package)}")
-    return machine_line("", ", ".join(versions))
+    return machine_line("", versions("warp-lang", "embreex", "open3d", "mitsuba", "trimesh"))
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
