@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import importlib
+import os
+from pathlib import Path
 from types import FunctionType
 from typing import Any
 
@@ -22,6 +24,9 @@ def use(name: str, *, real: bool = False, seed: int = 0) -> None:
         from tests.virtual_gpu import install
 
         install(seed=seed)
+        here = Path(__file__).parent  # processes that tests start find it too
+        paths = [str(here / "virtual_gpu" / "in_every_process"), str(here.parent), os.environ.get("PYTHONPATH", "")]
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     from wrt.core.device import start
 
     start(name)

@@ -13,7 +13,7 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.address_space import told_limit
 from wrt.core.device import free_memory, thread_count
 from wrt.core.errors import InputError
-from wrt.core.memory import SMALL, gib
+from wrt.core.memory import SMALL, available, gib
 from wrt.renderer.film_arrays import BYTES_OF_FILM, BYTES_OF_GROUP
 from wrt.renderer.plan import Plan
 from wrt.renderer.waves import capacity
@@ -37,10 +37,12 @@ def require_memory(plan: Plan, device: Any) -> None:
     pixel = BYTES_OF_FILM + BYTES_OF_GROUP * (plan.groups - 1) + (BYTES_OF_AOVS if plan.options.aov else 0)
     film = plan.area * (pixel + BYTES_OF_RESULT) + bytes_of_waves(plan)
     scene = bytes_of_scene(plan.scene, ACCELERATORS[plan.accel], plan.meshes)
-    free = free_memory(device)
+    rooms = {str(device): free_memory(device)} | ({"the host": available()} if device.is_cuda else {})  # trees grow on the host
+    where, free = min(rooms.items(), key=lambda room: room[1])
     if film + scene > max(free, SMALL):
+        otherwise = "" if where.startswith("cuda") else " (WRT_MEMORY can say otherwise)"
         raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {gib(film)} of memory, its scene {gib(scene)};"
-                         f" {device} has {gib(free)} free (WRT_MEMORY can say otherwise){told_limit()}")
+                         f" {where} has {gib(free)} free{otherwise}{told_limit()}")
 
 
 def bytes_of_waves(plan: Plan) -> float:

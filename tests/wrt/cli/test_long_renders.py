@@ -17,6 +17,7 @@ import pytest
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run
 from tests.data import ROOT
+from tests.device import NAME
 from wrt.cli import save as cli_save
 from wrt.core.errors import InputError
 from wrt.picture import film
@@ -46,7 +47,7 @@ def channels(name: str) -> dict[str, bytes]:
 
 # --- kill -9 ----------------------------------------------------------------------------------------------------------
 
-RENDER = ("render", "box.obj", "--size", "160x90", "--spp", 600, "-o", "a.exr", "--aov", "depth")
+RENDER = ("render", "box.obj", "--size", "160x90", "--spp", 600, "-o", "a.exr", "--aov", "depth", "--device", NAME)
 # Tells of each look at the tiles, a tenth of a second apart: seconds of tracing so far.
 TELLING = """
 import sys, wrt.renderer.progress
@@ -61,8 +62,9 @@ main()
 
 
 def started(*arguments: object) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     return subprocess.Popen([sys.executable, "-c", TELLING, *map(str, arguments)], text=True, stderr=subprocess.PIPE,
-                            stdout=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": str(ROOT)})
+                            stdout=subprocess.DEVNULL, env=environment)
 
 
 def killed_when(traced: float, later: float, *arguments: object) -> list[str]:

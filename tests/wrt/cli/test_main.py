@@ -19,6 +19,7 @@ from PIL import Image
 from tests.command_line import BOX_OBJ, Result, largest_file, without_compiling
 from tests.command_line import wrt as run
 from tests.data import ROOT
+from tests.device import NAME
 from tests.picture_metadata import read_metadata
 from wrt import __version__
 from wrt.cli import common as cli_common
@@ -291,7 +292,7 @@ def test_what_is_found_late_names_the_scene_and_leaves_the_old_picture() -> None
 def test_a_picture_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wrt.renderer.memory_estimate.free_memory", lambda device: 2.0**20)
     refused(run("render", "box.obj", "--size", "4000x2000"),
-            "box.obj: a picture of 4000x2000 takes 1.0 GiB of memory, its scene 0 MiB; cpu has 1 MiB free (WRT_MEMORY")
+            f"box.obj: a picture of 4000x2000 takes 1.0 GiB of memory, its scene 0 MiB; {NAME} has 1 MiB free")
 
 
 def test_no_memory_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,7 @@ TILE = (3, 2, 37, 22)
 
 def prepared(name: str, aov: tuple[str, ...] = (), **settings: Any) -> Prepared:
     scene = load_scene(SCENES / f"{name}.toml").with_settings(size=(48, 27), **settings)
-    return prepare(plan_of(scene, Options(threads=1, crop=corners(TILE), aov=aov)), start("cpu"))
+    return prepare(plan_of(scene, Options(device="cpu", threads=1, crop=corners(TILE), aov=aov)), start("cpu"))
 
 
 def one_ray_at_a_time(ready: Prepared) -> Prepared:
@@ -105,13 +105,14 @@ def test_aovs_are_those_of_one_ray_at_a_time(name: str) -> None:
 
 def test_scenes_share_what_they_have_in_common() -> None:
     """A traversal is compiled once for a structure, and no kernel for another depth."""
-    of = {name: plan_of(load_scene(SCENES / f"{name}.toml"), Options()).wave_kernels for name in ("whitted", "glass_slab", "lens")}
+    of = {name: plan_of(load_scene(SCENES / f"{name}.toml"), Options(device="cpu")).wave_kernels
+          for name in ("whitted", "glass_slab", "lens")}
     for name in ("closest_hit", "any_hit", "gather", "add"):
         assert len({getattr(kernels, name) for kernels in of.values()}) == 1, name
     assert of["whitted"].begin is of["glass_slab"].begin is not of["lens"].begin
     assert len({kernels.shade for kernels in of.values()}) == 3
     deeper = load_scene(SCENES / "whitted.toml").with_settings(max_depth=64)
-    assert plan_of(deeper, Options()).wave_kernels == of["whitted"]
+    assert plan_of(deeper, Options(device="cpu")).wave_kernels == of["whitted"]
 
 
 def test_waves_are_smaller_where_each_sample_takes_more_room() -> None:
@@ -148,7 +149,7 @@ def test_neighbours_are_next_to_each_other(width: int, height: int) -> None:
 
 
 def test_only_the_cpu_has_waves() -> None:
-    plan = plan_of(load_scene(SCENES / "fisheye.toml"), Options())
+    plan = plan_of(load_scene(SCENES / "fisheye.toml"), Options(device="cpu"))
     on_cuda = copy(plan.options)
     on_cuda.device = "cuda:0"
     assert plan.by_waves and not replace(plan, options=on_cuda).by_waves

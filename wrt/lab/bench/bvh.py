@@ -103,12 +103,12 @@ def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[
 def published_cost(accel: Accelerator, rays: RaySet) -> float:
     """Nodes and leaves popped and triangles tested, a ray, as tinybvh counts."""
     hits = accel.closest_hit(rays.origins, rays.directions)
-    counts = [wp.zeros(len(rays), dtype=wp.int32, device="cpu") for _ in range(2)]
+    counts = [wp.zeros(len(rays), dtype=wp.int32, device=accel.device) for _ in range(2)]
     load_kernel(count_popped, accel.device)
-    device_rays = rays_on("cpu", rays_of(rays.origins, rays.directions, 0.0, rays.t_max))
-    wp.launch(count_popped, dim=len(rays), device="cpu", inputs=[
-        accel.data.nodes, upload(accel.built.order.copy(), wp.int32, "cpu"), device_rays, upload(hits.t, wp.float32, "cpu"),
-        upload(hits.prim_id, wp.int32, "cpu"), *counts])
+    device_rays = rays_on(accel.device, rays_of(rays.origins, rays.directions, 0.0, rays.t_max))
+    wp.launch(count_popped, dim=len(rays), device=accel.device, inputs=[
+        accel.data.nodes, upload(accel.built.order.copy(), wp.int32, accel.device), device_rays,
+        upload(hits.t, wp.float32, accel.device), upload(hits.prim_id, wp.int32, accel.device), *counts])
     return float(sum(count.numpy().mean() for count in counts))
 
 
@@ -156,15 +156,15 @@ def tester_of(accel: Accelerator, rays: RaySet) -> Callable[[], int]:
     load_kernel(kernel, accel.device)
     data = accel.structure.struct()
     nodes = accel.built.arrays["nodes"]
-    data.nodes = upload(nodes[:: max(len(nodes) // TESTED_NODES, 1)][:TESTED_NODES].copy(), volumes.node, "cpu")
+    data.nodes = upload(nodes[:: max(len(nodes) // TESTED_NODES, 1)][:TESTED_NODES].copy(), volumes.node, accel.device)
     if accel.name == "bvh2_kdop":
         data.middle = accel.data.middle
     n = min(TESTED_RAYS, len(rays))
-    some = rays_on("cpu", rays_of(rays.origins[:n], rays.directions[:n], 0.0, rays.t_max[:n]))
-    inputs = [data, some, wp.zeros(n, dtype=wp.int32, device="cpu")]
+    some = rays_on(accel.device, rays_of(rays.origins[:n], rays.directions[:n], 0.0, rays.t_max[:n]))
+    inputs = [data, some, wp.zeros(n, dtype=wp.int32, device=accel.device)]
 
     def test() -> int:
-        wp.launch(kernel, dim=n, inputs=inputs, device="cpu")
+        wp.launch(kernel, dim=n, inputs=inputs, device=accel.device)
         return n * 2 * len(data.nodes)
 
     return test

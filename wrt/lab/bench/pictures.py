@@ -36,7 +36,7 @@ waves run by run. rays a sample: with shadow rays. differ: pixels of another val
 def rows(plan: Plan) -> Iterator[Row]:
     for path in plan.scenes:
         scene = load_scene(path).with_settings(size=as_size(plan.size), spp=plan.spp)
-        waves = prepare(plan_of(scene, Options(threads=1, accel=plan.accel)), start("cpu"))
+        waves = prepare(plan_of(scene, Options(threads=1, accel=plan.accel, device="cpu")), start("cpu"))
         kernel = render_kernel(waves.plan.features, waves.plan.structure)
         load_kernel(kernel, waves.device)
         yield row_of(Path(path).name, {"loop": replace(waves, waves=None, kernels=[kernel]), "waves": waves}, plan)

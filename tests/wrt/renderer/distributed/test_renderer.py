@@ -22,6 +22,7 @@ import pytest
 
 import wrt
 from tests.data import ROOT
+from tests.device import NAME
 from tests.wrt.renderer.test_checkpoint import SCENE, same
 from wrt import profile
 from wrt.core.errors import InputError, SceneWarning
@@ -201,7 +202,7 @@ def test_time_limit(threads: Executor) -> None:
 
 def test_a_checkpoint_from_threads_is_finished_by_others_and_back(tmp_path: Path, threads: Executor) -> None:
     whole, path = render(SCENE, aov="depth"), tmp_path / "a.checkpoint"
-    for step, how in ((6, {}), (12, {"executor": threads}), (24, {"devices": ["cpu", "cpu"]})):
+    for step, how in ((6, {}), (12, {"executor": threads}), (24, {"devices": [NAME, NAME]})):
         film = render(SCENE, spp=step, aov="depth", checkpoint=path, resume=True, checkpoint_every=1e-9, **how, **HOW)
     assert same(film, whole) and film.stats["resumed"]["samples"] == 12
 
