@@ -336,10 +336,11 @@ class AovFilm:
 
 @wp.struct
 class Tile:
-    """A rectangle of pixels, and which samples of them to take."""
+    """A rectangle of pixels, and which samples of them to take; threads: that share the samples of a pixel, one or n_samples."""
 
     x: int
     y: int
     width: int
     first_sample: int
     n_samples: int
+    threads: int

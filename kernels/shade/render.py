@@ -101,7 +101,8 @@ def with_sample(before: Pixel, sample: Sample) -> Pixel:
 
 
 def make_render_kernel(features: Any, structure: Any, camera_kind: Any) -> Any:
-    """A kernel that adds samples to the pixels of a tile; it holds only the code that `features` asks for.
+    """A kernel that adds samples to the pixels of a tile, or, with a thread for each sample, writes them to `samples`, pixel by
+    pixel, for add_samples. It holds only the code that `features` asks for.
 
     camera_kind: a module as wrt.kernels.shade.cameras says.
     Where the structure's units count, it must be a wrt.kernels.study.ray_log one, and every ray is logged.
@@ -123,16 +124,17 @@ def make_render_kernel(features: Any, structure: Any, camera_kind: Any) -> Any:
         limits: Limits,
         film: Film,
         tile: Tile,
+        samples: wp.array(dtype=Sample),
     ):
         tid = wp.tid()
         if wp.static(counting):
             accel.row = tid
-        x = tile.x + tid % tile.width
-        y = tile.y + tid / tile.width
+        x = tile.x + tid / tile.threads % tile.width
+        y = tile.y + tid / tile.threads / tile.width
         at = (y - film.y) * film.columns + x - film.x
         key = hash_pair(hash_pair(limits.seed, wp.uint32(x)), wp.uint32(y))
         pixel = load_pixel(film, at)
-        for i in range(tile.n_samples):
+        for i in range(tid % tile.threads, tile.n_samples, tile.threads):
             index = wp.uint32(tile.first_sample + i)
             lens_xi = wp.vec2(0.0, 0.0)
             if wp.static(features.lens):
@@ -141,10 +143,25 @@ def make_render_kernel(features: Any, structure: Any, camera_kind: Any) -> Any:
             sample = Sample()
             if ray.t_max > 0.0:  # else the film gets no light here
                 sample = radiance(accel, surfaces, lighting, limits, ray, key, index)
-            pixel = with_sample(pixel, sample)
-        store_pixel(film, at, pixel)
+            if tile.threads > 1:
+                samples[tid] = sample
+            else:
+                pixel = with_sample(pixel, sample)
+        if tile.threads == 1:
+            store_pixel(film, at, pixel)
 
     return render
+
+
+@kernel
+def add_samples(film: Film, tile: Tile, samples: wp.array(dtype=Sample)):
+    """What a thread for each sample wrote, to the pixels of a tile, in the samples' order."""
+    tid = wp.tid()
+    at = (tile.y + tid / tile.width - film.y) * film.columns + tile.x + tid % tile.width - film.x
+    pixel = load_pixel(film, at)
+    for i in range(tile.n_samples):
+        pixel = with_sample(pixel, samples[tid * tile.n_samples + i])
+    store_pixel(film, at, pixel)
 
 
 @wp.func

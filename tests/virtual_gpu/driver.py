@@ -27,7 +27,7 @@ NAME = "virtual GPU"
 MOST_BLOCKS = 2**31 - 1  # of a grid in x
 # Functions that always answer the same.
 CONSTANT: dict[str, Any] = {
-    "is_cuda_enabled": 1, "cuda_driver_is_initialized": 1, "cuda_device_get_name": NAME.encode(), "cuda_device_get_sm_count": 1,
+    "is_cuda_enabled": 1, "cuda_driver_is_initialized": 1, "cuda_device_get_name": NAME.encode(), "cuda_device_get_sm_count": 36,
     "cuda_device_get_max_shared_memory": 48 << 10, "cuda_device_is_uva": 1, "cuda_device_is_mempool_supported": 1,
     "cuda_context_is_primary": 1, "cuda_context_check": 0, "cuda_get_kernel_static_shared_memory": 0, "cuda_stream_is_blocking": 1,
     **dict.fromkeys((

@@ -17,6 +17,7 @@ from tests.virtual_gpu import gpus
 from wrt.accel import batches
 from wrt.core import device as core_device
 from wrt.core.errors import InputError
+from wrt.renderer import pixels
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
 from wrt.scene import shapes
@@ -43,14 +44,22 @@ def some_rays(n: int = N) -> tuple[np.ndarray, np.ndarray]:
     return origins, -origins
 
 
-def test_a_picture_is_a_launch_a_pass_and_comes_back_once() -> None:
+@pytest.mark.parametrize(("threads", "launches"), [
+    (0, 5),  # a pixel is a thread's
+    (2048, 8),  # where there are several, a sample is, and all are added up then
+    (4 * PIXELS // 36 // 4 + 1, 10),  # at most four samples in a launch
+])
+def test_a_picture_is_a_launch_a_pass_and_comes_back_once(threads: int, launches: int, monkeypatch: pytest.MonkeyPatch) -> None:
     renderer = Renderer(wrt.load_scene(ROOT / "scenes/spot.toml"), Options(device="cuda:0"))
     renderer.aim(renderer.prepared.plan.camera, size=(48, 27), spp=16)
+    monkeypatch.setattr(pixels, "THREADS_OF_SM", threads)
     with asked() as picture:
-        renderer.run()
-    assert picture.launches == picture.waits == 5  # 1, 1, 2, 4 and 8 samples; not one a tile
+        film = renderer.run()
+    assert (picture.launches, picture.waits) == (launches, 5)  # passes of 1, 1, 2, 4 and 8 samples; not one a tile
     assert picture.copies == {"h2d": 1, "d2h": 8}  # the filter's table; each array of the film, once
     assert picture.bytes["d2h"] == FILM
+    here = wrt.render(ROOT / "scenes/spot.toml", device="cpu", size=(48, 27), spp=16)
+    assert film.pixels.tobytes() == here.pixels.tobytes() and film.stats["rays"] == here.stats["rays"]
 
 
 def test_rays_of_numpy_go_there_and_hits_come_back() -> None:

@@ -75,14 +75,15 @@ class Plan:
 
     @property
     def kernels(self) -> list[Any]:
-        """All that are compiled; without waves, the render kernel, and the AOV kernel where AOVs are asked for."""
+        """All that are compiled; without waves first the render kernel, then the AOV kernel where AOVs are asked for."""
         return self._kernels(bool(self.options.aov))
 
     def _kernels(self, aov: bool) -> list[Any]:
         if self.by_waves:
             return wave_kernels(self.features, self.structure, aov).all()
-        kernels = [render_kernel(self.features, self.structure)]
-        return [*kernels, aov_kernel(self.features, self.structure)] if aov else kernels
+        makes = [render_kernel, aov_kernel] if aov else [render_kernel]
+        folds = [] if self.options.device == "cpu" else [kernels.add_samples]
+        return [make(self.features, self.structure) for make in makes] + folds
 
     def kernels_hash(self) -> str:
         """Of the whole code that makes pixels, the same in every process."""

@@ -14,12 +14,12 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build, reports_progress
-from wrt.core.device import launch_on, load_kernel, thread_count
+from wrt.core.device import load_kernel, thread_count
 from wrt.core.seconds import Span, counted_once, loads_since
-from wrt.kernels import structs
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.memory_estimate import require_memory
 from wrt.renderer.options import Progress
+from wrt.renderer.pixels import aov_launch, film_launch
 from wrt.renderer.plan import Plan
 from wrt.renderer.tiles import Rectangle, Work, corners, tiles
 from wrt.renderer.upload import DeviceScene, camera_struct, upload_scene
@@ -80,25 +80,14 @@ class Prepared:
     def launch(self, film: DeviceFilm | AovFilm, accel: Any = None) -> Callable[[Work], int]:
         """A function that traces some work into the film, and gives its samples. accel: a record in place of the structure's."""
         accel = self.accel.data if accel is None else accel
+        world = (accel, self.arrays.surfaces, self.arrays.lighting, self.camera)
+        limits = [] if isinstance(film, AovFilm) else [self.plan.limits(seed) for seed in film.seeds]
         if self.waves is not None:
-            limits = [] if isinstance(film, AovFilm) else [self.plan.limits(seed) for seed in film.seeds]
-            return self.waves.launch((accel, self.arrays.surfaces, self.arrays.lighting, self.camera), limits, film)
+            return self.waves.launch(world, limits, film)
         if isinstance(film, AovFilm):
-            kernel, groups = self.kernels[1], [[accel, self.arrays.surfaces, self.camera, film.struct]]
-        else:
-            world = [accel, self.arrays.surfaces, self.arrays.lighting, self.camera]
-            kernel, groups = self.kernels[0], [[*world, self.plan.limits(seed), group]
-                                               for seed, group in zip(film.seeds, film.groups, strict=True)]
-
-        def trace(work: Work) -> int:
-            tile = structs.Tile()
-            tile.x, tile.y, tile.width, height = work.rectangle
-            tile.first_sample, tile.n_samples = work.first, work.n
-            for arguments in groups:
-                launch_on(self.device, kernel, tile.width * height, *arguments, tile)
-            return work.total
-
-        return trace
+            return aov_launch(self.device, self.kernels[1], world, film)
+        alone = self.device.is_cpu or self.plan.structure.units.counters
+        return film_launch(self.device, self.kernels[0], world, limits, film, alone)
 
     # --- what a worker is asked for (wrt.renderer.distributed) ---
 

@@ -1,0 +1,65 @@
+"""Pictures by one ray at a time (wrt.kernels.shade.render): on CUDA, and wherever rays are counted.
+
+A thread takes a pixel; or a sample, where the pixels alone would leave multiprocessors of a GPU without work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import warp as wp
+
+from wrt.core.device import launch_on
+from wrt.kernels import structs
+from wrt.kernels.shade.render import add_samples
+from wrt.kernels.shade.step import Sample
+from wrt.renderer.film_arrays import AovFilm, DeviceFilm
+from wrt.renderer.tiles import Work
+from wrt.renderer.waves import World
+
+THREADS_OF_SM = 2048  # that a multiprocessor keeps at a time, of NVIDIA's largest
+ROUNDS = 4  # times as many samples in a launch
+
+
+def film_launch(device: Any, kernel: Any, world: World, limits: list[Any], film: DeviceFilm, alone: bool) -> Callable[[Work], int]:
+    """A function that adds some work's samples to the film, and gives their number. limits: those of each group of the film; alone:
+    a pixel is always one thread's."""
+    room = 0 if alone else device.sm_count * THREADS_OF_SM * ROUNDS
+    samples = wp.empty(0, dtype=Sample, device=device)
+
+    def trace(work: Work) -> int:
+        nonlocal samples
+        pixels, end = work.rectangle[2] * work.rectangle[3], work.first + work.n
+        by_samples = work.n > 1 and pixels * ROUNDS <= room
+        step = min(room // pixels, work.n) if by_samples else work.n
+        if by_samples and len(samples) < pixels * step:
+            samples = wp.empty(pixels * step, dtype=Sample, device=device)
+        for first in range(work.first, end, step):
+            tile = tile_of(work._replace(first=first, n=min(step, end - first)))
+            tile.threads = tile.n_samples if by_samples else 1
+            for limit, group in zip(limits, film.groups, strict=True):
+                launch_on(device, kernel, pixels * tile.threads, *world, limit, group, tile, samples)
+                if tile.threads > 1:
+                    launch_on(device, add_samples, pixels, group, tile, samples)
+        return work.total
+
+    return trace
+
+
+def aov_launch(device: Any, kernel: Any, world: World, film: AovFilm) -> Callable[[Work], int]:
+    """As film_launch, of AOVs."""
+    accel, surfaces, _, camera = world
+
+    def trace(work: Work) -> int:
+        launch_on(device, kernel, work.rectangle[2] * work.rectangle[3], accel, surfaces, camera, film.struct, tile_of(work))
+        return work.total
+
+    return trace
+
+
+def tile_of(work: Work) -> Any:
+    tile = structs.Tile()
+    tile.x, tile.y, tile.width, _ = work.rectangle
+    tile.first_sample, tile.n_samples, tile.threads = work.first, work.n, 1
+    return tile
