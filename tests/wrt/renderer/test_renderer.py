@@ -23,7 +23,7 @@ from wrt.io.mesh_file import load_mesh
 from wrt.picture.film import Film
 from wrt.renderer import prepare, schedule
 from wrt.renderer.options import AOVS, Options, Progress
-from wrt.renderer.render import render
+from wrt.renderer.render import builder_for, render
 from wrt.renderer.renderer import Renderer
 from wrt.renderer.result import plain_text
 from wrt.renderer.schedule import MAX_PASS, Run
@@ -33,7 +33,7 @@ from wrt.scene.lights import DirectionalLight
 from wrt.scene.materials import Checkerboard, Material
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import Settings
-from wrt.scene.shapes import box, quad
+from wrt.scene.shapes import box, icosphere, quad
 
 SIZE = (37, 22)  # no multiple of any tile
 # One set of features for nearly all tests here: each other one is a kernel to compile.
@@ -511,3 +511,13 @@ def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch
 def test_a_scene_without_a_camera_is_refused() -> None:
     with pytest.raises(InputError, match="the scene has no camera"):
         render(replace(SCENE, cameras=()))
+
+
+def test_a_tree_is_refined_where_samples_are_many_and_pixels_do_not_tell() -> None:
+    scene = replace(SCENE, objects=(*SCENE.objects, Object(icosphere(4), (Material(),))))
+    few = scene.with_settings(size=(40, 20), spp=2)
+    enough = few.with_settings(spp=8 * len(icosphere(4).faces) // 800 + 1)
+    assert builder_for(few, Options()) == {"builder": "binned"} and builder_for(enough, Options()) == {}
+    assert builder_for(few, Options(accel="grid")) == builder_for(few, Options(accel="bvh2")) == {}
+    films = [render(few, aov=["prim_id"], **options) for options in ({}, {"accel_options": {"builder": "refined"}})]
+    assert same(*films) and films[0].stats["accel"]["sah_cost"] > films[1].stats["accel"]["sah_cost"]
