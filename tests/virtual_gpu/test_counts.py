@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 
@@ -95,6 +95,12 @@ def test_many_rays_of_numpy_are_traced_in_parts(monkeypatch: pytest.MonkeyPatch)
     for name in ("t", "u", "v", "prim_id"):
         assert getattr(parts, name).tobytes() == getattr(whole, name).tobytes()
     assert 0 < (whole.prim_id >= 0).sum() < N
+
+
+def test_a_picture_has_to_fit_into_the_memory_of_the_host_too(say_memory: Callable[[str], None]) -> None:
+    say_memory("100M")
+    with pytest.raises(InputError, match=r"takes 0\.\d GiB of memory, its scene \d MiB; the host has \d+ MiB free \(WRT_MEMORY"):
+        wrt.render(ROOT / "scenes/spot.toml", device="cuda:0", size=(1500, 1500), spp=1)
 
 
 def test_what_does_not_fit_on_the_device_is_told_before_it_is_built(monkeypatch: pytest.MonkeyPatch) -> None:

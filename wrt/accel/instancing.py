@@ -7,6 +7,7 @@ from collections import defaultdict
 import numpy as np
 
 from wrt.core.checks import as_choice
+from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 INSTANCING = ("auto", "always", "never")
@@ -32,6 +33,12 @@ def instanced_meshes(scene: Scene, instancing: str = "auto") -> frozenset[int]:
     least = MIN_SAVED if instancing == "auto" else 1
     return frozenset(key for key, things in users.items() if len(things) > 1
                      and (sum(map(is_invertible, things)) - 1) * len(things[0].mesh.faces) >= least)
+
+
+def stored_meshes(scene: Scene, kept_once: frozenset[int]) -> list[Mesh]:
+    """What a structure is over: each mesh of `kept_once` (of instanced_meshes), and one more for each copy."""
+    once = {id(thing.mesh): thing.mesh for thing in scene.objects if is_instance(thing, kept_once)}
+    return [*once.values(), *(thing.mesh for thing in scene.objects if not is_instance(thing, kept_once))]
 
 
 def is_instance(thing: Object, meshes: frozenset[int]) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from wrt.accel.base import Accelerator
-from wrt.accel.instancing import is_instance
+from wrt.accel.instancing import stored_meshes
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.address_space import told_limit
 from wrt.core.device import free_memory, thread_count
@@ -60,9 +60,7 @@ def bytes_of_waves(plan: Plan) -> float:
 def bytes_of_scene(scene: Scene, accel: type[Accelerator], kept_once: frozenset[int] = frozenset()) -> float:
     """Bytes that the scene's arrays and its structure take at most while they are made, beside the scene itself. kept_once: the
     id()s of the meshes that are (wrt.accel.instancing)."""
-    meshes = {id(thing.mesh): thing.mesh for thing in scene.objects if is_instance(thing, kept_once)}
-    copied = [thing.mesh for thing in scene.objects if not is_instance(thing, kept_once)]
-    every = [*meshes.values(), *copied]
+    every = stored_meshes(scene, kept_once)
     faces, vertices = sum(len(mesh.faces) for mesh in every), sum(len(mesh.vertices) for mesh in every)
     emitters = sum(len(thing.mesh.faces) for thing in scene.objects if any(m.lights_others for m in thing.materials))
     images = {id(t.image): t.image for m in scene.materials for t in m.textures if isinstance(t, Texture)}

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
-from inspect import signature
 from typing import Any
 
-from wrt.accel.structures import ACCELERATORS, chosen
 from wrt.core.checks import unknown
 from wrt.core.errors import InputError
 from wrt.io.load import as_scene
@@ -19,7 +16,6 @@ from wrt.scene.model import Scene
 from wrt.scene.settings import SETTINGS
 
 MAX_SPP = 1 << 16  # where a target error asks for more than anybody said
-REFINED_FROM = 8  # camera samples a triangle: with fewer, to refine a tree takes longer than it saves
 
 
 def render(scene: Scene | Mesh | str | os.PathLike[str], *, spp: int | None = None,
@@ -44,18 +40,8 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], *, spp: int | None = No
             raise InputError(unknown(name, "argument of render", (*SETTINGS, *OPTIONS)))
     how = Options(**options)
     scene = as_scene(scene).with_settings(**changes)
-    how = replace(how, accel_options=builder_for(scene, how) | how.accel_options)
     if how.executor is None and how.devices is None:
-        return Renderer(scene, how).run()
+        return Renderer(scene, how, once=True).run()
     from wrt.renderer.distributed.renderer import DistributedRenderer
 
     return DistributedRenderer(scene, how).run()
-
-
-def builder_for(scene: Scene, how: Options) -> dict[str, str]:
-    """The option `builder` of a structure for one picture, where the structure's own default takes too long for its few samples."""
-    width, height = scene.settings.size
-    triangles = sum(len(thing.mesh.faces) for thing in scene.objects)
-    default = signature(ACCELERATORS[chosen(how.accel, how.device)]._build).parameters.get("builder")
-    few = width * height * scene.settings.spp < REFINED_FROM * triangles
-    return {"builder": "binned"} if few and default is not None and default.default == "refined" else {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import asdict, replace
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -11,30 +12,37 @@ import numpy as np
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.accel.instancing import stored_meshes
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import checkpoint_of
 from wrt.renderer.memory_estimate import require_memory
 from wrt.renderer.options import Options
-from wrt.renderer.plan import plan_of
+from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import kind_of, prepare
 from wrt.renderer.schedule import LocalTracer, Run
 from wrt.renderer.upload import upload_scene
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 
+REFINED_FROM = 8  # camera samples a triangle: with fewer, to refine a tree takes longer than it saves
+
 
 class Renderer:
-    """A scene made ready; `prepared` says how, and `run` takes the samples. Raises InputError where it cannot be rendered."""
+    """A scene made ready; `prepared` says how, and `run` takes the samples. once: one picture is all that it is for. Raises
+    InputError where it cannot be rendered."""
 
-    def __init__(self, scene: Scene, options: Options) -> None:
+    def __init__(self, scene: Scene, options: Options, *, once: bool = False) -> None:
         if options.executor is not None or options.devices is not None:
             raise InputError("an executor or several devices are for wrt.render; this runs on one device")
         device = start(options.device)
         plan = plan_of(scene, options)
         require_memory(plan, device)
         self.checkpoint = checkpoint_of(plan, kind_of(device))
+        if once:  # after the checkpoint: another render of it may take another tree
+            plan = replace(plan, options=replace(options, accel_options=builder_for(plan) | options.accel_options))
         self.prepared = prepare(plan, device)
 
     @property
@@ -76,6 +84,14 @@ class Renderer:
         if self.checkpoint is not None and (seed is not None or spp is not None):
             raise InputError("a render with a checkpoint has the seed and spp that it was made with")
         return Run(LocalTracer(self.prepared), self.checkpoint, seed, spp).film()
+
+
+def builder_for(plan: Plan) -> dict[str, str]:
+    """The structure's option `builder` for one picture, where its default takes too long for so few samples."""
+    default = signature(ACCELERATORS[plan.accel]._build).parameters.get("builder")
+    triangles = sum(len(mesh.faces) for mesh in stored_meshes(plan.scene, plan.meshes))
+    few = plan.area * plan.scene.settings.spp < REFINED_FROM * triangles
+    return {"builder": "binned"} if few and default is not None and default.default == "refined" else {}
 
 
 def can_refit(accel: Accelerator, geometry: Geometry) -> bool:

@@ -23,8 +23,9 @@ from wrt.io.mesh_file import load_mesh
 from wrt.picture.film import Film
 from wrt.renderer import prepare, schedule
 from wrt.renderer.options import AOVS, Options, Progress
-from wrt.renderer.render import builder_for, render
-from wrt.renderer.renderer import Renderer
+from wrt.renderer.plan import plan_of
+from wrt.renderer.render import render
+from wrt.renderer.renderer import Renderer, builder_for
 from wrt.renderer.result import plain_text
 from wrt.renderer.schedule import MAX_PASS, Run
 from wrt.scene.backgrounds import EnvironmentBackground, GradientBackground
@@ -513,11 +514,23 @@ def test_a_scene_without_a_camera_is_refused() -> None:
         render(replace(SCENE, cameras=()))
 
 
-def test_a_tree_is_refined_where_samples_are_many_and_pixels_do_not_tell() -> None:
-    scene = replace(SCENE, objects=(*SCENE.objects, Object(icosphere(4), (Material(),))))
-    few = scene.with_settings(size=(40, 20), spp=2)
-    enough = few.with_settings(spp=8 * len(icosphere(4).faces) // 800 + 1)
-    assert builder_for(few, Options()) == {"builder": "binned"} and builder_for(enough, Options()) == {}
-    assert builder_for(few, Options(accel="grid")) == builder_for(few, Options(accel="bvh2")) == {}
-    films = [render(few, aov=["prim_id"], **options) for options in ({}, {"accel_options": {"builder": "refined"}})]
+def test_a_tree_is_refined_where_samples_are_many_and_pixels_do_not_tell(tmp_path: Path) -> None:
+    ball = Object(icosphere(4), (Material(),))
+    few = replace(SCENE, objects=(*SCENE.objects, ball)).with_settings(size=(40, 20), spp=2)
+    many = 8 * len(ball.mesh.faces) // 800 + 1
+
+    def chosen(scene: Scene, **options: Any) -> dict[str, str]:
+        return builder_for(plan_of(scene, Options(**options)))
+
+    assert chosen(few) == {"builder": "binned"} and chosen(few.with_settings(spp=many)) == {}
+    assert chosen(few.with_settings(spp=many), crop=(0, 0, 20, 20)) == {"builder": "binned"}
+    assert chosen(few, accel="grid") == chosen(few, accel="bvh2") == {}
+    copies = replace(few, objects=(ball,) * 9).with_settings(spp=2 * many)
+    assert chosen(copies, instancing="never") == {"builder": "binned"} and chosen(copies, instancing="always") == {}
+    path = tmp_path / "a.checkpoint"
+    films = [render(few, aov=["prim_id"], **options)
+             for options in ({"checkpoint": path}, {"accel_options": {"builder": "refined"}})]
     assert same(*films) and films[0].stats["accel"]["sah_cost"] > films[1].stats["accel"]["sah_cost"]
+    more = render(few, spp=many, aov=["prim_id"], checkpoint=path, resume=True)  # with the other tree
+    assert more.stats["accel"] | {"build_seconds": 0.0} == films[1].stats["accel"] | {"build_seconds": 0.0}
+    assert same(more, render(few, spp=many, aov=["prim_id"]))

@@ -18,7 +18,7 @@ from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.geometry import Geometry
 from wrt.accel.rays import rays_of, rays_on
-from wrt.core.device import load_kernel, thread_count, upload
+from wrt.core.device import launch_on, load_kernel, thread_count, upload
 from wrt.io.mesh_file import as_mesh
 from wrt.kernels.study.query_volumes import count_popped, make_enter_kernel
 from wrt.kernels.traverse.bvh2 import box_volumes
@@ -104,11 +104,9 @@ def published_cost(accel: Accelerator, rays: RaySet) -> float:
     """Nodes and leaves popped and triangles tested, a ray, as tinybvh counts."""
     hits = accel.closest_hit(rays.origins, rays.directions)
     counts = [wp.zeros(len(rays), dtype=wp.int32, device=accel.device) for _ in range(2)]
-    load_kernel(count_popped, accel.device)
     device_rays = rays_on(accel.device, rays_of(rays.origins, rays.directions, 0.0, rays.t_max))
-    wp.launch(count_popped, dim=len(rays), device=accel.device, inputs=[
-        accel.data.nodes, upload(accel.built.order.copy(), wp.int32, accel.device), device_rays,
-        upload(hits.t, wp.float32, accel.device), upload(hits.prim_id, wp.int32, accel.device), *counts])
+    launch_on(accel.device, count_popped, len(rays), accel.data.nodes, upload(accel.built.order.copy(), wp.int32, accel.device),
+              device_rays, upload(hits.t, wp.float32, accel.device), upload(hits.prim_id, wp.int32, accel.device), *counts)
     return float(sum(count.numpy().mean() for count in counts))
 
 
@@ -164,7 +162,7 @@ def tester_of(accel: Accelerator, rays: RaySet) -> Callable[[], int]:
     inputs = [data, some, wp.zeros(n, dtype=wp.int32, device=accel.device)]
 
     def test() -> int:
-        wp.launch(kernel, dim=n, inputs=inputs, device=accel.device)
+        launch_on(accel.device, kernel, n, *inputs)
         return n * 2 * len(data.nodes)
 
     return test
