@@ -133,7 +133,9 @@ def make_render_kernel(features: Any, structure: Any, camera_kind: Any) -> Any:
         y = tile.y + tid / tile.threads / tile.width
         at = (y - film.y) * film.columns + x - film.x
         key = hash_pair(hash_pair(limits.seed, wp.uint32(x)), wp.uint32(y))
-        pixel = load_pixel(film, at)
+        pixel = Pixel()
+        if tile.threads == 1:
+            pixel = load_pixel(film, at)
         for i in range(tid % tile.threads, tile.n_samples, tile.threads):
             index = wp.uint32(tile.first_sample + i)
             lens_xi = wp.vec2(0.0, 0.0)

@@ -47,7 +47,7 @@ def some_rays(n: int = N) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(("threads", "launches"), [
     (0, 5),  # a pixel is a thread's
     (2048, 8),  # where there are several, a sample is, and all are added up then
-    (4 * PIXELS // 36 // 4 + 1, 10),  # at most four samples in a launch
+    (PIXELS // 36 + 1, 10),  # of each of 36 multiprocessors: at most four samples in a launch
 ])
 def test_a_picture_is_a_launch_a_pass_and_comes_back_once(threads: int, launches: int, monkeypatch: pytest.MonkeyPatch) -> None:
     renderer = Renderer(wrt.load_scene(ROOT / "scenes/spot.toml"), Options(device="cuda:0"))

@@ -41,8 +41,8 @@ class Renderer:
         plan = plan_of(scene, options)
         require_memory(plan, device)
         self.checkpoint = checkpoint_of(plan, kind_of(device))
-        if once:  # after the checkpoint: another render of it may take another tree
-            plan = replace(plan, options=replace(options, accel_options=builder_for(plan) | options.accel_options))
+        if once and (builder := builder_for(plan)):  # after the checkpoint: another render of it may take another tree
+            plan = replace(plan, options=replace(options, accel_options=builder | options.accel_options))
         self.prepared = prepare(plan, device)
 
     @property

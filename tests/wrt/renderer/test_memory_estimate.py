@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.data import ROOT
+from tests.device import NAME
 from wrt.accel.build import build
 from wrt.accel.instancing import instanced_meshes
 from wrt.accel.structures import ACCELERATORS
@@ -52,7 +53,7 @@ def test_a_scene_larger_than_the_memory_is_refused_before_any_work(say_memory: C
     monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("work was done"))
     scene = replace(SCENE, objects=SCENE.objects * 1000)
     with pytest.raises(InputError, match=r"a picture of 8x8 takes \d+ MiB of memory, its scene \d\.\d GiB;"
-                                          r" (cpu|the host) has 100 MiB free"):
+                                          rf" {'cpu' if NAME == 'cpu' else 'the host'} has 100 MiB free"):
         render(scene, size=(8, 8), instancing="never")
     monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: None)
     Renderer(replace(SCENE, settings=replace(SCENE.settings, size=(8, 8))), Options())
