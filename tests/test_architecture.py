@@ -34,6 +34,7 @@ BELOW_WRT = {
 # The folders of kernels/, and from which others each may import; `structs` is below all of them.
 BELOW_KERNELS = {
     "native": set(),
+    "launches": set(),
     "structs": set(),
     "units": {"structs"},
     "traverse": {"native", "units", "structs"},
@@ -41,7 +42,7 @@ BELOW_KERNELS = {
     "ray_query": {"query", "traverse", "units", "structs"},
     "winding": {"structs"},
     "wide": {"native", "query", "traverse", "units", "structs"},
-    "shade": {"native", "query", "traverse", "units", "structs"},
+    "shade": {"native", "launches", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
     "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }

@@ -5,7 +5,8 @@ queue; one launch traces all of them, and the next shades all hits. Each sample 
 and adds up its light in that order, so that pictures have the same bits. Traversal and shading are kernels of their own: another
 scene compiles no traversal.
 
-Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once.
+Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once. One more launches
+them, so that a wave is a single launch to Python.
 """
 
 from functools import cache
@@ -13,6 +14,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.launches import Launch, run, run_range, run_with
 from wrt.kernels.query import HitArrays, Queue, hit_at, put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import make_background
 from wrt.kernels.shade.materials import Scatter
@@ -265,12 +267,11 @@ def make_shadow_kernel(features: Any) -> Any:
     return shadow_wave
 
 
-@cache
-def make_gather_kernel(transparent_shadows: bool) -> Any:
+def make_gather(transparent_shadows: bool) -> Any:
     """What the lights send to the hits of the queue; then the next path of each sample is queued."""
 
-    @kernel
-    def gather_wave(wave: Wave, lights: int):
+    @wp.func
+    def gather(wave: Wave, lights: int):
         queued = int(0)
         for k in range(wave.job[0].queued):
             number = wave.number[k]
@@ -297,7 +298,56 @@ def make_gather_kernel(transparent_shadows: bool) -> Any:
             wave.asking[i] = 0
         wave.job[0].queued = queued
 
-    return gather_wave
+    return gather
+
+
+@wp.func
+def add_to_film(wave: Wave, film: Film):
+    """The samples of a wave to their pixels, in their order."""
+    job = wave.job[0]
+    for p in range(job.pixels):
+        i = pixel_of(job, wave.order[p], film.x, film.y, film.columns)
+        pixel = load_pixel(film, i)
+        for j in range(job.samples):
+            pixel = with_sample(pixel, wave.done[p * job.samples + j])
+        store_pixel(film, i, pixel)
+
+
+@wp.struct
+class WaveLaunches:
+    """Those of a wave. shadow_hit: any hit, or where shadows are transparent, the closest one, with which go_through goes on."""
+
+    begin: Launch
+    closest_hit: Launch
+    shade: Launch
+    shadow_hit: Launch
+    go_through: Launch
+
+
+@cache
+def make_loop_kernel(transparent_shadows: bool) -> Any:
+    """All of a wave, from its camera rays to the film."""
+    gather = make_gather(transparent_shadows)
+
+    @kernel
+    def trace_wave(wave: Wave, launches: WaveLaunches, lights: int, film: Film):
+        run(launches.begin)
+        while wave.job[0].queued > 0:
+            run_range(launches.closest_hit, 0, wave.job[0].queued)
+            run(launches.shade)
+            for light in range(lights):
+                first = light * wave.capacity
+                asking = wave.asking[light]
+                while asking > 0:
+                    run_range(launches.shadow_hit, first, first + asking)
+                    asking = 0
+                    if wp.static(transparent_shadows):
+                        run_with(launches.go_through, light)
+                        asking = wave.asking[light]
+            gather(wave, lights)
+        add_to_film(wave, film)
+
+    return trace_wave
 
 
 def make_begin_aov_kernel(camera_kind: Any) -> Any:
@@ -329,15 +379,3 @@ def make_see_kernel(features: Any) -> Any:
             see(film, pixel, surfaces, queued_ray(wave.rays, p), hit_at(wave.hits, p))
 
     return see_wave
-
-
-@kernel
-def add_wave(wave: Wave, film: Film):
-    """The samples of a wave to their pixels, in their order."""
-    job = wave.job[0]
-    for p in range(job.pixels):
-        i = pixel_of(job, wave.order[p], film.x, film.y, film.columns)
-        pixel = load_pixel(film, i)
-        for j in range(job.samples):
-            pixel = with_sample(pixel, wave.done[p * job.samples + j])
-        store_pixel(film, i, pixel)

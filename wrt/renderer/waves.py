@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from wrt.kernels.shade.step import Lit, Sample
 from wrt.kernels.wide.batch import BatchTraversal
 from wrt.renderer.features import Features
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
+from wrt.renderer.launches import Launches
 from wrt.renderer.tiles import Work
 from wrt.renderer.upload import camera_kind
 
@@ -84,8 +85,7 @@ class WaveKernels:
     shade: Any
     shadow: Any
     begin: Any
-    gather: Any
-    add: Any
+    loop: Any
     begin_aov: Any
     see: Any
     block: int
@@ -108,8 +108,7 @@ def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
         shade=shade_kernel(surfaces),
         shadow=shadow_kernel(surfaces) if transparent else None,
         begin=begin_kernel(some(features, OF_CAMERA)),
-        gather=wave.make_gather_kernel(transparent),
-        add=wave.add_wave,
+        loop=wave.make_loop_kernel(transparent),
         begin_aov=begin_aov_kernel(features.camera) if aov else None,
         see=see_kernel(surfaces) if aov else None,
         block=block,
@@ -194,41 +193,32 @@ class Picture:
 
     def __init__(self, waves: Waves, buffers: Buffers, world: World, limits: list[Any], film: DeviceFilm) -> None:
         kernels, w, (accel, surfaces, lighting, camera) = waves.kernels, buffers.wave, world
-        self.buffers, self.lights = buffers, range(waves.lights)
-        self.begin = [command(kernels.begin, w, camera, *group) for group in zip(limits, film.groups, strict=True)]
-        self.add = [command(kernels.add, w, group) for group in film.groups]
-        self.shade, self.gather = command(kernels.shade, w, surfaces, lighting, limits[0]), command(kernels.gather, w, waves.lights)
-        self.closest_hit = traversal(kernels.closest_hit, kernels.block, buffers, accel, surfaces, w.rays, w.hits)
+        self.buffers, self.kept, self.groups = buffers, Launches(), []
+        recorded = self.kept.recorded
+
+        def trace(kernel: Any, rays: Any, out: Any) -> Any:
+            return recorded(traversal(kernels, kernel, buffers, accel, surfaces, rays, out), kernels.block)
+
+        launches = {
+            "closest_hit": trace(kernels.closest_hit, w.rays, w.hits),
+            "shade": recorded(command(kernels.shade, w, surfaces, lighting, limits[0])),
+        }
         if kernels.shadow:
-            self.shadow_hit = traversal(kernels.closest_hit, kernels.block, buffers, accel, surfaces, w.shadow_rays, w.shadow_hits)
+            launches["shadow_hit"] = trace(kernels.closest_hit, w.shadow_rays, w.shadow_hits)
+            launches["go_through"] = recorded(command(kernels.shadow, w, surfaces, 0))
         elif kernels.any_hit:
-            self.shadow_hit = traversal(kernels.any_hit, kernels.block, buffers, accel, surfaces, w.shadow_rays, w.occluded)
-        self.go_through = [command(kernels.shadow, w, surfaces, light) for light in self.lights] if kernels.shadow else None
+            launches["shadow_hit"] = trace(kernels.any_hit, w.shadow_rays, w.occluded)
+        for group_limits, group in zip(limits, film.groups, strict=True):
+            launches["begin"] = recorded(command(kernels.begin, w, camera, group_limits, group))
+            of_group = wave.WaveLaunches()
+            for name, launch in launches.items():
+                setattr(of_group, name, launch)
+            self.groups.append(command(kernels.loop, w, of_group, waves.lights, group))
 
     def take(self, work: Work) -> None:
         """All samples of some work."""
-        for begin, add in zip(self.begin, self.add, strict=True):
-            self.buffers.take(work, partial(self.trace, begin, add))
-
-    def trace(self, begin: Any, add: Any) -> None:
-        begin.launch()
-        job = self.buffers.job[0]
-        while queued := int(job["queued"]):
-            self.closest_hit(0, queued)
-            self.shade.launch()
-            for light in self.lights:
-                self.look_for(light)
-            self.gather.launch()
-        add.launch()
-
-    def look_for(self, light: int) -> None:
-        """Trace the shadow rays to a light: where they go through surfaces, from one to the next."""
-        asking, first = self.buffers.asking, light * self.buffers.capacity
-        while asked := int(asking[light]):
-            self.shadow_hit(first, first + asked)
-            if self.go_through is None:
-                return
-            self.go_through[light].launch()
+        for group in self.groups:
+            self.buffers.take(work, group.launch)
 
 
 class Aovs:
@@ -236,16 +226,19 @@ class Aovs:
 
     def __init__(self, waves: Waves, buffers: Buffers, world: World, film: AovFilm) -> None:
         kernels, w, (accel, surfaces, _, camera) = waves.kernels, buffers.wave, world
-        self.buffers = buffers
+        self.buffers, self.block = buffers, kernels.block
         self.begin, self.see = command(kernels.begin_aov, w, camera, film.struct), command(kernels.see, w, surfaces, film.struct)
-        self.closest_hit = traversal(kernels.closest_hit, kernels.block, buffers, accel, surfaces, w.rays, w.hits)
+        self.closest_hit = traversal(kernels, kernels.closest_hit, buffers, accel, surfaces, w.rays, w.hits)
 
     def take(self, work: Work) -> None:
         self.buffers.take(work, self.trace)
 
     def trace(self) -> None:
+        pixels = int(self.buffers.job[0]["pixels"])
         self.begin.launch()
-        self.closest_hit(0, int(self.buffers.job[0]["pixels"]))
+        self.closest_hit.set_dim(-(-pixels // self.block))
+        self.closest_hit.set_param_by_name("end", pixels)
+        self.closest_hit.launch()
         self.see.launch()
 
 
@@ -253,18 +246,9 @@ def command(kernel: Any, *inputs: Any) -> Any:
     return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
 
 
-def traversal(kernel: Any, block: int, buffers: Buffers, *inputs: Any) -> Callable[[int, int], None]:
-    """A function that traces rays first .. end - 1 of a queue."""
-    inputs = (*inputs, buffers.scratch) if block > 1 else inputs
-    launch = command(kernel, *inputs, 0, 0)
-
-    def trace(first: int, end: int) -> None:
-        launch.set_dim(-(-(end - first) // block))
-        launch.set_param_at_index_from_ctype(len(inputs), first)
-        launch.set_param_at_index_from_ctype(len(inputs) + 1, end)
-        launch.launch()
-
-    return trace
+def traversal(kernels: WaveKernels, kernel: Any, buffers: Buffers, *inputs: Any) -> Any:
+    """A launch whose last two arguments are the range of a queue's rays: first, end."""
+    return command(kernel, *inputs, *([buffers.scratch] if kernels.block > 1 else []), 0, 0)
 
 
 def room(n: int, dtype: Any) -> Any:

@@ -107,7 +107,7 @@ def test_scenes_share_what_they_have_in_common() -> None:
     """A traversal is compiled once for a structure, and no kernel for another depth."""
     of = {name: plan_of(load_scene(SCENES / f"{name}.toml"), Options(device="cpu")).wave_kernels
           for name in ("whitted", "glass_slab", "lens")}
-    for name in ("closest_hit", "any_hit", "gather", "add"):
+    for name in ("closest_hit", "any_hit", "loop"):
         assert len({getattr(kernels, name) for kernels in of.values()}) == 1, name
     assert of["whitted"].begin is of["glass_slab"].begin is not of["lens"].begin
     assert len({kernels.shade for kernels in of.values()}) == 3

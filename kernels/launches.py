@@ -1,0 +1,45 @@
+"""Launches that a kernel of the CPU makes: a loop over kernels without Python between them, and without its lock."""
+
+import warp as wp
+
+
+@wp.struct
+class Launch:
+    """A kernel that is compiled for the CPU, with its arguments: addresses, which wrt.renderer.launches has.
+
+    entry: of the machine code, bounds: of the launch's size, args: of all arguments, tail: of the last of them; block: how many
+    rays each of its threads takes, where it has a range of them.
+    """
+
+    entry: wp.uint64
+    bounds: wp.uint64
+    args: wp.uint64
+    tail: wp.uint64
+    block: int
+
+
+@wp.func_native("""
+    ((void (*)(void*, void*))launch.entry)((void*)launch.bounds, (void*)launch.args);
+""")
+def run(launch: Launch) -> None:
+    """As it was recorded."""
+
+
+@wp.func_native("""
+    *(int*)launch.tail = last;
+    ((void (*)(void*, void*))launch.entry)((void*)launch.bounds, (void*)launch.args);
+""")
+def run_with(launch: Launch, last: int) -> None:
+    """With that last argument, an int."""
+
+
+@wp.func_native("""
+    int* const range = (int*)launch.tail - 1;
+    range[0] = first;
+    range[1] = end;
+    auto* const bounds = (wp::launch_bounds_t<1>*)launch.bounds;
+    bounds->size = bounds->shape[0] = (end - first + launch.block - 1) / launch.block;
+    ((void (*)(void*, void*))launch.entry)(bounds, (void*)launch.args);
+""")
+def run_range(launch: Launch, first: int, end: int) -> None:
+    """Of rays first .. end - 1; these are its last two arguments."""
