@@ -24,7 +24,8 @@ from wrt.renderer.prepare import Prepared
 from wrt.renderer.result import film_of, film_so_far
 from wrt.renderer.tiles import Rectangle, Work, work_left
 
-MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C and a time limit have to wait for
+MAX_PASS = 64  # samples a pixel in one pass
+GROWTH = 16  # times as many samples a pixel after a pass as before it: waves of many samples of few pixels are the fastest
 # Samples (summed over pixels) that are done, and whether no tile runs at the moment: then each pixel is done whole.
 Steps = Generator[tuple[int, bool], None, None]
 
@@ -88,7 +89,7 @@ class LocalTracer:
 
 
 class Passes:
-    """First sample and number of samples (of each group) of each pass: 1, 1, 2, 4 ..., so that a first picture comes soon.
+    """First sample and number of samples (of each group) of each pass: 1, 15, 64, 64 ..., so that a first picture comes soon.
 
     A time limit counts from the first pass on: a pass takes no more samples than are likely to be done by then, but for the
     first of each pixel, which is always taken; nor, with `every`, more than in so many seconds. samples: the fewest and the most
@@ -106,7 +107,7 @@ class Passes:
         limit = self.options.time_limit or math.inf
         first = known = self.fewest  # the speed is that of the samples since `known`, when `since`
         begin = since = time.perf_counter()
-        count = self.options.pass_size or min(max(first, 1), self.largest)
+        count = self._size(first)
         while first < self.spp and (first < self.most or not self._precise_enough(first)):
             count = min(count, (self.most if first < self.most else self.spp) - first)
             if self.options.target_error is not None:
@@ -123,7 +124,11 @@ class Passes:
             first += count
             if first == self.most:
                 known, since = first, time.perf_counter()
-            count = self.options.pass_size or min(first, self.largest)
+            count = self._size(first)
+
+    def _size(self, first: int) -> int:
+        """Of a pass, if nothing but the samples so far matters."""
+        return self.options.pass_size or min(max((GROWTH - 1) * first, 1), self.largest)
 
     def _precise_enough(self, taken: int) -> bool:
         """Whether the target error is reached after so many samples of each group; looked at when they are a power of 2."""
