@@ -27,7 +27,10 @@ def gradient(b: Background, direction: wp.vec3) -> wp.vec3:
 @wp.func
 def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
     """Turned about +y, counter-clockwise seen from above."""
-    sin, cos = sin_cos(angle)
+    sin = angle
+    cos = float(1.0)
+    if angle != 0.0:
+        sin, cos = sin_cos(angle)
     return wp.vec3(cos * d[0] + sin * d[2], d[1], cos * d[2] - sin * d[0])
 
 

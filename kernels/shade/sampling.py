@@ -40,13 +40,14 @@ def hash_pair(a: wp.uint32, b: wp.uint32) -> wp.uint32:
     return hash_u32(a + wp.static(wp.uint32(0x9E3779B9)) * hash_u32(b + wp.static(wp.uint32(0x85EBCA6B))))
 
 
-@wp.func
-def reverse_bits(x: wp.uint32) -> wp.uint32:
-    x = ((x >> wp.uint32(1)) & wp.static(wp.uint32(BITS_1))) | ((x & wp.static(wp.uint32(BITS_1))) << wp.uint32(1))
-    x = ((x >> wp.uint32(2)) & wp.static(wp.uint32(BITS_2))) | ((x & wp.static(wp.uint32(BITS_2))) << wp.uint32(2))
-    x = ((x >> wp.uint32(4)) & wp.static(wp.uint32(BITS_4))) | ((x & wp.static(wp.uint32(BITS_4))) << wp.uint32(4))
-    x = ((x >> wp.uint32(8)) & wp.static(wp.uint32(BITS_8))) | ((x & wp.static(wp.uint32(BITS_8))) << wp.uint32(8))
-    return (x >> wp.uint32(16)) | (x << wp.uint32(16))
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __brev(x);
+#else
+    return __builtin_bitreverse32(x);
+#endif
+""")
+def reverse_bits(x: wp.uint32) -> wp.uint32: ...
 
 
 @wp.func

@@ -6,7 +6,7 @@ import warp as wp
 
 from wrt.kernels.shade.elementary import exp
 from wrt.kernels.shade.shading import BLEND
-from wrt.kernels.shade.surface import Surface, spawn_point
+from wrt.kernels.shade.surface import Surface, make_place_of, spawn_point
 from wrt.kernels.structs import Hit, Material, Ray, Surfaces
 
 OUTSIDE = wp.constant(-1)  # of any glass
@@ -62,6 +62,12 @@ def left(p: Passage) -> Passage:
     if p.medium >= 0:
         out.transmittance = wp.cw_mul(p.transmittance, mixed(p.there, p.inside))
     return out
+
+
+@wp.func
+def is_opaque(m: Material) -> bool:
+    """Whether no light goes straight through, whatever the textures say and wherever it comes from."""
+    return m.transmission <= 0.0 and m.alpha_mode != wp.static(BLEND)
 
 
 def make_pass_surface(features: Any, scatter: Any, is_solid: Any) -> Any:
@@ -143,11 +149,15 @@ def begin_shadow(ray: Ray, end: wp.vec3) -> ShadowWalk:
 def make_go_through(features: Any, shading: Any) -> Any:
     """What a shadow ray does with the closest hit on its way. Nothing here traces a ray."""
     surface_at, resolve, shading_normal, scatter, is_solid = shading
+    place_of = make_place_of(features.instances)
     pass_surface = make_pass_surface(features, scatter, is_solid)
 
     @wp.func
     def through_hit(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
         walk = before
+        if is_opaque(surfaces.materials[place_of(surfaces, hit.prim_id).material]):
+            walk.done = 1
+            return walk
         ray = walk.ray
         s = surface_at(surfaces, ray, hit)
         m = resolve(surfaces, s)

@@ -14,6 +14,8 @@ WRAP_MIRROR = 2
 @wp.func
 def wrapped(i: int, size: int, wrap: int) -> int:
     """The column (or row) 0 .. size - 1 that stands for column i."""
+    if i >= 0 and i < size:  # most are, and a division takes as long as all the rest
+        return i
     if wrap == wp.static(WRAP_CLAMP):
         return wp.clamp(i, 0, size - 1)
     period = wp.where(wrap == wp.static(WRAP_MIRROR), 2 * size, size)

@@ -27,6 +27,7 @@ inline int device_block_dim() { return ::blockDim.x; }
 // Of CUDA's functions, those that kernels name; `atomicMin` and the like are named through Warp's.
 inline int __ffs(int mask) { return __builtin_ffs(mask); }
 inline int __popc(unsigned mask) { return __builtin_popcount(mask); }
+inline unsigned __brev(unsigned x) { return __builtin_bitreverse32(x); }
 inline int __clz(int mask) { return mask ? __builtin_clz(mask) : 32; }
 inline float __int_as_float(int bits) { return __builtin_bit_cast(float, bits); }
 inline void __threadfence() {}

@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 
-from wrt.kernels.shade.shadows import MAX_TRANSPARENT
+from tests.kernel_tools import DEVICE, launch, zeros  # isort: skip (starts Warp)
+import warp as wp
+
+from wrt.core.device import upload
+from wrt.kernels.shade.shadows import MAX_TRANSPARENT, is_opaque
+from wrt.kernels.structs import Material as MaterialRecord
+from wrt.kernels.structs import kernel
 from wrt.renderer.render import render
+from wrt.renderer.upload import TextureTable, material_records
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, PointLight
 from wrt.scene.materials import Material
@@ -87,3 +94,28 @@ def test_alpha_lets_no_light_through_what_is_not_blended(mode):
 def test_layers_of_blended_surfaces_multiply():
     layers = [pane(Material(alpha=alpha, alpha_mode="blend"), 1.0 + alpha) for alpha in (0.25, 0.5)]
     assert np.allclose(lit(*layers)[0], 0.8 * 0.75 * 0.5, rtol=1e-5)
+
+
+@kernel
+def opaque_kernel(materials: wp.array(dtype=MaterialRecord), out: wp.array(dtype=wp.bool)):
+    out[wp.tid()] = is_opaque(materials[wp.tid()])
+
+
+KINDS = [("diffuse", {}), ("mirror", {}), ("conductor", {}), ("glass", {}), ("glass", {"thin": True}), ("metallic_roughness", {}),
+         ("metallic_roughness", {"transmission": 0.01})]
+
+
+@pytest.mark.parametrize("alpha_mode", ["opaque", "mask", "blend"])
+@pytest.mark.parametrize("kind", range(len(KINDS)))
+def test_opaque_is_what_leaves_the_floor_below_it_dark(kind, alpha_mode):
+    """From either side."""
+    materials = [Material(name, alpha_mode=alpha_mode, alpha=0.5, alpha_cutoff=0.1, **fields) for name, fields in KINDS]
+    out = zeros(len(KINDS), wp.bool)
+    launch(opaque_kernel, len(KINDS), upload(material_records(tuple(materials), TextureTable()), MaterialRecord, DEVICE), out)
+    opaque = out.numpy()
+    assert opaque.any() == (alpha_mode != "blend") and not opaque.all()
+    far = [Object(quad((1e4, 10 + i, 0), (1, 0, 0), (0, 1, 0)), (Material(name, **fields),))  # as EXTRA
+           for i, (name, fields) in enumerate(KINDS)]
+    below = Object(quad((-10, 1, 10), (0, 0, -20), (20, 0, 0)), (materials[kind],))
+    for sheet in (pane(materials[kind]), below):
+        assert lit(sheet, *far, shadows="tinted")[0].any() != opaque[kind]
