@@ -5,7 +5,8 @@ import warp as wp
 
 @wp.struct
 class Launch:
-    """A kernel that is compiled for the CPU, with its arguments: addresses, which wrt.renderer.launches has.
+    """A kernel that is compiled for the CPU, with its arguments: addresses, which wrt.renderer.launches has. For one thread at a
+    time: launches write into it.
 
     entry: of the machine code, bounds: of the launch's size, args: of all arguments, tail: of the last of them; block: how many
     rays each of its threads takes, where it has a range of them.
@@ -22,7 +23,7 @@ class Launch:
     ((void (*)(void*, void*))launch.entry)((void*)launch.bounds, (void*)launch.args);
 """)
 def run(launch: Launch) -> None:
-    """As it was recorded."""
+    """With the arguments that it had last."""
 
 
 @wp.func_native("""

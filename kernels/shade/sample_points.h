@@ -19,7 +19,7 @@
     for (int j = 0; j < count; j += 8) {
         float points[16];
         for (int lane = 0; lane < 8; ++lane) {
-            const unsigned i = __builtin_bitreverse32(Hashes::scramble(__builtin_bitreverse32(first + j + lane), seed));
+            const unsigned i = __builtin_bitreverse32(Hashes::scramble(__builtin_bitreverse32((unsigned)first + j + lane), seed));
             const unsigned x = __builtin_bitreverse32(Hashes::scramble(i, seed_x));
             const unsigned y = __builtin_bitreverse32(Hashes::scramble(Hashes::second(i), seed_y));
             points[2 * lane] = (float)(x >> 8) * UNIT;

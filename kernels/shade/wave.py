@@ -5,8 +5,8 @@ queue; one launch traces all of them, and the next shades all hits. Each sample 
 and adds up its light in that order, so that pictures have the same bits. Traversal and shading are kernels of their own: another
 scene compiles no traversal.
 
-Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once. One more launches
-them, so that a wave is a single launch to Python.
+Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once. trace_wave launches
+the others, so that a wave is a single launch to Python.
 """
 
 from functools import cache

@@ -12,8 +12,6 @@ from wrt.kernels.launches import Launch, run, run_range, run_with
 from wrt.kernels.structs import kernel
 from wrt.renderer.launches import Launches
 
-BLOCK = 5
-
 
 @wp.struct
 class Log:
@@ -37,10 +35,20 @@ def take(log: Log, first: int, end: int):
 
 
 @kernel
-def loop(log: Log, note_launch: Launch, take_launch: Launch):
+def take_one(log: Log, first: int, end: int):
+    i = first + wp.tid()  # a thread too many is seen behind the range
+    log.seen[i] = log.seen[i] + 1
+
+
+@kernel
+def loop(log: Log, note_launch: Launch):
     run(note_launch)
     while log.entries[0] < 4:  # which `note` adds to
         run_with(note_launch, log.entries[0])
+
+
+@kernel
+def ranges(take_launch: Launch):
     run_range(take_launch, 3, 20)
     run_range(take_launch, 8, 9)
     run_range(take_launch, 7, 7)
@@ -50,20 +58,39 @@ def recorded(kernel: wp.Kernel, *inputs: object) -> wp.Launch:
     return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True)
 
 
-@pytest.mark.parametrize("collected", [False, True])
-def test_a_kernel_launches_others(collected: bool) -> None:
-    """Also when nothing but Launches knows of them."""
-    log, launches = Log(), Launches()
-    log.entries, log.what, log.seen = (wp.zeros(n, dtype=wp.int32, device="cpu") for n in (1, 8, 24))
-    of_note = launches.recorded(recorded(note, log, 10.0, 7))
-    of_take = launches.recorded(recorded(take, log, 0, 0), BLOCK)
-    if collected:
-        gc.collect()
-    wp.launch(loop, dim=1, inputs=[log, of_note, of_take], device="cpu")
-    assert log.what.numpy().tolist() == [70, 10, 20, 30, 0, 0, 0, 0]
+def log() -> Log:
+    out = Log()
+    out.entries, out.what, out.seen = (wp.zeros(n, dtype=wp.int32, device="cpu") for n in (1, 8, 24))
+    return out
+
+
+def test_a_kernel_launches_another_until_that_has_done_enough() -> None:
+    it, launches = log(), Launches()
+    of_note = launches.recorded(recorded(note, it, 10.0, 7))
+    gc.collect()
+    wp.launch(loop, dim=1, inputs=[it, of_note], device="cpu")
+    assert it.what.numpy().tolist() == [70, 10, 20, 30, 0, 0, 0, 0]
+    wp.launch(loop, dim=1, inputs=[it, of_note], device="cpu")  # with the argument that it had last
+    assert it.what.numpy()[4] == 30 and it.entries.numpy()[0] == 5
+
+
+@pytest.mark.parametrize(("kernel", "block"), [(take, 5), (take_one, 1)])
+def test_a_range_is_taken_by_as_many_threads_as_it_needs(kernel: wp.Kernel, block: int) -> None:
+    it, launches = log(), Launches()
+    of_take = launches.recorded(recorded(kernel, it, 0, 0), block)
+    gc.collect()
+    wp.launch(ranges, dim=1, inputs=[of_take], device="cpu")
     expected = np.zeros(24, np.int32)
     expected[3:20] = 1
     expected[8] += 1
-    np.testing.assert_array_equal(log.seen.numpy(), expected)
-    wp.launch(loop, dim=1, inputs=[log, of_note, of_take], device="cpu")  # again, with what is left of the first time
-    assert log.what.numpy()[4] == 30 and log.entries.numpy()[0] == 5 and log.seen.numpy().sum() == 2 * expected.sum()
+    np.testing.assert_array_equal(it.seen.numpy(), expected)
+
+
+def test_nothing_stays_of_launches_that_are_let_go() -> None:
+    it = log()
+    Launches().recorded(recorded(take, it, 0, 0))
+    gc.collect()
+    before = len(gc.get_objects())
+    for _ in range(50):
+        Launches().recorded(recorded(take, it, 0, 0))
+    assert len(gc.get_objects()) < before + 50

@@ -45,8 +45,8 @@ def some_rays(n: int = N) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(("threads", "launches"), [
-    (0, 2),  # a pixel is a thread's
-    (2048, 3),  # where there are several, a sample is, and all are added up then
+    (0, 3),  # a pixel is a thread's
+    (2048, 5),  # where there are several, a sample is, and all are added up then
     (PIXELS // 36 + 1, 9),  # of each of 36 multiprocessors: at most four samples in a launch
 ])
 def test_a_picture_is_a_launch_a_pass_and_comes_back_once(threads: int, launches: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,7 +55,7 @@ def test_a_picture_is_a_launch_a_pass_and_comes_back_once(threads: int, launches
     monkeypatch.setattr(pixels, "THREADS_OF_SM", threads)
     with asked() as picture:
         film = renderer.run()
-    assert (picture.launches, picture.waits) == (launches, 2)  # passes of 1 and 15 samples; not one a tile
+    assert (picture.launches, picture.waits) == (launches, 3)  # passes of 1, 3 and 12 samples; not one a tile
     assert picture.copies == {"h2d": 1, "d2h": 8}  # the filter's table; each array of the film, once
     assert picture.bytes["d2h"] == FILM
     here = wrt.render(ROOT / "scenes/spot.toml", device="cpu", size=(48, 27), spp=16)

@@ -24,8 +24,10 @@ from wrt.renderer.prepare import Prepared
 from wrt.renderer.result import film_of, film_so_far
 from wrt.renderer.tiles import Rectangle, Work, work_left
 
-MAX_PASS = 64  # samples a pixel in one pass
-GROWTH = 16  # times as many samples a pixel after a pass as before it: waves of many samples of few pixels are the fastest
+MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C has to wait for on a GPU, and how uneven it leaves a picture on the CPU
+# Times as many samples a pixel after a pass as before it. On the CPU waves of many samples of few pixels are the fastest (16 spp: 4
+# is up to 1.15 times as fast as 2, and 16 up to 1.1 times as fast as 4), but pictures that end early are the less even.
+GROWTH = 4
 # Samples (summed over pixels) that are done, and whether no tile runs at the moment: then each pixel is done whole.
 Steps = Generator[tuple[int, bool], None, None]
 
@@ -89,7 +91,7 @@ class LocalTracer:
 
 
 class Passes:
-    """First sample and number of samples (of each group) of each pass: 1, 15, 64, 64 ..., so that a first picture comes soon.
+    """First sample and number of samples (of each group) of each pass: 1, 3, 12, 48, 64 ..., so that a first picture comes soon.
 
     A time limit counts from the first pass on: a pass takes no more samples than are likely to be done by then, but for the
     first of each pixel, which is always taken; nor, with `every`, more than in so many seconds. samples: the fewest and the most

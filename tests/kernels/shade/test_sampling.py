@@ -384,18 +384,19 @@ def test_search_cdf(weights, before):
 
 
 def test_points_in_lanes_are_those_of_one_at_a_time():
-    """What pictures draw on the CPU: the same bits, whichever index a pixel begins with."""
-    n, draw, at = 37, make_draw(Features()), 3
+    """What pictures draw on the CPU: the same bits, whichever index a pixel begins with, and however many are drawn."""
+    draw, at = make_draw(Features()), 3
 
     @kernel
-    def compare(key: wp.uint32, first: int, lanes: wp.array(dtype=wp.vec2), single: wp.array(dtype=wp.vec2)):
+    def compare(key: wp.uint32, first: int, n: int, lanes: wp.array(dtype=wp.vec2), single: wp.array(dtype=wp.vec2)):
         draw(key, 1, first, n, lanes, at)
         for i in range(n):
             single[at + i] = sample_2d(key, wp.uint32(first + i), 1)
 
-    for key, first in ((0, 0), (0xFFFFFFFF, 5), (0x12345678, (1 << 20) - 7), (77, 0x7FFFFFFF - n)):
-        lanes, single = zeros(n + 2 * at, wp.vec2), zeros(n + 2 * at, wp.vec2)
-        launch(compare, 1, wp.uint32(key), first, lanes, single)
-        np.testing.assert_array_equal(lanes.numpy().view(np.int32), single.numpy().view(np.int32))
-        drawn = lanes.numpy().any(axis=1)
-        assert drawn[at : at + n].sum() >= n - 1 and not drawn[:at].any() and not drawn[at + n :].any()
+    for key, first in ((0, 0), (0xFFFFFFFF, 5), (0x12345678, (1 << 20) - 7), (77, 0x7FFFFFFF - 37)):
+        for n in (1, 7, 8, 9, 12, 16, 37):
+            lanes, single = zeros(n + 2 * at, wp.vec2), zeros(n + 2 * at, wp.vec2)
+            launch(compare, 1, wp.uint32(key), first, n, lanes, single)
+            np.testing.assert_array_equal(lanes.numpy().view(np.int32), single.numpy().view(np.int32))
+            drawn = lanes.numpy().any(axis=1)
+            assert drawn[at : at + n].sum() >= n - 1 and not drawn[:at].any() and not drawn[at + n :].any()

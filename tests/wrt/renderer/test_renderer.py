@@ -231,8 +231,8 @@ def passes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[list[int], Fi
 
 
 @pytest.mark.parametrize(("spp", "pass_size", "expected"), [
-    (1, None, [1]), (8, None, [1, 7]), (16, None, [1, 15]), (20, None, [1, 15, 4]), (7, 3, [3, 3, 1]), (3, 100, [3]),
-    (300, None, [1, 15, 64, 64, 64, 64, 28]),
+    (1, None, [1]), (8, None, [1, 3, 4]), (16, None, [1, 3, 12]), (20, None, [1, 3, 12, 4]), (7, 3, [3, 3, 1]), (3, 100, [3]),
+    (300, None, [1, 3, 12, 48, 64, 64, 64, 44]),
 ])
 def test_passes_take_each_sample_once(passes: Any, spp: int, pass_size: int | None, expected: list[int]) -> None:
     sizes, film = passes(spp, pass_size=pass_size)
@@ -240,11 +240,11 @@ def test_passes_take_each_sample_once(passes: Any, spp: int, pass_size: int | No
 
 
 @pytest.mark.parametrize(("limit", "seconds", "expected"), [
-    (10.0, 1.0, [1, 9]),  # the last pass is no longer than the time that is left
+    (10.0, 1.0, [1, 3, 6]),  # the last pass is no longer than the time that is left
     (10.0, 3.0, [1, 2, 1]),  # what is left is not enough, but one sample is the least there is
     (0.5, 1.0, [1]),  # the first sample is always taken
-    (1e9, 1.0, [1, 15, 4]),
-    (np.inf, 1.0, [1, 15, 4]),
+    (1e9, 1.0, [1, 3, 12, 4]),
+    (np.inf, 1.0, [1, 3, 12, 4]),
 ])
 def test_a_time_limit_shortens_the_passes(passes: Any, limit: float, seconds: float, expected: list[int]) -> None:
     sizes, film = passes(20, seconds, time_limit=limit)
@@ -295,6 +295,16 @@ def test_ctrl_c_keeps_what_there_is(progress: Callable[[Progress], None], pass_s
     there = film.samples == fewest
     assert np.array_equal(film.pixels[there], whole.pixels[there])
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_picture_that_ends_early_is_even_up_to_what_a_pass_adds() -> None:
+    def stop_within(progress: Progress) -> None:
+        if progress.stage == "trace" and progress.done > 0.01 * progress.total:
+            raise KeyboardInterrupt
+
+    film = render(SCENE, spp=1000, size=(200, 150), tile_size=8, progress=stop_within)
+    assert film.stats["interrupted"] and 4 <= film.samples.max() < 1000
+    assert film.samples.max() <= min(schedule.GROWTH * film.samples.min(), film.samples.min() + MAX_PASS)
 
 
 def test_ctrl_c_does_not_wait_for_the_end_of_a_pass() -> None:
