@@ -58,6 +58,16 @@ def test_panes_of_alpha_0_shade_nothing_up_to_a_number_that_is_counted(count):
     assert stats["lost_throughput_per_sample"] == pytest.approx(float(not there))  # a white floor reflects all of it
 
 
+@pytest.mark.parametrize("count", [0, 3, 255, 256])
+def test_an_opaque_pane_behind_clear_ones_is_counted_as_one_more(count):
+    """It ends the shadow, and is a ray; behind MAX_TRANSPARENT panes nobody looks what it is."""
+    clear = Material(alpha=0.0, alpha_mode="blend")
+    lamp = PointLight((0.0, 3.0, 0.0), ONE)
+    value, stats = lit(*(pane(clear, y) for y in np.linspace(1.0, 2.0, count)), pane(WHITE, 2.5), light=lamp)
+    assert not value.any() and stats["rays"] == stats["samples"] * (1 + count + 1)
+    assert stats["cut_by_depth"] == (stats["samples"] if count == MAX_TRANSPARENT else 0)
+
+
 @pytest.mark.parametrize("shadows", ["opaque", "tinted"])
 @pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0])
 def test_the_shadow_of_blended_solid_glass_is_that_with_and_without_it(shadows, alpha):
