@@ -26,12 +26,8 @@ def run(launch: Launch) -> None:
     """With the arguments that it had last."""
 
 
-@wp.func_native("""
-    *(int*)launch.tail = last;
-    ((void (*)(void*, void*))launch.entry)((void*)launch.bounds, (void*)launch.args);
-""")
-def run_with(launch: Launch, last: int) -> None:
-    """With that last argument, an int."""
+@wp.func_native("*(int*)launch.tail = last;")
+def set_last(launch: Launch, last: int) -> None: ...
 
 
 @wp.func_native("""
@@ -40,7 +36,19 @@ def run_with(launch: Launch, last: int) -> None:
     range[1] = end;
     auto* const bounds = (wp::launch_bounds_t<1>*)launch.bounds;
     bounds->size = bounds->shape[0] = (end - first + launch.block - 1) / launch.block;
-    ((void (*)(void*, void*))launch.entry)(bounds, (void*)launch.args);
 """)
-def run_range(launch: Launch, first: int, end: int) -> None:
+def set_range(launch: Launch, first: int, end: int) -> None: ...
+
+
+@wp.func
+def run_with(launch: Launch, last: int):
+    """With that last argument, an int."""
+    set_last(launch, last)
+    run(launch)
+
+
+@wp.func
+def run_range(launch: Launch, first: int, end: int):
     """Of rays first .. end - 1; these are its last two arguments."""
+    set_range(launch, first, end)
+    run(launch)

@@ -27,7 +27,7 @@ def gradient(b: Background, direction: wp.vec3) -> wp.vec3:
 @wp.func
 def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
     """Turned about +y, counter-clockwise seen from above."""
-    sin = angle
+    sin = angle  # most pictures are not turned: sin_cos gives the same bits for 0 and -0, at each look-up
     cos = float(1.0)
     if angle != 0.0:
         sin, cos = sin_cos(angle)
