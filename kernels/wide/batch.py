@@ -49,7 +49,7 @@ from wrt.kernels.wide.packets import (
     write_hits,
     write_occluded,
 )
-from wrt.kernels.wide.references import leaf_count, leaf_first
+from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.kernels.wide.traverse import (
     STACK_SIZE,
     WideTraversal,
@@ -65,7 +65,7 @@ PRIM_ID = WIDTH * (size_of(Primitive) // 4 - 1)  # where a row has its primitive
 PACKETS = 4  # set up at a time
 SLOTS = 16  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
-LINES = 4  # cache lines that are called in of what is next
+LINES = 5  # cache lines that are called in of what is next: a row of triangles, or a node and one more; to ask which costs more
 # Where packets fall apart, one after another, none is tried for a while: so many in a row, for so many that follow.
 IN_A_ROW, PAUSE = 4, 32
 FAILED = SLOT_SIZE * SLOTS  # where Scratch.slots counts the packets in a row that fell apart
@@ -154,6 +154,7 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -
     """A packet with a beam, from the root. test_row: make_leaf_test."""
     struct = make_struct(units.triangle_test.record)
     size_of_row = row_size(units.triangle_test.record, WIDTH)
+    call_in = make_call_in(units.triangle_test.record, WIDTH, False, LINES)
 
     @wp.func
     def test_leaf(accel: struct, surfaces: Surfaces, reference: int, mask: int, packet: wp.array(dtype=wp.float32), base: int):
@@ -202,7 +203,9 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -
                 while met != 0:
                     lane = lowest(met)
                     met = met & (met - 1)
-                    key = key_of(number(packet, base + CHILD_ENTRY + lane), bits(accel.nodes, first + REFERENCES + lane))
+                    child = bits(accel.nodes, first + REFERENCES + lane)
+                    call_in(accel.nodes, accel.primitives, child)
+                    key = key_of(number(packet, base + CHILD_ENTRY + lane), child)
                     at = size
                     if wp.static(not any_hit):  # sorted, the farthest deepest
                         while at > under and stack[at - 1] < key:
@@ -261,15 +264,20 @@ def make_interleaved(units: Units, any_hit: bool, test_row: Any) -> Any:
                 cull_row(accel, scratch, words, ray, row + wp.static(size_of_row), left)
                 return True
             t = number(scratch.packets, ray + wp.static(ROW["t"]))
-            if not pop(accel.nodes, t, scratch.stacks, slot * STACK_WORDS, scratch.slots, words):
+            put_slot(scratch.slots, words + wp.static(SLOT["pending"]), 0)
+            next = pop(accel.nodes, t, scratch.stacks, slot * STACK_WORDS, scratch.slots, words)
+            if next == EMPTY:
                 return False
-            call_in(accel.nodes, accel.primitives, slot_at(scratch.slots, words + wp.static(SLOT["next"])))
+            call_in(accel.nodes, accel.primitives, next)
             return True
         reference = slot_at(scratch.slots, words + wp.static(SLOT["next"]))
         if reference < 0:
             cull_row(accel, scratch, words, ray, leaf_first(reference) * wp.static(size_of_row), leaf_count(reference))
             return True
-        call_in(accel.nodes, accel.primitives, step(accel.nodes, scratch.packets, scratch.stacks, scratch.slots, words))
+        next = step(accel.nodes, scratch.packets, scratch.stacks, slot * STACK_WORDS, scratch.slots, words)
+        if next == EMPTY:
+            return False
+        call_in(accel.nodes, accel.primitives, next)
         return True
 
     @wp.func

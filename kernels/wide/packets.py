@@ -45,18 +45,19 @@ ROOT_ENTRIES = LANES * (CHILD_RAYS // LANES + 1)
 PACKET_SIZE = ROOT_ENTRIES + WIDTH * LANES  # a multiple of 16: where the first row begins at a cache line, all rows do
 
 # The stack of one ray is made of levels, one for each node on the way to where the ray is that has children still to come. A level
-# holds eight keys, and where the node's references begin (LEVEL_REFERENCES). A key is the distance, whose last four bits are
-# replaced by the child's number + 8: four bits less do not matter for an order. A child that is not met, or was taken, has all
-# bits, which is a NaN. For any hit, which needs no order, one mask of children is in place of the keys. The first level is empty.
+# holds eight keys, where the node's references begin (LEVEL_REFERENCES), and the mask of the children to come (LEVEL_LEFT). A key is
+# the distance, whose last four bits are replaced by the child's number + 8: four bits less do not matter for an order. A child that
+# is not met, or was taken, has all bits, which is a NaN. Any hit needs no order, and has no keys. The first level is empty.
 LEVEL = 16
 LEVEL_REFERENCES = WIDTH
+LEVEL_LEFT = WIDTH + 1
 KEY_MASK = 2 * WIDTH - 1
 # A level is added for a node with two or more children that are met, for which a single ray's walk has an entry on its stack.
 STACK_WORDS = LEVEL * (STACK_SIZE + 2)
 
-# A slot is where one ray is under way. ray: its column in `packets`; next: the reference to go to; place: where its stack goes on;
-# pending: what comes before that, a mask of triangles to test (whose row begins at `row`), and TO_POP; left: triangles of its leaf
-# in the rows after that one.
+# A slot is where one ray is under way. ray: its column in `packets`; next: the reference to go to; place: its last level; pending:
+# what comes before that, a mask of triangles to test (whose row begins at `row`), and TO_POP; left: triangles of its leaf in the
+# rows after that one.
 SLOT_WORDS = ("ray", "next", "place", "pending", "row", "left")
 SLOT = {name: i for i, name in enumerate(SLOT_WORDS)}
 SLOT_SIZE = 8
@@ -65,7 +66,7 @@ TO_POP = 1 << WIDTH
 LAYOUT = {
     "WIDTH": WIDTH, "LANES": LANES, "COHERENT": COHERENT, "AXIS_BITS": AXIS_BITS, "AXIS_MASK": (1 << AXIS_BITS) - 1,
     "REFUSED": REFUSED, "CHILD_ENTRY": CHILD_ENTRY, "CHILD_RAYS": CHILD_RAYS, "ROOT_ENTRIES": ROOT_ENTRIES, "LEVEL": LEVEL,
-    "LEVEL_REFERENCES": LEVEL_REFERENCES, "KEY_MASK": KEY_MASK, "TO_POP": TO_POP,
+    "LEVEL_REFERENCES": LEVEL_REFERENCES, "LEVEL_LEFT": LEVEL_LEFT, "KEY_MASK": KEY_MASK, "TO_POP": TO_POP,
     "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
     "PRIM_ID_ROW": size_of(Primitive) // 4 - 1, "NO_HIT": NO_HIT,
     "LARGEST": LARGEST, "FARTHEST": FARTHEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
@@ -136,9 +137,9 @@ def write_occluded(occluded: wp.array(dtype=wp.bool), first: int, count: int, pa
 
 
 class Steps(NamedTuple):
-    """begin: put a ray into a slot, at the root's children; its stack begins at `bottom`. step: from a node to its next child; the
-    others become a level of the stack. Both give the reference that is next. pop: go to the next child on the stack, of those that
-    begin at or before t; whether there is one."""
+    """begin: put a ray into a slot, at the root's children; its stack begins at `bottom`. step: from a node to the next child, its
+    own or one on the stack; pop: to one on the stack; of those that begin at or before `reach`, the ray's t. All give the reference
+    that is next, or EMPTY where the ray is done."""
 
     begin: Any
     step: Any
@@ -154,12 +155,12 @@ def make_steps(any_hit: bool) -> Steps:
               bottom: int, slots: wp.array(dtype=wp.int32), slot: int) -> int: ...
 
     @wp.func_native(source("wide/ray_step.h", ANY_HIT=int(any_hit), **LAYOUT))
-    def step(nodes: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint32),
+    def step(nodes: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint32), bottom: int,
              slots: wp.array(dtype=wp.int32), slot: int) -> int: ...
 
     @wp.func_native(source("wide/ray_pop.h", ANY_HIT=int(any_hit), **LAYOUT))
-    def pop(nodes: wp.array(dtype=wp.float32), t: float, stacks: wp.array(dtype=wp.uint32), bottom: int,
-            slots: wp.array(dtype=wp.int32), slot: int) -> bool: ...
+    def pop(nodes: wp.array(dtype=wp.float32), reach: float, stacks: wp.array(dtype=wp.uint32), bottom: int,
+            slots: wp.array(dtype=wp.int32), slot: int) -> int: ...
 
     return Steps(begin, step, pop)
 

@@ -4,7 +4,9 @@
     const float* q = packet.data + (long long)ray + ROOT_ENTRIES;
     Row enter;
     for (int child = 0; child < WIDTH; ++child) enter[child] = q[LANES * child];
-    const auto met = enter < (Row)(__builtin_inff());
+    const float reach = __builtin_inff();
+    const auto met = enter < (Row)(reach);
     words[SLOT_RAY] = ray;
     words[SLOT_PLACE] = bottom;
+    words[SLOT_PENDING] = 0;
     #include "ray_push.h"

@@ -24,12 +24,13 @@ from wrt.kernels.wide.packets import (
     ROWS,
     SLOT_SIZE,
     STACK_WORDS,
-    TO_POP,
     WIDTH,
 )
+from wrt.kernels.wide.references import EMPTY
 from wrt.kernels.wide.traverse import lane_ray
 
 NOTHING = wp.constant(99)
+CHILDREN = np.array([-3, -2, -1, 1, 2, 3, 4, 5], np.int32)  # references of a node: leaves and nodes, none EMPTY
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, -1e-40, 3e38, -3e38, np.inf, -np.inf, np.nan], np.float32)
 
 
@@ -61,16 +62,16 @@ def make_walk(any_hit):
         """What is next at the root, and then in `node` after a step, and after one pop after another, or NOTHING."""
         slot = ray * SLOT_SIZE
         bottom = ray * STACK_WORDS
-        begin(nodes, packet, column, stacks, bottom, slots, slot)
-        begun[ray] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
+        next = begin(nodes, packet, column, stacks, bottom, slots, slot)
+        begun[ray] = wp.where(next == EMPTY, NOTHING, next)
         slots[slot + 1] = node
         slots[slot + 2] = bottom
-        step(nodes, packet, stacks, slots, slot)
-        out[ray, 0] = wp.where(slots[slot + 3] == TO_POP, NOTHING, slots[slot + 1])
-        goes_on = bool(True)
+        next = step(nodes, packet, stacks, bottom, slots, slot)
+        out[ray, 0] = wp.where(next == EMPTY, NOTHING, next)
         for k in range(WIDTH):
-            goes_on = goes_on and pop(nodes, reach, stacks, bottom, slots, slot)
-            out[ray, k + 1] = wp.where(goes_on, slots[slot + 1], NOTHING)
+            if next != EMPTY:
+                next = pop(nodes, reach, stacks, bottom, slots, slot)
+            out[ray, k + 1] = wp.where(next == EMPTY, NOTHING, next)
 
     return walk
 
@@ -226,7 +227,7 @@ def plain_nodes(lo, hi):
     n = len(lo)
     nodes = np.zeros((n, 8, WIDTH), np.float32)
     nodes[:, 0:6:2], nodes[:, 1:6:2] = lo.transpose(0, 2, 1), hi.transpose(0, 2, 1)
-    nodes[:, 6] = (np.arange(1, 9) - 4).astype(np.int32).view(np.float32)
+    nodes[:, 6] = CHILDREN.view(np.float32)
     return nodes
 
 
@@ -328,7 +329,7 @@ def walked(both, reach=np.inf):
     order = np.argsort(keys, axis=1)
     begins = (np.take_along_axis(keys, order, axis=1).clip(0, 2**31 - 1) & ~15).astype(np.int32).view(np.float32)
     within = np.take_along_axis(entered, order, axis=1) & ((begins <= reach) | (np.arange(WIDTH) == 0))  # the first is not popped
-    return np.concatenate([np.where(within, order - 3, NOTHING), np.full((len(order), 1), NOTHING)], axis=1), entered
+    return np.concatenate([np.where(within, CHILDREN[order], NOTHING), np.full((len(order), 1), NOTHING)], axis=1), entered
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -348,7 +349,7 @@ def test_any_hit_takes_all_children_from_the_last_to_the_first(name):
     both = case(name)
     entered = (both.scalar.entered.numpy()[:, None] >> np.arange(WIDTH) & 1).astype(bool)
     order = np.argsort(np.where(entered, WIDTH - 1 - np.arange(WIDTH), WIDTH), axis=1)
-    expected = np.where(np.take_along_axis(entered, order, axis=1), order - 3, NOTHING)
+    expected = np.where(np.take_along_axis(entered, order, axis=1), CHILDREN[order], NOTHING)
     some = entered.any(axis=1)
     np.testing.assert_array_equal(both.begun_any, expected[:, 0])
     np.testing.assert_array_equal(both.walk_any[some, :WIDTH], expected[some])
