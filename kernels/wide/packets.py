@@ -45,9 +45,9 @@ ROOT_ENTRIES = LANES * (CHILD_RAYS // LANES + 1)
 PACKET_SIZE = ROOT_ENTRIES + WIDTH * LANES  # a multiple of 16: where the first row begins at a cache line, all rows do
 
 # The stack of one ray is made of levels, one for each node on the way to where the ray is that has children still to come. A level
-# holds eight keys, where the node's references begin (LEVEL_REFERENCES), and the mask of the children to come (LEVEL_LEFT). A key is
-# the distance, whose last four bits are replaced by the child's number + 8: four bits less do not matter for an order. A child that
-# is not met, or was taken, has all bits, which is a NaN. Any hit needs no order, and has no keys. The first level is empty.
+# holds eight keys, where the node's references begin (LEVEL_REFERENCES), and the mask of the children to come (LEVEL_LEFT). A key
+# is the distance, whose last four bits are replaced by the child's number + 8: four bits less do not matter for an order. A child
+# that is not met, or was taken, has all bits, which is a NaN. Any hit needs no order, and has no keys. The first level is empty.
 LEVEL = 16
 LEVEL_REFERENCES = WIDTH
 LEVEL_LEFT = WIDTH + 1
