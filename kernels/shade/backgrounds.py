@@ -25,12 +25,19 @@ def gradient(b: Background, direction: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
-    """Turned about +y, counter-clockwise seen from above."""
+def turn_of(angle: float) -> tuple[float, float]:
+    """Its sine and cosine."""
     sin = angle  # most pictures are not turned: sin_cos gives the same bits for 0 and -0, at each look-up
     cos = float(1.0)
     if angle != 0.0:
         sin, cos = sin_cos(angle)
+    return sin, cos
+
+
+@wp.func
+def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
+    """Turned about +y, counter-clockwise seen from above."""
+    sin, cos = turn_of(angle)
     return wp.vec3(cos * d[0] + sin * d[2], d[1], cos * d[2] - sin * d[0])
 
 
@@ -42,11 +49,19 @@ def environment_pixel(b: Background, column: int, row: int) -> wp.vec3:
 
 
 @wp.func
-def environment(b: Background, direction: wp.vec3) -> wp.vec3:
-    """Bilinear look-up in the equirectangular picture; the unit direction is in world space."""
-    d = rotate_y(direction, -b.rotation)
-    x = (0.5 + atan2(d[0], -d[2]) / TWO_PI) * float(b.width) - 0.5
-    y = acos(wp.clamp(d[1], -1.0, 1.0)) / PI * float(b.height) - 0.5
+def environment_column(b: Background, x: float, z: float) -> float:
+    """Where a direction is in the equirectangular picture, with a fraction."""
+    return (0.5 + atan2(x, -z) / TWO_PI) * float(b.width) - 0.5
+
+
+@wp.func
+def environment_row(b: Background, y: float) -> float:
+    return acos(wp.clamp(y, -1.0, 1.0)) / PI * float(b.height) - 0.5
+
+
+@wp.func
+def environment_at(b: Background, x: float, y: float) -> wp.vec3:
+    """Bilinear look-up in column x and row y."""
     column = int(wp.floor(x))
     row = int(wp.floor(y))
     fx = x - wp.floor(x)
@@ -54,6 +69,36 @@ def environment(b: Background, direction: wp.vec3) -> wp.vec3:
     top = (1.0 - fx) * environment_pixel(b, column, row) + fx * environment_pixel(b, column + 1, row)
     low = (1.0 - fx) * environment_pixel(b, column, row + 1) + fx * environment_pixel(b, column + 1, row + 1)
     return b.scale * ((1.0 - fy) * top + fy * low)
+
+
+@wp.func
+def environment(b: Background, direction: wp.vec3) -> wp.vec3:
+    """The picture's colour in a unit direction in world space."""
+    d = rotate_y(direction, -b.rotation)
+    return environment_at(b, environment_column(b, d[0], d[2]), environment_row(b, d[1]))
+
+
+@wp.func_native("return array.data[(long long)i][k];")
+def number_of(array: wp.array(dtype=wp.vec3), i: int, k: int) -> float: ...
+
+
+@wp.func_native("array.data[(long long)i] = value;")
+def put_number(array: wp.array(dtype=wp.float32), i: int, value: float) -> None: ...
+
+
+@wp.func
+def environment_places(b: Background, directions: wp.array(dtype=wp.vec3), first: int, end: int, x: wp.array(dtype=wp.float32),
+                       y: wp.array(dtype=wp.float32)):
+    """Columns and rows of the directions first .. end - 1, to x and y from 0 on. On the CPU the compiler makes lanes of the loop: it
+    is no `for`, has no branches, no calls that return vectors, and arrays without gaps; ten times as fast as one by one."""
+    sin, cos = turn_of(-b.rotation)
+    i = int(first)
+    while i < end:
+        d_x = number_of(directions, i, 0)
+        d_z = number_of(directions, i, 2)
+        put_number(x, i - first, environment_column(b, cos * d_x + sin * d_z, cos * d_z - sin * d_x))
+        put_number(y, i - first, environment_row(b, number_of(directions, i, 1)))
+        i = i + 1
 
 
 @wp.func
@@ -80,17 +125,20 @@ def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
 
 
 class BackgroundKind(NamedTuple):
-    """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine."""
+    """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine. at, places: as
+    environment_at and environment_places, for many directions at a time; None: as well one by one."""
 
     radiance: Any
     sample: Any = None
+    at: Any = None
+    places: Any = None
 
 
 # By the name in wrt.scene.backgrounds.BACKGROUNDS.
 BACKGROUNDS = {
     "constant": BackgroundKind(constant),
     "gradient": BackgroundKind(gradient),
-    "environment": BackgroundKind(environment, environment_sample),
+    "environment": BackgroundKind(environment, environment_sample, environment_at, environment_places),
 }
 
 
@@ -104,7 +152,8 @@ def make_background(features: Any) -> Any:
 
 def make_sky_sample(features: Any) -> Any:
     """One direction to the background."""
-    radiance, by_kind = BACKGROUNDS[features.background]
+    kind = BACKGROUNDS[features.background]
+    radiance, by_kind = kind.radiance, kind.sample
     of_cosine = by_kind is None
     sample_of_kind = no_sample if of_cosine else by_kind
 

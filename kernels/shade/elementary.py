@@ -133,11 +133,8 @@ def acos(x: float) -> float:
     z = wp.where(inner, x * x, 0.5 - 0.5 * a)
     s = wp.where(inner, x, wp.sqrt(z))
     beyond = s * z * (ASIN_1 + z * (ASIN_2 + z * (ASIN_3 + z * (ASIN_4 + z * ASIN_5))))  # asin s = s + beyond
-    if inner:
-        return HALF_PI - (s - (HALF_PI_REST - beyond))
-    if x > 0.0:
-        return 2.0 * (s + beyond)
-    return 2.0 * (HALF_PI - (s - (HALF_PI_REST - beyond)))
+    lower = HALF_PI - (s - (HALF_PI_REST - beyond))
+    return wp.where(inner, lower, wp.where(x > 0.0, 2.0 * (s + beyond), 2.0 * lower))
 
 
 @wp.func
@@ -147,16 +144,14 @@ def atan2(y: float, x: float) -> float:
     high = wp.max(wp.abs(x), wp.abs(y))
     if not wp.abs(x) + wp.abs(y) >= 0.0:
         return nan()
-    base = float(0.0)  # in units of pi / 2
-    t = float(0.0)
-    if low == high:  # of zeros and infinities too
-        base = wp.where(high > 0.0, 0.5, 0.0)
-    elif 2.0 * low > high:  # atan(low / high) = pi / 4 + atan((low - high) / (low + high))
-        half = wp.where(high > 1.0, 0.5, 1.0)  # against overflow
-        base = 0.5
-        t = (half * low - half * high) / (half * low + half * high)
-    else:
-        t = low / high
+    # atan(low / high), or where 2 low > high pi / 4 + atan((low - high) / (low + high)). Without branches, for loops in lanes.
+    equal = low == high  # of zeros and infinities too
+    middle = 2.0 * low > high
+    half = wp.where(high > 1.0, 0.5, 1.0)  # against overflow
+    over = wp.where(middle, half * low - half * high, low)
+    under = wp.where(middle, half * low + half * high, high)
+    t = wp.where(equal, 0.0, over / under)
+    base = wp.where(wp.where(equal, high > 0.0, middle), 0.5, 0.0)  # in units of pi / 2
     z = t * t
     beyond = t * z * (ATAN_1 + z * (ATAN_2 + z * (ATAN_3 + z * (ATAN_4 + z * ATAN_5))))  # atan t = t + beyond
     angle = base * HALF_PI + (t + (beyond + base * HALF_PI_REST))

@@ -16,7 +16,7 @@ import warp as wp
 
 from wrt.kernels.launches import Launch, run, run_range, run_with
 from wrt.kernels.query import HitArrays, Queue, hit_at, put_ray, queued_ray
-from wrt.kernels.shade.backgrounds import make_background
+from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.render import center_of, load_pixel, make_camera_sample, make_see, store_pixel, with_sample
 from wrt.kernels.shade.sampling import hash_pair, make_draw
@@ -28,6 +28,7 @@ from wrt.kernels.structs import AovFilm, Film, Lighting, Limits, Surfaces, kerne
 Path = make_path(False)
 first_path, ray_of, _ = make_paths()
 AHEAD = 4  # hits, of what memory is asked for before it is read
+BLOCK = 64  # rays whose directions are looked for in the sky at a time
 
 
 @wp.struct
@@ -78,6 +79,8 @@ class Wave:
     walks: wp.array(dtype=ShadowWalk)
     shadow_hits: HitArrays
     waiting: wp.array(dtype=wp.int32)
+    sky_x: wp.array(dtype=wp.float32)
+    sky_y: wp.array(dtype=wp.float32)
 
 
 @wp.func
@@ -164,7 +167,7 @@ def make_shade_kernel(features: Any) -> Any:
     shading = make_shading(features)
     step = make_step(features, shading)
     _, _, _, shade, extra_lights, shadow_request, keep, worth = step
-    background_radiance = make_background(features)
+    radiance, _, radiance_at, places = BACKGROUNDS[features.background]
 
     @wp.func
     def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
@@ -192,6 +195,9 @@ def make_shade_kernel(features: Any) -> Any:
         for k in range(job.queued):
             if wp.static(not features.instances):
                 call_in_surface(wave, surfaces, k, job.queued)
+            if wp.static(places is not None):
+                if k % BLOCK == 0:
+                    places(lighting.background, wave.rays.direction, k, wp.min(k + BLOCK, job.queued), wave.sky_x, wave.sky_y)
             number = wave.number[k]
             size = wave.size[number]
             traced = wave.traced[number] + 1
@@ -202,7 +208,11 @@ def make_shade_kernel(features: Any) -> Any:
             asked = int(0)
             hit = hit_at(wave.hits, k)
             if hit.prim_id < 0:
-                out.radiance += wp.cw_mul(path.throughput, background_radiance(lighting.background, path.direction))
+                if wp.static(places is not None):
+                    seen = radiance_at(lighting.background, wave.sky_x[k % BLOCK], wave.sky_y[k % BLOCK])
+                    out.radiance += wp.cw_mul(path.throughput, seen)
+                else:
+                    out.radiance += wp.cw_mul(path.throughput, radiance(lighting.background, path.direction))
             else:
                 index = wp.uint32(job.first_sample + number % job.samples)
                 shaded = shade(surfaces, lighting, path, ray_of(path), hit, index)
