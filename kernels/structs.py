@@ -90,6 +90,14 @@ class Ray:
 
 
 @wp.func
+def unit(v: wp.vec3) -> wp.vec3:
+    """wp.normalize without a branch, for loops in lanes."""
+    length = wp.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    return wp.vec3(wp.where(length > 0.0, v[0] / length, 0.0), wp.where(length > 0.0, v[1] / length, 0.0),
+                   wp.where(length > 0.0, v[2] / length, 0.0))
+
+
+@wp.func
 def make_ray(origin: wp.vec3, direction: wp.vec3) -> Ray:
     """The ray from origin to infinity (t_min = 0, t_max = inf), which leaves nothing out. World space; direction of any length
     between 2^-64 and 2^64 (kernels.query.direction_scale brings others there)."""

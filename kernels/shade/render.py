@@ -5,18 +5,10 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.loop import make_radiance
-from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
+from wrt.kernels.shade.sampling import hash_pair, make_sample_2d, quantile
 from wrt.kernels.shade.shading import make_cutout, make_shading
 from wrt.kernels.shade.step import Sample
 from wrt.kernels.structs import AovFilm, Film, Hit, Lighting, Limits, Ray, Surfaces, Tile, kernel
-
-
-@wp.func
-def filter_offset(icdf: wp.array(dtype=wp.float32), x: float) -> float:
-    """Where a filter puts the sample x in [0, 1): its inverse distribution, in pixels from the pixel's centre."""
-    position = x * float(icdf.shape[0] - 1)
-    i = wp.min(int(position), icdf.shape[0] - 2)
-    return wp.lerp(icdf[i], icdf[i + 1], position - float(i))
 
 
 def make_traversals(features: Any, structure: Any) -> Any:
@@ -35,7 +27,7 @@ def make_camera_sample(features: Any, camera_kind: Any) -> Any:
         # The filter is sampled by importance, so that each sample has weight 1 and belongs to this pixel alone.
         offset = wp.vec2(xi[0] - 0.5, xi[1] - 0.5)
         if wp.static(features.filter):
-            offset = wp.vec2(filter_offset(film.filter_icdf, xi[0]), filter_offset(film.filter_icdf, xi[1]))
+            offset = wp.vec2(quantile(film.filter_icdf, xi[0]), quantile(film.filter_icdf, xi[1]))
         position = wp.vec2((float(x) + 0.5 + offset[0]) / float(film.width), (float(y) + 0.5 + offset[1]) / float(film.height))
         return camera_ray(camera, position, lens_xi)
 

@@ -15,19 +15,15 @@
     };
     const unsigned seed_x = Hashes::hash(seed ^ SEED_X), seed_y = Hashes::hash(seed ^ SEED_Y);
     float* to = (float*)(out.data + (long long)at);
-    // Eight at a time, also where fewer are left: those are computed in vain.
-    for (int j = 0; j < count; j += 8) {
-        float points[16];
-        for (int lane = 0; lane < 8; ++lane) {
+    // Sixteen at a time, also where fewer are left: the others are computed and written in vain.
+    for (int j = 0; j < count; j += LANES) {
+        float points[2 * LANES];
+        for (int lane = 0; lane < LANES; ++lane) {
             const unsigned i = __builtin_bitreverse32(Hashes::scramble(__builtin_bitreverse32((unsigned)first + j + lane), seed));
             const unsigned x = __builtin_bitreverse32(Hashes::scramble(i, seed_x));
             const unsigned y = __builtin_bitreverse32(Hashes::scramble(Hashes::second(i), seed_y));
             points[2 * lane] = (float)(x >> 8) * UNIT;
             points[2 * lane + 1] = (float)(y >> 8) * UNIT;
         }
-        if (count - j >= 8) {
-            memcpy(to + 2 * j, points, sizeof(points));
-        } else {
-            for (int k = 0; k < 2 * (count - j); ++k) to[2 * j + k] = points[k];
-        }
+        memcpy(to + 2 * j, points, sizeof(points));
     }

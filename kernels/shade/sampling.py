@@ -20,6 +20,7 @@ SEED_X, SEED_Y = 0xA511E9B3, 0x63D83595
 # Every second bit, pair, four and eight bits; and what a number of 24 bits is multiplied by.
 BITS_1, BITS_2, BITS_4, BITS_8 = 0x55555555, 0x33333333, 0x0F0F0F0F, 0x00FF00FF
 UNIT = wp.constant(2.0**-24)
+LANES = 16  # numbers that are computed at a time on the CPU
 TWO_PI = wp.constant(6.283185307179586)
 PI = wp.constant(3.141592653589793)
 
@@ -100,9 +101,23 @@ def independent_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
 
 
 @wp.func_native(source("shade/sample_points.h", HASH_1=HASH_1, HASH_2=HASH_2, LK_1=LK_1, LK_2=LK_2, LK_3=LK_3, SEED_X=SEED_X,
-                       SEED_Y=SEED_Y, BITS_1=BITS_1, BITS_2=BITS_2, BITS_4=BITS_4, BITS_8=BITS_8, UNIT=UNIT))
+                       SEED_Y=SEED_Y, LANES=LANES, BITS_1=BITS_1, BITS_2=BITS_2, BITS_4=BITS_4, BITS_8=BITS_8, UNIT=UNIT))
 def sample_points(seed: wp.uint32, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int) -> None:
-    """Points first, first + 1 ... of sample_2d's sequence to out[at], out[at + 1] ... (CPU); seed: hash_pair(key, dimension)."""
+    """Points first, first + 1 ... of sample_2d's sequence to out[at], out[at + 1] ... (CPU); seed: hash_pair(key, dimension). There
+    must be room for LANES - 1 more."""
+
+
+@wp.func_native(source("shade/quantiles.h", LANES=LANES))
+def quantiles(icdf: wp.array(dtype=wp.float32), points: wp.array(dtype=wp.vec2), first: int, count: int) -> None:
+    """Both numbers of each point, as `quantile` has them."""
+
+
+@wp.func
+def quantile(icdf: wp.array(dtype=wp.float32), x: float) -> float:
+    """Where a distribution puts the sample x in [0, 1); icdf: its inverse, with straight lines between the entries."""
+    position = x * float(icdf.shape[0] - 1)
+    i = wp.min(int(position), icdf.shape[0] - 2)
+    return wp.lerp(icdf[i], icdf[i + 1], position - float(i))
 
 
 def make_draw(features: Any) -> Any:
@@ -111,7 +126,7 @@ def make_draw(features: Any) -> Any:
 
     @wp.func
     def draw(key: wp.uint32, dimension: int, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int):
-        """sample_2d(key, first + i, dimension) to out[at + i], for each i below `count`."""
+        """sample_2d(key, first + i, dimension) to out[at + i], for each i below `count`; as sample_points."""
         if wp.static(features.independent):
             for i in range(count):
                 out[at + i] = sample(key, wp.uint32(first + i), dimension)

@@ -18,8 +18,8 @@ from wrt.kernels.launches import Launch, run, run_range, run_with
 from wrt.kernels.query import HitArrays, Queue, hit_at, put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.materials import Scatter
-from wrt.kernels.shade.render import center_of, load_pixel, make_camera_sample, make_see, store_pixel, with_sample
-from wrt.kernels.shade.sampling import hash_pair, make_draw
+from wrt.kernels.shade.render import center_of, load_pixel, make_see, store_pixel, with_sample
+from wrt.kernels.shade.sampling import hash_pair, make_draw, quantiles
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, ShadowWalk, begin_shadow, make_go_through
 from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, lit_by, make_path, make_paths, make_step
@@ -28,7 +28,7 @@ from wrt.kernels.structs import AovFilm, Film, Lighting, Limits, Surfaces, kerne
 Path = make_path(False)
 first_path, ray_of, _ = make_paths()
 AHEAD = 4  # hits, of what memory is asked for before it is read
-BLOCK = 64  # rays whose directions are looked for in the sky at a time
+BLOCK = 64  # rays for which something is computed in lanes at a time
 
 
 @wp.struct
@@ -95,6 +95,28 @@ def pixel_of(job: Job, at: int, x: int, y: int, columns: int) -> int:
     return (job.y + at / job.width - y) * columns + job.x + at % job.width - x
 
 
+@wp.func_native("return array.data[(long long)i][k];")
+def number_2(array: wp.array(dtype=wp.vec2), i: int, k: int) -> float: ...
+
+
+@wp.func_native("array.data[(long long)i][k] = value;")
+def put_number_3(array: wp.array(dtype=wp.vec3), i: int, k: int, value: float) -> None: ...
+
+
+@wp.func_native("array.data[(long long)i] = value;")
+def put_number(array: wp.array(dtype=wp.float32), i: int, value: float) -> None: ...
+
+
+@wp.func
+def pixel_key(job: Job, at: int, limits: Limits) -> wp.uint32:
+    """Of the samples of pixel `at` of a tile."""
+    return hash_pair(hash_pair(limits.seed, wp.uint32(job.x + at % job.width)), wp.uint32(job.y + at / job.width))
+
+
+@wp.func_native("array.data[(long long)i][k] = value;")
+def put_number_2(array: wp.array(dtype=wp.vec2), i: int, k: int, value: float) -> None: ...
+
+
 @wp.func_native("__builtin_prefetch(array.data + (long long)i);")
 def call_in_face(array: wp.array(dtype=wp.vec3i), i: int) -> None: ...
 
@@ -128,35 +150,76 @@ def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, queued: int):
 def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
     """Camera rays of a wave. Where there is none, the sample is done."""
     camera_struct = camera_kind.Camera
-    camera_sample = make_camera_sample(features, camera_kind)
+    camera_ray = camera_kind.make_camera_ray(features)
     draw = make_draw(features)
+
+    @wp.func
+    def place(wave: Wave, film: Film, limits: Limits, first: int, end: int):
+        """The samples of the pixels first .. end - 1: where they are on the film, in pixels, and on the lens."""
+        job = wave.job[0]
+        for p in range(first, end):
+            key = pixel_key(job, wave.order[p], limits)
+            draw(key, 0, job.first_sample, job.samples, wave.xi, p * job.samples)
+            if wp.static(features.lens):
+                draw(key, 1, job.first_sample, job.samples, wave.lens_xi, p * job.samples)
+        if wp.static(features.filter):
+            quantiles(film.filter_icdf, wave.xi, first * job.samples, (end - first) * job.samples)
+        for p in range(first, end):
+            x = float(job.x + wave.order[p] % job.width) + 0.5
+            y = float(job.y + wave.order[p] / job.width) + 0.5
+            i = p * job.samples
+            while i < (p + 1) * job.samples:
+                offset_x = number_2(wave.xi, i, 0)
+                offset_y = number_2(wave.xi, i, 1)
+                if wp.static(not features.filter):
+                    offset_x = offset_x - 0.5
+                    offset_y = offset_y - 0.5
+                put_number_2(wave.xi, i, 0, x + offset_x)
+                put_number_2(wave.xi, i, 1, y + offset_y)
+                i = i + 1
+
+    @wp.func
+    def look(wave: Wave, camera: camera_struct, film: Film, first: int, end: int):
+        """The camera rays of the samples first .. end - 1, each to its place in the queue: in lanes (backgrounds.environment_places
+        tells how)."""
+        i = int(first)
+        while i < end:
+            position = wp.vec2(number_2(wave.xi, i, 0) / float(film.width), number_2(wave.xi, i, 1) / float(film.height))
+            lens_xi = wp.vec2(0.0, 0.0)
+            if wp.static(features.lens):
+                lens_xi = wp.vec2(number_2(wave.lens_xi, i, 0), number_2(wave.lens_xi, i, 1))
+            ray = camera_ray(camera, position, lens_xi)
+            put_number_3(wave.rays.origin, i, 0, ray.origin[0])
+            put_number_3(wave.rays.origin, i, 1, ray.origin[1])
+            put_number_3(wave.rays.origin, i, 2, ray.origin[2])
+            put_number_3(wave.rays.direction, i, 0, ray.direction[0])
+            put_number_3(wave.rays.direction, i, 1, ray.direction[1])
+            put_number_3(wave.rays.direction, i, 2, ray.direction[2])
+            put_number(wave.rays.t_max, i, ray.t_max)
+            i = i + 1
 
     @kernel
     def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film):
         job = wave.job[0]
         queued = int(0)
-        for p in range(job.pixels):
-            at = wave.order[p]
-            x = job.x + at % job.width
-            y = job.y + at / job.width
-            key = hash_pair(hash_pair(limits.seed, wp.uint32(x)), wp.uint32(y))
-            draw(key, 0, job.first_sample, job.samples, wave.xi, p * job.samples)
-            if wp.static(features.lens):
-                draw(key, 1, job.first_sample, job.samples, wave.lens_xi, p * job.samples)
-            for i in range(job.samples):
-                number = p * job.samples + i
-                lens_xi = wp.vec2(0.0, 0.0)
-                if wp.static(features.lens):
-                    lens_xi = wave.lens_xi[number]
-                ray = camera_sample(camera, film, x, y, wave.xi[number], lens_xi)
-                wave.done[number] = Sample()
-                wave.size[number] = 0
-                wave.traced[number] = 0
-                if ray.t_max > 0.0:
-                    path = first_path(ray, key)
-                    wave.paths[number] = path
-                    enqueue(wave, queued, number, path)
-                    queued += 1
+        first = int(0)
+        while first < job.pixels:
+            end = wp.min(first + wp.max(BLOCK / job.samples, 1), job.pixels)
+            place(wave, film, limits, first, end)
+            look(wave, camera, film, first * job.samples, end * job.samples)
+            for p in range(first, end):
+                key = pixel_key(job, wave.order[p], limits)
+                for number in range(p * job.samples, (p + 1) * job.samples):
+                    wave.done[number] = Sample()
+                    wave.size[number] = 0
+                    wave.traced[number] = 0
+                    ray = queued_ray(wave.rays, number)
+                    if ray.t_max > 0.0:
+                        path = first_path(ray, key)
+                        wave.paths[number] = path
+                        enqueue(wave, queued, number, path)
+                        queued += 1
+            first = end
         wave.job[0].queued = queued
 
     return begin_wave

@@ -15,6 +15,7 @@ from wrt.core.device import made_once, records, upload
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
 from wrt.kernels.shade import wave
 from wrt.kernels.shade.materials import Scatter
+from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_cutout
 from wrt.kernels.shade.shadows import ShadowWalk
 from wrt.kernels.shade.step import Lit, Sample
@@ -161,7 +162,7 @@ class Buffers:
         w.capacity = n
         w.job, w.asking, w.order = (upload(array, dtype, "cpu") for array, dtype in (
             (self.job, wave.Job), (self.asking, wp.int32), (self.order, wp.int32)))
-        w.xi, w.lens_xi = room(n, wp.vec2), room(n, wp.vec2)
+        w.xi, w.lens_xi = room(n + LANES, wp.vec2), room(n + LANES, wp.vec2)
         w.done, w.size, w.traced, w.number = room(n, Sample), room(n, wp.int32), room(n, wp.int32), room(n, wp.int32)
         w.paths = room(n * features.stack_size, wave.Path)
         w.sky_x, w.sky_y = room(wave.BLOCK, wp.float32), room(wave.BLOCK, wp.float32)

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.sampling import disk, polygon
-from wrt.kernels.structs import Ray, lift, make_ray
+from wrt.kernels.structs import Ray, lift, make_ray, unit
 
 
 @wp.struct
@@ -45,7 +45,7 @@ def make_camera_ray(features: Any = None) -> Any:
         the chief ray at distance s = focus_distance along the axis. The ray then goes from the lens sample L to S.
         """
         chief = chief_ray(camera, film)
-        ray = make_ray(camera.origin, wp.normalize(chief))
+        ray = make_ray(camera.origin, unit(chief))
         if wp.static(lens):
             sample = disk(xi)
             if wp.static(blades):
@@ -53,7 +53,7 @@ def make_camera_ray(features: Any = None) -> Any:
             offset = camera.aperture_radius * (sample[0] * camera.right + sample[1] * camera.up)
             ray.origin = camera.origin + offset
             way = camera.focus_distance * chief - offset
-            ray.direction = wp.normalize(lift(way) * way)
+            ray.direction = unit(lift(way) * way)
         return ray
 
     return camera_ray
