@@ -6,7 +6,7 @@ import warp as wp
 
 from wrt.kernels.shade.elementary import acos, atan2, sin_cos
 from wrt.kernels.shade.lights import LightSample
-from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, search_cdf, share_of_row
+from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_point, search_cdf, share_of_row, turned_to
 from wrt.kernels.structs import Background
 
 # --- the kinds --------------------------------------------------------------------------------------------------------
@@ -150,22 +150,35 @@ def make_background(features: Any) -> Any:
     return BACKGROUNDS[features.background].radiance
 
 
+def make_sky_point(features: Any) -> Any:
+    """What sky_sample takes, from two numbers: without branches, for loops in lanes."""
+    of_cosine = BACKGROUNDS[features.background].sample is None
+
+    @wp.func
+    def sky_point(xi: wp.vec2) -> wp.vec3:
+        if wp.static(of_cosine):
+            return cosine_point(xi)
+        return wp.vec3(xi[0], xi[1], 0.0)
+
+    return sky_point
+
+
 def make_sky_sample(features: Any) -> Any:
-    """One direction to the background."""
+    """One direction to the background. point: of sky_point."""
     kind = BACKGROUNDS[features.background]
     radiance, by_kind = kind.radiance, kind.sample
     of_cosine = by_kind is None
     sample_of_kind = no_sample if of_cosine else by_kind
 
     @wp.func
-    def sky_sample(b: Background, n: wp.vec3, xi: wp.vec2) -> LightSample:
+    def sky_sample(b: Background, n: wp.vec3, point: wp.vec3) -> LightSample:
         sample = LightSample()
         if wp.static(of_cosine):
-            sample.wi = cosine_hemisphere(xi, n)
+            sample.wi = turned_to(point, n)
             cosine = wp.max(wp.dot(sample.wi, n), 1.0e-9)
             sample.weight = radiance(b, sample.wi) * (PI / cosine)
         else:
-            sample = sample_of_kind(b, xi)
+            sample = sample_of_kind(b, wp.vec2(point[0], point[1]))
         sample.distant = 1
         sample.area = 1
         return sample

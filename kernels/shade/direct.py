@@ -1,10 +1,10 @@
 """Direct light: one sample of one light, as what it sends to the eye and as the segment to look along."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.shade.backgrounds import make_sky_sample
+from wrt.kernels.shade.backgrounds import make_sky_point, make_sky_sample
 from wrt.kernels.shade.lights import LIGHTS, WITHOUT_AREA, LightSample, make_light_sample
 from wrt.kernels.shade.materials import Scatter, blinn_phong
 from wrt.kernels.shade.sampling import PI, hash_pair, make_sample_2d
@@ -34,15 +34,15 @@ def make_reflected_light(features: Any) -> Any:
     lights = bool(features.lights)
 
     @wp.func
-    def choose(lighting: Lighting, surfaces: Surfaces, i: int, s: Surface, xi: wp.vec2) -> LightSample:
-        """Lights are numbered; the background comes after the last one."""
+    def choose(lighting: Lighting, surfaces: Surfaces, i: int, s: Surface, point: wp.vec3) -> LightSample:
+        """Lights are numbered; the background comes after the last one. point: of light_point."""
         sample = LightSample()
         if wp.static(lights):
             if i < lighting.count:
-                sample = light_sample(lighting, surfaces, lighting.lights[i], s, xi)
+                sample = light_sample(lighting, surfaces, lighting.lights[i], s, wp.vec2(point[0], point[1]))
         if wp.static(features.sky_light):
             if i == lighting.count:
-                sample = sky_sample(lighting.background, s.shading, xi)
+                sample = sky_sample(lighting.background, s.shading, point)
         return sample
 
     @wp.func
@@ -61,19 +61,36 @@ def make_reflected_light(features: Any) -> Any:
     return choose, reflected
 
 
-def make_light_xi(features: Any) -> Any:
-    """The numbers that place a sample on a light."""
+class LightPoints(NamedTuple):
+    """numbers(key, index, i) -> vec2: what places a sample on light i, at the path vertex `key`. of_sky: sky_point of those numbers.
+    point(lighting, key, index, i) -> vec3: the one of the background, and of another light its two numbers."""
+
+    numbers: Any
+    of_sky: Any
+    point: Any
+
+
+def make_light_points(features: Any) -> LightPoints:
+    """What places a sample on a light."""
     sample_2d = make_sample_2d(features)
+    sky_point = make_sky_point(features)
     single = {number for number, name in enumerate(LIGHTS) if name in features.lights and name in WITHOUT_AREA}
     is_single = wp.types.vector(len(LIGHTS), int)(*(int(number in single) for number in range(len(LIGHTS))))
 
     @wp.func
-    def light_xi(lighting: Lighting, key: wp.uint32, index: wp.uint32, i: int) -> wp.vec2:
-        """Two numbers for light i at the path vertex `key`."""
+    def numbers(key: wp.uint32, index: wp.uint32, i: int) -> wp.vec2:
+        return sample_2d(hash_pair(key, wp.static(wp.uint32(0x4C49))), index, i)
+
+    @wp.func
+    def light_point(lighting: Lighting, key: wp.uint32, index: wp.uint32, i: int) -> wp.vec3:
         if wp.static(bool(single)):
             if i < lighting.count:
                 if is_single[lighting.lights[i].kind] != 0:
-                    return wp.vec2(0.0, 0.0)
-        return sample_2d(hash_pair(key, wp.static(wp.uint32(0x4C49))), index, i)
+                    return wp.vec3(0.0, 0.0, 0.0)
+        xi = numbers(key, index, i)
+        if wp.static(features.sky_light):
+            if i == lighting.count:
+                return sky_point(xi)
+        return wp.vec3(xi[0], xi[1], 0.0)
 
-    return light_xi
+    return LightPoints(numbers, sky_point, light_point)

@@ -93,24 +93,8 @@ def reduced(x: float) -> wp.vec3:
 
 
 @wp.func
-def sin_cos(x: float) -> tuple[float, float]:
-    """(sin x, cos x), x in radians; NaN for an infinity."""
-    n = nearest(x * TWO_OVER_PI)
-    r = x
-    less = float(0.0)  # the reduced angle is r - less
-    if wp.abs(x) <= REDUCED_BY_PARTS:
-        rest = (x - n * QUARTER_1) - n * QUARTER_2
-        part = n * QUARTER_3
-        r = rest - part
-        less = (part - (rest - r)) + n * QUARTER_4  # Cody and Waite 1980; what rounding r has lost, and the last part
-    elif wp.abs(x) < wp.inf:
-        sign = wp.sign(x)
-        of_size = reduced(x)
-        r = sign * of_size[0]
-        less = sign * of_size[1]
-        n = sign * of_size[2]
-    else:
-        return nan(), nan()
+def sin_cos_of_parts(x: float, r: float, less: float, n: float) -> tuple[float, float]:
+    """Of x = r - less + n quarter turns."""
     z = r * r
     s = wp.where(x == 0.0, x, r - (less - r * z * (SIN_1 + z * (SIN_2 + z * SIN_3))))  # the sine of -0 is -0
     half = 0.5 * z
@@ -121,6 +105,32 @@ def sin_cos(x: float) -> tuple[float, float]:
     sin = wp.where(odd, c, s)
     cos = wp.where(odd, s, c)
     return wp.where((quarter & 2) != 0, -sin, sin), wp.where(((quarter + 1) & 2) != 0, -cos, cos)
+
+
+@wp.func
+def near_sin_cos(x: float) -> tuple[float, float]:
+    """sin_cos for |x| <= REDUCED_BY_PARTS, without branches. Cody and Waite 1980; `less` is what rounding r has lost, and the last
+    part."""
+    n = nearest(x * TWO_OVER_PI)
+    rest = (x - n * QUARTER_1) - n * QUARTER_2
+    part = n * QUARTER_3
+    r = rest - part
+    sin, cos = sin_cos_of_parts(x, r, (part - (rest - r)) + n * QUARTER_4, n)
+    return sin, cos
+
+
+@wp.func
+def sin_cos(x: float) -> tuple[float, float]:
+    """(sin x, cos x), x in radians; NaN for an infinity."""
+    sin = nan()
+    cos = nan()
+    if wp.abs(x) <= REDUCED_BY_PARTS:
+        sin, cos = near_sin_cos(x)
+    elif wp.abs(x) < wp.inf:
+        sign = wp.sign(x)
+        of_size = reduced(x)
+        sin, cos = sin_cos_of_parts(x, sign * of_size[0], sign * of_size[1], sign * of_size[2])
+    return sin, cos
 
 
 @wp.func

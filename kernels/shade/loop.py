@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.backgrounds import make_background
+from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, make_transmittance
 from wrt.kernels.shade.step import Lit, Sample, add_up, counted, is_lit, lit_by, make_shaded, make_step
@@ -15,13 +16,14 @@ def make_direct_light(features: Any, accel_struct: Any, transmittance: Any, step
     """Light straight from every light (and the background) by one shadow ray each."""
     Shaded = make_shaded(counting)
     shadow_request, extra_lights = step.shadow_request, step.extra_lights
+    light_point = make_light_points(features).point
 
     @wp.func
     def direct_light(accel: accel_struct, surfaces: Surfaces, lighting: Lighting, shaded: Shaded, index: wp.uint32) -> Shadow:
         """As `add_up` takes it. cut: shadow rays that were, and lost: the light they were worth in a room of radiance 1."""
         out = Shadow()
         for i in range(lighting.count + wp.static(extra_lights)):
-            request = shadow_request(surfaces, lighting, shaded, i, index)
+            request = shadow_request(surfaces, lighting, shaded, i, light_point(lighting, shaded.key, index, i))
             if wp.max(request.value) > 0.0:
                 out = lit_by(out, request.value, shaded.scatter, transmittance(accel, surfaces, request.ray, request.end))
         return out

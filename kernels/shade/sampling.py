@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.native import source
-from wrt.kernels.shade.elementary import sin_cos
+from wrt.kernels.shade.elementary import near_sin_cos, sin_cos
 
 # The constants of the hash, of the scramble, and what makes the seeds of a point's two numbers differ.
 HASH_1, HASH_2 = 0x21F0AAAD, 0xD35A2D97
@@ -153,11 +153,12 @@ def disk(xi: wp.vec2) -> wp.vec2:
     """The unit disk, uniformly, by concentric squares (Shirley and Chiu 1997)."""
     a = 2.0 * xi[0] - 1.0
     b = 2.0 * xi[1] - 1.0
-    if a == 0.0 and b == 0.0:
-        return wp.vec2(0.0, 0.0)
-    if wp.abs(a) > wp.abs(b):
-        return a * point_at(PI / 4.0 * (b / a))
-    return b * point_at(PI / 2.0 - PI / 4.0 * (a / b))
+    wide = wp.abs(a) > wp.abs(b)
+    radius = wp.where(wide, a, b)
+    share = PI / 4.0 * (wp.where(wide, b, a) / radius)
+    sin, cos = near_sin_cos(wp.where(wide, share, PI / 2.0 - share))
+    away = radius != 0.0  # else the share is NaN
+    return wp.vec2(wp.where(away, radius * cos, 0.0), wp.where(away, radius * sin, 0.0))
 
 
 @wp.func
@@ -190,12 +191,23 @@ def frame_x(n: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def cosine_hemisphere(xi: wp.vec2, n: wp.vec3) -> wp.vec3:
-    """A direction around n with density cos / pi (Malley's method)."""
+def cosine_point(xi: wp.vec2) -> wp.vec3:
+    """A direction around the z axis with density cos / pi (Malley's method)."""
     d = disk(xi)
-    z = wp.sqrt(wp.max(0.0, 1.0 - d[0] * d[0] - d[1] * d[1]))
+    return wp.vec3(d[0], d[1], wp.sqrt(wp.max(0.0, 1.0 - d[0] * d[0] - d[1] * d[1])))
+
+
+@wp.func
+def turned_to(point: wp.vec3, n: wp.vec3) -> wp.vec3:
+    """A direction around the z axis as one around n."""
     x = frame_x(n)
-    return wp.normalize(d[0] * x + d[1] * wp.cross(n, x) + z * n)
+    return wp.normalize(point[0] * x + point[1] * wp.cross(n, x) + point[2] * n)
+
+
+@wp.func
+def cosine_hemisphere(xi: wp.vec2, n: wp.vec3) -> wp.vec3:
+    """A direction around n with density cos / pi."""
+    return turned_to(cosine_point(xi), n)
 
 
 @wp.func

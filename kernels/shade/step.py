@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.shade.direct import make_light_xi, make_reflected_light, shadow_ray
+from wrt.kernels.shade.direct import make_reflected_light, shadow_ray
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
 from wrt.kernels.shade.shading import BLEND
@@ -180,7 +180,7 @@ class Step(NamedTuple):
 
     Path: the struct; first_path(ray, key); ray_of(path). shade(surfaces, lighting, path, ray, hit, index) -> Shaded.
     shadow_requests: how many lights there are beside those of `lighting` (the background is one), and shadow_request(surfaces,
-    lighting, shaded, i, index) -> ShadowRequest to each. keep(path, limits, traced): whether a new path is followed, and
+    lighting, shaded, i, point) -> ShadowRequest to each. keep(path, limits, traced): whether a new path is followed, and
     worth(surfaces, path, verdict) what is lost where it is not.
     """
 
@@ -334,15 +334,14 @@ def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) 
 def make_shadow_request(features: Any, counting: bool = False) -> Any:
     """What a surface asks of a light."""
     Shaded = make_shaded(counting)
-    light_xi = make_light_xi(features)
     choose, reflected = make_reflected_light(features)
 
     @wp.func
-    def shadow_request(surfaces: Surfaces, lighting: Lighting, shaded: Shaded, i: int, index: wp.uint32) -> ShadowRequest:
-        """Lights are numbered; the background comes after the last one."""
+    def shadow_request(surfaces: Surfaces, lighting: Lighting, shaded: Shaded, i: int, point: wp.vec3) -> ShadowRequest:
+        """Lights are numbered; the background comes after the last one. point: of LightPoints."""
         out = ShadowRequest()
         s = shaded.surface
-        sample = choose(lighting, surfaces, i, s, light_xi(lighting, shaded.key, index, i))
+        sample = choose(lighting, surfaces, i, s, point)
         out.value = reflected(sample, s, shaded.scatter, shaded.wo)
         if wp.max(out.value) > 0.0:
             out.ray = shadow_ray(s, sample)

@@ -17,6 +17,7 @@ import warp as wp
 from wrt.kernels.launches import Launch, run, run_range, run_with
 from wrt.kernels.query import HitArrays, Queue, hit_at, put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
+from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.render import center_of, load_pixel, make_see, store_pixel, with_sample
 from wrt.kernels.shade.sampling import hash_pair, make_draw, quantiles
@@ -81,6 +82,9 @@ class Wave:
     waiting: wp.array(dtype=wp.int32)
     sky_x: wp.array(dtype=wp.float32)
     sky_y: wp.array(dtype=wp.float32)
+    sky_z: wp.array(dtype=wp.float32)
+    keys: wp.array(dtype=wp.uint32)
+    indices: wp.array(dtype=wp.uint32)
 
 
 @wp.func
@@ -111,6 +115,10 @@ def put_number(array: wp.array(dtype=wp.float32), i: int, value: float) -> None:
 def pixel_key(job: Job, at: int, limits: Limits) -> wp.uint32:
     """Of the samples of pixel `at` of a tile."""
     return hash_pair(hash_pair(limits.seed, wp.uint32(job.x + at % job.width)), wp.uint32(job.y + at / job.width))
+
+
+@wp.func_native("return array.data[(long long)i];")
+def bits_of(array: wp.array(dtype=wp.uint32), i: int) -> wp.uint32: ...
 
 
 @wp.func_native("array.data[(long long)i][k] = value;")
@@ -230,7 +238,9 @@ def make_shade_kernel(features: Any) -> Any:
     shading = make_shading(features)
     step = make_step(features, shading)
     _, _, _, shade, extra_lights, shadow_request, keep, worth = step
-    radiance, _, radiance_at, places = BACKGROUNDS[features.background]
+    radiance, by_kind, radiance_at, places = BACKGROUNDS[features.background]
+    light_numbers, sky_point, light_point = make_light_points(features)
+    sky_in_lanes = features.sky_light and by_kind is None  # else the numbers are all there is to it
 
     @wp.func
     def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
@@ -252,15 +262,39 @@ def make_shade_kernel(features: Any) -> Any:
             wave.waiting[slot] = slot
         return slot
 
+    @wp.func
+    def sky_points(wave: Wave, light: int, first: int, end: int):
+        """Those of the rays first .. end - 1 that hit something, one after another: in lanes (backgrounds.environment_places tells
+        how)."""
+        job = wave.job[0]
+        hits = int(0)
+        for k in range(first, end):
+            if wave.hits.prim_id[k] >= 0:
+                number = wave.number[k]
+                wave.keys[hits] = wave.paths[wave.size[number] * wave.capacity + number].key
+                wave.indices[hits] = wp.uint32(job.first_sample + number % job.samples)
+                hits += 1
+        i = int(0)
+        while i < hits:
+            point = sky_point(light_numbers(bits_of(wave.keys, i), bits_of(wave.indices, i), light))
+            put_number(wave.sky_x, i, point[0])
+            put_number(wave.sky_y, i, point[1])
+            put_number(wave.sky_z, i, point[2])
+            i = i + 1
+
     @kernel
     def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits):
         job = wave.job[0]
+        hits = int(0)
         for k in range(job.queued):
             if wp.static(not features.instances):
                 call_in_surface(wave, surfaces, k, job.queued)
-            if wp.static(places is not None):
-                if k % BLOCK == 0:
+            if k % BLOCK == 0:
+                if wp.static(places is not None):
                     places(lighting.background, wave.rays.direction, k, wp.min(k + BLOCK, job.queued), wave.sky_x, wave.sky_y)
+                if wp.static(sky_in_lanes):
+                    sky_points(wave, lighting.count, k, wp.min(k + BLOCK, job.queued))
+                    hits = int(0)
             number = wave.number[k]
             size = wave.size[number]
             traced = wave.traced[number] + 1
@@ -300,12 +334,18 @@ def make_shade_kernel(features: Any) -> Any:
                 if wp.static(features.lit):
                     if is_lit(shaded.scatter):
                         for i in range(lighting.count + wp.static(extra_lights)):
-                            request = shadow_request(surfaces, lighting, shaded, i, index)
+                            point = wp.vec3()
+                            if wp.static(sky_in_lanes):
+                                point = wp.vec3(wave.sky_x[hits], wave.sky_y[hits], wave.sky_z[hits])
+                            if wp.static(not sky_in_lanes) or i < lighting.count:
+                                point = light_point(lighting, shaded.key, index, i)
+                            request = shadow_request(surfaces, lighting, shaded, i, point)
                             slot = int(-1)
                             if wp.max(request.value) > 0.0:
                                 slot = ask(wave, i, request)
                                 asked += 1
                             wave.request[i * wave.capacity + k] = slot
+                hits += 1
                 if asked > 0:
                     wave.lit[k] = lit
                     if wp.static(features.transparent_shadows):
