@@ -90,6 +90,12 @@ class Ray:
 
 
 @wp.func
+def any_positive(v: wp.vec3) -> bool:
+    """Whether a component is above 0; NaN is not. wp.max takes three times as long."""
+    return v[0] > 0.0 or v[1] > 0.0 or v[2] > 0.0
+
+
+@wp.func
 def unit(v: wp.vec3) -> wp.vec3:
     """wp.normalize without a branch, for loops in lanes."""
     length = wp.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])

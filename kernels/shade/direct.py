@@ -9,7 +9,7 @@ from wrt.kernels.shade.lights import LIGHTS, WITHOUT_AREA, LightSample, make_lig
 from wrt.kernels.shade.materials import Scatter, blinn_phong
 from wrt.kernels.shade.sampling import PI, hash_pair, make_sample_2d
 from wrt.kernels.shade.surface import Surface, spawn_point
-from wrt.kernels.structs import Lighting, Ray, Surfaces, gamma, make_ray
+from wrt.kernels.structs import Lighting, Ray, Surfaces, any_positive, gamma, make_ray
 
 
 @wp.func
@@ -54,7 +54,7 @@ def make_reflected_light(features: Any) -> Any:
         if wp.static(features.highlight):
             # A traced reflection finds lights that have an area by itself; the background is no small light.
             if sample.area == 0 or (scatter.traced == 0 and sample.distant == 0):
-                if wp.max(scatter.highlight) > 0.0:
+                if any_positive(scatter.highlight):
                     value = value + scatter.highlight * blinn_phong(s.shading, sample.wi, wo, scatter.exponent)
         return cosine * wp.cw_mul(value, sample.weight)
 

@@ -9,7 +9,7 @@ from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, make_transmittance
 from wrt.kernels.shade.step import Lit, Sample, add_up, counted, is_lit, lit_by, make_shaded, make_step
-from wrt.kernels.structs import Lighting, Limits, Ray, Surfaces
+from wrt.kernels.structs import Lighting, Limits, Ray, Surfaces, any_positive
 
 
 def make_direct_light(features: Any, accel_struct: Any, transmittance: Any, step: Any, counting: bool = False) -> Any:
@@ -24,7 +24,7 @@ def make_direct_light(features: Any, accel_struct: Any, transmittance: Any, step
         out = Shadow()
         for i in range(lighting.count + wp.static(extra_lights)):
             request = shadow_request(surfaces, lighting, shaded, i, light_point(lighting, shaded.key, index, i))
-            if wp.max(request.value) > 0.0:
+            if any_positive(request.value):
                 out = lit_by(out, request.value, shaded.scatter, transmittance(accel, surfaces, request.ray, request.end))
         return out
 

@@ -18,7 +18,7 @@ from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
 from wrt.kernels.shade.shading import BLEND
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT, OUTSIDE, Shadow, attenuation
 from wrt.kernels.shade.surface import Surface, spawn_point
-from wrt.kernels.structs import Hit, Lighting, Limits, Material, Ray, Surfaces, make_ray
+from wrt.kernels.structs import Hit, Lighting, Limits, Material, Ray, Surfaces, any_positive, make_ray
 
 MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
 UNKNOWN = wp.constant(-2)  # where a camera ray begins: within glass, or not
@@ -136,7 +136,7 @@ class Lit:
 @wp.func
 def is_lit(scatter: Scatter) -> bool:
     """Whether light from elsewhere can be seen on a surface."""
-    return wp.max(scatter.diffuse) > 0.0 or wp.max(scatter.highlight) > 0.0
+    return any_positive(scatter.diffuse) or any_positive(scatter.highlight)
 
 
 @wp.func
@@ -343,7 +343,7 @@ def make_shadow_request(features: Any, counting: bool = False) -> Any:
         s = shaded.surface
         sample = choose(lighting, surfaces, i, s, point)
         out.value = reflected(sample, s, shaded.scatter, shaded.wo)
-        if wp.max(out.value) > 0.0:
+        if any_positive(out.value):
             out.ray = shadow_ray(s, sample)
             out.end = sample.end
         return out

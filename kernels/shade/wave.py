@@ -24,7 +24,7 @@ from wrt.kernels.shade.sampling import hash_pair, make_draw, quantiles
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, ShadowWalk, begin_shadow, make_go_through
 from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, lit_by, make_path, make_paths, make_step
-from wrt.kernels.structs import AovFilm, Film, Lighting, Limits, Surfaces, kernel
+from wrt.kernels.structs import AovFilm, Film, Lighting, Limits, Surfaces, any_positive, kernel
 
 Path = make_path(False)
 first_path, ray_of, _ = make_paths()
@@ -357,7 +357,7 @@ def make_shade_kernel(features: Any) -> Any:
                                 point = light_point(lighting, shaded.key, index, i)
                             request = shadow_request(surfaces, lighting, shaded, i, point)
                             slot = int(-1)
-                            if wp.max(request.value) > 0.0:
+                            if any_positive(request.value):
                                 slot = ask(wave, i, request)
                                 asked += 1
                             wave.request[i * wave.capacity + k] = slot
