@@ -153,6 +153,10 @@ def call_in_number(array: wp.array(dtype=wp.int32), i: int) -> None: ...
 def call_in_corner(array: wp.array(dtype=wp.vec3), i: int) -> None: ...
 
 
+@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
+def call_in_count(array: wp.array(dtype=wp.int64), i: int) -> None: ...
+
+
 @wp.func
 def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, queued: int):
     """What the hits after this one will read of their triangles: the face of one, the corners of another before it."""
@@ -435,6 +439,11 @@ def add_to_film(wave: Wave, film: Film):
     """The samples of a wave to their pixels, in their order."""
     job = wave.job[0]
     for p in range(job.pixels):
+        if p + AHEAD < job.pixels:
+            next = pixel_of(job, wave.order[p + AHEAD], film.x, film.y, film.columns)
+            call_in_corner(film.mean, next)
+            call_in_corner(film.m2, next)
+            call_in_count(film.rays, next)
         i = pixel_of(job, wave.order[p], film.x, film.y, film.columns)
         pixel = load_pixel(film, i)
         for j in range(job.samples):
