@@ -35,6 +35,7 @@ BELOW_WRT = {
 BELOW_KERNELS = {
     "native": set(),
     "launches": set(),
+    "memory": set(),
     "structs": set(),
     "units": {"structs"},
     "traverse": {"native", "units", "structs"},
@@ -42,7 +43,7 @@ BELOW_KERNELS = {
     "ray_query": {"query", "traverse", "units", "structs"},
     "winding": {"structs"},
     "wide": {"native", "query", "traverse", "units", "structs"},
-    "shade": {"native", "launches", "query", "traverse", "units", "structs"},
+    "shade": {"native", "launches", "memory", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
     "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }

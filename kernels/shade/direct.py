@@ -62,7 +62,7 @@ def make_reflected_light(features: Any) -> Any:
 
 
 class LightPoints(NamedTuple):
-    """numbers(key, index, i) -> vec2: what places a sample on light i, at the path vertex `key`. of_sky: sky_point of those numbers.
+    """numbers(key, index, i) -> vec2: what places a sample on light i, at the path vertex `key`; of_sky: sky_point of those.
     point(lighting, key, index, i) -> vec3: the one of the background, and of another light its two numbers."""
 
     numbers: Any

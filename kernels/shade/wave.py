@@ -6,7 +6,7 @@ and adds up its light in that order, so that pictures have the same bits. Traver
 scene compiles no traversal.
 
 Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once. trace_wave launches
-the others, so that a wave is a single launch to Python.
+the others, so that a wave is a single launch to Python. What begins a wave is in wave_begin.py, the step in wave_shade.py.
 """
 
 from functools import cache
@@ -15,20 +15,18 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.launches import Launch, run, run_range, run_with
+from wrt.kernels.memory import call_in_long, call_in_vec3
 from wrt.kernels.query import HitArrays, Queue, hit_at, put_ray, queued_ray
-from wrt.kernels.shade.backgrounds import BACKGROUNDS
-from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.materials import Scatter
-from wrt.kernels.shade.render import center_of, load_pixel, make_see, store_pixel, with_sample
-from wrt.kernels.shade.sampling import hash_pair, make_draw, quantiles
+from wrt.kernels.shade.render import load_pixel, make_see, store_pixel, with_sample
 from wrt.kernels.shade.shading import make_shading
-from wrt.kernels.shade.shadows import Shadow, ShadowWalk, begin_shadow, make_go_through
-from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, lit_by, make_path, make_paths, make_step
-from wrt.kernels.structs import AovFilm, Film, Lighting, Limits, Surfaces, any_positive, kernel
+from wrt.kernels.shade.shadows import Shadow, ShadowWalk, make_go_through
+from wrt.kernels.shade.step import Lit, Sample, add_up, lit_by, make_path, make_paths
+from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel
 
 Path = make_path(False)
-first_path, ray_of, _ = make_paths()
-AHEAD = 4  # hits, of what memory is asked for before it is read
+_, ray_of, _ = make_paths()
+AHEAD = 4  # hits, or pixels, whose memory is called in before it is read
 BLOCK = 64  # rays for which something is computed in lanes at a time
 
 
@@ -54,7 +52,7 @@ class Wave:
     By place in the queue: number, rays, hits, lit, scatter, asked (shadow rays of a hit), and for light i from i * capacity on
     request: the place of its shadow ray, or -1. By place of a shadow ray, for light i from i * capacity on: value, shadow_rays,
     occluded or, where shadows are transparent, walks and shadow_hits, and waiting: which walks those rays are of. asking: shadow
-    rays to each light.
+    rays to each light. By place in a block of the queue (BLOCK): sky_x, sky_y, sky_z, and keys and indices, of which they are made.
     """
 
     capacity: int
@@ -99,18 +97,6 @@ def pixel_of(job: Job, at: int, x: int, y: int, columns: int) -> int:
     return (job.y + at / job.width - y) * columns + job.x + at % job.width - x
 
 
-@wp.func_native("return array.data[(long long)i][k];")
-def number_2(array: wp.array(dtype=wp.vec2), i: int, k: int) -> float: ...
-
-
-@wp.func_native("array.data[(long long)i][k] = value;")
-def put_number_3(array: wp.array(dtype=wp.vec3), i: int, k: int, value: float) -> None: ...
-
-
-@wp.func_native("array.data[(long long)i] = value;")
-def put_number(array: wp.array(dtype=wp.float32), i: int, value: float) -> None: ...
-
-
 @wp.func_native("""
     auto& sample = samples.data[(long long)i];
     sample.radiance = radiance; sample.lost = lost;
@@ -122,261 +108,9 @@ def put_fields(samples: wp.array(dtype=Sample), i: int, radiance: wp.vec3, rays:
 
 @wp.func
 def put_sample(samples: wp.array(dtype=Sample), i: int, sample: Sample):
-    """samples[i] = sample, field by field: a copy of the whole reads 16 bytes at a time what was written 4 at a time just before, for
-    which a core waits until it is in the cache."""
+    """samples[i] = sample, field by field: a copy of the whole reads 16 bytes at a time what was written 4 at a time just before,
+    and for that a core waits until it is in the cache."""
     put_fields(samples, i, sample.radiance, sample.rays, sample.cut_depth, sample.cut_throughput, sample.lost)
-
-
-@wp.func
-def pixel_key(job: Job, at: int, limits: Limits) -> wp.uint32:
-    """Of the samples of pixel `at` of a tile."""
-    return hash_pair(hash_pair(limits.seed, wp.uint32(job.x + at % job.width)), wp.uint32(job.y + at / job.width))
-
-
-@wp.func_native("return array.data[(long long)i];")
-def bits_of(array: wp.array(dtype=wp.uint32), i: int) -> wp.uint32: ...
-
-
-@wp.func_native("array.data[(long long)i][k] = value;")
-def put_number_2(array: wp.array(dtype=wp.vec2), i: int, k: int, value: float) -> None: ...
-
-
-@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_face(array: wp.array(dtype=wp.vec3i), i: int) -> None: ...
-
-
-@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_number(array: wp.array(dtype=wp.int32), i: int) -> None: ...
-
-
-@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_corner(array: wp.array(dtype=wp.vec3), i: int) -> None: ...
-
-
-@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_count(array: wp.array(dtype=wp.int64), i: int) -> None: ...
-
-
-@wp.func
-def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, queued: int):
-    """What the hits after this one will read of their triangles: the face of one, the corners of another before it."""
-    if k + 2 * AHEAD < queued:
-        prim_id = wave.hits.prim_id[k + 2 * AHEAD]
-        if prim_id >= 0 and prim_id < surfaces.n_triangles:
-            call_in_face(surfaces.faces, prim_id)
-            call_in_number(surfaces.prim_material, prim_id)
-    if k + AHEAD < queued:
-        prim_id = wave.hits.prim_id[k + AHEAD]
-        if prim_id >= 0 and prim_id < surfaces.n_triangles:
-            face = surfaces.faces[prim_id]
-            for corner in range(3):
-                call_in_corner(surfaces.vertices, face[corner])
-                if surfaces.normals.shape[0] > 1:
-                    call_in_corner(surfaces.normals, face[corner])
-
-
-def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
-    """Camera rays of a wave. Where there is none, the sample is done."""
-    camera_struct = camera_kind.Camera
-    camera_ray = camera_kind.make_camera_ray(features)
-    draw = make_draw(features)
-
-    @wp.func
-    def place(wave: Wave, film: Film, limits: Limits, first: int, end: int):
-        """The samples of the pixels first .. end - 1: where they are on the film, in pixels, and on the lens."""
-        job = wave.job[0]
-        for p in range(first, end):
-            key = pixel_key(job, wave.order[p], limits)
-            draw(key, 0, job.first_sample, job.samples, wave.xi, p * job.samples)
-            if wp.static(features.lens):
-                draw(key, 1, job.first_sample, job.samples, wave.lens_xi, p * job.samples)
-        if wp.static(features.filter):
-            quantiles(film.filter_icdf, wave.xi, first * job.samples, (end - first) * job.samples)
-        for p in range(first, end):
-            x = float(job.x + wave.order[p] % job.width) + 0.5
-            y = float(job.y + wave.order[p] / job.width) + 0.5
-            i = p * job.samples
-            while i < (p + 1) * job.samples:
-                offset_x = number_2(wave.xi, i, 0)
-                offset_y = number_2(wave.xi, i, 1)
-                if wp.static(not features.filter):
-                    offset_x = offset_x - 0.5
-                    offset_y = offset_y - 0.5
-                put_number_2(wave.xi, i, 0, x + offset_x)
-                put_number_2(wave.xi, i, 1, y + offset_y)
-                i = i + 1
-
-    @wp.func
-    def look(wave: Wave, camera: camera_struct, film: Film, first: int, end: int):
-        """The camera rays of the samples first .. end - 1, each to its place in the queue: in lanes (backgrounds.environment_places
-        tells how)."""
-        i = int(first)
-        while i < end:
-            position = wp.vec2(number_2(wave.xi, i, 0) / float(film.width), number_2(wave.xi, i, 1) / float(film.height))
-            lens_xi = wp.vec2(0.0, 0.0)
-            if wp.static(features.lens):
-                lens_xi = wp.vec2(number_2(wave.lens_xi, i, 0), number_2(wave.lens_xi, i, 1))
-            ray = camera_ray(camera, position, lens_xi)
-            put_number_3(wave.rays.origin, i, 0, ray.origin[0])
-            put_number_3(wave.rays.origin, i, 1, ray.origin[1])
-            put_number_3(wave.rays.origin, i, 2, ray.origin[2])
-            put_number_3(wave.rays.direction, i, 0, ray.direction[0])
-            put_number_3(wave.rays.direction, i, 1, ray.direction[1])
-            put_number_3(wave.rays.direction, i, 2, ray.direction[2])
-            put_number(wave.rays.t_max, i, ray.t_max)
-            i = i + 1
-
-    @kernel
-    def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film):
-        job = wave.job[0]
-        queued = int(0)
-        first = int(0)
-        while first < job.pixels:
-            end = wp.min(first + wp.max(BLOCK / job.samples, 1), job.pixels)
-            place(wave, film, limits, first, end)
-            look(wave, camera, film, first * job.samples, end * job.samples)
-            for p in range(first, end):
-                key = pixel_key(job, wave.order[p], limits)
-                for number in range(p * job.samples, (p + 1) * job.samples):
-                    wave.done[number] = Sample()
-                    wave.size[number] = 0
-                    wave.traced[number] = 0
-                    ray = queued_ray(wave.rays, number)
-                    if ray.t_max > 0.0:
-                        path = first_path(ray, key)
-                        wave.paths[number] = path
-                        enqueue(wave, queued, number, path)
-                        queued += 1
-            first = end
-        wave.job[0].queued = queued
-
-    return begin_wave
-
-
-def make_shade_kernel(features: Any) -> Any:
-    """The step at every hit of the queue: its light, its new paths, and its requests for shadow rays."""
-    shading = make_shading(features)
-    step = make_step(features, shading)
-    _, _, _, shade, extra_lights, shadow_request, keep, worth = step
-    radiance, by_kind, radiance_at, places = BACKGROUNDS[features.background]
-    light_numbers, sky_point, light_point = make_light_points(features)
-    sky_in_lanes = features.sky_light and by_kind is None  # else the numbers are all there is to it
-
-    @wp.func
-    def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
-        """The number of paths that wait, with this one where it is followed."""
-        if verdict == 1:
-            wave.paths[size * wave.capacity + number] = path
-            return size + 1
-        return size
-
-    @wp.func
-    def ask(wave: Wave, i: int, request: ShadowRequest) -> int:
-        """The place of a shadow ray to light i."""
-        slot = i * wave.capacity + wave.asking[i]
-        wave.asking[i] = wave.asking[i] + 1
-        wave.value[slot] = request.value
-        put_ray(wave.shadow_rays, slot, request.ray)
-        if wp.static(features.transparent_shadows):
-            wave.walks[slot] = begin_shadow(request.ray, request.end)
-            wave.waiting[slot] = slot
-        return slot
-
-    @wp.func
-    def sky_points(wave: Wave, light: int, first: int, end: int):
-        """Those of the rays first .. end - 1 that hit something, one after another: in lanes (backgrounds.environment_places tells
-        how)."""
-        job = wave.job[0]
-        hits = int(0)
-        for k in range(first, end):
-            if wave.hits.prim_id[k] >= 0:
-                number = wave.number[k]
-                wave.keys[hits] = wave.paths[wave.size[number] * wave.capacity + number].key
-                wave.indices[hits] = wp.uint32(job.first_sample + number % job.samples)
-                hits += 1
-        i = int(0)
-        while i < hits:
-            point = sky_point(light_numbers(bits_of(wave.keys, i), bits_of(wave.indices, i), light))
-            put_number(wave.sky_x, i, point[0])
-            put_number(wave.sky_y, i, point[1])
-            put_number(wave.sky_z, i, point[2])
-            i = i + 1
-
-    @kernel
-    def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits):
-        job = wave.job[0]
-        hits = int(0)
-        for k in range(job.queued):
-            if wp.static(not features.instances):
-                call_in_surface(wave, surfaces, k, job.queued)
-            if k % BLOCK == 0:
-                if wp.static(places is not None):
-                    places(lighting.background, wave.rays.direction, k, wp.min(k + BLOCK, job.queued), wave.sky_x, wave.sky_y)
-                if wp.static(sky_in_lanes):
-                    sky_points(wave, lighting.count, k, wp.min(k + BLOCK, job.queued))
-                    hits = int(0)
-            number = wave.number[k]
-            size = wave.size[number]
-            traced = wave.traced[number] + 1
-            wave.traced[number] = traced
-            path = wave.paths[size * wave.capacity + number]
-            out = wave.done[number]
-            out.rays += 1
-            asked = int(0)
-            hit = hit_at(wave.hits, k)
-            if hit.prim_id < 0:
-                if wp.static(places is not None):
-                    seen = radiance_at(lighting.background, wave.sky_x[k % BLOCK], wave.sky_y[k % BLOCK])
-                    out.radiance += wp.cw_mul(path.throughput, seen)
-                else:
-                    out.radiance += wp.cw_mul(path.throughput, radiance(lighting.background, path.direction))
-            else:
-                index = wp.uint32(job.first_sample + number % job.samples)
-                shaded = shade(surfaces, lighting, path, ray_of(path), hit, index)
-                lit = Lit()
-                lit.light = shaded.light
-                lit.throughput = shaded.throughput
-                if wp.static(features.blend):
-                    verdict = keep(shaded.onward, limits, traced)
-                    size = follow(wave, number, size, shaded.onward, verdict)
-                    out = counted(out, verdict)
-                    out.lost += worth(surfaces, shaded.onward, verdict)
-                if wp.static(features.reflection):
-                    verdict = keep(shaded.reflected, limits, traced)
-                    size = follow(wave, number, size, shaded.reflected, verdict)
-                    out = counted(out, verdict)
-                    lit.reflected = worth(surfaces, shaded.reflected, verdict)
-                if wp.static(features.refraction):
-                    verdict = keep(shaded.refracted, limits, traced)
-                    size = follow(wave, number, size, shaded.refracted, verdict)
-                    out = counted(out, verdict)
-                    lit.refracted = worth(surfaces, shaded.refracted, verdict)
-                if wp.static(features.lit):
-                    if is_lit(shaded.scatter):
-                        for i in range(lighting.count + wp.static(extra_lights)):
-                            point = wp.vec3()
-                            if wp.static(sky_in_lanes):
-                                point = wp.vec3(wave.sky_x[hits], wave.sky_y[hits], wave.sky_z[hits])
-                            if wp.static(not sky_in_lanes) or i < lighting.count:
-                                point = light_point(lighting, shaded.key, index, i)
-                            request = shadow_request(surfaces, lighting, shaded, i, point)
-                            slot = int(-1)
-                            if any_positive(request.value):
-                                slot = ask(wave, i, request)
-                                asked += 1
-                            wave.request[i * wave.capacity + k] = slot
-                hits += 1
-                if asked > 0:
-                    wave.lit[k] = lit
-                    if wp.static(features.transparent_shadows):
-                        wave.scatter[k] = shaded.scatter
-                else:
-                    out = add_up(out, lit, Shadow())
-            put_sample(wave.done, number, out)
-            wave.size[number] = size
-            wave.asked[k] = asked
-
-    return shade_wave
 
 
 def make_shadow_kernel(features: Any) -> Any:
@@ -441,9 +175,9 @@ def add_to_film(wave: Wave, film: Film):
     for p in range(job.pixels):
         if p + AHEAD < job.pixels:
             next = pixel_of(job, wave.order[p + AHEAD], film.x, film.y, film.columns)
-            call_in_corner(film.mean, next)
-            call_in_corner(film.m2, next)
-            call_in_count(film.rays, next)
+            call_in_vec3(film.mean, next)
+            call_in_vec3(film.m2, next)
+            call_in_long(film.rays, next)
         i = pixel_of(job, wave.order[p], film.x, film.y, film.columns)
         pixel = load_pixel(film, i)
         for j in range(job.samples):
@@ -486,23 +220,6 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
         add_to_film(wave, film)
 
     return trace_wave
-
-
-def make_begin_aov_kernel(camera_kind: Any) -> Any:
-    """A ray through the middle of each pixel; where there is none, it has no length."""
-    camera_struct = camera_kind.Camera
-    camera_ray = camera_kind.make_camera_ray()
-
-    @kernel
-    def begin_aov(wave: Wave, camera: camera_struct, film: AovFilm):
-        job = wave.job[0]
-        for p in range(job.pixels):
-            x = job.x + wave.order[p] % job.width
-            y = job.y + wave.order[p] / job.width
-            ray = camera_ray(camera, center_of(x, y, film.width, film.height), wp.vec2(0.5, 0.5))
-            put_ray(wave.rays, p, ray)
-
-    return begin_aov
 
 
 def make_see_kernel(features: Any) -> Any:

@@ -13,7 +13,7 @@ import warp as wp
 from wrt.accel.batches import new_scratch
 from wrt.core.device import made_once, records, upload
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
-from wrt.kernels.shade import wave
+from wrt.kernels.shade import wave, wave_begin, wave_shade
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_cutout
@@ -41,12 +41,12 @@ def some(features: Features, names: tuple[str, ...]) -> Features:
 
 @made_once
 def begin_kernel(features: Features) -> Any:
-    return wave.make_begin_kernel(features, camera_kind(features.camera))
+    return wave_begin.make_begin_kernel(features, camera_kind(features.camera))
 
 
 @made_once
 def shade_kernel(features: Features) -> Any:
-    return wave.make_shade_kernel(features)
+    return wave_shade.make_shade_kernel(features)
 
 
 @made_once
@@ -61,7 +61,7 @@ def see_kernel(features: Features) -> Any:
 
 @made_once
 def begin_aov_kernel(camera: str) -> Any:
-    return wave.make_begin_aov_kernel(camera_kind(camera))
+    return wave_begin.make_begin_aov_kernel(camera_kind(camera))
 
 
 @made_once

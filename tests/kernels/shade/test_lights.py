@@ -6,12 +6,20 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import DEVICE, directions, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
+from tests.kernel_tools import DEVICE, cpu_only, directions, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
 import warp as wp
 
 from wrt.accel.build import build
 from wrt.kernels.shade import backgrounds, lights
-from wrt.kernels.shade.backgrounds import environment, make_sky_sample
+from wrt.kernels.shade.backgrounds import (
+    environment,
+    environment_column,
+    environment_places,
+    environment_row,
+    make_sky_point,
+    make_sky_sample,
+    rotate_y,
+)
 from wrt.kernels.shade.direct import shadow_ray
 from wrt.kernels.shade.lights import LightSample, make_light_sample
 from wrt.kernels.shade.surface import Surface
@@ -31,7 +39,7 @@ ALL_LIGHTS = Features(lights=(*LIGHTS, *EMISSIVE), sky_light=True)
 @cache
 def light_kernel(features):
     light_sample = make_light_sample(features)
-    sky_sample = make_sky_sample(features)
+    sky_sample, sky_point = make_sky_sample(features), make_sky_point(features)
 
     @kernel
     def take(lighting: Lighting, surfaces: Surfaces, point: wp.array(dtype=wp.vec3), n: wp.array(dtype=wp.vec3), light: int,
@@ -44,10 +52,40 @@ def light_kernel(features):
         if light < lighting.count:
             out[i] = light_sample(lighting, surfaces, lighting.lights[light], s, xi[i])
         else:
-            out[i] = sky_sample(lighting.background, n[i], xi[i])
+            out[i] = sky_sample(lighting.background, n[i], sky_point(xi[i]))
         ray[i] = shadow_ray(s, out[i])
 
     return take
+
+
+@kernel
+def places_kernel(b: Background, direction: wp.array(dtype=wp.vec3), first: int, end: int, x: wp.array(dtype=float),
+                  y: wp.array(dtype=float)):
+    environment_places(b, direction, first, end, x, y)
+
+
+@kernel
+def place_kernel(b: Background, direction: wp.array(dtype=wp.vec3), x: wp.array(dtype=float), y: wp.array(dtype=float)):
+    i = wp.tid()
+    d = rotate_y(direction[i], -b.rotation)
+    x[i] = environment_column(b, d[0], d[2])
+    y[i] = environment_row(b, d[1])
+
+
+@cpu_only
+@pytest.mark.parametrize("rotation", [0.0, 0.7])
+def test_places_in_lanes_are_those_of_one_direction_at_a_time(rotation):
+    axes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-0.0, 1, -0.0], [0.5**0.5, 0, 0.5**0.5]])
+    direction = np.concatenate([unit(np.random.default_rng(1).normal(size=(71, 3))), axes, -axes])
+    b = Background()
+    b.rotation, b.width, b.height = rotation, 64, 32
+    n, first, end = len(direction), 3, len(direction) - 2
+    lanes, single = (zeros(n), zeros(n)), (zeros(n), zeros(n))
+    launch(places_kernel, 1, b, vec3s(direction), first, end, *lanes)
+    launch(place_kernel, n, b, vec3s(direction), *single)
+    for a, c in zip(lanes, single, strict=True):
+        np.testing.assert_array_equal(a.numpy()[: end - first].view(np.int32), c.numpy()[first:end].view(np.int32))
+        assert not a.numpy()[end - first :].any()
 
 
 @kernel

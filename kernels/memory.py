@@ -1,0 +1,52 @@
+"""Numbers of arrays without gaps, for loops that run on one CPU thread.
+
+The compiler makes lanes of a loop in plain Warp, sixteen at a time where the CPU has them, and it takes a tenth of the time: if it
+is a `while` with a counter, has no branches (wp.where is none) and calls no function that has any, and reads and writes arrays by
+what is here, where the compiler sees the addresses, but no table at places that it computes. (`-Rpass=loop-vectorize` among
+wp.config.cpu_compiler_flags says which loops are.)
+
+call_in: a cache line that is read soon.
+"""
+
+import warp as wp
+
+
+@wp.func_native("return array.data[(long long)i];")
+def bits_at(array: wp.array(dtype=wp.uint32), i: int) -> wp.uint32: ...
+
+
+@wp.func_native("return array.data[(long long)i][k];")
+def number_of_vec2(array: wp.array(dtype=wp.vec2), i: int, k: int) -> float:
+    """Component k."""
+
+
+@wp.func_native("return array.data[(long long)i][k];")
+def number_of_vec3(array: wp.array(dtype=wp.vec3), i: int, k: int) -> float: ...
+
+
+@wp.func_native("array.data[(long long)i] = value;")
+def put_number(array: wp.array(dtype=wp.float32), i: int, value: float) -> None: ...
+
+
+@wp.func_native("array.data[(long long)i][k] = value;")
+def put_in_vec2(array: wp.array(dtype=wp.vec2), i: int, k: int, value: float) -> None: ...
+
+
+@wp.func_native("array.data[(long long)i][k] = value;")
+def put_in_vec3(array: wp.array(dtype=wp.vec3), i: int, k: int, value: float) -> None: ...
+
+
+@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
+def call_in_int(array: wp.array(dtype=wp.int32), i: int) -> None: ...
+
+
+@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
+def call_in_long(array: wp.array(dtype=wp.int64), i: int) -> None: ...
+
+
+@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
+def call_in_vec3(array: wp.array(dtype=wp.vec3), i: int) -> None: ...
+
+
+@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
+def call_in_vec3i(array: wp.array(dtype=wp.vec3i), i: int) -> None: ...

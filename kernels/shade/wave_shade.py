@@ -1,0 +1,158 @@
+"""The step at every hit of a wave's queue."""
+
+from typing import Any
+
+import warp as wp
+
+from wrt.kernels.memory import bits_at, call_in_int, call_in_vec3, call_in_vec3i, put_number
+from wrt.kernels.query import hit_at, put_ray
+from wrt.kernels.shade.backgrounds import BACKGROUNDS
+from wrt.kernels.shade.direct import make_light_points
+from wrt.kernels.shade.shading import make_shading
+from wrt.kernels.shade.shadows import Shadow, begin_shadow
+from wrt.kernels.shade.step import Lit, ShadowRequest, add_up, counted, is_lit, make_step
+from wrt.kernels.shade.wave import AHEAD, BLOCK, Path, Wave, put_sample, ray_of
+from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
+
+
+@wp.func
+def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, queued: int):
+    """What the hits after this one will read of their triangles: the face of one, the corners of another before it."""
+    if k + 2 * AHEAD < queued:
+        prim_id = wave.hits.prim_id[k + 2 * AHEAD]
+        if prim_id >= 0 and prim_id < surfaces.n_triangles:
+            call_in_vec3i(surfaces.faces, prim_id)
+            call_in_int(surfaces.prim_material, prim_id)
+    if k + AHEAD < queued:
+        prim_id = wave.hits.prim_id[k + AHEAD]
+        if prim_id >= 0 and prim_id < surfaces.n_triangles:
+            face = surfaces.faces[prim_id]
+            for corner in range(3):
+                call_in_vec3(surfaces.vertices, face[corner])
+                if surfaces.normals.shape[0] > 1:
+                    call_in_vec3(surfaces.normals, face[corner])
+
+
+def make_shade_kernel(features: Any) -> Any:
+    """The step at every hit of the queue: its light, its new paths, and its requests for shadow rays."""
+    shading = make_shading(features)
+    step = make_step(features, shading)
+    _, _, _, shade, extra_lights, shadow_request, keep, worth = step
+    radiance, by_kind, radiance_at, places = BACKGROUNDS[features.background]
+    light_numbers, sky_point, light_point = make_light_points(features)
+    sky_in_lanes = features.sky_light and by_kind is None  # else the numbers are all there is to it
+
+    @wp.func
+    def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
+        """The number of paths that wait, with this one where it is followed."""
+        if verdict == 1:
+            wave.paths[size * wave.capacity + number] = path
+            return size + 1
+        return size
+
+    @wp.func
+    def ask(wave: Wave, i: int, request: ShadowRequest) -> int:
+        """The place of a shadow ray to light i."""
+        slot = i * wave.capacity + wave.asking[i]
+        wave.asking[i] = wave.asking[i] + 1
+        wave.value[slot] = request.value
+        put_ray(wave.shadow_rays, slot, request.ray)
+        if wp.static(features.transparent_shadows):
+            wave.walks[slot] = begin_shadow(request.ray, request.end)
+            wave.waiting[slot] = slot
+        return slot
+
+    @wp.func
+    def sky_points(wave: Wave, light: int, first: int, end: int):
+        """Those of the rays first .. end - 1 that hit something, one after another: in lanes (kernels.memory)."""
+        job = wave.job[0]
+        hits = int(0)
+        for k in range(first, end):
+            if wave.hits.prim_id[k] >= 0:
+                number = wave.number[k]
+                wave.keys[hits] = wave.paths[wave.size[number] * wave.capacity + number].key
+                wave.indices[hits] = wp.uint32(job.first_sample + number % job.samples)
+                hits += 1
+        i = int(0)
+        while i < hits:
+            point = sky_point(light_numbers(bits_at(wave.keys, i), bits_at(wave.indices, i), light))
+            put_number(wave.sky_x, i, point[0])
+            put_number(wave.sky_y, i, point[1])
+            put_number(wave.sky_z, i, point[2])
+            i = i + 1
+
+    @kernel
+    def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits):
+        job = wave.job[0]
+        hits = int(0)
+        for k in range(job.queued):
+            if wp.static(not features.instances):
+                call_in_surface(wave, surfaces, k, job.queued)
+            if k % BLOCK == 0:
+                if wp.static(places is not None):
+                    places(lighting.background, wave.rays.direction, k, wp.min(k + BLOCK, job.queued), wave.sky_x, wave.sky_y)
+                if wp.static(sky_in_lanes):
+                    sky_points(wave, lighting.count, k, wp.min(k + BLOCK, job.queued))
+                    hits = int(0)
+            number = wave.number[k]
+            size = wave.size[number]
+            traced = wave.traced[number] + 1
+            wave.traced[number] = traced
+            path = wave.paths[size * wave.capacity + number]
+            out = wave.done[number]
+            out.rays += 1
+            asked = int(0)
+            hit = hit_at(wave.hits, k)
+            if hit.prim_id < 0:
+                if wp.static(places is not None):
+                    seen = radiance_at(lighting.background, wave.sky_x[k % BLOCK], wave.sky_y[k % BLOCK])
+                    out.radiance += wp.cw_mul(path.throughput, seen)
+                else:
+                    out.radiance += wp.cw_mul(path.throughput, radiance(lighting.background, path.direction))
+            else:
+                index = wp.uint32(job.first_sample + number % job.samples)
+                shaded = shade(surfaces, lighting, path, ray_of(path), hit, index)
+                lit = Lit()
+                lit.light = shaded.light
+                lit.throughput = shaded.throughput
+                if wp.static(features.blend):
+                    verdict = keep(shaded.onward, limits, traced)
+                    size = follow(wave, number, size, shaded.onward, verdict)
+                    out = counted(out, verdict)
+                    out.lost += worth(surfaces, shaded.onward, verdict)
+                if wp.static(features.reflection):
+                    verdict = keep(shaded.reflected, limits, traced)
+                    size = follow(wave, number, size, shaded.reflected, verdict)
+                    out = counted(out, verdict)
+                    lit.reflected = worth(surfaces, shaded.reflected, verdict)
+                if wp.static(features.refraction):
+                    verdict = keep(shaded.refracted, limits, traced)
+                    size = follow(wave, number, size, shaded.refracted, verdict)
+                    out = counted(out, verdict)
+                    lit.refracted = worth(surfaces, shaded.refracted, verdict)
+                if wp.static(features.lit):
+                    if is_lit(shaded.scatter):
+                        for i in range(lighting.count + wp.static(extra_lights)):
+                            point = wp.vec3()
+                            if wp.static(sky_in_lanes):
+                                point = wp.vec3(wave.sky_x[hits], wave.sky_y[hits], wave.sky_z[hits])
+                            if wp.static(not sky_in_lanes) or i < lighting.count:
+                                point = light_point(lighting, shaded.key, index, i)
+                            request = shadow_request(surfaces, lighting, shaded, i, point)
+                            slot = int(-1)
+                            if any_positive(request.value):
+                                slot = ask(wave, i, request)
+                                asked += 1
+                            wave.request[i * wave.capacity + k] = slot
+                hits += 1
+                if asked > 0:
+                    wave.lit[k] = lit
+                    if wp.static(features.transparent_shadows):
+                        wave.scatter[k] = shaded.scatter
+                else:
+                    out = add_up(out, lit, Shadow())
+            put_sample(wave.done, number, out)
+            wave.size[number] = size
+            wave.asked[k] = asked
+
+    return shade_wave
