@@ -1,11 +1,12 @@
 """Numbers of arrays without gaps, for loops that run on one CPU thread.
 
-The compiler makes lanes of a loop in plain Warp, sixteen at a time where the CPU has them, and it takes a tenth of the time: if it
-is a `while` with a counter, has no branches (wp.where is none) and calls no function that has any, and reads and writes arrays by
-what is here, where the compiler sees the addresses, but no table at places that it computes. (`-Rpass=loop-vectorize` among
-wp.config.cpu_compiler_flags says which loops are.)
+The compiler makes lanes of a plain Warp loop (sixteen where the CPU has them), and it takes a tenth of the time, if
+- it is a `while` with a counter;
+- it has no branches (wp.where is none), and calls nothing that has;
+- it reads and writes arrays by the functions here, and looks up no table at a place that it computes.
+`-Rpass=loop-vectorize` among wp.config.cpu_compiler_flags says which loops are.
 
-call_in: a cache line that is read soon.
+call_in_...: prefetch the cache line of entry i. CPU only.
 """
 
 import warp as wp

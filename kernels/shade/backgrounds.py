@@ -118,7 +118,8 @@ def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
 
 class BackgroundKind(NamedTuple):
     """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine. at, places: as
-    environment_at and environment_places, for many directions at a time; None: as well one by one."""
+    environment_at and environment_places, for many directions at a time; None: there is no faster way than one
+    by one."""
 
     radiance: Any
     sample: Any = None
@@ -143,7 +144,7 @@ def make_background(features: Any) -> Any:
 
 
 def make_sky_point(features: Any) -> Any:
-    """What sky_sample takes, from two numbers: without branches, for loops in lanes."""
+    """sky_point(xi): the point that sky_sample takes. It has no branches, so that loops can run in lanes."""
     of_cosine = BACKGROUNDS[features.background].sample is None
 
     @wp.func

@@ -62,11 +62,10 @@ def make_reflected_light(features: Any) -> Any:
 
 
 class LightPoints(NamedTuple):
-    """numbers(key, index, i) -> vec2: what places a sample on light i, at the path vertex `key`; of_sky: sky_point of those.
-    point(lighting, key, index, i) -> vec3: the one of the background, and of another light its two numbers."""
+    """numbers(key, index, i) -> vec2: what places a sample on light i, at the path vertex `key`. point(lighting, key, index, i) ->
+    vec3: sky_point of these for the background; the two numbers and 0 for any other light."""
 
     numbers: Any
-    of_sky: Any
     point: Any
 
 
@@ -93,4 +92,4 @@ def make_light_points(features: Any) -> LightPoints:
                 return sky_point(xi)
         return wp.vec3(xi[0], xi[1], 0.0)
 
-    return LightPoints(numbers, sky_point, light_point)
+    return LightPoints(numbers, light_point)

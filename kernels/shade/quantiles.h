@@ -1,5 +1,5 @@
-    // As render.quantile, for the coordinates of many points: a loop that the compiler makes lanes of. Of the table it knows no end, and
-    // so it has to see that what is written is another memory: that is `out`.
+    // As sampling.quantile, for both numbers of many points: a loop that the compiler makes lanes of. It cannot tell where the table
+    // ends, so results go to `out` first: they cannot overwrite it.
     float* const values = (float*)(points.data + (long long)first);
     const int size = icdf.shape[0];
     for (int j = 0; j < 2 * count; j += LANES) {

@@ -126,7 +126,7 @@ def make_draw(features: Any) -> Any:
 
     @wp.func
     def draw(key: wp.uint32, dimension: int, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int):
-        """sample_2d(key, first + i, dimension) to out[at + i], for each i below `count`; as sample_points."""
+        """sample_2d(key, first + i, dimension) to out[at + i], for each i below `count`; needs room as sample_points does."""
         if wp.static(features.independent):
             for i in range(count):
                 out[at + i] = sample(key, wp.uint32(first + i), dimension)
@@ -155,9 +155,9 @@ def disk(xi: wp.vec2) -> wp.vec2:
     b = 2.0 * xi[1] - 1.0
     wide = wp.abs(a) > wp.abs(b)
     radius = wp.where(wide, a, b)
-    share = PI / 4.0 * (wp.where(wide, b, a) / radius)
+    away = radius != 0.0
+    share = PI / 4.0 * (wp.where(wide, b, a) / wp.where(away, radius, 1.0))
     sin, cos = near_sin_cos(wp.where(wide, share, PI / 2.0 - share))
-    away = radius != 0.0  # else the share is NaN
     return wp.vec2(wp.where(away, radius * cos, 0.0), wp.where(away, radius * sin, 0.0))
 
 

@@ -52,7 +52,8 @@ class Wave:
     By place in the queue: number, rays, hits, lit, scatter, asked (shadow rays of a hit), and for light i from i * capacity on
     request: the place of its shadow ray, or -1. By place of a shadow ray, for light i from i * capacity on: value, shadow_rays,
     occluded or, where shadows are transparent, walks and shadow_hits, and waiting: which walks those rays are of. asking: shadow
-    rays to each light. By place in a block of the queue (BLOCK): sky_x, sky_y, sky_z, and keys and indices, of which they are made.
+    rays to each light. sky_x, sky_y, sky_z: by place in a block of the queue (BLOCK),
+    or, of hits alone, by their count in it, as are keys and indices.
     """
 
     capacity: int
@@ -99,6 +100,7 @@ def pixel_of(job: Job, at: int, x: int, y: int, columns: int) -> int:
 
 @wp.func_native("""
     auto& sample = samples.data[(long long)i];
+    static_assert(sizeof(sample) == sizeof(radiance) + 16, "every field of Sample is stored");
     sample.radiance = radiance; sample.lost = lost;
     sample.rays = rays; sample.cut_depth = cut_depth; sample.cut_throughput = cut_throughput;
 """)

@@ -6,7 +6,7 @@ import warp as wp
 
 from wrt.kernels.memory import bits_at, call_in_int, call_in_vec3, call_in_vec3i, put_number
 from wrt.kernels.query import hit_at, put_ray
-from wrt.kernels.shade.backgrounds import BACKGROUNDS
+from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
@@ -39,8 +39,9 @@ def make_shade_kernel(features: Any) -> Any:
     step = make_step(features, shading)
     _, _, _, shade, extra_lights, shadow_request, keep, worth = step
     radiance, by_kind, radiance_at, places = BACKGROUNDS[features.background]
-    light_numbers, sky_point, light_point = make_light_points(features)
-    sky_in_lanes = features.sky_light and by_kind is None  # else the numbers are all there is to it
+    light_numbers, light_point = make_light_points(features)
+    sky_point = make_sky_point(features)
+    sky_in_lanes = features.sky_light and by_kind is None and places is None  # by_kind: else a point is just its two numbers
 
     @wp.func
     def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
@@ -64,7 +65,7 @@ def make_shade_kernel(features: Any) -> Any:
 
     @wp.func
     def sky_points(wave: Wave, light: int, first: int, end: int):
-        """Those of the rays first .. end - 1 that hit something, one after another: in lanes (kernels.memory)."""
+        """A sky_point for each of the rays first .. end - 1 that hit something, one after another: in lanes (kernels.memory)."""
         job = wave.job[0]
         hits = int(0)
         for k in range(first, end):

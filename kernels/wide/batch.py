@@ -65,7 +65,7 @@ PRIM_ID = WIDTH * (size_of(Primitive) // 4 - 1)  # where a row has its primitive
 PACKETS = 4  # set up at a time
 SLOTS = 16  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
-LINES = 5  # cache lines that are called in of what is next: a row of triangles, or a node and one more; to ask which costs more
+LINES = 5  # cache lines that are called in of what is next: a row of triangles has 5, a node 4, and a branch would cost more
 # Where packets fall apart, one after another, none is tried for a while: so many in a row, for so many that follow.
 IN_A_ROW, PAUSE = 4, 32
 FAILED = SLOT_SIZE * SLOTS  # where Scratch.slots counts the packets in a row that fell apart
@@ -236,6 +236,7 @@ def make_interleaved(units: Units, any_hit: bool, test_row: Any) -> Any:
 
     @wp.func
     def start(accel: struct, scratch: Scratch, slot: int, ray: int):
+        """`meets` has found that the ray meets a child of the root: there is a next one."""
         column = ray / LANES * PACKET_SIZE + ray % LANES
         next = begin(accel.nodes, scratch.packets, column, scratch.stacks, slot * STACK_WORDS, scratch.slots, slot * SLOT_SIZE)
         call_in(accel.nodes, accel.primitives, next)

@@ -1,6 +1,6 @@
-    // A new level of a ray's stack for the children of a node that it meets (`met`, from `enter` on), if it meets any; and then the
-    // next child of the last level, whichever node that is of: to ask which costs more than to look there, as every third node or so
-    // is left again at once, and no one can tell which.
+    // A new level of a ray's stack for the children of a node that it meets (`met`, from `enter` on), if it meets any; then the next
+    // child of the last level. Both cases share one path: about every third node has no child that is met, and a branch on that is
+    // mispredicted. Distances are not negative.
     typedef unsigned Keys __attribute__((ext_vector_type(WIDTH), aligned(4)));
     static_assert(WIDTH == 8, "the children have numbers");
     const unsigned all = ROW_MASK(met);

@@ -1,5 +1,5 @@
-    // The next child on a ray's stack, whose last level is at `at`: of any hit the last one there, else the nearest that begins at or
-    // before `reach`; 0 (EMPTY) where there is none.
+    // The next child on a ray's stack, whose last level is at `at`: for any hit the last one there, else the nearest that begins at
+    // or before `reach`; 0 (EMPTY) where there is none.
 #if ANY_HIT
     if (at == bottom) return 0;
     unsigned* const level = (unsigned*)stacks.data + at;
@@ -11,7 +11,7 @@
         if (at == bottom) return 0;
         level = (unsigned*)stacks.data + at;
         key = __builtin_reduce_min(*(const Keys*)level);
-        if (__builtin_bit_cast(float, key & ~(unsigned)KEY_MASK) <= reach) break;  // equal stays: a tie may have a lower prim_id there
+        if (__builtin_bit_cast(float, key & ~(unsigned)KEY_MASK) <= reach) break;  // equal stays: a tie may have a lower prim_id
     }
     const int child = key & (WIDTH - 1);
     level[child] = ~0u;

@@ -46,6 +46,8 @@ class Lanes:
     walk: wp.array2d(dtype=wp.int32)
     begun_any: wp.array(dtype=wp.int32)
     walk_any: wp.array2d(dtype=wp.int32)
+    missed: wp.array(dtype=wp.int32)
+    missed_any: wp.array(dtype=wp.int32)
     candidates: wp.array(dtype=wp.int32)
 
 
@@ -56,14 +58,22 @@ def make_walk(any_hit):
     begin, step, pop = packets.make_steps(any_hit)
 
     @wp.func
-    def walk(nodes: wp.array(dtype=wp.float32), node: int, packet: wp.array(dtype=wp.float32), column: int, reach: float,
-             stacks: wp.array(dtype=wp.uint32), slots: wp.array(dtype=wp.int32), ray: int, begun: wp.array(dtype=wp.int32),
-             out: wp.array2d(dtype=wp.int32)):
-        """What is next at the root, and then in `node` after a step, and after one pop after another, or NOTHING."""
+    def walk(nodes: wp.array(dtype=wp.float32), node: int, empty: int, packet: wp.array(dtype=wp.float32), column: int,
+             reach: float, stacks: wp.array(dtype=wp.uint32), slots: wp.array(dtype=wp.int32), ray: int,
+             begun: wp.array(dtype=wp.int32), missed: wp.array(dtype=wp.int32), out: wp.array2d(dtype=wp.int32)):
+        """What is next, or NOTHING: at the root; after a step into `node` and one into `empty`; and after a step into `node` and
+        one pop after another."""
         slot = ray * SLOT_SIZE
         bottom = ray * STACK_WORDS
         next = begin(nodes, packet, column, stacks, bottom, slots, slot)
         begun[ray] = wp.where(next == EMPTY, NOTHING, next)
+        slots[slot + 1] = node
+        slots[slot + 2] = bottom
+        next = step(nodes, packet, stacks, bottom, slots, slot)
+        if next != EMPTY:
+            slots[slot + 1] = empty
+            next = step(nodes, packet, stacks, bottom, slots, slot)
+        missed[ray] = wp.where(next == EMPTY, NOTHING, next)
         slots[slot + 1] = node
         slots[slot + 2] = bottom
         next = step(nodes, packet, stacks, bottom, slots, slot)
@@ -80,8 +90,9 @@ walk, walk_any = make_walk(False), make_walk(True)
 
 
 @kernel
-def by_packets(rays: RayArrays, count: int, reach: float, nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32),
-               packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint32), slots: wp.array(dtype=wp.int32), out: Lanes):
+def by_packets(rays: RayArrays, count: int, reach: float, empty: int, nodes: wp.array(dtype=wp.float32),
+               rows: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint32),
+               slots: wp.array(dtype=wp.int32), out: Lanes):
     """Packet i with node i and row i, and a slot for each ray; rays beyond `count` of each packet are left out."""
     i = wp.tid()
     base = PACKET_SIZE * i
@@ -94,8 +105,8 @@ def by_packets(rays: RayArrays, count: int, reach: float, nodes: wp.array(dtype=
         out.children[i] = packets.children(nodes, 64 * i, mask, packet, base)
     for j in range(LANES):
         ray = LANES * i + j
-        walk(nodes, i, packet, base + j, reach, stacks, slots, ray, out.begun, out.walk)
-        walk_any(nodes, i, packet, base + j, reach, stacks, slots, ray, out.begun_any, out.walk_any)
+        walk(nodes, i, empty, packet, base + j, reach, stacks, slots, ray, out.begun, out.missed, out.walk)
+        walk_any(nodes, i, empty, packet, base + j, reach, stacks, slots, ray, out.begun_any, out.missed_any, out.walk_any)
         out.candidates[ray] = packets.cull(rows, 80 * i, 255, packet, base + j)
 
 
@@ -180,18 +191,22 @@ class Both:
         self.n = n
         rows = np.concatenate([corners.astype(np.float32).reshape(n, 72),
                                np.tile(np.array([3, 1, 4, 0, 5, 9, 2, 6], np.int32).view(np.float32), (n, 1))], axis=1)
-        nodes, rows = floats(nodes.reshape(-1)), floats(rows.reshape(-1))
+        never = np.full((1, WIDTH, 3), np.inf, np.float32)
+        nodes, rows = floats(np.concatenate([nodes, plain_nodes(never, -never)]).reshape(-1)), floats(rows.reshape(-1))
         lanes = Lanes()
         for name, length in (("state", n), ("meets", n), ("children", n), ("reaching", n), ("begun", n * LANES),
-                             ("begun_any", n * LANES), ("candidates", n * LANES), ("walk", (n * LANES, WIDTH + 1)),
+                             ("begun_any", n * LANES), ("missed", n * LANES), ("missed_any", n * LANES),
+                             ("candidates", n * LANES), ("walk", (n * LANES, WIDTH + 1)),
                              ("walk_any", (n * LANES, WIDTH + 1))):
             setattr(lanes, name, zeros(length, wp.int32))
         packet, stacks = zeros(n * PACKET_SIZE), zeros(n * LANES * STACK_WORDS, wp.uint32)
-        launch(by_packets, n, self.rays, count, reach, nodes, rows, packet, stacks, zeros(n * LANES * SLOT_SIZE, wp.int32), lanes)
+        slots = zeros(n * LANES * SLOT_SIZE, wp.int32)
+        launch(by_packets, n, self.rays, count, reach, n, nodes, rows, packet, stacks, slots, lanes)
         self.state, self.meets, self.children, self.reaching = (
             getattr(lanes, name).numpy() for name in ("state", "meets", "children", "reaching"))
         self.begun, self.walk, self.candidates = (getattr(lanes, name).numpy() for name in ("begun", "walk", "candidates"))
         self.begun_any, self.walk_any = lanes.begun_any.numpy(), lanes.walk_any.numpy()
+        self.missed, self.missed_any = lanes.missed.numpy(), lanes.missed_any.numpy()
         self.set_up = packet.numpy().reshape(n, PACKET_SIZE).copy()
         found = zeros(n, wp.int32)
         launch(triangles_by_packets, n, rows, lanes.state, any_hit, packet, found)
@@ -338,6 +353,7 @@ def test_a_step_and_pops_lead_from_the_near_to_the_far(name):
     expected, entered = walked(both)
     np.testing.assert_array_equal(np.where(entered.any(axis=1, keepdims=True), both.walk, NOTHING), expected)
     assert (both.walk[~entered.any(axis=1), 0] == NOTHING).all()
+    np.testing.assert_array_equal(both.missed, both.walk[:, 1])  # a node without a child that is met is as good as a pop
     # A key is never farther than the entry, and hardly nearer: no child is dropped that begins before the hit.
     entries = both.scalar.entries.numpy()[entered]
     begins = (entries.view(np.int32) & ~15).view(np.float32).astype(np.float64)
@@ -354,6 +370,7 @@ def test_any_hit_takes_all_children_from_the_last_to_the_first(name):
     np.testing.assert_array_equal(both.begun_any, expected[:, 0])
     np.testing.assert_array_equal(both.walk_any[some, :WIDTH], expected[some])
     assert (both.walk_any[some, WIDTH] == NOTHING).all() and (both.walk_any[~some, 0] == NOTHING).all()
+    np.testing.assert_array_equal(both.missed_any, both.walk_any[:, 1])
 
 
 @pytest.mark.parametrize("reach", [0.0, 0.5])

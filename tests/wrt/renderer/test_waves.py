@@ -55,8 +55,8 @@ def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> Non
         np.testing.assert_array_equal(values.view(np.uint8), other[name].view(np.uint8), err_msg=name)
 
 
-# What there is beside plain surfaces: shadow rays through glass and panes, cut-outs, instances, an image circle. Each slow one
-# compiles the loop for its scene; tests/test_bits.py holds all their pixels.
+# What there is beside plain surfaces: shadow rays through glass and panes, cut-outs, instances, an image circle, a picture of the
+# sky. Each slow one compiles the loop for its scene; tests/test_bits.py holds all their pixels.
 @pytest.mark.parametrize(("name", "settings"), [
     ("tinted_shadows", {"max_depth": 3}),
     pytest.param("thin_glass", {"max_depth": 2}, marks=pytest.mark.slow),
@@ -64,6 +64,7 @@ def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> Non
     pytest.param("cutout", {"max_depth": 0}, marks=pytest.mark.slow),
     pytest.param("instances", {"max_depth": 1}, marks=pytest.mark.slow),
     ("fisheye", {}),
+    ("glass_sky", {"max_depth": 2}),
 ])
 def test_the_film_is_that_of_one_ray_at_a_time(name: str, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     ready = prepared(name, **settings)
