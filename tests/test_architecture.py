@@ -42,7 +42,7 @@ BELOW_KERNELS = {
     "query": {"traverse", "units", "structs"},
     "ray_query": {"query", "traverse", "units", "structs"},
     "winding": {"structs"},
-    "wide": {"native", "query", "traverse", "units", "structs"},
+    "wide": {"native", "memory", "query", "traverse", "units", "structs"},
     "shade": {"native", "launches", "memory", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
     "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},

@@ -36,10 +36,15 @@ def turn_of(angle: float) -> tuple[float, float]:
 
 
 @wp.func
-def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
-    """Turned about +y, counter-clockwise seen from above."""
-    sin, cos = turn_of(angle)
+def turned(d: wp.vec3, sin: float, cos: float) -> wp.vec3:
+    """About +y, counter-clockwise seen from above, by the angle of this sine and cosine."""
     return wp.vec3(cos * d[0] + sin * d[2], d[1], cos * d[2] - sin * d[0])
+
+
+@wp.func
+def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
+    sin, cos = turn_of(angle)
+    return turned(d, sin, cos)
 
 
 @wp.func
@@ -86,10 +91,10 @@ def environment_places(b: Background, directions: wp.array(dtype=wp.vec3), first
     sin, cos = turn_of(-b.rotation)
     i = int(first)
     while i < end:
-        d_x = number_of_vec3(directions, i, 0)
-        d_z = number_of_vec3(directions, i, 2)
-        put_number(x, i - first, environment_column(b, cos * d_x + sin * d_z, cos * d_z - sin * d_x))
-        put_number(y, i - first, environment_row(b, number_of_vec3(directions, i, 1)))
+        d = wp.vec3(number_of_vec3(directions, i, 0), number_of_vec3(directions, i, 1), number_of_vec3(directions, i, 2))
+        d = turned(d, sin, cos)
+        put_number(x, i - first, environment_column(b, d[0], d[2]))
+        put_number(y, i - first, environment_row(b, d[1]))
         i = i + 1
 
 

@@ -52,8 +52,10 @@ class Wave:
     By place in the queue: number, rays, hits, lit, scatter, asked (shadow rays of a hit), and for light i from i * capacity on
     request: the place of its shadow ray, or -1. By place of a shadow ray, for light i from i * capacity on: value, shadow_rays,
     occluded or, where shadows are transparent, walks and shadow_hits, and waiting: which walks those rays are of. asking: shadow
-    rays to each light. sky_x, sky_y, sky_z: by place in a block of the queue (BLOCK),
-    or, of hits alone, by their count in it, as are keys and indices.
+    rays to each light.
+
+    By place in a block of the queue (BLOCK), or of hits alone by their count in it: sky_x, sky_y, sky_z, keys and indices. While a
+    wave begins, keys are those of a block of pixels.
     """
 
     capacity: int

@@ -9,16 +9,10 @@ from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.render import center_of
 from wrt.kernels.shade.sampling import hash_pair, make_draw, quantiles
 from wrt.kernels.shade.step import Sample, make_paths
-from wrt.kernels.shade.wave import BLOCK, Job, Wave, enqueue
+from wrt.kernels.shade.wave import BLOCK, Wave, enqueue
 from wrt.kernels.structs import AovFilm, Film, Limits, kernel
 
 first_path, _, _ = make_paths()
-
-
-@wp.func
-def pixel_key(job: Job, at: int, limits: Limits) -> wp.uint32:
-    """Of the samples of pixel `at` of a tile."""
-    return hash_pair(hash_pair(limits.seed, wp.uint32(job.x + at % job.width)), wp.uint32(job.y + at / job.width))
 
 
 def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
@@ -29,18 +23,21 @@ def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
 
     @wp.func
     def place(wave: Wave, film: Film, limits: Limits, first: int, end: int):
-        """The samples of the pixels first .. end - 1: where they are on the film, in pixels, and on the lens."""
+        """The samples of the pixels first .. end - 1: where they are on the film (in pixels) and the lens; and the pixels' keys."""
         job = wave.job[0]
         for p in range(first, end):
-            key = pixel_key(job, wave.order[p], limits)
+            x = wp.uint32(job.x + wave.order[p] % job.width)
+            y = wp.uint32(job.y + wave.order[p] / job.width)
+            key = hash_pair(hash_pair(limits.seed, x), y)
+            wave.keys[p - first] = key
             draw(key, 0, job.first_sample, job.samples, wave.xi, p * job.samples)
             if wp.static(features.lens):
                 draw(key, 1, job.first_sample, job.samples, wave.lens_xi, p * job.samples)
         if wp.static(features.filter):
             quantiles(film.filter_icdf, wave.xi, first * job.samples, (end - first) * job.samples)
         for p in range(first, end):
-            x = float(job.x + wave.order[p] % job.width) + 0.5
-            y = float(job.y + wave.order[p] / job.width) + 0.5
+            center_x = float(job.x + wave.order[p] % job.width) + 0.5
+            center_y = float(job.y + wave.order[p] / job.width) + 0.5
             i = p * job.samples
             while i < (p + 1) * job.samples:
                 offset_x = number_of_vec2(wave.xi, i, 0)
@@ -48,8 +45,8 @@ def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
                 if wp.static(not features.filter):
                     offset_x = offset_x - 0.5
                     offset_y = offset_y - 0.5
-                put_in_vec2(wave.xi, i, 0, x + offset_x)
-                put_in_vec2(wave.xi, i, 1, y + offset_y)
+                put_in_vec2(wave.xi, i, 0, center_x + offset_x)
+                put_in_vec2(wave.xi, i, 1, center_y + offset_y)
                 i = i + 1
 
     @wp.func
@@ -82,7 +79,7 @@ def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
             place(wave, film, limits, first, end)
             look(wave, camera, film, first * job.samples, end * job.samples)
             for p in range(first, end):
-                key = pixel_key(job, wave.order[p], limits)
+                key = wave.keys[p - first]
                 for number in range(p * job.samples, (p + 1) * job.samples):
                     wave.done[number] = Sample()
                     wave.size[number] = 0

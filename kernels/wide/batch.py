@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.memory import put_number
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect
@@ -41,7 +42,6 @@ from wrt.kernels.wide.packets import (
     make_steps,
     meets,
     put_bits,
-    put_number,
     put_slot,
     reaching,
     slot_at,
