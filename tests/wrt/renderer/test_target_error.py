@@ -109,7 +109,7 @@ def test_what_is_not_known_is_not_called_small(tmp_path: Any) -> None:
         if progress.stage == "trace":
             raise KeyboardInterrupt
 
-    film = render(SCENE, target_error=0.5, progress=at_once, size=(480, 320), threads=1, device="cpu")  # by tiles
+    film = render(SCENE, target_error=0.5, progress=at_once, size=(1920, 1080), threads=1, device="cpu")  # by tiles, for seconds
     none = film.samples == 0
     assert none.any() and np.isposinf(film.variance[none]).all() and np.isfinite(film.variance[~none]).all()
     assert film.stats["estimated_error"] == math.inf and not film.stats["target_reached"]
