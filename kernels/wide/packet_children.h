@@ -1,9 +1,10 @@
-    auto once = [&]() __attribute__((noinline)) {  // the compiler would copy it to where it is called
+    float* const q = packet.data + (long long)base;
+    const float* const p = nodes.data + (long long)first;
+    auto once = [=]() __attribute__((noinline)) {  // the compiler would copy it to where it is called
     #include "packet.h"
     #include "rows.h"
     // The beam first. Distances are products of two intervals: bounds are the extreme origin times both reciprocals. The largest
     // reciprocal comes first: it may be infinite, and 0 * inf = NaN then says nothing.
-    const float* p = nodes.data + (long long)first;
     #define PLANES(k) (*(const Row*)(p + WIDTH * (k)))
     const int near[3] = {(int)q[BEAM_NEAR_ROW], (int)q[BEAM_NEAR_ROW + 1], (int)q[BEAM_NEAR_ROW + 2]};
     Row beam_enter = (Row)(q[BEAM_T_MIN]), beam_leave = (Row)(LARGEST);

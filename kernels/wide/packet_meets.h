@@ -1,3 +1,4 @@
+    float* const q = packet.data + (long long)base;
     #include "packet.h"
     #include "packet_rays.h"
     const float* p = nodes.data + (long long)first;

@@ -1,4 +1,12 @@
-    auto once = [&]() __attribute__((noinline)) {  // the compiler would copy it to where it is called
+    float* const q = packet.data + (long long)base;
+    // Not `rays` itself: sixteen loads of what was just copied would wait for the copy, longer where the stack is not at a cache line.
+    const float *const origins = (const float*)(rays.origin.data + first), *const directions = (const float*)(rays.direction.data + first);
+    const bool one_t_min = rays.t_min.strides[0] == 0, one_t_max = rays.t_max.strides[0] == 0;
+    const float *const t_mins = rays.t_min.data + (one_t_min ? 0 : first), *const t_maxs = rays.t_max.data + (one_t_max ? 0 : first);
+#if QUEUE
+    const int* const excludes = rays.exclude.data + first;
+#endif
+    auto once = [=]() __attribute__((noinline)) {  // the compiler would copy it to where it is called
     #include "packet.h"
     #include "packet_load.h"
     const Rays one = 1.0f, nothing = -__builtin_inff(), largest = LARGEST;

@@ -1,10 +1,11 @@
-    auto once = [&]() __attribute__((noinline)) {  // the compiler would copy it to where it is called
+    float* const q = packet.data + (long long)base;
+    const float* const p = rows.data + (long long)first;
+    auto once = [=](int mask) __attribute__((noinline)) {  // the compiler would copy it to where it is called
     // As kernels.units.triangle.ray_triangle and kernels.traverse.common.intersect, one triangle after another.
     #include "packet.h"
     typedef double Doubles __attribute__((ext_vector_type(LANES), aligned(8)));
     #define WIDE(x) __builtin_convertvector(x, Doubles)
     #define NARROW(x) __builtin_convertvector(x, Rays)
-    const float* p = rows.data + (long long)first;
     const RayInts axes = int_row(AXES), kx = axes & AXIS_MASK, ky = axes >> AXIS_BITS & AXIS_MASK, kz = axes >> 2 * AXIS_BITS;
     const Rays o_x = row(TURNED_X), o_y = row(TURNED_Y), o_z = row(TURNED_Z), s_x = row(SHEAR_X), s_y = row(SHEAR_Y);
     const Rays inf = __builtin_inff();
@@ -38,4 +39,4 @@
     }
     return found;
     };
-    return once();
+    return once(mask);

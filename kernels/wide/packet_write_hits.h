@@ -1,3 +1,4 @@
+    float* const q = packet.data + (long long)base;
     #include "packet.h"
     const Rays far = __builtin_inff();
     const RayInts id = int_row(PRIM_ID), none = -1;
