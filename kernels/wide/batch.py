@@ -15,7 +15,7 @@ from wrt.kernels.memory import put_number
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect
-from wrt.kernels.traverse.stack import key_of, make_uninitialized, reference_of, t_of
+from wrt.kernels.traverse.stack import key_of, reference_of, t_of
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
 from wrt.kernels.wide.nodes import ROW_PADS, far_pad, first_reference, node_size
@@ -37,11 +37,15 @@ from wrt.kernels.wide.packets import (
     children,
     count_of,
     cull,
+    key_at,
     lowest_of_all,
     make_set_up,
     make_steps,
+    mask_at,
     meets,
+    move_entry,
     put_bits,
+    put_entry,
     put_slot,
     reaching,
     slot_at,
@@ -74,7 +78,6 @@ ANY_REFUSED = PAUSED + 1  # where it says whether a query refuses one of the ray
 
 # A packet leaves as many entries as a ray alone, but the nearest child is on the stack as well, before it is taken from there.
 ENTRIES = STACK_SIZE + 1
-empty_keys, empty_masks = make_uninitialized(ENTRIES, wp.uint64), make_uninitialized(ENTRIES, wp.int32)
 
 
 @wp.func
@@ -182,12 +185,11 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -
             first = first + wp.static(size_of_row)
 
     @wp.func
-    def walk(accel: struct, surfaces: Surfaces, packet: wp.array(dtype=wp.float32), base: int, active: int) -> int:
+    def walk(accel: struct, surfaces: Surfaces, packet: wp.array(dtype=wp.float32), base: int, active: int,
+             stacks: wp.array(dtype=wp.uint32)) -> int:
         """1 where it was worth it, -1 where two rays hardly ever met the same leaf, 0 without any leaf."""
         leaves = int(0)
         visits = int(0)
-        stack = empty_keys()
-        masks = empty_masks()
         size = int(0)
         reference = int(0)
         mask = int(active)
@@ -208,20 +210,18 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -
                     key = key_of(number(packet, base + CHILD_ENTRY + lane), child)
                     at = size
                     if wp.static(not any_hit):  # sorted, the farthest deepest
-                        while at > under and stack[at - 1] < key:
-                            stack[at] = stack[at - 1]
-                            masks[at] = masks[at - 1]
+                        while at > under and key_at(stacks, at - 1) < key:
+                            move_entry(stacks, at - 1, at)
                             at = at - 1
-                    stack[at] = key
-                    masks[at] = bits(packet, base + CHILD_RAYS + lane)
+                    put_entry(stacks, at, key, bits(packet, base + CHILD_RAYS + lane))
                     size = size + 1
             mask = int(0)
             while size > 0 and mask == 0:
                 size = size - 1
-                mask = masks[size] & reaching(t_of(stack[size]), packet, base)
+                mask = mask_at(stacks, size) & reaching(t_of(key_at(stacks, size)), packet, base)
             if mask == 0:
                 break
-            reference = reference_of(stack[size])
+            reference = reference_of(key_at(stacks, size))
         return wp.where(leaves == 0, 0, wp.where(visits < 2 * leaves, -1, 1))
 
     return walk
@@ -334,7 +334,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 put_slot(scratch.slots, ANY_REFUSED, 1)
             paused = slot_at(scratch.slots, PAUSED)
             if active >= COHERENT and paused == 0:
-                worth = walk_packet(accel, surfaces, scratch.packets, base, active - COHERENT)
+                worth = walk_packet(accel, surfaces, scratch.packets, base, active - COHERENT, scratch.stacks)
                 failed = wp.where(worth > 0, 0, slot_at(scratch.slots, FAILED) - worth)
                 if failed == IN_A_ROW:  # after the pause one more that fails is enough for the next
                     failed = failed - 1

@@ -133,6 +133,25 @@ def write_occluded(occluded: wp.array(dtype=wp.bool), first: int, count: int, pa
                    base: int) -> None: ...
 
 
+# --- the stack of a packet: four words an entry, the key (traverse.stack.key_of) and the mask of the rays that go there ------
+
+
+@wp.func_native("const int words[] = {(int)key, (int)(key >> 32), mask}; __builtin_memcpy(stacks.data + 4 * i, words, 12);")
+def put_entry(stacks: wp.array(dtype=wp.uint32), i: int, key: wp.uint64, mask: int) -> None: ...
+
+
+@wp.func_native("__builtin_memcpy(stacks.data + 4 * to, stacks.data + 4 * i, 16);")
+def move_entry(stacks: wp.array(dtype=wp.uint32), i: int, to: int) -> None: ...
+
+
+@wp.func_native("wp::uint64 key; __builtin_memcpy(&key, stacks.data + 4 * i, 8); return key;")
+def key_at(stacks: wp.array(dtype=wp.uint32), i: int) -> wp.uint64: ...
+
+
+@wp.func_native("return (int)stacks.data[4 * i + 2];")
+def mask_at(stacks: wp.array(dtype=wp.uint32), i: int) -> int: ...
+
+
 # --- one ray of a packet, and its slot --------------------------------------------------------------------------------
 
 
