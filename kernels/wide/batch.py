@@ -70,6 +70,7 @@ PACKETS = 4  # set up at a time
 SLOTS = 16  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
 LINES = 5  # cache lines that are called in of what is next: a row of triangles has 5, a node 4, and a branch would cost more
+WORTH = 3  # rays that come to a node together, on average, from which on a packet takes less time than its rays alone
 # Where packets fall apart, one after another, none is tried for a while: so many in a row, for so many that follow.
 IN_A_ROW, PAUSE = 4, 32
 FAILED = SLOT_SIZE * SLOTS  # where Scratch.slots counts the packets in a row that fell apart
@@ -186,19 +187,19 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -
 
     @wp.func
     def walk(accel: struct, surfaces: Surfaces, packet: wp.array(dtype=wp.float32), base: int, active: int,
-             stacks: wp.array(dtype=wp.uint32)) -> int:
-        """1 where it was worth it, -1 where two rays hardly ever met the same leaf, 0 without any leaf."""
-        leaves = int(0)
+             stacks: wp.array(dtype=wp.uint32)) -> bool:
+        """Whether it was worth it."""
+        nodes = int(0)
         visits = int(0)
         size = int(0)
         reference = int(0)
         mask = int(active)
         while True:
             if reference < 0:
-                leaves += 1
-                visits += count_of(mask)
                 test_leaf(accel, surfaces, reference, mask, packet, base)
             else:
+                nodes += 1
+                visits += count_of(mask)
                 first = reference * NODE
                 met = children(accel.nodes, first, mask, packet, base)
                 under = size
@@ -222,7 +223,7 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -
             if mask == 0:
                 break
             reference = reference_of(key_at(stacks, size))
-        return wp.where(leaves == 0, 0, wp.where(visits < 2 * leaves, -1, 1))
+        return visits >= WORTH * nodes
 
     return walk
 
@@ -335,7 +336,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
             paused = slot_at(scratch.slots, PAUSED)
             if active >= COHERENT and paused == 0:
                 worth = walk_packet(accel, surfaces, scratch.packets, base, active - COHERENT, scratch.stacks)
-                failed = wp.where(worth > 0, 0, slot_at(scratch.slots, FAILED) - worth)
+                failed = wp.where(worth, 0, slot_at(scratch.slots, FAILED) + 1)
                 if failed == IN_A_ROW:  # after the pause one more that fails is enough for the next
                     failed = failed - 1
                     put_slot(scratch.slots, PAUSED, PAUSE)
