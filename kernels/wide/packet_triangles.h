@@ -30,12 +30,13 @@
         if (m == 0) continue;
         found |= m;
         const RayInts on = IN(m);
-        const Rays best_u = row(U), best_v = row(V);
         row(T) = on ? (any_hit ? -inf : at) : best;
-        row(U) = on ? NARROW(w_1 / area) : best_u;
-        row(V) = on ? NARROW(w_2 / area) : best_v;
         int_row(PRIM_ID) = on ? id : best_id;
         if (any_hit && (mask &= ~m) == 0) break;
+        if (any_hit) continue;
+        const Rays best_u = row(U), best_v = row(V);
+        row(U) = on ? NARROW(w_1 / area) : best_u;
+        row(V) = on ? NARROW(w_2 / area) : best_v;
     }
     return found;
     };
