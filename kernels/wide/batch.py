@@ -15,14 +15,12 @@ from wrt.kernels.memory import put_number
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect
-from wrt.kernels.traverse.stack import key_of, reference_of, t_of
+from wrt.kernels.traverse.stack import reference_of, t_of
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
-from wrt.kernels.wide.nodes import ROW_PADS, far_pad, first_reference, node_size
+from wrt.kernels.wide.nodes import ROW_PADS, far_pad, node_size
 from wrt.kernels.wide.packets import (
     AXIS_BITS,
-    CHILD_ENTRY,
-    CHILD_RAYS,
     COHERENT,
     LANES,
     PACKET_SIZE,
@@ -34,19 +32,17 @@ from wrt.kernels.wide.packets import (
     TO_POP,
     WIDTH,
     Scratch,
-    children,
     count_of,
     cull,
     key_at,
     lowest_of_all,
+    make_children,
     make_set_up,
     make_steps,
-    mask_at,
     meets,
-    move_entry,
     put_bits,
-    put_entry,
     put_slot,
+    rays_at,
     reaching,
     slot_at,
     triangles,
@@ -55,7 +51,6 @@ from wrt.kernels.wide.packets import (
 )
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.kernels.wide.traverse import (
-    STACK_SIZE,
     WideTraversal,
     make_call_in,
     make_gather,
@@ -64,7 +59,6 @@ from wrt.kernels.wide.traverse import (
 )
 
 NODE = node_size(WIDTH, False)
-REFERENCES = first_reference(WIDTH, False)
 PRIM_ID = WIDTH * (size_of(Primitive) // 4 - 1)  # where a row has its primitives' numbers
 PACKETS = 4  # set up at a time
 SLOTS = 16  # rays under way at a time
@@ -76,9 +70,6 @@ IN_A_ROW, PAUSE = 4, 32
 FAILED = SLOT_SIZE * SLOTS  # where Scratch.slots counts the packets in a row that fell apart
 PAUSED = FAILED + 1  # and those that are left until one is tried again
 ANY_REFUSED = PAUSED + 1  # where it says whether a query refuses one of the rays: the last number of `slots`
-
-# A packet leaves as many entries as a ray alone, but the nearest child is on the stack as well, before it is taken from there.
-ENTRIES = STACK_SIZE + 1
 
 
 @wp.func
@@ -158,7 +149,7 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -
     """A packet with a beam, from the root. test_row: make_leaf_test."""
     struct = make_struct(units.triangle_test.record)
     size_of_row = row_size(units.triangle_test.record, WIDTH)
-    call_in = make_call_in(units.triangle_test.record, WIDTH, False, LINES)
+    children = make_children(any_hit, size_of_row, LINES)
 
     @wp.func
     def test_leaf(accel: struct, surfaces: Surfaces, reference: int, mask: int, packet: wp.array(dtype=wp.float32), base: int):
@@ -200,26 +191,11 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -
             else:
                 nodes += 1
                 visits += count_of(mask)
-                first = reference * NODE
-                met = children(accel.nodes, first, mask, packet, base)
-                under = size
-                while met != 0:
-                    lane = lowest(met)
-                    met = met & (met - 1)
-                    child = bits(accel.nodes, first + REFERENCES + lane)
-                    call_in(accel.nodes, accel.primitives, child)
-                    key = key_of(number(packet, base + CHILD_ENTRY + lane), child)
-                    at = size
-                    if wp.static(not any_hit):  # sorted, the farthest deepest
-                        while at > under and key_at(stacks, at - 1) < key:
-                            move_entry(stacks, at - 1, at)
-                            at = at - 1
-                    put_entry(stacks, at, key, bits(packet, base + CHILD_RAYS + lane))
-                    size = size + 1
+                size = children(accel.nodes, accel.primitives, reference * NODE, mask, packet, base, stacks, size)
             mask = int(0)
             while size > 0 and mask == 0:
                 size = size - 1
-                mask = mask_at(stacks, size) & reaching(t_of(key_at(stacks, size)), packet, base)
+                mask = rays_at(stacks, size) & reaching(t_of(key_at(stacks, size)), packet, base)
             if mask == 0:
                 break
             reference = reference_of(key_at(stacks, size))

@@ -1,5 +1,6 @@
     float* const q = packet.data + (long long)base;
-    const float* const p = nodes.data + (long long)first;
+    const float *const all = nodes.data, *const p = all + (long long)first, *const rows = primitives.data;
+    unsigned* const stack = stacks.data;
     auto once = [=]() __attribute__((noinline)) {  // the compiler would copy it to where it is called
     #include "packet.h"
     #include "rows.h"
@@ -16,8 +17,7 @@
         const Row most = d > c ? d : c;
         beam_leave = most < beam_leave ? most : beam_leave;
     }
-    *(Row*)(q + CHILD_ENTRY) = beam_enter;
-    int left = ROW_MASK(beam_enter <= beam_leave), out = 0;
+    int left = ROW_MASK(beam_enter <= beam_leave), top = size;
     // Then the rays, for each child that the beam meets.
     #include "packet_rays.h"
     const float *near_x = p + WIDTH * near[0], *near_y = p + WIDTH * near[1], *near_z = p + WIDTH * near[2];
@@ -30,9 +30,22 @@
         Rays enter = t_min, leave = t_max;
         #include "slabs.h"
         const int met = RAY_MASK(enter <= leave) & mask;
-        ((int*)(q + CHILD_RAYS))[child] = met;
-        out |= (met != 0) << child;
+        if (!met) continue;
+        int next;
+        __builtin_memcpy(&next, p + REFERENCES + child, sizeof(next));
+        const float* const there = next < 0 ? rows + (long long)(~next >> LEAF_BITS) * ROW_SIZE : all + (long long)next * NODE_SIZE;
+        for (int k = 0; k < LINES; ++k) __builtin_prefetch(there + CACHE_LINE * k);
+        const float entry = beam_enter[child];  // of `beam_enter[child]` itself clang 22 casts the bits of element 0
+        const wp::uint64 key = (wp::uint64)__builtin_bit_cast(unsigned, entry) << 32 | (unsigned)next;
+        unsigned* at = stack + ENTRY * top++;
+#if !ANY_HIT
+        wp::uint64 below;  // the farthest is deepest
+        for (; at > stack + ENTRY * size && (__builtin_memcpy(&below, at - ENTRY, sizeof(below)), below < key); at -= ENTRY)
+            __builtin_memcpy(at, at - ENTRY, ENTRY * sizeof(unsigned));
+#endif
+        __builtin_memcpy(at, &key, sizeof(key));
+        at[ENTRY_RAYS] = met;
     }
-    return out;
+    return top;
     };
     return once();

@@ -14,7 +14,9 @@ from wrt.kernels.query import FARTHEST, LARGEST, LENGTHEN, LONGEST, SHORTEN, SHO
 from wrt.kernels.structs import NO_HIT, Primitive, size_of
 from wrt.kernels.units.box import FAR_PAD, PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST
 from wrt.kernels.units.triangle import CLAMP_ROUNDING, CLAMP_STEP, SLOWEST
+from wrt.kernels.wide.lanes import CACHE_LINE
 from wrt.kernels.wide.nodes import PLANES, first_reference, node_size
+from wrt.kernels.wide.references import LEAF_BITS
 from wrt.kernels.wide.traverse import STACK_SIZE
 
 WIDTH = 8  # children of a node, and triangles of a row
@@ -37,12 +39,13 @@ BEAM_WORDS = ("near_origin", "far_origin", "largest", "smallest", "far_largest",
 BEAM = {name: LANES * len(ROWS) + 3 * i for i, name in enumerate(BEAM_WORDS)}
 REFUSED = BEAM["t_min"] + 1
 
-# Then what `children` and `meets` find. CHILD_ENTRY: where the beam enters each child; CHILD_RAYS: the mask (int32) of the rays
-# that meet each; ROOT_ENTRIES: for each child a row of where the rays enter it, inf where they do not.
-CHILD_ENTRY = LANES * len(ROWS) + 3 * len(BEAM_WORDS)
-CHILD_RAYS = CHILD_ENTRY + WIDTH
-ROOT_ENTRIES = LANES * (CHILD_RAYS // LANES + 1)
+# Then what `meets` finds: for each child of the root a row of where the rays enter it, inf where they do not.
+ROOT_ENTRIES = LANES * (REFUSED // LANES + 1)
 PACKET_SIZE = ROOT_ENTRIES + WIDTH * LANES  # a multiple of 16: where the first row begins at a cache line, all rows do
+
+# An entry of a packet's stack: its key (traverse.stack.key_of), of two words; then the mask of the rays that go there (ENTRY_RAYS);
+# then nothing, so that an entry is moved at once. A packet has one entry more than a ray alone: the nearest child is one as well.
+ENTRY, ENTRY_RAYS = 4, 2
 
 # The stack of one ray is made of levels, one for each node on the way to where the ray is that has children still to come. A level
 # holds eight keys, where the node's references begin (LEVEL_REFERENCES), and the mask of the children to come (LEVEL_LEFT). A key
@@ -65,8 +68,9 @@ TO_POP = 1 << WIDTH
 
 LAYOUT = {
     "WIDTH": WIDTH, "LANES": LANES, "COHERENT": COHERENT, "AXIS_BITS": AXIS_BITS, "AXIS_MASK": (1 << AXIS_BITS) - 1,
-    "REFUSED": REFUSED, "CHILD_ENTRY": CHILD_ENTRY, "CHILD_RAYS": CHILD_RAYS, "ROOT_ENTRIES": ROOT_ENTRIES, "LEVEL": LEVEL,
-    "LEVEL_REFERENCES": LEVEL_REFERENCES, "LEVEL_LEFT": LEVEL_LEFT, "KEY_MASK": KEY_MASK, "TO_POP": TO_POP,
+    "REFUSED": REFUSED, "ROOT_ENTRIES": ROOT_ENTRIES, "ENTRY": ENTRY, "ENTRY_RAYS": ENTRY_RAYS, "LEAF_BITS": LEAF_BITS,
+    "CACHE_LINE": CACHE_LINE, "LEVEL": LEVEL, "LEVEL_REFERENCES": LEVEL_REFERENCES, "LEVEL_LEFT": LEVEL_LEFT,
+    "KEY_MASK": KEY_MASK, "TO_POP": TO_POP,
     "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
     "PRIM_ID_ROW": size_of(Primitive) // 4 - 1, "NO_HIT": NO_HIT,
     "LARGEST": LARGEST, "FARTHEST": FARTHEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
@@ -103,9 +107,17 @@ def make_set_up(rays_struct: Any) -> Any:
     return set_up
 
 
-@wp.func_native(source("wide/packet_children.h", **LAYOUT))
-def children(nodes: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32), base: int) -> int:
-    """The mask of the children of a node that rays of the mask meet: CHILD_ENTRY and CHILD_RAYS of these. Only with a beam."""
+@cache
+def make_children(any_hit: bool, row_size: int, lines: int) -> Any:
+    """row_size: of a row of primitives; lines: cache lines that are called in of what a child leads to."""
+
+    @wp.func_native(source("wide/packet_children.h", ANY_HIT=int(any_hit), ROW_SIZE=row_size, LINES=lines, **LAYOUT))
+    def children(nodes: wp.array(dtype=wp.float32), primitives: wp.array(dtype=wp.float32), first: int, mask: int,
+                 packet: wp.array(dtype=wp.float32), base: int, stacks: wp.array(dtype=wp.uint32), size: int) -> int:
+        """Put the children of a node that rays of the mask meet on a stack of `size` entries, the nearest last or, for any hit, as
+        they are in the node; the size it then has. Only with a beam."""
+
+    return children
 
 
 @wp.func_native(source("wide/packet_meets.h", **LAYOUT))
@@ -133,23 +145,14 @@ def write_occluded(occluded: wp.array(dtype=wp.bool), first: int, count: int, pa
                    base: int) -> None: ...
 
 
-# --- the stack of a packet: four words an entry, the key (traverse.stack.key_of) and the mask of the rays that go there ------
+@wp.func_native(f"wp::uint64 key; __builtin_memcpy(&key, stacks.data + {ENTRY} * i, sizeof(key)); return key;")
+def key_at(stacks: wp.array(dtype=wp.uint32), i: int) -> wp.uint64:
+    """The key of entry i of a packet's stack."""
 
 
-@wp.func_native("const int words[] = {(int)key, (int)(key >> 32), mask}; __builtin_memcpy(stacks.data + 4 * i, words, 12);")
-def put_entry(stacks: wp.array(dtype=wp.uint32), i: int, key: wp.uint64, mask: int) -> None: ...
-
-
-@wp.func_native("__builtin_memcpy(stacks.data + 4 * to, stacks.data + 4 * i, 16);")
-def move_entry(stacks: wp.array(dtype=wp.uint32), i: int, to: int) -> None: ...
-
-
-@wp.func_native("wp::uint64 key; __builtin_memcpy(&key, stacks.data + 4 * i, 8); return key;")
-def key_at(stacks: wp.array(dtype=wp.uint32), i: int) -> wp.uint64: ...
-
-
-@wp.func_native("return (int)stacks.data[4 * i + 2];")
-def mask_at(stacks: wp.array(dtype=wp.uint32), i: int) -> int: ...
+@wp.func_native(f"return (int)stacks.data[{ENTRY} * i + {ENTRY_RAYS}];")
+def rays_at(stacks: wp.array(dtype=wp.uint32), i: int) -> int:
+    """The mask of the rays of entry i."""
 
 
 # --- one ray of a packet, and its slot --------------------------------------------------------------------------------

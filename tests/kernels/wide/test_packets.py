@@ -16,9 +16,9 @@ from wrt.kernels.wide.batch import PACKETS, SLOTS
 from wrt.kernels.wide.lanes import LANE_PAD, make_plain_cull, row_type
 from wrt.kernels.wide.nodes import make_plain
 from wrt.kernels.wide.packets import (
-    CHILD_ENTRY,
-    CHILD_RAYS,
     COHERENT,
+    ENTRY,
+    ENTRY_RAYS,
     LANES,
     PACKET_SIZE,
     ROWS,
@@ -40,7 +40,8 @@ class Lanes:
 
     state: wp.array(dtype=wp.int32)
     meets: wp.array(dtype=wp.int32)
-    children: wp.array(dtype=wp.int32)
+    children: wp.array2d(dtype=wp.uint32)
+    children_any: wp.array2d(dtype=wp.uint32)
     reaching: wp.array(dtype=wp.int32)
     begun: wp.array(dtype=wp.int32)
     walk: wp.array2d(dtype=wp.int32)
@@ -52,6 +53,8 @@ class Lanes:
 
 
 set_up = packets.make_set_up(RayArrays)
+children, children_any = packets.make_children(False, 80, 5), packets.make_children(True, 80, 5)
+BELOW = wp.constant(2)  # entries that are on a stack before
 
 
 def make_walk(any_hit):
@@ -102,7 +105,10 @@ def by_packets(rays: RayArrays, count: int, reach: float, empty: int, nodes: wp.
     out.meets[i] = packets.meets(nodes, 64 * i, mask, packet, base)
     out.reaching[i] = packets.reaching(0.5, packet, base)
     if active >= COHERENT:
-        out.children[i] = packets.children(nodes, 64 * i, mask, packet, base)
+        size = children(nodes, rows, 64 * i, mask, packet, base, out.children[i], BELOW)
+        size_any = children_any(nodes, rows, 64 * i, mask, packet, base, out.children_any[i], BELOW)
+        out.children[i, 3] = wp.uint32(size)
+        out.children_any[i, 3] = wp.uint32(size_any)
     for j in range(LANES):
         ray = LANES * i + j
         walk(nodes, i, empty, packet, base + j, reach, stacks, slots, ray, out.begun, out.missed, out.walk)
@@ -194,16 +200,16 @@ class Both:
         never = np.full((1, WIDTH, 3), np.inf, np.float32)
         nodes, rows = floats(np.concatenate([nodes, plain_nodes(never, -never)]).reshape(-1)), floats(rows.reshape(-1))
         lanes = Lanes()
-        for name, length in (("state", n), ("meets", n), ("children", n), ("reaching", n), ("begun", n * LANES),
-                             ("begun_any", n * LANES), ("missed", n * LANES), ("missed_any", n * LANES),
-                             ("candidates", n * LANES), ("walk", (n * LANES, WIDTH + 1)),
-                             ("walk_any", (n * LANES, WIDTH + 1))):
+        for name, length in (("state", n), ("meets", n), ("reaching", n), ("begun", n * LANES), ("begun_any", n * LANES),
+                             ("missed", n * LANES), ("missed_any", n * LANES), ("candidates", n * LANES),
+                             ("walk", (n * LANES, WIDTH + 1)), ("walk_any", (n * LANES, WIDTH + 1))):
             setattr(lanes, name, zeros(length, wp.int32))
+        lanes.children, lanes.children_any = (zeros((n, ENTRY * (BELOW + WIDTH)), wp.uint32) for _ in range(2))
         packet, stacks = zeros(n * PACKET_SIZE), zeros(n * LANES * STACK_WORDS, wp.uint32)
         slots = zeros(n * LANES * SLOT_SIZE, wp.int32)
         launch(by_packets, n, self.rays, count, reach, n, nodes, rows, packet, stacks, slots, lanes)
-        self.state, self.meets, self.children, self.reaching = (
-            getattr(lanes, name).numpy() for name in ("state", "meets", "children", "reaching"))
+        self.state, self.meets, self.reaching = (getattr(lanes, name).numpy() for name in ("state", "meets", "reaching"))
+        self.stacks = [array.numpy().reshape(n, BELOW + WIDTH, ENTRY) for array in (lanes.children, lanes.children_any)]
         self.begun, self.walk, self.candidates = (getattr(lanes, name).numpy() for name in ("begun", "walk", "candidates"))
         self.begun_any, self.walk_any = lanes.begun_any.numpy(), lanes.walk_any.numpy()
         self.missed, self.missed_any = lanes.missed.numpy(), lanes.missed_any.numpy()
@@ -326,13 +332,21 @@ def test_a_beam_enters_what_one_of_its_rays_enters(name):
     entered = entered.astype(bool) & both.active[..., None]
     np.testing.assert_array_equal(both.meets[:, None] >> np.arange(LANES) & 1, entered.any(axis=2))
     coherent = both.state >= COHERENT
-    masks = both.set_up[:, CHILD_RAYS : CHILD_RAYS + WIDTH].view(np.int32)
-    met = (both.children[:, None] >> np.arange(WIDTH) & 1).astype(bool)
     expected = (entered << np.arange(LANES)[:, None]).sum(axis=1)
-    np.testing.assert_array_equal(met[coherent], (expected > 0)[coherent])
-    np.testing.assert_array_equal(np.where(met, masks, 0)[coherent], expected[coherent])
     first = np.where(entered, both.scalar.entries.numpy().reshape(-1, LANES, WIDTH), np.inf).min(axis=1)
-    assert (both.set_up[:, CHILD_ENTRY : CHILD_ENTRY + WIDTH] <= first)[coherent[:, None] & met].all()
+    for i in np.flatnonzero(coherent):
+        for stack, any_hit in zip(both.stacks, (False, True), strict=True):
+            size = stack[i, 0, 3]  # what `children` says, where no entry is
+            assert (stack[i, BELOW:size, ENTRY_RAYS] > 0).all()
+            assert not stack[i, :BELOW, :3].any() and not stack[i, size:].any()
+            references, begins = stack[i, BELOW:size, 0].view(np.int32), stack[i, BELOW:size, 1].view(np.float32)
+            child = np.searchsorted(CHILDREN, references)
+            np.testing.assert_array_equal(CHILDREN[child], references)
+            masks = np.zeros(WIDTH, int)
+            masks[child] = stack[i, BELOW:size, ENTRY_RAYS]
+            np.testing.assert_array_equal(masks, expected[i])
+            assert (begins <= first[i, child]).all()
+            assert (np.diff(child) > 0).all() if any_hit else (np.diff(begins) <= 0).all()
 
 
 def walked(both, reach=np.inf):
