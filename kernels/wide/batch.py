@@ -20,6 +20,7 @@ from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
 from wrt.kernels.wide.nodes import ROW_PADS, far_pad, node_size
 from wrt.kernels.wide.packets import (
+    ACTIVE,
     AXIS_BITS,
     COHERENT,
     LANES,
@@ -307,8 +308,12 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
             base = PACKET_SIZE * p
             count = wp.min(end - block - LANES * p, LANES)
             active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch.packets, base)
+            put_bits(scratch.packets, base + ACTIVE, active)
             if bits(scratch.packets, base + REFUSED) != 0:
                 put_slot(scratch.slots, ANY_REFUSED, 1)
+        for p in range(packets):
+            base = PACKET_SIZE * p
+            active = bits(scratch.packets, base + ACTIVE)
             paused = slot_at(scratch.slots, PAUSED)
             if active >= COHERENT and paused == 0:
                 worth = walk_packet(accel, surfaces, scratch.packets, base, active - COHERENT, scratch.stacks)

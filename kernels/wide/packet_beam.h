@@ -4,32 +4,27 @@
     // A lane without an active ray takes the numbers of one that has one.
     const int some = __builtin_ctz(active);
     const RayInts on = IN(active);
-    typedef float Eight __attribute__((ext_vector_type(8), aligned(4)));
-    typedef float Four __attribute__((ext_vector_type(4)));
-    auto lowest = [](Rays x) {
-        const Eight a = x.lo < x.hi ? x.lo : x.hi;
-        const Four b = a.lo < a.hi ? a.lo : a.hi;
-        const float c = b[0] < b[1] ? b[0] : b[1], d = b[2] < b[3] ? b[2] : b[3];
-        return c < d ? c : d;
+    #define OF_ACTIVE(x, k) (on ? (x) : (Rays)(q[(k) + some]))
+    const Rays b_x = OF_ACTIVE(o_x, ORIGIN_X), b_y = OF_ACTIVE(o_y, ORIGIN_Y), b_z = OF_ACTIVE(o_z, ORIGIN_Z);
+    const Rays r_x = OF_ACTIVE(i_x, INVERSE_X), r_y = OF_ACTIVE(i_y, INVERSE_Y), r_z = OF_ACTIVE(i_z, INVERSE_Z);
+    const Rays begin = OF_ACTIVE(t_min, T_MIN);
+    // The lesser of two neighbours, a's in the lower half and b's in the upper: four layers leave the least of each of sixteen rows.
+    // A greatest number is the least of the negative ones.
+    auto lesser = [](Rays a, Rays b) {
+        const Rays even = __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+        const Rays odd = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+        return even < odd ? even : odd;
     };
-    auto highest = [](Rays x) {
-        const Eight a = x.lo > x.hi ? x.lo : x.hi;
-        const Four b = a.lo > a.hi ? a.lo : a.hi;
-        const float c = b[0] > b[1] ? b[0] : b[1], d = b[2] > b[3] ? b[2] : b[3];
-        return c > d ? c : d;
-    };
-    const int negative[3] = {nx != 0, ny != 0, nz != 0};
-    for (int axis = 0; axis < 3; ++axis) {
-        const Rays o_some = q[ORIGIN_X + LANES * axis + some], i_some = q[INVERSE_X + LANES * axis + some];
-        const Rays o = on ? row(ORIGIN_X + LANES * axis) : o_some, i = on ? row(INVERSE_X + LANES * axis) : i_some;
-        const float o_low = lowest(o), o_high = highest(o), i_low = lowest(i), i_high = highest(i);
-        q[BEAM_NEAR_ORIGIN + axis] = negative[axis] ? o_low : o_high;
-        q[BEAM_FAR_ORIGIN + axis] = negative[axis] ? o_high : o_low;
-        q[BEAM_LARGEST + axis] = negative[axis] ? i_low : i_high;
-        q[BEAM_SMALLEST + axis] = negative[axis] ? i_high : i_low;
-        q[BEAM_FAR_LARGEST + axis] = pad * q[BEAM_LARGEST + axis];
-        q[BEAM_FAR_SMALLEST + axis] = pad * q[BEAM_SMALLEST + axis];
-        q[BEAM_NEAR_ROW + axis] = (float)(2 * axis + negative[axis]);
-    }
-    const Rays t_some = q[T_MIN + some];
-    q[BEAM_T_MIN] = lowest(on ? t_min : t_some);
+    auto lesser_of_4 = [=](Rays a, Rays b, Rays c, Rays d) { return lesser(lesser(a, b), lesser(c, d)); };
+    const Rays least = lesser(lesser(lesser_of_4(b_x, b_y, b_z, -b_x), lesser_of_4(-b_y, -b_z, r_x, r_y)),
+                              lesser(lesser_of_4(r_z, -r_x, -r_y, -r_z), lesser_of_4(begin, begin, begin, begin)));
+    // The least origins, the greatest ones, the least reciprocals, the greatest; or of an axis where rays run down, the other way
+    // round: in order those to near planes, to far planes, the largest reciprocals in magnitude, the smallest.
+    const Rays ends = __builtin_shufflevector(least, -least, 0, 1, 2, 19, 20, 21, 6, 7, 8, 25, 26, 27, 12, 13, 14, 15);
+    const Rays other_ends = __builtin_shufflevector(ends, ends, 3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8, 12, 13, 14, 15);
+    const RayInts down = {nx, ny, nz, nx, ny, nz, nx, ny, nz, nx, ny, nz};
+    const Rays beam = down != 0 ? ends : other_ends, far = pad * beam;
+    for (int k = 0; k < 12; ++k) q[BEAM_NEAR_ORIGIN + k] = beam[k];
+    for (int k = 0; k < 6; ++k) q[BEAM_FAR_LARGEST + k] = far[6 + k];
+    q[BEAM_NEAR_ROW] = nx != 0; q[BEAM_NEAR_ROW + 1] = 2 + (ny != 0); q[BEAM_NEAR_ROW + 2] = 4 + (nz != 0);
+    q[BEAM_T_MIN] = least[12];

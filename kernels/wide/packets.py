@@ -33,14 +33,15 @@ AXIS_BITS = 2
 
 # Then the beam: intervals that hold the origins and the reciprocals of all its rays. Each word is there for x, y and z: the origin
 # that is closest to the near planes, and to the far planes; the reciprocal of the largest magnitude, and of the smallest; the same
-# two for far planes; and which plane of a node is near (as a float). One word more: the lowest t_min. And one that is not the
-# beam's, REFUSED: the mask of rays whose numbers a query refuses (wrt.accel.rays).
+# two for far planes; and which plane of a node is near (as a float). One word more: the lowest t_min. And two that are not the
+# beam's. REFUSED: the mask of rays whose numbers a query refuses (wrt.accel.rays); ACTIVE: what set_up says.
 BEAM_WORDS = ("near_origin", "far_origin", "largest", "smallest", "far_largest", "far_smallest", "near_row", "t_min")
 BEAM = {name: LANES * len(ROWS) + 3 * i for i, name in enumerate(BEAM_WORDS)}
 REFUSED = BEAM["t_min"] + 1
+ACTIVE = REFUSED + 1
 
 # Then what `meets` finds: for each child of the root a row of where the rays enter it, inf where they do not.
-ROOT_ENTRIES = LANES * (REFUSED // LANES + 1)
+ROOT_ENTRIES = LANES * (ACTIVE // LANES + 1)
 PACKET_SIZE = ROOT_ENTRIES + WIDTH * LANES  # a multiple of 16: where the first row begins at a cache line, all rows do
 
 # An entry of a packet's stack: its key (traverse.stack.key_of), of two words; then the mask of the rays that go there (ENTRY_RAYS);
