@@ -30,7 +30,6 @@ from wrt.kernels.wide.packets import (
     SLOT,
     SLOT_SIZE,
     STACK_WORDS,
-    TO_POP,
     WIDTH,
     Scratch,
     count_of,
@@ -38,6 +37,7 @@ from wrt.kernels.wide.packets import (
     key_at,
     lowest_of_all,
     make_children,
+    make_ray_triangles,
     make_set_up,
     make_steps,
     meets,
@@ -110,14 +110,24 @@ def best_at(packet: wp.array(dtype=wp.float32), ray: int) -> Hit:
     return best
 
 
-def make_leaf_test(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The triangles of a row that are in a mask against one ray of a packet; whether the ray has found what it asks for."""
+@wp.func
+def holds_sphere(rows: wp.array(dtype=wp.float32), first: int, count: int, n_triangles: int) -> bool:
+    """Whether one of a row's primitives is no triangle."""
+    for j in range(count):
+        if bits(rows, first + wp.static(PRIM_ID) + j) >= n_triangles:
+            return True
+    return False
+
+
+def make_row_test(units: Units, any_hit: bool, accepts: Any = None) -> Any:
+    """The first `count` primitives of a row against one ray of a packet; whether the ray has found what it asks for."""
+    ray_triangles = make_ray_triangles(any_hit)
     gather = make_gather(units.triangle_test.record, WIDTH)
     intersect = make_intersect(units, accepts)
 
     @wp.func
-    def test_row(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces, packet: wp.array(dtype=wp.float32),
-                 ray: int) -> bool:
+    def one_by_one(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces, packet: wp.array(dtype=wp.float32),
+                   ray: int) -> bool:
         probe = probe_at(packet, ray)
         best = best_at(packet, ray)
         while mask != 0:
@@ -134,20 +144,25 @@ def make_leaf_test(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         put_bits(packet, ray + wp.static(ROW["prim_id"]), best.prim_id)
         return wp.static(any_hit) and best.prim_id != NO_HIT
 
+    @wp.func
+    def test_row(rows: wp.array(dtype=wp.float32), first: int, count: int, surfaces: Surfaces, packet: wp.array(dtype=wp.float32),
+                 ray: int) -> bool:
+        mask = (2 << (count - 1)) - 1
+        lanes = bool(wp.static(accepts is None))
+        if wp.static(units.spheres):
+            lanes = lanes and not holds_sphere(rows, first, count, surfaces.n_triangles)
+        if lanes:
+            return ray_triangles(rows, first, mask, packet, ray)
+        mask = cull(rows, first, mask, packet, ray)
+        if mask == 0:
+            return False
+        return one_by_one(rows, first, mask, surfaces, packet, ray)
+
     return test_row
 
 
-@wp.func
-def holds_sphere(rows: wp.array(dtype=wp.float32), first: int, count: int, n_triangles: int) -> bool:
-    """Whether one of a row's primitives is no triangle."""
-    for j in range(count):
-        if bits(rows, first + wp.static(PRIM_ID) + j) >= n_triangles:
-            return True
-    return False
-
-
 def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -> Any:
-    """A packet with a beam, from the root. test_row: make_leaf_test."""
+    """A packet with a beam, from the root. test_row: make_row_test."""
     struct = make_struct(units.triangle_test.record)
     size_of_row = row_size(units.triangle_test.record, WIDTH)
     children = make_children(any_hit, size_of_row, LINES)
@@ -170,10 +185,8 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any, test_row: Any) -
                 while rays != 0:
                     lane = lowest(rays)
                     rays = rays & (rays - 1)
-                    candidates = cull(accel.primitives, first, (2 << (n - 1)) - 1, packet, base + lane)
-                    if candidates != 0:
-                        if test_row(accel.primitives, first, candidates, surfaces, packet, base + lane):
-                            mask = mask & ~(1 << lane)
+                    if test_row(accel.primitives, first, n, surfaces, packet, base + lane):
+                        mask = mask & ~(1 << lane)
             left = left - WIDTH
             first = first + wp.static(size_of_row)
 
@@ -220,40 +233,23 @@ def make_interleaved(units: Units, any_hit: bool, test_row: Any) -> Any:
         call_in(accel.nodes, accel.primitives, next)
 
     @wp.func
-    def cull_row(accel: struct, scratch: Scratch, words: int, ray: int, first: int, n: int):
-        """Note the triangles of a leaf's next row that are to be tested; n: triangles of the leaf that are left."""
-        candidates = cull(accel.primitives, first, (2 << (wp.min(n, WIDTH) - 1)) - 1, scratch.packets, ray)
-        put_slot(scratch.slots, words + wp.static(SLOT["pending"]), candidates | TO_POP)
-        put_slot(scratch.slots, words + wp.static(SLOT["row"]), first)
-        put_slot(scratch.slots, words + wp.static(SLOT["left"]), n - WIDTH)
-
-    @wp.func
     def turn(accel: struct, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
-        """One node, one row of triangles, or what is left to do after them; False where the ray is done."""
+        """A node or a leaf, and on to what is next; False where the ray is done."""
         words = slot * SLOT_SIZE
-        ray = slot_at(scratch.slots, words + wp.static(SLOT["ray"]))
-        pending = slot_at(scratch.slots, words + wp.static(SLOT["pending"]))
-        if pending != 0:
-            row = slot_at(scratch.slots, words + wp.static(SLOT["row"]))
-            if pending != TO_POP:
-                if test_row(accel.primitives, row, pending & (TO_POP - 1), surfaces, scratch.packets, ray):
-                    return False
-            left = slot_at(scratch.slots, words + wp.static(SLOT["left"]))
-            if left > 0:
-                cull_row(accel, scratch, words, ray, row + wp.static(size_of_row), left)
-                return True
-            t = number(scratch.packets, ray + wp.static(ROW["t"]))
-            put_slot(scratch.slots, words + wp.static(SLOT["pending"]), 0)
-            next = pop(accel.nodes, t, scratch.stacks, slot * STACK_WORDS, scratch.slots, words)
-            if next == EMPTY:
-                return False
-            call_in(accel.nodes, accel.primitives, next)
-            return True
         reference = slot_at(scratch.slots, words + wp.static(SLOT["next"]))
         if reference < 0:
-            cull_row(accel, scratch, words, ray, leaf_first(reference) * wp.static(size_of_row), leaf_count(reference))
-            return True
-        next = step(accel.nodes, scratch.packets, scratch.stacks, slot * STACK_WORDS, scratch.slots, words)
+            ray = slot_at(scratch.slots, words + wp.static(SLOT["ray"]))
+            left = leaf_count(reference)
+            first = leaf_first(reference) * wp.static(size_of_row)
+            while left > 0:
+                if test_row(accel.primitives, first, wp.min(left, WIDTH), surfaces, scratch.packets, ray):
+                    return False
+                left = left - WIDTH
+                first = first + wp.static(size_of_row)
+            next = pop(accel.nodes, number(scratch.packets, ray + wp.static(ROW["t"])), scratch.stacks, slot * STACK_WORDS,
+                       scratch.slots, words)
+        else:
+            next = step(accel.nodes, scratch.packets, scratch.stacks, slot * STACK_WORDS, scratch.slots, words)
         if next == EMPTY:
             return False
         call_in(accel.nodes, accel.primitives, next)
@@ -288,7 +284,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
     """Rays first .. end - 1, a block of PACKETS packets a thread, one thread after another in the same scratch. out:
     HitArrays, or for any hit an array of bool. Arrays must have no gaps."""
     struct = make_struct(units.triangle_test.record)
-    test_row = make_leaf_test(units, any_hit, accepts)
+    test_row = make_row_test(units, any_hit, accepts)
     walk_packet = make_packet_walk(units, any_hit, accepts, test_row)
     interleaved = make_interleaved(units, any_hit, test_row)
     set_up = make_set_up(rays_struct)

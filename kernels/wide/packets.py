@@ -188,6 +188,16 @@ def make_steps(any_hit: bool) -> Steps:
     return Steps(begin, step, pop)
 
 
+@cache
+def make_ray_triangles(any_hit: bool) -> Any:
+    @wp.func_native(source("wide/ray_triangles.h", ANY_HIT=int(any_hit), **LAYOUT))
+    def ray_triangles(rows: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32),
+                      ray: int) -> bool:
+        """The triangles of a row that are in the mask against one ray of a packet; whether it has found what it asks for."""
+
+    return ray_triangles
+
+
 @wp.func_native(source("wide/ray_cull.h", **LAYOUT))
 def cull(rows: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32), ray: int) -> int:
     """As lanes.make_cull."""
