@@ -59,19 +59,16 @@ KEY_MASK = 2 * WIDTH - 1
 # A level is added for a node with two or more children that are met, for which a single ray's walk has an entry on its stack.
 STACK_WORDS = LEVEL * (STACK_SIZE + 2)
 
-# A slot is where one ray is under way. ray: its column in `packets`; next: the reference to go to; place: its last level; pending:
-# what comes before that, a mask of triangles to test (whose row begins at `row`), and TO_POP; left: triangles of its leaf in the
-# rows after that one.
-SLOT_WORDS = ("ray", "next", "place", "pending", "row", "left")
+# A slot is where one ray is under way. ray: its column in `packets`; next: the reference to go to; place: its last level.
+SLOT_WORDS = ("ray", "next", "place")
 SLOT = {name: i for i, name in enumerate(SLOT_WORDS)}
-SLOT_SIZE = 8
-TO_POP = 1 << WIDTH
+SLOT_SIZE = 4
 
 LAYOUT = {
     "WIDTH": WIDTH, "LANES": LANES, "COHERENT": COHERENT, "AXIS_BITS": AXIS_BITS, "AXIS_MASK": (1 << AXIS_BITS) - 1,
     "REFUSED": REFUSED, "ROOT_ENTRIES": ROOT_ENTRIES, "ENTRY": ENTRY, "ENTRY_RAYS": ENTRY_RAYS, "LEAF_BITS": LEAF_BITS,
     "CACHE_LINE": CACHE_LINE, "LEVEL": LEVEL, "LEVEL_REFERENCES": LEVEL_REFERENCES, "LEVEL_LEFT": LEVEL_LEFT,
-    "KEY_MASK": KEY_MASK, "TO_POP": TO_POP,
+    "KEY_MASK": KEY_MASK,
     "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
     "PRIM_ID_ROW": size_of(Primitive) // 4 - 1, "NO_HIT": NO_HIT,
     "LARGEST": LARGEST, "FARTHEST": FARTHEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
@@ -189,8 +186,10 @@ def make_steps(any_hit: bool) -> Steps:
 
 
 @cache
-def make_ray_triangles(any_hit: bool) -> Any:
-    @wp.func_native(source("wide/ray_triangles.h", ANY_HIT=int(any_hit), **LAYOUT))
+def make_ray_triangles(any_hit: bool, inlined: bool) -> Any:
+    called = "" if inlined else "__attribute__((noinline))"
+
+    @wp.func_native(source("wide/ray_triangles.h", ANY_HIT=int(any_hit), CALLED=called, **LAYOUT))
     def ray_triangles(rows: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32),
                       ray: int) -> bool:
         """The triangles of a row that are in the mask against one ray of a packet; whether it has found what it asks for."""

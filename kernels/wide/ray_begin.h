@@ -8,5 +8,4 @@
     const auto met = enter < (Row)(reach);
     words[SLOT_RAY] = ray;
     words[SLOT_PLACE] = bottom;
-    words[SLOT_PENDING] = 0;
     #include "ray_push.h"

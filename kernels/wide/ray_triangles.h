@@ -1,6 +1,6 @@
     float* const q = packet.data + (long long)ray;
     const float* const p = rows.data + (long long)first;
-    auto once = [=]() __attribute__((noinline)) {  // the compiler would copy it to where it is called
+    auto once = [=]() CALLED {
     #include "rows.h"
     typedef Row Lanes;
     typedef int LaneInts __attribute__((ext_vector_type(WIDTH), aligned(4)));
@@ -30,7 +30,7 @@
         const int k = __builtin_ctz(ties), own = id[k];
         if (own <= least) { least = own; j = k; }
     }
-    q[T] = nearest;
+    q[T] = at[j];  // 0 and -0 are equal: not `nearest`
     const double whole = area[j], part_1 = w_1[j], part_2 = w_2[j];
     q[U] = (float)(part_1 / whole);
     q[V] = (float)(part_2 / whole);
