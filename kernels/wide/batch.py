@@ -119,15 +119,24 @@ def holds_sphere(rows: wp.array(dtype=wp.float32), first: int, count: int, n_tri
     return False
 
 
+@wp.func
+def put_best(packet: wp.array(dtype=wp.float32), ray: int, best: Hit):
+    put_number(packet, ray + wp.static(ROW["t"]), best.t)
+    put_number(packet, ray + wp.static(ROW["u"]), best.u)
+    put_number(packet, ray + wp.static(ROW["v"]), best.v)
+    put_bits(packet, ray + wp.static(ROW["prim_id"]), best.prim_id)
+
+
 def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> Any:
     """The first `count` primitives of a row against one ray of a packet; whether the ray has found what it asks for."""
-    ray_triangles = make_ray_triangles(any_hit, inlined)
+    ray_triangles = make_ray_triangles(any_hit and accepts is None, inlined)
     gather = make_gather(units.triangle_test.record, WIDTH)
     intersect = make_intersect(units, accepts)
 
     @wp.func
     def one_by_one(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces, packet: wp.array(dtype=wp.float32),
                    ray: int) -> bool:
+        mask = cull(rows, first, mask, packet, ray)
         probe = probe_at(packet, ray)
         best = best_at(packet, ray)
         while mask != 0:
@@ -135,28 +144,41 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
             mask = mask & (mask - 1)
             if wp.static(any_hit):
                 mask = wp.where(best.prim_id != NO_HIT, 0, mask)
-        t = best.t
+        found = bool(best.prim_id != NO_HIT)
         if wp.static(any_hit):
-            t = wp.where(best.prim_id != NO_HIT, -float(wp.inf), t)  # nothing else is reached
-        put_number(packet, ray + wp.static(ROW["t"]), t)
-        put_number(packet, ray + wp.static(ROW["u"]), best.u)
-        put_number(packet, ray + wp.static(ROW["v"]), best.v)
-        put_bits(packet, ray + wp.static(ROW["prim_id"]), best.prim_id)
-        return wp.static(any_hit) and best.prim_id != NO_HIT
+            best.t = wp.where(found, -float(wp.inf), best.t)  # nothing else is reached
+        put_best(packet, ray, best)
+        return wp.static(any_hit) and found
+
+    @wp.func
+    def nearest_accepted(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces,
+                         packet: wp.array(dtype=wp.float32), ray: int) -> bool:
+        """The nearest triangle that is hit, until one is accepted."""
+        before = best_at(packet, ray)
+        while True:
+            lane = ray_triangles(rows, first, mask, packet, ray)
+            if lane < 0:
+                return False
+            hit = best_at(packet, ray)
+            if accepts(surfaces, hit.prim_id, hit.u, hit.v):
+                break
+            put_best(packet, ray, before)
+            mask = mask & ~(1 << lane)
+        if wp.static(any_hit):
+            put_number(packet, ray + wp.static(ROW["t"]), -float(wp.inf))
+        return wp.static(any_hit)
 
     @wp.func
     def test_row(rows: wp.array(dtype=wp.float32), first: int, count: int, surfaces: Surfaces, packet: wp.array(dtype=wp.float32),
                  ray: int) -> bool:
         mask = (2 << (count - 1)) - 1
-        lanes = bool(wp.static(accepts is None))
         if wp.static(units.spheres):
-            lanes = lanes and not holds_sphere(rows, first, count, surfaces.n_triangles)
-        if lanes:
-            return ray_triangles(rows, first, mask, packet, ray)
-        mask = cull(rows, first, mask, packet, ray)
-        if mask == 0:
-            return False
-        return one_by_one(rows, first, mask, surfaces, packet, ray)
+            if holds_sphere(rows, first, count, surfaces.n_triangles):
+                return one_by_one(rows, first, mask, surfaces, packet, ray)
+        if wp.static(accepts is None):
+            return ray_triangles(rows, first, mask, packet, ray) >= 0 and wp.static(any_hit)
+        else:
+            return nearest_accepted(rows, first, mask, surfaces, packet, ray)
 
     return test_row
 

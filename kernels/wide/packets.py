@@ -191,8 +191,9 @@ def make_ray_triangles(any_hit: bool, inlined: bool) -> Any:
 
     @wp.func_native(source("wide/ray_triangles.h", ANY_HIT=int(any_hit), CALLED=called, **LAYOUT))
     def ray_triangles(rows: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32),
-                      ray: int) -> bool:
-        """The triangles of a row that are in the mask against one ray of a packet; whether it has found what it asks for."""
+                      ray: int) -> int:
+        """The nearest of a row's triangles in the mask that one ray of a packet hits, in its column: its lane, or -1. For any hit
+        0, whichever it is, and no u and v."""
 
     return ray_triangles
 

@@ -10,7 +10,7 @@
     #define IN(mask) ((((mask) >> lane) & 1) != 0)
     #define RAY(k) q[k]
     #define RAY_INT(k) ((const int*)q)[k]
-    #define MISSED return false
+    #define MISSED return -1
     #define CORNER(i, axis) (*(const Row*)(p + WIDTH * (3 * (i) + (axis))))
     const int axes = RAY_INT(AXES), kx = axes & AXIS_MASK, ky = axes >> AXIS_BITS & AXIS_MASK, kz = axes >> 2 * AXIS_BITS;
     const float o_x = q[TURNED_X], o_y = q[TURNED_Y], o_z = q[TURNED_Z], s_x = q[SHEAR_X], s_y = q[SHEAR_Y], inf = __builtin_inff();
@@ -21,7 +21,7 @@
 #if ANY_HIT
     q[T] = -inf;
     ((int*)q)[PRIM_ID] = 0;
-    return true;
+    return 0;
 #else
     const Row t = IN(m) ? at : (Row)(inf);
     const float nearest = __builtin_reduce_min(t);
@@ -35,7 +35,7 @@
     q[U] = (float)(part_1 / whole);
     q[V] = (float)(part_2 / whole);
     ((int*)q)[PRIM_ID] = least;
-    return false;
+    return j;
 #endif
     };
     return once();
