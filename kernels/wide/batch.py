@@ -13,7 +13,7 @@ import warp as wp
 
 from wrt.kernels.memory import put_number
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel, size_of
+from wrt.kernels.structs import NO_HIT, Hit, Surfaces, kernel
 from wrt.kernels.traverse.common import Probe, Units, make_intersect
 from wrt.kernels.traverse.stack import reference_of, t_of
 from wrt.kernels.wide.lanes import bits, lowest
@@ -34,6 +34,7 @@ from wrt.kernels.wide.packets import (
     Scratch,
     count_of,
     cull,
+    holds_sphere,
     key_at,
     lowest_of_all,
     make_children,
@@ -60,7 +61,6 @@ from wrt.kernels.wide.traverse import (
 )
 
 NODE = node_size(WIDTH, False)
-PRIM_ID = WIDTH * (size_of(Primitive) // 4 - 1)  # where a row has its primitives' numbers
 PACKETS = 4  # set up at a time
 SLOTS = 16  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
@@ -108,15 +108,6 @@ def best_at(packet: wp.array(dtype=wp.float32), ray: int) -> Hit:
     best.v = number(packet, ray + wp.static(ROW["v"]))
     best.prim_id = bits(packet, ray + wp.static(ROW["prim_id"]))
     return best
-
-
-@wp.func
-def holds_sphere(rows: wp.array(dtype=wp.float32), first: int, count: int, n_triangles: int) -> bool:
-    """Whether one of a row's primitives is no triangle."""
-    for j in range(count):
-        if bits(rows, first + wp.static(PRIM_ID) + j) >= n_triangles:
-            return True
-    return False
 
 
 @wp.func
@@ -173,7 +164,7 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
                  ray: int) -> bool:
         mask = (2 << (count - 1)) - 1
         if wp.static(units.spheres):
-            if holds_sphere(rows, first, count, surfaces.n_triangles):
+            if holds_sphere(rows, first, mask, surfaces.n_triangles):
                 return one_by_one(rows, first, mask, surfaces, packet, ray)
         if wp.static(accepts is None):
             return ray_triangles(rows, first, mask, packet, ray) >= 0 and wp.static(any_hit)
@@ -198,7 +189,7 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             n = wp.min(left, WIDTH)
             lanes = bool(wp.static(accepts is None) and count_of(mask) > FEW)
             if wp.static(units.spheres):
-                lanes = lanes and not holds_sphere(accel.primitives, first, n, surfaces.n_triangles)
+                lanes = lanes and not holds_sphere(accel.primitives, first, (2 << (n - 1)) - 1, surfaces.n_triangles)
             if lanes:
                 found = triangles(accel.primitives, first, n, mask, any_hit, packet, base)
                 if wp.static(any_hit):

@@ -185,6 +185,11 @@ def make_steps(any_hit: bool) -> Steps:
     return Steps(begin, step, pop)
 
 
+@wp.func_native(source("wide/row_holds_sphere.h", **LAYOUT))
+def holds_sphere(rows: wp.array(dtype=wp.float32), first: int, mask: int, n_triangles: int) -> bool:
+    """Whether one of a row's primitives in the mask is no triangle."""
+
+
 @cache
 def make_ray_triangles(any_hit: bool, inlined: bool) -> Any:
     called = "" if inlined else "__attribute__((noinline))"

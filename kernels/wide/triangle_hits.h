@@ -3,7 +3,8 @@
         // a row of the packet, of all rays or of the one; v: corners; id: primitives. Leaves `m`: those of `mask` that hit at or before
         // T; where they do, `at`; and what u and v are made of.
         #include "edges.h"
-        int m = MASK(~outside) & mask;
+        const LaneInts exclude = RAY_INT(EXCLUDE);
+        int m = MASK(~outside & (id + 1 != exclude)) & mask;  // a ray's own triangle here, as it is at its origin
         if (m == 0) MISSED;
         #define WIDE(x) __builtin_convertvector(x, Doubles)
         #define NARROW(x) __builtin_convertvector(x, Lanes)
@@ -14,7 +15,7 @@
         const Lanes shear_z = RAY(SHEAR_Z), best = RAY(T);
         Lanes at = NARROW((w_0 * WIDE(a_z) + w_1 * WIDE(b_z) + w_2 * WIDE(c_z)) / area * WIDE(shear_z));
         #include "within_bounds.h"
-        const LaneInts best_id = RAY_INT(PRIM_ID), exclude = RAY_INT(EXCLUDE);
+        const LaneInts best_id = RAY_INT(PRIM_ID);
         m &= MASK((__builtin_elementwise_abs(at) < inf) & (at >= (Lanes)RAY(T_MIN)) & (at <= best));
-        m &= MASK(~((at == best) & (id > best_id)) & (id + 1 != exclude));
+        m &= MASK(~((at == best) & (id > best_id)));
         if (m == 0) MISSED;
