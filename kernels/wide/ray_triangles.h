@@ -23,18 +23,16 @@
     ((int*)q)[PRIM_ID] = 0;
     return 0;
 #else
-    const Row t = IN(m) ? at : (Row)(inf);
-    const float nearest = __builtin_reduce_min(t);
-    int j = 0, least = NO_HIT;
-    for (int ties = ROW_MASK(t == nearest) & m; ties; ties &= ties - 1) {
-        const int k = __builtin_ctz(ties), own = id[k];
-        if (own <= least) { least = own; j = k; }
+    int j = __builtin_ctz(m);
+    for (int others = m & (m - 1); others; others &= others - 1) {
+        const int k = __builtin_ctz(others);
+        if (at[k] < at[j] || (at[k] == at[j] && id[k] < id[j])) j = k;
     }
-    q[T] = at[j];  // 0 and -0 are equal: not `nearest`
+    q[T] = at[j];
     const double whole = area[j], part_1 = w_1[j], part_2 = w_2[j];
     q[U] = (float)(part_1 / whole);
     q[V] = (float)(part_2 / whole);
-    ((int*)q)[PRIM_ID] = least;
+    ((int*)q)[PRIM_ID] = id[j];
     return j;
 #endif
     };
