@@ -62,7 +62,7 @@ from wrt.kernels.wide.traverse import (
 
 NODE = node_size(WIDTH, False)
 PACKETS = 4  # set up at a time
-SLOTS = 16  # rays under way at a time
+SLOTS = 24  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
 LINES = 5  # cache lines that are called in of what is next: a row of triangles has 5, a node 4, and a branch would cost more
 WORTH = 3  # rays that come to a node together, on average, from which on a packet takes less time than its rays alone

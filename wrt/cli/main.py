@@ -52,7 +52,7 @@ from wrt.core.interrupts import Interrupted, exit_code, raise_on_termination
 from wrt.io.meshes import SUFFIXES
 from wrt.lab.plans import WhatIf
 
-GARBAGE_AT = 250_000  # new objects before Python looks for garbage: a start makes 200,000, and all of them stay
+GARBAGE_AT = 500_000  # new objects before Python looks for garbage: a start makes 300,000, and all of them stay
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
