@@ -71,17 +71,46 @@ def make_probe(units: Units) -> Any:
     return probe_of
 
 
-def make_intersect(units: Units, accepts: Any = None) -> Any:
-    """The unit that tests one primitive and keeps the better hit.
+def make_better(units: Units, accepts: Any = None) -> Any:
+    """The unit that keeps the better of two hits.
 
     accepts(surfaces, prim_id, u, v) -> bool may refuse a hit (cut-outs); None takes all.
     """
+
+    @wp.func
+    def better(ray: Ray, surfaces: Surfaces, hit: Hit, prim_id: int, best: Hit) -> Hit:
+        """The closer of `best` and a primitive's hit (prim_id: NO_HIT where there is none) in [t_min, best.t]; at equal t the lower
+        prim_id."""
+        if hit.prim_id == NO_HIT or not (hit.t >= ray.t_min and hit.t <= best.t):
+            return best
+        if hit.t == best.t and prim_id > best.prim_id:
+            return best
+        if wp.static(units.resumes):
+            if hit.t == ray.t_min and prim_id < ray.slot:
+                return best
+        if wp.static(accepts is not None):
+            if not accepts(surfaces, prim_id, hit.u, hit.v):
+                return best
+        hit.prim_id = prim_id
+        return hit
+
+    return better
+
+
+@wp.func
+def sphere_hit(probe: Probe, surfaces: Surfaces, prim_id: int) -> Hit:
+    sphere = surfaces.spheres[prim_id - surfaces.n_triangles]
+    return ray_sphere(probe.box, probe.ray, wp.vec3(sphere[0], sphere[1], sphere[2]), sphere[3])
+
+
+def make_intersect(units: Units, accepts: Any = None) -> Any:
+    """The unit that tests one primitive and keeps the better hit. accepts: of make_better."""
     record = units.triangle_test.record
     ray_triangle = units.triangle_test.intersect
+    better = make_better(units, accepts)
 
     @wp.func
     def intersect(probe: Probe, surfaces: Surfaces, primitive: record, best: Hit) -> Hit:
-        """The closer of `best` and this primitive's hit in [t_min, best.t]; at equal t the lower prim_id."""
         prim_id = primitive.prim_id
         if wp.static(units.instances):
             prim_id = primitive.prim_id + probe.ray.first_prim
@@ -90,23 +119,11 @@ def make_intersect(units: Units, accepts: Any = None) -> Any:
         hit = Hit()
         if wp.static(units.spheres):
             if prim_id >= surfaces.n_triangles:
-                sphere = surfaces.spheres[prim_id - surfaces.n_triangles]
-                hit = ray_sphere(probe.box, probe.ray, wp.vec3(sphere[0], sphere[1], sphere[2]), sphere[3])
+                hit = sphere_hit(probe, surfaces, prim_id)
             else:
                 hit = ray_triangle(probe.box, probe.triangle, probe.ray, primitive)
         else:
             hit = ray_triangle(probe.box, probe.triangle, probe.ray, primitive)
-        if hit.prim_id == NO_HIT or not (hit.t >= probe.ray.t_min and hit.t <= best.t):
-            return best
-        if hit.t == best.t and prim_id > best.prim_id:
-            return best
-        if wp.static(units.resumes):
-            if hit.t == probe.ray.t_min and prim_id < probe.ray.slot:
-                return best
-        if wp.static(accepts is not None):
-            if not accepts(surfaces, prim_id, hit.u, hit.v):
-                return best
-        hit.prim_id = prim_id
-        return hit
+        return better(probe.ray, surfaces, hit, prim_id, best)
 
     return intersect

@@ -14,17 +14,17 @@ import warp as wp
 from wrt.kernels.memory import put_number
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import NO_HIT, Hit, Surfaces, kernel
-from wrt.kernels.traverse.common import Probe, Units, make_intersect
+from wrt.kernels.traverse.common import Probe, Units, make_better, sphere_hit
 from wrt.kernels.traverse.stack import reference_of, t_of
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
 from wrt.kernels.wide.nodes import ROW_PADS, far_pad, node_size
 from wrt.kernels.wide.packets import (
     ACTIVE,
-    AXIS_BITS,
     COHERENT,
     LANES,
     PACKET_SIZE,
+    PRIM_ID_ROW,
     REFUSED,
     ROW,
     SLOT,
@@ -33,8 +33,6 @@ from wrt.kernels.wide.packets import (
     WIDTH,
     Scratch,
     count_of,
-    cull,
-    holds_sphere,
     key_at,
     lowest_of_all,
     make_children,
@@ -47,6 +45,7 @@ from wrt.kernels.wide.packets import (
     rays_at,
     reaching,
     slot_at,
+    spheres_of,
     triangles,
     write_hits,
     write_occluded,
@@ -55,12 +54,12 @@ from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.kernels.wide.traverse import (
     WideTraversal,
     make_call_in,
-    make_gather,
     make_struct,
     row_size,
 )
 
 NODE = node_size(WIDTH, False)
+PRIM_ID = WIDTH * PRIM_ID_ROW  # where a row has its primitives' numbers
 PACKETS = 4  # set up at a time
 SLOTS = 24  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
@@ -81,7 +80,7 @@ def vector(packet: wp.array(dtype=wp.float32), first: int) -> wp.vec3:
 
 @wp.func
 def probe_at(packet: wp.array(dtype=wp.float32), ray: int) -> Probe:
-    """The scalar units' set-up, from one column of a packet."""
+    """What the sphere unit needs of one column of a packet."""
     probe = Probe()
     probe.ray.origin = vector(packet, ray + wp.static(ROW["origin_x"]))
     probe.ray.direction = vector(packet, ray + wp.static(ROW["direction_x"]))
@@ -90,13 +89,6 @@ def probe_at(packet: wp.array(dtype=wp.float32), ray: int) -> Probe:
     probe.box.origin = probe.ray.origin
     probe.box.inv_dir = vector(packet, ray + wp.static(ROW["inverse_x"]))
     probe.box.t_min = probe.ray.t_min
-    axes = bits(packet, ray + wp.static(ROW["axes"]))
-    probe.triangle.kx = axes & wp.static((1 << AXIS_BITS) - 1)
-    probe.triangle.ky = (axes >> AXIS_BITS) & wp.static((1 << AXIS_BITS) - 1)
-    probe.triangle.kz = axes >> wp.static(2 * AXIS_BITS)
-    probe.triangle.shear_x = number(packet, ray + wp.static(ROW["shear_x"]))
-    probe.triangle.shear_y = number(packet, ray + wp.static(ROW["shear_y"]))
-    probe.triangle.shear_z = number(packet, ray + wp.static(ROW["shear_z"]))
     return probe
 
 
@@ -121,20 +113,18 @@ def put_best(packet: wp.array(dtype=wp.float32), ray: int, best: Hit):
 def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> Any:
     """The first `count` primitives of a row against one ray of a packet; whether the ray has found what it asks for."""
     ray_triangles = make_ray_triangles(any_hit and accepts is None, inlined)
-    gather = make_gather(units.triangle_test.record, WIDTH)
-    intersect = make_intersect(units, accepts)
+    better = make_better(units, accepts)
 
     @wp.func
-    def one_by_one(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces, packet: wp.array(dtype=wp.float32),
-                   ray: int) -> bool:
-        mask = cull(rows, first, mask, packet, ray)
+    def test_spheres(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces,
+                     packet: wp.array(dtype=wp.float32), ray: int) -> bool:
         probe = probe_at(packet, ray)
         best = best_at(packet, ray)
         while mask != 0:
-            best = intersect(probe, surfaces, gather(rows, first + lowest(mask)), best)
+            prim_id = bits(rows, first + PRIM_ID + lowest(mask))
             mask = mask & (mask - 1)
-            if wp.static(any_hit):
-                mask = wp.where(best.prim_id != NO_HIT, 0, mask)
+            if prim_id + 1 != probe.ray.exclude_plus_one:
+                best = better(probe.ray, surfaces, sphere_hit(probe, surfaces, prim_id), prim_id, best)
         found = bool(best.prim_id != NO_HIT)
         if wp.static(any_hit):
             best.t = wp.where(found, -float(wp.inf), best.t)  # nothing else is reached
@@ -164,8 +154,11 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
                  ray: int) -> bool:
         mask = (2 << (count - 1)) - 1
         if wp.static(units.spheres):
-            if holds_sphere(rows, first, mask, surfaces.n_triangles):
-                return one_by_one(rows, first, mask, surfaces, packet, ray)
+            spheres = spheres_of(rows, first, mask, surfaces.n_triangles)
+            if spheres != 0:
+                if test_spheres(rows, first, spheres, surfaces, packet, ray):
+                    return True
+                mask = mask & ~spheres
         if wp.static(accepts is None):
             return ray_triangles(rows, first, mask, packet, ray) >= 0 and wp.static(any_hit)
         else:
@@ -189,7 +182,7 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             n = wp.min(left, WIDTH)
             lanes = bool(wp.static(accepts is None) and count_of(mask) > FEW)
             if wp.static(units.spheres):
-                lanes = lanes and not holds_sphere(accel.primitives, first, (2 << (n - 1)) - 1, surfaces.n_triangles)
+                lanes = lanes and spheres_of(accel.primitives, first, (2 << (n - 1)) - 1, surfaces.n_triangles) == 0
             if lanes:
                 found = triangles(accel.primitives, first, n, mask, any_hit, packet, base)
                 if wp.static(any_hit):

@@ -21,6 +21,7 @@ from wrt.kernels.wide.traverse import STACK_SIZE
 
 WIDTH = 8  # children of a node, and triangles of a row
 LANES = 16  # rays of a packet
+PRIM_ID_ROW = size_of(Primitive) // 4 - 1  # of the rows of a leaf that make a row of primitives
 COHERENT = 1 << LANES  # what set_up adds to the mask of active rays if they have a beam
 
 # A packet is a block of floats. It begins with a row of sixteen lanes for each number that a ray has. turned: the origin, in the
@@ -70,7 +71,7 @@ LAYOUT = {
     "CACHE_LINE": CACHE_LINE, "LEVEL": LEVEL, "LEVEL_REFERENCES": LEVEL_REFERENCES, "LEVEL_LEFT": LEVEL_LEFT,
     "KEY_MASK": KEY_MASK,
     "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
-    "PRIM_ID_ROW": size_of(Primitive) // 4 - 1, "NO_HIT": NO_HIT,
+    "PRIM_ID_ROW": PRIM_ID_ROW, "NO_HIT": NO_HIT,
     "LARGEST": LARGEST, "FARTHEST": FARTHEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
     "FAR_PAD": FAR_PAD, "PAD_EXTENT": PAD_EXTENT, "PAD_COORDINATE": PAD_COORDINATE, "PAD_SMALLEST": PAD_SMALLEST,
     "CLAMP_ROUNDING": CLAMP_ROUNDING, "CLAMP_STEP": CLAMP_STEP, "SLOWEST": SLOWEST,
@@ -185,9 +186,9 @@ def make_steps(any_hit: bool) -> Steps:
     return Steps(begin, step, pop)
 
 
-@wp.func_native(source("wide/row_holds_sphere.h", **LAYOUT))
-def holds_sphere(rows: wp.array(dtype=wp.float32), first: int, mask: int, n_triangles: int) -> bool:
-    """Whether one of a row's primitives in the mask is no triangle."""
+@wp.func_native(source("wide/row_spheres.h", **LAYOUT))
+def spheres_of(rows: wp.array(dtype=wp.float32), first: int, mask: int, n_triangles: int) -> int:
+    """Those of a row's primitives in the mask that are no triangles."""
 
 
 @cache
@@ -201,11 +202,6 @@ def make_ray_triangles(any_hit: bool, inlined: bool) -> Any:
         0, whichever it is, and no u and v."""
 
     return ray_triangles
-
-
-@wp.func_native(source("wide/ray_cull.h", **LAYOUT))
-def cull(rows: wp.array(dtype=wp.float32), first: int, mask: int, packet: wp.array(dtype=wp.float32), ray: int) -> int:
-    """As lanes.make_cull."""
 
 
 @wp.func_native("return __builtin_ctzll(mask);")

@@ -13,7 +13,7 @@ from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 from wrt.kernels.wide import packets
 from wrt.kernels.wide.batch import PACKETS, SLOTS
-from wrt.kernels.wide.lanes import LANE_PAD, make_plain_cull, row_type
+from wrt.kernels.wide.lanes import LANE_PAD, row_type
 from wrt.kernels.wide.nodes import make_plain
 from wrt.kernels.wide.packets import (
     COHERENT,
@@ -29,8 +29,10 @@ from wrt.kernels.wide.packets import (
 from wrt.kernels.wide.references import EMPTY
 from wrt.kernels.wide.traverse import lane_ray
 
+EXCLUDE = LANES * ROWS.index("exclude")
 NOTHING = wp.constant(99)
 CHILDREN = np.array([-3, -2, -1, 1, 2, 3, 4, 5], np.int32)  # references of a node: leaves and nodes, none EMPTY
+PRIM_IDS = np.array([3, 1, 4, 0, 5, 9, 2, 6], np.int32)
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, -1e-40, 3e38, -3e38, np.inf, -np.inf, np.nan], np.float32)
 
 
@@ -49,7 +51,6 @@ class Lanes:
     walk_any: wp.array2d(dtype=wp.int32)
     missed: wp.array(dtype=wp.int32)
     missed_any: wp.array(dtype=wp.int32)
-    candidates: wp.array(dtype=wp.int32)
 
 
 set_up = packets.make_set_up(RayArrays)
@@ -113,7 +114,6 @@ def by_packets(rays: RayArrays, count: int, reach: float, empty: int, nodes: wp.
         ray = LANES * i + j
         walk(nodes, i, empty, packet, base + j, reach, stacks, slots, ray, out.begun, out.missed, out.walk)
         walk_any(nodes, i, empty, packet, base + j, reach, stacks, slots, ray, out.begun_any, out.missed_any, out.walk_any)
-        out.candidates[ray] = packets.cull(rows, 80 * i, 255, packet, base + j)
 
 
 @kernel
@@ -124,12 +124,30 @@ def triangles_by_packets(rows: wp.array(dtype=wp.float32), state: wp.array(dtype
     found[i] = packets.triangles(rows, 80 * i, WIDTH, mask, any_hit, packet, PACKET_SIZE * i)
 
 
+ray_triangles, ray_triangles_any = packets.make_ray_triangles(False, True), packets.make_ray_triangles(True, False)
+
+
+@kernel
+def triangles_ray_by_ray(rows: wp.array(dtype=wp.float32), state: wp.array(dtype=wp.int32), any_hit: bool,
+                         packet: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.int32)):
+    """found: a lane, or -1."""
+    i = wp.tid()
+    for j in range(LANES):
+        column = PACKET_SIZE * i + j
+        lane = int(-1)
+        if (state[i] >> j) & 1 != 0:
+            if any_hit:
+                lane = ray_triangles_any(rows, 80 * i, 255, packet, column)
+            else:
+                lane = ray_triangles(rows, 80 * i, 255, packet, column)
+        found[LANES * i + j] = lane
+
+
 @cache
 def scalar_kernel():
     row = row_type(WIDTH)
     probe_of, intersect = make_probe(Units()), make_intersect(Units())
     children = make_plain(WIDTH, False)
-    cull = make_plain_cull(WIDTH)
 
     @wp.struct
     class Scalars:
@@ -137,7 +155,6 @@ def scalar_kernel():
         bits: wp.array2d(dtype=wp.int32)
         entries: wp.array(dtype=row)
         entered: wp.array(dtype=wp.int32)
-        candidates: wp.array(dtype=wp.int32)
         hits: wp.array(dtype=Hit)
 
     @wp.func
@@ -168,13 +185,11 @@ def scalar_kernel():
         out.bits[i, 3] = 8 * lanes.near_z
         out.rows[i, 20] = direction_scale(rays.direction[i])
         node = 64 * (i / LANES)
-        first = 80 * (i / LANES)
         entries, entered = children(nodes, node, lanes, best.t)
         out.entries[i] = entries
         out.entered[i] = entered
-        out.candidates[i] = cull(rows, first, lanes)
         for j in range(WIDTH):
-            k = first + j
+            k = 80 * (i / LANES) + j
             triangle = Primitive()
             triangle.v0 = wp.vec3(rows[k], rows[k + 8], rows[k + 16])
             triangle.v1 = wp.vec3(rows[k + 24], rows[k + 32], rows[k + 40])
@@ -189,19 +204,19 @@ def scalar_kernel():
 class Both:
     """Rays, (16 n, 3) each, with a node and a row of triangles for each packet, through both."""
 
-    def __init__(self, rays, nodes, corners, count=LANES, any_hit=False, reach=LARGEST):
+    def __init__(self, rays, nodes, corners, count=LANES, any_hit=False, reach=LARGEST, exclude=None):
         self.rays = RayArrays()
         self.rays.origin, self.rays.direction, self.rays.t_min, self.rays.t_max = (
             vec3s(rays[0]), vec3s(rays[1]), floats(rays[2]), floats(rays[3]))
         n = len(rays[0]) // LANES
         self.n = n
         rows = np.concatenate([corners.astype(np.float32).reshape(n, 72),
-                               np.tile(np.array([3, 1, 4, 0, 5, 9, 2, 6], np.int32).view(np.float32), (n, 1))], axis=1)
+                               np.tile(PRIM_IDS.view(np.float32), (n, 1))], axis=1)
         never = np.full((1, WIDTH, 3), np.inf, np.float32)
         nodes, rows = floats(np.concatenate([nodes, plain_nodes(never, -never)]).reshape(-1)), floats(rows.reshape(-1))
         lanes = Lanes()
         for name, length in (("state", n), ("meets", n), ("reaching", n), ("begun", n * LANES), ("begun_any", n * LANES),
-                             ("missed", n * LANES), ("missed_any", n * LANES), ("candidates", n * LANES),
+                             ("missed", n * LANES), ("missed_any", n * LANES),
                              ("walk", (n * LANES, WIDTH + 1)), ("walk_any", (n * LANES, WIDTH + 1))):
             setattr(lanes, name, zeros(length, wp.int32))
         lanes.children, lanes.children_any = (zeros((n, ENTRY * (BELOW + WIDTH)), wp.uint32) for _ in range(2))
@@ -210,10 +225,16 @@ class Both:
         launch(by_packets, n, self.rays, count, reach, n, nodes, rows, packet, stacks, slots, lanes)
         self.state, self.meets, self.reaching = (getattr(lanes, name).numpy() for name in ("state", "meets", "reaching"))
         self.stacks = [array.numpy().reshape(n, BELOW + WIDTH, ENTRY) for array in (lanes.children, lanes.children_any)]
-        self.begun, self.walk, self.candidates = (getattr(lanes, name).numpy() for name in ("begun", "walk", "candidates"))
+        self.begun, self.walk = lanes.begun.numpy(), lanes.walk.numpy()
         self.begun_any, self.walk_any = lanes.begun_any.numpy(), lanes.walk_any.numpy()
         self.missed, self.missed_any = lanes.missed.numpy(), lanes.missed_any.numpy()
         self.set_up = packet.numpy().reshape(n, PACKET_SIZE).copy()
+        if exclude is not None:
+            row = packet.numpy().reshape(n, PACKET_SIZE)[:, EXCLUDE : EXCLUDE + LANES]
+            row[:] = exclude.astype(np.int32).view(np.float32).reshape(n, LANES)
+        one_by_one, self.lanes = wp.clone(packet), zeros(n * LANES, wp.int32)
+        launch(triangles_ray_by_ray, n, rows, lanes.state, any_hit, one_by_one, self.lanes)
+        self.one_by_one = one_by_one.numpy().reshape(n, PACKET_SIZE)
         found = zeros(n, wp.int32)
         launch(triangles_by_packets, n, rows, lanes.state, any_hit, packet, found)
         self.found, self.after = found.numpy(), packet.numpy().reshape(n, PACKET_SIZE)
@@ -223,7 +244,7 @@ class Both:
         m = n * LANES
         out.rows, out.bits = zeros((m, 21)), zeros((m, 4), wp.int32)
         out.entries, out.hits = zeros(m, row_type(WIDTH)), zeros(m, Hit)
-        out.entered, out.candidates = zeros(m, wp.int32), zeros(m, wp.int32)
+        out.entered = zeros(m, wp.int32)
         launch(scalars, m, self.rays, nodes, rows, Surfaces(), out)
         self.scalar = out
 
@@ -403,12 +424,6 @@ def test_rays_begin_with_the_nearest_child_of_the_root(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_culling_leaves_what_the_rows_leave(name):
-    both = case(name)
-    np.testing.assert_array_equal(both.candidates, both.scalar.candidates.numpy())
-
-
-@pytest.mark.parametrize("name", CASES)
 def test_triangles_are_hit_as_the_unit_hits_them(name):
     both = case(name)
     hits, active = both.scalar.hits.numpy(), both.active.reshape(-1)
@@ -418,6 +433,12 @@ def test_triangles_are_hit_as_the_unit_hits_them(name):
     same(lanes[active], np.stack([hits["t"], hits["u"], hits["v"]], axis=1)[active])
     np.testing.assert_array_equal((both.found[:, None] >> np.arange(LANES) & 1).reshape(-1), found & active)
     assert (name == "special") or 0.05 < (found & active).mean() < 0.95
+    # And so are those of a row in lanes, for one ray.
+    names = ["t", "u", "v", "prim_id"]
+    same(both.lane_rows(both.one_by_one, names)[active], both.lane_rows(both.after, names)[active])
+    lane = both.lanes.numpy()
+    np.testing.assert_array_equal(lane >= 0, found & active)
+    np.testing.assert_array_equal(PRIM_IDS[lane[lane >= 0]], hits["prim_id"][lane >= 0])
 
 
 def test_any_hit_leaves_nothing_within_reach():
@@ -426,6 +447,27 @@ def test_any_hit_leaves_nothing_within_reach():
     t, before = both.lane_rows(both.after, ["t"])[:, 0], both.lane_rows(both.set_up, ["t"])[:, 0]
     np.testing.assert_array_equal(t, np.where(found, -np.inf, before))
     np.testing.assert_array_equal(both.lane_rows(both.after, ["prim_id"]).view(np.int32)[:, 0] != NO_HIT, found)
+    np.testing.assert_array_equal(both.lanes.numpy() >= 0, found)
+    same(both.lane_rows(both.one_by_one, ["t"])[:, 0], t)
+
+
+@pytest.mark.parametrize("any_hit", [False, True])
+def test_a_primitive_that_is_left_out_is_not_hit(any_hit):
+    rays, nodes, corners = CASES["coherent"](np.random.default_rng(8))
+    nearest = Both(rays, nodes, corners).scalar.hits.numpy()
+    found = nearest["prim_id"] != NO_HIT
+    both = Both(rays, nodes, corners, any_hit=any_hit, exclude=np.where(found, nearest["prim_id"] + 1, 0))
+    without = both.lane_rows(both.one_by_one, ["prim_id"]).view(np.int32)[:, 0]
+    active = both.active.reshape(-1)
+    if not any_hit:
+        same(both.lane_rows(both.one_by_one, ["t", "prim_id"])[active], both.lane_rows(both.after, ["t", "prim_id"])[active])
+        assert (without != nearest["prim_id"])[found & active].all()
+        t = both.lane_rows(both.one_by_one, ["t"])[:, 0]
+        assert (t >= nearest["t"])[found & active].all() and (without != NO_HIT)[found & active].any()
+    else:
+        packets_say = (both.found[:, None] >> np.arange(LANES) & 1).reshape(-1).astype(bool)
+        np.testing.assert_array_equal(both.lanes.numpy() >= 0, packets_say)
+        assert 0 < packets_say.sum() < (found & active).sum()
 
 
 @pytest.mark.parametrize("count", [1, 7, 15])
