@@ -51,12 +51,7 @@ from wrt.kernels.wide.packets import (
     write_occluded,
 )
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
-from wrt.kernels.wide.traverse import (
-    WideTraversal,
-    make_call_in,
-    make_struct,
-    row_size,
-)
+from wrt.kernels.wide.traverse import WideTraversal, make_call_in, make_struct, row_size
 
 NODE = node_size(WIDTH, False)
 PRIM_ID = WIDTH * PRIM_ID_ROW  # where a row has its primitives' numbers
@@ -348,6 +343,6 @@ class BatchTraversal(WideTraversal):
 
     def make_stream(self, units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
         """None for units that it has no lanes for."""
-        if units.triangle != "watertight" or units.box not in ROW_PADS or units.counters or units.instances:
+        if units.triangle != "watertight" or units.box not in ROW_PADS or units.counters or units.instances or units.resumes:
             return None
         return make_kernel(units, any_hit, rays_struct, accepts)

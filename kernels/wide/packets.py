@@ -47,6 +47,7 @@ PACKET_SIZE = ROOT_ENTRIES + WIDTH * LANES  # a multiple of 16: where the first 
 
 # An entry of a packet's stack: its key (traverse.stack.key_of), of two words; then the mask of the rays that go there (ENTRY_RAYS);
 # then nothing, so that an entry is moved at once. A packet has one entry more than a ray alone: the nearest child is one as well.
+# The stack is where those of slots begin, which are not yet in use.
 ENTRY, ENTRY_RAYS = 4, 2
 
 # The stack of one ray is made of levels, one for each node on the way to where the ray is that has children still to come. A level
@@ -69,8 +70,7 @@ LAYOUT = {
     "WIDTH": WIDTH, "LANES": LANES, "COHERENT": COHERENT, "AXIS_BITS": AXIS_BITS, "AXIS_MASK": (1 << AXIS_BITS) - 1,
     "REFUSED": REFUSED, "ROOT_ENTRIES": ROOT_ENTRIES, "ENTRY": ENTRY, "ENTRY_RAYS": ENTRY_RAYS, "LEAF_BITS": LEAF_BITS,
     "CACHE_LINE": CACHE_LINE, "LEVEL": LEVEL, "LEVEL_REFERENCES": LEVEL_REFERENCES, "LEVEL_LEFT": LEVEL_LEFT,
-    "KEY_MASK": KEY_MASK,
-    "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
+    "KEY_MASK": KEY_MASK, "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
     "PRIM_ID_ROW": PRIM_ID_ROW, "NO_HIT": NO_HIT,
     "LARGEST": LARGEST, "FARTHEST": FARTHEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
     "FAR_PAD": FAR_PAD, "PAD_EXTENT": PAD_EXTENT, "PAD_COORDINATE": PAD_COORDINATE, "PAD_SMALLEST": PAD_SMALLEST,
@@ -84,8 +84,8 @@ LAYOUT = {
 
 @wp.struct
 class Scratch:
-    """What one thread works in. packets: PACKET_SIZE each; stacks: STACK_WORDS a slot; slots: SLOT_SIZE each, then three numbers
-    of batch.make_kernel."""
+    """What one thread works in. packets: PACKET_SIZE each; stacks: STACK_WORDS a slot, or before these one packet's; slots:
+    SLOT_SIZE each, then three numbers of batch.make_kernel."""
 
     packets: wp.array(dtype=wp.float32)
     stacks: wp.array(dtype=wp.uint32)

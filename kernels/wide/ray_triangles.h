@@ -20,7 +20,7 @@
     #include "triangle_hits.h"
 #if ANY_HIT
     q[T] = -inf;
-    ((int*)q)[PRIM_ID] = 0;
+    ((int*)q)[PRIM_ID] = 0;  // whichever it is: nobody asks
     return 0;
 #else
     int j = __builtin_ctz(m);

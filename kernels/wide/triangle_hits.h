@@ -1,7 +1,7 @@
         // As kernels.units.triangle.ray_triangle and kernels.traverse.common.intersect, for a packet of rays and one triangle or for one
-        // ray and a row of triangles: Lanes, LaneInts and Doubles, of which MASK(x) is a mask of bits, and IN(mask) back again. RAY(k):
-        // a row of the packet, of all rays or of the one; v: corners; id: primitives. Leaves `m`: those of `mask` that hit at or before
-        // T; where they do, `at`; and what u and v are made of.
+        // ray and a row of triangles: Lanes, LaneInts and Doubles, of which MASK(x) is a mask of bits, and IN(mask) back again. RAY(k)
+        // and RAY_INT(k): a row of the packet, of all rays or of the one; v: corners; id: primitives; inf; and what edges.h reads.
+        // Leaves `m`: those of `mask` that hit at or before T, else goes to MISSED; where they hit, `at`; and what u and v are made of.
         #include "edges.h"
         const LaneInts exclude = RAY_INT(EXCLUDE);
         int m = MASK(~outside & (id + 1 != exclude)) & mask;  // a ray's own triangle here, as it is at its origin

@@ -1,5 +1,5 @@
         // As kernels.units.triangle.within_bounds: `at` is moved into the interval of the triangle's own box, or of the padded one;
-        // m loses the rays that pass by even that.
+        // m loses those that pass by even that.
         decltype(v[0][0] + 0.0f) lo[3], hi[3];
         for (int k = 0; k < 3; ++k) {
             lo[k] = v[1][k] < v[0][k] ? v[1][k] : v[0][k]; lo[k] = v[2][k] < lo[k] ? v[2][k] : lo[k];

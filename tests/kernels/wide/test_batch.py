@@ -18,8 +18,10 @@ from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
+from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
-from wrt.kernels.wide.batch import BatchTraversal
+from wrt.kernels.wide.batch import FAILED, IN_A_ROW, PACKETS, PAUSED, BatchTraversal
+from wrt.kernels.wide.packets import LANES
 from wrt.kernels.wide.references import EMPTY, leaf_reference
 from wrt.kernels.wide.traverse import STACK_SIZE
 from wrt.lab.bench.rays import ray_sets
@@ -27,11 +29,16 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 
+def new_hits(n):
+    hits = HitArrays()
+    hits.t, hits.u, hits.v, hits.prim_id = zeros(n), zeros(n), zeros(n), zeros(n, wp.int32)
+    return hits
+
+
 def one_by_one(accel, o, d, t_min, t_max):
     """Closest hits and any hits by the kernel for one ray."""
     rays, n = rays_on(accel.device, rays_of(o, d, t_min, t_max)), len(o)
-    hits = HitArrays()
-    hits.t, hits.u, hits.v, hits.prim_id = zeros(n), zeros(n), zeros(n), zeros(n, wp.int32)
+    hits = new_hits(n)
     launch(closest_hit_kernel(accel.structure), n, accel.data, accel._surfaces, rays, hits, 0)
     dark = zeros(n, wp.bool)
     launch(any_hit_kernel(accel.structure), n, accel.data, accel._surfaces, rays, dark, 0)
@@ -202,6 +209,16 @@ def test_packets_are_given_up_where_they_fall_apart():
     accel = build(Geometry.of(icosphere(6)), "bvh8")
     rays = ray_sets(accel, 6_000)["primary"]
     assert_same(accel, rays.origins, rays.directions)
+    # And they are given up: rays that are parallel, but far from each other, and not those beside each other.
+    n = PACKETS * LANES
+    apart = np.random.default_rng(7).uniform(-1.0, 1.0, (n, 2)).astype(np.float32)
+    for xy, failed in ((apart, IN_A_ROW - 1), (0.3 + 0.001 * apart, 0)):
+        o = np.concatenate([xy, np.full((n, 1), 3.0, np.float32)], axis=1)
+        scratch = new_scratch(BatchTraversal.stream_sizes)
+        rays = rays_on(accel.device, rays_of(o, np.tile([0.1, 0.1, -1.0], (n, 1)), 0.0, np.inf))
+        inputs = [accel.data, accel._surfaces, rays, new_hits(n), scratch, 0, n]
+        wp.launch(tracer(accel.structure, False).kernel, 1, inputs, device=DEVICE)
+        assert scratch.slots.numpy()[FAILED] == failed and (scratch.slots.numpy()[PAUSED] > 0) == (failed > 0)
 
 
 def test_units_without_lanes_have_no_stream():
@@ -222,32 +239,52 @@ def test_a_million_rays(name):
             assert_same(accel, rays.origins, rays.directions, 0.0, rays.t_max)
 
 
+def assert_queue_as_one_ray(accel, o, d, t_max, exclude, accepts=None):
+    """A Queue's rays by the kernel for many and by the one for one ray. The closest hits' prim_id."""
+    queue = Queue()
+    queue.origin, queue.direction = vec3s(o), vec3s(d)
+    queue.t_min, queue.t_max = zeros(len(o)), wp.array(t_max.astype(np.float32), dtype=wp.float32, device=DEVICE)
+    queue.exclude = wp.array(exclude, dtype=wp.int32, device=DEVICE)
+    structure, block = accel.structure, BatchTraversal.stream_block
+    for any_hit in (True, False):
+        many = structure.accel.kernels.make_stream(structure.units, any_hit, Queue, accepts)
+        one = make_queue_kernel(structure.struct, structure.traversal(any_hit=any_hit, accepts=accepts), any_hit)
+        scratch, answers = new_scratch(BatchTraversal.stream_sizes), []
+        for kernel, threads, more in ((many, -(-len(o) // block), [scratch]), (one, len(o), [])):
+            hits = new_hits(len(o))
+            out = zeros(len(o), wp.bool) if any_hit else hits
+            wp.launch(kernel, threads, [accel.data, accel._surfaces, queue, out, *more, 0, len(o)], device=DEVICE)
+            arrays = [out] if any_hit else [hits.t, hits.u, hits.v, hits.prim_id]
+            answers.append(np.concatenate([array.numpy().view(np.uint8) for array in arrays]))
+        np.testing.assert_array_equal(*answers)
+    return hits.prim_id.numpy()
+
+
 @cpu_only
 def test_rays_of_a_picture_leave_out_what_they_start_on():
-    """A Queue's rays, and a mesh with spheres in its leaves: as the kernel for one ray."""
+    """A mesh with spheres in its leaves."""
     mesh = icosphere(3)
     spheres = np.array([[1.0, 0.2, 0.0, 0.3], [0.0, -1.0, 0.1, 0.25], [0.4, 0.4, 0.9, 0.01]], np.float32)
     accel = build(Geometry(mesh.vertices, mesh.faces, spheres), "bvh8")
     o, d, _, t_max = mixed_rays(4000, 3)
     first = accel.closest_hit(o, d).prim_id
     assert (first >= len(mesh.faces)).any() and (first < 0).any()
-    queue = Queue()
-    queue.origin, queue.direction = vec3s(o), vec3s(d)
-    queue.t_min, queue.t_max = zeros(len(o)), wp.array(t_max.astype(np.float32), dtype=wp.float32, device=DEVICE)
-    answers = {}
-    for exclude in (np.zeros_like(first), first + 1):
-        queue.exclude = wp.array(exclude, dtype=wp.int32, device=DEVICE)
-        for any_hit in (False, True):
-            many, block = accel.structure.accel.kernels.make_stream(accel.structure.units, any_hit, Queue), 64
-            one = make_queue_kernel(accel.structure.struct, accel.structure.traversal(any_hit=any_hit), any_hit)
-            scratch = new_scratch(BatchTraversal.stream_sizes)
-            for kernel, threads, more in ((many, -(-len(o) // block), [scratch]), (one, len(o), [])):
-                hits = HitArrays()
-                hits.t, hits.u, hits.v, hits.prim_id = zeros(len(o)), zeros(len(o)), zeros(len(o)), zeros(len(o), wp.int32)
-                out = zeros(len(o), wp.bool) if any_hit else hits
-                wp.launch(kernel, threads, [accel.data, accel._surfaces, queue, out, *more, 0, len(o)], device=DEVICE)
-                arrays = [out.numpy()] if any_hit else [hits.t.numpy(), hits.u.numpy(), hits.v.numpy(), hits.prim_id.numpy()]
-                answers.setdefault((any_hit, bool(exclude.any())), []).append([array.view(np.uint8) for array in arrays])
-    for both in answers.values():
-        np.testing.assert_array_equal(*map(np.concatenate, both))
-    assert (answers[False, True][0][3] != answers[False, False][0][3]).any()
+    whole, without = (assert_queue_as_one_ray(accel, o, d, t_max, exclude) for exclude in (np.zeros_like(first), first + 1))
+    assert (whole != without).any()
+
+
+@wp.func
+def one_in_three(surfaces: Surfaces, prim_id: int, u: float, v: float) -> bool:
+    return (wp.cast(u, wp.int32) ^ wp.cast(v, wp.int32) ^ prim_id) % 3 == 0
+
+
+@cpu_only
+def test_hits_that_are_not_accepted_are_passed():
+    """As of cut-outs: many triangles of a row are hit, and the nearest is often refused."""
+    mesh, spheres = crowd(), np.array([[0.5, 0.5, 0.5, 0.2]], np.float32)
+    accel = build(Geometry(mesh.vertices, mesh.faces, spheres), "bvh8")
+    o, d, _, t_max = mixed_rays(4000, 4)
+    nearest = accel.closest_hit(o, d).prim_id
+    for exclude in (np.zeros_like(nearest), nearest + 1):
+        accepted = assert_queue_as_one_ray(accel, o, d, t_max, exclude, one_in_three)
+        assert ((accepted >= 0) & (accepted != nearest)).sum() > 100

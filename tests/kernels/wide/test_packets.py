@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import floats, launch, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, floats, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.kernels.query import LARGEST, RayArrays, direction_scale, load_ray
@@ -27,7 +27,7 @@ from wrt.kernels.wide.packets import (
     WIDTH,
 )
 from wrt.kernels.wide.references import EMPTY
-from wrt.kernels.wide.traverse import lane_ray
+from wrt.kernels.wide.traverse import STACK_SIZE, lane_ray
 
 EXCLUDE = LANES * ROWS.index("exclude")
 NOTHING = wp.constant(99)
@@ -117,18 +117,18 @@ def by_packets(rays: RayArrays, count: int, reach: float, empty: int, nodes: wp.
 
 
 @kernel
-def triangles_by_packets(rows: wp.array(dtype=wp.float32), state: wp.array(dtype=wp.int32), any_hit: bool,
+def triangles_by_packets(rows: wp.array(dtype=wp.float32), state: wp.array(dtype=wp.int32), in_row: int, any_hit: bool,
                          packet: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.int32)):
     i = wp.tid()
     mask = state[i] & wp.static(COHERENT - 1)
-    found[i] = packets.triangles(rows, 80 * i, WIDTH, mask, any_hit, packet, PACKET_SIZE * i)
+    found[i] = packets.triangles(rows, 80 * i, in_row, mask, any_hit, packet, PACKET_SIZE * i)
 
 
 ray_triangles, ray_triangles_any = packets.make_ray_triangles(False, True), packets.make_ray_triangles(True, False)
 
 
 @kernel
-def triangles_ray_by_ray(rows: wp.array(dtype=wp.float32), state: wp.array(dtype=wp.int32), any_hit: bool,
+def triangles_ray_by_ray(rows: wp.array(dtype=wp.float32), state: wp.array(dtype=wp.int32), in_row: int, any_hit: bool,
                          packet: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.int32)):
     """found: a lane, or -1."""
     i = wp.tid()
@@ -137,9 +137,9 @@ def triangles_ray_by_ray(rows: wp.array(dtype=wp.float32), state: wp.array(dtype
         lane = int(-1)
         if (state[i] >> j) & 1 != 0:
             if any_hit:
-                lane = ray_triangles_any(rows, 80 * i, 255, packet, column)
+                lane = ray_triangles_any(rows, 80 * i, (1 << in_row) - 1, packet, column)
             else:
-                lane = ray_triangles(rows, 80 * i, 255, packet, column)
+                lane = ray_triangles(rows, 80 * i, (1 << in_row) - 1, packet, column)
         found[LANES * i + j] = lane
 
 
@@ -164,9 +164,10 @@ def scalar_kernel():
 
     @kernel
     def scalars(rays: RayArrays, nodes: wp.array(dtype=wp.float32), rows: wp.array(dtype=wp.float32), surfaces: Surfaces,
-                out: Scalars):
+                in_row: int, exclude: wp.array(dtype=wp.int32), out: Scalars):
         i = wp.tid()
         ray = load_ray(rays, i)
+        ray.exclude_plus_one = exclude[i]
         probe = probe_of(ray)
         lanes = lane_ray(probe, LANE_PAD)
         best = no_hit(ray)
@@ -188,7 +189,7 @@ def scalar_kernel():
         entries, entered = children(nodes, node, lanes, best.t)
         out.entries[i] = entries
         out.entered[i] = entered
-        for j in range(WIDTH):
+        for j in range(in_row):
             k = 80 * (i / LANES) + j
             triangle = Primitive()
             triangle.v0 = wp.vec3(rows[k], rows[k + 8], rows[k + 16])
@@ -204,7 +205,8 @@ def scalar_kernel():
 class Both:
     """Rays, (16 n, 3) each, with a node and a row of triangles for each packet, through both."""
 
-    def __init__(self, rays, nodes, corners, count=LANES, any_hit=False, reach=LARGEST, exclude=None):
+    def __init__(self, rays, nodes, corners, count=LANES, any_hit=False, reach=LARGEST, in_row=WIDTH,
+                 exclude=None):
         self.rays = RayArrays()
         self.rays.origin, self.rays.direction, self.rays.t_min, self.rays.t_max = (
             vec3s(rays[0]), vec3s(rays[1]), floats(rays[2]), floats(rays[3]))
@@ -229,14 +231,13 @@ class Both:
         self.begun_any, self.walk_any = lanes.begun_any.numpy(), lanes.walk_any.numpy()
         self.missed, self.missed_any = lanes.missed.numpy(), lanes.missed_any.numpy()
         self.set_up = packet.numpy().reshape(n, PACKET_SIZE).copy()
-        if exclude is not None:
-            row = packet.numpy().reshape(n, PACKET_SIZE)[:, EXCLUDE : EXCLUDE + LANES]
-            row[:] = exclude.astype(np.int32).view(np.float32).reshape(n, LANES)
+        exclude = np.zeros(n * LANES, np.int32) if exclude is None else exclude.astype(np.int32)
+        packet.numpy().reshape(n, PACKET_SIZE)[:, EXCLUDE : EXCLUDE + LANES] = exclude.view(np.float32).reshape(n, LANES)
         one_by_one, self.lanes = wp.clone(packet), zeros(n * LANES, wp.int32)
-        launch(triangles_ray_by_ray, n, rows, lanes.state, any_hit, one_by_one, self.lanes)
+        launch(triangles_ray_by_ray, n, rows, lanes.state, in_row, any_hit, one_by_one, self.lanes)
         self.one_by_one = one_by_one.numpy().reshape(n, PACKET_SIZE)
         found = zeros(n, wp.int32)
-        launch(triangles_by_packets, n, rows, lanes.state, any_hit, packet, found)
+        launch(triangles_by_packets, n, rows, lanes.state, in_row, any_hit, packet, found)
         self.found, self.after = found.numpy(), packet.numpy().reshape(n, PACKET_SIZE)
 
         out_type, scalars = scalar_kernel()
@@ -245,7 +246,7 @@ class Both:
         out.rows, out.bits = zeros((m, 21)), zeros((m, 4), wp.int32)
         out.entries, out.hits = zeros(m, row_type(WIDTH)), zeros(m, Hit)
         out.entered = zeros(m, wp.int32)
-        launch(scalars, m, self.rays, nodes, rows, Surfaces(), out)
+        launch(scalars, m, self.rays, nodes, rows, Surfaces(), in_row, wp.array(exclude, dtype=wp.int32, device=DEVICE), out)
         self.scalar = out
 
     def lane_rows(self, of, names):
@@ -451,23 +452,33 @@ def test_any_hit_leaves_nothing_within_reach():
     same(both.lane_rows(both.one_by_one, ["t"])[:, 0], t)
 
 
+def assert_rows_as_the_unit(both, any_hit):
+    """Triangles by packets and ray by ray against the scalar unit's hits."""
+    hits, active = both.scalar.hits.numpy(), both.active.reshape(-1)
+    found = (hits["prim_id"] != NO_HIT) & active
+    np.testing.assert_array_equal((both.found[:, None] >> np.arange(LANES) & 1).reshape(-1), found)
+    np.testing.assert_array_equal(both.lanes.numpy() >= 0, found)
+    if not any_hit:
+        expected = np.stack([hits["t"], hits["u"], hits["v"], hits["prim_id"].view(np.float32)], axis=1)[active]
+        for packet in (both.after, both.one_by_one):
+            same(both.lane_rows(packet, ["t", "u", "v", "prim_id"])[active], expected)
+    return found
+
+
 @pytest.mark.parametrize("any_hit", [False, True])
 def test_a_primitive_that_is_left_out_is_not_hit(any_hit):
     rays, nodes, corners = CASES["coherent"](np.random.default_rng(8))
-    nearest = Both(rays, nodes, corners).scalar.hits.numpy()
-    found = nearest["prim_id"] != NO_HIT
-    both = Both(rays, nodes, corners, any_hit=any_hit, exclude=np.where(found, nearest["prim_id"] + 1, 0))
-    without = both.lane_rows(both.one_by_one, ["prim_id"]).view(np.int32)[:, 0]
-    active = both.active.reshape(-1)
-    if not any_hit:
-        same(both.lane_rows(both.one_by_one, ["t", "prim_id"])[active], both.lane_rows(both.after, ["t", "prim_id"])[active])
-        assert (without != nearest["prim_id"])[found & active].all()
-        t = both.lane_rows(both.one_by_one, ["t"])[:, 0]
-        assert (t >= nearest["t"])[found & active].all() and (without != NO_HIT)[found & active].any()
-    else:
-        packets_say = (both.found[:, None] >> np.arange(LANES) & 1).reshape(-1).astype(bool)
-        np.testing.assert_array_equal(both.lanes.numpy() >= 0, packets_say)
-        assert 0 < packets_say.sum() < (found & active).sum()
+    nearest = Both(rays, nodes, corners).scalar.hits.numpy()["prim_id"]
+    exclude = np.where(nearest != NO_HIT, nearest + 1, 0)
+    found = assert_rows_as_the_unit(Both(rays, nodes, corners, any_hit=any_hit, exclude=exclude), any_hit)
+    assert 0 < found.sum() < (nearest != NO_HIT).sum()
+
+
+@pytest.mark.parametrize("any_hit", [False, True])
+@pytest.mark.parametrize("in_row", [1, 3, 7])
+def test_what_is_behind_the_last_triangle_of_a_row_is_not_hit(in_row, any_hit):
+    rays, nodes, corners = CASES["coherent"](np.random.default_rng(9))
+    assert assert_rows_as_the_unit(Both(rays, nodes, corners, any_hit=any_hit, in_row=in_row), any_hit).any()
 
 
 @pytest.mark.parametrize("count", [1, 7, 15])
@@ -482,4 +493,5 @@ def test_lanes_beyond_the_last_ray_are_not_active(count):
 
 
 def test_constants_fit_each_other():
+    assert ENTRY * (STACK_SIZE + 1) <= STACK_WORDS  # a packet's stack, and that of one ray
     assert SLOTS <= 31 and PACKETS * LANES == 64 and COHERENT == 1 << LANES  # masks of slots, of waiting rays and of lanes
