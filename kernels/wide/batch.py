@@ -59,7 +59,7 @@ PACKETS = 4  # set up at a time
 SLOTS = 24  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
 LINES = 5  # cache lines that are called in of what is next: a row of triangles has 5, a node 4, and a branch would cost more
-WORTH = 3  # rays that come to a node together, on average, from which on a packet takes less time than its rays alone
+WORTH = 6  # rays that come to a node together, on average, from which on a packet takes less time than its rays alone
 # Where packets fall apart, one after another, none is tried for a while: so many in a row, for so many that follow.
 IN_A_ROW, PAUSE = 4, 32
 FAILED = SLOT_SIZE * SLOTS  # where Scratch.slots counts the packets in a row that fell apart
