@@ -16,6 +16,7 @@ from wrt.kernels.wide.batch import PACKETS, SLOTS
 from wrt.kernels.wide.lanes import LANE_PAD, row_type
 from wrt.kernels.wide.nodes import make_plain
 from wrt.kernels.wide.packets import (
+    BEAM,
     COHERENT,
     ENTRY,
     ENTRY_RAYS,
@@ -369,6 +370,24 @@ def test_a_beam_enters_what_one_of_its_rays_enters(name):
             np.testing.assert_array_equal(masks, expected[i])
             assert (begins <= first[i, child]).all()
             assert (np.diff(child) > 0).all() if any_hit else (np.diff(begins) <= 0).all()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_beam_has_the_ends_of_all_its_rays(name):
+    both = case(name)
+    beam = {word: both.set_up[:, first : first + 3] for word, first in BEAM.items()}
+    origin, inverse = (both.lane_rows(both.set_up, [f"{of}_{axis}" for axis in "xyz"]).reshape(-1, LANES, 3)
+                       for of in ("origin", "inverse"))
+    for i in np.flatnonzero(both.state >= COHERENT):
+        o, r = origin[i][both.active[i]], inverse[i][both.active[i]]
+        down = (r < 0.0).all(axis=0)
+        ends = {"near_origin": np.where(down, o.min(0), o.max(0)), "far_origin": np.where(down, o.max(0), o.min(0)),
+                "largest": np.where(down, r.min(0), r.max(0)), "smallest": np.where(down, r.max(0), r.min(0))}
+        with np.errstate(over="ignore"):
+            ends |= {f"far_{word}": np.float32(LANE_PAD) * ends[word] for word in ("largest", "smallest")}
+        for word, expected in ends.items():
+            np.testing.assert_array_equal(beam[word][i], expected, err_msg=word)
+        np.testing.assert_array_equal(beam["near_row"][i], 2 * np.arange(3) + down)
 
 
 def walked(both, reach=np.inf):
