@@ -15,10 +15,11 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.launches import Launch, run, run_range, run_with
-from wrt.kernels.memory import call_in_long, call_in_vec3
+from wrt.kernels.native import source
 from wrt.kernels.query import HitArrays, Queue, hit_at, put_ray, queued_ray
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.render import load_pixel, make_see, store_pixel, with_sample
+from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, ShadowWalk, make_go_through
 from wrt.kernels.shade.step import Lit, Sample, add_up, lit_by, make_path, make_paths
@@ -26,13 +27,16 @@ from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel
 
 Path = make_path(False)
 _, ray_of, _ = make_paths()
-AHEAD = 4  # hits, or pixels, whose memory is called in before it is read
+AHEAD = 4  # hits whose memory is called in before it is read
 BLOCK = 64  # rays for which something is computed in lanes at a time
+FRESH = 2048  # camera rays that are made, traced and shaded at a time, while they are in the cache
 
 
 @wp.struct
 class Job:
-    """What a wave is: `samples` of each of the first `pixels` of Wave.order, in a tile at x, y; and how many rays are queued."""
+    """What a wave is: `samples` of each of the first `pixels` of Wave.order, in a tile at x, y. And how far it is: fresh: 1 while
+    its camera rays are traced, of which `begun` are in the queue; queued: rays that are traced next; asked: surfaces that ask
+    lights."""
 
     x: int
     y: int
@@ -40,22 +44,24 @@ class Job:
     pixels: int
     first_sample: int
     samples: int
+    fresh: int
+    begun: int
     queued: int
+    asked: int
 
 
 @wp.struct
 class Wave:
     """Samples are numbered pixel by pixel; there is room for `capacity`. By number: xi, lens_xi, what places a sample on the film
     and on the lens; done, the sum so far; size, traced: paths that wait, and rays so far; paths[level * capacity + number]: those
-    that wait.
+    that wait, and after them the one that is queued. pixel_keys: of the samples of each pixel, and pixels: where on the film those are.
 
-    By place in the queue: number, rays, hits, lit, scatter, asked (shadow rays of a hit), and for light i from i * capacity on
-    request: the place of its shadow ray, or -1. By place of a shadow ray, for light i from i * capacity on: value, shadow_rays,
-    occluded or, where shadows are transparent, walks and shadow_hits, and waiting: which walks those rays are of. asking: shadow
-    rays to each light.
+    By place in the queue: number, rays, hits. By count of the surfaces that ask lights: asked (their sample's number), lit,
+    scatter, and for light i from i * capacity on request: the place of its shadow ray, or -1. By place of a shadow ray, for light i
+    from i * capacity on: value, shadow_rays, occluded or, where shadows are transparent, walks and shadow_hits, and waiting: which
+    walks those rays are of. asking: shadow rays to each light.
 
-    By place in a block of the queue (BLOCK), or of hits alone by their count in it: sky_x, sky_y, sky_z, keys and indices. While a
-    wave begins, keys are those of a block of pixels.
+    By place in a block of the queue (BLOCK), or of hits alone by their count in it: sky_x, sky_y, sky_z, keys and indices.
     """
 
     capacity: int
@@ -66,6 +72,8 @@ class Wave:
     done: wp.array(dtype=Sample)
     size: wp.array(dtype=wp.int32)
     traced: wp.array(dtype=wp.int32)
+    pixel_keys: wp.array(dtype=wp.uint32)
+    pixels: wp.array(dtype=wp.int32)
     paths: wp.array(dtype=Path)
     number: wp.array(dtype=wp.int32)
     rays: Queue
@@ -139,37 +147,37 @@ def make_shadow_kernel(features: Any) -> Any:
 
 
 def make_gather(transparent_shadows: bool) -> Any:
-    """What the lights send to the hits of the queue; then the next path of each sample is queued."""
+    """What the lights send to the surfaces that asked them."""
 
     @wp.func
     def gather(wave: Wave, lights: int):
-        queued = int(0)
-        for k in range(wave.job[0].queued):
-            number = wave.number[k]
-            if wave.asked[k] > 0:
-                direct = Shadow()
-                for i in range(lights):
-                    slot = wave.request[i * wave.capacity + k]
-                    if slot >= 0:
-                        if wp.static(transparent_shadows):
-                            direct = lit_by(direct, wave.value[slot], wave.scatter[k], wave.walks[slot].shadow)
-                        else:
-                            shadow = Shadow()
-                            shadow.rays = 1
-                            if not wave.occluded[slot]:
-                                shadow.transmittance = wp.vec3(1.0, 1.0, 1.0)
-                            direct = lit_by(direct, wave.value[slot], Scatter(), shadow)
-                put_sample(wave.done, number, add_up(wave.done[number], wave.lit[k], direct))
-            size = wave.size[number] - 1
-            if size >= 0:
-                wave.size[number] = size
-                enqueue(wave, queued, number, wave.paths[size * wave.capacity + number])
-                queued += 1
+        for a in range(wave.job[0].asked):
+            direct = Shadow()
+            light = wp.vec3()  # a struct that changes in a loop is written and read back
+            rays = int(0)
+            for i in range(lights):
+                slot = wave.request[i * wave.capacity + a]
+                if slot >= 0:
+                    if wp.static(transparent_shadows):
+                        direct = lit_by(direct, wave.value[slot], wave.scatter[a], wave.walks[slot].shadow)
+                    else:
+                        light += wp.where(wave.occluded[slot], 0.0, 1.0) * wave.value[slot]
+                        rays += 1
+            if wp.static(not transparent_shadows):
+                direct.transmittance = light
+                direct.rays = rays
+            number = wave.asked[a]
+            put_sample(wave.done, number, add_up(wave.done[number], wave.lit[a], direct))
         for i in range(lights):
             wave.asking[i] = 0
-        wave.job[0].queued = queued
+        wave.job[0].asked = 0
 
     return gather
+
+
+@wp.func_native(source("shade/film_samples.h", LANES=LANES))
+def add_to_pixels(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(dtype=Sample), p: int, samples: int) -> None:
+    """As with_sample, to the LANES entries of the film that pixels[p], pixels[p + 1] ... name: done[p * samples] and those after it."""
 
 
 @wp.func
@@ -177,16 +185,17 @@ def add_to_film(wave: Wave, film: Film):
     """The samples of a wave to their pixels, in their order."""
     job = wave.job[0]
     for p in range(job.pixels):
-        if p + AHEAD < job.pixels:
-            next = pixel_of(job, wave.order[p + AHEAD], film.x, film.y, film.columns)
-            call_in_vec3(film.mean, next)
-            call_in_vec3(film.m2, next)
-            call_in_long(film.rays, next)
-        i = pixel_of(job, wave.order[p], film.x, film.y, film.columns)
-        pixel = load_pixel(film, i)
+        wave.pixels[p] = pixel_of(job, wave.order[p], film.x, film.y, film.columns)
+    p = int(0)
+    while p + LANES <= job.pixels:
+        add_to_pixels(film, wave.pixels, wave.done, p, job.samples)
+        p += LANES
+    while p < job.pixels:
+        pixel = load_pixel(film, wave.pixels[p])
         for j in range(job.samples):
             pixel = with_sample(pixel, wave.done[p * job.samples + j])
-        store_pixel(film, i, pixel)
+        store_pixel(film, wave.pixels[p], pixel)
+        p += 1
 
 
 @wp.struct
@@ -205,22 +214,40 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
     """All of a wave, from its camera rays to the film."""
     gather = make_gather(transparent_shadows)
 
+    @wp.func
+    def ask_lights(wave: Wave, launches: WaveLaunches, lights: int):
+        """All shadow rays, and what their surfaces send on."""
+        for light in range(lights):
+            first = light * wave.capacity
+            asking = wave.asking[light]
+            while asking > 0:
+                run_range(launches.shadow_hit, first, first + asking)
+                asking = 0
+                if wp.static(transparent_shadows):
+                    run_with(launches.go_through, light)
+                    asking = wave.asking[light]
+        gather(wave, lights)
+
     @kernel
     def trace_wave(wave: Wave, launches: WaveLaunches, lights: int, film: Film):
-        run(launches.begin)
+        job = wave.job[0]
+        wave.job[0].queued = 0
+        wave.job[0].fresh = 1
+        pixel = int(0)
+        while pixel < job.pixels:
+            first = pixel * job.samples
+            pixel = wp.min(pixel + wp.max(FRESH / job.samples, 1), job.pixels)
+            run_range(launches.begin, first / job.samples, pixel)
+            run_range(launches.closest_hit, first, wave.job[0].begun)
+            run_range(launches.shade, first, wave.job[0].begun)
+        wave.job[0].fresh = 0
+        ask_lights(wave, launches, lights)
         while wave.job[0].queued > 0:
-            run_range(launches.closest_hit, 0, wave.job[0].queued)
-            run(launches.shade)
-            for light in range(lights):
-                first = light * wave.capacity
-                asking = wave.asking[light]
-                while asking > 0:
-                    run_range(launches.shadow_hit, first, first + asking)
-                    asking = 0
-                    if wp.static(transparent_shadows):
-                        run_with(launches.go_through, light)
-                        asking = wave.asking[light]
-            gather(wave, lights)
+            queued = wave.job[0].queued
+            wave.job[0].queued = 0
+            run_range(launches.closest_hit, 0, queued)
+            run_range(launches.shade, 0, queued)
+            ask_lights(wave, launches, lights)
         add_to_film(wave, film)
 
     return trace_wave

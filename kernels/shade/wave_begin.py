@@ -4,19 +4,17 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.memory import number_of_vec2, put_in_vec2, put_in_vec3, put_number
+from wrt.kernels.memory import number_of_vec2, put_in_vec2, put_in_vec3, put_int, put_number
 from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.render import center_of
 from wrt.kernels.shade.sampling import hash_pair, make_draw, quantiles
-from wrt.kernels.shade.step import Sample, make_paths
-from wrt.kernels.shade.wave import BLOCK, Wave, enqueue
+from wrt.kernels.shade.step import Sample
+from wrt.kernels.shade.wave import BLOCK, Wave, put_sample
 from wrt.kernels.structs import AovFilm, Film, Limits, kernel
-
-first_path, _, _ = make_paths()
 
 
 def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
-    """Camera rays of a wave. Where there is none, the sample is done."""
+    """Camera rays of a wave. Where there is none, the sample is done: black."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray(features)
     draw = make_draw(features)
@@ -29,7 +27,7 @@ def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
             x = wp.uint32(job.x + wave.order[p] % job.width)
             y = wp.uint32(job.y + wave.order[p] / job.width)
             key = hash_pair(hash_pair(limits.seed, x), y)
-            wave.keys[p - first] = key
+            wave.pixel_keys[p] = key
             draw(key, 0, job.first_sample, job.samples, wave.xi, p * job.samples)
             if wp.static(features.lens):
                 draw(key, 1, job.first_sample, job.samples, wave.lens_xi, p * job.samples)
@@ -50,8 +48,10 @@ def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
                 i = i + 1
 
     @wp.func
-    def look(wave: Wave, camera: camera_struct, film: Film, first: int, end: int):
-        """The camera rays of the samples first .. end - 1, each to its place in the queue: in lanes (kernels.memory)."""
+    def look(wave: Wave, camera: camera_struct, film: Film, first: int, end: int) -> int:
+        """The camera rays of the samples first .. end - 1, each to the place of its number in the queue: in lanes (kernels.memory).
+        How many have no length."""
+        dead = int(0)
         i = int(first)
         while i < end:
             x = number_of_vec2(wave.xi, i, 0)
@@ -67,31 +67,43 @@ def make_begin_kernel(features: Any, camera_kind: Any) -> Any:
             put_in_vec3(wave.rays.direction, i, 1, ray.direction[1])
             put_in_vec3(wave.rays.direction, i, 2, ray.direction[2])
             put_number(wave.rays.t_max, i, ray.t_max)
+            put_int(wave.rays.exclude, i, 0)
+            put_int(wave.number, i, i)
+            dead = dead + wp.where(ray.t_max > 0.0, 0, 1)
             i = i + 1
+        return dead
+
+    @wp.func
+    def without_dead(wave: Wave, first: int, end: int, queued: int) -> int:
+        """Leaves the camera rays of the samples first .. end - 1 in the queue from place `queued` on, but for those without length,
+        whose samples are done."""
+        place = queued
+        for number in range(first, end):
+            ray = queued_ray(wave.rays, number)
+            if ray.t_max > 0.0:
+                if place != number:
+                    put_ray(wave.rays, place, ray)
+                    wave.number[place] = number
+                place += 1
+            else:
+                put_sample(wave.done, number, Sample())
+        return place
 
     @kernel
-    def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film):
-        job = wave.job[0]
-        queued = int(0)
-        first = int(0)
-        while first < job.pixels:
-            end = wp.min(first + wp.max(BLOCK / job.samples, 1), job.pixels)
+    def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film, first_pixel: int, end_pixel: int):
+        """Of the pixels first_pixel .. end_pixel - 1, from the place of their first sample in the queue on."""
+        samples = wave.job[0].samples
+        queued = first_pixel * samples
+        first = int(first_pixel)
+        while first < end_pixel:
+            end = wp.min(first + wp.max(BLOCK / samples, 1), end_pixel)
             place(wave, film, limits, first, end)
-            look(wave, camera, film, first * job.samples, end * job.samples)
-            for p in range(first, end):
-                key = wave.keys[p - first]
-                for number in range(p * job.samples, (p + 1) * job.samples):
-                    wave.done[number] = Sample()
-                    wave.size[number] = 0
-                    wave.traced[number] = 0
-                    ray = queued_ray(wave.rays, number)
-                    if ray.t_max > 0.0:
-                        path = first_path(ray, key)
-                        wave.paths[number] = path
-                        enqueue(wave, queued, number, path)
-                        queued += 1
+            if look(wave, camera, film, first * samples, end * samples) > 0 or queued < first * samples:
+                queued = without_dead(wave, first * samples, end * samples, queued)
+            else:
+                queued = end * samples
             first = end
-        wave.job[0].queued = queued
+        wave.job[0].begun = queued
 
     return begin_wave
 

@@ -5,25 +5,25 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.memory import bits_at, call_in_int, call_in_vec3, call_in_vec3i, put_number
-from wrt.kernels.query import hit_at, put_ray
+from wrt.kernels.query import hit_at, put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
-from wrt.kernels.shade.step import Lit, ShadowRequest, add_up, counted, is_lit, make_step
-from wrt.kernels.shade.wave import AHEAD, BLOCK, Path, Wave, put_sample, ray_of
+from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, make_step
+from wrt.kernels.shade.wave import AHEAD, BLOCK, Job, Path, Wave, enqueue, put_sample, ray_of
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
 
 
 @wp.func
-def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, queued: int):
-    """What the hits after this one will read of their triangles: the face of one, the corners of another before it."""
-    if k + 2 * AHEAD < queued:
+def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, end: int):
+    """What the hits after this one, before `end`, will read of their triangles: the face of one, the corners of another before it."""
+    if k + 2 * AHEAD < end:
         prim_id = wave.hits.prim_id[k + 2 * AHEAD]
         if prim_id >= 0 and prim_id < surfaces.n_triangles:
             call_in_vec3i(surfaces.faces, prim_id)
             call_in_int(surfaces.prim_material, prim_id)
-    if k + AHEAD < queued:
+    if k + AHEAD < end:
         prim_id = wave.hits.prim_id[k + AHEAD]
         if prim_id >= 0 and prim_id < surfaces.n_triangles:
             face = surfaces.faces[prim_id]
@@ -37,11 +37,19 @@ def make_shade_kernel(features: Any) -> Any:
     """The step at every hit of the queue: its light, its new paths, and its requests for shadow rays."""
     shading = make_shading(features)
     step = make_step(features, shading)
-    _, _, _, shade, extra_lights, shadow_request, keep, worth = step
+    _, first_path, _, shade, extra_lights, shadow_request, keep, worth = step
     radiance, by_kind, radiance_at, places = BACKGROUNDS[features.background]
     light_numbers, light_point = make_light_points(features)
     sky_point = make_sky_point(features)
     sky_in_lanes = features.sky_light and by_kind is None and places is None  # by_kind: else a point is just its two numbers
+
+    @wp.func
+    def key_at(wave: Wave, job: Job, number: int) -> wp.uint32:
+        """Of the samples of a path that has just been traced."""
+        key = wave.pixel_keys[number / job.samples]
+        if job.fresh == 0:
+            key = wave.paths[wave.size[number] * wave.capacity + number].key
+        return key
 
     @wp.func
     def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
@@ -71,7 +79,7 @@ def make_shade_kernel(features: Any) -> Any:
         for k in range(first, end):
             if wave.hits.prim_id[k] >= 0:
                 number = wave.number[k]
-                wave.keys[hits] = wave.paths[wave.size[number] * wave.capacity + number].key
+                wave.keys[hits] = key_at(wave, job, number)
                 wave.indices[hits] = wp.uint32(job.first_sample + number % job.samples)
                 hits += 1
         i = int(0)
@@ -83,30 +91,40 @@ def make_shade_kernel(features: Any) -> Any:
             i = i + 1
 
     @kernel
-    def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits):
+    def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits, first: int, end: int):
+        """Of the rays first .. end - 1 of the queue. What is traced next is queued from place job.queued on, which is not behind
+        `first`."""
         job = wave.job[0]
+        queued = int(job.queued)
+        asked = int(job.asked)
         hits = int(0)
-        for k in range(job.queued):
+        for k in range(first, end):
             if wp.static(not features.instances):
-                call_in_surface(wave, surfaces, k, job.queued)
-            if k % BLOCK == 0:
+                call_in_surface(wave, surfaces, k, end)
+            if (k - first) % BLOCK == 0:
                 if wp.static(places is not None):
-                    places(lighting.background, wave.rays.direction, k, wp.min(k + BLOCK, job.queued), wave.sky_x, wave.sky_y)
+                    places(lighting.background, wave.rays.direction, k, wp.min(k + BLOCK, end), wave.sky_x, wave.sky_y)
                 if wp.static(sky_in_lanes):
-                    sky_points(wave, lighting.count, k, wp.min(k + BLOCK, job.queued))
+                    sky_points(wave, lighting.count, k, wp.min(k + BLOCK, end))
                     hits = int(0)
             number = wave.number[k]
-            size = wave.size[number]
-            traced = wave.traced[number] + 1
-            wave.traced[number] = traced
-            path = wave.paths[size * wave.capacity + number]
-            out = wave.done[number]
+            size = int(0)
+            traced = int(1)
+            path = Path()
+            out = Sample()
+            if job.fresh != 0:
+                path = first_path(queued_ray(wave.rays, k), wave.pixel_keys[number / job.samples])
+            else:
+                size = wave.size[number]
+                traced = wave.traced[number] + 1
+                path = wave.paths[size * wave.capacity + number]
+                out = wave.done[number]
             out.rays += 1
-            asked = int(0)
+            asks = int(0)
             hit = hit_at(wave.hits, k)
             if hit.prim_id < 0:
                 if wp.static(places is not None):
-                    seen = radiance_at(lighting.background, wave.sky_x[k % BLOCK], wave.sky_y[k % BLOCK])
+                    seen = radiance_at(lighting.background, wave.sky_x[(k - first) % BLOCK], wave.sky_y[(k - first) % BLOCK])
                     out.radiance += wp.cw_mul(path.throughput, seen)
                 else:
                     out.radiance += wp.cw_mul(path.throughput, radiance(lighting.background, path.direction))
@@ -143,17 +161,24 @@ def make_shade_kernel(features: Any) -> Any:
                             slot = int(-1)
                             if any_positive(request.value):
                                 slot = ask(wave, i, request)
-                                asked += 1
-                            wave.request[i * wave.capacity + k] = slot
+                                asks += 1
+                            wave.request[i * wave.capacity + asked] = slot
                 hits += 1
-                if asked > 0:
-                    wave.lit[k] = lit
+                if asks > 0:
+                    wave.asked[asked] = number
+                    wave.lit[asked] = lit
                     if wp.static(features.transparent_shadows):
-                        wave.scatter[k] = shaded.scatter
+                        wave.scatter[asked] = shaded.scatter
+                    asked += 1
                 else:
                     out = add_up(out, lit, Shadow())
             put_sample(wave.done, number, out)
-            wave.size[number] = size
-            wave.asked[k] = asked
+            if size > 0:
+                wave.size[number] = size - 1
+                wave.traced[number] = traced
+                enqueue(wave, queued, number, wave.paths[(size - 1) * wave.capacity + number])
+                queued += 1
+        wave.job[0].queued = queued
+        wave.job[0].asked = asked
 
     return shade_wave

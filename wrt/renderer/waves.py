@@ -29,6 +29,7 @@ from wrt.renderer.upload import camera_kind
 # Samples of a wave: 2,048 to 8,192 are 0.95 to 1.07 times as fast, by the scene. Fewer where each has room for many paths or asks
 # many lights: ROOM is for all of them together.
 CAPACITY, ROOM = 16384, 1 << 18
+ALL = 1 << 30  # rays of a kernel whose only thread takes them all
 World = tuple[Any, Any, Any, Any]  # the records of structure, surfaces, lighting and camera
 OF_CAMERA = ("camera", "lens", "blades", "filter", "independent")
 OF_CUTOUT = ("instances", "textures", "checkerboards", "cutout")
@@ -166,7 +167,7 @@ class Buffers:
         w.done, w.size, w.traced, w.number = room(n, Sample), room(n, wp.int32), room(n, wp.int32), room(n, wp.int32)
         w.paths = room(n * features.stack_size, wave.Path)
         w.sky_x, w.sky_y, w.sky_z = (room(wave.BLOCK, wp.float32) for _ in range(3))
-        w.keys, w.indices = room(wave.BLOCK, wp.uint32), room(wave.BLOCK, wp.uint32)
+        w.pixels, w.pixel_keys, w.keys, w.indices = room(n + LANES, wp.int32), room(n, wp.uint32), room(wave.BLOCK, wp.uint32), room(wave.BLOCK, wp.uint32)
         w.rays, w.hits, w.lit, w.asked = queue(n), hit_arrays(n), room(n, Lit), room(n, wp.int32)
         w.request, w.value, w.shadow_rays = room(shadows, wp.int32), room(shadows, wp.vec3), queue(shadows)
         if features.transparent_shadows:
@@ -204,7 +205,7 @@ class Picture:
 
         launches = {
             "closest_hit": trace(kernels.closest_hit, w.rays, w.hits),
-            "shade": recorded(command(kernels.shade, w, surfaces, lighting, limits[0])),
+            "shade": recorded(command(kernels.shade, w, surfaces, lighting, limits[0], 0, 0), ALL),
         }
         if kernels.shadow:
             launches["shadow_hit"] = trace(kernels.closest_hit, w.shadow_rays, w.shadow_hits)
@@ -212,7 +213,7 @@ class Picture:
         elif kernels.any_hit:
             launches["shadow_hit"] = trace(kernels.any_hit, w.shadow_rays, w.occluded)
         for group_limits, group in zip(limits, film.groups, strict=True):
-            launches["begin"] = recorded(command(kernels.begin, w, camera, group_limits, group))
+            launches["begin"] = recorded(command(kernels.begin, w, camera, group_limits, group, 0, 0), ALL)
             of_group = wave.WaveLaunches()
             for name, launch in launches.items():
                 setattr(of_group, name, launch)
