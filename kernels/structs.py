@@ -262,9 +262,15 @@ class Light:
 
 @wp.struct
 class Emitter:
-    """A triangle that emits: prim_id, and the density per area with which its points are chosen among its light's."""
+    """A triangle that emits: its corners and unit normal, in the space of its mesh; the rows of its material and, where there are
+    instances, of its instance; and the density per area with which its points are chosen among its light's."""
 
-    prim_id: int
+    v0: wp.vec3
+    v1: wp.vec3
+    v2: wp.vec3
+    normal: wp.vec3
+    material: int
+    instance: int
     pdf_area: float
 
 

@@ -8,7 +8,7 @@ Barycentric coordinates, which kernels.shade.surface starts from, carry the erro
 import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.shade.surface import Place, instance_at, sphere_uv, triangle_point, world_normal
+from wrt.kernels.shade.surface import Place, corners_at, instance_at, sphere_uv, triangle_point, world_normal
 from wrt.kernels.structs import Instance, Surfaces, kernel
 
 U32 = wp.constant(wp.float64(2.0**-24))  # unit roundoffs
@@ -134,7 +134,7 @@ def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp
     v0 = wp.vec3d(surfaces.vertices[face[0]])
     v1 = wp.vec3d(surfaces.vertices[face[1]])
     v2 = wp.vec3d(surfaces.vertices[face[2]])
-    middle = wp.vec3d(triangle_point(surfaces, place.face, u, v))
+    middle = wp.vec3d(triangle_point(corners_at(surfaces, place.face), u, v))
     off = wp.vec3d()
     side = wp.float64(1.0)
     if place.instance >= 0:

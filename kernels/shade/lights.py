@@ -6,10 +6,9 @@ import warp as wp
 
 from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, point_at, search_cdf, share_of_row, triangle
 from wrt.kernels.shade.surface import (
+    Corners,
     Surface,
-    make_place_of,
     spawn_point,
-    triangle_normal,
     triangle_point,
     triangle_point_error,
     world_error,
@@ -84,7 +83,6 @@ def spot_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface,
 
 def make_mesh_light(features: Any) -> Any:
     """A point on the emitters of one light, by power and then uniformly by area."""
-    place_of = make_place_of(features.instances)
 
     @wp.func
     def mesh_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
@@ -94,17 +92,20 @@ def make_mesh_light(features: Any) -> Any:
         left = lighting.emitter_cdf[light.first + chosen] - xi[0]
         within = wp.clamp(1.0 - left / wp.max(share, 1.0e-30), 0.0, 0.99999994)
         b = triangle(wp.vec2(within, xi[1]))
-        place = place_of(surfaces, emitter.prim_id)
-        point = triangle_point(surfaces, place.face, b[0], b[1])
-        n = triangle_normal(surfaces, place.face)
-        error = triangle_point_error(surfaces, place.face, b[0], b[1])
+        c = Corners()
+        c.v0 = emitter.v0
+        c.v1 = emitter.v1
+        c.v2 = emitter.v2
+        point = triangle_point(c, b[0], b[1])
+        n = emitter.normal
+        error = triangle_point_error(c, b[0], b[1])
         if wp.static(features.instances):
-            instance = surfaces.instances[place.instance]
+            instance = surfaces.instances[emitter.instance]
             local = point
             point = world_point(instance, local)
             n = world_normal(instance, n)
             error = world_error(instance, local, error, point)
-        material = surfaces.materials[place.material]
+        material = surfaces.materials[emitter.material]
         sample = LightSample()
         way = point - s.point
         distance2 = wp.dot(way, way)
@@ -112,8 +113,8 @@ def make_mesh_light(features: Any) -> Any:
         cos_light = -wp.dot(sample.wi, n)
         if material.two_sided != 0:
             cos_light = wp.abs(cos_light)
-        if cos_light > 0.0 and distance2 > 0.0:
-            sample.weight = material.emission * (cos_light / (distance2 * emitter.pdf_area))
+        share = wp.where(cos_light > 0.0 and distance2 > 0.0, cos_light / (distance2 * emitter.pdf_area), 0.0)
+        sample.weight = share * material.emission
         # The way ends just before the light: its own surface must not shade it.
         sample.end = spawn_point(point, error, n, s.point - point)
         sample.area = 1

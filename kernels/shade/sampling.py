@@ -175,11 +175,9 @@ def polygon(xi: wp.vec2, sides: int, rotation: float) -> wp.vec2:
 @wp.func
 def triangle(xi: wp.vec2) -> wp.vec2:
     """Barycentrics (of v1, v2), uniform over a triangle, without folding or square root (Heitz 2019)."""
-    if xi[1] > xi[0]:
-        half = 0.5 * xi[0]
-        return wp.vec2(half, xi[1] - half)
-    half = 0.5 * xi[1]
-    return wp.vec2(xi[0] - half, half)
+    above = xi[1] > xi[0]  # no branches here and in search_cdf: of random numbers, every second would be mispredicted
+    half = 0.5 * wp.where(above, xi[0], xi[1])
+    return wp.vec2(wp.where(above, half, xi[0] - half), wp.where(above, xi[1] - half, half))
 
 
 @wp.func
@@ -245,10 +243,9 @@ def search_cdf(cdf: wp.array(dtype=wp.float32), first: int, count: int, x: float
     high = int(count - 1)
     while low < high:
         middle = (low + high) / 2
-        if x < cdf[first + middle]:
-            high = middle
-        else:
-            low = middle + 1
+        below = x < cdf[first + middle]
+        high = wp.where(below, middle, high)
+        low = wp.where(below, low, middle + 1)
     return low
 
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from wrt.kernels.query import RayArrays
-from wrt.kernels.shade.surface import spawn_point, triangle_normal
+from wrt.kernels.shade.surface import corners_at, spawn_point, triangle_normal
 from wrt.kernels.structs import Surfaces, gamma, kernel, largest
 
 END = 64.0  # roundings of the largest coordinate: so near to an end nothing is looked for
@@ -15,13 +15,10 @@ def lifted(surfaces: Surfaces, face: int, point: wp.vec3, towards: wp.vec3) -> w
     is. A face beside it in the same plane is then not met."""
     if face < 0:
         return point
-    corner = surfaces.faces[face]
-    v0 = surfaces.vertices[corner[0]]
-    v1 = surfaces.vertices[corner[1]]
-    v2 = surfaces.vertices[corner[2]]
-    size = wp.max(largest(v1 - v0), largest(v2 - v0))
-    error = gamma(8.0) * (wp.max(wp.max(wp.abs(v0), wp.abs(v1)), wp.abs(v2)) + wp.vec3(size, size, size))
-    return spawn_point(point, error, triangle_normal(surfaces, face), towards - point)
+    c = corners_at(surfaces, face)
+    size = wp.max(largest(c.v1 - c.v0), largest(c.v2 - c.v0))
+    error = gamma(8.0) * (wp.max(wp.max(wp.abs(c.v0), wp.abs(c.v1)), wp.abs(c.v2)) + wp.vec3(size, size, size))
+    return spawn_point(point, error, triangle_normal(c), towards - point)
 
 
 @wp.func

@@ -134,39 +134,54 @@ def world_error(i: Instance, p: wp.vec3, error: wp.vec3, world: wp.vec3) -> wp.v
     return transformed(wp.abs(i.world_x), wp.abs(i.world_y), wp.abs(i.world_z), e, 0.0) + gamma(2.0) * wp.abs(world)
 
 
+@wp.struct
+class Corners:
+    """Of a triangle, in the space of its mesh."""
+
+    v0: wp.vec3
+    v1: wp.vec3
+    v2: wp.vec3
+
+
 @wp.func
-def triangle_point(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec3:
-    """The point of face `index` with these barycentrics, in the space of its vertices."""
+def corners_at(surfaces: Surfaces, index: int) -> Corners:
+    """Of face `index`."""
     face = surfaces.faces[index]
-    return (1.0 - u - v) * surfaces.vertices[face[0]] + u * surfaces.vertices[face[1]] + v * surfaces.vertices[face[2]]
+    c = Corners()
+    c.v0 = surfaces.vertices[face[0]]
+    c.v1 = surfaces.vertices[face[1]]
+    c.v2 = surfaces.vertices[face[2]]
+    return c
 
 
 @wp.func
-def triangle_point_error(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec3:
+def triangle_point(c: Corners, u: float, v: float) -> wp.vec3:
+    """The point with these barycentrics, in the space of its corners."""
+    return (1.0 - u - v) * c.v0 + u * c.v1 + v * c.v2
+
+
+@wp.func
+def triangle_point_error(c: Corners, u: float, v: float) -> wp.vec3:
     """How far a ray that starts at triangle_point must stand off to be clear of the triangle's plane, per axis.
 
     Two parts: the rounding of the point itself, seven roundings in a row (PBR, section 6.8.5), and that of the next ray's
     distance to a neighbour in the same plane, which grows with the triangle's size and not with its coordinates: a floor at
     y = 0 has none of the first.
     """
-    face = surfaces.faces[index]
-    v0 = surfaces.vertices[face[0]]
-    v1 = surfaces.vertices[face[1]]
-    v2 = surfaces.vertices[face[2]]
-    size = gamma(8.0) * wp.max(largest(v1 - v0), largest(v2 - v0))
-    point = gamma(7.0) * (wp.abs((1.0 - u - v) * v0) + wp.abs(u * v1) + wp.abs(v * v2))
+    size = gamma(8.0) * wp.max(largest(c.v1 - c.v0), largest(c.v2 - c.v0))
+    point = gamma(7.0) * (wp.abs((1.0 - u - v) * c.v0) + wp.abs(u * c.v1) + wp.abs(v * c.v2))
     return point + wp.vec3(size, size, size)
 
 
 @wp.func
-def triangle_normal(surfaces: Surfaces, index: int) -> wp.vec3:
-    """Unit normal of face `index` on the counter-clockwise side, in the space of its vertices.
+def triangle_normal(c: Corners) -> wp.vec3:
+    """Unit normal on the counter-clockwise side, in the space of its corners; 0 where there is none. wrt.renderer.upload has the
+    same in NumPy.
 
     The edges are scaled to about 1 first: a triangle of size 1e-20 would otherwise have a normal of length 0.
     """
-    face = surfaces.faces[index]
-    e1 = surfaces.vertices[face[1]] - surfaces.vertices[face[0]]
-    e2 = surfaces.vertices[face[2]] - surfaces.vertices[face[0]]
+    e1 = c.v1 - c.v0
+    e2 = c.v2 - c.v0
     return wp.normalize(wp.cross(e1 / largest(e1), e2 / largest(e2)))
 
 
@@ -180,9 +195,10 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
         s = Surface()
         face = surfaces.faces[place.face]
         w = 1.0 - hit.u - hit.v
-        s.point = triangle_point(surfaces, place.face, hit.u, hit.v)
-        s.error = triangle_point_error(surfaces, place.face, hit.u, hit.v)
-        s.geometric = triangle_normal(surfaces, place.face)
+        c = corners_at(surfaces, place.face)
+        s.point = triangle_point(c, hit.u, hit.v)
+        s.error = triangle_point_error(c, hit.u, hit.v)
+        s.geometric = triangle_normal(c)
         if wp.static(smooth):
             n0 = surfaces.normals[face[0]]
             n1 = surfaces.normals[face[1]]
@@ -199,8 +215,8 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
         if wp.static(uvs):
             s.uv = w * surfaces.uvs[face[0]] + hit.u * surfaces.uvs[face[1]] + hit.v * surfaces.uvs[face[2]]
         if wp.static(tangents):
-            e1 = surfaces.vertices[face[1]] - surfaces.vertices[face[0]]
-            e2 = surfaces.vertices[face[2]] - surfaces.vertices[face[0]]
+            e1 = c.v1 - c.v0
+            e2 = c.v2 - c.v0
             longer = wp.min(lift(e1), lift(e2))
             e1 = longer * e1
             e2 = longer * e2

@@ -52,6 +52,13 @@ class World:
     placed: Placed | None = None
     objects: np.ndarray | None = None
 
+    def places(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The row in `faces` of each triangle, and its row in `placed` (0 where nothing is), (N,) each."""
+        if self.placed is None:
+            return prim_id, np.zeros(len(prim_id), np.int32)
+        run, local = self._run(prim_id)
+        return self.placed.first_face[run] + local, run
+
     def materials(self, prim_id: np.ndarray) -> np.ndarray:
         """The material of each primitive, (N,) int32."""
         if self.placed is None:
@@ -61,10 +68,10 @@ class World:
 
     def corners(self, prim_id: np.ndarray) -> np.ndarray:
         """The corners of triangles in world space, (N, 3, 3) float64."""
+        face, run = self.places(prim_id)
+        corners = self.vertices[self.faces[face]].astype(np.float64)
         if self.placed is None:
-            return self.vertices[self.faces[prim_id]].astype(np.float64)
-        run, local = self._run(prim_id)
-        corners = self.vertices[self.faces[self.placed.first_face[run] + local]].astype(np.float64)
+            return corners
         to_world = self.placed.to_world[run]
         return corners @ to_world[:, :, :3].transpose(0, 2, 1) + to_world[:, None, :, 3]
 

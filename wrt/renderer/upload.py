@@ -163,11 +163,24 @@ def _emitters(scene: Scene, world: World, prim_id: np.ndarray) -> tuple[np.ndarr
     cdf[np.nonzero(power)[0][-1] :] = 1.0
     share = np.diff(cdf.astype(np.float64), prepend=0.0)
     out = records(structs.Emitter, len(prim_id))
-    out["prim_id"] = prim_id
+    face, out["instance"] = world.places(prim_id)
+    out["v0"], out["v1"], out["v2"] = corners = np.moveaxis(world.vertices[world.faces[face]], 1, 0)
+    out["normal"] = unit_normals(*corners)
+    out["material"] = world.materials(prim_id)
     # A light of less than 2^-128 square units lights nothing: a density of inf. At SMALLEST_LIT that is 3e-9 of its radiance.
     with np.errstate(over="ignore"):
         out["pdf_area"] = np.divide(share, area, out=np.zeros_like(area), where=area > 0.0)
     return out, cdf
+
+
+def unit_normals(v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
+    """Bit for bit as wrt.kernels.shade.surface.triangle_normal has them: corners (N, 3) float32 each, (N, 3) float32 out."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
+        a, b = (edge / np.abs(edge).max(axis=1, keepdims=True) for edge in (v1 - v0, v2 - v0))
+        n = a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
+        x, y, z = n.T
+        length = np.sqrt(x * x + y * y + z * z)[:, None]
+        return np.where(length > 0.0, n / length, np.float32(0.0))
 
 
 def background_struct(background: Background, device: Any) -> Any:

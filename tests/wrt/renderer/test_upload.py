@@ -160,7 +160,10 @@ def test_each_glowing_object_is_a_light() -> None:
     rows, emitters, cdf = light_records(scene, world_mesh(scene))
     assert (rows["kind"] == list(lights.LIGHTS).index("mesh")).all()
     assert rows["count"].tolist() == [2, 2, 2] and rows["first"].tolist() == [0, 2, 4]
-    assert emitters["prim_id"].tolist() == list(range(12, 18))
+    assert emitters["material"].tolist() == [1, 1, 2, 2, 3, 3] and (emitters["instance"] == 0).all()
+    world = world_mesh(scene)
+    for number, corner in enumerate(("v0", "v1", "v2")):
+        assert (emitters[corner] == world.vertices[world.faces[12:, number]]).all()
     assert np.allclose(cdf, [0.5, 1.0] * 3)
     assert np.allclose(emitters["pdf_area"], 1.0 / np.repeat([1.0, 2.0, 3.0], 2))  # uniform over each quad
     dark = lamps(3, emits_light=False)
