@@ -161,6 +161,13 @@ def triangle_point(c: Corners, u: float, v: float) -> wp.vec3:
 
 
 @wp.func
+def triangle_uv(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec2:
+    """Texture coordinates of face `index` at these barycentrics."""
+    face = surfaces.faces[index]
+    return (1.0 - u - v) * surfaces.uvs[face[0]] + u * surfaces.uvs[face[1]] + v * surfaces.uvs[face[2]]
+
+
+@wp.func
 def triangle_point_error(c: Corners, u: float, v: float) -> wp.vec3:
     """How far a ray that starts at triangle_point must stand off to be clear of the triangle's plane, per axis.
 
@@ -213,7 +220,7 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
             if length > 0.0:  # corners without a normal are zero: flat there
                 s.shading = n / length
         if wp.static(uvs):
-            s.uv = w * surfaces.uvs[face[0]] + hit.u * surfaces.uvs[face[1]] + hit.v * surfaces.uvs[face[2]]
+            s.uv = triangle_uv(surfaces, place.face, hit.u, hit.v)
         if wp.static(tangents):
             e1 = c.v1 - c.v0
             e2 = c.v2 - c.v0

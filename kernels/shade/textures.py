@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.memory import call_in_bits
 from wrt.kernels.structs import Surfaces, Texture
 
 WRAP_REPEAT = 0
@@ -39,11 +40,40 @@ def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec
 
 
 @wp.func
-def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4:
-    """Bilinear; a texel's colour is at its centre."""
+def place_between(at: float, size: int) -> float:
+    """Of a coordinate, in texels, whose colours are at their centres."""
     # Beyond 2^24 no digits are left for a place between texels, and beyond 2^31 each device makes another integer of it.
-    x = wp.clamp(u * float(texture.width) - 0.5, -wp.static(2.0**30), wp.static(2.0**30))
-    y = wp.clamp(v * float(texture.height) - 0.5, -wp.static(2.0**30), wp.static(2.0**30))
+    return wp.clamp(at * float(size) - 0.5, -wp.static(2.0**30), wp.static(2.0**30))
+
+
+@wp.func
+def turned(texture: Texture, uv: wp.vec2) -> wp.vec2:
+    """Texture coordinates as a texture takes them."""
+    u = texture.row_u[0] * uv[0] + texture.row_u[1] * uv[1] + texture.row_u[2]
+    v = texture.row_v[0] * uv[0] + texture.row_v[1] * uv[1] + texture.row_v[2]
+    return wp.vec2(u, v)
+
+
+@wp.func
+def call_in_texels(surfaces: Surfaces, index: int, uv: wp.vec2):
+    """Those that sample_texture will read, but for a right one in another cache line. CPU only."""
+    if index < 0:
+        return
+    texture = surfaces.textures[index]
+    if texture.width == 0:
+        return
+    at = turned(texture, uv)
+    column = wrapped(int(wp.floor(place_between(at[0], texture.width))), texture.width, texture.wrap_u)
+    row = int(wp.floor(place_between(at[1], texture.height)))
+    call_in_bits(surfaces.texels, texture.first + wrapped(row, texture.height, texture.wrap_v) * texture.width + column)
+    call_in_bits(surfaces.texels, texture.first + wrapped(row + 1, texture.height, texture.wrap_v) * texture.width + column)
+
+
+@wp.func
+def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4:
+    """Bilinear."""
+    x = place_between(u, texture.width)
+    y = place_between(v, texture.height)
     left = wrapped(int(wp.floor(x)), texture.width, texture.wrap_u)
     right = wrapped(int(wp.floor(x)) + 1, texture.width, texture.wrap_u)
     fx = x - wp.floor(x)
@@ -75,15 +105,14 @@ def make_sample_texture(pictures: bool, checkerboards: bool) -> Any:
         if index < 0:
             return wp.vec4(1.0, 1.0, 1.0, 1.0)
         texture = surfaces.textures[index]
-        u = texture.row_u[0] * uv[0] + texture.row_u[1] * uv[1] + texture.row_u[2]
-        v = texture.row_v[0] * uv[0] + texture.row_v[1] * uv[1] + texture.row_v[2]
+        at = turned(texture, uv)
         result = wp.vec4(1.0, 1.0, 1.0, 1.0)
         if wp.static(checkerboards):
             if texture.width == 0:
-                result = checkerboard(texture, u, v)
+                result = checkerboard(texture, at[0], at[1])
         if wp.static(pictures):
             if texture.width > 0:
-                result = picture(surfaces, texture, u, v)
+                result = picture(surfaces, texture, at[0], at[1])
         return result
 
     return sample_texture

@@ -4,39 +4,72 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.memory import bits_at, call_in_int, call_in_vec3, call_in_vec3i, put_number
+from wrt.kernels.memory import bits_at, call_in_int, call_in_vec2, call_in_vec3, call_in_vec3i, put_number
 from wrt.kernels.query import hit_at, put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
 from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, make_step
+from wrt.kernels.shade.surface import triangle_uv
+from wrt.kernels.shade.textures import call_in_texels
 from wrt.kernels.shade.wave import AHEAD, BLOCK, Job, Path, Wave, enqueue, put_sample, ray_of
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
 
 
-@wp.func
-def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, end: int):
-    """What the hits after this one, before `end`, will read of their triangles: the face of one, the corners of another before it."""
-    if k + 2 * AHEAD < end:
-        prim_id = wave.hits.prim_id[k + 2 * AHEAD]
-        if prim_id >= 0 and prim_id < surfaces.n_triangles:
+def make_call_in(features: Any) -> Any:
+    """What the hits after this one, before `end`, will read: the face of one, the corners of another before it, and the texels of
+    a third."""
+    pictures = [name for name, used in (("albedo_texture", features.textures), ("emission_texture", features.textures),
+                                        ("metallic_roughness_texture", features.parameter_textures),
+                                        ("transmission_texture", features.parameter_textures),
+                                        ("normal_texture", features.normal_maps)) if used]
+
+    @wp.func
+    def triangle_at(wave: Wave, surfaces: Surfaces, k: int, end: int) -> int:
+        """The triangle that ray k hit, or -1."""
+        if k >= end:
+            return -1
+        prim_id = wave.hits.prim_id[k]
+        return wp.where(prim_id < surfaces.n_triangles, prim_id, -1)
+
+    @wp.func
+    def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, end: int):
+        prim_id = triangle_at(wave, surfaces, k + 3 * AHEAD, end)
+        if prim_id >= 0:
             call_in_vec3i(surfaces.faces, prim_id)
             call_in_int(surfaces.prim_material, prim_id)
-    if k + AHEAD < end:
-        prim_id = wave.hits.prim_id[k + AHEAD]
-        if prim_id >= 0 and prim_id < surfaces.n_triangles:
+        prim_id = triangle_at(wave, surfaces, k + 2 * AHEAD, end)
+        if prim_id >= 0:
             face = surfaces.faces[prim_id]
             for corner in range(3):
                 call_in_vec3(surfaces.vertices, face[corner])
-                if surfaces.normals.shape[0] > 1:
+                if wp.static(features.smooth):
                     call_in_vec3(surfaces.normals, face[corner])
+                if wp.static(bool(pictures)):
+                    call_in_vec2(surfaces.uvs, face[corner])
+        if wp.static(bool(pictures)):
+            prim_id = triangle_at(wave, surfaces, k + AHEAD, end)
+            if prim_id >= 0:
+                m = surfaces.materials[surfaces.prim_material[prim_id]]
+                uv = triangle_uv(surfaces, prim_id, wave.hits.u[k + AHEAD], wave.hits.v[k + AHEAD])
+                if wp.static("albedo_texture" in pictures):
+                    call_in_texels(surfaces, m.albedo_texture, uv)
+                    call_in_texels(surfaces, m.emission_texture, uv)
+                if wp.static("transmission_texture" in pictures):
+                    call_in_texels(surfaces, m.metallic_roughness_texture, uv)
+                    call_in_texels(surfaces, m.transmission_texture, uv)
+                if wp.static("normal_texture" in pictures):
+                    call_in_texels(surfaces, m.normal_texture, uv)
+
+    return call_in_surface
 
 
 def make_shade_kernel(features: Any) -> Any:
     """The step at every hit of the queue: its light, its new paths, and its requests for shadow rays."""
     shading = make_shading(features)
     step = make_step(features, shading)
+    call_in_surface = make_call_in(features)
     _, first_path, _, shade, extra_lights, shadow_request, keep, worth = step
     radiance, by_kind, radiance_at, places = BACKGROUNDS[features.background]
     light_numbers, light_point = make_light_points(features)
