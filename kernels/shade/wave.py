@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.launches import Launch, run, run_range, run_with
+from wrt.kernels.launches import Launch, run_range, run_with
 from wrt.kernels.native import source
 from wrt.kernels.query import HitArrays, Queue, hit_at, put_ray, queued_ray
 from wrt.kernels.shade.materials import Scatter
@@ -89,6 +89,8 @@ class Wave:
     walks: wp.array(dtype=ShadowWalk)
     shadow_hits: HitArrays
     waiting: wp.array(dtype=wp.int32)
+    met: wp.array(dtype=wp.int32)
+    missed: wp.array(dtype=wp.int32)
     sky_x: wp.array(dtype=wp.float32)
     sky_y: wp.array(dtype=wp.float32)
     sky_z: wp.array(dtype=wp.float32)

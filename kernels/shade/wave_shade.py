@@ -18,7 +18,7 @@ from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
 
 
 def make_call_in(features: Any) -> Any:
-    """What the hits after this one, before `end`, will read: the face of one, the corners of another before it, and the texels of
+    """What the hits after this one, will read: the face of one, the corners of another before it, and the texels of
     a third."""
     pictures = [name for name, used in (("albedo_texture", features.textures), ("emission_texture", features.textures),
                                         ("metallic_roughness_texture", features.parameter_textures),
@@ -26,20 +26,21 @@ def make_call_in(features: Any) -> Any:
                                         ("normal_texture", features.normal_maps)) if used]
 
     @wp.func
-    def triangle_at(wave: Wave, surfaces: Surfaces, k: int, end: int) -> int:
-        """The triangle that ray k hit, or -1."""
-        if k >= end:
+    def triangle_at(wave: Wave, surfaces: Surfaces, j: int, hits: int) -> int:
+        """The triangle of hit j, or -1."""
+        if j >= hits:
             return -1
-        prim_id = wave.hits.prim_id[k]
+        prim_id = wave.hits.prim_id[wave.met[j]]
         return wp.where(prim_id < surfaces.n_triangles, prim_id, -1)
 
     @wp.func
-    def call_in_surface(wave: Wave, surfaces: Surfaces, k: int, end: int):
-        prim_id = triangle_at(wave, surfaces, k + 3 * AHEAD, end)
+    def call_in_surface(wave: Wave, surfaces: Surfaces, j: int, hits: int):
+        """j: a hit; there are `hits`."""
+        prim_id = triangle_at(wave, surfaces, j + 3 * AHEAD, hits)
         if prim_id >= 0:
             call_in_vec3i(surfaces.faces, prim_id)
             call_in_int(surfaces.prim_material, prim_id)
-        prim_id = triangle_at(wave, surfaces, k + 2 * AHEAD, end)
+        prim_id = triangle_at(wave, surfaces, j + 2 * AHEAD, hits)
         if prim_id >= 0:
             face = surfaces.faces[prim_id]
             for corner in range(3):
@@ -49,10 +50,11 @@ def make_call_in(features: Any) -> Any:
                 if wp.static(bool(pictures)):
                     call_in_vec2(surfaces.uvs, face[corner])
         if wp.static(bool(pictures)):
-            prim_id = triangle_at(wave, surfaces, k + AHEAD, end)
+            prim_id = triangle_at(wave, surfaces, j + AHEAD, hits)
             if prim_id >= 0:
                 m = surfaces.materials[surfaces.prim_material[prim_id]]
-                uv = triangle_uv(surfaces, prim_id, wave.hits.u[k + AHEAD], wave.hits.v[k + AHEAD])
+                k = wave.met[j + AHEAD]
+                uv = triangle_uv(surfaces, prim_id, wave.hits.u[k], wave.hits.v[k])
                 if wp.static("albedo_texture" in pictures):
                     call_in_texels(surfaces, m.albedo_texture, uv)
                     call_in_texels(surfaces, m.emission_texture, uv)
@@ -106,22 +108,75 @@ def make_shade_kernel(features: Any) -> Any:
 
     @wp.func
     def sky_points(wave: Wave, light: int, first: int, end: int):
-        """A sky_point for each of the rays first .. end - 1 that hit something, one after another: in lanes (kernels.memory)."""
+        """A sky_point for each of the hits first .. end - 1: in lanes (kernels.memory)."""
         job = wave.job[0]
-        hits = int(0)
-        for k in range(first, end):
-            if wave.hits.prim_id[k] >= 0:
-                number = wave.number[k]
-                wave.keys[hits] = key_at(wave, job, number)
-                wave.indices[hits] = wp.uint32(job.first_sample + number % job.samples)
-                hits += 1
+        for j in range(first, end):
+            number = wave.number[wave.met[j]]
+            wave.keys[j - first] = key_at(wave, job, number)
+            wave.indices[j - first] = wp.uint32(job.first_sample + number % job.samples)
         i = int(0)
-        while i < hits:
+        while i < end - first:
             point = sky_point(light_numbers(bits_at(wave.keys, i), bits_at(wave.indices, i), light))
             put_number(wave.sky_x, i, point[0])
             put_number(wave.sky_y, i, point[1])
             put_number(wave.sky_z, i, point[2])
             i = i + 1
+
+    @wp.func
+    def part(wave: Wave, first: int, end: int) -> int:
+        """wave.met: those of the rays first .. end - 1 that hit something, wave.missed: the others. Returns how many hit. There are
+        no branches, which would be mispredicted here, at each line that is called in, and where a ray is shaded."""
+        met = int(0)
+        missed = int(0)
+        for k in range(first, end):
+            wave.met[met] = k
+            wave.missed[missed] = k
+            hit = wp.where(wave.hits.prim_id[k] >= 0, 1, 0)
+            met += hit
+            missed += 1 - hit
+        return met
+
+    @wp.func
+    def see_background(wave: Wave, lighting: Lighting, first: int, end: int, missed: int) -> int:
+        """What the rays that missed add to their samples. Returns how many of those have paths that wait: wave.missed holds their
+        numbers then."""
+        job = wave.job[0]
+        left = int(0)
+        block = int(first)
+        for j in range(missed):
+            k = wave.missed[j]
+            if wp.static(places is not None):
+                if k >= block:
+                    begin = k - (k - first) % BLOCK
+                    block = wp.min(begin + BLOCK, end)
+                    places(lighting.background, wave.rays.direction, begin, block, wave.sky_x, wave.sky_y)
+            number = wave.number[k]
+            seen = wp.vec3()
+            if wp.static(places is not None):
+                seen = radiance_at(lighting.background, wave.sky_x[(k - first) % BLOCK], wave.sky_y[(k - first) % BLOCK])
+            else:
+                seen = radiance(lighting.background, wave.rays.direction[k])
+            if job.fresh != 0:
+                out = Sample()
+                out.radiance += seen
+                out.rays = 1
+                put_sample(wave.done, number, out)
+            else:
+                size = wave.size[number]
+                more = wave.done[number]
+                more.radiance += wp.cw_mul(wave.paths[size * wave.capacity + number].throughput, seen)
+                more.rays += 1
+                put_sample(wave.done, number, more)
+                wave.traced[number] = wave.traced[number] + 1
+                wave.missed[left] = number
+                left += wp.where(size > 0, 1, 0)
+        return left
+
+    @wp.func
+    def follow_next(wave: Wave, queued: int, number: int, size: int):
+        """Queue the last path of a sample of which `size` wait."""
+        wave.size[number] = size - 1
+        enqueue(wave, queued, number, wave.paths[(size - 1) * wave.capacity + number])
 
     @kernel
     def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits, first: int, end: int):
@@ -130,16 +185,15 @@ def make_shade_kernel(features: Any) -> Any:
         job = wave.job[0]
         queued = int(job.queued)
         asked = int(job.asked)
-        hits = int(0)
-        for k in range(first, end):
+        hits = part(wave, first, end)
+        left = see_background(wave, lighting, first, end, end - first - hits)
+        for j in range(hits):
             if wp.static(not features.instances):
-                call_in_surface(wave, surfaces, k, end)
-            if (k - first) % BLOCK == 0:
-                if wp.static(places is not None):
-                    places(lighting.background, wave.rays.direction, k, wp.min(k + BLOCK, end), wave.sky_x, wave.sky_y)
-                if wp.static(sky_in_lanes):
-                    sky_points(wave, lighting.count, k, wp.min(k + BLOCK, end))
-                    hits = int(0)
+                call_in_surface(wave, surfaces, j, hits)
+            if wp.static(sky_in_lanes):
+                if j % BLOCK == 0:
+                    sky_points(wave, lighting.count, j, wp.min(j + BLOCK, hits))
+            k = wave.met[j]
             number = wave.number[k]
             size = int(0)
             traced = int(1)
@@ -155,62 +209,57 @@ def make_shade_kernel(features: Any) -> Any:
             out.rays += 1
             asks = int(0)
             hit = hit_at(wave.hits, k)
-            if hit.prim_id < 0:
-                if wp.static(places is not None):
-                    seen = radiance_at(lighting.background, wave.sky_x[(k - first) % BLOCK], wave.sky_y[(k - first) % BLOCK])
-                    out.radiance += wp.cw_mul(path.throughput, seen)
-                else:
-                    out.radiance += wp.cw_mul(path.throughput, radiance(lighting.background, path.direction))
+            index = wp.uint32(job.first_sample + number % job.samples)
+            shaded = shade(surfaces, lighting, path, ray_of(path), hit, index)
+            lit = Lit()
+            lit.light = shaded.light
+            lit.throughput = shaded.throughput
+            if wp.static(features.blend):
+                verdict = keep(shaded.onward, limits, traced)
+                size = follow(wave, number, size, shaded.onward, verdict)
+                out = counted(out, verdict)
+                out.lost += worth(surfaces, shaded.onward, verdict)
+            if wp.static(features.reflection):
+                verdict = keep(shaded.reflected, limits, traced)
+                size = follow(wave, number, size, shaded.reflected, verdict)
+                out = counted(out, verdict)
+                lit.reflected = worth(surfaces, shaded.reflected, verdict)
+            if wp.static(features.refraction):
+                verdict = keep(shaded.refracted, limits, traced)
+                size = follow(wave, number, size, shaded.refracted, verdict)
+                out = counted(out, verdict)
+                lit.refracted = worth(surfaces, shaded.refracted, verdict)
+            if wp.static(features.lit):
+                if is_lit(shaded.scatter):
+                    for i in range(lighting.count + wp.static(extra_lights)):
+                        point = wp.vec3()
+                        if wp.static(sky_in_lanes):
+                            point = wp.vec3(wave.sky_x[j % BLOCK], wave.sky_y[j % BLOCK], wave.sky_z[j % BLOCK])
+                        if wp.static(not sky_in_lanes) or i < lighting.count:
+                            point = light_point(lighting, shaded.key, index, i)
+                        request = shadow_request(surfaces, lighting, shaded, i, point)
+                        slot = int(-1)
+                        if any_positive(request.value):
+                            slot = ask(wave, i, request)
+                            asks += 1
+                        wave.request[i * wave.capacity + asked] = slot
+            if asks > 0:
+                wave.asked[asked] = number
+                wave.lit[asked] = lit
+                if wp.static(features.transparent_shadows):
+                    wave.scatter[asked] = shaded.scatter
+                asked += 1
             else:
-                index = wp.uint32(job.first_sample + number % job.samples)
-                shaded = shade(surfaces, lighting, path, ray_of(path), hit, index)
-                lit = Lit()
-                lit.light = shaded.light
-                lit.throughput = shaded.throughput
-                if wp.static(features.blend):
-                    verdict = keep(shaded.onward, limits, traced)
-                    size = follow(wave, number, size, shaded.onward, verdict)
-                    out = counted(out, verdict)
-                    out.lost += worth(surfaces, shaded.onward, verdict)
-                if wp.static(features.reflection):
-                    verdict = keep(shaded.reflected, limits, traced)
-                    size = follow(wave, number, size, shaded.reflected, verdict)
-                    out = counted(out, verdict)
-                    lit.reflected = worth(surfaces, shaded.reflected, verdict)
-                if wp.static(features.refraction):
-                    verdict = keep(shaded.refracted, limits, traced)
-                    size = follow(wave, number, size, shaded.refracted, verdict)
-                    out = counted(out, verdict)
-                    lit.refracted = worth(surfaces, shaded.refracted, verdict)
-                if wp.static(features.lit):
-                    if is_lit(shaded.scatter):
-                        for i in range(lighting.count + wp.static(extra_lights)):
-                            point = wp.vec3()
-                            if wp.static(sky_in_lanes):
-                                point = wp.vec3(wave.sky_x[hits], wave.sky_y[hits], wave.sky_z[hits])
-                            if wp.static(not sky_in_lanes) or i < lighting.count:
-                                point = light_point(lighting, shaded.key, index, i)
-                            request = shadow_request(surfaces, lighting, shaded, i, point)
-                            slot = int(-1)
-                            if any_positive(request.value):
-                                slot = ask(wave, i, request)
-                                asks += 1
-                            wave.request[i * wave.capacity + asked] = slot
-                hits += 1
-                if asks > 0:
-                    wave.asked[asked] = number
-                    wave.lit[asked] = lit
-                    if wp.static(features.transparent_shadows):
-                        wave.scatter[asked] = shaded.scatter
-                    asked += 1
-                else:
-                    out = add_up(out, lit, Shadow())
+                out = add_up(out, lit, Shadow())
             put_sample(wave.done, number, out)
             if size > 0:
-                wave.size[number] = size - 1
                 wave.traced[number] = traced
-                enqueue(wave, queued, number, wave.paths[(size - 1) * wave.capacity + number])
+                follow_next(wave, queued, number, size)
                 queued += 1
+        for j in range(left):
+            number = wave.missed[j]
+            follow_next(wave, queued, number, wave.size[number])
+            queued += 1
         wave.job[0].queued = queued
         wave.job[0].asked = asked
 

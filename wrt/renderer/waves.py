@@ -166,6 +166,7 @@ class Buffers:
         w.xi, w.lens_xi = room(n + LANES, wp.vec2), room(n + LANES, wp.vec2)
         w.done, w.size, w.traced, w.number = room(n, Sample), room(n, wp.int32), room(n, wp.int32), room(n, wp.int32)
         w.paths = room(n * features.stack_size, wave.Path)
+        w.met, w.missed = room(n, wp.int32), room(n, wp.int32)
         w.sky_x, w.sky_y, w.sky_z = (room(wave.BLOCK, wp.float32) for _ in range(3))
         w.pixels, w.pixel_keys, w.keys, w.indices = room(n + LANES, wp.int32), room(n, wp.uint32), room(wave.BLOCK, wp.uint32), room(wave.BLOCK, wp.uint32)
         w.rays, w.hits, w.lit, w.asked = queue(n), hit_arrays(n), room(n, Lit), room(n, wp.int32)
