@@ -33,6 +33,10 @@ def put_number(array: wp.array(dtype=wp.float32), i: int, value: float) -> None:
 def put_int(array: wp.array(dtype=wp.int32), i: int, value: int) -> None: ...
 
 
+@wp.func_native("return array.data[(long long)i];")
+def number_at(array: wp.array(dtype=wp.float32), i: int) -> float: ...
+
+
 @wp.func_native("array.data[(long long)i][k] = value;")
 def put_in_vec2(array: wp.array(dtype=wp.vec2), i: int, k: int, value: float) -> None: ...
 

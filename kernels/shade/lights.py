@@ -6,8 +6,8 @@ import warp as wp
 
 from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, point_at, search_cdf, share_of_row, triangle
 from wrt.kernels.shade.surface import (
-    Corners,
     Surface,
+    Triangle,
     spawn_point,
     triangle_point,
     triangle_point_error,
@@ -92,13 +92,13 @@ def make_mesh_light(features: Any) -> Any:
         left = lighting.emitter_cdf[light.first + chosen] - xi[0]
         within = wp.clamp(1.0 - left / wp.max(share, 1.0e-30), 0.0, 0.99999994)
         b = triangle(wp.vec2(within, xi[1]))
-        c = Corners()
-        c.v0 = emitter.v0
-        c.v1 = emitter.v1
-        c.v2 = emitter.v2
-        point = triangle_point(c, b[0], b[1])
+        t = Triangle()
+        t.v0 = emitter.v0
+        t.v1 = emitter.v1
+        t.v2 = emitter.v2
+        point = triangle_point(t, b[0], b[1])
         n = emitter.normal
-        error = triangle_point_error(c, b[0], b[1])
+        error = triangle_point_error(t, b[0], b[1])
         if wp.static(features.instances):
             instance = surfaces.instances[emitter.instance]
             local = point

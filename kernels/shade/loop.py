@@ -35,6 +35,7 @@ def make_radiance(features: Any, accel_struct: Any, closest_hit: Any, any_hit: A
     """The whole tree of rays behind one camera ray. `features`: wrt.renderer.features.Features; counting: rays carry a label."""
     shading = make_shading(features)
     step = make_step(features, shading, counting)
+    surface_at = shading.surface_at
     Path, first_path, ray_of, shade, _, _, keep, worth = step
     background_radiance = make_background(features)
     transmittance = make_transmittance(features, shading, accel_struct, closest_hit, any_hit)
@@ -60,7 +61,7 @@ def make_radiance(features: Any, accel_struct: Any, closest_hit: Any, any_hit: A
             if hit.prim_id < 0:
                 out.radiance += wp.cw_mul(path.throughput, background_radiance(lighting.background, path.direction))
                 continue
-            shaded = shade(surfaces, lighting, path, ray, hit, index)
+            shaded = shade(surfaces, lighting, path, surface_at(surfaces, ray, hit), hit.t, index)
             lit = Lit()
             lit.light = shaded.light
             lit.throughput = shaded.throughput

@@ -18,7 +18,7 @@ from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
 from wrt.kernels.shade.shading import BLEND
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT, OUTSIDE, Shadow, attenuation
 from wrt.kernels.shade.surface import Surface, spawn_point
-from wrt.kernels.structs import Hit, Lighting, Limits, Material, Ray, Surfaces, any_positive, make_ray
+from wrt.kernels.structs import Lighting, Limits, Material, Ray, Surfaces, any_positive, make_ray
 
 MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
 UNKNOWN = wp.constant(-2)  # where a camera ray begins: within glass, or not
@@ -178,7 +178,7 @@ def counted(before: Sample, verdict: int) -> Sample:
 class Step(NamedTuple):
     """What a loop is made of.
 
-    Path: the struct; first_path(ray, key); ray_of(path). shade(surfaces, lighting, path, ray, hit, index) -> Shaded.
+    Path: the struct; first_path(ray, key); ray_of(path). shade(surfaces, lighting, path, met, t, index) -> Shaded.
     shadow_requests: how many lights there are beside those of `lighting` (the background is one), and shadow_request(surfaces,
     lighting, shaded, i, point) -> ShadowRequest to each. keep(path, limits, traced): whether a new path is followed, and
     worth(surfaces, path, verdict) what is lost where it is not.
@@ -264,7 +264,7 @@ def make_missing(features: Any, is_solid: Any) -> Any:
 def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) -> Any:
     """One device function from a path and its hit to everything that follows from them."""
     Path, Shaded = make_path(counting), make_shaded(counting)
-    surface_at, resolve, shading_normal, scatter_at, is_solid = shading
+    _, resolve, shading_normal, scatter_at, is_solid = shading
     sample_2d = make_sample_2d(features)
     missing = make_missing(features, is_solid)
 
@@ -289,25 +289,25 @@ def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) 
         return onward
 
     @wp.func
-    def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, ray: Ray, hit: Hit, index: wp.uint32) -> Shaded:
-        """hit: of `ray` (of ray_of), with prim_id >= 0; index: of the sample."""
+    def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, met: Surface, t: float, index: wp.uint32) -> Shaded:
+        """met: the surface at the end of the path's ray (of ray_of), and t of the hit; index: of the sample."""
         out = Shaded()
         path = arriving
-        s = surface_at(surfaces, ray, hit)
+        s = met
         m = resolve(surfaces, s)
         out.wo = -path.direction
         s.shading = shading_normal(surfaces, m, s, out.wo)
         if wp.static(features.blend):
             share = missing(m, s, path.medium)
             if share > 0.0:
-                out.onward = straight_on(surfaces, path, m, s, share, hit.t)
+                out.onward = straight_on(surfaces, path, m, s, share, t)
                 if share >= 1.0:
                     return out
                 path.throughput = (1.0 - share) * path.throughput
         if wp.static(features.refraction):
             path.medium = medium_at(m, s, path.medium)
         if wp.static(features.absorption):
-            path.throughput = absorbed(surfaces, path.throughput, path.medium, hit.t)
+            path.throughput = absorbed(surfaces, path.throughput, path.medium, t)
         xi = wp.vec2(0.0, 0.0)
         if wp.static(features.rough):
             xi = sample_2d(path.key, index, 2)

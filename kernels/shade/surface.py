@@ -134,107 +134,185 @@ def world_error(i: Instance, p: wp.vec3, error: wp.vec3, world: wp.vec3) -> wp.v
     return transformed(wp.abs(i.world_x), wp.abs(i.world_y), wp.abs(i.world_z), e, 0.0) + gamma(2.0) * wp.abs(world)
 
 
+@wp.func
+def select(condition: bool, a: wp.vec3, b: wp.vec3) -> wp.vec3:
+    """a or b, component by component: wp.where of vectors does not run in lanes (kernels.memory)."""
+    return wp.vec3(wp.where(condition, a[0], b[0]), wp.where(condition, a[1], b[1]), wp.where(condition, a[2], b[2]))
+
+
+@wp.func
+def unit(v: wp.vec3) -> wp.vec3:
+    """At length 1, or 0: as wp.normalize, without its branch, which does not run in lanes either."""
+    length = wp.length(v)
+    return select(length > 0.0, v / wp.where(length > 0.0, length, 1.0), wp.vec3(0.0, 0.0, 0.0))
+
+
 @wp.struct
-class Corners:
-    """Of a triangle, in the space of its mesh."""
+class Triangle:
+    """Its corners and, where a scene has them, the normals and texture coordinates there. Corners are in the space of its mesh,
+    normals in the world."""
 
     v0: wp.vec3
     v1: wp.vec3
     v2: wp.vec3
+    n0: wp.vec3
+    n1: wp.vec3
+    n2: wp.vec3
+    t0: wp.vec2
+    t1: wp.vec2
+    t2: wp.vec2
+
+
+def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
+    """With only those attributes that the scene has."""
+
+    @wp.func
+    def triangle_at(surfaces: Surfaces, place: Place) -> Triangle:
+        face = surfaces.faces[place.face]
+        triangle = Triangle()
+        triangle.v0 = surfaces.vertices[face[0]]
+        triangle.v1 = surfaces.vertices[face[1]]
+        triangle.v2 = surfaces.vertices[face[2]]
+        if wp.static(smooth):
+            triangle.n0 = surfaces.normals[face[0]]
+            triangle.n1 = surfaces.normals[face[1]]
+            triangle.n2 = surfaces.normals[face[2]]
+            if wp.static(instances):  # each by itself: an interpolated one would turn elsewhere
+                instance = surfaces.instances[place.instance]
+                triangle.n0 = world_normal(instance, triangle.n0)
+                triangle.n1 = world_normal(instance, triangle.n1)
+                triangle.n2 = world_normal(instance, triangle.n2)
+        if wp.static(uvs):
+            triangle.t0 = surfaces.uvs[face[0]]
+            triangle.t1 = surfaces.uvs[face[1]]
+            triangle.t2 = surfaces.uvs[face[2]]
+        return triangle
+
+    return triangle_at
+
+
+corners_of_place = make_triangle_at(False, False, False)
 
 
 @wp.func
-def corners_at(surfaces: Surfaces, index: int) -> Corners:
-    """Of face `index`."""
-    face = surfaces.faces[index]
-    c = Corners()
-    c.v0 = surfaces.vertices[face[0]]
-    c.v1 = surfaces.vertices[face[1]]
-    c.v2 = surfaces.vertices[face[2]]
-    return c
+def corners_at(surfaces: Surfaces, face: int) -> Triangle:
+    """A face without attributes."""
+    place = Place()
+    place.face = face
+    return corners_of_place(surfaces, place)
 
 
 @wp.func
-def triangle_point(c: Corners, u: float, v: float) -> wp.vec3:
+def triangle_point(t: Triangle, u: float, v: float) -> wp.vec3:
     """The point with these barycentrics, in the space of its corners."""
-    return (1.0 - u - v) * c.v0 + u * c.v1 + v * c.v2
+    return (1.0 - u - v) * t.v0 + u * t.v1 + v * t.v2
 
 
 @wp.func
-def triangle_uv(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec2:
-    """Texture coordinates of face `index` at these barycentrics."""
-    face = surfaces.faces[index]
-    return (1.0 - u - v) * surfaces.uvs[face[0]] + u * surfaces.uvs[face[1]] + v * surfaces.uvs[face[2]]
+def triangle_uv(t: Triangle, u: float, v: float) -> wp.vec2:
+    """Texture coordinates at these barycentrics."""
+    return (1.0 - u - v) * t.t0 + u * t.t1 + v * t.t2
 
 
 @wp.func
-def triangle_point_error(c: Corners, u: float, v: float) -> wp.vec3:
+def triangle_point_error(t: Triangle, u: float, v: float) -> wp.vec3:
     """How far a ray that starts at triangle_point must stand off to be clear of the triangle's plane, per axis.
 
     Two parts: the rounding of the point itself, seven roundings in a row (PBR, section 6.8.5), and that of the next ray's
     distance to a neighbour in the same plane, which grows with the triangle's size and not with its coordinates: a floor at
     y = 0 has none of the first.
     """
-    size = gamma(8.0) * wp.max(largest(c.v1 - c.v0), largest(c.v2 - c.v0))
-    point = gamma(7.0) * (wp.abs((1.0 - u - v) * c.v0) + wp.abs(u * c.v1) + wp.abs(v * c.v2))
+    size = gamma(8.0) * wp.max(largest(t.v1 - t.v0), largest(t.v2 - t.v0))
+    point = gamma(7.0) * (wp.abs((1.0 - u - v) * t.v0) + wp.abs(u * t.v1) + wp.abs(v * t.v2))
     return point + wp.vec3(size, size, size)
 
 
 @wp.func
-def triangle_normal(c: Corners) -> wp.vec3:
+def triangle_normal(t: Triangle) -> wp.vec3:
     """Unit normal on the counter-clockwise side, in the space of its corners; 0 where there is none. wrt.renderer.upload has the
     same in NumPy.
 
     The edges are scaled to about 1 first: a triangle of size 1e-20 would otherwise have a normal of length 0.
     """
-    e1 = c.v1 - c.v0
-    e2 = c.v2 - c.v0
-    return wp.normalize(wp.cross(e1 / largest(e1), e2 / largest(e2)))
+    e1 = t.v1 - t.v0
+    e2 = t.v2 - t.v0
+    return unit(wp.cross(e1 / largest(e1), e2 / largest(e2)))
 
 
-def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False) -> Any:
-    """Interpolation at a hit, with only those attributes that the scene has."""
-    place_of = make_place_of(instances)
+def make_on_triangle(smooth: bool) -> Any:
+    """Where a hit is, and the normals there. Like `facing`, it has no branches, so that loops can run in lanes."""
 
     @wp.func
-    def on_triangle(surfaces: Surfaces, hit: Hit, place: Place) -> Surface:
-        """In the space of the triangle's vertices, but for the shading normal, which is in the world (0: that of the triangle)."""
+    def on_triangle(t: Triangle, u: float, v: float) -> Surface:
+        """In the space of its corners, but for the shading normal, which is in the world (0: that of the triangle)."""
         s = Surface()
-        face = surfaces.faces[place.face]
-        w = 1.0 - hit.u - hit.v
-        c = corners_at(surfaces, place.face)
-        s.point = triangle_point(c, hit.u, hit.v)
-        s.error = triangle_point_error(c, hit.u, hit.v)
-        s.geometric = triangle_normal(c)
-        if wp.static(smooth):
-            n0 = surfaces.normals[face[0]]
-            n1 = surfaces.normals[face[1]]
-            n2 = surfaces.normals[face[2]]
-            if wp.static(instances):  # each by itself: an interpolated one would turn elsewhere
-                instance = surfaces.instances[place.instance]
-                n0 = world_normal(instance, n0)
-                n1 = world_normal(instance, n1)
-                n2 = world_normal(instance, n2)
-            n = w * n0 + hit.u * n1 + hit.v * n2
-            length = wp.length(n)
-            if length > 0.0:  # corners without a normal are zero: flat there
-                s.shading = n / length
+        s.point = triangle_point(t, u, v)
+        s.error = triangle_point_error(t, u, v)
+        s.geometric = triangle_normal(t)
+        if wp.static(smooth):  # corners without a normal are zero: flat there
+            s.shading = unit((1.0 - u - v) * t.n0 + u * t.n1 + v * t.n2)
+        return s
+
+    return on_triangle
+
+
+def make_with_uv(uvs: bool, tangents: bool) -> Any:
+    """What textures need beside that. It is computed for one hit at a time: with it, a Surface does not run in lanes."""
+
+    @wp.func
+    def with_uv(met: Surface, t: Triangle, u: float, v: float, outward: wp.vec3) -> Surface:
+        """outward: the geometric normal on the outside."""
+        s = met
         if wp.static(uvs):
-            s.uv = triangle_uv(surfaces, place.face, hit.u, hit.v)
+            s.uv = triangle_uv(t, u, v)
         if wp.static(tangents):
-            e1 = c.v1 - c.v0
-            e2 = c.v2 - c.v0
+            e1 = t.v1 - t.v0
+            e2 = t.v2 - t.v0
             longer = wp.min(lift(e1), lift(e2))
             e1 = longer * e1
             e2 = longer * e2
-            t1 = surfaces.uvs[face[1]] - surfaces.uvs[face[0]]
-            t2 = surfaces.uvs[face[2]] - surfaces.uvs[face[0]]
+            t1 = t.t1 - t.t0
+            t2 = t.t2 - t.t0
             # dp/du up to a positive factor. v runs down: a picture that is not mirrored has a negative determinant.
             s.bitangent_sign = wp.where(t1[0] * t2[1] - t1[1] * t2[0] > 0.0, -1.0, 1.0)
             along_u = -s.bitangent_sign * (t2[1] * e1 - t1[1] * e2)
             length = wp.length(along_u)
-            s.tangent = wp.where(length > 0.0, along_u / length, frame_x(s.geometric))
+            s.tangent = wp.where(length > 0.0, along_u / length, frame_x(outward))
         return s
+
+    return with_uv
+
+
+@wp.func
+def facing(met: Surface, direction: wp.vec3) -> Surface:
+    """A surface as a ray of this direction sees it.
+
+    A smooth normal belongs to the outside, which the winding defines: both are turned together, and a normal that disagrees with
+    the winding by more than a right angle is brought to the winding's side.
+    """
+    s = met
+    n = met.geometric
+    shading = select(wp.dot(met.shading, met.shading) > 0.0, met.shading, n)
+    shading = wp.where(wp.dot(shading, n) < 0.0, -1.0, 1.0) * shading
+    back = wp.dot(direction, n) > 0.0
+    side = wp.where(back, -1.0, 1.0)
+    s.front = wp.where(back, 0, 1)
+    s.geometric = side * n
+    s.shading = side * shading
+    return s
+
+
+def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False) -> Any:
+    """The surface at a hit, with only those attributes that the scene has."""
+    place_of = make_place_of(instances)
+    triangle_at = make_triangle_at(smooth, uvs, instances)
+    plain, with_uv = make_on_triangle(smooth), make_with_uv(uvs, tangents)
+
+    @wp.func
+    def on_triangle(surfaces: Surfaces, hit: Hit, place: Place) -> Surface:
+        t = triangle_at(surfaces, place)
+        s = plain(t, hit.u, hit.v)
+        return with_uv(s, t, hit.u, hit.v, s.geometric)
 
     @wp.func
     def in_world(local: Surface, instance: Instance) -> Surface:
@@ -285,19 +363,9 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
             s = on_triangle(surfaces, hit, place)
             if wp.static(instances):
                 s = in_world(s, surfaces.instances[place.instance])
-        if not wp.dot(s.shading, s.shading) > 0.0:
-            s.shading = s.geometric
+        s = facing(s, ray.direction)
         s.material = place.material
         s.exclude_plus_one = wp.where(hit.prim_id < surfaces.n_triangles, hit.prim_id + 1, 0)
-        s.front = 1
-        # A smooth normal belongs to the outside, which the winding defines: both are turned together, and a normal that
-        # disagrees with the winding by more than a right angle is brought to the winding's side.
-        if wp.dot(s.shading, s.geometric) < 0.0:
-            s.shading = -s.shading
-        if wp.dot(ray.direction, s.geometric) > 0.0:
-            s.front = 0
-            s.geometric = -s.geometric
-            s.shading = -s.shading
         return s
 
     return surface_at

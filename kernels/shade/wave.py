@@ -54,14 +54,15 @@ class Job:
 class Wave:
     """Samples are numbered pixel by pixel; there is room for `capacity`. By number: xi, lens_xi, what places a sample on the film
     and on the lens; done, the sum so far; size, traced: paths that wait, and rays so far; paths[level * capacity + number]: those
-    that wait, and after them the one that is queued. pixel_keys: of the samples of each pixel, and pixels: where on the film those are.
+    that wait, and after them the one that is queued. pixel_keys: of the samples of each pixel, and pixels: where on the film it is.
 
     By place in the queue: number, rays, hits. By count of the surfaces that ask lights: asked (their sample's number), lit,
     scatter, and for light i from i * capacity on request: the place of its shadow ray, or -1. By place of a shadow ray, for light i
     from i * capacity on: value, shadow_rays, occluded or, where shadows are transparent, walks and shadow_hits, and waiting: which
     walks those rays are of. asking: shadow rays to each light.
 
-    By place in a block of the queue (BLOCK), or of hits alone by their count in it: sky_x, sky_y, sky_z, keys and indices.
+    met, missed: places in the queue of the rays that hit something and of the others, each in their order. By place in a block of
+    BLOCK of the hits: rows (wave_surfaces.py), keys, indices, and sky_x, sky_y, sky_z, which before that are of a block of the queue.
     """
 
     capacity: int
@@ -91,6 +92,7 @@ class Wave:
     waiting: wp.array(dtype=wp.int32)
     met: wp.array(dtype=wp.int32)
     missed: wp.array(dtype=wp.int32)
+    rows: wp.array(dtype=wp.float32)
     sky_x: wp.array(dtype=wp.float32)
     sky_y: wp.array(dtype=wp.float32)
     sky_z: wp.array(dtype=wp.float32)
@@ -179,7 +181,7 @@ def make_gather(transparent_shadows: bool) -> Any:
 
 @wp.func_native(source("shade/film_samples.h", LANES=LANES))
 def add_to_pixels(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(dtype=Sample), p: int, samples: int) -> None:
-    """As with_sample, to the LANES entries of the film that pixels[p], pixels[p + 1] ... name: done[p * samples] and those after it."""
+    """As with_sample, to the LANES entries of the film from pixels[p] on: done[p * samples] and what follows it."""
 
 
 @wp.func

@@ -4,73 +4,23 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.memory import bits_at, call_in_int, call_in_vec2, call_in_vec3, call_in_vec3i, put_number
-from wrt.kernels.query import hit_at, put_ray, queued_ray
+from wrt.kernels.memory import bits_at, put_number
+from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
 from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, make_step
-from wrt.kernels.shade.surface import triangle_uv
-from wrt.kernels.shade.textures import call_in_texels
-from wrt.kernels.shade.wave import AHEAD, BLOCK, Job, Path, Wave, enqueue, put_sample, ray_of
+from wrt.kernels.shade.wave import BLOCK, Job, Path, Wave, enqueue, put_sample
+from wrt.kernels.shade.wave_surfaces import make_call_in, make_wave_surfaces
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
-
-
-def make_call_in(features: Any) -> Any:
-    """What the hits after this one, will read: the face of one, the corners of another before it, and the texels of
-    a third."""
-    pictures = [name for name, used in (("albedo_texture", features.textures), ("emission_texture", features.textures),
-                                        ("metallic_roughness_texture", features.parameter_textures),
-                                        ("transmission_texture", features.parameter_textures),
-                                        ("normal_texture", features.normal_maps)) if used]
-
-    @wp.func
-    def triangle_at(wave: Wave, surfaces: Surfaces, j: int, hits: int) -> int:
-        """The triangle of hit j, or -1."""
-        if j >= hits:
-            return -1
-        prim_id = wave.hits.prim_id[wave.met[j]]
-        return wp.where(prim_id < surfaces.n_triangles, prim_id, -1)
-
-    @wp.func
-    def call_in_surface(wave: Wave, surfaces: Surfaces, j: int, hits: int):
-        """j: a hit; there are `hits`."""
-        prim_id = triangle_at(wave, surfaces, j + 3 * AHEAD, hits)
-        if prim_id >= 0:
-            call_in_vec3i(surfaces.faces, prim_id)
-            call_in_int(surfaces.prim_material, prim_id)
-        prim_id = triangle_at(wave, surfaces, j + 2 * AHEAD, hits)
-        if prim_id >= 0:
-            face = surfaces.faces[prim_id]
-            for corner in range(3):
-                call_in_vec3(surfaces.vertices, face[corner])
-                if wp.static(features.smooth):
-                    call_in_vec3(surfaces.normals, face[corner])
-                if wp.static(bool(pictures)):
-                    call_in_vec2(surfaces.uvs, face[corner])
-        if wp.static(bool(pictures)):
-            prim_id = triangle_at(wave, surfaces, j + AHEAD, hits)
-            if prim_id >= 0:
-                m = surfaces.materials[surfaces.prim_material[prim_id]]
-                k = wave.met[j + AHEAD]
-                uv = triangle_uv(surfaces, prim_id, wave.hits.u[k], wave.hits.v[k])
-                if wp.static("albedo_texture" in pictures):
-                    call_in_texels(surfaces, m.albedo_texture, uv)
-                    call_in_texels(surfaces, m.emission_texture, uv)
-                if wp.static("transmission_texture" in pictures):
-                    call_in_texels(surfaces, m.metallic_roughness_texture, uv)
-                    call_in_texels(surfaces, m.transmission_texture, uv)
-                if wp.static("normal_texture" in pictures):
-                    call_in_texels(surfaces, m.normal_texture, uv)
-
-    return call_in_surface
 
 
 def make_shade_kernel(features: Any) -> Any:
     """The step at every hit of the queue: its light, its new paths, and its requests for shadow rays."""
     shading = make_shading(features)
     step = make_step(features, shading)
+    find, found = make_wave_surfaces(features)
     call_in_surface = make_call_in(features)
     _, first_path, _, shade, extra_lights, shadow_request, keep, worth = step
     radiance, by_kind, radiance_at, places = BACKGROUNDS[features.background]
@@ -190,8 +140,9 @@ def make_shade_kernel(features: Any) -> Any:
         for j in range(hits):
             if wp.static(not features.instances):
                 call_in_surface(wave, surfaces, j, hits)
-            if wp.static(sky_in_lanes):
-                if j % BLOCK == 0:
+            if j % BLOCK == 0:
+                find(wave, surfaces, j, wp.min(j + BLOCK, hits))
+                if wp.static(sky_in_lanes):
                     sky_points(wave, lighting.count, j, wp.min(j + BLOCK, hits))
             k = wave.met[j]
             number = wave.number[k]
@@ -208,9 +159,8 @@ def make_shade_kernel(features: Any) -> Any:
                 out = wave.done[number]
             out.rays += 1
             asks = int(0)
-            hit = hit_at(wave.hits, k)
             index = wp.uint32(job.first_sample + number % job.samples)
-            shaded = shade(surfaces, lighting, path, ray_of(path), hit, index)
+            shaded = shade(surfaces, lighting, path, found(wave, surfaces, j % BLOCK, k), wave.hits.t[k], index)
             lit = Lit()
             lit.light = shaded.light
             lit.throughput = shaded.throughput

@@ -13,7 +13,7 @@ import warp as wp
 from wrt.accel.batches import new_scratch
 from wrt.core.device import made_once, records, upload
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
-from wrt.kernels.shade import wave, wave_begin, wave_shade
+from wrt.kernels.shade import wave, wave_begin, wave_shade, wave_surfaces
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_cutout
@@ -167,8 +167,10 @@ class Buffers:
         w.done, w.size, w.traced, w.number = room(n, Sample), room(n, wp.int32), room(n, wp.int32), room(n, wp.int32)
         w.paths = room(n * features.stack_size, wave.Path)
         w.met, w.missed = room(n, wp.int32), room(n, wp.int32)
+        w.rows = room(wave_surfaces.ROWS * wave.BLOCK, wp.float32)
         w.sky_x, w.sky_y, w.sky_z = (room(wave.BLOCK, wp.float32) for _ in range(3))
-        w.pixels, w.pixel_keys, w.keys, w.indices = room(n + LANES, wp.int32), room(n, wp.uint32), room(wave.BLOCK, wp.uint32), room(wave.BLOCK, wp.uint32)
+        w.keys, w.indices = room(wave.BLOCK, wp.uint32), room(wave.BLOCK, wp.uint32)
+        w.pixels, w.pixel_keys = room(n + LANES, wp.int32), room(n, wp.uint32)
         w.rays, w.hits, w.lit, w.asked = queue(n), hit_arrays(n), room(n, Lit), room(n, wp.int32)
         w.request, w.value, w.shadow_rays = room(shadows, wp.int32), room(shadows, wp.vec3), queue(shadows)
         if features.transparent_shadows:

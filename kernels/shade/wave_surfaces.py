@@ -1,0 +1,188 @@
+"""The surfaces at a wave's hits, many at a time: triangles are gathered, and computed in lanes (kernels.memory)."""
+
+from itertools import accumulate
+from typing import Any
+
+import warp as wp
+
+from wrt.kernels.memory import call_in_int, call_in_vec2, call_in_vec3, call_in_vec3i, number_at, put_number
+from wrt.kernels.query import hit_at, queued_ray
+from wrt.kernels.shade.surface import (
+    Surface,
+    Triangle,
+    facing,
+    make_on_triangle,
+    make_place_of,
+    make_surface_at,
+    make_triangle_at,
+    make_with_uv,
+    triangle_uv,
+)
+from wrt.kernels.shade.textures import call_in_texels
+from wrt.kernels.shade.wave import AHEAD, BLOCK, Wave
+from wrt.kernels.structs import Surfaces
+
+# What there is of a hit, and in how many numbers: what is gathered, and what is computed of it.
+GATHERED = {"v0": 3, "v1": 3, "v2": 3, "n0": 3, "n1": 3, "n2": 3, "u": 1, "v": 1, "direction": 3}
+COMPUTED = {"point": 3, "error": 3, "geometric": 3, "shading": 3, "front": 1}
+SIZES = {**GATHERED, **COMPUTED}
+ROW = dict(zip(SIZES, accumulate(SIZES.values(), initial=0), strict=False))  # what begins where: a row has a number of each hit
+ROWS = sum(SIZES.values())
+
+
+@wp.func
+def row_number(rows: wp.array(dtype=wp.float32), row: int, i: int) -> float:
+    """Of hit i of a block."""
+    return number_at(rows, row * BLOCK + i)
+
+
+@wp.func
+def put_row_number(rows: wp.array(dtype=wp.float32), row: int, i: int, value: float):
+    put_number(rows, row * BLOCK + i, value)
+
+
+@wp.func
+def row_vec3(rows: wp.array(dtype=wp.float32), row: int, i: int) -> wp.vec3:
+    return wp.vec3(row_number(rows, row, i), row_number(rows, row + 1, i), row_number(rows, row + 2, i))
+
+
+@wp.func
+def put_row_vec3(rows: wp.array(dtype=wp.float32), row: int, i: int, value: wp.vec3):
+    put_row_number(rows, row, i, value[0])
+    put_row_number(rows, row + 1, i, value[1])
+    put_row_number(rows, row + 2, i, value[2])
+
+
+def make_wave_surfaces(features: Any) -> tuple[Any, Any]:
+    """find(wave, surfaces, first, end): computes those of the hits first .. end - 1, at most BLOCK; found(wave, surfaces, first, j)
+    -> Surface: that of hit j. Spheres, and triangles with places of their own, are computed one by one, when they are asked for."""
+    smooth, uvs, tangents = features.smooth, features.textures or features.checkerboards, features.normal_maps
+    surface_at = make_surface_at(features.spheres, smooth, uvs, tangents, features.instances)
+    place_of, triangle_at = make_place_of(False), make_triangle_at(smooth, uvs, False)
+    on_triangle, with_uv = make_on_triangle(smooth), make_with_uv(uvs, tangents)
+
+    @wp.func
+    def gather(wave: Wave, surfaces: Surfaces, first: int, end: int):
+        for j in range(first, end):
+            k = wave.met[j]
+            i = j - first
+            # A sphere's numbers are computed in vain.
+            t = triangle_at(surfaces, place_of(surfaces, wp.min(wave.hits.prim_id[k], surfaces.n_triangles - 1)))
+            put_row_vec3(wave.rows, wp.static(ROW["v0"]), i, t.v0)
+            put_row_vec3(wave.rows, wp.static(ROW["v1"]), i, t.v1)
+            put_row_vec3(wave.rows, wp.static(ROW["v2"]), i, t.v2)
+            if wp.static(smooth):
+                put_row_vec3(wave.rows, wp.static(ROW["n0"]), i, t.n0)
+                put_row_vec3(wave.rows, wp.static(ROW["n1"]), i, t.n1)
+                put_row_vec3(wave.rows, wp.static(ROW["n2"]), i, t.n2)
+            put_row_number(wave.rows, wp.static(ROW["u"]), i, wave.hits.u[k])
+            put_row_number(wave.rows, wp.static(ROW["v"]), i, wave.hits.v[k])
+            put_row_vec3(wave.rows, wp.static(ROW["direction"]), i, wave.rays.direction[k])
+
+    @wp.func
+    def gathered(rows: wp.array(dtype=wp.float32), i: int) -> Triangle:
+        t = Triangle()
+        t.v0 = row_vec3(rows, wp.static(ROW["v0"]), i)
+        t.v1 = row_vec3(rows, wp.static(ROW["v1"]), i)
+        t.v2 = row_vec3(rows, wp.static(ROW["v2"]), i)
+        if wp.static(smooth):
+            t.n0 = row_vec3(rows, wp.static(ROW["n0"]), i)
+            t.n1 = row_vec3(rows, wp.static(ROW["n1"]), i)
+            t.n2 = row_vec3(rows, wp.static(ROW["n2"]), i)
+        return t
+
+    @wp.func
+    def find(wave: Wave, surfaces: Surfaces, first: int, end: int):
+        if wp.static(features.instances):
+            return
+        if surfaces.n_triangles == 0:
+            return
+        gather(wave, surfaces, first, end)
+        rows = wave.rows
+        i = int(0)
+        while i < end - first:
+            u = row_number(rows, wp.static(ROW["u"]), i)
+            v = row_number(rows, wp.static(ROW["v"]), i)
+            s = facing(on_triangle(gathered(rows, i), u, v), row_vec3(rows, wp.static(ROW["direction"]), i))
+            put_row_vec3(rows, wp.static(ROW["point"]), i, s.point)
+            put_row_vec3(rows, wp.static(ROW["error"]), i, s.error)
+            put_row_vec3(rows, wp.static(ROW["geometric"]), i, s.geometric)
+            put_row_vec3(rows, wp.static(ROW["shading"]), i, s.shading)
+            put_row_number(rows, wp.static(ROW["front"]), i, float(s.front))
+            i = i + 1
+
+    @wp.func
+    def found(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
+        hit = hit_at(wave.hits, k)
+        if wp.static(features.instances):
+            return surface_at(surfaces, queued_ray(wave.rays, k), hit)
+        if wp.static(features.spheres):
+            if hit.prim_id >= surfaces.n_triangles:
+                return surface_at(surfaces, queued_ray(wave.rays, k), hit)
+        rows = wave.rows
+        s = Surface()
+        s.point = row_vec3(rows, wp.static(ROW["point"]), i)
+        s.error = row_vec3(rows, wp.static(ROW["error"]), i)
+        s.geometric = row_vec3(rows, wp.static(ROW["geometric"]), i)
+        s.shading = row_vec3(rows, wp.static(ROW["shading"]), i)
+        s.front = int(row_number(rows, wp.static(ROW["front"]), i))
+        if wp.static(uvs):
+            t = triangle_at(surfaces, place_of(surfaces, hit.prim_id))
+            s = with_uv(s, t, hit.u, hit.v, wp.where(s.front != 0, 1.0, -1.0) * s.geometric)
+        s.material = surfaces.prim_material[hit.prim_id]
+        s.exclude_plus_one = hit.prim_id + 1
+        return s
+
+    return find, found
+
+
+def make_call_in(features: Any) -> Any:
+    """What the hits after this one, will read: the face of one, the corners of another before it, and the texels of
+    a third."""
+    pictures = [name for name, used in (("albedo_texture", features.textures), ("emission_texture", features.textures),
+                                        ("metallic_roughness_texture", features.parameter_textures),
+                                        ("transmission_texture", features.parameter_textures),
+                                        ("normal_texture", features.normal_maps)) if used]
+
+    place_of, triangle_at = make_place_of(False), make_triangle_at(False, True, False)
+
+    @wp.func
+    def hit_triangle(wave: Wave, surfaces: Surfaces, j: int, hits: int) -> int:
+        """The triangle of hit j, or -1."""
+        if j >= hits:
+            return -1
+        prim_id = wave.hits.prim_id[wave.met[j]]
+        return wp.where(prim_id < surfaces.n_triangles, prim_id, -1)
+
+    @wp.func
+    def call_in_surface(wave: Wave, surfaces: Surfaces, j: int, hits: int):
+        """j: a hit; there are `hits`."""
+        prim_id = hit_triangle(wave, surfaces, j + BLOCK + 2 * AHEAD, hits)
+        if prim_id >= 0:
+            call_in_vec3i(surfaces.faces, prim_id)
+            call_in_int(surfaces.prim_material, prim_id)
+        prim_id = hit_triangle(wave, surfaces, j + BLOCK + AHEAD, hits)
+        if prim_id >= 0:
+            face = surfaces.faces[prim_id]
+            for corner in range(3):
+                call_in_vec3(surfaces.vertices, face[corner])
+                if wp.static(features.smooth):
+                    call_in_vec3(surfaces.normals, face[corner])
+                if wp.static(bool(pictures)):
+                    call_in_vec2(surfaces.uvs, face[corner])
+        if wp.static(bool(pictures)):
+            prim_id = hit_triangle(wave, surfaces, j + AHEAD, hits)
+            if prim_id >= 0:
+                m = surfaces.materials[surfaces.prim_material[prim_id]]
+                k = wave.met[j + AHEAD]
+                uv = triangle_uv(triangle_at(surfaces, place_of(surfaces, prim_id)), wave.hits.u[k], wave.hits.v[k])
+                if wp.static("albedo_texture" in pictures):
+                    call_in_texels(surfaces, m.albedo_texture, uv)
+                    call_in_texels(surfaces, m.emission_texture, uv)
+                if wp.static("transmission_texture" in pictures):
+                    call_in_texels(surfaces, m.metallic_roughness_texture, uv)
+                    call_in_texels(surfaces, m.transmission_texture, uv)
+                if wp.static("normal_texture" in pictures):
+                    call_in_texels(surfaces, m.normal_texture, uv)
+
+    return call_in_surface
