@@ -14,7 +14,8 @@
     }
     struct Pixels {
         float mean[3][LANES], m2[3][LANES], lost[LANES];
-        int samples[LANES], rays[LANES], cut_depth[LANES], cut_throughput[LANES], not_finite[LANES];
+        long long rays[LANES];
+        int samples[LANES], cut_depth[LANES], cut_throughput[LANES], not_finite[LANES];
     } sum;
     for (int lane = 0; lane < LANES; ++lane) {
         const long long i = at[lane];

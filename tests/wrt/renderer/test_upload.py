@@ -7,11 +7,14 @@ import warnings
 import numpy as np
 import pytest
 
-from tests.kernel_tools import DEVICE, unit  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, launch, unit, vec3s, zeros  # isort: skip (starts Warp)
+import warp as wp
 
 from wrt.accel.flatten import world_mesh
 from wrt.core.errors import InputError, SceneWarning
 from wrt.kernels.shade import lights
+from wrt.kernels.shade.surface import Triangle, triangle_normal
+from wrt.kernels.structs import kernel
 from wrt.renderer.upload import (
     LUMINANCE,
     MAX_MESH_LIGHTS,
@@ -20,6 +23,7 @@ from wrt.renderer.upload import (
     light_records,
     material_records,
     srgb_table,
+    unit_normals,
     upload_scene,
 )
 from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
@@ -200,6 +204,33 @@ def test_the_density_of_emitters_is_that_of_the_rounded_table_by_which_they_are_
     chance = np.diff(cdf.astype(np.float64), prepend=0.0)
     assert np.allclose(emitters["pdf_area"] * area, chance, rtol=1e-6)
     assert np.abs(chance * count - 1.0).max() > 0.01  # what rounding makes of equal shares
+
+
+@kernel
+def normal_kernel(v0: wp.array(dtype=wp.vec3), v1: wp.array(dtype=wp.vec3), v2: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    t = Triangle()
+    t.v0 = v0[i]
+    t.v1 = v1[i]
+    t.v2 = v2[i]
+    out[i] = triangle_normal(t)
+
+
+def test_normals_of_emitters_are_those_of_the_device_to_the_last_bit() -> None:
+    rng = np.random.default_rng(3)
+    n = 200_000
+    corners = (rng.normal(size=(3, n, 3)) + rng.normal(size=(1, n, 3))) * 10.0 ** rng.uniform(-22, 18, (1, n, 1))
+    corners = corners.astype(np.float32)
+    corners[1, :1000] = corners[0, :1000]  # no edge, edges on a line, and edges that are nearly on one
+    corners[2, 1000:2000] = 2.0 * corners[1, 1000:2000] - corners[0, 1000:2000]
+    corners[2, 2000:3000] = corners[1, 2000:3000] * np.float32(1.0 + 1e-6)
+    corners[:, 3000:4000] *= np.float32(1e-38)
+    corners[:, 4000:5000, 1] = 0.0
+    out = zeros(n, wp.vec3)
+    launch(normal_kernel, n, *map(vec3s, corners), out)
+    expected = out.numpy()
+    assert (unit_normals(*corners).view(np.uint32) == expected.view(np.uint32)).all()
+    assert (expected[:1000] == 0.0).all() and (np.linalg.norm(expected, axis=1) > 0.99).mean() > 0.9
 
 
 def test_emission_that_light_samples_cannot_reach_is_told_once() -> None:
