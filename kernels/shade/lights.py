@@ -15,7 +15,7 @@ from wrt.kernels.shade.surface import (
     world_normal,
     world_point,
 )
-from wrt.kernels.structs import Light, Lighting, Surfaces
+from wrt.kernels.structs import Emitter, Light, Lighting, Surfaces
 
 
 @wp.struct
@@ -81,21 +81,51 @@ def spot_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface,
     return sample
 
 
+@wp.func
+def choose_emitter(lighting: Lighting, light: Light, xi: float) -> tuple[int, float]:
+    """By power: the emitter that xi falls on, and where in its share, in [0, 1), which is uniform again."""
+    chosen = search_cdf(lighting.emitter_cdf, light.first, light.count, xi)
+    share = share_of_row(lighting.emitter_cdf, light.first, chosen)
+    left = lighting.emitter_cdf[light.first + chosen] - xi
+    return light.first + chosen, wp.clamp(1.0 - left / wp.max(share, 1.0e-30), 0.0, 0.99999994)
+
+
+@wp.func
+def emitter_corners(emitter: Emitter) -> Triangle:
+    t = Triangle()
+    t.v0 = emitter.v0
+    t.v1 = emitter.v1
+    t.v2 = emitter.v2
+    return t
+
+
+@wp.func
+def from_emitter(point: wp.vec3, error: wp.vec3, n: wp.vec3, emission: wp.vec3, two_sided: bool, pdf_area: float,
+                 eye: wp.vec3) -> LightSample:
+    """What arrives at `eye` from a point of an emitter with normal n. It has no branches, so that loops can run in lanes."""
+    sample = LightSample()
+    way = point - eye
+    distance2 = wp.dot(way, way)
+    sample.wi = way / wp.sqrt(wp.max(distance2, wp.static(2.0**-126)))
+    cos_light = -wp.dot(sample.wi, n)
+    cos_light = wp.where(two_sided, wp.abs(cos_light), cos_light)
+    share = wp.where(cos_light > 0.0 and distance2 > 0.0, cos_light / (distance2 * pdf_area), 0.0)
+    sample.weight = share * emission
+    # The way ends just before the light: its own surface must not shade it.
+    sample.end = spawn_point(point, error, n, eye - point)
+    sample.area = 1
+    return sample
+
+
 def make_mesh_light(features: Any) -> Any:
     """A point on the emitters of one light, by power and then uniformly by area."""
 
     @wp.func
     def mesh_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
-        chosen = search_cdf(lighting.emitter_cdf, light.first, light.count, xi[0])
-        emitter = lighting.emitters[light.first + chosen]
-        share = share_of_row(lighting.emitter_cdf, light.first, chosen)
-        left = lighting.emitter_cdf[light.first + chosen] - xi[0]
-        within = wp.clamp(1.0 - left / wp.max(share, 1.0e-30), 0.0, 0.99999994)
+        chosen, within = choose_emitter(lighting, light, xi[0])
+        emitter = lighting.emitters[chosen]
         b = triangle(wp.vec2(within, xi[1]))
-        t = Triangle()
-        t.v0 = emitter.v0
-        t.v1 = emitter.v1
-        t.v2 = emitter.v2
+        t = emitter_corners(emitter)
         point = triangle_point(t, b[0], b[1])
         n = emitter.normal
         error = triangle_point_error(t, b[0], b[1])
@@ -106,19 +136,7 @@ def make_mesh_light(features: Any) -> Any:
             n = world_normal(instance, n)
             error = world_error(instance, local, error, point)
         material = surfaces.materials[emitter.material]
-        sample = LightSample()
-        way = point - s.point
-        distance2 = wp.dot(way, way)
-        sample.wi = way / wp.sqrt(wp.max(distance2, wp.static(2.0**-126)))
-        cos_light = -wp.dot(sample.wi, n)
-        if material.two_sided != 0:
-            cos_light = wp.abs(cos_light)
-        share = wp.where(cos_light > 0.0 and distance2 > 0.0, cos_light / (distance2 * emitter.pdf_area), 0.0)
-        sample.weight = share * material.emission
-        # The way ends just before the light: its own surface must not shade it.
-        sample.end = spawn_point(point, error, n, s.point - point)
-        sample.area = 1
-        return sample
+        return from_emitter(point, error, n, material.emission, material.two_sided != 0, emitter.pdf_area, s.point)
 
     return mesh_light
 

@@ -15,7 +15,7 @@ from wrt.kernels.structs import Lighting, Limits, Ray, Surfaces, any_positive
 def make_direct_light(features: Any, accel_struct: Any, transmittance: Any, step: Any, counting: bool = False) -> Any:
     """Light straight from every light (and the background) by one shadow ray each."""
     Shaded = make_shaded(counting)
-    shadow_request, extra_lights = step.shadow_request, step.extra_lights
+    choose, shadow_request, extra_lights = step.choose, step.shadow_request, step.extra_lights
     light_point = make_light_points(features).point
 
     @wp.func
@@ -23,7 +23,8 @@ def make_direct_light(features: Any, accel_struct: Any, transmittance: Any, step
         """As `add_up` takes it. cut: shadow rays that were, and lost: the light they were worth in a room of radiance 1."""
         out = Shadow()
         for i in range(lighting.count + wp.static(extra_lights)):
-            request = shadow_request(surfaces, lighting, shaded, i, light_point(lighting, shaded.key, index, i))
+            point = light_point(lighting, shaded.key, index, i)
+            request = shadow_request(shaded, choose(lighting, surfaces, i, shaded.surface, point))
             if any_positive(request.value):
                 out = lit_by(out, request.value, shaded.scatter, transmittance(accel, surfaces, request.ray, request.end))
         return out
@@ -36,7 +37,7 @@ def make_radiance(features: Any, accel_struct: Any, closest_hit: Any, any_hit: A
     shading = make_shading(features)
     step = make_step(features, shading, counting)
     surface_at = shading.surface_at
-    Path, first_path, ray_of, shade, _, _, keep, worth = step
+    Path, first_path, ray_of, shade, keep, worth = step.Path, step.first_path, step.ray_of, step.shade, step.keep, step.worth
     background_radiance = make_background(features)
     transmittance = make_transmittance(features, shading, accel_struct, closest_hit, any_hit)
     direct_light = make_direct_light(features, accel_struct, transmittance, step, counting)

@@ -173,11 +173,30 @@ def polygon(xi: wp.vec2, sides: int, rotation: float) -> wp.vec2:
 
 
 @wp.func
+def triangle_numbers(x: float, y: float) -> tuple[float, float]:
+    """As `triangle`. No branches here and in search_cdf: of random numbers, every second would be mispredicted."""
+    half = 0.5 * wp.where(y > x, x, y)
+    return wp.where(y > x, half, x - half), wp.where(y > x, y - half, half)
+
+
+@wp.func
 def triangle(xi: wp.vec2) -> wp.vec2:
     """Barycentrics (of v1, v2), uniform over a triangle, without folding or square root (Heitz 2019)."""
-    above = xi[1] > xi[0]  # no branches here and in search_cdf: of random numbers, every second would be mispredicted
-    half = 0.5 * wp.where(above, xi[0], xi[1])
-    return wp.vec2(wp.where(above, half, xi[0] - half), wp.where(above, xi[1] - half, half))
+    u, v = triangle_numbers(xi[0], xi[1])
+    return wp.vec2(u, v)
+
+
+@wp.func
+def select(condition: bool, a: wp.vec3, b: wp.vec3) -> wp.vec3:
+    """a or b, component by component: wp.where of vectors does not run in lanes (kernels.memory)."""
+    return wp.vec3(wp.where(condition, a[0], b[0]), wp.where(condition, a[1], b[1]), wp.where(condition, a[2], b[2]))
+
+
+@wp.func
+def unit(v: wp.vec3) -> wp.vec3:
+    """At length 1, or 0: as wp.normalize, without its branch, which does not run in lanes either."""
+    length = wp.length(v)
+    return select(length > 0.0, v / wp.where(length > 0.0, length, 1.0), wp.vec3(0.0, 0.0, 0.0))
 
 
 @wp.func
@@ -199,7 +218,7 @@ def cosine_point(xi: wp.vec2) -> wp.vec3:
 def turned_to(point: wp.vec3, n: wp.vec3) -> wp.vec3:
     """A direction around the z axis as one around n."""
     x = frame_x(n)
-    return wp.normalize(point[0] * x + point[1] * wp.cross(n, x) + point[2] * n)
+    return unit(point[0] * x + point[1] * wp.cross(n, x) + point[2] * n)
 
 
 @wp.func

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.shade.materials import make_scatter
-from wrt.kernels.shade.surface import Surface, make_place_of, make_surface_at
+from wrt.kernels.shade.surface import Surface, bent, make_place_of, make_surface_at
 from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Material, Surfaces
 
@@ -124,9 +124,7 @@ def make_shading(features: Any) -> Any:
         if wp.static(features.normal_maps):
             n = bump(surfaces, m, s)
         if wp.static(features.smooth or features.normal_maps):
-            facing = wp.dot(n, wo)
-            if facing < 1.0e-3:
-                n = wp.normalize(n + (1.0e-3 - facing) * wo)
+            n = bent(n, wo)
         return n
 
     return Shading(surface_at, resolve, shading_normal, make_scatter(features), make_is_solid(features))

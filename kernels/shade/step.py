@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.shade.direct import make_reflected_light, shadow_ray
+from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
 from wrt.kernels.shade.shading import BLEND
@@ -179,8 +180,9 @@ class Step(NamedTuple):
     """What a loop is made of.
 
     Path: the struct; first_path(ray, key); ray_of(path). shade(surfaces, lighting, path, met, t, index) -> Shaded.
-    shadow_requests: how many lights there are beside those of `lighting` (the background is one), and shadow_request(surfaces,
-    lighting, shaded, i, point) -> ShadowRequest to each. keep(path, limits, traced): whether a new path is followed, and
+    extra_lights: how many there are beside those of `lighting` (the background is one); choose(lighting, surfaces, i, surface,
+    point) -> LightSample of light i (the background comes after the last one; point: of LightPoints), and shadow_request(shaded,
+    sample) -> ShadowRequest. keep(path, limits, traced): whether a new path is followed, and
     worth(surfaces, path, verdict) what is lost where it is not.
     """
 
@@ -189,6 +191,7 @@ class Step(NamedTuple):
     ray_of: Any
     shade: Any
     extra_lights: int
+    choose: Any
     shadow_request: Any
     keep: Any
     worth: Any
@@ -199,7 +202,7 @@ def make_step(features: Any, shading: Any, counting: bool = False) -> Any:
     Path = make_path(counting)
     first_path, ray_of, child = make_paths(counting)
     return Step(Path, first_path, ray_of, make_shade(features, shading, child, counting), 1 if features.sky_light else 0,
-                make_shadow_request(features, counting), *make_keep(features, counting))
+                *make_shadow_request(features, counting), *make_keep(features, counting))
 
 
 def make_paths(counting: bool = False) -> Any:
@@ -337,18 +340,16 @@ def make_shadow_request(features: Any, counting: bool = False) -> Any:
     choose, reflected = make_reflected_light(features)
 
     @wp.func
-    def shadow_request(surfaces: Surfaces, lighting: Lighting, shaded: Shaded, i: int, point: wp.vec3) -> ShadowRequest:
-        """Lights are numbered; the background comes after the last one. point: of LightPoints."""
+    def shadow_request(shaded: Shaded, sample: LightSample) -> ShadowRequest:
         out = ShadowRequest()
         s = shaded.surface
-        sample = choose(lighting, surfaces, i, s, point)
         out.value = reflected(sample, s, shaded.scatter, shaded.wo)
         if any_positive(out.value):
             out.ray = shadow_ray(s, sample)
             out.end = sample.end
         return out
 
-    return shadow_request
+    return choose, shadow_request
 
 
 def make_keep(features: Any, counting: bool = False) -> Any:

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.elementary import acos, atan2
-from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x
+from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x, select, unit
 from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift
 
 
@@ -132,19 +132,6 @@ def world_error(i: Instance, p: wp.vec3, error: wp.vec3, world: wp.vec3) -> wp.v
     """
     e = error + gamma(2.0) * wp.abs(p)
     return transformed(wp.abs(i.world_x), wp.abs(i.world_y), wp.abs(i.world_z), e, 0.0) + gamma(2.0) * wp.abs(world)
-
-
-@wp.func
-def select(condition: bool, a: wp.vec3, b: wp.vec3) -> wp.vec3:
-    """a or b, component by component: wp.where of vectors does not run in lanes (kernels.memory)."""
-    return wp.vec3(wp.where(condition, a[0], b[0]), wp.where(condition, a[1], b[1]), wp.where(condition, a[2], b[2]))
-
-
-@wp.func
-def unit(v: wp.vec3) -> wp.vec3:
-    """At length 1, or 0: as wp.normalize, without its branch, which does not run in lanes either."""
-    length = wp.length(v)
-    return select(length > 0.0, v / wp.where(length > 0.0, length, 1.0), wp.vec3(0.0, 0.0, 0.0))
 
 
 @wp.struct
@@ -300,6 +287,13 @@ def facing(met: Surface, direction: wp.vec3) -> Surface:
     s.geometric = side * n
     s.shading = side * shading
     return s
+
+
+@wp.func
+def bent(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
+    """A shading normal, bent no farther than it is still seen from wo."""
+    facing = wp.dot(n, wo)
+    return select(facing < 1.0e-3, unit(n + (1.0e-3 - facing) * wo), n)
 
 
 def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False) -> Any:

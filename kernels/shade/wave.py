@@ -62,7 +62,7 @@ class Wave:
     walks those rays are of. asking: shadow rays to each light.
 
     met, missed: places in the queue of the rays that hit something and of the others, each in their order. By place in a block of
-    BLOCK of the hits: rows (wave_surfaces.py), keys, indices, and sky_x, sky_y, sky_z, which before that are of a block of the queue.
+    BLOCK of the hits: rows (wave_surfaces.py), keys, indices, and sky_x, sky_y, sky_z, which before are of a block of the queue.
     """
 
     capacity: int

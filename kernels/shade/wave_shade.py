@@ -4,14 +4,13 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.memory import bits_at, put_number
 from wrt.kernels.query import put_ray, queued_ray
-from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point
-from wrt.kernels.shade.direct import make_light_points
+from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
 from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, make_step
-from wrt.kernels.shade.wave import BLOCK, Job, Path, Wave, enqueue, put_sample
+from wrt.kernels.shade.wave import BLOCK, Path, Wave, enqueue, put_sample
+from wrt.kernels.shade.wave_lights import make_wave_lights
 from wrt.kernels.shade.wave_surfaces import make_call_in, make_wave_surfaces
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
 
@@ -22,19 +21,9 @@ def make_shade_kernel(features: Any) -> Any:
     step = make_step(features, shading)
     find, found = make_wave_surfaces(features)
     call_in_surface = make_call_in(features)
-    _, first_path, _, shade, extra_lights, shadow_request, keep, worth = step
-    radiance, by_kind, radiance_at, places = BACKGROUNDS[features.background]
-    light_numbers, light_point = make_light_points(features)
-    sky_point = make_sky_point(features)
-    sky_in_lanes = features.sky_light and by_kind is None and places is None  # by_kind: else a point is just its two numbers
-
-    @wp.func
-    def key_at(wave: Wave, job: Job, number: int) -> wp.uint32:
-        """Of the samples of a path that has just been traced."""
-        key = wave.pixel_keys[number / job.samples]
-        if job.fresh == 0:
-            key = wave.paths[wave.size[number] * wave.capacity + number].key
-        return key
+    _, first_path, _, shade, extra_lights, choose, shadow_request, keep, worth = step
+    sample_lights, light_at = make_wave_lights(features, choose)
+    radiance, _, radiance_at, places = BACKGROUNDS[features.background]
 
     @wp.func
     def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
@@ -55,22 +44,6 @@ def make_shade_kernel(features: Any) -> Any:
             wave.walks[slot] = begin_shadow(request.ray, request.end)
             wave.waiting[slot] = slot
         return slot
-
-    @wp.func
-    def sky_points(wave: Wave, light: int, first: int, end: int):
-        """A sky_point for each of the hits first .. end - 1: in lanes (kernels.memory)."""
-        job = wave.job[0]
-        for j in range(first, end):
-            number = wave.number[wave.met[j]]
-            wave.keys[j - first] = key_at(wave, job, number)
-            wave.indices[j - first] = wp.uint32(job.first_sample + number % job.samples)
-        i = int(0)
-        while i < end - first:
-            point = sky_point(light_numbers(bits_at(wave.keys, i), bits_at(wave.indices, i), light))
-            put_number(wave.sky_x, i, point[0])
-            put_number(wave.sky_y, i, point[1])
-            put_number(wave.sky_z, i, point[2])
-            i = i + 1
 
     @wp.func
     def part(wave: Wave, first: int, end: int) -> int:
@@ -142,8 +115,8 @@ def make_shade_kernel(features: Any) -> Any:
                 call_in_surface(wave, surfaces, j, hits)
             if j % BLOCK == 0:
                 find(wave, surfaces, j, wp.min(j + BLOCK, hits))
-                if wp.static(sky_in_lanes):
-                    sky_points(wave, lighting.count, j, wp.min(j + BLOCK, hits))
+                if wp.static(features.lit):
+                    sample_lights(wave, surfaces, lighting, j, wp.min(j + BLOCK, hits))
             k = wave.met[j]
             number = wave.number[k]
             size = int(0)
@@ -182,12 +155,8 @@ def make_shade_kernel(features: Any) -> Any:
             if wp.static(features.lit):
                 if is_lit(shaded.scatter):
                     for i in range(lighting.count + wp.static(extra_lights)):
-                        point = wp.vec3()
-                        if wp.static(sky_in_lanes):
-                            point = wp.vec3(wave.sky_x[j % BLOCK], wave.sky_y[j % BLOCK], wave.sky_z[j % BLOCK])
-                        if wp.static(not sky_in_lanes) or i < lighting.count:
-                            point = light_point(lighting, shaded.key, index, i)
-                        request = shadow_request(surfaces, lighting, shaded, i, point)
+                        sample = light_at(wave, surfaces, lighting, shaded.surface, shaded.key, index, i, j % BLOCK)
+                        request = shadow_request(shaded, sample)
                         slot = int(-1)
                         if any_positive(request.value):
                             slot = ask(wave, i, request)

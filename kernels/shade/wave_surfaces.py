@@ -10,6 +10,7 @@ from wrt.kernels.query import hit_at, queued_ray
 from wrt.kernels.shade.surface import (
     Surface,
     Triangle,
+    bent,
     facing,
     make_on_triangle,
     make_place_of,
@@ -22,11 +23,16 @@ from wrt.kernels.shade.textures import call_in_texels
 from wrt.kernels.shade.wave import AHEAD, BLOCK, Wave
 from wrt.kernels.structs import Surfaces
 
-# What there is of a hit, and in how many numbers: what is gathered, and what is computed of it.
+# Rows of a block, with a number for each hit, and how many each thing has: what is gathered, and what is computed of it (bent: the
+# shading normal as lights see it).
 GATHERED = {"v0": 3, "v1": 3, "v2": 3, "n0": 3, "n1": 3, "n2": 3, "u": 1, "v": 1, "direction": 3}
-COMPUTED = {"point": 3, "error": 3, "geometric": 3, "shading": 3, "front": 1}
-SIZES = {**GATHERED, **COMPUTED}
-ROW = dict(zip(SIZES, accumulate(SIZES.values(), initial=0), strict=False))  # what begins where: a row has a number of each hit
+COMPUTED = {"point": 3, "error": 3, "geometric": 3, "shading": 3, "front": 1, "bent": 3}
+# Then (wave_lights.py) what the first light and the sky send; and, in place of what was gathered, an emitter.
+SAMPLED = {"wi": 3, "weight": 3, "end": 3, "sky_wi": 3, "sky_weight": 3}
+EMITTER = {"e0": 3, "e1": 3, "e2": 3, "normal": 3, "emission": 3, "pdf_area": 1, "two_sided": 1, "within": 1, "across": 1}
+SIZES = {**GATHERED, **COMPUTED, **SAMPLED}
+ROW = dict(zip(SIZES, accumulate(SIZES.values(), initial=0), strict=False))  # where each begins
+ROW.update(zip(EMITTER, accumulate(EMITTER.values(), initial=0), strict=False))
 ROWS = sum(SIZES.values())
 
 
@@ -103,12 +109,18 @@ def make_wave_surfaces(features: Any) -> tuple[Any, Any]:
         while i < end - first:
             u = row_number(rows, wp.static(ROW["u"]), i)
             v = row_number(rows, wp.static(ROW["v"]), i)
-            s = facing(on_triangle(gathered(rows, i), u, v), row_vec3(rows, wp.static(ROW["direction"]), i))
+            direction = row_vec3(rows, wp.static(ROW["direction"]), i)
+            s = facing(on_triangle(gathered(rows, i), u, v), direction)
             put_row_vec3(rows, wp.static(ROW["point"]), i, s.point)
             put_row_vec3(rows, wp.static(ROW["error"]), i, s.error)
             put_row_vec3(rows, wp.static(ROW["geometric"]), i, s.geometric)
             put_row_vec3(rows, wp.static(ROW["shading"]), i, s.shading)
             put_row_number(rows, wp.static(ROW["front"]), i, float(s.front))
+            if wp.static(features.sky_light):
+                n = s.shading
+                if wp.static(smooth):
+                    n = bent(n, -direction)
+                put_row_vec3(rows, wp.static(ROW["bent"]), i, n)
             i = i + 1
 
     @wp.func

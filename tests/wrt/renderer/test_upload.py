@@ -207,7 +207,8 @@ def test_the_density_of_emitters_is_that_of_the_rounded_table_by_which_they_are_
 
 
 @kernel
-def normal_kernel(v0: wp.array(dtype=wp.vec3), v1: wp.array(dtype=wp.vec3), v2: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.vec3)):
+def normal_kernel(v0: wp.array(dtype=wp.vec3), v1: wp.array(dtype=wp.vec3), v2: wp.array(dtype=wp.vec3),
+                  out: wp.array(dtype=wp.vec3)):
     i = wp.tid()
     t = Triangle()
     t.v0 = v0[i]
