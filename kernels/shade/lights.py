@@ -109,8 +109,8 @@ def from_emitter(point: wp.vec3, error: wp.vec3, n: wp.vec3, emission: wp.vec3, 
     sample.wi = way / wp.sqrt(wp.max(distance2, wp.static(2.0**-126)))
     cos_light = -wp.dot(sample.wi, n)
     cos_light = wp.where(two_sided, wp.abs(cos_light), cos_light)
-    share = wp.where(cos_light > 0.0 and distance2 > 0.0, cos_light / (distance2 * pdf_area), 0.0)
-    sample.weight = share * emission
+    lit = cos_light > 0.0 and distance2 > 0.0
+    sample.weight = wp.where(lit, cos_light / (distance2 * pdf_area), 0.0) * emission  # which is finite
     # The way ends just before the light: its own surface must not shade it.
     sample.end = spawn_point(point, error, n, eye - point)
     sample.area = 1

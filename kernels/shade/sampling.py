@@ -12,6 +12,7 @@ import warp as wp
 
 from wrt.kernels.native import source
 from wrt.kernels.shade.elementary import near_sin_cos, sin_cos
+from wrt.kernels.structs import unit
 
 # The constants of the hash, of the scramble, and what makes the seeds of a point's two numbers differ.
 HASH_1, HASH_2 = 0x21F0AAAD, 0xD35A2D97
@@ -187,16 +188,9 @@ def triangle(xi: wp.vec2) -> wp.vec2:
 
 
 @wp.func
-def select(condition: bool, a: wp.vec3, b: wp.vec3) -> wp.vec3:
+def where_vec3(condition: bool, a: wp.vec3, b: wp.vec3) -> wp.vec3:
     """a or b, component by component: wp.where of vectors does not run in lanes (kernels.memory)."""
     return wp.vec3(wp.where(condition, a[0], b[0]), wp.where(condition, a[1], b[1]), wp.where(condition, a[2], b[2]))
-
-
-@wp.func
-def unit(v: wp.vec3) -> wp.vec3:
-    """At length 1, or 0: as wp.normalize, without its branch, which does not run in lanes either."""
-    length = wp.length(v)
-    return select(length > 0.0, v / wp.where(length > 0.0, length, 1.0), wp.vec3(0.0, 0.0, 0.0))
 
 
 @wp.func

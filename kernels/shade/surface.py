@@ -5,8 +5,8 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.elementary import acos, atan2
-from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x, select, unit
-from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift
+from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x, where_vec3
+from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift, unit
 
 
 @wp.struct
@@ -150,16 +150,24 @@ class Triangle:
     t2: wp.vec2
 
 
+@wp.func
+def corners_at(surfaces: Surfaces, index: int) -> Triangle:
+    """Face `index` without attributes."""
+    face = surfaces.faces[index]
+    triangle = Triangle()
+    triangle.v0 = surfaces.vertices[face[0]]
+    triangle.v1 = surfaces.vertices[face[1]]
+    triangle.v2 = surfaces.vertices[face[2]]
+    return triangle
+
+
 def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
     """With only those attributes that the scene has."""
 
     @wp.func
     def triangle_at(surfaces: Surfaces, place: Place) -> Triangle:
+        triangle = corners_at(surfaces, place.face)
         face = surfaces.faces[place.face]
-        triangle = Triangle()
-        triangle.v0 = surfaces.vertices[face[0]]
-        triangle.v1 = surfaces.vertices[face[1]]
-        triangle.v2 = surfaces.vertices[face[2]]
         if wp.static(smooth):
             triangle.n0 = surfaces.normals[face[0]]
             triangle.n1 = surfaces.normals[face[1]]
@@ -178,17 +186,6 @@ def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
     return triangle_at
 
 
-corners_of_place = make_triangle_at(False, False, False)
-
-
-@wp.func
-def corners_at(surfaces: Surfaces, face: int) -> Triangle:
-    """A face without attributes."""
-    place = Place()
-    place.face = face
-    return corners_of_place(surfaces, place)
-
-
 @wp.func
 def triangle_point(t: Triangle, u: float, v: float) -> wp.vec3:
     """The point with these barycentrics, in the space of its corners."""
@@ -196,9 +193,10 @@ def triangle_point(t: Triangle, u: float, v: float) -> wp.vec3:
 
 
 @wp.func
-def triangle_uv(t: Triangle, u: float, v: float) -> wp.vec2:
-    """Texture coordinates at these barycentrics."""
-    return (1.0 - u - v) * t.t0 + u * t.t1 + v * t.t2
+def triangle_uv(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec2:
+    """Texture coordinates of face `index` at these barycentrics."""
+    face = surfaces.faces[index]
+    return (1.0 - u - v) * surfaces.uvs[face[0]] + u * surfaces.uvs[face[1]] + v * surfaces.uvs[face[2]]
 
 
 @wp.func
@@ -251,7 +249,7 @@ def make_with_uv(uvs: bool, tangents: bool) -> Any:
         """outward: the geometric normal on the outside."""
         s = met
         if wp.static(uvs):
-            s.uv = triangle_uv(t, u, v)
+            s.uv = (1.0 - u - v) * t.t0 + u * t.t1 + v * t.t2
         if wp.static(tangents):
             e1 = t.v1 - t.v0
             e2 = t.v2 - t.v0
@@ -279,7 +277,7 @@ def facing(met: Surface, direction: wp.vec3) -> Surface:
     """
     s = met
     n = met.geometric
-    shading = select(wp.dot(met.shading, met.shading) > 0.0, met.shading, n)
+    shading = where_vec3(wp.dot(met.shading, met.shading) > 0.0, met.shading, n)
     shading = wp.where(wp.dot(shading, n) < 0.0, -1.0, 1.0) * shading
     back = wp.dot(direction, n) > 0.0
     side = wp.where(back, -1.0, 1.0)
@@ -293,7 +291,7 @@ def facing(met: Surface, direction: wp.vec3) -> Surface:
 def bent(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
     """A shading normal, bent no farther than it is still seen from wo."""
     facing = wp.dot(n, wo)
-    return select(facing < 1.0e-3, unit(n + (1.0e-3 - facing) * wo), n)
+    return where_vec3(facing < 1.0e-3, unit(n + (1.0e-3 - facing) * wo), n)
 
 
 def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False) -> Any:

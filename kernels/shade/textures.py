@@ -47,7 +47,7 @@ def place_between(at: float, size: int) -> float:
 
 
 @wp.func
-def turned(texture: Texture, uv: wp.vec2) -> wp.vec2:
+def texture_uv(texture: Texture, uv: wp.vec2) -> wp.vec2:
     """Texture coordinates as a texture takes them."""
     u = texture.row_u[0] * uv[0] + texture.row_u[1] * uv[1] + texture.row_u[2]
     v = texture.row_v[0] * uv[0] + texture.row_v[1] * uv[1] + texture.row_v[2]
@@ -62,7 +62,7 @@ def call_in_texels(surfaces: Surfaces, index: int, uv: wp.vec2):
     texture = surfaces.textures[index]
     if texture.width == 0:
         return
-    at = turned(texture, uv)
+    at = texture_uv(texture, uv)
     column = wrapped(int(wp.floor(place_between(at[0], texture.width))), texture.width, texture.wrap_u)
     row = int(wp.floor(place_between(at[1], texture.height)))
     call_in_bits(surfaces.texels, texture.first + wrapped(row, texture.height, texture.wrap_v) * texture.width + column)
@@ -105,7 +105,7 @@ def make_sample_texture(pictures: bool, checkerboards: bool) -> Any:
         if index < 0:
             return wp.vec4(1.0, 1.0, 1.0, 1.0)
         texture = surfaces.textures[index]
-        at = turned(texture, uv)
+        at = texture_uv(texture, uv)
         result = wp.vec4(1.0, 1.0, 1.0, 1.0)
         if wp.static(checkerboards):
             if texture.width == 0:

@@ -27,7 +27,7 @@ from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel
 
 Path = make_path(False)
 _, ray_of, _ = make_paths()
-AHEAD = 4  # hits whose memory is called in before it is read
+AHEAD = 4  # hits whose texels are called in before they are read
 BLOCK = 64  # rays for which something is computed in lanes at a time
 FRESH = 2048  # camera rays that are made, traced and shaded at a time, while they are in the cache
 

@@ -21,10 +21,9 @@ MESH = list(LIGHTS).index("mesh")
 @wp.func
 def key_at(wave: Wave, job: Job, number: int) -> wp.uint32:
     """Of the samples of a path that has just been traced."""
-    key = wave.pixel_keys[number / job.samples]
-    if job.fresh == 0:
-        key = wave.paths[wave.size[number] * wave.capacity + number].key
-    return key
+    if job.fresh != 0:
+        return wave.pixel_keys[number / job.samples]
+    return wave.paths[wave.size[number] * wave.capacity + number].key
 
 
 @wp.func

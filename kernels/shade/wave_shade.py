@@ -11,7 +11,7 @@ from wrt.kernels.shade.shadows import Shadow, begin_shadow
 from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, make_step
 from wrt.kernels.shade.wave import BLOCK, Path, Wave, enqueue, put_sample
 from wrt.kernels.shade.wave_lights import make_wave_lights
-from wrt.kernels.shade.wave_surfaces import make_call_in, make_wave_surfaces
+from wrt.kernels.shade.wave_surfaces import make_call_in_texels, make_wave_surfaces
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
 
 
@@ -19,8 +19,8 @@ def make_shade_kernel(features: Any) -> Any:
     """The step at every hit of the queue: its light, its new paths, and its requests for shadow rays."""
     shading = make_shading(features)
     step = make_step(features, shading)
-    find, found = make_wave_surfaces(features)
-    call_in_surface = make_call_in(features)
+    find, found = make_wave_surfaces(features, shading.surface_at)
+    call_in_texels = make_call_in_texels(features)
     _, first_path, _, shade, extra_lights, choose, shadow_request, keep, worth = step
     sample_lights, light_at = make_wave_lights(features, choose)
     radiance, _, radiance_at, places = BACKGROUNDS[features.background]
@@ -111,10 +111,9 @@ def make_shade_kernel(features: Any) -> Any:
         hits = part(wave, first, end)
         left = see_background(wave, lighting, first, end, end - first - hits)
         for j in range(hits):
-            if wp.static(not features.instances):
-                call_in_surface(wave, surfaces, j, hits)
+            call_in_texels(wave, surfaces, j, hits)
             if j % BLOCK == 0:
-                find(wave, surfaces, j, wp.min(j + BLOCK, hits))
+                find(wave, surfaces, j, wp.min(j + BLOCK, hits), hits)
                 if wp.static(features.lit):
                     sample_lights(wave, surfaces, lighting, j, wp.min(j + BLOCK, hits))
             k = wave.met[j]

@@ -1,6 +1,5 @@
 """The surfaces at a wave's hits, many at a time: triangles are gathered, and computed in lanes (kernels.memory)."""
 
-from itertools import accumulate
 from typing import Any
 
 import warp as wp
@@ -14,7 +13,6 @@ from wrt.kernels.shade.surface import (
     facing,
     make_on_triangle,
     make_place_of,
-    make_surface_at,
     make_triangle_at,
     make_with_uv,
     triangle_uv,
@@ -30,10 +28,17 @@ COMPUTED = {"point": 3, "error": 3, "geometric": 3, "shading": 3, "front": 1, "b
 # Then (wave_lights.py) what the first light and the sky send; and, in place of what was gathered, an emitter.
 SAMPLED = {"wi": 3, "weight": 3, "end": 3, "sky_wi": 3, "sky_weight": 3}
 EMITTER = {"e0": 3, "e1": 3, "e2": 3, "normal": 3, "emission": 3, "pdf_area": 1, "two_sided": 1, "within": 1, "across": 1}
-SIZES = {**GATHERED, **COMPUTED, **SAMPLED}
-ROW = dict(zip(SIZES, accumulate(SIZES.values(), initial=0), strict=False))  # where each begins
-ROW.update(zip(EMITTER, accumulate(EMITTER.values(), initial=0), strict=False))
-ROWS = sum(SIZES.values())
+ROWS = sum(GATHERED.values()) + sum(COMPUTED.values()) + sum(SAMPLED.values())
+
+
+def first_rows(sizes: dict[str, int]) -> dict[str, int]:
+    """Where each thing begins."""
+    ends = [sum(list(sizes.values())[:i]) for i in range(len(sizes))]
+    return dict(zip(sizes, ends, strict=True))
+
+
+ROW = first_rows({**GATHERED, **COMPUTED, **SAMPLED}) | first_rows(EMITTER)
+FAR = 16  # hits whose triangle is called in before it is gathered
 
 
 @wp.func
@@ -59,21 +64,42 @@ def put_row_vec3(rows: wp.array(dtype=wp.float32), row: int, i: int, value: wp.v
     put_row_number(rows, row + 2, i, value[2])
 
 
-def make_wave_surfaces(features: Any) -> tuple[Any, Any]:
-    """find(wave, surfaces, first, end): computes those of the hits first .. end - 1, at most BLOCK; found(wave, surfaces, first, j)
-    -> Surface: that of hit j. Spheres, and triangles with places of their own, are computed one by one, when they are asked for."""
+def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
+    """find(wave, surfaces, first, end, hits): computes those of the hits first .. end - 1, at most BLOCK, of so many; found(wave,
+    surfaces, i, k) -> Surface: of the i-th of them, at place k in the queue.
+
+    Spheres, and triangles of instances, are computed by surface_at (of make_shading), one by one, when they are asked for.
+    """
     smooth, uvs, tangents = features.smooth, features.textures or features.checkerboards, features.normal_maps
-    surface_at = make_surface_at(features.spheres, smooth, uvs, tangents, features.instances)
     place_of, triangle_at = make_place_of(False), make_triangle_at(smooth, uvs, False)
     on_triangle, with_uv = make_on_triangle(smooth), make_with_uv(uvs, tangents)
 
     @wp.func
-    def gather(wave: Wave, surfaces: Surfaces, first: int, end: int):
+    def hit_triangle(wave: Wave, surfaces: Surfaces, j: int) -> int:
+        """Of hit j; of a sphere any, whose numbers are computed in vain."""
+        return wp.min(wave.hits.prim_id[wave.met[j]], surfaces.n_triangles - 1)
+
+    @wp.func
+    def call_in(wave: Wave, surfaces: Surfaces, j: int, hits: int):
+        """The face of a hit after j, and the corners of one before that."""
+        prim_id = hit_triangle(wave, surfaces, wp.min(j + 2 * FAR, hits - 1))
+        call_in_vec3i(surfaces.faces, prim_id)
+        call_in_int(surfaces.prim_material, prim_id)
+        face = surfaces.faces[hit_triangle(wave, surfaces, wp.min(j + FAR, hits - 1))]
+        for corner in range(3):
+            call_in_vec3(surfaces.vertices, face[corner])
+            if wp.static(smooth):
+                call_in_vec3(surfaces.normals, face[corner])
+            if wp.static(uvs):
+                call_in_vec2(surfaces.uvs, face[corner])
+
+    @wp.func
+    def gather(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
         for j in range(first, end):
+            call_in(wave, surfaces, j, hits)
             k = wave.met[j]
             i = j - first
-            # A sphere's numbers are computed in vain.
-            t = triangle_at(surfaces, place_of(surfaces, wp.min(wave.hits.prim_id[k], surfaces.n_triangles - 1)))
+            t = triangle_at(surfaces, place_of(surfaces, hit_triangle(wave, surfaces, j)))
             put_row_vec3(wave.rows, wp.static(ROW["v0"]), i, t.v0)
             put_row_vec3(wave.rows, wp.static(ROW["v1"]), i, t.v1)
             put_row_vec3(wave.rows, wp.static(ROW["v2"]), i, t.v2)
@@ -98,12 +124,10 @@ def make_wave_surfaces(features: Any) -> tuple[Any, Any]:
         return t
 
     @wp.func
-    def find(wave: Wave, surfaces: Surfaces, first: int, end: int):
-        if wp.static(features.instances):
-            return
+    def find(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
         if surfaces.n_triangles == 0:
             return
-        gather(wave, surfaces, first, end)
+        gather(wave, surfaces, first, end, hits)
         rows = wave.rows
         i = int(0)
         while i < end - first:
@@ -126,8 +150,6 @@ def make_wave_surfaces(features: Any) -> tuple[Any, Any]:
     @wp.func
     def found(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
         hit = hit_at(wave.hits, k)
-        if wp.static(features.instances):
-            return surface_at(surfaces, queued_ray(wave.rays, k), hit)
         if wp.static(features.spheres):
             if hit.prim_id >= surfaces.n_triangles:
                 return surface_at(surfaces, queued_ray(wave.rays, k), hit)
@@ -145,56 +167,39 @@ def make_wave_surfaces(features: Any) -> tuple[Any, Any]:
         s.exclude_plus_one = hit.prim_id + 1
         return s
 
-    return find, found
-
-
-def make_call_in(features: Any) -> Any:
-    """What the hits after this one, will read: the face of one, the corners of another before it, and the texels of
-    a third."""
-    pictures = [name for name, used in (("albedo_texture", features.textures), ("emission_texture", features.textures),
-                                        ("metallic_roughness_texture", features.parameter_textures),
-                                        ("transmission_texture", features.parameter_textures),
-                                        ("normal_texture", features.normal_maps)) if used]
-
-    place_of, triangle_at = make_place_of(False), make_triangle_at(False, True, False)
+    @wp.func
+    def find_nothing(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
+        pass
 
     @wp.func
-    def hit_triangle(wave: Wave, surfaces: Surfaces, j: int, hits: int) -> int:
-        """The triangle of hit j, or -1."""
-        if j >= hits:
-            return -1
-        prim_id = wave.hits.prim_id[wave.met[j]]
-        return wp.where(prim_id < surfaces.n_triangles, prim_id, -1)
+    def found_alone(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
+        return surface_at(surfaces, queued_ray(wave.rays, k), hit_at(wave.hits, k))
+
+    return (find_nothing, found_alone) if features.instances else (find, found)
+
+
+def make_call_in_texels(features: Any) -> Any:
+    """Those of a hit some way after hit j."""
+    texels, parameters, normals = features.textures, features.parameter_textures, features.normal_maps
 
     @wp.func
-    def call_in_surface(wave: Wave, surfaces: Surfaces, j: int, hits: int):
-        """j: a hit; there are `hits`."""
-        prim_id = hit_triangle(wave, surfaces, j + BLOCK + 2 * AHEAD, hits)
-        if prim_id >= 0:
-            call_in_vec3i(surfaces.faces, prim_id)
-            call_in_int(surfaces.prim_material, prim_id)
-        prim_id = hit_triangle(wave, surfaces, j + BLOCK + AHEAD, hits)
-        if prim_id >= 0:
-            face = surfaces.faces[prim_id]
-            for corner in range(3):
-                call_in_vec3(surfaces.vertices, face[corner])
-                if wp.static(features.smooth):
-                    call_in_vec3(surfaces.normals, face[corner])
-                if wp.static(bool(pictures)):
-                    call_in_vec2(surfaces.uvs, face[corner])
-        if wp.static(bool(pictures)):
-            prim_id = hit_triangle(wave, surfaces, j + AHEAD, hits)
-            if prim_id >= 0:
-                m = surfaces.materials[surfaces.prim_material[prim_id]]
-                k = wave.met[j + AHEAD]
-                uv = triangle_uv(triangle_at(surfaces, place_of(surfaces, prim_id)), wave.hits.u[k], wave.hits.v[k])
-                if wp.static("albedo_texture" in pictures):
-                    call_in_texels(surfaces, m.albedo_texture, uv)
-                    call_in_texels(surfaces, m.emission_texture, uv)
-                if wp.static("transmission_texture" in pictures):
-                    call_in_texels(surfaces, m.metallic_roughness_texture, uv)
-                    call_in_texels(surfaces, m.transmission_texture, uv)
-                if wp.static("normal_texture" in pictures):
-                    call_in_texels(surfaces, m.normal_texture, uv)
+    def call_in(wave: Wave, surfaces: Surfaces, j: int, hits: int):
+        k = wave.met[wp.min(j + AHEAD, hits - 1)]
+        prim_id = wave.hits.prim_id[k]
+        if prim_id < surfaces.n_triangles:
+            m = surfaces.materials[surfaces.prim_material[prim_id]]
+            uv = triangle_uv(surfaces, prim_id, wave.hits.u[k], wave.hits.v[k])
+            if wp.static(texels):
+                call_in_texels(surfaces, m.albedo_texture, uv)
+                call_in_texels(surfaces, m.emission_texture, uv)
+            if wp.static(parameters):
+                call_in_texels(surfaces, m.metallic_roughness_texture, uv)
+                call_in_texels(surfaces, m.transmission_texture, uv)
+            if wp.static(normals):
+                call_in_texels(surfaces, m.normal_texture, uv)
 
-    return call_in_surface
+    @wp.func
+    def call_in_nothing(wave: Wave, surfaces: Surfaces, j: int, hits: int):
+        pass
+
+    return call_in if (texels or parameters or normals) and not features.instances else call_in_nothing

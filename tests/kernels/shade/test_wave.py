@@ -12,10 +12,10 @@ import warp as wp
 
 from wrt.core.device import records, upload
 from wrt.kernels.shade.render import load_pixel, store_pixel, with_sample
+from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.step import Sample
-from wrt.kernels.shade.surface import select, unit
 from wrt.kernels.shade.wave import LANES, add_to_pixels
-from wrt.kernels.structs import Film, kernel
+from wrt.kernels.structs import Film, kernel, unit
 
 OF_FILM = {"mean": wp.vec3, "m2": wp.vec3, "samples": wp.int32, "rays": wp.int64, "cut_depth": wp.int32, "cut_throughput": wp.int32,
            "lost": wp.float32, "not_finite": wp.int32}
@@ -85,10 +85,10 @@ def test_unit_vectors_without_a_branch() -> None:
 @kernel
 def select_kernel(a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.vec3)):
     i = wp.tid()
-    out[i] = select(i % 2 == 0, a[i], b[i])
+    out[i] = where_vec3(i % 2 == 0, a[i], b[i])
 
 
-def test_select() -> None:
+def test_one_of_two_vectors() -> None:
     a, b = np.random.default_rng(1).normal(size=(2, 8, 3)).astype(np.float32)
     out = zeros(8, wp.vec3)
     launch(select_kernel, 8, vec3s(a), vec3s(b), out)
