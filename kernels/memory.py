@@ -3,7 +3,11 @@
 The compiler makes lanes of a plain Warp loop (sixteen where the CPU has them), and it takes a tenth of the time, if
 - it is a `while` with a counter;
 - it has no branches (wp.where is none), and calls nothing that has;
-- it reads and writes arrays by the functions here, and looks up no table at a place that it computes.
+- it reads and writes arrays by the functions here, and looks up no table at a place that it computes;
+- vectors of three are made, chosen from and normalised number by number (where_vec3, structs.unit), and there are none of two: LLVM
+  keeps two numbers together, in what it calls an instruction's vector type;
+- places in one array differ by constants, or it would have to compare too many ranges. In C++, a place that is a multiple of a
+  variable makes lanes for 1 times alone (film_samples.h).
 `-Rpass=loop-vectorize` among wp.config.cpu_compiler_flags says which loops are.
 
 call_in_...: prefetch the cache line of entry i. CPU only.

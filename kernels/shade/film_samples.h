@@ -1,7 +1,7 @@
-    // As render.with_sample, for many pixels at a time, whose samples stand one after another: a loop over pixels that the compiler
+    // As render.with_sample, for LANES pixels at a time, whose samples stand one after another: a loop over pixels that the compiler
     // makes lanes of. Each pixel takes its samples in their order.
     const int* const at = pixels.data + (long long)p;
-    for (int lane = 0; lane < LANES; ++lane) {  // the next ones are called in
+    for (int lane = 0; lane < LANES; ++lane) {  // the next ones are called in; behind the last, what was there before
         const long long i = at[LANES + lane];
         __builtin_prefetch(film.mean.data + i, 1);
         __builtin_prefetch(film.m2.data + i, 1);

@@ -1,12 +1,14 @@
 """Many camera samples at a time, for one CPU thread: the integrator's step in a loop over queues.
 
 A wavefront (Laine, Karras and Aila 2013, "Megakernels Considered Harmful"): the pending rays of a wave of samples wait in one
-queue; one launch traces all of them, and the next shades all hits. Each sample goes through its own paths in the order of loop.py
+queue; one launch traces all of them, and the next shades all hits. Camera rays are made, traced and shaded FRESH at a time, while
+they are in the cache; what comes of them waits until all have been. Each sample goes through its own paths in the order of loop.py
 and adds up its light in that order, so that pictures have the same bits. Traversal and shading are kernels of their own: another
 scene compiles no traversal.
 
 Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once. trace_wave launches
-the others, so that a wave is a single launch to Python. What begins a wave is in wave_begin.py, the step in wave_shade.py.
+the others, so that a wave is a single launch to Python. What begins a wave is in wave_begin.py, the step in wave_shade.py; for many
+hits at a time, surfaces are in wave_surfaces.py, and lights in wave_lights.py.
 """
 
 from functools import cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -13,6 +14,7 @@ import warp as wp
 from tests.data import ROOT
 from wrt.core.device import load_kernel, start
 from wrt.io.load import load_scene
+from wrt.kernels.shade import wave
 from wrt.kernels.structs import fields_of
 from wrt.renderer import waves
 from wrt.renderer.film_arrays import OF_AOVS, AovFilm, DeviceFilm
@@ -83,6 +85,31 @@ def test_more_samples_a_pixel_than_a_wave_has(monkeypatch: pytest.MonkeyPatch) -
     expected = film_of(ready, (0, 150))
     monkeypatch.setattr(waves, "CAPACITY", 64)
     assert_same(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 150)), expected)
+
+
+def test_more_samples_a_pixel_than_camera_rays_are_made_at_a_time() -> None:
+    assert wave.FRESH < 2100 < waves.CAPACITY
+    ready = prepared("fisheye")
+    assert_same(film_of(ready, (0, 2100)), film_of(ready, (0, 1000), (1000, 1100)))
+
+
+@pytest.mark.parametrize("name", ["fisheye", "tinted_shadows", "glass_sky"])
+def test_nothing_is_read_before_it_is_written(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Buffers are not cleared, and hold what the wave before left."""
+    ready = prepared(name)
+    films = [film_of(ready, (0, 3))]
+    made = waves.room
+    for byte in (0xCD, 0xFF):
+
+        def filled(n: int, dtype: Any, byte: int = byte) -> Any:
+            array = made(n, dtype)
+            ctypes.memset(array.ptr, byte, array.capacity)
+            return array
+
+        monkeypatch.setattr(waves, "room", filled)
+        films.append(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 3)))
+    assert_same(films[0], films[1])
+    assert_same(films[0], films[2])
 
 
 def test_groups_have_samples_of_their_own() -> None:
