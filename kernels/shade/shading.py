@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.shade.materials import make_scatter
-from wrt.kernels.shade.surface import Surface, bent, make_place_of, make_surface_at
+from wrt.kernels.shade.surface import SEEN, Surface, bent, make_place_of, make_surface_at
 from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Material, Surfaces
 
@@ -124,7 +124,8 @@ def make_shading(features: Any) -> Any:
         if wp.static(features.normal_maps):
             n = bump(surfaces, m, s)
         if wp.static(features.smooth or features.normal_maps):
-            n = bent(n, wo)
+            if wp.dot(n, wo) < SEEN:  # seldom: what `bent` does beyond this test takes a while
+                n = bent(n, wo)
         return n
 
     return Shading(surface_at, resolve, shading_normal, make_scatter(features), make_is_solid(features))

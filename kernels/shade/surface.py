@@ -9,6 +9,9 @@ from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x, where_vec3
 from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift, unit
 
 
+SEEN = wp.constant(1.0e-3)  # the least cosine of a shading normal with the way to the eye
+
+
 @wp.struct
 class Surface:
     """A point on a surface, in world space.
@@ -291,7 +294,7 @@ def facing(met: Surface, direction: wp.vec3) -> Surface:
 def bent(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
     """A shading normal, bent no farther than it is still seen from wo."""
     facing = wp.dot(n, wo)
-    return where_vec3(facing < 1.0e-3, unit(n + (1.0e-3 - facing) * wo), n)
+    return where_vec3(facing < SEEN, unit(n + (SEEN - facing) * wo), n)
 
 
 def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False) -> Any:
