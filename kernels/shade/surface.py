@@ -8,7 +8,6 @@ from wrt.kernels.shade.elementary import acos, atan2
 from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x, where_vec3
 from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift, unit
 
-
 SEEN = wp.constant(1.0e-3)  # the least cosine of a shading normal with the way to the eye
 
 
