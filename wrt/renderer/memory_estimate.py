@@ -22,7 +22,7 @@ from wrt.scene.materials import Texture
 from wrt.scene.model import Scene
 
 BYTES_OF_FACE, BYTES_OF_VERTEX = 55.0, 60.0  # of a mesh in the world: joined, turned and uploaded
-BYTES_OF_EMITTER = 120.0  # of a triangle that lights others, beside that
+BYTES_OF_EMITTER = 190.0  # of a triangle that lights others, beside that
 BYTES_OF_OBJECT, BYTES_OF_TEXEL, BYTES_OF_SKY = 1000.0, 12.0, 40.0
 BYTES_OF_AOVS, BYTES_OF_RESULT = 36, 80  # a pixel; of the result: measured, with writing it to a file
 # Of a sample of a wave (wrt.renderer.waves.Buffers), of each path that it has room for, and of its ray to each light.

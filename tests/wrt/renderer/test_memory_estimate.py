@@ -70,13 +70,14 @@ MEASURE = """
 import re, sys
 from pathlib import Path
 import numpy as np
-from wrt.accel import ACCELERATORS, build
+from wrt.accel.build import build
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start
 from wrt.renderer.upload import upload_scene
 from wrt.renderer.memory_estimate import bytes_of_scene
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Material, Object, Scene
-from wrt.scene.shapes import icosphere
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene
 
 def status(key):
     return int(re.search(rf"^{key}:\\s+(\\d+)", Path("/proc/self/status").read_text(), re.M)[1]) * 1024
