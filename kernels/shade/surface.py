@@ -296,30 +296,8 @@ def bent(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
     return where_vec3(facing < SEEN, unit(n + (SEEN - facing) * wo), n)
 
 
-def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False) -> Any:
-    """The surface at a hit, with only those attributes that the scene has."""
-    place_of = make_place_of(instances)
-    triangle_at = make_triangle_at(smooth, uvs, instances)
-    plain, with_uv = make_on_triangle(smooth), make_with_uv(uvs, tangents)
-
-    @wp.func
-    def on_triangle(surfaces: Surfaces, hit: Hit, place: Place) -> Surface:
-        t = triangle_at(surfaces, place)
-        s = plain(t, hit.u, hit.v)
-        return with_uv(s, t, hit.u, hit.v, s.geometric)
-
-    @wp.func
-    def in_world(local: Surface, instance: Instance) -> Surface:
-        """What is computed in the mesh's space is taken to the world once."""
-        s = local
-        s.point = world_point(instance, local.point)
-        s.error = world_error(instance, local.point, local.error, s.point)
-        s.geometric = world_normal(instance, local.geometric)
-        if wp.static(tangents):
-            s.bitangent_sign = local.bitangent_sign * instance.handedness
-            tangent = world_direction(instance, local.tangent)
-            s.tangent = wp.normalize(lift(tangent) * tangent)
-        return s
+def make_on_sphere(uvs: bool, tangents: bool) -> Any:
+    """As on_triangle, of a sphere."""
 
     @wp.func
     def on_sphere(surfaces: Surfaces, ray: Ray, hit: Hit) -> Surface:
@@ -339,6 +317,34 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
             along_u = wp.vec3(s.geometric[2], 0.0, -s.geometric[0])
             length = wp.length(along_u)
             s.tangent = wp.where(length > 0.0, along_u / length, wp.vec3(1.0, 0.0, 0.0))
+        return s
+
+    return on_sphere
+
+
+def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False) -> Any:
+    """The surface at a hit, with only those attributes that the scene has."""
+    place_of = make_place_of(instances)
+    triangle_at = make_triangle_at(smooth, uvs, instances)
+    plain, with_uv, on_sphere = make_on_triangle(smooth), make_with_uv(uvs, tangents), make_on_sphere(uvs, tangents)
+
+    @wp.func
+    def on_triangle(surfaces: Surfaces, hit: Hit, place: Place) -> Surface:
+        t = triangle_at(surfaces, place)
+        s = plain(t, hit.u, hit.v)
+        return with_uv(s, t, hit.u, hit.v, s.geometric)
+
+    @wp.func
+    def in_world(local: Surface, instance: Instance) -> Surface:
+        """What is computed in the mesh's space is taken to the world once."""
+        s = local
+        s.point = world_point(instance, local.point)
+        s.error = world_error(instance, local.point, local.error, s.point)
+        s.geometric = world_normal(instance, local.geometric)
+        if wp.static(tangents):
+            s.bitangent_sign = local.bitangent_sign * instance.handedness
+            tangent = world_direction(instance, local.tangent)
+            s.tangent = wp.normalize(lift(tangent) * tangent)
         return s
 
     @wp.func

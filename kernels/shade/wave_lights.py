@@ -10,7 +10,7 @@ from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point, make_sky_
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.lights import LIGHTS, LightSample, choose_emitter, from_emitter
 from wrt.kernels.shade.sampling import triangle_numbers
-from wrt.kernels.shade.surface import Surface, Triangle, bent, make_surface_at, triangle_point, triangle_point_error
+from wrt.kernels.shade.surface import Surface, Triangle, bent, facing, make_on_sphere, triangle_point, triangle_point_error
 from wrt.kernels.shade.wave import Job, Wave
 from wrt.kernels.shade.wave_surfaces import ROW, put_row_number, put_row_vec3, row_number, row_vec3
 from wrt.kernels.structs import Lighting, Surfaces
@@ -47,7 +47,7 @@ def make_wave_lights(features: Any, choose: Any) -> tuple[Any, Any]:
     points = features.sky_light and kind.sample is None and kind.places is None
     sky = points and not features.normal_maps and not features.instances
     mesh = "mesh" in features.lights and not features.instances
-    sphere_at = make_surface_at(True, False, False, False)
+    on_sphere = make_on_sphere(False, False)
 
     @wp.func
     def put_keys(wave: Wave, first: int, end: int):
@@ -89,7 +89,7 @@ def make_wave_lights(features: Any, choose: Any) -> tuple[Any, Any]:
         for j in range(first, end):
             k = wave.met[j]
             if wave.hits.prim_id[k] >= surfaces.n_triangles:
-                s = sphere_at(surfaces, queued_ray(wave.rays, k), hit_at(wave.hits, k))
+                s = facing(on_sphere(surfaces, queued_ray(wave.rays, k), hit_at(wave.hits, k)), wave.rays.direction[k])
                 put_row_vec3(wave.rows, wp.static(ROW["point"]), j - first, s.point)
                 put_row_vec3(wave.rows, wp.static(ROW["bent"]), j - first, s.shading)
                 if wp.static(features.smooth):

@@ -11,6 +11,7 @@ from wrt.kernels.shade.surface import (
     Triangle,
     bent,
     facing,
+    make_on_sphere,
     make_on_triangle,
     make_place_of,
     make_triangle_at,
@@ -68,11 +69,11 @@ def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
     """find(wave, surfaces, first, end, hits): computes those of the hits first .. end - 1, at most BLOCK, of so many; found(wave,
     surfaces, i, k) -> Surface: of the i-th of them, at place k in the queue.
 
-    Spheres, and triangles of instances, are computed by surface_at (of make_shading), one by one, when they are asked for.
+    Spheres, and with instances all, are computed one by one, when they are asked for; surface_at: of make_shading.
     """
     smooth, uvs, tangents = features.smooth, features.textures or features.checkerboards, features.normal_maps
     place_of, triangle_at = make_place_of(False), make_triangle_at(smooth, uvs, False)
-    on_triangle, with_uv = make_on_triangle(smooth), make_with_uv(uvs, tangents)
+    on_triangle, with_uv, on_sphere = make_on_triangle(smooth), make_with_uv(uvs, tangents), make_on_sphere(uvs, tangents)
 
     @wp.func
     def hit_triangle(wave: Wave, surfaces: Surfaces, j: int) -> int:
@@ -152,7 +153,9 @@ def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
         hit = hit_at(wave.hits, k)
         if wp.static(features.spheres):
             if hit.prim_id >= surfaces.n_triangles:
-                return surface_at(surfaces, queued_ray(wave.rays, k), hit)
+                sphere = facing(on_sphere(surfaces, queued_ray(wave.rays, k), hit), wave.rays.direction[k])
+                sphere.material = surfaces.prim_material[hit.prim_id]
+                return sphere
         rows = wave.rows
         s = Surface()
         s.point = row_vec3(rows, wp.static(ROW["point"]), i)
