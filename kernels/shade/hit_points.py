@@ -8,7 +8,7 @@ Barycentric coordinates, which kernels.shade.surface starts from, carry the erro
 import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.shade.surface import Place, corners_at, instance_at, sphere_uv, triangle_point, world_normal
+from wrt.kernels.shade.surface import Place, corners_at, instance_at, sphere_uv, triangle_point, triangle_uv, world_normal
 from wrt.kernels.structs import Instance, Surfaces, kernel
 
 U32 = wp.constant(wp.float64(2.0**-24))  # unit roundoffs
@@ -130,11 +130,11 @@ def drawn_in(found: Found, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> Found:
 @wp.func
 def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp.vec3d, direction: wp.vec3d) -> Found:
     """The point on a face; its normal is on the outside, also of a mirrored instance."""
-    face = surfaces.faces[place.face]
-    v0 = wp.vec3d(surfaces.vertices[face[0]])
-    v1 = wp.vec3d(surfaces.vertices[face[1]])
-    v2 = wp.vec3d(surfaces.vertices[face[2]])
-    middle = wp.vec3d(triangle_point(corners_at(surfaces, place.face), u, v))
+    t = corners_at(surfaces, place.face)
+    v0 = wp.vec3d(t.v0)
+    v1 = wp.vec3d(t.v1)
+    v2 = wp.vec3d(t.v2)
+    middle = wp.vec3d(triangle_point(t, u, v))
     off = wp.vec3d()
     side = wp.float64(1.0)
     if place.instance >= 0:
@@ -281,8 +281,7 @@ def put_interpolated(surfaces: Surfaces, place: Place, u: float, v: float, norma
     if out.shading.shape[0] > 0:
         out.shading[i] = shading_normal(surfaces, place, u, v, normal)
     if out.uv.shape[0] > 0:
-        face = surfaces.faces[place.face]
-        out.uv[i] = (1.0 - u - v) * surfaces.uvs[face[0]] + u * surfaces.uvs[face[1]] + v * surfaces.uvs[face[2]]
+        out.uv[i] = triangle_uv(surfaces, place.face, u, v)
 
 
 @wp.func

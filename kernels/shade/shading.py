@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.shade.materials import make_scatter
-from wrt.kernels.shade.surface import SEEN, Surface, bent, make_place_of, make_surface_at
+from wrt.kernels.shade.surface import SEEN, Surface, bent, make_place_of, make_surface_at, triangle_uv
 from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Material, Surfaces
 
@@ -52,9 +52,7 @@ def make_cutout(features: Any) -> Any:
         alpha = m.alpha
         if wp.static(features.textures or features.checkerboards):
             if prim_id < surfaces.n_triangles:
-                face = surfaces.faces[place.face]
-                uv = (1.0 - u - v) * surfaces.uvs[face[0]] + u * surfaces.uvs[face[1]] + v * surfaces.uvs[face[2]]
-                alpha = alpha * sample_texture(surfaces, m.albedo_texture, uv)[3]
+                alpha = alpha * sample_texture(surfaces, m.albedo_texture, triangle_uv(surfaces, place.face, u, v))[3]
         return alpha >= m.alpha_cutoff
 
     return accepts

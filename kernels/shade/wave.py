@@ -241,11 +241,11 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
         wave.job[0].fresh = 1
         pixel = int(0)
         while pixel < job.pixels:
-            first = pixel * job.samples
-            pixel = wp.min(pixel + wp.max(FRESH / job.samples, 1), job.pixels)
-            run_range(launches.begin, first / job.samples, pixel)
-            run_range(launches.closest_hit, first, wave.job[0].begun)
-            run_range(launches.shade, first, wave.job[0].begun)
+            end = wp.min(pixel + wp.max(FRESH / job.samples, 1), job.pixels)
+            run_range(launches.begin, pixel, end)
+            run_range(launches.closest_hit, pixel * job.samples, wave.job[0].begun)
+            run_range(launches.shade, pixel * job.samples, wave.job[0].begun)
+            pixel = end
         wave.job[0].fresh = 0
         ask_lights(wave, launches, lights)
         while wave.job[0].queued > 0:

@@ -91,9 +91,10 @@ def make_wave_lights(features: Any, choose: Any) -> tuple[Any, Any]:
             if wave.hits.prim_id[k] >= surfaces.n_triangles:
                 s = facing(on_sphere(surfaces, queued_ray(wave.rays, k), hit_at(wave.hits, k)), wave.rays.direction[k])
                 put_row_vec3(wave.rows, wp.static(ROW["point"]), j - first, s.point)
-                put_row_vec3(wave.rows, wp.static(ROW["bent"]), j - first, s.shading)
+                n = s.shading
                 if wp.static(features.smooth):
-                    put_row_vec3(wave.rows, wp.static(ROW["bent"]), j - first, bent(s.shading, -wave.rays.direction[k]))
+                    n = bent(n, -wave.rays.direction[k])
+                put_row_vec3(wave.rows, wp.static(ROW["bent"]), j - first, n)
 
     @wp.func
     def sample_mesh(wave: Wave, surfaces: Surfaces, lighting: Lighting, count: int):
@@ -159,7 +160,6 @@ def make_wave_lights(features: Any, choose: Any) -> tuple[Any, Any]:
                 out.end = row_vec3(wave.rows, wp.static(ROW["end"]), i)
                 out.area = 1
                 return out
-        point = wp.vec3()
         if wp.static(points):
             if light == lighting.count:
                 if wp.static(sky):
@@ -169,9 +169,7 @@ def make_wave_lights(features: Any, choose: Any) -> tuple[Any, Any]:
                     sky_light.distant = 1
                     sky_light.area = 1
                     return sky_light
-                point = wp.vec3(wave.sky_x[i], wave.sky_y[i], wave.sky_z[i])
-                return choose(lighting, surfaces, light, s, point)
-        point = light_point(lighting, key, index, light)
-        return choose(lighting, surfaces, light, s, point)
+                return choose(lighting, surfaces, light, s, wp.vec3(wave.sky_x[i], wave.sky_y[i], wave.sky_z[i]))
+        return choose(lighting, surfaces, light, s, light_point(lighting, key, index, light))
 
     return sample_lights, light_at

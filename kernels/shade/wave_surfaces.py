@@ -34,8 +34,7 @@ ROWS = sum(GATHERED.values()) + sum(COMPUTED.values()) + sum(SAMPLED.values())
 
 def first_rows(sizes: dict[str, int]) -> dict[str, int]:
     """Where each thing begins."""
-    ends = [sum(list(sizes.values())[:i]) for i in range(len(sizes))]
-    return dict(zip(sizes, ends, strict=True))
+    return {name: sum(list(sizes.values())[:i]) for i, name in enumerate(sizes)}
 
 
 ROW = first_rows({**GATHERED, **COMPUTED, **SAMPLED}) | first_rows(EMITTER)

@@ -26,7 +26,7 @@ from wrt.renderer.launches import Launches
 from wrt.renderer.tiles import Work
 from wrt.renderer.upload import camera_kind
 
-# Samples of a wave: 4,096 to 32,768 are 0.98 to 1.06 times as fast, by the scene. Fewer where each has room for many paths or asks
+# Samples of a wave: 4,096 to 32,768 are 0.92 to 1.06 times as fast, by the scene. Fewer where each has room for many paths or asks
 # many lights: ROOM is for all of them together.
 CAPACITY, ROOM = 16384, 1 << 18
 ALL = 1 << 30  # rays of a kernel whose only thread takes them all

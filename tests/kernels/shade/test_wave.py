@@ -83,7 +83,7 @@ def test_unit_vectors_without_a_branch() -> None:
 
 
 @kernel
-def select_kernel(a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.vec3)):
+def where_kernel(a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.vec3)):
     i = wp.tid()
     out[i] = where_vec3(i % 2 == 0, a[i], b[i])
 
@@ -91,5 +91,5 @@ def select_kernel(a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), out: w
 def test_one_of_two_vectors() -> None:
     a, b = np.random.default_rng(1).normal(size=(2, 8, 3)).astype(np.float32)
     out = zeros(8, wp.vec3)
-    launch(select_kernel, 8, vec3s(a), vec3s(b), out)
+    launch(where_kernel, 8, vec3s(a), vec3s(b), out)
     assert (out.numpy() == np.where(np.arange(8)[:, None] % 2 == 0, a, b)).all()
