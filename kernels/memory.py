@@ -25,16 +25,16 @@ def number_of_vec2(array: wp.array(dtype=wp.vec2), i: int, k: int) -> float:
     """Component k."""
 
 
-@wp.func_native("return array.data[(long long)i][k];")
-def number_of_vec3(array: wp.array(dtype=wp.vec3), i: int, k: int) -> float: ...
-
-
 @wp.func_native("array.data[(long long)i] = value;")
 def put_number(array: wp.array(dtype=wp.float32), i: int, value: float) -> None: ...
 
 
 @wp.func_native("array.data[(long long)i] = value;")
 def put_int(array: wp.array(dtype=wp.int32), i: int, value: int) -> None: ...
+
+
+@wp.func_native("return array.data[(long long)i];")
+def int_at(array: wp.array(dtype=wp.int32), i: int) -> int: ...
 
 
 @wp.func_native("return array.data[(long long)i];")
@@ -51,10 +51,6 @@ def put_in_vec3(array: wp.array(dtype=wp.vec3), i: int, k: int, value: float) ->
 
 @wp.func_native("__builtin_prefetch(array.data + (long long)i);")
 def call_in_int(array: wp.array(dtype=wp.int32), i: int) -> None: ...
-
-
-@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_bits(array: wp.array(dtype=wp.uint32), i: int) -> None: ...
 
 
 @wp.func_native("__builtin_prefetch(array.data + (long long)i);")

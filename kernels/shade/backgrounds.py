@@ -4,10 +4,11 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.memory import number_of_vec3, put_number
+from wrt.kernels.memory import number_at, put_number
+from wrt.kernels.native import source
 from wrt.kernels.shade.elementary import acos, atan2, sin_cos
 from wrt.kernels.shade.lights import LightSample
-from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_point, search_cdf, share_of_row, turned_to
+from wrt.kernels.shade.sampling import LANES, PI, TWO_PI, cosine_point, search_cdf, share_of_row, turned_to
 from wrt.kernels.structs import Background
 
 # --- the kinds --------------------------------------------------------------------------------------------------------
@@ -84,18 +85,25 @@ def environment(b: Background, direction: wp.vec3) -> wp.vec3:
     return environment_at(b, environment_column(b, d[0], d[2]), environment_row(b, d[1]))
 
 
+@wp.func_native(source("shade/environment_lanes.h", LANES=LANES))
+def environment_colors(background: Background, x: wp.array(dtype=wp.float32), y: wp.array(dtype=wp.float32),
+                       z: wp.array(dtype=wp.float32), count: int) -> None:
+    """environment_at of `count` columns x and rows y, to red in x, green in y and blue in z; each has room for LANES - 1 more."""
+
+
 @wp.func
-def environment_places(b: Background, directions: wp.array(dtype=wp.vec3), first: int, end: int, x: wp.array(dtype=wp.float32),
-                       y: wp.array(dtype=wp.float32)):
-    """Columns and rows of the directions first .. end - 1, to x and y from 0 on: in lanes (kernels.memory)."""
+def environment_seen(b: Background, directions: wp.array(dtype=wp.float32), at: int, step: int, count: int,
+                     x: wp.array(dtype=wp.float32), y: wp.array(dtype=wp.float32), z: wp.array(dtype=wp.float32)):
+    """Many at a time (kernels.memory): of the directions whose components are in three rows from `at` on, each after `step`."""
     sin, cos = turn_of(-b.rotation)
-    i = int(first)
-    while i < end:
-        d = wp.vec3(number_of_vec3(directions, i, 0), number_of_vec3(directions, i, 1), number_of_vec3(directions, i, 2))
+    i = int(0)
+    while i < count:
+        d = wp.vec3(number_at(directions, at + i), number_at(directions, at + step + i), number_at(directions, at + 2 * step + i))
         d = turned(d, sin, cos)
-        put_number(x, i - first, environment_column(b, d[0], d[2]))
-        put_number(y, i - first, environment_row(b, d[1]))
+        put_number(x, i, environment_column(b, d[0], d[2]))
+        put_number(y, i, environment_row(b, d[1]))
         i = i + 1
+    environment_colors(b, x, y, z, count)
 
 
 @wp.func
@@ -122,21 +130,19 @@ def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
 
 
 class BackgroundKind(NamedTuple):
-    """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine. at, places: as
-    environment_at and environment_places, for many directions at a time; None: there is no faster way than one
-    by one."""
+    """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine. seen: as
+    environment_seen; None: it is not faster."""
 
     radiance: Any
     sample: Any = None
-    at: Any = None
-    places: Any = None
+    seen: Any = None
 
 
 # By the name in wrt.scene.backgrounds.BACKGROUNDS.
 BACKGROUNDS = {
     "constant": BackgroundKind(constant),
     "gradient": BackgroundKind(gradient),
-    "environment": BackgroundKind(environment, environment_sample, environment_at, environment_places),
+    "environment": BackgroundKind(environment, environment_sample, environment_seen),
 }
 
 

@@ -36,8 +36,9 @@ def make_radiance(features: Any, accel_struct: Any, closest_hit: Any, any_hit: A
     """The whole tree of rays behind one camera ray. `features`: wrt.renderer.features.Features; counting: rays carry a label."""
     shading = make_shading(features)
     step = make_step(features, shading, counting)
-    surface_at = shading.surface_at
+    surface_at, look_up, shading_normal = shading.surface_at, shading.look_up, shading.shading_normal
     Path, first_path, ray_of, shade, keep, worth = step.Path, step.first_path, step.ray_of, step.shade, step.keep, step.worth
+    choose_facet = step.choose_facet
     background_radiance = make_background(features)
     transmittance = make_transmittance(features, shading, accel_struct, closest_hit, any_hit)
     direct_light = make_direct_light(features, accel_struct, transmittance, step, counting)
@@ -62,7 +63,10 @@ def make_radiance(features: Any, accel_struct: Any, closest_hit: Any, any_hit: A
             if hit.prim_id < 0:
                 out.radiance += wp.cw_mul(path.throughput, background_radiance(lighting.background, path.direction))
                 continue
-            shaded = shade(surfaces, lighting, path, surface_at(surfaces, ray, hit), hit.t, index)
+            met = surface_at(surfaces, ray, hit)
+            texels = look_up(surfaces, met)
+            met.shading = shading_normal(surfaces, met, texels, -path.direction)
+            shaded = shade(surfaces, lighting, path, met, texels, hit.t, choose_facet(path.key, index))
             lit = Lit()
             lit.light = shaded.light
             lit.throughput = shaded.throughput

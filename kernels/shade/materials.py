@@ -196,8 +196,8 @@ def make_scatter(features: Any) -> Any:
     of_kind = make_of_kind(features)
 
     @wp.func
-    def scatter(m: Material, s: Surface, wo: wp.vec3, xi: wp.vec2) -> Scatter:
-        """What a ray from direction -wo turns into. xi: two numbers in [0, 1) that choose a microfacet where it is rough."""
+    def scatter(m: Material, s: Surface, wo: wp.vec3, facet: wp.vec3) -> Scatter:
+        """What a ray from direction -wo turns into. facet: of cap_point, what chooses a microfacet where it is rough."""
         out = Scatter()
         n = s.shading
         rough = bool(False)
@@ -205,7 +205,7 @@ def make_scatter(features: Any) -> Any:
         if wp.static(features.rough):
             rough = alpha > SMOOTH
             if rough:
-                n = ggx_normal(xi, s.shading, wo, alpha)
+                n = ggx_normal(facet, s.shading, wo, alpha)
         out.reflection = 2.0 * wp.dot(n, wo) * n - wo
         out = of_kind(m, s, n, wo, out)
         if rough:

@@ -166,7 +166,7 @@ def center_of(x: int, y: int, width: int, height: int) -> wp.vec2:
 
 def make_see(features: Any) -> Any:
     """What a pixel's center shows."""
-    surface_at, resolve, shading_normal, _, _ = make_shading(features)
+    surface_at, look_up, resolve, shading_normal, _, _ = make_shading(features)
 
     @wp.func
     def see(film: AovFilm, pixel: int, surfaces: Surfaces, ray: Ray, hit: Hit):
@@ -176,8 +176,9 @@ def make_see(features: Any) -> Any:
         film.material_id[pixel] = -1
         if hit.prim_id >= 0:
             s = surface_at(surfaces, ray, hit)
-            m = resolve(surfaces, s)
-            film.normal[pixel] = shading_normal(surfaces, m, s, -ray.direction)
+            texels = look_up(surfaces, s)
+            m = resolve(surfaces, s, texels)
+            film.normal[pixel] = shading_normal(surfaces, s, texels, -ray.direction)
             film.albedo[pixel] = m.albedo
             film.material_id[pixel] = s.material
 

@@ -222,15 +222,22 @@ def cosine_hemisphere(xi: wp.vec2, n: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def ggx_normal(xi: wp.vec2, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
-    """A microfacet normal among those of the GGX surface that wo sees (Dupuy and Benyoub 2023, spherical caps)."""
+def cap_point(xi: wp.vec2) -> wp.vec3:
+    """Where on a spherical cap: a point of the unit circle, and how far down."""
+    sin, cos = near_sin_cos(TWO_PI * xi[0])
+    return wp.vec3(cos, sin, xi[1])
+
+
+@wp.func
+def ggx_normal(cap: wp.vec3, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
+    """A microfacet normal among those of the GGX surface that wo sees (Dupuy and Benyoub 2023, spherical caps); cap: of
+    cap_point."""
     x = frame_x(n)
     y = wp.cross(n, x)
     w = wp.normalize(wp.vec3(alpha * wp.dot(wo, x), alpha * wp.dot(wo, y), wp.dot(wo, n)))
-    z = (1.0 - xi[1]) * (1.0 + w[2]) - w[2]
+    z = (1.0 - cap[2]) * (1.0 + w[2]) - w[2]
     r = wp.sqrt(wp.max(0.0, 1.0 - z * z))
-    p = r * point_at(TWO_PI * xi[0])
-    h = wp.vec3(p[0], p[1], z) + w
+    h = wp.vec3(r * cap[0], r * cap[1], z) + w
     return wp.normalize(alpha * h[0] * x + alpha * h[1] * y + wp.max(h[2], 1.0e-6) * n)
 
 

@@ -5,31 +5,69 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.shade.materials import make_scatter
+from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.surface import SEEN, Surface, bent, make_place_of, make_surface_at, triangle_uv
 from wrt.kernels.shade.textures import make_sample_texture
-from wrt.kernels.structs import Material, Surfaces
+from wrt.kernels.structs import Material, Surfaces, unit
 
 MASK = 1  # alpha modes; 0 is opaque
 BLEND = 2
 
 
-def make_resolve(features: Any, sample_texture: Any) -> Any:
+@wp.struct
+class Texels:
+    """What a material's textures say at a point, linear; 1 where there is none, and unread where the scene has none."""
+
+    albedo: wp.vec3
+    alpha: float
+    emission: wp.vec3
+    roughness: float
+    metallic: float
+    transmission: float
+    normal: wp.vec3
+
+
+def make_look_up(features: Any) -> Any:
+    """All textures of a surface's material."""
+    sample_texture = make_sample_texture(features.textures, features.checkerboards)
+
+    @wp.func
+    def look_up(surfaces: Surfaces, s: Surface) -> Texels:
+        out = Texels()
+        uv = wp.vec2(s.u, s.v)
+        if wp.static(features.textures or features.checkerboards):
+            color = sample_texture(surfaces, surfaces.materials[s.material].albedo_texture, uv)
+            out.albedo = wp.vec3(color[0], color[1], color[2])
+            out.alpha = color[3]
+            light = sample_texture(surfaces, surfaces.materials[s.material].emission_texture, uv)
+            out.emission = wp.vec3(light[0], light[1], light[2])
+        if wp.static(features.parameter_textures):
+            mr = sample_texture(surfaces, surfaces.materials[s.material].metallic_roughness_texture, uv)
+            out.roughness = mr[1]
+            out.metallic = mr[2]
+            out.transmission = sample_texture(surfaces, surfaces.materials[s.material].transmission_texture, uv)[0]
+        if wp.static(features.normal_maps):
+            n = sample_texture(surfaces, surfaces.materials[s.material].normal_texture, uv)
+            out.normal = wp.vec3(n[0], n[1], n[2])
+        return out
+
+    return look_up
+
+
+def make_resolve(features: Any) -> Any:
     """The material at a point: parameters times textures."""
 
     @wp.func
-    def resolve(surfaces: Surfaces, s: Surface) -> Material:
+    def resolve(surfaces: Surfaces, s: Surface, texels: Texels) -> Material:
         m = surfaces.materials[s.material]
         if wp.static(features.textures or features.checkerboards):
-            color = sample_texture(surfaces, m.albedo_texture, s.uv)
-            m.albedo = wp.cw_mul(m.albedo, wp.vec3(color[0], color[1], color[2]))
-            m.alpha = m.alpha * color[3]
-            light = sample_texture(surfaces, m.emission_texture, s.uv)
-            m.emission = wp.cw_mul(m.emission, wp.vec3(light[0], light[1], light[2]))
+            m.albedo = wp.cw_mul(m.albedo, texels.albedo)
+            m.alpha = m.alpha * texels.alpha
+            m.emission = wp.cw_mul(m.emission, texels.emission)
         if wp.static(features.parameter_textures):
-            mr = sample_texture(surfaces, m.metallic_roughness_texture, s.uv)
-            m.roughness = m.roughness * mr[1]
-            m.metallic = m.metallic * mr[2]
-            m.transmission = m.transmission * sample_texture(surfaces, m.transmission_texture, s.uv)[0]
+            m.roughness = m.roughness * texels.roughness
+            m.metallic = m.metallic * texels.metallic
+            m.transmission = m.transmission * texels.transmission
         return m
 
     return resolve
@@ -58,29 +96,20 @@ def make_cutout(features: Any) -> Any:
     return accepts
 
 
-def make_bump(features: Any, sample_texture: Any) -> Any:
-    """Normal maps: the shading normal that the picture says."""
-
-    @wp.func
-    def bump(surfaces: Surfaces, m: Material, s: Surface) -> wp.vec3:
-        if m.normal_texture < 0:
-            return s.shading
-        side = wp.where(s.front != 0, 1.0, -1.0)
-        outward = side * s.shading
-        t = s.tangent - wp.dot(s.tangent, outward) * outward
-        length = wp.length(t)
-        if length == 0.0:
-            return s.shading
-        t = t / length
-        color = sample_texture(surfaces, m.normal_texture, s.uv)
-        x = (2.0 * color[0] - 1.0) * m.normal_scale
-        y = (2.0 * color[1] - 1.0) * m.normal_scale
-        z = 2.0 * color[2] - 1.0
-        # glTF: +y is up in the picture, while v runs down; the bitangent is cross(n, t) for pictures that are not mirrored.
-        n = wp.normalize(x * t + y * s.bitangent_sign * wp.cross(outward, t) + z * outward)
-        return side * n
-
-    return bump
+@wp.func
+def bump(s: Surface, scale: float, color: wp.vec3) -> wp.vec3:
+    """Normal maps: the shading normal that the picture says. No branches, for loops in lanes."""
+    side = wp.where(s.front != 0, 1.0, -1.0)
+    outward = side * s.shading
+    t = s.tangent - wp.dot(s.tangent, outward) * outward
+    length = wp.sqrt(wp.dot(t, t))
+    t = t / length
+    x = (2.0 * color[0] - 1.0) * scale
+    y = (2.0 * color[1] - 1.0) * scale
+    z = 2.0 * color[2] - 1.0
+    # glTF: +y is up in the picture, while v runs down; the bitangent is cross(n, t) for pictures that are not mirrored.
+    n = unit(x * t + y * s.bitangent_sign * wp.cross(outward, t) + z * outward)
+    return where_vec3(length == 0.0, s.shading, side * n)
 
 
 def make_is_solid(features: Any) -> Any:
@@ -97,10 +126,12 @@ def make_is_solid(features: Any) -> Any:
 
 
 class Shading(NamedTuple):
-    """What is known at a hit: surface_at(surfaces, ray, hit); resolve(surfaces, surface) -> Material; shading_normal(surfaces,
-    material, surface, wo); scatter(material, surface, wo, xi) -> Scatter; is_solid(material)."""
+    """What is known at a hit: surface_at(surfaces, ray, hit); look_up(surfaces, surface) -> Texels; resolve(surfaces, surface,
+    texels) -> Material; shading_normal(surfaces, surface, texels, wo); scatter(material, surface, wo, facet) -> Scatter;
+    is_solid(material)."""
 
     surface_at: Any
+    look_up: Any
     resolve: Any
     shading_normal: Any
     scatter: Any
@@ -109,21 +140,20 @@ class Shading(NamedTuple):
 
 def make_shading(features: Any) -> Any:
     """Once for a kernel: the integrator's step, shadow rays and AOVs share it."""
-    sample_texture = make_sample_texture(features.textures, features.checkerboards)
     uvs = features.textures or features.checkerboards
     surface_at = make_surface_at(features.spheres, features.smooth, uvs, features.normal_maps, features.instances)
-    resolve = make_resolve(features, sample_texture)
-    bump = make_bump(features, sample_texture)
+    look_up, resolve = make_look_up(features), make_resolve(features)
 
     @wp.func
-    def shading_normal(surfaces: Surfaces, m: Material, s: Surface, wo: wp.vec3) -> wp.vec3:
+    def shading_normal(surfaces: Surfaces, s: Surface, texels: Texels, wo: wp.vec3) -> wp.vec3:
         """The interpolated or mapped normal, bent no farther than it is still seen from wo."""
         n = s.shading
         if wp.static(features.normal_maps):
-            n = bump(surfaces, m, s)
+            if surfaces.materials[s.material].normal_texture >= 0:
+                n = bump(s, surfaces.materials[s.material].normal_scale, texels.normal)
         if wp.static(features.smooth or features.normal_maps):
             if wp.dot(n, wo) < SEEN:  # seldom: what `bent` does beyond this test takes a while
                 n = bent(n, wo)
         return n
 
-    return Shading(surface_at, resolve, shading_normal, make_scatter(features), make_is_solid(features))
+    return Shading(surface_at, look_up, resolve, shading_normal, make_scatter(features), make_is_solid(features))

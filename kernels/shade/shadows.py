@@ -80,7 +80,7 @@ def make_pass_surface(features: Any, scatter: Any, is_solid: Any) -> Any:
         An unbent ray meets both sides of solid glass at its angle outside: from_outside.front must be 1, or a ray on its way
         out would be held for totally reflected.
         """
-        share = scatter(m, from_outside, wo, wp.vec2(0.0, 0.0))
+        share = scatter(m, from_outside, wo, wp.vec3())
         if share.bends == 0:
             return share.transmitted
         if wp.static(features.tinted_shadows):
@@ -148,7 +148,7 @@ def begin_shadow(ray: Ray, end: wp.vec3) -> ShadowWalk:
 
 def make_go_through(features: Any, shading: Any) -> Any:
     """What a shadow ray does with the closest hit on its way. Nothing here traces a ray."""
-    surface_at, resolve, shading_normal, scatter, is_solid = shading
+    surface_at, look_up, resolve, shading_normal, scatter, is_solid = shading
     place_of = make_place_of(features.instances)
     pass_surface = make_pass_surface(features, scatter, is_solid)
 
@@ -160,10 +160,11 @@ def make_go_through(features: Any, shading: Any) -> Any:
             return walk
         ray = walk.ray
         s = surface_at(surfaces, ray, hit)
-        m = resolve(surfaces, s)
+        texels = look_up(surfaces, s)
+        m = resolve(surfaces, s, texels)
         m.roughness = 0.0
         d = wp.normalize(ray.direction)
-        s.shading = shading_normal(surfaces, m, s, -d)
+        s.shading = shading_normal(surfaces, s, texels, -d)
         walk.passage = pass_surface(surfaces, walk.passage, m, s, -d, hit.t * wp.length(ray.direction))
         now = left(walk.passage)
         if wp.max(now.transmittance) <= 0.0:

@@ -15,14 +15,15 @@ import warp as wp
 from wrt.kernels.shade.direct import make_reflected_light, shadow_ray
 from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.materials import Scatter
-from wrt.kernels.shade.sampling import hash_pair, make_sample_2d
-from wrt.kernels.shade.shading import BLEND
+from wrt.kernels.shade.sampling import cap_point, hash_pair, make_sample_2d
+from wrt.kernels.shade.shading import BLEND, Texels
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT, OUTSIDE, Shadow, attenuation
 from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Lighting, Limits, Material, Ray, Surfaces, any_positive, make_ray
 
 MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
 UNKNOWN = wp.constant(-2)  # where a camera ray begins: within glass, or not
+FACET = wp.constant(2)  # the dimension of what chooses a microfacet
 BRANCHES = wp.constant(4)  # camera, reflection, refraction, straight on: the numbers that make_step gives its new paths
 
 
@@ -179,7 +180,9 @@ def counted(before: Sample, verdict: int) -> Sample:
 class Step(NamedTuple):
     """What a loop is made of.
 
-    Path: the struct; first_path(ray, key); ray_of(path). shade(surfaces, lighting, path, met, t, index) -> Shaded.
+    Path: the struct; first_path(ray, key); ray_of(path). choose_facet(key, index) -> vec3: what chooses a microfacet at the end of
+    a path with that key, for the sample `index`. shade(surfaces, lighting, path, met, texels, t, facet) ->
+    Shaded.
     extra_lights: how many there are beside those of `lighting` (the background is one); choose(lighting, surfaces, i, surface,
     point) -> LightSample of light i (the background comes after the last one; point: of LightPoints), and shadow_request(shaded,
     sample) -> ShadowRequest. keep(path, limits, traced): whether a new path is followed, and
@@ -189,6 +192,7 @@ class Step(NamedTuple):
     Path: Any
     first_path: Any
     ray_of: Any
+    choose_facet: Any
     shade: Any
     extra_lights: int
     choose: Any
@@ -201,8 +205,8 @@ def make_step(features: Any, shading: Any, counting: bool = False) -> Any:
     """The step of a scene's kernel. `features`: wrt.renderer.features.Features; `shading`: of make_shading."""
     Path = make_path(counting)
     first_path, ray_of, child = make_paths(counting)
-    return Step(Path, first_path, ray_of, make_shade(features, shading, child, counting), 1 if features.sky_light else 0,
-                *make_shadow_request(features, counting), *make_keep(features, counting))
+    return Step(Path, first_path, ray_of, make_choose_facet(features), make_shade(features, shading, child, counting),
+                1 if features.sky_light else 0, *make_shadow_request(features, counting), *make_keep(features, counting))
 
 
 def make_paths(counting: bool = False) -> Any:
@@ -264,11 +268,23 @@ def make_missing(features: Any, is_solid: Any) -> Any:
     return missing
 
 
+def make_choose_facet(features: Any) -> Any:
+    """Nothing is drawn where nothing is rough."""
+    sample_2d = make_sample_2d(features)
+
+    @wp.func
+    def choose_facet(key: wp.uint32, index: wp.uint32) -> wp.vec3:
+        if wp.static(features.rough):
+            return cap_point(sample_2d(key, index, FACET))
+        return wp.vec3()
+
+    return choose_facet
+
+
 def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) -> Any:
     """One device function from a path and its hit to everything that follows from them."""
     Path, Shaded = make_path(counting), make_shaded(counting)
-    _, resolve, shading_normal, scatter_at, is_solid = shading
-    sample_2d = make_sample_2d(features)
+    _, _, resolve, _, scatter_at, is_solid = shading
     missing = make_missing(features, is_solid)
 
     @wp.func
@@ -292,14 +308,15 @@ def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) 
         return onward
 
     @wp.func
-    def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, met: Surface, t: float, index: wp.uint32) -> Shaded:
-        """met: the surface at the end of the path's ray (of ray_of), and t of the hit; index: of the sample."""
+    def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, met: Surface, texels: Texels, t: float,
+              facet: wp.vec3) -> Shaded:
+        """met: the surface at the end of the path's ray (of ray_of), whose shading normal is as seen from there; its texels; t of
+        the hit; facet: of choose_facet."""
         out = Shaded()
         path = arriving
         s = met
-        m = resolve(surfaces, s)
+        m = resolve(surfaces, s, texels)
         out.wo = -path.direction
-        s.shading = shading_normal(surfaces, m, s, out.wo)
         if wp.static(features.blend):
             share = missing(m, s, path.medium)
             if share > 0.0:
@@ -311,10 +328,7 @@ def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) 
             path.medium = medium_at(m, s, path.medium)
         if wp.static(features.absorption):
             path.throughput = absorbed(surfaces, path.throughput, path.medium, t)
-        xi = wp.vec2(0.0, 0.0)
-        if wp.static(features.rough):
-            xi = sample_2d(path.key, index, 2)
-        scatter = scatter_at(m, s, out.wo, xi)
+        scatter = scatter_at(m, s, out.wo, facet)
         out.throughput = path.throughput
         out.surface = s
         out.scatter = scatter

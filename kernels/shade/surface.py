@@ -19,7 +19,7 @@ class Surface:
     ray's side; shading: the interpolated one, on that side too; front: the ray comes from outside (counter-clockwise);
     exclude_plus_one: 1 + the triangle that rays from here need not be tested against, 0 on a sphere.
     tangent: unit vector along growing u, not necessarily at right angles to the normal; bitangent_sign: -1 where the texture
-    is mirrored, else 1.
+    is mirrored, else 1. u, v: texture coordinates, two numbers since a vector of two would not run in lanes.
     """
 
     point: wp.vec3
@@ -28,7 +28,8 @@ class Surface:
     shading: wp.vec3
     tangent: wp.vec3
     bitangent_sign: float
-    uv: wp.vec2
+    u: float
+    v: float
     material: int
     front: int
     exclude_plus_one: int
@@ -138,8 +139,8 @@ def world_error(i: Instance, p: wp.vec3, error: wp.vec3, world: wp.vec3) -> wp.v
 
 @wp.struct
 class Triangle:
-    """Its corners and, where a scene has them, the normals and texture coordinates there. Corners are in the space of its mesh,
-    normals in the world."""
+    """Its corners and, where a scene has them, the normals and texture coordinates (u of the three corners, and v) there. Corners
+    are in the space of its mesh, normals in the world."""
 
     v0: wp.vec3
     v1: wp.vec3
@@ -147,9 +148,8 @@ class Triangle:
     n0: wp.vec3
     n1: wp.vec3
     n2: wp.vec3
-    t0: wp.vec2
-    t1: wp.vec2
-    t2: wp.vec2
+    u: wp.vec3
+    v: wp.vec3
 
 
 @wp.func
@@ -180,9 +180,11 @@ def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
                 triangle.n1 = world_normal(instance, triangle.n1)
                 triangle.n2 = world_normal(instance, triangle.n2)
         if wp.static(uvs):
-            triangle.t0 = surfaces.uvs[face[0]]
-            triangle.t1 = surfaces.uvs[face[1]]
-            triangle.t2 = surfaces.uvs[face[2]]
+            t0 = surfaces.uvs[face[0]]
+            t1 = surfaces.uvs[face[1]]
+            t2 = surfaces.uvs[face[2]]
+            triangle.u = wp.vec3(t0[0], t1[0], t2[0])
+            triangle.v = wp.vec3(t0[1], t1[1], t2[1])
         return triangle
 
     return triangle_at
@@ -226,7 +228,23 @@ def triangle_normal(t: Triangle) -> wp.vec3:
     return unit(wp.cross(e1 / largest(e1), e2 / largest(e2)))
 
 
-def make_on_triangle(smooth: bool) -> Any:
+@wp.func
+def towards_u(t: Triangle, outward: wp.vec3) -> tuple[wp.vec3, float]:
+    """Surface.tangent and bitangent_sign; outward: the normal on the outside."""
+    e1 = t.v1 - t.v0
+    e2 = t.v2 - t.v0
+    longer = wp.min(lift(e1), lift(e2))
+    u1 = t.u[1] - t.u[0]
+    v1 = t.v[1] - t.v[0]
+    u2 = t.u[2] - t.u[0]
+    v2 = t.v[2] - t.v[0]
+    # dp/du up to a positive factor. v runs down: a picture that is not mirrored has a negative determinant.
+    sign = wp.where(u1 * v2 - v1 * u2 > 0.0, -1.0, 1.0)
+    along = -sign * (v2 * (longer * e1) - v1 * (longer * e2))
+    return where_vec3(wp.dot(along, along) > 0.0, unit(along), frame_x(outward)), sign
+
+
+def make_on_triangle(smooth: bool, uvs: bool, tangents: bool) -> Any:
     """Where a hit is, and the normals there. Like `facing`, it has no branches, so that loops can run in lanes."""
 
     @wp.func
@@ -238,36 +256,16 @@ def make_on_triangle(smooth: bool) -> Any:
         s.geometric = triangle_normal(t)
         if wp.static(smooth):  # corners without a normal are zero: flat there
             s.shading = unit((1.0 - u - v) * t.n0 + u * t.n1 + v * t.n2)
+        if wp.static(uvs):
+            s.u = (1.0 - u - v) * t.u[0] + u * t.u[1] + v * t.u[2]
+            s.v = (1.0 - u - v) * t.v[0] + u * t.v[1] + v * t.v[2]
+        if wp.static(tangents):
+            tangent, sign = towards_u(t, s.geometric)
+            s.tangent = tangent
+            s.bitangent_sign = sign
         return s
 
     return on_triangle
-
-
-def make_with_uv(uvs: bool, tangents: bool) -> Any:
-    """What textures need beside that. It is computed for one hit at a time: with it, a Surface does not run in lanes."""
-
-    @wp.func
-    def with_uv(met: Surface, t: Triangle, u: float, v: float, outward: wp.vec3) -> Surface:
-        """outward: the geometric normal on the outside."""
-        s = met
-        if wp.static(uvs):
-            s.uv = (1.0 - u - v) * t.t0 + u * t.t1 + v * t.t2
-        if wp.static(tangents):
-            e1 = t.v1 - t.v0
-            e2 = t.v2 - t.v0
-            longer = wp.min(lift(e1), lift(e2))
-            e1 = longer * e1
-            e2 = longer * e2
-            t1 = t.t1 - t.t0
-            t2 = t.t2 - t.t0
-            # dp/du up to a positive factor. v runs down: a picture that is not mirrored has a negative determinant.
-            s.bitangent_sign = wp.where(t1[0] * t2[1] - t1[1] * t2[0] > 0.0, -1.0, 1.0)
-            along_u = -s.bitangent_sign * (t2[1] * e1 - t1[1] * e2)
-            length = wp.length(along_u)
-            s.tangent = wp.where(length > 0.0, along_u / length, frame_x(outward))
-        return s
-
-    return with_uv
 
 
 @wp.func
@@ -311,7 +309,9 @@ def make_on_sphere(uvs: bool, tangents: bool) -> Any:
         s.point = center + sphere[3] * s.geometric
         s.error = gamma(6.0) * (wp.vec3(sphere[3], sphere[3], sphere[3]) + wp.abs(center))
         if wp.static(uvs):
-            s.uv = sphere_uv(s.geometric)
+            uv = sphere_uv(s.geometric)
+            s.u = uv[0]
+            s.v = uv[1]
         if wp.static(tangents):
             s.bitangent_sign = 1.0
             along_u = wp.vec3(s.geometric[2], 0.0, -s.geometric[0])
@@ -326,13 +326,11 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
     """The surface at a hit, with only those attributes that the scene has."""
     place_of = make_place_of(instances)
     triangle_at = make_triangle_at(smooth, uvs, instances)
-    plain, with_uv, on_sphere = make_on_triangle(smooth), make_with_uv(uvs, tangents), make_on_sphere(uvs, tangents)
+    met_triangle, on_sphere = make_on_triangle(smooth, uvs, tangents), make_on_sphere(uvs, tangents)
 
     @wp.func
     def on_triangle(surfaces: Surfaces, hit: Hit, place: Place) -> Surface:
-        t = triangle_at(surfaces, place)
-        s = plain(t, hit.u, hit.v)
-        return with_uv(s, t, hit.u, hit.v, s.geometric)
+        return met_triangle(triangle_at(surfaces, place), hit.u, hit.v)
 
     @wp.func
     def in_world(local: Surface, instance: Instance) -> Surface:

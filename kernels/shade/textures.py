@@ -4,12 +4,12 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.memory import call_in_bits
 from wrt.kernels.structs import Surfaces, Texture
 
 WRAP_REPEAT = 0
 WRAP_CLAMP = 1
 WRAP_MIRROR = 2
+FARTHEST = wp.constant(2.0**30)  # texels from a picture's beginning
 
 
 @wp.func
@@ -43,7 +43,7 @@ def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec
 def place_between(at: float, size: int) -> float:
     """Of a coordinate, in texels, whose colours are at their centres."""
     # Beyond 2^24 no digits are left for a place between texels, and beyond 2^31 each device makes another integer of it.
-    return wp.clamp(at * float(size) - 0.5, -wp.static(2.0**30), wp.static(2.0**30))
+    return wp.clamp(at * float(size) - 0.5, -FARTHEST, FARTHEST)
 
 
 @wp.func
@@ -52,21 +52,6 @@ def texture_uv(texture: Texture, uv: wp.vec2) -> wp.vec2:
     u = texture.row_u[0] * uv[0] + texture.row_u[1] * uv[1] + texture.row_u[2]
     v = texture.row_v[0] * uv[0] + texture.row_v[1] * uv[1] + texture.row_v[2]
     return wp.vec2(u, v)
-
-
-@wp.func
-def call_in_texels(surfaces: Surfaces, index: int, uv: wp.vec2):
-    """Those that sample_texture will read, but for a right one in another cache line. CPU only."""
-    if index < 0:
-        return
-    texture = surfaces.textures[index]
-    if texture.width == 0:
-        return
-    at = texture_uv(texture, uv)
-    column = wrapped(int(wp.floor(place_between(at[0], texture.width))), texture.width, texture.wrap_u)
-    row = int(wp.floor(place_between(at[1], texture.height)))
-    call_in_bits(surfaces.texels, texture.first + wrapped(row, texture.height, texture.wrap_v) * texture.width + column)
-    call_in_bits(surfaces.texels, texture.first + wrapped(row + 1, texture.height, texture.wrap_v) * texture.width + column)
 
 
 @wp.func

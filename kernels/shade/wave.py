@@ -8,7 +8,8 @@ scene compiles no traversal.
 
 Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once. trace_wave launches
 the others, so that a wave is a single launch to Python. What begins a wave is in wave_begin.py, the step in wave_shade.py; for many
-hits at a time, surfaces are in wave_surfaces.py, and lights in wave_lights.py.
+hits at a time, surfaces are in wave_surfaces.py, textures in wave_textures.py, normals in wave_normals.py, random numbers in
+wave_numbers.py, and lights in wave_lights.py. clear.py says which shadow rays need a closest hit.
 """
 
 from functools import cache
@@ -29,7 +30,6 @@ from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel
 
 Path = make_path(False)
 _, ray_of, _ = make_paths()
-AHEAD = 4  # hits whose texels are called in before they are read
 BLOCK = 64  # rays for which something is computed in lanes at a time
 FRESH = 2048  # camera rays that are made, traced and shaded at a time, while they are in the cache
 
@@ -60,11 +60,13 @@ class Wave:
 
     By place in the queue: number, rays, hits. By count of the surfaces that ask lights: asked (their sample's number), lit,
     scatter, and for light i from i * capacity on request: the place of its shadow ray, or -1. By place of a shadow ray, for light i
-    from i * capacity on: value, shadow_rays, occluded or, where shadows are transparent, walks and shadow_hits, and waiting: which
-    walks those rays are of. asking: shadow rays to each light.
+    from i * capacity on: value, shadow_rays, occluded. Where shadows are transparent, these are rays that can meet what light
+    passes through; they have walks and shadow_hits in place of occluded, and waiting: which walks they are of. The others stand
+    from (i + 1) * capacity - 1 downwards. asking: shadow rays to each light, and plain: those others.
 
     met, missed: places in the queue of the rays that hit something and of the others, each in their order. By place in a block of
-    BLOCK of the hits: rows (wave_surfaces.py), keys, indices, and sky_x, sky_y, sky_z, which before are of a block of the queue.
+    BLOCK of the hits: rows (wave_surfaces.py), keys, indices, wanted (wave_textures.py), and sky_x, sky_y, sky_z, which before
+    are of a block of those that missed.
     """
 
     capacity: int
@@ -86,6 +88,7 @@ class Wave:
     asked: wp.array(dtype=wp.int32)
     request: wp.array(dtype=wp.int32)
     asking: wp.array(dtype=wp.int32)
+    plain: wp.array(dtype=wp.int32)
     value: wp.array(dtype=wp.vec3)
     shadow_rays: Queue
     occluded: wp.array(dtype=wp.bool)
@@ -98,6 +101,7 @@ class Wave:
     sky_x: wp.array(dtype=wp.float32)
     sky_y: wp.array(dtype=wp.float32)
     sky_z: wp.array(dtype=wp.float32)
+    wanted: wp.array(dtype=wp.int32)
     keys: wp.array(dtype=wp.uint32)
     indices: wp.array(dtype=wp.uint32)
 
@@ -165,7 +169,11 @@ def make_gather(transparent_shadows: bool) -> Any:
                 slot = wave.request[i * wave.capacity + a]
                 if slot >= 0:
                     if wp.static(transparent_shadows):
-                        direct = lit_by(direct, wave.value[slot], wave.scatter[a], wave.walks[slot].shadow)
+                        if slot >= (i + 1) * wave.capacity - wave.plain[i]:
+                            direct.transmittance += wp.where(wave.occluded[slot], 0.0, 1.0) * wave.value[slot]
+                            direct.rays += 1
+                        else:
+                            direct = lit_by(direct, wave.value[slot], wave.scatter[a], wave.walks[slot].shadow)
                     else:
                         light += wp.where(wave.occluded[slot], 0.0, 1.0) * wave.value[slot]
                         rays += 1
@@ -176,6 +184,7 @@ def make_gather(transparent_shadows: bool) -> Any:
             put_sample(wave.done, number, add_up(wave.done[number], wave.lit[a], direct))
         for i in range(lights):
             wave.asking[i] = 0
+            wave.plain[i] = 0
         wave.job[0].asked = 0
 
     return gather
@@ -206,12 +215,13 @@ def add_to_film(wave: Wave, film: Film):
 
 @wp.struct
 class WaveLaunches:
-    """Those of a wave. shadow_hit: any hit, or where shadows are transparent, the closest one, with which go_through goes on."""
+    """Those of a wave. shadow_hit: any hit; walk_hit: the closest one, with which go_through goes on."""
 
     begin: Launch
     closest_hit: Launch
     shade: Launch
     shadow_hit: Launch
+    walk_hit: Launch
     go_through: Launch
 
 
@@ -225,13 +235,15 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
         """All shadow rays, and what their surfaces send on."""
         for light in range(lights):
             first = light * wave.capacity
-            asking = wave.asking[light]
-            while asking > 0:
-                run_range(launches.shadow_hit, first, first + asking)
-                asking = 0
-                if wp.static(transparent_shadows):
+            if wp.static(transparent_shadows):
+                while wave.asking[light] > 0:
+                    run_range(launches.walk_hit, first, first + wave.asking[light])
                     run_with(launches.go_through, light)
-                    asking = wave.asking[light]
+                end = first + wave.capacity
+                if wave.plain[light] > 0:
+                    run_range(launches.shadow_hit, end - wave.plain[light], end)
+            elif wave.asking[light] > 0:
+                run_range(launches.shadow_hit, first, first + wave.asking[light])
         gather(wave, lights)
 
     @kernel

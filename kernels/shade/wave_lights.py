@@ -10,20 +10,13 @@ from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point, make_sky_
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.lights import LIGHTS, LightSample, choose_emitter, from_emitter
 from wrt.kernels.shade.sampling import triangle_numbers
-from wrt.kernels.shade.surface import Surface, Triangle, bent, facing, make_on_sphere, triangle_point, triangle_point_error
-from wrt.kernels.shade.wave import Job, Wave
+from wrt.kernels.shade.surface import Surface, Triangle, facing, make_on_sphere, triangle_point, triangle_point_error
+from wrt.kernels.shade.wave import Wave
+from wrt.kernels.shade.wave_normals import row_of_normals
 from wrt.kernels.shade.wave_surfaces import ROW, put_row_number, put_row_vec3, row_number, row_vec3
 from wrt.kernels.structs import Lighting, Surfaces
 
 MESH = list(LIGHTS).index("mesh")
-
-
-@wp.func
-def key_at(wave: Wave, job: Job, number: int) -> wp.uint32:
-    """Of the samples of a path that has just been traced."""
-    if job.fresh != 0:
-        return wave.pixel_keys[number / job.samples]
-    return wave.paths[wave.size[number] * wave.capacity + number].key
 
 
 @wp.func
@@ -33,30 +26,23 @@ def first_is_mesh(lighting: Lighting) -> bool:
     return lighting.lights[0].kind == MESH
 
 
-def make_wave_lights(features: Any, choose: Any) -> tuple[Any, Any]:
+def make_wave_lights(features: Any, shading: Any, choose: Any) -> tuple[Any, Any, bool]:
     """sample_lights(wave, surfaces, lighting, first, end): for the hits first .. end - 1, at most BLOCK, whose surfaces are found;
     light_at(wave, surfaces, lighting, surface, key, index, light, i) -> LightSample for the i-th of them: what was computed before,
     or by `choose` (of make_step).
 
-    Computed before: the first light where it is a mesh, and a sky that is sampled by the cosine, or where pictures turn
-    normals its points alone.
+    Computed before: the first light where it is a mesh, and a sky that is sampled by the cosine, or its points alone where normals
+    are computed one by one (wave_normals.py). The third: whether keys must be put before (wave_numbers.py).
     """
     light_numbers, light_point = make_light_points(features)
     sky_point, sky_sample = make_sky_point(features), make_sky_sample(features)
     kind = BACKGROUNDS[features.background]
-    points = features.sky_light and kind.sample is None and kind.places is None
-    sky = points and not features.normal_maps and not features.instances
+    points = features.sky_light and kind.sample is None and kind.seen is None
+    normals = row_of_normals(features)
+    sky = points and normals is not None
     mesh = "mesh" in features.lights and not features.instances
-    on_sphere = make_on_sphere(False, False)
-
-    @wp.func
-    def put_keys(wave: Wave, first: int, end: int):
-        """What the numbers of each hit's samples are made from."""
-        job = wave.job[0]
-        for j in range(first, end):
-            number = wave.number[wave.met[j]]
-            wave.keys[j - first] = key_at(wave, job, number)
-            wave.indices[j - first] = wp.uint32(job.first_sample + number % job.samples)
+    look_up, shading_normal = shading.look_up, shading.shading_normal
+    on_sphere = make_on_sphere(features.textures or features.checkerboards, features.normal_maps)
 
     @wp.func
     def sky_points(wave: Wave, light: int, count: int):
@@ -78,7 +64,7 @@ def make_wave_lights(features: Any, choose: Any) -> tuple[Any, Any]:
         i = int(0)
         while i < count:
             point = sky_point(light_numbers(bits_at(wave.keys, i), bits_at(wave.indices, i), light))
-            sample = sky_sample(background, row_vec3(rows, wp.static(ROW["bent"]), i), point)
+            sample = sky_sample(background, row_vec3(rows, wp.static(normals or 0), i), point)
             put_row_vec3(rows, wp.static(ROW["sky_wi"]), i, sample.wi)
             put_row_vec3(rows, wp.static(ROW["sky_weight"]), i, sample.weight)
             i = i + 1
@@ -91,10 +77,10 @@ def make_wave_lights(features: Any, choose: Any) -> tuple[Any, Any]:
             if wave.hits.prim_id[k] >= surfaces.n_triangles:
                 s = facing(on_sphere(surfaces, queued_ray(wave.rays, k), hit_at(wave.hits, k)), wave.rays.direction[k])
                 put_row_vec3(wave.rows, wp.static(ROW["point"]), j - first, s.point)
-                n = s.shading
-                if wp.static(features.smooth):
-                    n = bent(n, -wave.rays.direction[k])
-                put_row_vec3(wave.rows, wp.static(ROW["bent"]), j - first, n)
+                if wp.static(sky):
+                    s.material = surfaces.prim_material[wave.hits.prim_id[k]]
+                    n = shading_normal(surfaces, s, look_up(surfaces, s), -wave.rays.direction[k])
+                    put_row_vec3(wave.rows, wp.static(normals or 0), j - first, n)
 
     @wp.func
     def sample_mesh(wave: Wave, surfaces: Surfaces, lighting: Lighting, count: int):
@@ -137,8 +123,6 @@ def make_wave_lights(features: Any, choose: Any) -> tuple[Any, Any]:
 
     @wp.func
     def sample_lights(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
-        if wp.static(points or mesh):
-            put_keys(wave, first, end)
         if wp.static(features.spheres and (sky or mesh)):
             put_spheres(wave, surfaces, first, end)
         if wp.static(sky):
@@ -172,4 +156,4 @@ def make_wave_lights(features: Any, choose: Any) -> tuple[Any, Any]:
                 return choose(lighting, surfaces, light, s, wp.vec3(wave.sky_x[i], wave.sky_y[i], wave.sky_z[i]))
         return choose(lighting, surfaces, light, s, light_point(lighting, key, index, light))
 
-    return sample_lights, light_at
+    return sample_lights, light_at, points or mesh

@@ -6,12 +6,16 @@ import warp as wp
 
 from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
+from wrt.kernels.shade.clear import may_pass
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
 from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, make_step
 from wrt.kernels.shade.wave import BLOCK, Path, Wave, enqueue, put_sample
 from wrt.kernels.shade.wave_lights import make_wave_lights
-from wrt.kernels.shade.wave_surfaces import make_call_in_texels, make_wave_surfaces
+from wrt.kernels.shade.wave_normals import make_wave_normals
+from wrt.kernels.shade.wave_numbers import make_sample_facets, put_keys
+from wrt.kernels.shade.wave_surfaces import ROW, make_wave_surfaces, put_row_vec3, row_vec3
+from wrt.kernels.shade.wave_textures import make_wave_textures
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
 
 
@@ -20,10 +24,13 @@ def make_shade_kernel(features: Any) -> Any:
     shading = make_shading(features)
     step = make_step(features, shading)
     find, found = make_wave_surfaces(features, shading.surface_at)
-    call_in_texels = make_call_in_texels(features)
-    _, first_path, _, shade, extra_lights, choose, shadow_request, keep, worth = step
-    sample_lights, light_at = make_wave_lights(features, choose)
-    radiance, _, radiance_at, places = BACKGROUNDS[features.background]
+    sample_textures, texels_at = make_wave_textures(features, shading.look_up)
+    _, first_path, _, _, shade, extra_lights, choose, shadow_request, keep, worth = step
+    bend, normal_at = make_wave_normals(features, shading.shading_normal)
+    sample_lights, light_at, by_keys = make_wave_lights(features, shading, choose)
+    keyed = features.rough or by_keys
+    sample_facets = make_sample_facets(features)
+    radiance, _, seen_at = BACKGROUNDS[features.background]
 
     @wp.func
     def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
@@ -34,15 +41,22 @@ def make_shade_kernel(features: Any) -> Any:
         return size
 
     @wp.func
-    def ask(wave: Wave, i: int, request: ShadowRequest) -> int:
+    def ask(wave: Wave, lighting: Lighting, i: int, request: ShadowRequest) -> int:
         """The place of a shadow ray to light i."""
         slot = i * wave.capacity + wave.asking[i]
-        wave.asking[i] = wave.asking[i] + 1
+        plain = bool(False)
+        if wp.static(features.transparent_shadows):
+            plain = not may_pass(lighting, request.ray)
+        if plain:
+            wave.plain[i] = wave.plain[i] + 1
+            slot = (i + 1) * wave.capacity - wave.plain[i]
+        else:
+            wave.asking[i] = wave.asking[i] + 1
+            if wp.static(features.transparent_shadows):
+                wave.walks[slot] = begin_shadow(request.ray, request.end)
+                wave.waiting[slot] = slot
         wave.value[slot] = request.value
         put_ray(wave.shadow_rays, slot, request.ray)
-        if wp.static(features.transparent_shadows):
-            wave.walks[slot] = begin_shadow(request.ray, request.end)
-            wave.waiting[slot] = slot
         return slot
 
     @wp.func
@@ -60,23 +74,24 @@ def make_shade_kernel(features: Any) -> Any:
         return met
 
     @wp.func
-    def see_background(wave: Wave, lighting: Lighting, first: int, end: int, missed: int) -> int:
+    def see_background(wave: Wave, lighting: Lighting, missed: int) -> int:
         """What the rays that missed add to their samples. Returns how many of those have paths that wait: wave.missed holds their
         numbers then."""
         job = wave.job[0]
         left = int(0)
-        block = int(first)
         for j in range(missed):
             k = wave.missed[j]
-            if wp.static(places is not None):
-                if k >= block:
-                    begin = k - (k - first) % BLOCK
-                    block = wp.min(begin + BLOCK, end)
-                    places(lighting.background, wave.rays.direction, begin, block, wave.sky_x, wave.sky_y)
             number = wave.number[k]
             seen = wp.vec3()
-            if wp.static(places is not None):
-                seen = radiance_at(lighting.background, wave.sky_x[(k - first) % BLOCK], wave.sky_y[(k - first) % BLOCK])
+            if wp.static(seen_at is not None):
+                i = j % BLOCK
+                if i == 0:
+                    count = wp.min(BLOCK, missed - j)
+                    for n in range(count):
+                        put_row_vec3(wave.rows, wp.static(ROW["direction"]), n, wave.rays.direction[wave.missed[j + n]])
+                    seen_at(lighting.background, wave.rows, wp.static(ROW["direction"] * BLOCK), BLOCK, count,
+                            wave.sky_x, wave.sky_y, wave.sky_z)
+                seen = wp.vec3(wave.sky_x[i], wave.sky_y[i], wave.sky_z[i])
             else:
                 seen = radiance(lighting.background, wave.rays.direction[k])
             if job.fresh != 0:
@@ -109,13 +124,19 @@ def make_shade_kernel(features: Any) -> Any:
         queued = int(job.queued)
         asked = int(job.asked)
         hits = part(wave, first, end)
-        left = see_background(wave, lighting, first, end, end - first - hits)
+        left = see_background(wave, lighting, end - first - hits)
         for j in range(hits):
-            call_in_texels(wave, surfaces, j, hits)
             if j % BLOCK == 0:
-                find(wave, surfaces, j, wp.min(j + BLOCK, hits), hits)
+                block = wp.min(j + BLOCK, hits)
+                find(wave, surfaces, j, block, hits)
+                sample_textures(wave, surfaces, j, block)
+                bend(wave, block - j)
+                if wp.static(keyed):
+                    put_keys(wave, j, block)
+                if wp.static(features.rough):
+                    sample_facets(wave, block - j)
                 if wp.static(features.lit):
-                    sample_lights(wave, surfaces, lighting, j, wp.min(j + BLOCK, hits))
+                    sample_lights(wave, surfaces, lighting, j, block)
             k = wave.met[j]
             number = wave.number[k]
             size = int(0)
@@ -132,7 +153,13 @@ def make_shade_kernel(features: Any) -> Any:
             out.rays += 1
             asks = int(0)
             index = wp.uint32(job.first_sample + number % job.samples)
-            shaded = shade(surfaces, lighting, path, found(wave, surfaces, j % BLOCK, k), wave.hits.t[k], index)
+            facet = wp.vec3()
+            if wp.static(features.rough):
+                facet = row_vec3(wave.rows, wp.static(ROW["facet"]), j % BLOCK)
+            met = found(wave, surfaces, j % BLOCK, k)
+            texels = texels_at(wave, surfaces, met, j % BLOCK)
+            met.shading = normal_at(wave, surfaces, met, texels, -path.direction, j % BLOCK)
+            shaded = shade(surfaces, lighting, path, met, texels, wave.hits.t[k], facet)
             lit = Lit()
             lit.light = shaded.light
             lit.throughput = shaded.throughput
@@ -158,7 +185,7 @@ def make_shade_kernel(features: Any) -> Any:
                         request = shadow_request(shaded, sample)
                         slot = int(-1)
                         if any_positive(request.value):
-                            slot = ask(wave, i, request)
+                            slot = ask(wave, lighting, i, request)
                             asks += 1
                         wave.request[i * wave.capacity + asked] = slot
             if asks > 0:

@@ -9,25 +9,24 @@ from wrt.kernels.query import hit_at, queued_ray
 from wrt.kernels.shade.surface import (
     Surface,
     Triangle,
-    bent,
     facing,
     make_on_sphere,
     make_on_triangle,
     make_place_of,
     make_triangle_at,
-    make_with_uv,
-    triangle_uv,
 )
-from wrt.kernels.shade.textures import call_in_texels
-from wrt.kernels.shade.wave import AHEAD, BLOCK, Wave
+from wrt.kernels.shade.wave import BLOCK, Wave
 from wrt.kernels.structs import Surfaces
 
 # Rows of a block, with a number for each hit, and how many each thing has: what is gathered, and what is computed of it (bent: the
 # shading normal as lights see it).
-GATHERED = {"v0": 3, "v1": 3, "v2": 3, "n0": 3, "n1": 3, "n2": 3, "u": 1, "v": 1, "direction": 3}
-COMPUTED = {"point": 3, "error": 3, "geometric": 3, "shading": 3, "front": 1, "bent": 3}
-# Then (wave_lights.py) what the first light and the sky send; and, in place of what was gathered, an emitter.
-SAMPLED = {"wi": 3, "weight": 3, "end": 3, "sky_wi": 3, "sky_weight": 3}
+GATHERED = {"v0": 3, "v1": 3, "v2": 3, "n0": 3, "n1": 3, "n2": 3, "u": 1, "v": 1, "direction": 3, "tu": 3, "tv": 3}
+COMPUTED = {"point": 3, "error": 3, "geometric": 3, "shading": 3, "front": 1, "tex_u": 1, "tex_v": 1, "tangent": 3,
+            "bitangent_sign": 1, "bent": 3}
+# Then (wave_textures.py, wave_numbers.py, wave_lights.py) what textures say, what chooses a microfacet, and what the first light
+# and the sky send; and, in place of what was gathered, an emitter.
+SAMPLED = {"albedo": 4, "emissive": 3, "parameters": 3, "transmission": 1, "mapped": 3, "normal_scale": 1, "facet": 3,
+           "wi": 3, "weight": 3, "end": 3, "sky_wi": 3, "sky_weight": 3}
 EMITTER = {"e0": 3, "e1": 3, "e2": 3, "normal": 3, "emission": 3, "pdf_area": 1, "two_sided": 1, "within": 1, "across": 1}
 ROWS = sum(GATHERED.values()) + sum(COMPUTED.values()) + sum(SAMPLED.values())
 
@@ -72,7 +71,7 @@ def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
     """
     smooth, uvs, tangents = features.smooth, features.textures or features.checkerboards, features.normal_maps
     place_of, triangle_at = make_place_of(False), make_triangle_at(smooth, uvs, False)
-    on_triangle, with_uv, on_sphere = make_on_triangle(smooth), make_with_uv(uvs, tangents), make_on_sphere(uvs, tangents)
+    on_triangle, on_sphere = make_on_triangle(smooth, uvs, tangents), make_on_sphere(uvs, tangents)
 
     @wp.func
     def hit_triangle(wave: Wave, surfaces: Surfaces, j: int) -> int:
@@ -107,6 +106,9 @@ def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
                 put_row_vec3(wave.rows, wp.static(ROW["n0"]), i, t.n0)
                 put_row_vec3(wave.rows, wp.static(ROW["n1"]), i, t.n1)
                 put_row_vec3(wave.rows, wp.static(ROW["n2"]), i, t.n2)
+            if wp.static(uvs):
+                put_row_vec3(wave.rows, wp.static(ROW["tu"]), i, t.u)
+                put_row_vec3(wave.rows, wp.static(ROW["tv"]), i, t.v)
             put_row_number(wave.rows, wp.static(ROW["u"]), i, wave.hits.u[k])
             put_row_number(wave.rows, wp.static(ROW["v"]), i, wave.hits.v[k])
             put_row_vec3(wave.rows, wp.static(ROW["direction"]), i, wave.rays.direction[k])
@@ -121,6 +123,9 @@ def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
             t.n0 = row_vec3(rows, wp.static(ROW["n0"]), i)
             t.n1 = row_vec3(rows, wp.static(ROW["n1"]), i)
             t.n2 = row_vec3(rows, wp.static(ROW["n2"]), i)
+        if wp.static(uvs):
+            t.u = row_vec3(rows, wp.static(ROW["tu"]), i)
+            t.v = row_vec3(rows, wp.static(ROW["tv"]), i)
         return t
 
     @wp.func
@@ -140,11 +145,12 @@ def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
             put_row_vec3(rows, wp.static(ROW["geometric"]), i, s.geometric)
             put_row_vec3(rows, wp.static(ROW["shading"]), i, s.shading)
             put_row_number(rows, wp.static(ROW["front"]), i, float(s.front))
-            if wp.static(features.sky_light):
-                n = s.shading
-                if wp.static(smooth):
-                    n = bent(n, -direction)
-                put_row_vec3(rows, wp.static(ROW["bent"]), i, n)
+            if wp.static(uvs):
+                put_row_number(rows, wp.static(ROW["tex_u"]), i, s.u)
+                put_row_number(rows, wp.static(ROW["tex_v"]), i, s.v)
+            if wp.static(tangents):
+                put_row_vec3(rows, wp.static(ROW["tangent"]), i, s.tangent)
+                put_row_number(rows, wp.static(ROW["bitangent_sign"]), i, s.bitangent_sign)
             i = i + 1
 
     @wp.func
@@ -163,8 +169,11 @@ def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
         s.shading = row_vec3(rows, wp.static(ROW["shading"]), i)
         s.front = int(row_number(rows, wp.static(ROW["front"]), i))
         if wp.static(uvs):
-            t = triangle_at(surfaces, place_of(surfaces, hit.prim_id))
-            s = with_uv(s, t, hit.u, hit.v, wp.where(s.front != 0, 1.0, -1.0) * s.geometric)
+            s.u = row_number(rows, wp.static(ROW["tex_u"]), i)
+            s.v = row_number(rows, wp.static(ROW["tex_v"]), i)
+        if wp.static(tangents):
+            s.tangent = row_vec3(rows, wp.static(ROW["tangent"]), i)
+            s.bitangent_sign = row_number(rows, wp.static(ROW["bitangent_sign"]), i)
         s.material = surfaces.prim_material[hit.prim_id]
         s.exclude_plus_one = hit.prim_id + 1
         return s
@@ -178,30 +187,3 @@ def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
         return surface_at(surfaces, queued_ray(wave.rays, k), hit_at(wave.hits, k))
 
     return (find_nothing, found_alone) if features.instances else (find, found)
-
-
-def make_call_in_texels(features: Any) -> Any:
-    """Those of a hit some way after hit j."""
-    texels, parameters, normals = features.textures, features.parameter_textures, features.normal_maps
-
-    @wp.func
-    def call_in(wave: Wave, surfaces: Surfaces, j: int, hits: int):
-        k = wave.met[wp.min(j + AHEAD, hits - 1)]
-        prim_id = wave.hits.prim_id[k]
-        if prim_id < surfaces.n_triangles:
-            m = surfaces.materials[surfaces.prim_material[prim_id]]
-            uv = triangle_uv(surfaces, prim_id, wave.hits.u[k], wave.hits.v[k])
-            if wp.static(texels):
-                call_in_texels(surfaces, m.albedo_texture, uv)
-                call_in_texels(surfaces, m.emission_texture, uv)
-            if wp.static(parameters):
-                call_in_texels(surfaces, m.metallic_roughness_texture, uv)
-                call_in_texels(surfaces, m.transmission_texture, uv)
-            if wp.static(normals):
-                call_in_texels(surfaces, m.normal_texture, uv)
-
-    @wp.func
-    def call_in_nothing(wave: Wave, surfaces: Surfaces, j: int, hits: int):
-        pass
-
-    return call_in if (texels or parameters or normals) and not features.instances else call_in_nothing

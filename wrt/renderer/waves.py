@@ -13,7 +13,7 @@ import warp as wp
 from wrt.accel.batches import new_scratch
 from wrt.core.device import made_once, records, upload
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
-from wrt.kernels.shade import wave, wave_begin, wave_shade, wave_surfaces
+from wrt.kernels.shade import wave, wave_begin, wave_shade, wave_surfaces, wave_textures
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_cutout
@@ -106,7 +106,7 @@ def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
     closest_hit, block = queue_kernel(structure, cutout, False)
     return WaveKernels(
         closest_hit=closest_hit,
-        any_hit=queue_kernel(structure, cutout, True)[0] if features.lit and not transparent else None,
+        any_hit=queue_kernel(structure, cutout, True)[0] if features.lit else None,
         shade=shade_kernel(surfaces),
         shadow=shadow_kernel(surfaces) if transparent else None,
         begin=begin_kernel(some(features, OF_CAMERA)),
@@ -153,22 +153,23 @@ def capacity(features: Features, lights: int) -> int:
 
 
 class Buffers:
-    """What one thread works in. job, asking, order: views of the wave's."""
+    """What one thread works in. job, order: views of the wave's."""
 
     def __init__(self, features: Features, lights: int) -> None:
         self.capacity = n = capacity(features, lights)
         shadows = n * lights
-        self.job, self.asking, self.order = records(wave.Job, 1), np.zeros(max(lights, 1), np.int32), np.zeros(n, np.int32)
+        self.job, self.order = records(wave.Job, 1), np.zeros(n, np.int32)
         w = self.wave = wave.Wave()
         w.capacity = n
-        w.job, w.asking, w.order = (upload(array, dtype, "cpu") for array, dtype in (
-            (self.job, wave.Job), (self.asking, wp.int32), (self.order, wp.int32)))
+        w.job, w.order = upload(self.job, wave.Job, "cpu"), upload(self.order, wp.int32, "cpu")
+        w.asking, w.plain = (wp.zeros(max(lights, 1), dtype=wp.int32, device="cpu") for _ in range(2))
         w.xi, w.lens_xi = room(n + LANES, wp.vec2), room(n + LANES, wp.vec2)
         w.done, w.size, w.traced, w.number = room(n, Sample), room(n, wp.int32), room(n, wp.int32), room(n, wp.int32)
         w.paths = room(n * features.stack_size, wave.Path)
         w.met, w.missed = room(n, wp.int32), room(n, wp.int32)
         w.rows = room(wave_surfaces.ROWS * wave.BLOCK, wp.float32)
         w.sky_x, w.sky_y, w.sky_z = (room(wave.BLOCK, wp.float32) for _ in range(3))
+        w.wanted = room(wave_textures.SLOTS * wave.BLOCK, wp.int32)
         w.keys, w.indices = room(wave.BLOCK, wp.uint32), room(wave.BLOCK, wp.uint32)
         w.pixels, w.pixel_keys = room(n + LANES, wp.int32), room(n, wp.uint32)
         w.rays, w.hits, w.lit, w.asked = queue(n), hit_arrays(n), room(n, Lit), room(n, wp.int32)
@@ -176,8 +177,7 @@ class Buffers:
         if features.transparent_shadows:
             w.scatter, w.walks, w.waiting = room(n, Scatter), room(shadows, ShadowWalk), room(shadows, wp.int32)
             w.shadow_hits = hit_arrays(shadows)
-        else:
-            w.occluded = room(shadows, wp.bool)
+        w.occluded = room(shadows, wp.bool)
         self.scratch = new_scratch(BatchTraversal.stream_sizes)
 
     def take(self, work: Work, each: Callable[[], None]) -> None:
@@ -211,9 +211,9 @@ class Picture:
             "shade": recorded(command(kernels.shade, w, surfaces, lighting, limits[0], 0, 0), ALL),
         }
         if kernels.shadow:
-            launches["shadow_hit"] = trace(kernels.closest_hit, w.shadow_rays, w.shadow_hits)
+            launches["walk_hit"] = trace(kernels.closest_hit, w.shadow_rays, w.shadow_hits)
             launches["go_through"] = recorded(command(kernels.shadow, w, surfaces, 0))
-        elif kernels.any_hit:
+        if kernels.any_hit:
             launches["shadow_hit"] = trace(kernels.any_hit, w.shadow_rays, w.occluded)
         for group_limits, group in zip(limits, film.groups, strict=True):
             launches["begin"] = recorded(command(kernels.begin, w, camera, group_limits, group, 0, 0), ALL)

@@ -6,22 +6,20 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import DEVICE, cpu_only, directions, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
+from tests.kernel_tools import DEVICE, cpu_only, directions, floats, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
 import warp as wp
 
 from wrt.accel.build import build
 from wrt.kernels.shade import backgrounds, lights
 from wrt.kernels.shade.backgrounds import (
     environment,
-    environment_column,
-    environment_places,
-    environment_row,
+    environment_seen,
     make_sky_point,
     make_sky_sample,
-    rotate_y,
 )
 from wrt.kernels.shade.direct import shadow_ray
 from wrt.kernels.shade.lights import LightSample, make_light_sample
+from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Background, Lighting, Ray, Surfaces, kernel
 from wrt.renderer.features import Features
@@ -59,33 +57,28 @@ def light_kernel(features):
 
 
 @kernel
-def places_kernel(b: Background, direction: wp.array(dtype=wp.vec3), first: int, end: int, x: wp.array(dtype=float),
-                  y: wp.array(dtype=float)):
-    environment_places(b, direction, first, end, x, y)
-
-
-@kernel
-def place_kernel(b: Background, direction: wp.array(dtype=wp.vec3), x: wp.array(dtype=float), y: wp.array(dtype=float)):
-    i = wp.tid()
-    d = rotate_y(direction[i], -b.rotation)
-    x[i] = environment_column(b, d[0], d[2])
-    y[i] = environment_row(b, d[1])
+def seen_kernel(b: Background, directions: wp.array(dtype=float), at: int, step: int, count: int, x: wp.array(dtype=float),
+                y: wp.array(dtype=float), z: wp.array(dtype=float)):
+    environment_seen(b, directions, at, step, count, x, y, z)
 
 
 @cpu_only
 @pytest.mark.parametrize("rotation", [0.0, 0.7])
-def test_places_in_lanes_are_those_of_one_direction_at_a_time(rotation):
+def test_a_picture_of_the_sky_in_lanes_is_that_of_one_direction_at_a_time(rotation):
+    """Also at its seam and its poles; what stands behind the last direction is anything."""
+    rng = np.random.default_rng(1)
     axes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-0.0, 1, -0.0], [0.5**0.5, 0, 0.5**0.5]])
-    direction = np.concatenate([unit(np.random.default_rng(1).normal(size=(71, 3))), axes, -axes])
-    b = Background()
-    b.rotation, b.width, b.height = rotation, 64, 32
-    n, first, end = len(direction), 3, len(direction) - 2
-    lanes, single = (zeros(n), zeros(n)), (zeros(n), zeros(n))
-    launch(places_kernel, 1, b, vec3s(direction), first, end, *lanes)
-    launch(place_kernel, n, b, vec3s(direction), *single)
-    for a, c in zip(lanes, single, strict=True):
-        np.testing.assert_array_equal(a.numpy()[: end - first].view(np.int32), c.numpy()[first:end].view(np.int32))
-        assert not a.numpy()[end - first :].any()
+    direction = np.concatenate([unit(rng.normal(size=(71, 3))), axes, -axes])
+    n, step = len(direction), len(direction) + LANES
+    sky = EnvironmentBackground(rng.random((5, 8, 3)), rotation=rotation, scale=1.5)
+    b = upload_scene(Scene(background=sky), DEVICE).lighting.background
+    rows = np.full((3, step), np.nan)
+    rows[:, :n] = direction.T
+    seen, expected = [floats(np.full(step, np.nan)) for _ in range(3)], zeros(n, wp.vec3)
+    launch(seen_kernel, 1, b, floats(rows.ravel()), 0, step, n, *seen)
+    launch(environment_kernel, n, b, vec3s(direction), expected)
+    found = np.stack([color.numpy()[:n] for color in seen], axis=1)
+    np.testing.assert_array_equal(found.view(np.int32), expected.numpy().view(np.int32))
 
 
 @kernel

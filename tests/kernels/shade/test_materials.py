@@ -14,6 +14,7 @@ from wrt.kernels import structs
 from wrt.kernels.shade import materials
 from wrt.kernels.shade.fresnel import fresnel_conductor, fresnel_dielectric, fresnel_schlick, fresnel_tint
 from wrt.kernels.shade.materials import Scatter, blinn_phong, make_scatter
+from wrt.kernels.shade.sampling import cap_point
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import kernel
 from wrt.renderer.features import Features
@@ -172,7 +173,7 @@ def scatter_kernel(features):
         s.front = front
         s.geometric = geometric
         s.shading = shading
-        out[i] = scatter(materials[0], s, wo[i], xi[i])
+        out[i] = scatter(materials[0], s, wo[i], cap_point(xi[i]))
 
     return run_scatter
 

@@ -10,6 +10,7 @@ import warp as wp
 
 from wrt.kernels.shade.sampling import (
     LANES,
+    cap_point,
     cosine_hemisphere,
     disk,
     frame_x,
@@ -65,7 +66,7 @@ def shapes_kernel(xi: wp.array(dtype=wp.vec2), sides: int, rotation: float, n: w
 def ggx_kernel(xi: wp.array(dtype=wp.vec2), n: wp.vec3, wo: wp.vec3, alpha: float, h: wp.array(dtype=wp.vec3),
                share: wp.array(dtype=wp.float32)):
     i = wp.tid()
-    m = ggx_normal(xi[i], n, wo, alpha)
+    m = ggx_normal(cap_point(xi[i]), n, wo, alpha)
     h[i] = m
     wi = 2.0 * wp.dot(m, wo) * m - wo
     if wp.dot(n, wi) > 0.0:

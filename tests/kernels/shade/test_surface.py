@@ -160,6 +160,11 @@ def test_corners_without_a_normal_are_flat():
     assert np.abs(np.linalg.norm(found["shading"], axis=1) - 1.0).max() < 1e-6
 
 
+def uv_of(found):
+    """Texture coordinates, (N, 2)."""
+    return np.stack([found["u"], found["v"]], axis=1)
+
+
 def textured_triangles(rng, n):
     mesh = random_triangles(rng, n)
     return Mesh(mesh.vertices, mesh.faces, uvs=rounded(rng.normal(size=(3 * n, 2))))
@@ -174,7 +179,7 @@ def test_uv_and_tangent():
     face = mesh.faces[hits.prim_id]
     w = np.stack([1.0 - hits.u.astype(np.float64) - hits.v, hits.u, hits.v], axis=1)
     uv = mesh.uvs[face].astype(np.float64)
-    assert np.abs(found["uv"] - np.einsum("ni,nij->nj", w, uv)).max() < 1e-5
+    assert np.abs(uv_of(found) - np.einsum("ni,nij->nj", w, uv)).max() < 1e-5
     # dp/du and dp/dv solve: edge_k = du_k dp/du + dv_k dp/dv.
     edges = (mesh.vertices[face[:, 1:]] - mesh.vertices[face[:, :1]]).astype(np.float64)
     changes = uv[:, 1:] - uv[:, :1]
@@ -231,18 +236,18 @@ def test_sphere_coordinates():
     where = np.array([[1, 0, 0], [0, 0, 1], [0, 0, -1], [0.6, 0.8, 0.0], [0.6, -0.8, 0.0], [-0.6, 0.0, 0.8], [0, 1, 0]], float)
     hits = build(upload_scene(scene, DEVICE).world.geometry, "bvh").closest_hit(4.0 * where, -where)
     found, _ = surfaces_at(scene, 4.0 * where, -where, hits)
-    assert np.allclose(found["uv"][:, 1], np.arccos(where[:, 1]) / np.pi, atol=1e-5)
+    assert np.allclose(uv_of(found)[:, 1], np.arccos(where[:, 1]) / np.pi, atol=1e-5)
     # From -x (the seam) over +z, +x and -z, which is to the right for who looks at it from outside with +y up.
-    assert np.allclose(found["uv"][[1, 0, 2], 0], [0.25, 0.5, 0.75], atol=1e-6)
+    assert np.allclose(uv_of(found)[[1, 0, 2], 0], [0.25, 0.5, 0.75], atol=1e-6)
     around = np.mod(np.arctan2(where[:, 2], -where[:, 0]) / (2.0 * np.pi), 1.0)
-    assert np.allclose(found["uv"][:6, 0], around[:6], atol=1e-6)
+    assert np.allclose(uv_of(found)[:6, 0], around[:6], atol=1e-6)
     tangent = found["tangent"]
     step = 1e-3
     moved = unit(where[:6] + step * tangent[:6])
     hits = build(upload_scene(scene, DEVICE).world.geometry, "bvh").closest_hit(4.0 * moved, -moved)
     further, _ = surfaces_at(scene, 4.0 * moved, -moved, hits)
-    assert (further["uv"][:6, 0] > found["uv"][:6, 0]).all()  # the tangent points along growing u
-    assert np.allclose(further["uv"][:3, 1], found["uv"][:3, 1], atol=1e-5)
+    assert (uv_of(further)[:6, 0] > uv_of(found)[:6, 0]).all()  # the tangent points along growing u
+    assert np.allclose(uv_of(further)[:3, 1], uv_of(found)[:3, 1], atol=1e-5)
 
 
 # --- new rays ---------------------------------------------------------------------------------------------------------

@@ -15,21 +15,61 @@ from tests.data import ROOT
 from wrt.core.device import load_kernel, start
 from wrt.io.load import load_scene
 from wrt.kernels.shade import wave
+from wrt.kernels.shade.clear import BOXES
 from wrt.kernels.structs import fields_of
 from wrt.renderer import waves
+from wrt.renderer.clear_boxes import put_clear_boxes
 from wrt.renderer.film_arrays import OF_AOVS, AovFilm, DeviceFilm
 from wrt.renderer.memory_estimate import bytes_of_waves
 from wrt.renderer.options import Options
 from wrt.renderer.plan import aov_kernel, plan_of, render_kernel
 from wrt.renderer.prepare import Prepared, prepare
 from wrt.renderer.tiles import Work, corners
+from wrt.renderer.upload import upload_scene
+from wrt.scene.backgrounds import GradientBackground
+from wrt.scene.cameras import Camera
+from wrt.scene.lights import DirectionalLight, PointLight
+from wrt.scene.materials import Material, Texture
+from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.shapes import icosphere, quad
 
 SCENES = ROOT / "scenes"
 TILE = (3, 2, 37, 22)
 
 
+def made() -> Scene:
+    """Everything that textures can say, of triangles and of spheres, in rough, clear and blended materials; and two lights whose
+    shadows pass what is clear."""
+    rng = np.random.default_rng(7)
+
+    def picture(height: int, width: int, **rest: Any) -> Texture:
+        return Texture(rng.integers(0, 256, (height, width, 4), dtype=np.uint8), **rest)
+
+    bumps = Texture(rng.integers([60, 60, 200, 255], [200, 200, 256, 256], (8, 8, 4), dtype=np.uint8), srgb=False)
+    parameters, share = picture(16, 8, srgb=False, wrap=("mirror", "clamp")), picture(4, 4, srgb=False)
+    painted = Material("metallic_roughness", albedo=(0.9, 0.8, 0.7), metallic=0.7, roughness=0.8, transmission=0.6,
+                       albedo_texture=picture(8, 8), metallic_roughness_texture=parameters, transmission_texture=share,
+                       normal_texture=bumps, normal_scale=1.5)
+    leaf = Material("metallic_roughness", albedo_texture=picture(5, 7, wrap=("clamp", "mirror")), emission=(0.1, 0.2, 0.1),
+                    emission_texture=picture(3, 3), emits_light=False, alpha=0.9, alpha_mode="blend")
+    plain = Material(albedo=(0.6, 0.6, 0.6))
+    ball, pane = icosphere(3), quad((-3, 0, -1.5), (1.5, 0, 0), (0, 1.5, 0.5))
+    ball = replace(ball, uvs=(3.0 * ball.vertices[:, :2]).astype(np.float32), normals=ball.vertices)
+    pane = replace(pane, uvs=np.float32([[-1, -1], [2, -1], [2, 2], [-1, 2]]))
+    floor = quad((-6, -1, 6), (12, 0, 0), (0, 0, -12))
+    floor = replace(floor, uvs=(floor.vertices[:, [0, 2]] * 0.7).astype(np.float32))
+    objects = (Object(ball, (painted,)), Object(pane, (leaf,)),
+               Object(floor, (replace(plain, albedo_texture=picture(32, 16), normal_texture=bumps),)))
+    spheres = tuple(Sphere((2.2, -0.2, z), 0.8, material) for z, material in ((0.5, painted), (-1.5, leaf), (2.5, plain)))
+    lights = (PointLight((3.0, 4.0, 2.0), (20.0, 20.0, 20.0)), DirectionalLight((-1.0, -2.0, -0.5), (1.0, 1.0, 1.0)))
+    camera = Camera.look_at((0.5, 1.5, 6.0), (0.3, -0.2, 0.0), fov_y=0.8)
+    sky = GradientBackground((0.2, 0.2, 0.2), (0.5, 0.6, 0.8))
+    return Scene(objects=objects, spheres=spheres, lights=lights, background=sky, cameras=(camera,))
+
+
 def prepared(name: str, aov: tuple[str, ...] = (), **settings: Any) -> Prepared:
-    scene = load_scene(SCENES / f"{name}.toml").with_settings(size=(48, 27), **settings)
+    scene = made() if name == "made" else load_scene(SCENES / f"{name}.toml")
+    scene = scene.with_settings(size=(48, 27), **settings)
     return prepare(plan_of(scene, Options(device="cpu", threads=1, crop=corners(TILE), aov=aov)), start("cpu"))
 
 
@@ -65,6 +105,9 @@ def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> Non
     pytest.param("blend", {}, marks=pytest.mark.slow),
     pytest.param("cutout", {"max_depth": 0}, marks=pytest.mark.slow),
     pytest.param("instances", {"max_depth": 1}, marks=pytest.mark.slow),
+    pytest.param("textures", {}, marks=pytest.mark.slow),
+    pytest.param("frosted", {}, marks=pytest.mark.slow),
+    ("made", {"max_depth": 2, "glass_shadows": "tinted"}),
     ("fisheye", {}),
     ("glass_sky", {"max_depth": 2}),
 ])
@@ -93,13 +136,13 @@ def test_more_samples_a_pixel_than_camera_rays_are_made_at_a_time() -> None:
     assert_same(film_of(ready, (0, 2100)), film_of(ready, (0, 1000), (1000, 1100)))
 
 
-@pytest.mark.parametrize("name", ["fisheye", "tinted_shadows", "glass_sky"])
+@pytest.mark.parametrize("name", ["fisheye", "tinted_shadows", "glass_sky", "made"])
 def test_nothing_is_read_before_it_is_written(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Buffers are not cleared, and hold what the wave before left."""
     ready = prepared(name)
     films = [film_of(ready, (0, 3))]
     made = waves.room
-    for byte in (0xCD, 0xFF):
+    for byte in (0xCD, 0xFF, 0x01):
 
         def filled(n: int, dtype: Any, byte: int = byte) -> Any:
             array = made(n, dtype)
@@ -108,8 +151,42 @@ def test_nothing_is_read_before_it_is_written(name: str, monkeypatch: pytest.Mon
 
         monkeypatch.setattr(waves, "room", filled)
         films.append(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 3)))
-    assert_same(films[0], films[1])
-    assert_same(films[0], films[2])
+    for film in films[1:]:
+        assert_same(films[0], film)
+
+
+@pytest.mark.parametrize("name", ["tinted_shadows", "made"])
+def test_both_kinds_of_shadow_ray_have_one_answer(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that can meet something clear are closest hits, the others any hits; where nothing is known, all are the former."""
+    ready = prepared(name, **({"glass_shadows": "tinted"} if name == "made" else {}))
+    made = waves.room
+    untold = 0xCD
+
+    def filled(n: int, dtype: Any) -> Any:
+        array = made(n, dtype)
+        ctypes.memset(array.ptr, untold, array.capacity)
+        return array
+
+    monkeypatch.setattr(waves, "room", filled)
+    film = film_of(ready, (0, 3))
+    wave_of = ready.waves.free[0].wave
+    told = wave_of.occluded.numpy().view(np.uint8) != untold
+    walked = wave_of.walks.numpy().view(np.uint8).reshape(len(told), -1)[:, 0] != untold
+    assert ready.arrays.lighting.clear.shape == (6 * BOXES,) and told.sum() > 100 and walked.sum() > 100
+    assert not told[:64].any() and told[wave_of.capacity - 64 : wave_of.capacity].all()  # from the back of what a light has
+    ready.arrays.lighting.clear = wp.zeros(0, dtype=wp.float32, device="cpu")
+    assert_same(film, film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 3)))
+
+
+def test_boxes_are_for_those_who_ask() -> None:
+    def boxes(name: str, **options: Any) -> int:
+        plan = plan_of(load_scene(SCENES / f"{name}.toml"), replace(Options(device="cpu"), **options))
+        arrays = upload_scene(plan.scene, start("cpu"), plan.meshes)
+        put_clear_boxes(arrays, plan)
+        return len(arrays.lighting.clear)
+
+    assert boxes("tinted_shadows") == 6 * BOXES
+    assert boxes("glass_slab") == boxes("tinted_shadows", triangle="moeller_trumbore") == 0
 
 
 def test_groups_have_samples_of_their_own() -> None:
