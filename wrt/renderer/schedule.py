@@ -62,6 +62,7 @@ class LocalTracer:
     def __init__(self, prepared: Prepared) -> None:
         self.prepared, self.plan, self.device, self.seconds = prepared, prepared.plan, prepared.device, prepared.seconds
         self.facts, self.tiles = prepared.facts, prepared.tiles
+        self.pool = ThreadPoolExecutor(prepared.threads)  # for all passes: threads take a while to start; they end with this object
 
     def trace(self, film: DeviceFilm | AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
         trace = self.prepared.launch(film)
@@ -70,24 +71,22 @@ class LocalTracer:
             wp.synchronize_device(self.device)
             yield done, True
             return
-        with ThreadPoolExecutor(self.prepared.threads) as pool:
-            pending = {pool.submit(trace, job): job for job in work}
-            done = 0
-            try:
-                while pending:
-                    finished, _ = wait(pending, timeout=0.1)
-                    at_rest = due()
-                    waiting = [future for future in pending if future.cancel()] if at_rest else []
-                    if at_rest:
-                        finished = pending.keys() - set(waiting)
-                    done += sum(future.result() for future in finished)
-                    pending = {future: job for future, job in pending.items() if future not in finished}
-                    yield done, at_rest or not pending
-                    if waiting:
-                        pending = {pool.submit(trace, job): job for job in pending.values()}
-            finally:
-                for future in pending:
-                    future.cancel()
+        pending = {self.pool.submit(trace, job): job for job in work}
+        done = 0
+        try:
+            while pending:
+                finished, _ = wait(pending, timeout=0.1)
+                at_rest = due()
+                waiting = [future for future in pending if future.cancel()] if at_rest else []
+                if at_rest:
+                    finished = pending.keys() - set(waiting)
+                done += sum(future.result() for future in finished)
+                pending = {future: job for future, job in pending.items() if future not in finished}
+                yield done, at_rest or not pending
+                if waiting:
+                    pending = {self.pool.submit(trace, job): job for job in pending.values()}
+        finally:
+            wait([future for future in pending if not future.cancel()])
 
 
 class Passes:
