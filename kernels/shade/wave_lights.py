@@ -5,12 +5,11 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.memory import bits_at, put_number
-from wrt.kernels.query import hit_at, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point, make_sky_sample
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.lights import LIGHTS, LightSample, choose_emitter, from_emitter
 from wrt.kernels.shade.sampling import triangle_numbers
-from wrt.kernels.shade.surface import Surface, Triangle, facing, make_on_sphere, triangle_point, triangle_point_error
+from wrt.kernels.shade.surface import Surface, Triangle, triangle_point, triangle_point_error
 from wrt.kernels.shade.wave import Wave
 from wrt.kernels.shade.wave_normals import row_of_normals
 from wrt.kernels.shade.wave_surfaces import ROW, put_row_number, put_row_vec3, row_number, row_vec3
@@ -26,10 +25,10 @@ def first_is_mesh(lighting: Lighting) -> bool:
     return lighting.lights[0].kind == MESH
 
 
-def make_wave_lights(features: Any, shading: Any, choose: Any) -> tuple[Any, Any, bool]:
+def make_wave_lights(features: Any, shading: Any, found: Any, choose: Any) -> tuple[Any, Any, bool]:
     """sample_lights(wave, surfaces, lighting, first, end): for the hits first .. end - 1, at most BLOCK, whose surfaces are found;
     light_at(wave, surfaces, lighting, surface, key, index, light, i) -> LightSample for the i-th of them: what was computed before,
-    or by `choose` (of make_step).
+    or by `choose` (of make_step). found: of make_wave_surfaces.
 
     Computed before: the first light where it is a mesh, and a sky that is sampled by the cosine, or its points alone where normals
     are computed one by one (wave_normals.py). The third: whether keys must be put before (wave_numbers.py).
@@ -42,7 +41,6 @@ def make_wave_lights(features: Any, shading: Any, choose: Any) -> tuple[Any, Any
     sky = points and normals is not None
     mesh = "mesh" in features.lights and not features.instances
     look_up, shading_normal = shading.look_up, shading.shading_normal
-    on_sphere = make_on_sphere(features.textures or features.checkerboards, features.normal_maps)
 
     @wp.func
     def sky_points(wave: Wave, light: int, count: int):
@@ -75,10 +73,9 @@ def make_wave_lights(features: Any, shading: Any, choose: Any) -> tuple[Any, Any
         for j in range(first, end):
             k = wave.met[j]
             if wave.hits.prim_id[k] >= surfaces.n_triangles:
-                s = facing(on_sphere(surfaces, queued_ray(wave.rays, k), hit_at(wave.hits, k)), wave.rays.direction[k])
+                s = found(wave, surfaces, j - first, k)
                 put_row_vec3(wave.rows, wp.static(ROW["point"]), j - first, s.point)
                 if wp.static(sky):
-                    s.material = surfaces.prim_material[wave.hits.prim_id[k]]
                     n = shading_normal(surfaces, s, look_up(surfaces, s), -wave.rays.direction[k])
                     put_row_vec3(wave.rows, wp.static(normals or 0), j - first, n)
 

@@ -5,8 +5,6 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.memory import bits_at
-from wrt.kernels.shade.sampling import cap_point, make_sample_2d
-from wrt.kernels.shade.step import FACET
 from wrt.kernels.shade.wave import Job, Wave
 from wrt.kernels.shade.wave_surfaces import ROW, put_row_vec3
 
@@ -29,16 +27,13 @@ def put_keys(wave: Wave, first: int, end: int):
         wave.indices[j - first] = wp.uint32(job.first_sample + number % job.samples)
 
 
-def make_sample_facets(features: Any) -> Any:
-    """sample_facets(wave, count): to the row facet, what chooses a microfacet at each hit of a block whose keys are put."""
-    sample_2d = make_sample_2d(features)
-
+def make_sample_facets(choose_facet: Any) -> Any:
+    """sample_facets(wave, count): to the row facet, choose_facet (of make_step) for each hit of a block whose keys are put."""
     @wp.func
     def sample_facets(wave: Wave, count: int):
         i = int(0)
         while i < count:
-            put_row_vec3(wave.rows, wp.static(ROW["facet"]), i,
-                         cap_point(sample_2d(bits_at(wave.keys, i), bits_at(wave.indices, i), FACET)))
+            put_row_vec3(wave.rows, wp.static(ROW["facet"]), i, choose_facet(bits_at(wave.keys, i), bits_at(wave.indices, i)))
             i = i + 1
 
     return sample_facets

@@ -25,11 +25,11 @@ def make_shade_kernel(features: Any) -> Any:
     step = make_step(features, shading)
     find, found = make_wave_surfaces(features, shading.surface_at)
     sample_textures, texels_at = make_wave_textures(features, shading.look_up)
-    _, first_path, _, _, shade, extra_lights, choose, shadow_request, keep, worth = step
+    _, first_path, _, choose_facet, shade, extra_lights, choose, shadow_request, keep, worth = step
     bend, normal_at = make_wave_normals(features, shading.shading_normal)
-    sample_lights, light_at, by_keys = make_wave_lights(features, shading, choose)
+    sample_lights, light_at, by_keys = make_wave_lights(features, shading, found, choose)
     keyed = features.rough or by_keys
-    sample_facets = make_sample_facets(features)
+    sample_facets = make_sample_facets(choose_facet)
     radiance, _, seen_at = BACKGROUNDS[features.background]
 
     @wp.func

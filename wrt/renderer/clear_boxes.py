@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import warp as wp
 
+from wrt.accel.bvh.tree import half_areas
 from wrt.accel.flatten import World
 from wrt.accel.geometry import Geometry
 from wrt.core.device import upload
@@ -41,7 +40,7 @@ def clear_boxes(world: World, clear: np.ndarray) -> np.ndarray:
     box by kernels.units.box.ray_aabb is found; primitives' boxes are padded as a structure's are.
     """
     nothing = np.empty((6, 0), np.float32)
-    if world.placed is not None or not isinstance(world.geometry, Geometry):
+    if not isinstance(world.geometry, Geometry):
         return nothing
     prim_id, n = np.flatnonzero(clear[world.prim_material]), world.geometry.n_triangles
     if len(prim_id) == 0:
@@ -51,11 +50,10 @@ def clear_boxes(world: World, clear: np.ndarray) -> np.ndarray:
     out = np.concatenate([np.full((3, BOXES), np.inf, np.float32), np.full((3, BOXES), -np.inf, np.float32)])
     for i, rows in enumerate(split(low, high)):
         out[:3, i], out[3:, i] = low[rows].min(axis=0), high[rows].max(axis=0)
-    met = sum(half_area(box[:3], box[3:]) for box in out.T if box[0] <= box[3])
     ends = [low, high, world.vertices, spheres[:, :3] - spheres[:, 3:], spheres[:, :3] + spheres[:, 3:]]
-    lowest, highest = ([end([end(points[:, axis]) for points in ends if len(points)]) for axis in range(3)]  # axis=0 is slow
-                       for end in (np.min, np.max))
-    return nothing if met > MOST_MET * half_area(lowest, highest) else out
+    lowest, highest = (np.array([end([end(points[:, axis]) for points in ends if len(points)]) for axis in range(3)])
+                       for end in (np.min, np.max))  # of rows of three, axis=0 is slow
+    return nothing if half_areas(out[:3].T, out[3:].T).sum() > MOST_MET * half_areas(lowest, highest) else out
 
 
 def split(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
@@ -75,11 +73,5 @@ def split(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
             continue
         halves = [rows[left], rows[~left]]
         groups[largest : largest + 1] = halves
-        sizes[largest : largest + 1] = [half_area(low[half].min(axis=0), high[half].max(axis=0)) for half in halves]
+        sizes[largest : largest + 1] = [float(half_areas(low[half].min(axis=0), high[half].max(axis=0))) for half in halves]
     return groups
-
-
-def half_area(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray) -> float:
-    """Of a box's faces: the chance that a ray meets it grows with it."""
-    x, y, z = (float(b) - float(a) for a, b in zip(low, high, strict=True))
-    return x * y + y * z + z * x

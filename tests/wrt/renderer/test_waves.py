@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -136,20 +137,24 @@ def test_more_samples_a_pixel_than_camera_rays_are_made_at_a_time() -> None:
     assert_same(film_of(ready, (0, 2100)), film_of(ready, (0, 1000), (1000, 1100)))
 
 
+def filled_with(byte: int) -> Callable[[int, Any], Any]:
+    """As waves.room, of arrays that hold this byte."""
+
+    def filled(n: int, dtype: Any) -> Any:
+        array = wp.empty(n, dtype=dtype, device="cpu")
+        ctypes.memset(array.ptr, byte, array.capacity)
+        return array
+
+    return filled
+
+
 @pytest.mark.parametrize("name", ["fisheye", "tinted_shadows", "glass_sky", "made"])
 def test_nothing_is_read_before_it_is_written(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Buffers are not cleared, and hold what the wave before left."""
     ready = prepared(name)
     films = [film_of(ready, (0, 3))]
-    made = waves.room
     for byte in (0xCD, 0xFF, 0x01):
-
-        def filled(n: int, dtype: Any, byte: int = byte) -> Any:
-            array = made(n, dtype)
-            ctypes.memset(array.ptr, byte, array.capacity)
-            return array
-
-        monkeypatch.setattr(waves, "room", filled)
+        monkeypatch.setattr(waves, "room", filled_with(byte))
         films.append(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 3)))
     for film in films[1:]:
         assert_same(films[0], film)
@@ -159,15 +164,8 @@ def test_nothing_is_read_before_it_is_written(name: str, monkeypatch: pytest.Mon
 def test_both_kinds_of_shadow_ray_have_one_answer(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that can meet something clear are closest hits, the others any hits; where nothing is known, all are the former."""
     ready = prepared(name, **({"glass_shadows": "tinted"} if name == "made" else {}))
-    made = waves.room
     untold = 0xCD
-
-    def filled(n: int, dtype: Any) -> Any:
-        array = made(n, dtype)
-        ctypes.memset(array.ptr, untold, array.capacity)
-        return array
-
-    monkeypatch.setattr(waves, "room", filled)
+    monkeypatch.setattr(waves, "room", filled_with(untold))
     film = film_of(ready, (0, 3))
     wave_of = ready.waves.free[0].wave
     told = wave_of.occluded.numpy().view(np.uint8) != untold
