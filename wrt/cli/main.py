@@ -102,6 +102,9 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
     output = output or Path(f"{scene.stem or 'picture'}.png")
     bits, aov = options.pop("bits"), options["aov"]
     check_writable(output, bits)
+    from wrt.core.device import preload_headers
+
+    preload_headers()  # while the rest is imported
     from wrt.picture.film import aov_path
     from wrt.renderer.options import Options
     from wrt.renderer.progress import progress_reporter

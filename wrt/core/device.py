@@ -13,7 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import cache, partial, wraps
 from math import prod
 from pathlib import Path
@@ -25,7 +25,7 @@ import warp as wp
 
 from wrt.core.address_space import LLVM, is_limited, require_warp, room_to_compile
 from wrt.core.checks import shown
-from wrt.core.compiler import first_with_headers, prepare_compiler
+from wrt.core.compiler import empty_kernel, headers_missing, prepare_compiler
 from wrt.core.errors import InputError
 from wrt.core.memory import SMALL, available, gib
 from wrt.core.seconds import loading
@@ -89,7 +89,7 @@ def _start_warp() -> None:
     require_warp(min(thread_count(None), 4) + 2)  # two that prepare; if more cannot be started, that is told then
     with _stderr_without(b"NVIDIA CUDA driver"), _cache_told():  # where there is no GPU, it says so each time
         wp.init()
-        prepare_compiler()
+        prepare_compiler(thread_count(None))
 
 
 @made_once
@@ -162,6 +162,22 @@ def load_kernel(kernel: Any, device: Any) -> None:
                 loaded.devices.add(place)
 
 
+def preload(*kernels: Any) -> None:
+    """Begin to load kernels for the CPU that this thread will come to: those not in the cache are compiled beside each other.
+    Errors are told where it comes to them."""
+    cpu = start("cpu")
+    for kernel in kernels:
+        if kernel not in _loaded:
+            _helpers(os.getpid()).submit(load_kernel, kernel, cpu)
+
+
+def preload_headers() -> None:
+    """Begin to precompile Warp's headers, where that has not been done: beside what comes before the first kernel."""
+    start("cpu")
+    if headers_missing() and not is_limited():
+        preload(empty_kernel)
+
+
 def _load(kernel: Any, device: Any, block_dim: int) -> None:
     with loading(), _cache_told():
         cache, name = Path(wp.config.kernel_cache_dir), kernel.module.get_module_identifier(block_dim)
@@ -171,7 +187,7 @@ def _load(kernel: Any, device: Any, block_dim: int) -> None:
         else:
             _require_room_to_compile(cache)
             folder = f"{name}_p{os.getpid()}_t{threading.get_ident()}"  # as Warp calls it
-            with room_to_compile(), compiling(cache, folder), first_with_headers() if device.is_cpu else nullcontext():
+            with room_to_compile(), compiling(cache, folder):
                 kernel.module.load(device, block_dim=block_dim)
 
 

@@ -1,10 +1,16 @@
-"""The two measures against Warp's compile times take hold, and change no kernel."""
+"""The measures against Warp's compile times take hold, and change no kernel."""
 
+import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+from tests.data import ROOT
 
 from tests.kernel_tools import cpu_only, launch, zeros  # isort: skip
 import warp as wp
@@ -43,6 +49,90 @@ def test_a_kernel_holds_what_is_called_alone():
     assert b"add_pairs" in compiled_object.read_bytes() and b"adj_atomic_add" not in compiled_object.read_bytes()
 
 
+def double_each(numbers: wp.array(dtype=float)):
+    i = wp.tid()
+    numbers[i] = 2.0 * numbers[i]
+
+
+def double_all(numbers: wp.array(dtype=float)):
+    for i in range(numbers.shape[0]):
+        numbers[i] = 2.0 * numbers[i]
+
+
+def test_a_kernel_of_ours_is_written_once(monkeypatch: pytest.MonkeyPatch):
+    twice, called = "_cpu_forward_tasks<true>", "static WP_NOINLINE void"
+    for function, threads in ((double_each, 5), (double_all, 1)):
+        sources = []
+        for module in ("wrt.kernels.pretended", "elsewhere"):
+            monkeypatch.setattr(function, "__module__", module)
+            monkeypatch.setattr(function, "__qualname__", f"{function.__name__}_{module[:3]}")
+            made, numbers = kernel(function), wp.array(np.arange(5.0), dtype=float, device="cpu")
+            launch(made, threads, numbers)
+            assert numbers.numpy().tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
+            sources.append(next(compiled(function.__qualname__).glob("*.cpp")).read_text())
+        ours, anybodys = sources
+        assert (called in ours) == (threads == 1) and twice not in ours
+        assert called not in anybodys and (twice in anybodys) == (threads > 1)
+
+
+@kernel
+def add_halves(numbers: wp.array(dtype=wp.bfloat16), sums: wp.array(dtype=float)):
+    i = wp.tid()
+    sums[i] = float(numbers[i]) + 0.5
+
+
+def test_a_kernel_of_bfloat16_has_headers_with_it():
+    start("cpu")
+    numbers, sums = wp.array([1.0, 2.0, -4.0], dtype=wp.bfloat16, device="cpu"), zeros(3)
+    launch(add_halves, 3, numbers, sums)
+    assert sums.numpy().tolist() == [1.5, 2.5, -3.5]
+
+
+def test_as_many_are_compiled_at_a_time_as_there_are_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(compiler, "_headers", lambda: tmp_path)
+    (tmp_path / "made.pch").write_text("")
+    without, with_it = tmp_path / "without.cpp", tmp_path / "with.cpp"
+    without.write_text("#define WP_NO_BFLOAT16\n")
+    with_it.write_text("\n")
+    together, taken, lock, given = [0], [0], threading.Lock(), set()
+
+    def build_cpu(obj_path, cpp_path, extra_flags="", verbose=False):
+        with lock:
+            given.add((cpp_path, extra_flags, verbose))
+            taken[0] += 1
+            together[0] = max(together[0], taken[0])
+        threading.Event().wait(0.02)
+        with lock:
+            taken[0] -= 1
+
+    build = SimpleNamespace(build_cpu=build_cpu)
+    compiler._compile_well(build, threading.BoundedSemaphore(2))
+    threads = [threading.Thread(target=build.build_cpu, args=("out.o", str(path)), kwargs={"extra_flags": "-O2", "verbose": True})
+               for path in (without, with_it) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    always = "-O2 -fpch-instantiate-templates -discard-value-names"
+    assert together == [2] and given == {(str(without), f"{always} -DWP_NO_BFLOAT16=", True), (str(with_it), always, True)}
+
+
+PRELOADED = """
+import os, sys
+from wrt.core.device import _helpers, preload_headers, start
+preload_headers()
+_helpers(os.getpid()).shutdown(wait=True)
+"""
+
+
+@pytest.mark.parametrize("is_limited", [False, True])
+def test_headers_are_made_beforehand_where_there_is_room(is_limited: bool, tmp_path: Path):
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))\n" if is_limited else ""
+    subprocess.run([sys.executable, "-c", limit + PRELOADED], cwd=ROOT, check=True, timeout=120,
+                   env=os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)})
+    assert len(list(tmp_path.glob("*/headers-*/*.pch"))) == (0 if is_limited else 1)
+
+
 def test_all_threads_share_the_precompiled_headers():
     start("cpu")
     folders = []
@@ -69,11 +159,11 @@ def test_others_wait_for_the_first_until_the_headers_are_there(monkeypatch: pyte
     inside, left = threading.Event(), threading.Event()
 
     def compile_second():
-        with compiler.first_with_headers():
+        with compiler._first_with_headers():
             inside.set()
         left.set()
 
-    with compiler.first_with_headers():
+    with compiler._first_with_headers():
         second = threading.Thread(target=compile_second)
         second.start()
         assert not inside.wait(5 * compiler.POLL)
@@ -88,7 +178,7 @@ def test_where_no_headers_are_made_one_compiles_after_another(monkeypatch: pytes
     most, now, lock = [0], [0], threading.Lock()
 
     def compile_one():
-        with compiler.first_with_headers():
+        with compiler._first_with_headers():
             with lock:
                 now[0] += 1
                 most[0] = max(most[0], now[0])

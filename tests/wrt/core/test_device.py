@@ -222,15 +222,19 @@ os.chmod(warp.config.kernel_cache_dir, 0o555)
 if os.geteuid() == 0:  # permissions do not bind the superuser, but one without capabilities (capset(2), version 3, none set)
     assert ctypes.CDLL(None).capset((ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()) == 0
 try:
-    print(accel.closest_hit(np.zeros((1, 3)), np.ones((1, 3))).t)
+    print(CALL)
 except wrt.InputError as error:
     print(error)
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="gives up the superuser's rights as Linux does")
-def test_a_read_only_kernel_cache_without_the_kernel_is_one_message(tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, "-c", READ_ONLY_CACHE], cwd=ROOT, capture_output=True, text=True,
+@pytest.mark.parametrize("call", [
+    "accel.closest_hit(np.zeros((1, 3)), np.ones((1, 3))).t",
+    "wrt.build(wrt.Mesh(np.eye(4, 3), np.array([[0, 1, 2], [1, 2, 3]])), 'bvh8')",  # which has kernels preloaded
+])
+def test_a_read_only_kernel_cache_without_the_kernel_is_one_message(call: str, tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", READ_ONLY_CACHE.replace("CALL", call)], cwd=ROOT, capture_output=True, text=True,
                           env=os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)})
     (cache,) = tmp_path.iterdir()
     assert done.stdout == f"{cache}: kernels cannot be compiled: Permission denied (WARP_CACHE_PATH names another folder)\n", done
