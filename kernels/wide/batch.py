@@ -284,8 +284,8 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 @cache
 def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
-    """Rays first .. end - 1, a block of PACKETS packets a thread, one thread after another in the same scratch. out:
-    HitArrays, or for any hit an array of bool. Arrays must have no gaps."""
+    """Rays first .. end - 1, PACKETS packets after another, in a single thread. out: HitArrays, or for any hit an array of bool.
+    Arrays must have no gaps."""
     struct = make_struct(units.triangle_test.record)
     walk_packet = make_packet_walk(units, any_hit, accepts)
     interleaved = make_interleaved(units, any_hit, accepts)
@@ -295,39 +295,38 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
 
     @kernel
     def trace(accel: struct, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
-        block = first + wp.static(PACKETS * LANES) * wp.tid()
-        if wp.tid() == 0:
-            put_slot(scratch.slots, FAILED, 0)
-            put_slot(scratch.slots, PAUSED, 0)
-            put_slot(scratch.slots, ANY_REFUSED, 0)
-        alone = wp.uint64(0)
-        packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # not a constant: the walk would be there once for each
-        for p in range(packets):
-            base = PACKET_SIZE * p
-            count = wp.min(end - block - LANES * p, LANES)
-            active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch.packets, base)
-            put_bits(scratch.packets, base + ACTIVE, active)
-            if bits(scratch.packets, base + REFUSED) != 0:
-                put_slot(scratch.slots, ANY_REFUSED, 1)
-        for p in range(packets):
-            base = PACKET_SIZE * p
-            active = bits(scratch.packets, base + ACTIVE)
-            paused = slot_at(scratch.slots, PAUSED)
-            if active >= COHERENT and paused == 0:
-                worth = walk_packet(accel, surfaces, scratch.packets, base, active - COHERENT, scratch.stacks)
-                failed = wp.where(worth, 0, slot_at(scratch.slots, FAILED) + 1)
-                if failed == IN_A_ROW:  # after the pause one more that fails is enough for the next
-                    failed = failed - 1
-                    put_slot(scratch.slots, PAUSED, PAUSE)
-                put_slot(scratch.slots, FAILED, failed)
-            else:
-                put_slot(scratch.slots, PAUSED, wp.max(paused - 1, 0))
-                active = active & wp.static(COHERENT - 1)
-                active = meets(accel.nodes, 0, active, scratch.packets, base)
-                alone = alone | (wp.uint64(active) << wp.uint64(LANES * p))
-        interleaved(accel, surfaces, scratch, alone)
-        for p in range(packets):
-            write(out, block + LANES * p, wp.min(end - block - LANES * p, LANES), scratch.packets, PACKET_SIZE * p)
+        put_slot(scratch.slots, FAILED, 0)
+        put_slot(scratch.slots, PAUSED, 0)
+        put_slot(scratch.slots, ANY_REFUSED, 0)
+        for block in range(first, end, wp.static(PACKETS * LANES)):
+            alone = wp.uint64(0)
+            packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # not a constant: the walk would be there once for each
+            for p in range(packets):
+                base = PACKET_SIZE * p
+                count = wp.min(end - block - LANES * p, LANES)
+                active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch.packets, base)
+                put_bits(scratch.packets, base + ACTIVE, active)
+                if bits(scratch.packets, base + REFUSED) != 0:
+                    put_slot(scratch.slots, ANY_REFUSED, 1)
+            for p in range(packets):
+                base = PACKET_SIZE * p
+                active = bits(scratch.packets, base + ACTIVE)
+                paused = slot_at(scratch.slots, PAUSED)
+                if active >= COHERENT and paused == 0:
+                    worth = walk_packet(accel, surfaces, scratch.packets, base, active - COHERENT, scratch.stacks)
+                    failed = wp.where(worth, 0, slot_at(scratch.slots, FAILED) + 1)
+                    if failed == IN_A_ROW:  # after the pause one more that fails is enough for the next
+                        failed = failed - 1
+                        put_slot(scratch.slots, PAUSED, PAUSE)
+                    put_slot(scratch.slots, FAILED, failed)
+                else:
+                    put_slot(scratch.slots, PAUSED, wp.max(paused - 1, 0))
+                    active = active & wp.static(COHERENT - 1)
+                    active = meets(accel.nodes, 0, active, scratch.packets, base)
+                    alone = alone | (wp.uint64(active) << wp.uint64(LANES * p))
+            interleaved(accel, surfaces, scratch, alone)
+            for p in range(packets):
+                write(out, block + LANES * p, wp.min(end - block - LANES * p, LANES), scratch.packets, PACKET_SIZE * p)
 
     return trace
 

@@ -119,7 +119,7 @@ class Worker:
             if inputs[i] is not last:
                 self.command.set_param_at_index_from_ctype(i, inputs[i])
                 self.inputs[i] = inputs[i]
-        threads = -(-(end - first) // self.block)
+        threads = end - first if self.block == 1 else 1
         if threads != self.command.bounds.size:
             self.command.set_dim(threads)
         self.command.launch()

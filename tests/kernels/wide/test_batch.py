@@ -246,12 +246,12 @@ def assert_queue_as_one_ray(accel, o, d, t_max, exclude, accepts=None):
     queue.origin, queue.direction = vec3s(o), vec3s(d)
     queue.t_min, queue.t_max = zeros(len(o)), wp.array(t_max.astype(np.float32), dtype=wp.float32, device=DEVICE)
     queue.exclude = wp.array(exclude, dtype=wp.int32, device=DEVICE)
-    structure, block = accel.structure, BatchTraversal.stream_block
+    structure = accel.structure
     for any_hit in (True, False):
         many = structure.accel.kernels.make_stream(structure.units, any_hit, Queue, accepts)
         one = make_queue_kernel(structure.struct, structure.traversal(any_hit=any_hit, accepts=accepts), any_hit)
         scratch, answers = new_scratch(BatchTraversal.stream_sizes), []
-        for kernel, threads, more in ((many, -(-len(o) // block), [scratch]), (one, len(o), [])):
+        for kernel, threads, more in ((many, 1, [scratch]), (one, len(o), [])):
             hits = new_hits(len(o))
             out = zeros(len(o), wp.bool) if any_hit else hits
             wp.launch(kernel, threads, [accel.data, accel._surfaces, queue, out, *more, 0, len(o)], device=DEVICE)

@@ -11,7 +11,7 @@ import warp as wp
 from wrt.accel.bvh.top_down import build_binned, build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch, records, start, upload
+from wrt.core.device import launch, preload, records, start, upload
 from wrt.kernels.build import reinsertion as kernels
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
@@ -47,6 +47,7 @@ def build_refined(geometry: Geometry, options: BvhOptions, threads: int) -> Bina
 
     That few nodes are worth it, those that cost most, is from Bittner, Hapala and Havran 2013, "Fast Insertion-Based
     Optimization of Bounding Volume Hierarchies"."""
+    preload(kernels.find_moves, kernels.make_moves, kernels.walk_down)
     tree = build_binned(geometry, replace(options, max_leaf=min(options.max_leaf, SMALL_LEAF)), threads)
     if len(tree.nodes) < 2:
         return tree

@@ -16,6 +16,8 @@ from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first, leaf_reference
 from wrt.kernels.wide.traverse import STACK_SIZE
 
+COLLAPSE = build_wide.subtree_costs, build_wide.collapse  # kernels of `collapse`
+
 
 @dataclass(frozen=True, eq=False)
 class WideTree:
