@@ -10,6 +10,8 @@ least (tests/elementary.py derives them). A constant in parts is their sum: the 
 
 import warp as wp
 
+from wrt.kernels.structs import noinline
+
 SHIFT = wp.constant(12582912.0)  # 1.5 * 2^23: what is added to it is rounded to an integer, a tie to the even one
 
 # sin, cos: pi / 2 in parts, the first two multiples of 2^-24, the third of 13 bits; the bits of 2 / pi behind 32 zeros.
@@ -237,7 +239,7 @@ def power_of_positive(x: float, y: float) -> float:
     return scaled_exp(((e1 - n) + e2) * LOG_2, n)
 
 
-@wp.func
+@noinline  # which takes a tenth of the time to compile what shades
 def power(x: float, y: float) -> float:
     """x^y; NaN for x < 0 where y is no integer. Of zeros, infinities and NaN as IEEE 754 has it (`pow`)."""
     if y == 0.0 or x == 1.0:

@@ -37,8 +37,8 @@ FRESH = 2048  # camera rays that are made, traced and shaded at a time, while th
 @wp.struct
 class Job:
     """What a wave is: `samples` of each of the first `pixels` of Wave.order, in a tile at x, y. And how far it is: fresh: 1 while
-    its camera rays are traced, of which `begun` are in the queue; queued: rays that are traced next; asked: surfaces that ask
-    lights."""
+    its camera rays are traced, of which `begun` are in the queue; hits: of the rays that are shaded, those that hit something;
+    queued: rays that are traced next; asked: surfaces that ask lights."""
 
     x: int
     y: int
@@ -48,6 +48,7 @@ class Job:
     samples: int
     fresh: int
     begun: int
+    hits: int
     queued: int
     asked: int
 
@@ -259,13 +260,14 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
             run_range(launches.shade, pixel * job.samples, wave.job[0].begun)
             pixel = end
         wave.job[0].fresh = 0
-        ask_lights(wave, launches, lights)
-        while wave.job[0].queued > 0:
+        while True:
+            ask_lights(wave, launches, lights)
             queued = wave.job[0].queued
+            if queued == 0:
+                break
             wave.job[0].queued = 0
             run_range(launches.closest_hit, 0, queued)
             run_range(launches.shade, 0, queued)
-            ask_lights(wave, launches, lights)
         add_to_film(wave, film)
 
     return trace_wave

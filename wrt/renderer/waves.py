@@ -12,6 +12,7 @@ import warp as wp
 
 from wrt.accel.batches import new_scratch
 from wrt.core.device import made_once, records, upload
+from wrt.kernels.launches import Launch
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
 from wrt.kernels.shade import wave, wave_begin, wave_shade, wave_surfaces, wave_textures
 from wrt.kernels.shade.materials import Scatter
@@ -46,8 +47,8 @@ def begin_kernel(features: Features) -> Any:
 
 
 @made_once
-def shade_kernel(features: Features) -> Any:
-    return wave_shade.make_shade_kernel(features)
+def shade_kernels(features: Features) -> tuple[Any, Any]:
+    return wave_shade.make_shade_kernels(features)
 
 
 @made_once
@@ -74,7 +75,7 @@ def queue_kernel(structure: Any, features: Features, any_hit: bool) -> tuple[Any
     make = getattr(structure.accel.kernels, "make_stream", None)
     kernel = make(structure.units, any_hit, Queue, accepts) if make else None
     if kernel is not None:
-        return kernel, structure.accel.kernels.stream_block
+        return kernel, ALL
     return make_queue_kernel(structure.struct, structure.traversal(any_hit=any_hit, accepts=accepts), any_hit), 1
 
 
@@ -82,9 +83,10 @@ def queue_kernel(structure: Any, features: Features, any_hit: bool) -> tuple[Any
 class WaveKernels:
     """Those that a picture is made by; None: not needed. block: of queue_kernel."""
 
+    shade: Any
+    prepare: Any
     closest_hit: Any
     any_hit: Any
-    shade: Any
     shadow: Any
     begin: Any
     loop: Any
@@ -104,10 +106,12 @@ def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
     cutout = some(features, OF_CUTOUT)
     transparent = features.transparent_shadows
     closest_hit, block = queue_kernel(structure, cutout, False)
+    shade, prepare = shade_kernels(surfaces)
     return WaveKernels(
+        shade=shade,
+        prepare=prepare,
         closest_hit=closest_hit,
         any_hit=queue_kernel(structure, cutout, True)[0] if features.lit else None,
-        shade=shade_kernel(surfaces),
         shadow=shadow_kernel(surfaces) if transparent else None,
         begin=begin_kernel(some(features, OF_CAMERA)),
         loop=wave.make_loop_kernel(transparent),
@@ -206,9 +210,10 @@ class Picture:
         def trace(kernel: Any, rays: Any, out: Any) -> Any:
             return recorded(traversal(kernels, kernel, buffers, accel, surfaces, rays, out), kernels.block)
 
+        block = recorded(command(kernels.prepare, w, surfaces, lighting, 0, 0), ALL) if kernels.prepare else Launch()
         launches = {
             "closest_hit": trace(kernels.closest_hit, w.rays, w.hits),
-            "shade": recorded(command(kernels.shade, w, surfaces, lighting, limits[0], 0, 0), ALL),
+            "shade": recorded(command(kernels.shade, w, surfaces, lighting, limits[0], block, 0, 0), ALL),
         }
         if kernels.shadow:
             launches["walk_hit"] = trace(kernels.closest_hit, w.shadow_rays, w.shadow_hits)
