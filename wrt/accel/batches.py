@@ -22,18 +22,24 @@ from wrt.kernels.structs import Surfaces, fields_of
 from wrt.kernels.wide.packets import Scratch
 
 # Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Up to FEWEST
-# are not divided. A thread takes one part after another, about PARTS of them, so that all threads end at about the same time.
-FEWEST, MOST, PARTS = 8192, 131072, 8
+# are not divided. A thread takes a SHARES-th of its part of what is left, LEAST or more, so that all end at about the same time.
+FEWEST, MOST, LEAST, SHARES = 8192, 131072, 4096, 2
 RAYS_PER_LAUNCH = 16384  # one at a time
 MOST_ON_GPU = 1 << 26  # rays from the host that are on a GPU at once: 3 GB with their hits; a kernel counts in int32
 BYTES_OF_RAY = 48  # with its hit
 SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
 
 
-def rays_per_launch(n: int, threads: int, block: int) -> int:
-    """A multiple of `block`."""
-    part = MOST if threads == 1 else max(FEWEST, min(n // (threads * PARTS), MOST))
-    return -(-part // block) * block
+def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
+    """Ranges first .. end - 1 of n rays, all but the last of multiples of `block`: large ones first, as each launch takes a while,
+    and small ones in the end, as what a thread still traces then is waited for."""
+    out, first = [], 0
+    while first < n:
+        size = MOST if threads == 1 else max(LEAST, min((n - first) // (SHARES * threads), MOST))
+        end = min(first + -(-size // block) * block, n)
+        out.append((first, end))
+        first = end
+    return out
 
 
 class Tracer:
@@ -60,11 +66,15 @@ class Tracer:
         given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in out]
         n = len(given[0])
         packed = pack(given, answers) if SMALL < n < 1 << 31 and all(map(readable, given)) else None  # a kernel counts in int32
-        part = FEWEST if not packed else rays_per_launch(n, threads, self.block) if self.stream else RAYS_PER_LAUNCH
+        if packed and self.stream:
+            ranges = parts(n, threads, self.block) if n > FEWEST else [(0, n)]
+        else:
+            part = RAYS_PER_LAUNCH if packed else FEWEST
+            ranges = [(first, min(first + part, n)) for first in range(0, n, part)]
         refused: list[bool] = []
 
-        def job(first: int) -> None:
-            worker, end = self.borrow(), min(first + part, n)
+        def job(first: int, end: int) -> None:
+            worker = self.borrow()
             if packed:
                 worker.launch(data, surfaces, packed, first, end)
             else:
@@ -74,7 +84,7 @@ class Tracer:
             refused.append(bool(worker.slots[-1]))
             self.free.append(worker)  # not after an error: a thread may still be at work in it
 
-        run_all([partial(job, first) for first in range(0, n, part)], threads)
+        run_all([partial(job, *each) for each in ranges], threads)
         if any(refused):
             rays.checked()
 

@@ -8,7 +8,7 @@ from tests.data import data_path
 from tests.kernel_tools import DEVICE, cpu_only, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel.batches import FEWEST, MOST, new_scratch, rays_per_launch, tracer
+from wrt.accel.batches import FEWEST, LEAST, MOST, SHARES, new_scratch, parts, tracer
 from wrt.accel.build import build
 from wrt.accel.built import Built
 from wrt.accel.bvh.wide_tree import stack_need
@@ -91,12 +91,17 @@ def test_more_rays_than_a_launch(sphere, threads):
     assert all(array.ptr % 64 == 0 for worker in free for array in (worker.scratch.packets, worker.scratch.stacks))
 
 
-@pytest.mark.parametrize("threads", [2, 3, 16])
-def test_threads_have_several_launches_each_to_end_together(threads):
-    for n in (100_000, 150_001, 5_000_000):
-        part = rays_per_launch(n, threads, 64)
-        assert part % 64 == 0 and FEWEST <= part <= MOST and (part == FEWEST or n // part >= 7 * threads)
-    assert rays_per_launch(FEWEST, threads, 64) >= FEWEST
+@pytest.mark.parametrize("threads", [1, 2, 3, 16])
+@pytest.mark.parametrize("n", [FEWEST + 1, 100_000, 150_001, 5_000_000])
+def test_launches_are_long_at_first_and_short_in_the_end(n, threads):
+    ranges = parts(n, threads, 64)
+    first, end = np.array(ranges).T
+    assert first[0] == 0 and end[-1] == n and (first[1:] == end[:-1]).all() and (end[:-1] % 64 == 0).all()
+    size = end - first
+    assert size.max() <= MOST and (np.diff(size) <= 0).all() and size[:-1].min(initial=MOST) >= LEAST
+    if threads > 1:
+        assert len(ranges) > threads or size[0] == LEAST
+        assert size[-1] <= LEAST and size[0] * threads <= max(n / SHARES + 64 * threads, LEAST * threads)
 
 
 def test_no_rays(sphere):

@@ -119,9 +119,9 @@ def test_as_many_are_compiled_at_a_time_as_there_are_cores(tmp_path: Path, monke
 
 PRELOADED = """
 import os, sys
-from wrt.core.device import _helpers, preload_headers, start
+from wrt.core.device import _compilers, preload_headers
 preload_headers()
-_helpers(os.getpid()).shutdown(wait=True)
+_compilers(os.getpid()).shutdown(wait=True)
 """
 
 
