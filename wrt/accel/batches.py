@@ -27,6 +27,7 @@ FEWEST, MOST, LEAST, SHARES = 8192, 131072, 4096, 2
 RAYS_PER_LAUNCH = 16384  # one at a time
 MOST_ON_GPU = 1 << 26  # rays from the host that are on a GPU at once: 3 GB with their hits; a kernel counts in int32
 BYTES_OF_RAY = 48  # with its hit
+MOST_PACKED = (1 << 31) - 64  # a kernel counts in int32, and by blocks up to the end or beyond
 SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
 
 
@@ -65,7 +66,7 @@ class Tracer:
             rays = rays.checked()
         given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in out]
         n = len(given[0])
-        packed = pack(given, answers) if SMALL < n < 1 << 31 and all(map(readable, given)) else None  # a kernel counts in int32
+        packed = pack(given, answers) if SMALL < n <= MOST_PACKED and all(map(readable, given)) else None
         if packed and self.stream:
             ranges = parts(n, threads, self.block) if n > FEWEST else [(0, n)]
         else:

@@ -104,7 +104,8 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
     check_writable(output, bits)
     from wrt.core.device import preload_headers
 
-    preload_headers()  # while the rest is imported
+    if scene.exists():
+        preload_headers()  # while the rest is imported
     from wrt.picture.film import aov_path
     from wrt.renderer.options import Options
     from wrt.renderer.progress import progress_reporter
@@ -112,7 +113,7 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
     from wrt.renderer.result import plain_text
     from wrt.scene.model import Scene
 
-    # Whatever can be wrong with an option is told before a scene is read and a kernel compiled.
+    # Whatever can be wrong with an option is told before a scene is read and one of our kernels compiled.
     flags = {"filter": options.pop("filter_name")}
     flags |= {name: options.pop(name) for name in (
         "spp", "size", "max_depth", "min_throughput", "fresnel", "sampler", "tonemap", "exposure")}

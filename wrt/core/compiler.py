@@ -6,8 +6,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import wraps
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,8 @@ def prepare_compiler(cores: int) -> None:
     inside = getattr(wp, "_src", None)
     _drop_unused_helpers(getattr(inside, "codegen", None))
     _compile_once(getattr(inside, "codegen", None))
-    _share_headers(getattr(getattr(inside, "context", None), "runtime", None))
-    _compile_well(getattr(inside, "build", None), threading.BoundedSemaphore(cores))
+    shared = _share_headers(getattr(getattr(inside, "context", None), "runtime", None))
+    _compile_well(getattr(inside, "build", None), threading.BoundedSemaphore(cores), shared)
 
 
 def _drop_unused_helpers(codegen: Any) -> None:
@@ -44,12 +45,12 @@ def _compile_once(codegen: Any) -> None:
 
     def written(kernel: Any, device: str, options: Any) -> Any:
         source = write(kernel, device, options)
-        if device == "cpu" and not kernel.adj.uses_tid and _is_own(kernel.adj):
+        if device == "cpu" and not getattr(kernel.adj, "uses_tid", True) and _is_own(kernel.adj):
             function = f"void {kernel.get_mangled_name()}_cpu_kernel_forward("
             source = source.replace(f"static {function}", f"static WP_NOINLINE {function}")
         return source
 
-    codegen.cpu_linear_contiguous_specialization_candidate = lambda adj, block_dim: not _is_own(adj) and twice(adj, block_dim)
+    codegen.cpu_linear_contiguous_specialization_candidate = lambda adj, *args: not _is_own(adj) and twice(adj, *args)
     codegen.codegen_kernel = written
 
 
@@ -57,7 +58,7 @@ def _is_own(adj: Any) -> bool:
     return str(adj.func.__module__).startswith("wrt.")
 
 
-def _compile_well(build: Any, free: threading.Semaphore) -> None:
+def _compile_well(build: Any, free: threading.Semaphore, shared_headers: bool) -> None:
     """As many at a time as there are cores, while other threads write the sources of what comes next: three on two cores took 1.1
     times as long as two.
 
@@ -65,15 +66,16 @@ def _compile_well(build: Any, free: threading.Semaphore) -> None:
     where a kernel's source says that it needs none, they take a third less time; templates that they use themselves are compiled
     with them, and not with each kernel (0.04 s of each); and values need no names (a twelfth of a kernel's time)."""
     plain = getattr(build, "build_cpu", None)
-    if plain is None:
+    if plain is None or "extra_flags" not in signature(plain).parameters:
         return
 
     @wraps(plain)
     def build_cpu(obj_path: str, cpp_path: str, *, extra_flags: str = "", **options: Any) -> Any:
         with open(cpp_path, encoding="utf-8") as source:
             without = source.readline().strip() == "#define WP_NO_BFLOAT16"
-        flags = [extra_flags, "-fpch-instantiate-templates", "-discard-value-names", *(["-DWP_NO_BFLOAT16="] if without else [])]
-        with free, _first_with_headers():
+        flags = ["-fpch-instantiate-templates", "-discard-value-names", *(["-DWP_NO_BFLOAT16="] if without else []), extra_flags]
+        waits = shared_headers and options.get("use_precompiled_headers")
+        with free, _first_with_headers() if waits else nullcontext():
             return plain(obj_path, cpp_path, extra_flags=" ".join(flags), **options)
 
     build.build_cpu = build_cpu
@@ -81,15 +83,16 @@ def _compile_well(build: Any, free: threading.Semaphore) -> None:
 
 def _headers() -> Path:
     """Where they are, for Warp's release and the processor."""
-    return Path(wp.config.kernel_cache_dir) / f"headers-{wp.get_cpu_kernel_cache_key()}"
+    return Path(wp.config.kernel_cache_dir) / f"precompiled-{wp.get_cpu_kernel_cache_key()}"
 
 
-def _share_headers(runtime: Any) -> None:
+def _share_headers(runtime: Any) -> bool:
     """Warp 1.19 precompiles its headers anew for every thread that compiles, in every process: 3.5 s, when a kernel takes 1 to 3.
-    Clang writes that file aside and renames it, and looks whether it fits before it takes it, so that all can share one."""
+    Clang writes that file aside and renames it, and looks whether it fits before it takes it, so that all can share one. Returns
+    whether they do."""
     own = getattr(runtime, "get_clang_pch_dir", None)
     if own is None or getattr(runtime, "llvm", None) is None:
-        return
+        return False
 
     def shared() -> str | None:
         folder = _headers()
@@ -100,10 +103,11 @@ def _share_headers(runtime: Any) -> None:
         return str(folder)
 
     runtime.get_clang_pch_dir = shared
+    return True
 
 
 def headers_missing() -> bool:
-    return not any(_headers().glob("*.pch"))
+    return bool(wp.config.use_precompiled_headers) and not any(_headers().glob("*.pch"))
 
 
 @wp.kernel(module="unique", enable_backward=False)  # type: ignore[call-arg]

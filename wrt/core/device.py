@@ -33,7 +33,7 @@ from wrt.core.seconds import loading
 from wrt.core.tuned import choice_for, kept
 from wrt.core.write_file import compiling
 
-MOST_HELPERS, MOST_COMPILERS = 1 << 10, 8
+MOST_HELPERS = 1 << 10
 MOST_ROWS = (1 << 31) - 1
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
 
@@ -157,36 +157,41 @@ def load_kernel(kernel: Any, device: Any) -> None:
     """
     loaded, place = _loaded.get(kernel) or _loaded.setdefault(kernel, _Loaded()), (device.alias, block_dim(device))
     if place not in loaded.devices:
-        with loaded.lock:
+        with loading(), loaded.lock:
             if place not in loaded.devices:
                 _load(kernel, device, place[1])
                 loaded.devices.add(place)
 
 
-@cache
-def _compilers(process: int) -> ThreadPoolExecutor:
-    """Threads for what is compiled beforehand; the process waits for them when it ends."""
-    return ThreadPoolExecutor(MOST_COMPILERS, "wrt compiler")
-
-
-def preload(*kernels: Any) -> None:
-    """Begin to load kernels for the CPU that this thread will come to: those not in the cache are compiled beside each other.
-    Errors are told where it comes to them."""
-    cpu = start("cpu")
-    for kernel in kernels:
-        if kernel not in _loaded:
-            _compilers(os.getpid()).submit(load_kernel, kernel, cpu)
+@contextmanager
+def preloading(*kernels: Any) -> Iterator[None]:
+    """Kernels for the CPU that this thread comes to in the block: those not in the cache are compiled beside each other. Errors are
+    told where it comes to them. At the end of the block all have been loaded: a process may be forked after it."""
+    missing = [] if is_limited() else [kernel for kernel in kernels if kernel not in _loaded]
+    if not missing:
+        yield
+        return
+    with ThreadPoolExecutor(len(missing), "wrt preloads") as pool:
+        for kernel in missing:
+            pool.submit(load_kernel, kernel, start("cpu"))
+        yield
 
 
 def preload_headers() -> None:
-    """Begin to precompile Warp's headers, where that has not been done: beside what comes before the first kernel."""
+    """Begin to precompile Warp's headers, where that has not been done: beside what comes before the first kernel. For a process of
+    wrt's own: one that was forked meanwhile would wait for ever."""
     start("cpu")
     if headers_missing() and not is_limited():
-        preload(empty_kernel)
+        threading.Thread(target=_load_nothing, name="wrt headers").start()
+
+
+def _load_nothing() -> None:
+    with contextlib.suppress(Exception):  # told where a kernel cannot be compiled
+        load_kernel(empty_kernel, wp.get_device("cpu"))
 
 
 def _load(kernel: Any, device: Any, block_dim: int) -> None:
-    with loading(), _cache_told():
+    with _cache_told():
         cache, name = Path(wp.config.kernel_cache_dir), kernel.module.get_module_identifier(block_dim)
         compiled = ("*.o",) if device.is_cpu else ("*.cubin", "*.ptx")
         if any(any((cache / name).glob(pattern)) for pattern in compiled):

@@ -14,7 +14,7 @@ from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.instancing import stored_meshes
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.device import preload_headers, start
+from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import checkpoint_of
@@ -39,7 +39,6 @@ class Renderer:
         if options.executor is not None or options.devices is not None:
             raise InputError("an executor or several devices are for wrt.render; this runs on one device")
         device = start(options.device)
-        preload_headers()
         plan = plan_of(scene, options)
         require_memory(plan, device)
         self.checkpoint = checkpoint_of(plan, kind_of(device))

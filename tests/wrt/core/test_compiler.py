@@ -16,7 +16,7 @@ from tests.kernel_tools import cpu_only, launch, zeros  # isort: skip
 import warp as wp
 
 from wrt.core import compiler
-from wrt.core.device import load_kernel, start
+from wrt.core.device import load_kernel, preloading, start
 from wrt.kernels.structs import kernel
 
 pytestmark = cpu_only
@@ -96,9 +96,9 @@ def test_as_many_are_compiled_at_a_time_as_there_are_cores(tmp_path: Path, monke
     with_it.write_text("\n")
     together, taken, lock, given = [0], [0], threading.Lock(), set()
 
-    def build_cpu(obj_path, cpp_path, extra_flags="", verbose=False):
+    def build_cpu(obj_path, cpp_path, extra_flags="", use_precompiled_headers=False):
         with lock:
-            given.add((cpp_path, extra_flags, verbose))
+            given.add((cpp_path, extra_flags, use_precompiled_headers))
             taken[0] += 1
             together[0] = max(together[0], taken[0])
         threading.Event().wait(0.02)
@@ -106,22 +106,58 @@ def test_as_many_are_compiled_at_a_time_as_there_are_cores(tmp_path: Path, monke
             taken[0] -= 1
 
     build = SimpleNamespace(build_cpu=build_cpu)
-    compiler._compile_well(build, threading.BoundedSemaphore(2))
-    threads = [threading.Thread(target=build.build_cpu, args=("out.o", str(path)), kwargs={"extra_flags": "-O2", "verbose": True})
+    compiler._compile_well(build, threading.BoundedSemaphore(2), True)
+    options = {"extra_flags": "-O2", "use_precompiled_headers": True}
+    threads = [threading.Thread(target=build.build_cpu, args=("out.o", str(path)), kwargs=options)
                for path in (without, with_it) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    always = "-O2 -fpch-instantiate-templates -discard-value-names"
-    assert together == [2] and given == {(str(without), f"{always} -DWP_NO_BFLOAT16=", True), (str(with_it), always, True)}
+    always = "-fpch-instantiate-templates -discard-value-names"
+    assert together == [2]
+    assert given == {(str(without), f"{always} -DWP_NO_BFLOAT16= -O2", True), (str(with_it), f"{always} -O2", True)}
+    (tmp_path / "made.pch").unlink()
+    build.build_cpu("out.o", str(with_it))  # who wants no headers does not wait for them
+
+
+def test_a_warp_with_other_insides_is_left_as_it_is():
+    plain = SimpleNamespace(build_cpu=lambda source: source)
+    before = plain.build_cpu
+    compiler._compile_well(plain, threading.BoundedSemaphore(1), True)
+    compiler._compile_well(SimpleNamespace(), threading.BoundedSemaphore(1), True)
+    compiler._compile_once(SimpleNamespace())
+    assert plain.build_cpu is before and not compiler._share_headers(SimpleNamespace())
+
+
+@kernel
+def add_one(numbers: wp.array(dtype=float)):
+    numbers[0] += 1.0
+
+
+@kernel
+def add_two(numbers: wp.array(dtype=float)):
+    numbers[0] += 2.0
+
+
+def test_what_is_preloaded_is_loaded_at_the_end_of_the_block():
+    """A process that is forked after it has no lock that a thread of its parent holds."""
+    before, numbers = threading.active_count(), zeros(1)
+    with preloading(add_one, add_two):
+        launch(add_one, 1, numbers)
+    assert threading.active_count() == before
+    with preloading(add_one, add_two):
+        assert threading.active_count() == before
+        launch(add_two, 1, numbers)
+    assert numbers.numpy().tolist() == [3.0]
+    with pytest.raises(KeyError), preloading(add_pairs):
+        raise KeyError
+    assert threading.active_count() == before
 
 
 PRELOADED = """
-import os, sys
-from wrt.core.device import _compilers, preload_headers
+from wrt.core.device import preload_headers
 preload_headers()
-_compilers(os.getpid()).shutdown(wait=True)
 """
 
 
@@ -130,7 +166,7 @@ def test_headers_are_made_beforehand_where_there_is_room(is_limited: bool, tmp_p
     limit = "import resource; resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))\n" if is_limited else ""
     subprocess.run([sys.executable, "-c", limit + PRELOADED], cwd=ROOT, check=True, timeout=120,
                    env=os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)})
-    assert len(list(tmp_path.glob("*/headers-*/*.pch"))) == (0 if is_limited else 1)
+    assert len(list(tmp_path.glob("*/precompiled-*/*.pch"))) == (0 if is_limited else 1)
 
 
 def test_all_threads_share_the_precompiled_headers():

@@ -11,7 +11,7 @@ import warp as wp
 from wrt.accel.bvh.top_down import build_binned, build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch, preload, records, start, upload
+from wrt.core.device import launch, preloading, records, start, upload
 from wrt.kernels.build import reinsertion as kernels
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
@@ -47,11 +47,12 @@ def build_refined(geometry: Geometry, options: BvhOptions, threads: int) -> Bina
 
     That few nodes are worth it, those that cost most, is from Bittner, Hapala and Havran 2013, "Fast Insertion-Based
     Optimization of Bounding Volume Hierarchies"."""
-    preload(kernels.find_moves, kernels.make_moves, kernels.walk_down)
-    tree = build_binned(geometry, replace(options, max_leaf=min(options.max_leaf, SMALL_LEAF)), threads)
-    if len(tree.nodes) < 2:
-        return tree
-    links, walk, fell = optimized(tree, LARGEST_NODES, threads)
+    leaf = min(options.max_leaf, SMALL_LEAF)
+    with preloading(*([kernels.find_moves, kernels.make_moves, kernels.walk_down] if len(geometry) > leaf else [])):
+        tree = build_binned(geometry, replace(options, max_leaf=leaf), threads)
+        if len(tree.nodes) < 2:
+            return tree
+        links, walk, fell = optimized(tree, LARGEST_NODES, threads)
     return tree if fell < LARGEST_NODES.least_gain else with_leaves(tree, links.numpy(), walk)
 
 

@@ -13,7 +13,7 @@ from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
-from wrt.core.device import empty_aligned, preload, record_dtype, run_all
+from wrt.core.device import empty_aligned, preloading, record_dtype, run_all
 from wrt.core.errors import InputError
 from wrt.kernels.wide.batch import BatchTraversal
 from wrt.kernels.wide.nodes import PLANES, first_reference, node_size
@@ -44,10 +44,10 @@ class WideBvh(Accelerator):
         BvhOptions(builder, max_leaf, cost_traversal, cost_intersection)  # refuses what is out of range
         # Two leaves are worth it where they have less area than one: what their places in a node cost is not yet known.
         options = BvhOptions(builder, min(max_leaf, self.width), 0.0, 1.0, split_alpha, split_budget, row=self.width)
-        preload(*COLLAPSE)
-        binary = build_binary(self.geometry, options, self.threads)
-        tree = (collapse(binary, self.width, max_leaf, cost_traversal, cost_intersection) if len(binary.order) > 1
-                else small_tree(binary, self.width))
+        with preloading(*(COLLAPSE if len(self.geometry) > 1 else ())):
+            binary = build_binary(self.geometry, options, self.threads)
+            tree = (collapse(binary, self.width, max_leaf, cost_traversal, cost_intersection) if len(binary.order) > 1
+                    else small_tree(binary, self.width))
         if self.compressed and len(binary.order) > MAX_FIRST:
             raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}; take bvh8")
         built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
