@@ -18,8 +18,9 @@ from wrt.accel.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
 from wrt.core.arrays import returned, to_numpy, to_warp
 from wrt.core.checks import as_integer, as_one, shown
-from wrt.core.device import launch_on, made_once, thread_count
+from wrt.core.device import launch_on, made_once
 from wrt.core.memory import require
+from wrt.core.threads import thread_count
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.ray_query import make_hit_kernels
 

@@ -25,11 +25,12 @@ from wrt.accel.rays import vectors
 from wrt.accel.store import save
 from wrt.accel.structure import Structure, check_options, check_units
 from wrt.core.arrays import check_no_gradients, taken
-from wrt.core.device import require_on, start, thread_count, upload
+from wrt.core.device import require_on, start, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
 from wrt.core.memory import require
 from wrt.core.seconds import seconds_without_loads
+from wrt.core.threads import thread_count
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 

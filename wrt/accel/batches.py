@@ -15,8 +15,9 @@ from wrt.accel.rays import Rays, rays_on
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
 from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
-from wrt.core.device import empty_aligned, free_memory, launch_on, load_kernel, made_once, run_all
+from wrt.core.device import empty_aligned, free_memory, launch_on, load_kernel, made_once
 from wrt.core.memory import SMALL as SMALL_BYTES
+from wrt.core.threads import run_all
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Surfaces, fields_of
 from wrt.kernels.wide.packets import Scratch

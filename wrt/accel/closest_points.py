@@ -14,8 +14,9 @@ from wrt.accel.contains import contains
 from wrt.accel.ray_query import require_one_mesh
 from wrt.accel.rays import vectors
 from wrt.core.checks import shown
-from wrt.core.device import launch_on, thread_count, upload
+from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
+from wrt.core.threads import thread_count
 from wrt.kernels.query import FARTHEST
 from wrt.kernels.structs import fields_of
 from wrt.kernels.wide.closest_point import PointArrays, make_closest_point_kernel

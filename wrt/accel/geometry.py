@@ -11,7 +11,8 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.triangle_data import LAYOUTS
-from wrt.core.device import records, run_all, upload
+from wrt.core.device import records, upload
+from wrt.core.threads import run_all
 from wrt.kernels.build.shape import Shape
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST

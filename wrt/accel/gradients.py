@@ -13,8 +13,8 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.ray_query import require_one_mesh
 from wrt.core.arrays import check_no_gradients, float32, recording, to_numpy
 from wrt.core.checks import shown
-from wrt.core.device import run_all, thread_count
 from wrt.core.errors import InputError
+from wrt.core.threads import run_all, thread_count
 
 ONE_MESH = "only hits of a structure over one mesh, without spheres, have gradients"
 HITS_PER_JOB = 8192  # so that what is between stays in the cache

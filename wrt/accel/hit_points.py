@@ -17,8 +17,9 @@ from wrt.accel.ray_query import require_one_mesh
 from wrt.accel.rays import Rays, rays_on
 from wrt.accel.worlds import WorldIds
 from wrt.core.arrays import returned, to_warp
-from wrt.core.device import launch_on, records, thread_count, upload
+from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
+from wrt.core.threads import thread_count
 from wrt.kernels import structs
 from wrt.kernels.query import HitArrays
 from wrt.kernels.shade.hit_points import HitPlaces, Numbering, hit_places

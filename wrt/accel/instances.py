@@ -19,9 +19,10 @@ from wrt.accel.structure import Structure, check_units
 from wrt.accel.top_level import BOXES, MOVED_BOXES, build_top, part_boxes, refit_top, spread_of, world_boxes
 from wrt.core.arrays import real_numbers
 from wrt.core.checks import shown
-from wrt.core.device import start, thread_count, upload
+from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import seconds_without_loads
+from wrt.core.threads import thread_count
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement

@@ -16,8 +16,8 @@ from wrt.accel.structure import Structure
 from wrt.accel.worlds import WorldIds, worlds_asked
 from wrt.core.arrays import recording, returned
 from wrt.core.checks import shown
-from wrt.core.device import thread_count
 from wrt.core.errors import InputError
+from wrt.core.threads import thread_count
 
 
 class Queries:

@@ -16,8 +16,9 @@ from wrt.accel.ray_query import require_one_mesh
 from wrt.accel.rays import vectors
 from wrt.core.arrays import check_no_gradients, real_numbers, returned, taken, to_numpy
 from wrt.core.checks import shown
-from wrt.core.device import launch_on, thread_count, upload
+from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
+from wrt.core.threads import thread_count
 from wrt.kernels.query import FARTHEST, RayArrays
 from wrt.kernels.shade.segments import see, segments
 from wrt.kernels.structs import Surfaces

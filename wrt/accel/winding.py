@@ -13,7 +13,8 @@ from wrt.accel.ray_query import require_one_mesh
 from wrt.accel.rays import vectors
 from wrt.core.arrays import returned
 from wrt.core.checks import shown
-from wrt.core.device import launch_on, thread_count, upload
+from wrt.core.device import launch_on, upload
+from wrt.core.threads import thread_count
 from wrt.kernels.query import FARTHEST
 from wrt.kernels.winding import wind
 

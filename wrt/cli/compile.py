@@ -16,7 +16,7 @@ from wrt.cli.common import load, naming, say_json, shared, warnings_reported
 @click.argument("scenes", nargs=-1, type=click.Path(path_type=Path))
 @shared("accel", "device", "threads", "quiet", "as_json")
 def compile_kernels(scenes: tuple[Path, ...], accel: str, device: str, threads: int | None, quiet: bool, as_json: bool) -> None:
-    from wrt.core.device import thread_count
+    from wrt.core.threads import thread_count
     from wrt.renderer.compile import compile_picture, compile_queries
 
     count, clock, done = thread_count(threads), dict[str, float](), list[dict[str, Any]]()

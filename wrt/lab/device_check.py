@@ -19,7 +19,8 @@ from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS, chosen
 from wrt.core.checks import as_integer
-from wrt.core.device import load_kernel, run_all, start, thread_count
+from wrt.core.device import load_kernel, start
+from wrt.core.threads import run_all, thread_count
 from wrt.io.load import load_scene
 from wrt.kernels.study.elementary import FUNCTIONS, call_functions
 from wrt.lab.bench.accel import BRUTE_FORCE_TESTS, answer

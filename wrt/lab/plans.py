@@ -49,8 +49,8 @@ class Plan:
 
     def __post_init__(self) -> None:
         from wrt.core.checks import as_integer, require_known
-        from wrt.core.device import thread_count
         from wrt.core.errors import InputError
+        from wrt.core.threads import thread_count
 
         for each in fields(self):
             value, between, of = getattr(self, each.name), each.metadata["between"], each.metadata["of"]

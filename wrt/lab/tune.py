@@ -15,8 +15,9 @@ import warp as wp
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.core.checks import as_one
-from wrt.core.device import start, thread_count
+from wrt.core.device import start
 from wrt.core.errors import InputError
+from wrt.core.threads import thread_count
 from wrt.core.tuned import BLOCK_DIMS, DEFAULT, STACKS, STRUCTURES, Choice, keep, place_for, using
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled

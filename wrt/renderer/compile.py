@@ -7,7 +7,8 @@ from functools import partial
 import numpy as np
 
 from wrt.accel.build import build
-from wrt.core.device import load_kernel, run_all, start
+from wrt.core.device import load_kernel, start
+from wrt.core.threads import run_all
 from wrt.renderer.film_arrays import OF_AOVS
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of

@@ -12,7 +12,8 @@ import warp as wp
 
 from wrt.accel.counting import copied
 from wrt.accel.structure import Structure
-from wrt.core.device import record_dtype, run_all
+from wrt.core.device import record_dtype
+from wrt.core.threads import run_all
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import Counts, Recorder
 from wrt.renderer.film_arrays import DeviceFilm

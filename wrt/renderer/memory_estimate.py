@@ -11,9 +11,10 @@ from wrt.accel.base import Accelerator
 from wrt.accel.instancing import stored_meshes
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.address_space import told_limit
-from wrt.core.device import free_memory, thread_count
+from wrt.core.device import free_memory
 from wrt.core.errors import InputError
 from wrt.core.memory import SMALL, available, gib
+from wrt.core.threads import thread_count
 from wrt.renderer.film_arrays import BYTES_OF_FILM, BYTES_OF_GROUP
 from wrt.renderer.plan import Plan
 from wrt.renderer.waves import capacity

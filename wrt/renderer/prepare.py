@@ -14,8 +14,9 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build, reports_progress
-from wrt.core.device import load_kernel, thread_count
+from wrt.core.device import load_kernel
 from wrt.core.seconds import Span, counted_once, loads_since
+from wrt.core.threads import thread_count
 from wrt.renderer.clear_boxes import put_clear_boxes
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.memory_estimate import require_memory

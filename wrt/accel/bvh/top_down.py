@@ -10,7 +10,8 @@ import warp as wp
 
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, records, run_growing, start, upload
+from wrt.core.device import load_kernel, records, start, upload
+from wrt.core.threads import run_growing
 from wrt.kernels.build import bvh2 as build_bvh2
 from wrt.kernels.build import records as build_records
 from wrt.kernels.traverse.bvh2 import Bvh2Node

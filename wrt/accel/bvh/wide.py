@@ -13,8 +13,9 @@ from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
-from wrt.core.device import empty_aligned, preloading, record_dtype, run_all
+from wrt.core.device import empty_aligned, preloading, record_dtype
 from wrt.core.errors import InputError
+from wrt.core.threads import run_all
 from wrt.kernels.wide.batch import BatchTraversal
 from wrt.kernels.wide.nodes import PLANES, first_reference, node_size
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first

@@ -14,8 +14,9 @@ from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
 from wrt.accel.cells.common import check_tree, require_between
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, records, run_all, start, upload
+from wrt.core.device import load_kernel, records, start, upload
 from wrt.core.errors import InputError
+from wrt.core.threads import run_all
 from wrt.kernels.build import bsp as build_bsp
 from wrt.kernels.build.bsp_cell import MAX_FACES, MAX_POINTS, Cells
 from wrt.kernels.build.bsp_split import BspOptions, BspTools, Pieces

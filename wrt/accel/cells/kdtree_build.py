@@ -11,8 +11,9 @@ import warp as wp
 
 from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch, load_kernel, records, run_all, start, upload
+from wrt.core.device import launch, load_kernel, records, start, upload
 from wrt.core.errors import InputError
+from wrt.core.threads import run_all
 from wrt.kernels.build import kdtree as kernels
 from wrt.kernels.build.clip import Clippable, clip_references
 from wrt.kernels.build.kdtree_split import half_area, split_cost

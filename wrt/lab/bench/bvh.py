@@ -18,7 +18,8 @@ from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.geometry import Geometry
 from wrt.accel.rays import rays_of, rays_on
-from wrt.core.device import launch_on, load_kernel, thread_count, upload
+from wrt.core.device import launch_on, load_kernel, upload
+from wrt.core.threads import thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.kernels.study.query_volumes import count_popped, make_enter_kernel
 from wrt.kernels.traverse.bvh2 import box_volumes

@@ -14,7 +14,7 @@ import numpy as np
 from wrt.accel.answers import Hits
 from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS, chosen
-from wrt.core.device import run_all, thread_count
+from wrt.core.threads import run_all, thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.accel import timing, warm_up
 from wrt.lab.bench.rays import RaySet, ray_sets

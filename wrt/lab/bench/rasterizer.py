@@ -14,8 +14,9 @@ import warp as wp
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.device import load_kernel, run_all, start, thread_count, upload
+from wrt.core.device import load_kernel, start, upload
 from wrt.core.errors import InputError
+from wrt.core.threads import run_all, thread_count
 from wrt.kernels.study import rasterize as kernels
 from wrt.renderer.pixel_rays import camera_rays
 from wrt.renderer.upload import camera_struct

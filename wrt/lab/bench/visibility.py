@@ -15,7 +15,7 @@ import numpy as np
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.core.address_space import require_scipy
-from wrt.core.device import thread_count
+from wrt.core.threads import thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.plot import LogLogPlot, Series
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wrt.core.device import thread_count
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
+from wrt.core.threads import thread_count
 from wrt.lab.bench.plot import LogLogPlot, Series
 from wrt.lab.bench.report import Columns, Part, check_folder, machine_line, repeating, table, tabled, write
 from wrt.lab.bench.report import Row as Line

@@ -16,8 +16,9 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.structure import Structure
-from wrt.core.device import load_kernel, thread_count, upload
+from wrt.core.device import load_kernel, upload
 from wrt.core.errors import InputError
+from wrt.core.threads import thread_count
 from wrt.kernels.query import HitList, make_all_hits_kernel
 from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces

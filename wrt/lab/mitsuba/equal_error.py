@@ -19,8 +19,8 @@ from functools import partial
 
 import numpy as np
 
-from wrt.core.device import thread_count
 from wrt.core.errors import InputError
+from wrt.core.threads import thread_count
 from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench.error import REFERENCE_SEEDS, finished, make_reference
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled

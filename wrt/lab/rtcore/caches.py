@@ -10,8 +10,9 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.answers import Counters
-from wrt.core.device import load_kernel, run_all, start, thread_count, upload
+from wrt.core.device import load_kernel, start, upload
 from wrt.core.errors import InputError
+from wrt.core.threads import run_all, thread_count
 from wrt.kernels.study.cache_lru import Caches, Missed, Trace, replay_lru, replay_warps
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 

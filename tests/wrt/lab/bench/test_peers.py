@@ -13,8 +13,8 @@ from tests.command_line import wrt as command
 from wrt.accel.answers import Hits
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
-from wrt.core.device import thread_count
 from wrt.core.errors import InputError
+from wrt.core.threads import thread_count
 from wrt.lab.bench import peers
 from wrt.lab.bench.peers import Plan, answer, differing, means, run, searching
 from wrt.lab.bench.rays import ray_sets

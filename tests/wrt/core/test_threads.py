@@ -1,0 +1,117 @@
+"""Threads, and tasks on them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+
+from tests.data import ROOT
+from wrt.core.errors import InputError
+from wrt.core.threads import _idle, run_all, run_growing, thread_count
+
+
+def test_threads() -> None:
+    assert thread_count(3) == 3 and 1 <= thread_count(None) <= (os.cpu_count() or 1)
+    for wrong in (0, -1):
+        with pytest.raises(InputError, match="threads must be 1 or more"):
+            thread_count(wrong)
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+def test_run_all_runs_each_task_once_and_raises_the_first_error(threads: int) -> None:
+    done: list[int] = []
+    lock = threading.Lock()
+
+    def task(i: int) -> None:
+        if i in (5, 7):
+            raise RuntimeError(f"task {i}")
+        with lock:
+            done.append(i)
+
+    run_all([lambda i=i: task(i) for i in range(5)], threads)
+    assert sorted(done) == list(range(5))
+    with pytest.raises(RuntimeError, match="task 5"):
+        run_all([lambda i=i: task(i) for i in range(5, 10)], threads)
+    run_all([], threads)
+
+
+def test_run_all_takes_part_and_begins_nothing_after_an_error() -> None:
+    begun: list[int] = []
+    seen: set[int] = set()
+    both = threading.Barrier(2)
+
+    def task(i: int) -> None:
+        begun.append(i)
+        seen.add(threading.get_ident())
+        if i < 2:
+            both.wait(60.0)
+            raise KeyError(i)
+        time.sleep(0.01)
+
+    with pytest.raises(KeyError, match="0"):
+        run_all([lambda i=i: task(i) for i in range(1000)], 2)
+    assert len(begun) < 10 and threading.get_ident() in seen and len(seen) == 2
+
+
+def test_run_all_within_run_all() -> None:
+    done: list[int] = []
+    for _ in range(3):
+        run_all([lambda: run_all([lambda: done.append(1)] * 5, 3)] * 20, 4)
+    assert len(done) == 300
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_run_all_has_threads_of_its_own_after_a_fork() -> None:
+    code = """if True:
+        import os, threading
+        from wrt.core.threads import run_all
+        def threads():
+            seen, both = set(), threading.Barrier(2)
+            run_all([lambda: (both.wait(60.0), seen.add(threading.get_ident()))] * 2, 2)
+            return len(seen)
+        assert threads() == 2
+        child = os.fork()
+        if child == 0:
+            os._exit(threads())
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 2
+    """
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
+
+
+def test_helpers_are_kept_and_none_is_waited_for_that_has_not_begun() -> None:
+    run_all([lambda: time.sleep(0.02)] * 4, 2)
+    deadline = time.monotonic() + 60.0
+    while not (kept := len(_idle(os.getpid()))):  # it is idle a moment after its last task
+        assert time.monotonic() < deadline
+    before = threading.active_count()
+    for _ in range(50):
+        run_all([lambda: None] * 2, 2)  # mostly done before a helper wakes
+        while len(_idle(os.getpid())) < kept:
+            assert time.monotonic() < deadline
+    assert threading.active_count() == before
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_run_growing_also_runs_what_tasks_give(threads: int) -> None:
+    done: list[int] = []
+
+    def begin(n: int) -> tuple[Callable[[], None], Callable[[], list[int]]]:
+        assert threading.current_thread() is threading.main_thread()
+        return partial(job, n), lambda: [n // 2, n - n // 2] if n > 1 else []
+
+    def job(n: int) -> None:
+        done.append(n)  # atomic in CPython
+        if n == 3:
+            raise ValueError("three")
+
+    run_growing(begin, [16, 4], threads)
+    assert sorted(done) == sorted([16] + 2 * [8] + 5 * [4] + 10 * [2] + 20 * [1])
+    with pytest.raises(ValueError, match="three"):
+        run_growing(begin, [5], threads)
