@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import closing, nullcontext
-from typing import Any, Protocol
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import closing, nullcontext, suppress
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import warp as wp
@@ -30,6 +31,7 @@ MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C has to wait for on a G
 GROWTH = 4
 # Samples (summed over pixels) that are done, and whether no tile runs at the moment: then each pixel is done whole.
 Steps = Generator[tuple[int, bool], None, None]
+T = TypeVar("T")
 
 
 class Tracer(Protocol):
@@ -71,22 +73,48 @@ class LocalTracer:
             wp.synchronize_device(self.device)
             yield done, True
             return
-        pending = {self.pool.submit(trace, job): job for job in work}
-        done = 0
+        left, samples = deque(work), deque[int]()  # a future for each job would take a tenth of a short picture's time
+        running, done = self._begin(trace, left, samples), 0
         try:
-            while pending:
-                finished, _ = wait(pending, timeout=0.1)
+            while running:
+                wait(running, timeout=0.1)
                 at_rest = due()
-                waiting = [future for future in pending if future.cancel()] if at_rest else []
+                waiting = taken_from(left) if at_rest else []
                 if at_rest:
-                    finished = pending.keys() - set(waiting)
-                done += sum(future.result() for future in finished)
-                pending = {future: job for future, job in pending.items() if future not in finished}
-                yield done, at_rest or not pending
+                    wait(running)
+                for future in [future for future in running if future.done()]:
+                    running.remove(future)
+                    future.result()
+                done += sum(taken_from(samples))
+                yield done, at_rest or not running
                 if waiting:
-                    pending = {self.pool.submit(trace, job): job for job in pending.values()}
+                    left.extend(waiting)
+                    running = self._begin(trace, left, samples)
         finally:
-            wait([future for future in pending if not future.cancel()])
+            left.clear()
+            wait(running)
+
+    def _begin(self, trace: Callable[[Work], int], left: deque[Work], samples: deque[int]) -> list[Future[None]]:
+        """Threads that take what is left, one after another."""
+
+        def trace_left() -> None:
+            while True:
+                try:
+                    job = left.popleft()
+                except IndexError:
+                    return
+                samples.append(trace(job))
+
+        return [self.pool.submit(trace_left) for _ in range(min(self.prepared.threads, len(left)))]
+
+
+def taken_from(things: deque[T]) -> list[T]:
+    """All of them; other threads may take or add some meanwhile."""
+    out = []
+    with suppress(IndexError):
+        while True:
+            out.append(things.popleft())
+    return out
 
 
 class Passes:
