@@ -133,10 +133,6 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
             sample_lights(wave, surfaces, lighting, first, end)
 
     @kernel
-    def prepare_block(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
-        prepare(wave, surfaces, lighting, first, end)
-
-    @kernel
     def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits, block: Launch, first: int, end: int):
         """Of the rays first .. end - 1 of the queue. What is traced next is queued from place job.queued on, which is not behind
         `first`. block: of prepare_block, if there is one."""
@@ -223,4 +219,11 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
         wave.job[0].queued = queued
         wave.job[0].asked = asked
 
-    return shade_wave, prepare_block if apart else None
+    if not apart:
+        return shade_wave, None
+
+    @kernel
+    def prepare_block(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
+        prepare(wave, surfaces, lighting, first, end)
+
+    return shade_wave, prepare_block

@@ -11,12 +11,13 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from functools import cache
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, TypeVar
 
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
 
 MOST_HELPERS = 1 << 10
+T = TypeVar("T")
 
 
 def thread_count(threads: int | None) -> int:
@@ -67,6 +68,15 @@ def _helper() -> _Helper:
         return _Helper(idle)
 
 
+def taken_from(things: deque[T]) -> list[T]:
+    """All of them; other threads may take or add some meanwhile."""
+    out = []
+    with contextlib.suppress(IndexError):
+        while True:
+            out.append(things.popleft())
+    return out
+
+
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
     """Run all tasks on so many threads, this one among them; after the first error none is begun, and it is raised when those
     that run have ended."""
@@ -107,11 +117,7 @@ def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
         work()
     finally:
         left.clear()
-        with contextlib.suppress(IndexError):
-            while True:
-                places.pop()
-                helpers -= 1
-        for _ in range(helpers):
+        for _ in range(helpers - len(taken_from(places))):
             ended.get()
     if errors:
         raise errors.pop(min(errors))

@@ -8,14 +8,15 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import closing, nullcontext, suppress
-from typing import Any, Protocol, TypeVar
+from contextlib import closing, nullcontext
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
 from wrt.core.errors import InputError
 from wrt.core.interrupts import held_interrupts
+from wrt.core.threads import taken_from
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import Checkpoint
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
@@ -31,7 +32,6 @@ MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C has to wait for on a G
 GROWTH = 4
 # Samples (summed over pixels) that are done, and whether no tile runs at the moment: then each pixel is done whole.
 Steps = Generator[tuple[int, bool], None, None]
-T = TypeVar("T")
 
 
 class Tracer(Protocol):
@@ -106,15 +106,6 @@ class LocalTracer:
                 samples.append(trace(job))
 
         return [self.pool.submit(trace_left) for _ in range(min(self.prepared.threads, len(left)))]
-
-
-def taken_from(things: deque[T]) -> list[T]:
-    """All of them; other threads may take or add some meanwhile."""
-    out = []
-    with suppress(IndexError):
-        while True:
-            out.append(things.popleft())
-    return out
 
 
 class Passes:

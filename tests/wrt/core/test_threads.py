@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 
@@ -14,7 +15,7 @@ import pytest
 
 from tests.data import ROOT
 from wrt.core.errors import InputError
-from wrt.core.threads import _idle, run_all, run_growing, thread_count
+from wrt.core.threads import _idle, run_all, run_growing, taken_from, thread_count
 
 
 def test_threads() -> None:
@@ -22,6 +23,11 @@ def test_threads() -> None:
     for wrong in (0, -1):
         with pytest.raises(InputError, match="threads must be 1 or more"):
             thread_count(wrong)
+
+
+def test_all_is_taken() -> None:
+    things = deque([1, 2, 3])
+    assert taken_from(things) == [1, 2, 3] and not things and taken_from(things) == []
 
 
 @pytest.mark.parametrize("threads", [1, 4])

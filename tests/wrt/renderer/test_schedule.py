@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from wrt.renderer.schedule import LocalTracer, taken_from
+from wrt.renderer.schedule import LocalTracer
 
 
 class Jobs:
@@ -70,8 +69,3 @@ def test_who_does_not_go_on_waits_for_the_tiles_that_run() -> None:
     next(steps)
     steps.close()
     assert jobs.running == 0 and len(jobs.done) < 1000
-
-
-def test_all_is_taken() -> None:
-    things = deque([1, 2, 3])
-    assert taken_from(things) == [1, 2, 3] and not things and taken_from(things) == []
