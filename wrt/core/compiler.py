@@ -23,6 +23,7 @@ def prepare_compiler(cores: int) -> None:
     inside = getattr(wp, "_src", None)
     _drop_unused_helpers(getattr(inside, "codegen", None))
     _compile_once(getattr(inside, "codegen", None))
+    _resolve_once(getattr(getattr(inside, "codegen", None), "Adjoint", None))
     shared = _share_headers(getattr(getattr(inside, "context", None), "runtime", None))
     _compile_well(getattr(inside, "build", None), threading.BoundedSemaphore(cores), shared)
 
@@ -52,6 +53,26 @@ def _compile_once(codegen: Any) -> None:
 
     codegen.cpu_linear_contiguous_specialization_candidate = lambda adj, *args: not _is_own(adj) and twice(adj, *args)
     codegen.codegen_kernel = written
+
+
+def _resolve_once(writer: Any) -> None:
+    """Warp 1.19 tries one overload of a built-in function after another at each call of it, which took a third of the time in which
+    a source is written. The types of the arguments tell which it is, and ten calls of eleven have had theirs before."""
+    plain = getattr(writer, "resolve_func", None)
+    if plain is None or list(signature(plain).parameters) != ["adj", "func", "arg_types", "kwarg_types", "min_outputs"]:
+        return
+    known: dict[Any, Any] = {}
+
+    @wraps(plain)
+    def resolve_func(adj: Any, func: Any, arg_types: Any, kwarg_types: Any, min_outputs: Any) -> Any:
+        if not func.is_builtin():
+            return plain(adj, func, arg_types, kwarg_types, min_outputs)
+        call = func, len(func.overloads), arg_types, tuple(kwarg_types.items()), min_outputs
+        if call not in known:
+            known[call] = plain(adj, func, arg_types, kwarg_types, min_outputs)
+        return known[call]
+
+    writer.resolve_func = resolve_func
 
 
 def _is_own(adj: Any) -> bool:

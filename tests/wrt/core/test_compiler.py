@@ -121,6 +121,33 @@ def test_as_many_are_compiled_at_a_time_as_there_are_cores(tmp_path: Path, monke
     build.build_cpu("out.o", str(with_it))  # who wants no headers does not wait for them
 
 
+@kernel
+def mixes(sums: wp.array(dtype=float), v: wp.vec3):
+    i = wp.tid()
+    a = wp.dot(v * 0.5, v + v) * float(i * i) + wp.max(v[0], v[0] * v[1])
+    sums[i] = wp.dot(v * 2.0, v + v) + a + float(wp.max(i, 2 * i))
+
+
+def test_an_overload_is_looked_for_once(monkeypatch: pytest.MonkeyPatch):
+    from warp._src.codegen import Adjoint
+
+    asked, plain = [], Adjoint.resolve_func.__wrapped__
+
+    def resolve_func(adj, func, arg_types, kwarg_types, min_outputs):
+        asked.append((func.key, arg_types))
+        return plain(adj, func, arg_types, kwarg_types, min_outputs)
+
+    written = []
+    monkeypatch.setattr(Adjoint, "resolve_func", resolve_func)
+    for _ in range(2):
+        asked.clear()
+        mixes.adj.build(None)
+        written.append((list(asked), list(mixes.adj.blocks[0].body_forward)))
+        compiler._resolve_once(Adjoint)
+    (each, forward), (once, same) = written
+    assert forward == same and set(each) == set(once) and len(set(once)) == len(once) < len(each) - 5
+
+
 def test_a_warp_with_other_insides_is_left_as_it_is():
     plain = SimpleNamespace(build_cpu=lambda source: source)
     before = plain.build_cpu

@@ -137,7 +137,7 @@ except wrt.InputError as error:
 @pytest.mark.skipif(sys.platform != "linux", reason="gives up the superuser's rights as Linux does")
 @pytest.mark.parametrize("call", [
     "accel.closest_hit(np.zeros((1, 3)), np.ones((1, 3))).t",
-    "wrt.build(wrt.Mesh(np.eye(4, 3), np.array([[0, 1, 2], [1, 2, 3]])), 'bvh8')",  # which has kernels preloaded
+    "wrt.build(wrt.Mesh(np.eye(4, 3), np.array([[0, 1, 2], [1, 2, 3]])), 'bvh8', builder='binned')",  # which has kernels preloaded
 ])
 def test_a_read_only_kernel_cache_without_the_kernel_is_one_message(call: str, tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", READ_ONLY_CACHE.replace("CALL", call)], cwd=ROOT, capture_output=True, text=True,

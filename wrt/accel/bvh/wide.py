@@ -10,16 +10,17 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
-from wrt.accel.bvh.builders import BvhOptions, build_binary
+from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
-from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, small_tree
+from wrt.accel.bvh.small import SMALL, small_tree
+from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit
 from wrt.core.device import empty_aligned, preloading, record_dtype
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.kernels.wide.batch import BatchTraversal
 from wrt.kernels.wide.nodes import PLANES, first_reference, node_size
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first
-from wrt.kernels.wide.traverse import WideTraversal
+from wrt.kernels.wide.traverse import STACK_SIZE, WideTraversal
 
 ROWS_PER_JOB = 4096
 
@@ -42,17 +43,26 @@ class WideBvh(Accelerator):
     def _build(self, builder: str = "refined", max_leaf: int | None = None, cost_traversal: float = 1.0,
                cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
         max_leaf = self.width if max_leaf is None else max_leaf
-        BvhOptions(builder, max_leaf, cost_traversal, cost_intersection)  # refuses what is out of range
-        # Two leaves are worth it where they have less area than one: what their places in a node cost is not yet known.
-        options = BvhOptions(builder, min(max_leaf, self.width), 0.0, 1.0, split_alpha, split_budget, row=self.width)
-        with preloading(*(COLLAPSE if len(self.geometry) > 1 else ())):
-            binary = build_binary(self.geometry, options, self.threads)
-            tree = (collapse(binary, self.width, max_leaf, cost_traversal, cost_intersection) if len(binary.order) > 1
-                    else small_tree(binary, self.width))
-        if self.compressed and len(binary.order) > MAX_FIRST:
-            raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}; take bvh8")
+        options = BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget, self.width)
+        BVH_BUILDERS.check(builder)
+        tree = None
+        if len(self.geometry) <= (SMALL if builder == "refined" else 1):
+            tree = small_tree(*self.geometry.bounds(), options)
+        if tree is None or tree.stack > STACK_SIZE:
+            tree = self._collapsed(options)
         built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
         return replace(built, sah_cost=(self._tree(built) if self.compressed else tree).sah_cost(tree.root_area))
+
+    def _collapsed(self, options: BvhOptions) -> WideTree:
+        """The tree of the builder that options name, over two primitives or more."""
+        # Two leaves are worth it where they have less area than one: what their places in a node cost is not yet known.
+        of_binary = replace(options, max_leaf=min(options.max_leaf, self.width), cost_traversal=0.0, cost_intersection=1.0)
+        with preloading(*COLLAPSE):
+            binary = build_binary(self.geometry, of_binary, self.threads)
+            tree = collapse(binary, self.width, options.max_leaf, options.cost_traversal, options.cost_intersection)
+        if self.compressed and len(binary.order) > MAX_FIRST:
+            raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}; take bvh8")
+        return tree
 
     @property
     def _unit(self) -> int:

@@ -76,17 +76,6 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
     return WideTree(lo, hi, children, out.order.numpy()[: rows * width].reshape(-1, width).copy(), leaves, depth, stack)
 
 
-def small_tree(tree: BinaryTree, width: int) -> WideTree:
-    """The wide tree over no primitive or one."""
-    n = len(tree.order)
-    lo, hi = np.full((1, width, 3), np.inf, np.float32), np.full((1, width, 3), -np.inf, np.float32)
-    children, order = np.full((1, width), EMPTY, np.int32), np.full((n, width), -1, np.int32)
-    if n:
-        lo[0, -1], hi[0, -1], children[0, -1], order[0, 0] = (
-            tree.nodes["lo_0"][0], tree.nodes["hi_0"][0], leaf_reference.func(0, 1), tree.order[0])
-    return WideTree(lo, hi, children, order, n, 1, 0)
-
-
 def refit(tree: WideTree, geometry: Geometry) -> WideTree:
     """The same tree around the geometry as it is now. Boxes of spatial splits become those of the whole triangles."""
     cpu = start("cpu")

@@ -1,0 +1,111 @@
+"""Wide trees over few primitives, made in Python: to load a builder's kernels takes as long, and to compile them much longer."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from wrt.accel.bvh.tree import BvhOptions, half_areas
+from wrt.accel.bvh.wide_tree import WideTree, stack_need
+from wrt.kernels.wide.references import EMPTY, leaf_reference
+
+SMALL = 128  # primitives
+
+
+class _Choice(NamedTuple):
+    """Of a subtree, to be at most some number of children of a node: what they cost, how many they are, and how many of these are
+    from its first part; none of them where the subtree is one child."""
+
+    cost: float
+    children: int
+    first: int
+
+
+class _Subtree:
+    """Of a binary tree: items (n,) and their boxes lo, hi (n, 3). parts: two where there are two items, once it is split. choices:
+    for at most 1, 2, .. children; opened: the best where it is not one."""
+
+    parts: list[_Subtree]
+    choices: list[_Choice]
+    opened: _Choice
+
+    def __init__(self, items: np.ndarray, lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> None:
+        self.items, self.lo, self.hi, self.options = items, lo, hi, options
+        self.area = float(half_areas(lo.min(axis=0), hi.max(axis=0)))
+        # A ray by itself tests a row's primitives at once, a packet one after another: a leaf costs half its rows, half its items.
+        rows = 0.5 * -(-len(items) // options.row) + 0.5 * len(items) / options.row
+        self.leaf_cost = options.cost_intersection * rows * self.area if len(items) <= options.max_leaf else np.inf
+
+    def split(self) -> None:
+        """Where a sweep along each axis finds the least cost; of several such places, where the parts are most equal."""
+        n, self.parts = len(self.items), []
+        if n == 1:
+            return
+        order = np.argsort(0.5 * self.lo + 0.5 * self.hi, axis=0, kind="stable")  # (n, axis)
+        lo, hi = self.lo[order], self.hi[order]  # (n, axis, 3)
+        below = half_areas(np.minimum.accumulate(lo), np.maximum.accumulate(hi))
+        above = half_areas(np.minimum.accumulate(lo[::-1]), np.maximum.accumulate(hi[::-1]))[::-1]
+        count = np.arange(1, n)[:, None]
+        cost = below[:-1] * count + above[1:] * (n - count)
+        k, axis = np.unravel_index(np.argmin(np.where(cost == cost.min(), abs(2 * count - n), n)), cost.shape)
+        self.parts = [_Subtree(self.items[part], self.lo[part], self.hi[part], self.options)
+                      for part in np.split(order[:, axis], [k + 1])]
+
+    def choose(self) -> None:
+        """After its parts have: as kernels.build.wide does, the least cost for every number of children."""
+        self.choices = [_Choice(self.leaf_cost, 1, 0)]
+        self.opened = _Choice(np.inf, 0, 0)
+        if self.parts:
+            first, second = (part.choices for part in self.parts)
+            several = [min(_Choice(first[a].cost + second[k - a].cost, k + 2, a + 1) for a in range(k + 1))
+                       for k in range(self.options.row - 1)]
+            self.opened = min(several)
+            self.choices = [min(self.choices[0], _Choice(self.options.cost_traversal * self.area + self.opened.cost, 1, 0))]
+            for choice in several:
+                self.choices.append(min(self.choices[-1], choice))
+        self.choices += self.choices[-1:] * (self.options.row - len(self.choices))
+
+    @property
+    def is_leaf(self) -> bool:
+        return self.leaf_cost <= self.choices[0].cost
+
+    def roots(self, choice: _Choice) -> list[_Subtree]:
+        if choice.first == 0:
+            return [self]
+        first, second = self.parts
+        return first.roots(first.choices[choice.first - 1]) + second.roots(second.choices[choice.children - choice.first - 1])
+
+    def children(self) -> list[_Subtree]:
+        """Of the node over this subtree."""
+        return [self] if self.leaf_cost <= self.opened.cost else self.roots(self.opened)
+
+
+def small_tree(lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> WideTree:
+    """The wide tree over boxes lo, hi (n, 3) float32, with options.row children a node: a binary tree by the surface area heuristic
+    (MacDonald and Booth 1990) down to single boxes, collapsed at least cost."""
+    width = options.row
+    subtrees = [_Subtree(np.arange(len(lo), dtype=np.int32), lo, hi, options)] if len(lo) else []
+    for subtree in subtrees:  # grows
+        subtree.split()
+        subtrees += subtree.parts
+    for subtree in reversed(subtrees):
+        subtree.choose()
+    nodes, children_of = subtrees[:1], []
+    for node in nodes:  # grows
+        children_of.append(node.children())
+        nodes += [child for child in children_of[-1] if not child.is_leaf]
+    shape = (max(len(nodes), 1), width)
+    low, high = np.full((*shape, 3), np.inf, np.float32), np.full((*shape, 3), -np.inf, np.float32)
+    references, depth, rows, leaves = np.full(shape, EMPTY, np.int32), [1], np.empty((0, width), np.int32), 0
+    for i, children in enumerate(children_of):
+        for place, child in enumerate(children, width - len(children)):
+            low[i, place], high[i, place] = child.lo.min(axis=0), child.hi.max(axis=0)
+            if child.is_leaf:
+                references[i, place] = leaf_reference.func(len(rows), len(child.items))
+                lanes = np.append(np.sort(child.items), np.full(-len(child.items) % width, -1, np.int32))
+                rows, leaves = np.append(rows, lanes.reshape(-1, width), axis=0), leaves + 1
+            else:
+                references[i, place] = len(depth)
+                depth.append(depth[i] + 1)
+    return WideTree(low, high, references, rows, leaves, depth[-1], stack_need(references))
