@@ -22,8 +22,8 @@ from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
 
 def make_shade_kernels(features: Any) -> tuple[Any, Any]:
     """The step at every hit of the queue: its light, its new paths, and its requests for shadow rays. And a kernel for what it
-    launches for a block of hits, or None: where textures are sampled in lanes, so that two cores compile the two in 0.6 of the
-    time; without, both together would take longer than one."""
+    launches for a block of hits, or None: where textures, or numbers that choose a facet or a place in the sky, are computed in
+    lanes, so that two cores compile the two in 0.6 of the time; without, both together would take longer than one."""
     shading = make_shading(features)
     step = make_step(features, shading)
     find, found = make_wave_surfaces(features, shading.surface_at)
@@ -31,7 +31,8 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
     _, first_path, _, choose_facet, shade, extra_lights, choose, shadow_request, keep, worth = step
     bend, normal_at = make_wave_normals(features, shading.shading_normal)
     sample_lights, light_at, by_keys = make_wave_lights(features, shading, found, choose)
-    keyed, apart = features.rough or by_keys, in_lanes(features)
+    keyed = features.rough or by_keys
+    apart = keyed or in_lanes(features)
     sample_facets = make_sample_facets(choose_facet)
     radiance, _, seen_at = BACKGROUNDS[features.background]
 

@@ -68,9 +68,13 @@ def _resolve_once(writer: Any) -> None:
         if not func.is_builtin():
             return plain(adj, func, arg_types, kwarg_types, min_outputs)
         call = func, len(func.overloads), arg_types, tuple(kwarg_types.items()), min_outputs
-        if call not in known:
-            known[call] = plain(adj, func, arg_types, kwarg_types, min_outputs)
-        return known[call]
+        try:
+            found = known.get(call)
+        except TypeError:  # a type without a hash
+            return plain(adj, func, arg_types, kwarg_types, min_outputs)
+        if found is None:
+            found = known[call] = plain(adj, func, arg_types, kwarg_types, min_outputs)
+        return found
 
     writer.resolve_func = resolve_func
 
