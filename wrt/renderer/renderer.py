@@ -11,6 +11,7 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build
+from wrt.accel.bvh.small import SMALL
 from wrt.accel.geometry import Geometry
 from wrt.accel.instancing import stored_meshes
 from wrt.accel.structures import ACCELERATORS
@@ -92,7 +93,7 @@ def builder_for(plan: Plan) -> dict[str, str]:
     """The structure's option `builder` for one picture, where its default takes too long for so few samples."""
     default = signature(ACCELERATORS[plan.accel]._build).parameters.get("builder")
     triangles = sum(len(mesh.faces) for mesh in stored_meshes(plan.scene, plan.meshes))
-    few = plan.area * plan.scene.settings.spp < REFINED_FROM * triangles
+    few = triangles > SMALL and plan.area * plan.scene.settings.spp < REFINED_FROM * triangles
     return {"builder": "binned"} if few and default is not None and default.default == "refined" else {}
 
 

@@ -23,43 +23,48 @@ class _Choice(NamedTuple):
 
 
 class _Subtree:
-    """Of a binary tree: items (n,) and their boxes lo, hi (n, 3). parts: two where there are two items, once it is split. choices:
-    for at most 1, 2, .. children; opened: the best where it is not one."""
+    """Of a binary tree: items (n,), their boxes lo, hi (n, 3), and half the surface of the box around them. parts: two where there
+    are two items, once it is split. choices: for at most 1, 2, .. children; opened: the best where it is not one."""
 
     parts: list[_Subtree]
     choices: list[_Choice]
     opened: _Choice
 
-    def __init__(self, items: np.ndarray, lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> None:
-        self.items, self.lo, self.hi, self.options = items, lo, hi, options
-        self.area = float(half_areas(lo.min(axis=0), hi.max(axis=0)))
+    def __init__(self, items: np.ndarray, lo: np.ndarray, hi: np.ndarray, area: float, options: BvhOptions) -> None:
+        self.items, self.lo, self.hi, self.area, self.options = items, lo, hi, area, options
         # A ray by itself tests a row's primitives at once, a packet one after another: a leaf costs half its rows, half its items.
         rows = 0.5 * -(-len(items) // options.row) + 0.5 * len(items) / options.row
-        self.leaf_cost = options.cost_intersection * rows * self.area if len(items) <= options.max_leaf else np.inf
+        self.leaf_cost = options.cost_intersection * rows * area if len(items) <= options.max_leaf else np.inf
 
     def split(self) -> None:
         """Where a sweep along each axis finds the least cost; of several such places, where the parts are most equal."""
         n, self.parts = len(self.items), []
         if n == 1:
             return
-        order = np.argsort(0.5 * self.lo + 0.5 * self.hi, axis=0, kind="stable")  # (n, axis)
+        with np.errstate(invalid="ignore"):  # a box may be all of space
+            centers = 0.5 * self.lo + 0.5 * self.hi
+        order = centers.argsort(axis=0, kind="stable")  # (n, axis)
         lo, hi = self.lo[order], self.hi[order]  # (n, axis, 3)
-        below = half_areas(np.minimum.accumulate(lo), np.maximum.accumulate(hi))
-        above = half_areas(np.minimum.accumulate(lo[::-1]), np.maximum.accumulate(hi[::-1]))[::-1]
+        # Of the first 1, 2, .. and of the last 1, 2, .. items along each axis.
+        below, above = half_areas(
+            np.minimum.accumulate(np.stack([lo, lo[::-1]]), axis=1), np.maximum.accumulate(np.stack([hi, hi[::-1]]), axis=1))
+        below, above = below[:-1], above[-2::-1]
         count = np.arange(1, n)[:, None]
-        cost = below[:-1] * count + above[1:] * (n - count)
-        k, axis = np.unravel_index(np.argmin(np.where(cost == cost.min(), abs(2 * count - n), n)), cost.shape)
-        self.parts = [_Subtree(self.items[part], self.lo[part], self.hi[part], self.options)
-                      for part in np.split(order[:, axis], [k + 1])]
+        cost = below * count + above * (n - count)
+        k, axis = divmod(int(np.where(cost == cost.min(), abs(2 * count - n), n).argmin()), 3)
+        self.parts = [_Subtree(self.items[part], self.lo[part], self.hi[part], float(area[k, axis]), self.options)
+                      for part, area in ((order[: k + 1, axis], below), (order[k + 1 :, axis], above))]
 
     def choose(self) -> None:
         """After its parts have: as kernels.build.wide does, the least cost for every number of children."""
         self.choices = [_Choice(self.leaf_cost, 1, 0)]
         self.opened = _Choice(np.inf, 0, 0)
         if self.parts:
-            first, second = (part.choices for part in self.parts)
-            several = [min(_Choice(first[a].cost + second[k - a].cost, k + 2, a + 1) for a in range(k + 1))
-                       for k in range(self.options.row - 1)]
+            first, second = ([choice.cost for choice in part.choices] for part in self.parts)
+            several = []
+            for k in range(2, min(self.options.row, len(self.items)) + 1):
+                cost, a = min((first[a - 1] + second[k - a - 1], a) for a in range(1, k))
+                several.append(_Choice(cost, k, a))
             self.opened = min(several)
             self.choices = [min(self.choices[0], _Choice(self.options.cost_traversal * self.area + self.opened.cost, 1, 0))]
             for choice in several:
@@ -68,7 +73,7 @@ class _Subtree:
 
     @property
     def is_leaf(self) -> bool:
-        return self.leaf_cost <= self.choices[0].cost
+        return len(self.items) == 1 or (len(self.items) <= self.options.max_leaf and self.leaf_cost <= self.choices[0].cost)
 
     def roots(self, choice: _Choice) -> list[_Subtree]:
         if choice.first == 0:
@@ -77,15 +82,20 @@ class _Subtree:
         return first.roots(first.choices[choice.first - 1]) + second.roots(second.choices[choice.children - choice.first - 1])
 
     def children(self) -> list[_Subtree]:
-        """Of the node over this subtree."""
-        return [self] if self.leaf_cost <= self.opened.cost else self.roots(self.opened)
+        """Of the node over this subtree, from the one to visit last to the one to visit first by a ray that asks for any hit: inner
+        nodes, leaves; and large boxes after small ones."""
+        alone = len(self.items) == 1 or (len(self.items) <= self.options.max_leaf and self.leaf_cost <= self.opened.cost)
+        return [self] if alone else sorted(self.roots(self.opened), key=lambda child: (child.is_leaf, child.area))
 
 
 def small_tree(lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> WideTree:
     """The wide tree over boxes lo, hi (n, 3) float32, with options.row children a node: a binary tree by the surface area heuristic
     (MacDonald and Booth 1990) down to single boxes, collapsed at least cost."""
     width = options.row
-    subtrees = [_Subtree(np.arange(len(lo), dtype=np.int32), lo, hi, options)] if len(lo) else []
+    subtrees = []
+    if len(lo):
+        area = float(half_areas(lo.min(axis=0), hi.max(axis=0)))
+        subtrees = [_Subtree(np.arange(len(lo), dtype=np.int32), lo, hi, area, options)]
     for subtree in subtrees:  # grows
         subtree.split()
         subtrees += subtree.parts

@@ -10,7 +10,7 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
-from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
+from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.small import SMALL, small_tree
 from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit
@@ -44,21 +44,21 @@ class WideBvh(Accelerator):
                cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
         max_leaf = self.width if max_leaf is None else max_leaf
         options = BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget, self.width)
-        BVH_BUILDERS.check(builder)
-        tree = None
-        if len(self.geometry) <= (SMALL if builder == "refined" else 1):
-            tree = small_tree(*self.geometry.bounds(), options)
-        if tree is None or tree.stack > STACK_SIZE:
+        few = builder == "refined" and len(self.geometry) <= SMALL
+        tree = small_tree(*self.geometry.bounds(), options) if few else self._collapsed(options)
+        if tree.stack > STACK_SIZE:
             tree = self._collapsed(options)
         built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
         return replace(built, sah_cost=(self._tree(built) if self.compressed else tree).sah_cost(tree.root_area))
 
     def _collapsed(self, options: BvhOptions) -> WideTree:
-        """The tree of the builder that options name, over two primitives or more."""
+        """The tree of the builder that options name."""
         # Two leaves are worth it where they have less area than one: what their places in a node cost is not yet known.
         of_binary = replace(options, max_leaf=min(options.max_leaf, self.width), cost_traversal=0.0, cost_intersection=1.0)
-        with preloading(*COLLAPSE):
+        with preloading(*(COLLAPSE if len(self.geometry) > 1 else ())):
             binary = build_binary(self.geometry, of_binary, self.threads)
+            if len(binary.order) < 2:
+                return small_tree(*self.geometry.bounds(), options)
             tree = collapse(binary, self.width, options.max_leaf, options.cost_traversal, options.cost_intersection)
         if self.compressed and len(binary.order) > MAX_FIRST:
             raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}; take bvh8")

@@ -11,6 +11,7 @@ from wrt.accel.bvh import wide
 from wrt.accel.bvh.small import SMALL, small_tree
 from wrt.accel.bvh.tree import BvhOptions
 from wrt.accel.bvh.wide_tree import WideTree, check_wide
+from wrt.core.errors import InputError
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.scene.shapes import icosphere
 
@@ -52,6 +53,9 @@ def assert_is_tree(tree: WideTree, lo: np.ndarray, hi: np.ndarray, options: BvhO
             assert np.array_equal(tree.lo[node, place], lo[items].min(axis=0))
             assert np.array_equal(tree.hi[node, place], hi[items].max(axis=0))
             found, height = found + items, max(height, deeper)
+        there = tree.children[node] != EMPTY  # what any-hit queries visit first stands last: leaves, and of those the largest
+        keys = list(zip(tree.children[node][there] < 0, tree.areas[node][there], strict=True))
+        assert keys == sorted(keys)
         return found, height + 1
 
     assert below(0)[1] == tree.depth
@@ -68,6 +72,18 @@ def test_it_is_a_tree_over_the_boxes(n: int, width: int, max_leaf: int | None, c
     same = np.ones((n, 3), np.float32)
     assert_is_tree(small_tree(same, same, options), same, same, options)
     assert_is_tree(small_tree(-3e38 * same, 3e38 * same, options), -3e38 * same, 3e38 * same, options)
+
+
+@pytest.mark.filterwarnings("error")
+def test_costs_and_boxes_beyond_all_numbers() -> None:
+    space = np.full((40, 3), np.inf, np.float32)
+    for (lo, hi), costs in (((-space, space), (1.0, 1.0)), (soup(40), (1e308, 1e308)), (soup(40), (1e308, 0.0))):
+        for max_leaf in (1, 8, 64):
+            options = options_for(8, max_leaf, costs)
+            assert_is_tree(small_tree(lo, hi, options), lo, hi, options)
+    lo, hi = soup(40)
+    lo[7] = np.nan  # as of a Geometry made by hand: it ends
+    check_wide(small_tree(lo, hi, options_for(8)).children, 40, 8)
 
 
 def cost(tree: WideTree, width: int) -> float:
@@ -110,6 +126,16 @@ def test_few_primitives_need_no_kernel_but_where_another_builder_is_asked_for(mo
     for faces, options in ((many, {}), (few, {"builder": "binned"})):
         with pytest.raises(CalledError):
             build((ball.vertices, faces), "bvh8", **options)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 100])
+def test_options_are_refused_as_ever(n: int) -> None:
+    ball = icosphere(1)
+    mesh = ball.vertices, np.resize(ball.faces, (n, 3))
+    for options, message in (({"builder": "sbvh", "split_budget": 9.0}, "split_budget"), ({"builder": "none"}, "no builder"),
+                             ({"cost_traversal": np.inf}, "cost_traversal"), ({"max_leaf": 0}, "max_leaf")):
+        with pytest.raises(InputError, match=message):
+            build(mesh, "bvh8", **options)
 
 
 def nested(n: int) -> tuple[np.ndarray, np.ndarray]:
