@@ -486,16 +486,25 @@ def test_help_and_version() -> None:
 # --- real processes ---------------------------------------------------------------------------------------------------
 
 
+def default_signals() -> None:
+    """Of a process whose parent may ignore some: under nohup, or in the background."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 def process(*arguments: object, code: str = "", **options: Any) -> subprocess.Popen[str]:
     """`python -m wrt arguments`, or with some code run before."""
     start = ["-c", f"{code}\nfrom wrt.cli.main import main; main()"] if code else ["-m", "wrt"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **options.pop("environment", {})}
     return subprocess.Popen([sys.executable, *start, *map(str, arguments)], text=True, env=environment,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=default_signals, **options)
 
 
 def finish(running: subprocess.Popen[str]) -> Result:
-    out, err = running.communicate(timeout=120)
+    try:
+        out, err = running.communicate(timeout=120)
+    finally:
+        running.kill()  # where it has not ended
     return Result(running.returncode, out, without_compiling(err))
 
 
