@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wrt.accel.bvh.tree import BvhOptions, half_areas
-from wrt.accel.bvh.wide_tree import WideTree, stack_need
+from wrt.accel.bvh.wide_tree import WideTree, lanes_of, stack_need
 from wrt.kernels.wide.references import EMPTY, leaf_reference
 
 SMALL = 128  # primitives
@@ -71,9 +71,13 @@ class _Subtree:
                 self.choices.append(min(self.choices[-1], choice))
         self.choices += self.choices[-1:] * (self.options.row - len(self.choices))
 
+    def _is_leaf_beside(self, cost: float) -> bool:
+        """Whether a leaf is no worse than what costs so much, which may be inf as a leaf of too many is."""
+        return len(self.items) == 1 or (len(self.items) <= self.options.max_leaf and self.leaf_cost <= cost)
+
     @property
     def is_leaf(self) -> bool:
-        return len(self.items) == 1 or (len(self.items) <= self.options.max_leaf and self.leaf_cost <= self.choices[0].cost)
+        return self._is_leaf_beside(self.choices[0].cost)
 
     def roots(self, choice: _Choice) -> list[_Subtree]:
         if choice.first == 0:
@@ -84,8 +88,9 @@ class _Subtree:
     def children(self) -> list[_Subtree]:
         """Of the node over this subtree, from the one to visit last to the one to visit first by a ray that asks for any hit: inner
         nodes, leaves; and large boxes after small ones."""
-        alone = len(self.items) == 1 or (len(self.items) <= self.options.max_leaf and self.leaf_cost <= self.opened.cost)
-        return [self] if alone else sorted(self.roots(self.opened), key=lambda child: (child.is_leaf, child.area))
+        if self._is_leaf_beside(self.opened.cost):
+            return [self]
+        return sorted(self.roots(self.opened), key=lambda child: (child.is_leaf, child.area))
 
 
 def small_tree(lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> WideTree:
@@ -107,15 +112,17 @@ def small_tree(lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> WideTree:
         nodes += [child for child in children_of[-1] if not child.is_leaf]
     shape = (max(len(nodes), 1), width)
     low, high = np.full((*shape, 3), np.inf, np.float32), np.full((*shape, 3), -np.inf, np.float32)
-    references, depth, rows, leaves = np.full(shape, EMPTY, np.int32), [1], np.empty((0, width), np.int32), 0
+    references, depth, rows = np.full(shape, EMPTY, np.int32), [1], 0
+    order: list[int] = []
     for i, children in enumerate(children_of):
         for place, child in enumerate(children, width - len(children)):
             low[i, place], high[i, place] = child.lo.min(axis=0), child.hi.max(axis=0)
             if child.is_leaf:
-                references[i, place] = leaf_reference.func(len(rows), len(child.items))
-                lanes = np.append(np.sort(child.items), np.full(-len(child.items) % width, -1, np.int32))
-                rows, leaves = np.append(rows, lanes.reshape(-1, width), axis=0), leaves + 1
+                references[i, place] = leaf_reference.func(rows, len(child.items))
+                order += sorted(child.items.tolist())
+                rows += -(-len(child.items) // width)
             else:
                 references[i, place] = len(depth)
                 depth.append(depth[i] + 1)
-    return WideTree(low, high, references, rows, leaves, depth[-1], stack_need(references))
+    lanes, leaves = lanes_of(references, np.array(order, np.int32), width), int((references < 0).sum())
+    return WideTree(low, high, references, lanes, leaves, depth[-1], stack_need(references))
