@@ -1,9 +1,6 @@
 """What all tests start from."""
 
-import os
 import signal
-import tempfile
-from collections.abc import Callable
 
 import pytest
 
@@ -21,9 +18,6 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    folder = tempfile.TemporaryDirectory(prefix="wrt-tests-")  # what the user has tuned is not for tests
-    config.add_cleanup(folder.cleanup)
-    os.environ["WRT_CACHE_PATH"] = folder.name
     if config.getoption("--device") != "cpu":
         from tests import device
 
@@ -35,15 +29,3 @@ def _hear_interrupts() -> None:
     """Ctrl-C means what it means at a terminal: a shell that runs tests in the background has it ignored, by their children too."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-@pytest.fixture
-def say_memory(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Sets WRT_MEMORY; what the process of the tests has taken so far does not count."""
-    from wrt.core import memory
-
-    def say(text: str) -> None:
-        monkeypatch.setenv("WRT_MEMORY", text)
-        monkeypatch.setattr(memory, "resident", lambda: memory._AT_START)
-
-    return say

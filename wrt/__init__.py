@@ -139,8 +139,6 @@ def __getattr__(name: str) -> Any:
     if name in _FOR_LIBRARIES:
         return importlib.import_module(f"wrt.{name}")
     if name in _HOME:
-        if _HOME[name] != "wrt.core.errors":
-            importlib.import_module("wrt.core.address_space").require_modules()
         value = getattr(_imported(_HOME[name]), name)
         globals()[name] = value
         return value

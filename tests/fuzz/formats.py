@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
-import re
 import struct
 import tempfile
 import zlib
@@ -26,10 +25,6 @@ from tests.fuzz.mutate import (
     TEXT,
     mutate,
     mutate_tree,
-    repeat_bytes,
-    repeat_in_tree,
-    repeat_text,
-    times,
 )
 from tests.fuzz.seeds import Seed
 from tests.gltf_files import pack_glb
@@ -37,15 +32,13 @@ from tests.gltf_files import pack_glb
 
 @dataclass(frozen=True)
 class Format:
-    """seeds: sound files; damaged: a file made of one of them; read: whatever it raises but InputError is a defect; pace: seconds
-    that a byte may take, where a file's time is to be in proportion to its size; compressed: then its memory is not, but what its
-    header says (a picture of one colour is a few bytes)."""
+    """seeds: sound files; damaged: a file made of one of them; read: whatever it raises but InputError is a defect; names_sizes: a
+    few bytes may ask for much, up to fixed limits (pixels, triangles by formula), and so a MemoryError is an end, too."""
 
     seeds: Callable[[], list[Seed]]
     damaged: Callable[[Seed, Seed, Random], Seed]
     read: Callable[[Path], object]
-    pace: float | None = None
-    compressed: bool = False
+    names_sizes: bool = False
 
 
 def make_case(form: Format, rng: Random) -> Seed:
@@ -414,95 +407,16 @@ def load_scene_with_normals(path: Path) -> Any:
     return scene
 
 
-# --- files that repeat one thing --------------------------------------------------------------------------------------
-
-
-def repeated_toml(seed: Seed, other: Seed, rng: Random) -> Seed:
-    import tomllib
-
-    if rng.random() < 0.6:
-        return Seed(".toml", repeat_text(seed.data, rng))
-    tree = repeat_in_tree(tomllib.loads(seed.data.decode()), rng, toml_text)
-    return Seed(".toml", "\n".join(f"{json.dumps(key)} = {toml_text(value)}" for key, value in tree.items()).encode())
-
-
-def repeated_gltf(seed: Seed, other: Seed, rng: Random) -> Seed:
-    tree, binary = gltf_parts(seed)
-    kind = rng.random()
-    if kind < 0.5:
-        return gltf_of(seed.suffix, repeat_in_tree(tree, rng, json.dumps), binary)
-    if kind < 0.6:
-        return gltf_of(seed.suffix, tree, repeat_bytes(binary, rng), True)
-    if seed.suffix == ".gltf":
-        return Seed(".gltf", repeat_text(seed.data, rng))
-    if kind < 0.9:
-        return Seed(".glb", pack_glb(repeat_text(json.dumps(tree).encode(), rng), binary))
-    return Seed(".glb", repeat_bytes(seed.data, rng))
-
-
-def repeated_mesh(seed: Seed, other: Seed, rng: Random) -> Seed:
-    """Half of the time with the number in the header that fits, or might."""
-    text = b"\0" not in seed.data
-    if not text and seed.suffix == ".stl":
-        count = times(bytes(50), rng)
-        begin = 84 + 50 * rng.randrange(2)
-        return Seed(".stl", seed.data[:80] + struct.pack("<I", count) + seed.data[begin : begin + 50] * count)
-    data = repeat_text(seed.data, rng) if text or rng.random() < 0.2 else repeat_bytes(seed.data, rng)
-    elements = list(re.finditer(rb"(element \w+ )(\d+)\n", data[:4000]))
-    if elements and rng.random() < 0.6:
-        element = rng.choice(elements)
-        count = int(element[2]) + rng.choice((data.count(b"\n"), (len(data) - len(seed.data)) // rng.randint(1, 50), 10**6))
-        data = data[: element.start(2)] + b"%d" % count + data[element.end(2) :]
-    return Seed(seed.suffix, data)
-
-
-def repeated_image(seed: Seed, other: Seed, rng: Random) -> Seed:
-    if seed.data[:4] == b"\x89PNG" and rng.random() < 0.8:
-        chunks = png_chunks(seed.data)
-        i = rng.randrange(len(chunks))
-        kind, body = chunks[i]
-        if rng.random() < 0.4:
-            kind = rng.choice((b"tEXt", b"iTXt", b"zTXt", b"abCd", b"IDAT", b"fcTL", b"fdAT", b"PLTE", b"sPLT", b"eXIf", b"iCCP"))
-            packed = zlib.compress(bytes(1000))
-            body = rng.choice((b"", b"k\0v", b"k\0\0" + packed, b"k\0\1\0\0\0" + packed, body))
-        chunks[i:i] = [(kind, body)] * times(bytes(12) + body, rng)
-        return Seed(seed.suffix, png_of(chunks))
-    return Seed(seed.suffix, repeat_text(seed.data, rng) if seed.suffix == ".hdr" else repeat_bytes(seed.data, rng))
-
-
-def repeated_checked(seed: Seed, other: Seed, rng: Random) -> Seed:
-    magic, header, body = seed.data[:-32].split(b"\n", 2)
-    if rng.random() < 0.5:
-        tree = repeat_in_tree(json.loads(header), rng, json.dumps)
-        return signed(seed.suffix, magic, json.dumps(tree).encode(), body)
-    return signed(seed.suffix, magic, header, repeat_bytes(body, rng))
-
-
 # What is read; and what is done with it, which takes longer and is run only when asked for.
 FORMATS: dict[str, Format] = {
-    "toml": Format(seeds.scenes, damaged_toml, read_scene),
-    "gltf": Format(seeds.gltf, damaged_gltf, read_scene),
+    "toml": Format(seeds.scenes, damaged_toml, read_scene, names_sizes=True),
+    "gltf": Format(seeds.gltf, damaged_gltf, read_scene, names_sizes=True),
     "obj": Format(seeds.obj, damaged_mesh, read_mesh),
     "ply": Format(seeds.ply, damaged_mesh, read_mesh),
     "stl": Format(seeds.stl, damaged_mesh, read_mesh),
-    "image": Format(seeds.images, damaged_image, read_picture),
+    "image": Format(seeds.images, damaged_image, read_picture, names_sizes=True),
     "accel": Format(accel_seeds, damaged_checked, read_accel),
     "checkpoint": Format(checkpoint_seeds, damaged_checked, read_checkpoint),
 }
-# Seconds that a byte may take are many times what it does: of a table that is an object, of a corner of concave polygons, of a
-# small chunk, of a number.
-REPEATED_FORMATS = {
-    f"{name}-repeated": replace(FORMATS[name], damaged=repeated, pace=pace, compressed=name == "image")
-    for name, repeated, pace in (
-        ("toml", repeated_toml, 2e-4),
-        ("gltf", repeated_gltf, 2e-4),
-        ("obj", repeated_mesh, 2e-4),
-        ("ply", repeated_mesh, 2e-4),
-        ("stl", repeated_mesh, 1e-5),
-        ("image", repeated_image, 3e-5),
-        ("accel", repeated_checked, 3e-5),
-        ("checkpoint", repeated_checked, 3e-5),
-    )
-}
-SLOW_FORMATS = {"render": Format(scene_seeds, damaged_scene, render_scene)}
-ALL_FORMATS = {**FORMATS, **REPEATED_FORMATS, **SLOW_FORMATS}
+SLOW_FORMATS = {"render": Format(scene_seeds, damaged_scene, render_scene, names_sizes=True)}
+ALL_FORMATS = {**FORMATS, **SLOW_FORMATS}

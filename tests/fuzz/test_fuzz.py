@@ -8,6 +8,7 @@ from __future__ import annotations
 import random
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -75,8 +76,10 @@ def test_a_defect_is_seen(tmp_path: Path) -> None:
         match path.read_bytes():
             case b"error":
                 raise UnicodeDecodeError("x", b"", 0, 1, "y")
-            case b"memory":
+            case b"hidden":
                 raise InputError("no") from MemoryError()
+            case b"memory":
+                raise MemoryError
             case b"stderr":
                 os.write(2, b"libpng says no\n")
             case b"warning":
@@ -87,11 +90,13 @@ def test_a_defect_is_seen(tmp_path: Path) -> None:
 
     judge = Judge(Format(list, lambda seed, other, rng: seed, reader), tmp_path)
     with judge.watching_stderr():
-        told = {
-            word: judge.read(0, Seed(".x", word.encode())) for word in ("error", "memory", "stderr", "warning", "refused", "fine")
-        }
+        words = ("error", "hidden", "memory", "stderr", "warning", "refused", "fine")
+        told = {word: judge.read(0, Seed(".x", word.encode())) for word in words}
     assert told.pop("refused") == told.pop("fine") == ""
-    assert [problem.split()[0] for problem in told.values()] == ["UnicodeDecodeError", "InputError", "stderr", "RuntimeWarning"]
+    assert [problem.split()[0] for problem in told.values()] == [
+        "UnicodeDecodeError", "InputError", "MemoryError", "stderr", "RuntimeWarning"]
+    judge.form = replace(judge.form, names_sizes=True)
+    assert judge.read(0, Seed(".x", b"memory")) == "" and judge.outcomes["out of memory"] == 1
 
 
 def test_the_command_runs_workers(tmp_path: Path) -> None:

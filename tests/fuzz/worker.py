@@ -10,13 +10,12 @@ import json
 import mmap
 import os
 import random
-import re
 import resource
 import sys
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,6 @@ from tests.fuzz.formats import ALL_FORMATS, Format, make_case
 from wrt.core.errors import InputError, SceneWarning
 
 ROOM = 1 << 30  # bytes of address space beyond what a worker has when it begins
-# What a file may take where that is to be in proportion to its size: seconds and bytes for any file, and bytes for each byte.
-SECONDS, BYTES, BYTES_OF_BYTE = 1.0, 1 << 26, 1500
 
 
 class Judge:
@@ -35,7 +32,7 @@ class Judge:
     def __init__(self, form: Format, folder: Path) -> None:
         self.form, self.folder = form, folder
         self.stderr: Any = None
-        self.outcomes = {"read": 0, "refused": 0}
+        self.outcomes = {"read": 0, "refused": 0, "out of memory": 0}
         self.slowest = (0.0, -1)
         seeds.side_files(folder)
         if not (folder / "pipe").exists():
@@ -58,14 +55,12 @@ class Judge:
         """Write the file and read it: "" where that went well, else what is wrong, its first line without details."""
         path = self.folder / f"case{seed.suffix}"
         path.write_bytes(seed.data)
-        taken = _peak() if self.form.pace else float
         begin = time.process_time()  # who stops the process for a while makes no case slow
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             problem = self._attempt(path)
         seconds = time.process_time() - begin
         self.slowest = max(self.slowest, (seconds, number))
-        problem = problem or self._beyond(len(seed.data), seconds, taken())
         problem = problem or next(
             (
                 f"{each.category.__name__} in {each.filename}:{each.lineno}\n{each.message}"
@@ -81,14 +76,6 @@ class Judge:
             self.stderr.truncate()
         return problem
 
-    def _beyond(self, size: int, seconds: float, taken: float) -> str:
-        """What is wrong where a file of `size` bytes took so much, and that is to be in proportion."""
-        if self.form.pace and seconds > SECONDS + self.form.pace * size:
-            return f"more time than a file of that size may take\n{size} bytes, {seconds:.2f} s"
-        if self.form.pace and not self.form.compressed and taken > BYTES + BYTES_OF_BYTE * size:
-            return f"more memory than a file of that size may take\n{size} bytes, {taken / 2**20:.0f} MiB"
-        return ""
-
     def _attempt(self, path: Path) -> str:
         try:
             self.form.read(path)
@@ -99,25 +86,13 @@ class Judge:
         except (KeyboardInterrupt, SystemExit):
             raise
         except BaseException as error:
+            if isinstance(error, MemoryError) and self.form.names_sizes:
+                self.outcomes["out of memory"] += 1
+                return ""
             return f"{type(error).__name__} at {_place(error)}\n{traceback.format_exc()}"
         else:
             self.outcomes["read"] += 1
         return ""
-
-
-def _peak() -> Callable[[], float]:
-    """Gives the most bytes that were resident since now, beyond those that are; 0 where the system does not tell."""
-
-    def status(key: str) -> float:
-        found = re.search(rf"^{key}:\s+(\d+)", Path("/proc/self/status").read_text(), re.MULTILINE)
-        return 1024.0 * int(found[1]) if found else 0.0
-
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-        before = status("VmRSS")
-    except OSError:
-        return float
-    return lambda: status("VmHWM") - before
 
 
 def _place(error: BaseException) -> str:

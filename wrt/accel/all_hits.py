@@ -19,12 +19,9 @@ from wrt.accel.structure import Structure
 from wrt.core.arrays import returned, to_numpy, to_warp
 from wrt.core.checks import as_integer, as_one, shown
 from wrt.core.device import launch_on, made_once
-from wrt.core.memory import require
 from wrt.core.threads import thread_count
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.ray_query import make_hit_kernels
-
-BYTES = 16  # of a hit
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +111,10 @@ def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0
     where the ray goes through, as if it stood aside of edges and corners by as little as one likes: where a surface goes on, one
     triangle of them, and none or two at an outline. So it crosses a closed surface an even number of times from outside to outside,
     with the watertight test exactly. A hit takes one walk from the root, and the count another; each walk tests all that is hit at
-    the same t. Raises InputError, also where memory does not suffice.
+    the same t. Raises InputError.
     """
     asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
     first = np.concatenate([[0], np.cumsum(asked.counts().numpy(), dtype=np.int64)])
-    require(float(first[-1]) * BYTES, f"{first[-1]} hits")
     return AllHits(*map(asked.give, asked.rows(first)))
 
 
@@ -134,7 +130,6 @@ def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min:
     """The first k hits of each ray in order, as Hits of (N, k) arrays; what a ray has not is a miss. As all_hits."""
     k = as_integer(k, "k", 1, (1 << 31) - 1)
     asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
-    require(float(asked.n) * k * BYTES, f"{k} hits of each of {asked.n} rays")
     rows = asked.rows(np.arange(asked.n + 1, dtype=np.int64) * k)[1:]
     t, u, v, prim_id = (asked.give(row.reshape((asked.n, k))) for row in rows)
     return Hits(t, u, v, prim_id)

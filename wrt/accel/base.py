@@ -25,10 +25,9 @@ from wrt.accel.rays import vectors
 from wrt.accel.store import save
 from wrt.accel.structure import Structure, check_options, check_units
 from wrt.core.arrays import check_no_gradients, taken
-from wrt.core.device import require_on, start, upload
+from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_facts
-from wrt.core.memory import require
 from wrt.core.seconds import seconds_without_loads
 from wrt.core.threads import thread_count
 from wrt.kernels.structs import Surfaces
@@ -48,8 +47,6 @@ class Accelerator(Queries, ABC):
     name: ClassVar[str]
     kernels: Any
     _options: Mapping[str, Any] = MappingProxyType({})  # that it was built with
-    bytes_to_build: ClassVar[float] = 320.0  # of memory for each primitive, at the peak; measured, rounded up
-    bytes_on_device: ClassVar[float] = 120.0  # likewise, of a GPU's: stats.bytes
     attributes: World | None = None  # what wrt.build knows of the primitives beyond the geometry: normals, uvs, materials, objects
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
@@ -57,8 +54,6 @@ class Accelerator(Queries, ABC):
         self._begin(geometry, device, threads, triangle, box)
         check_options(self.name, self._build, options)
         self._options = options
-        require(len(geometry) * self.bytes_to_build, f"a {self.name} over {len(geometry)} primitives")
-        require_on(self.device, len(geometry) * self.bytes_on_device, f"a {self.name} over {len(geometry)} primitives")
         begin = time.perf_counter()
         built = self._build(**options)
         self._take(built, begin, built.sah_cost)

@@ -15,8 +15,7 @@ from wrt.accel.rays import Rays, rays_on
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
 from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
-from wrt.core.device import empty_aligned, free_memory, launch_on, load_kernel, made_once
-from wrt.core.memory import SMALL as SMALL_BYTES
+from wrt.core.device import empty_aligned, launch_on, load_kernel, made_once, memory_of
 from wrt.core.threads import run_all
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Surfaces, fields_of
@@ -28,6 +27,7 @@ FEWEST, MOST, LEAST, SHARES = 8192, 131072, 4096, 2
 RAYS_PER_LAUNCH = 16384  # one at a time
 MOST_ON_GPU = 1 << 26  # rays from the host that are on a GPU at once: 3 GB with their hits; a kernel counts in int32
 BYTES_OF_RAY = 48  # with its hit
+SURE = 1 << 20  # rays that a GPU has room for: to ask takes longer
 MOST_PACKED = (1 << 31) - 64  # a kernel counts in int32, and by blocks up to the end or beyond
 SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
 
@@ -164,8 +164,7 @@ def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: 
 
 def rays_on_gpu(n: int, device: Any) -> int:
     """How many rays from the host go there at once: no more than half of what is free has room for."""
-    most = MOST_ON_GPU if n * BYTES_OF_RAY <= SMALL_BYTES else min(MOST_ON_GPU, int(free_memory(device) / 2.0 / BYTES_OF_RAY))
-    return max(most, FEWEST)
+    return MOST_ON_GPU if n <= SURE else max(FEWEST, min(MOST_ON_GPU, int(memory_of(device) / 2.0 / BYTES_OF_RAY)))
 
 
 def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out: list[Any], device: Any) -> None:

@@ -15,7 +15,6 @@ class BruteForce(Accelerator):
 
     name = "brute_force"
     kernels = kernels
-    bytes_to_build = 60.0
 
     def _build(self) -> Built:
         n = len(self.geometry)

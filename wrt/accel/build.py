@@ -19,7 +19,7 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.instances import Instances
 from wrt.accel.instancing import instanced_meshes
 from wrt.accel.store import check_target, read
-from wrt.accel.structures import ACCELERATORS, chosen
+from wrt.accel.structures import ACCELERATORS, meant
 from wrt.accel.worlds import worlds_over
 from wrt.core.arrays import is_tensor, taken, to_numpy
 from wrt.core.checks import as_one, shown
@@ -47,12 +47,12 @@ def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | Non
     A list of meshes and scenes without spheres: each is a world, and a ray sees the one that its query names (`world`). prim_ids
     count the faces of a world; each object is an instance, which can be moved (Instances.move); each mesh is kept once.
 
-    accel: a name in ACCELERATORS; "bvh" is bvh8, or what `wrt.tune` has kept for the device. options: `triangle` and `box`, the
-    intersection tests (names in wrt.kernels.units.triangle.RAY_TRIANGLE and wrt.kernels.units.box.RAY_AABB), and the structure's
-    own (see its class). Raises InputError that names the argument.
+    accel: a name in ACCELERATORS; "bvh" is bvh8. options: `triangle` and `box`, the intersection tests (names in
+    wrt.kernels.units.triangle.RAY_TRIANGLE and wrt.kernels.units.box.RAY_AABB), and the structure's own (see its class).
+    Raises InputError that names the argument.
     """
     ACCELERATORS.check(as_one(accel, str, "accel"))
-    kind = ACCELERATORS[chosen(accel, as_one(device, str, "device"))]
+    kind, device = ACCELERATORS[accel], as_one(device, str, "device")
     world = (worlds_over([shape_given(each) for each in mesh]) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else world_given(mesh))  # of a geometry no more is known
     geometry = mesh if world is None else world.geometry
@@ -80,7 +80,7 @@ def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: s
                  threads: int | None = None, **options: Any) -> Accelerator:
     """As `build`, but from `folder` where the same geometry was built with the same options before; else it is built, and left
     there. A damaged file there is written anew. Raises InputError as `build` does, and where the folder cannot be written."""
-    world, accel = world_given(mesh), chosen(accel, device)
+    world, accel = world_given(mesh), meant(accel)
     geometry = one_geometry(world)
     given = {name: value for name, value in options.items() if name != "progress"}
     key = json.dumps([geometry.digest(), accel, given, VERSION], sort_keys=True)

@@ -6,7 +6,7 @@ import zlib
 from typing import Any, NamedTuple
 
 from wrt.accel.structure import Structure, check_units
-from wrt.accel.structures import ACCELERATORS, chosen
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_one
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
@@ -32,20 +32,20 @@ class RayQuery(NamedTuple):
     next_hit: Any
 
 
-def ray_query(accel: Any, *, triangle: str | None = None, box: str | None = None, device: str = "cpu") -> RayQuery:
+def ray_query(accel: Any, *, triangle: str | None = None, box: str | None = None) -> RayQuery:
     """What a kernel needs to ask structures for hits, on the CPU and on CUDA.
 
     accel: a structure that the kernel is for, or for all of a kind its name in wrt.ACCELERATORS, with the intersection tests that
-    they are built with; "bvh" is what wrt.build takes on `device`, which may be tuned (wrt.tune). Make the kernel with @wrt.kernel,
-    which takes no arguments: where a kernel is compiled with fused multiply-add, or gets a structure of another kind, it prints so
-    once, and its rays hit nothing. Raises InputError for unknown names, and for structures over several meshes.
+    they are built with. Make the kernel with @wrt.kernel, which takes no arguments: where a kernel is compiled with fused
+    multiply-add, or gets a structure of another kind, it prints so once, and its rays hit nothing.
+    Raises InputError for unknown names, and for structures over several meshes.
     """
     structure = getattr(accel, "structure", None)
     if isinstance(accel, str):
         units = Units(as_one(triangle or Units().triangle, str, "triangle"), as_one(box or Units().box, str, "box"))
         ACCELERATORS.check(accel)
         check_units(units.triangle, units.box)
-        structure = Structure(ACCELERATORS[chosen(accel, as_one(device, str, "device"))], units)
+        structure = Structure(ACCELERATORS[accel], units)
     elif triangle is not None or box is not None:
         raise InputError("triangle and box belong to a structure's name; a structure has its own")
     structure = require_one_mesh(structure, "accel must be a structure over one mesh, or the name of one")

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from wrt.core import cuda
 from wrt.core.registry import Registry
-from wrt.core.tuned import DEFAULT, choice_for
 
 ACCELERATORS: Registry[type[Any]] = Registry("structure", {
-    "bvh": "wrt.accel.bvh.wide:Bvh8",  # the default, unless the device is tuned (`chosen`)
+    "bvh": "wrt.accel.bvh.wide:Bvh8",  # the default
     "bvh2": "wrt.accel.bvh.binary:Bvh2",
     "bvh4": "wrt.accel.bvh.wide:Bvh4",
     "bvh8": "wrt.accel.bvh.wide:Bvh8",
@@ -26,23 +26,9 @@ ACCELERATORS: Registry[type[Any]] = Registry("structure", {
 
 def meant(accel: str) -> str:
     """The name of what a name stands for: "bvh" is another name of the default."""
-    return DEFAULT.accel if accel == "bvh" else accel
+    return "bvh8" if accel == "bvh" else accel
 
 
-def chosen(accel: str, device: str) -> str:
-    """As `meant`, where "bvh" is what the device is tuned for (wrt.tune). Raises InputError where there is no such device."""
-    if accel != "bvh":
-        return accel
-    from wrt.core.device import start
-
-    return choice_for(start(device)).accel
-
-
-def stack_on(device: str, *, tuned: bool = True) -> str:
-    """In kernels.traverse.stack.PLACES, where kernels for a device have their stacks: what the device is tuned for, or with
-    tuned=False, which asks no device, the default. Raises InputError where there is no such device."""
-    if device == "cpu":
-        return "local"  # a CPU's threads have no other
-    from wrt.core.device import start
-
-    return (choice_for(start(device)) if tuned else DEFAULT).stack
+def stack_on(device: str) -> str:
+    """In kernels.traverse.stack.PLACES, where kernels for a device have their stacks."""
+    return "local" if device == "cpu" else cuda.stack  # a CPU's threads have no other

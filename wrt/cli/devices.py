@@ -13,8 +13,7 @@ from wrt.core.errors import InputError
 @click.command()
 @click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit, and measure its speed; exit code 1 where"
                                             " a bit differs. Minutes, as all kernels are compiled")
-@click.option("--tune", "tunes", is_flag=True, help="Find the structure and the block size that are fastest on a device, and keep"
-                                                    " them for it: --accel bvh then means that structure. The bits stay the same")
+@click.option("--tune", "tunes", is_flag=True, help="Measure which structure is fastest on a device, and print what to write")
 @click.option("--device", help="To check or to tune: cuda:0, ...  [default: cuda:0]")
 @click.option("--scene", "scenes", type=click.Path(path_type=Path), multiple=True,
               help="To check by, repeatable  [default: those that ship with wrt]")
@@ -22,7 +21,7 @@ from wrt.core.errors import InputError
 @shared("quiet", "as_json")
 def devices(check: bool, tunes: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool,
             as_json: bool) -> None:
-    """List the devices that Warp can compute on, check one, or tune wrt for one."""
+    """List the devices that Warp can compute on, check one, or find its fastest structure."""
     from wrt.core.device import describe_devices
 
     if check and tunes:
@@ -31,10 +30,10 @@ def devices(check: bool, tunes: bool, device: str | None, scenes: tuple[Path, ..
         if scenes or rays is not None or (device is not None and not tunes):
             raise InputError("--device, --scene and --rays belong to --check, and --device to --tune")
     if tunes:
-        from wrt.lab.tune import tune
+        from wrt.lab.tune import measured
 
         with warnings_reported(quiet):
-            tuning = tune(device or "cuda:0")
+            tuning = measured(device or "cuda:0")
         if as_json:
             say_json(tuning.as_dict())
         else:

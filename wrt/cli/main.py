@@ -46,20 +46,20 @@ from wrt.cli.measure import bench, profile, stability
 from wrt.cli.reporting import measured
 from wrt.cli.save import check_room, checkpoint_options, save_film
 from wrt.cli.view import view
-from wrt.core.address_space import is_out_of_memory, require_modules, told_limit
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code, raise_on_termination
 from wrt.io.meshes import SUFFIXES
 from wrt.lab.plans import WhatIf
 
 GARBAGE_AT = 500_000  # new objects before Python looks for garbage: a start makes 300,000, and all of them stay
+# In errors of Warp and Python that are no MemoryError: the system gave no thread, no array, no room for a library.
+OUT_OF_MEMORY = ("can't start new thread", "Failed to allocate", "failed to map segment")
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(wrt.__version__, message="wrt %(version)s")
 def cli() -> None:
     """A Whitted ray tracer on NVIDIA Warp."""
-    require_modules()  # before a command imports them
 
 
 for command in (stability, bench, build, compile_kernels, devices, profile, animate, view):
@@ -304,10 +304,11 @@ def main() -> None:
         cause = error.__cause__ if isinstance(error, click.Abort) else error
         code = exit_code(cause.number if isinstance(cause, Interrupted) else None)
         say("interrupted")
-    except (MemoryError, RuntimeError) as error:  # click.Abort is a RuntimeError, too
-        if not is_out_of_memory(error):
+    except (MemoryError, RuntimeError, ImportError) as error:  # click.Abort is a RuntimeError, too
+        told = f"{error}: {error.__cause__}" if error.__cause__ else str(error)
+        if not (isinstance(error, MemoryError) or any(words in told for words in OUT_OF_MEMORY)):
             raise
-        say(f"error: not enough memory: {error}{told_limit()}")
+        say(f"error: not enough memory{': ' if told else ''}{told}")
         code = 2
     except SystemExit as error:
         code = error.code

@@ -42,7 +42,7 @@ def instructions(structures: tuple[str, ...], as_json: bool) -> None:
         "units": [{"unit": each.unit, "test": each.test, "instructions": each.instructions, **each.classes} for each in units],
         "traversals": [{"structure": name, "query": query, "stack": stack, "arch": arch, "registers": code.registers,
                         "local_bytes": code.stack, "shared_bytes": code.shared,
-                        "warps": study.resident_warps(code, arch, study.DEFAULT.block_dim), "instructions": len(code.opcodes()),
+                        "warps": study.resident_warps(code, arch, study.cuda.block_dim), "instructions": len(code.opcodes()),
                         "code_bytes": len(code.code), **code.classes()}
                        for (name, query, stack, arch), code in codes.items()]})
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.files import open_regular
-from wrt.core.memory import require
 
 DIGEST_BYTES = 32
 MAX_HEADER = 1 << 16
@@ -41,7 +40,6 @@ def read_checked(path: str | os.PathLike[str], magic: bytes, what: str,
             size = os.fstat(file.fileno()).st_size
             if largest is not None and size > largest:
                 raise InputError(f"is damaged: it has {size} bytes, and cannot have more than {largest}")
-            require(2.0 * size, f"a file of {size} bytes")
             file.seek(0)
             data = memoryview(file.read(size))
     except OSError as error:

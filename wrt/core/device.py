@@ -21,13 +21,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import warp as wp
 
-from wrt.core.address_space import LLVM, is_limited, require_warp, room_to_compile
+from wrt.core import cuda
 from wrt.core.compiler import empty_kernel, headers_missing, prepare_compiler
 from wrt.core.errors import InputError
-from wrt.core.memory import SMALL, available, gib
 from wrt.core.seconds import loading
 from wrt.core.threads import run_all, thread_count
-from wrt.core.tuned import choice_for, kept
 from wrt.core.write_file import compiling
 
 MOST_ROWS = (1 << 31) - 1
@@ -83,7 +81,6 @@ def _stderr_without(text: bytes) -> Iterator[None]:
 
 @made_once
 def _start_warp() -> None:
-    require_warp(min(thread_count(None), 4) + 2)  # two that prepare; if more cannot be started, that is told then
     with _stderr_without(b"NVIDIA CUDA driver"), _cache_told():  # where there is no GPU, it says so each time
         wp.init()
         prepare_compiler(thread_count(None))
@@ -92,7 +89,7 @@ def _start_warp() -> None:
 @made_once
 def start(device: str) -> Any:
     """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are, and where the
-    kernel cache cannot be made or the address space is too small."""
+    kernel cache cannot be made."""
     _start_warp()
     try:
         with _stderr_without(b"Warp CUDA error"):  # told by the InputError below
@@ -105,34 +102,25 @@ def start(device: str) -> Any:
 def describe_devices() -> list[str]:
     """One line a device: its name for `--device`, and what it is."""
     start("cpu")
-    lines = [f"cpu: {wp.get_device('cpu').name or 'CPU'}, {thread_count(None)} threads{_tuned(wp.get_device('cpu'))}"]
+    lines = [f"cpu: {wp.get_device('cpu').name or 'CPU'}, {thread_count(None)} threads"]
     for device in wp.get_cuda_devices():
-        lines.append(f"{device.alias}: {device.name}, {device.total_memory / 2**30:.0f} GiB, sm_{device.arch}{_tuned(device)}")
+        lines.append(f"{device.alias}: {device.name}, {device.total_memory / 2**30:.0f} GiB, sm_{device.arch}")
     return lines
-
-
-def _tuned(device: Any) -> str:
-    choice = kept(device)
-    launches = f" in blocks of {choice.block_dim}, stack {choice.stack}" if choice and device.is_cuda else ""
-    return f", tuned: {choice.accel}{launches}" if choice else ""
 
 
 def block_dim(device: Any) -> int:
     """Threads of a block of a launch: on the CPU one; the module's default block size would be compiled for nothing."""
-    return 1 if device.is_cpu else choice_for(device).block_dim
+    return 1 if device.is_cpu else cuda.block_dim
 
 
-def free_memory(device: Any) -> float:
-    """Bytes of memory of a device that can still be had; infinite where the system does not tell. The compiler, which runs while
-    a scene is built, has its share of the address space where that is limited."""
-    return float(device.free_memory) if device.is_cuda else max(available() - (LLVM if is_limited() else 0.0), 0.0)
-
-
-def require_on(device: Any, needed: float, what: str) -> None:
-    """Raise InputError, which tells both numbers, where `what` takes more bytes than a GPU has free. (Of the CPU's memory:
-    wrt.core.memory.require.)"""
-    if device.is_cuda and needed > SMALL and needed > (there := free_memory(device)):
-        raise InputError(f"{what} takes {gib(needed)} of the memory of {device}; {gib(there)} are free")
+def memory_of(device: Any) -> float:
+    """Bytes that a GPU has free; of the CPU, all of the machine's main memory. Infinite where the system does not tell."""
+    if device.is_cuda:
+        return float(device.free_memory)
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
 
 
 class _Loaded:
@@ -163,7 +151,7 @@ def load_kernel(kernel: Any, device: Any) -> None:
 def preloading(*kernels: Any) -> Iterator[None]:
     """Kernels for the CPU that this thread comes to in the block: those not in the cache are compiled beside each other. Errors are
     told where it comes to them. At the end of the block all have been loaded: a process may be forked after it."""
-    missing = [] if is_limited() else [kernel for kernel in kernels if kernel not in _loaded]
+    missing = [kernel for kernel in kernels if kernel not in _loaded]
     if not missing:
         yield
         return
@@ -177,7 +165,7 @@ def preload_headers() -> None:
     """Begin to precompile Warp's headers, where that has not been done: beside what comes before the first kernel. For a process of
     wrt's own: one that was forked meanwhile would wait for ever."""
     start("cpu")
-    if headers_missing() and not is_limited():
+    if headers_missing():
         threading.Thread(target=_load_nothing, name="wrt headers").start()
 
 
@@ -195,7 +183,7 @@ def _load(kernel: Any, device: Any, block_dim: int) -> None:
         else:
             _require_room_to_compile(cache)
             folder = f"{name}_p{os.getpid()}_t{threading.get_ident()}"  # as Warp calls it
-            with room_to_compile(), compiling(cache, folder):
+            with compiling(cache, folder):
                 kernel.module.load(device, block_dim=block_dim)
 
 
@@ -272,7 +260,7 @@ def launch(kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -
 
 
 def launch_on(device: Any, kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -> None:
-    """As `launch` on the CPU; on a GPU one launch over all of n, in blocks of as many threads as the device is tuned for."""
+    """As `launch` on the CPU; on a GPU one launch over all of n, in blocks of wrt.core.cuda.block_dim threads."""
     if device.is_cpu:
         launch(kernel, n, *inputs, threads=threads, step=step)
     elif n:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 from wrt.core.errors import InputError
-from wrt.core.memory import require
 
 
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
@@ -38,16 +37,10 @@ def require_file(path: Path, what: str = "") -> None:
         raise InputError(f"no such file{what}", path)
 
 
-def read_file(path: str | os.PathLike[str], factor: float = 1.0) -> bytes:
-    """All bytes of a regular file.
-
-    factor: how many times its size the memory of what becomes of it is. Raises InputError, without the path, where the file
-    cannot be read, is no regular one, or where the memory does not suffice.
-    """
+def read_file(path: str | os.PathLike[str]) -> bytes:
+    """All bytes of a regular file. Raises InputError, without the path, where it cannot be read or is no regular one."""
     try:
         with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            require(size * factor, f"a file of {size} bytes")
-            return file.read(size)
+            return file.read(os.fstat(file.fileno()).st_size)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}") from None

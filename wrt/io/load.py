@@ -15,18 +15,12 @@ import numpy as np
 from wrt.core.checks import as_path, shown
 from wrt.core.errors import InputError, SceneWarning, at
 from wrt.core.files import read_file, require_file
-from wrt.core.memory import require
 from wrt.core.packages import needed_by
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh
-from wrt.io.toml.limits import look_at
 from wrt.scene.defaults import stage
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
-
-BYTES_OF_TOML = 5.0  # of memory for a byte of the file: itself, and a character
-# Of memory, at most, measured: of a table that is checked and becomes an object, and of an array or a value.
-BYTES_OF_TABLE, BYTES_OF_VALUE = 3500.0, 200.0
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
@@ -104,9 +98,7 @@ LOADERS: dict[str, Callable[[Path], Scene]] = {".toml": _load_toml, ".gltf": _lo
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        text = read_file(path, BYTES_OF_TOML).decode("utf-8-sig")
-        require(look_at(text).bytes, "its text")
-        data = tomllib.loads(text)
+        data = tomllib.loads(read_file(path).decode("utf-8-sig"))
         _require_sound(data)
         return data
     except InputError as error:
@@ -125,22 +117,16 @@ def _parse(path: Path) -> dict[str, Any]:
 
 
 def _require_sound(data: dict[str, Any]) -> None:
-    """Raise InputError for an integer of more than 64 bits, as TOML demands (others cannot deal with thousands of digits), and
-    where the memory does not suffice to check all values."""
+    """Raise InputError for an integer of more than 64 bits, as TOML demands (others cannot deal with thousands of digits)."""
     values: list[Any] = [data]
-    tables = others = 0
     while values:
         value = values.pop()
         if isinstance(value, dict):
-            tables += 1
             values += value.values()
-            continue
-        others += 1
-        if isinstance(value, list):
+        elif isinstance(value, list):
             values += value
         elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
             raise InputError("holds an integer of more than 64 bits")
-    require(BYTES_OF_TABLE * tables + BYTES_OF_VALUE * others, f"a text of {tables} tables and {others} values")
 
 
 def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = ()) -> Scene:

@@ -13,13 +13,10 @@ import numpy as np
 from wrt.core.checks import as_path, shown
 from wrt.core.errors import InputError, SceneWarning, at
 from wrt.core.files import require_file
-from wrt.core.memory import require
 from wrt.core.registry import Registry
 from wrt.io.meshes import PLACES
 from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh, unit_rows
-
-BYTES_OF_FACE, BYTES_OF_VERTEX = 60.0, 100.0  # of memory, measured: of a file's mesh while it becomes a Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +69,6 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
         if len(raw.faces) == 0:
             raise InputError(f"holds no triangles ({raw.positions} positions, {raw.incomplete} faces of fewer than 3 corners)")
         groups, face_group = _part_groups(parts, len(raw.faces)) if parts else (raw.groups, raw.face_group)
-    require(BYTES_OF_FACE * len(raw.faces) + BYTES_OF_VERTEX * len(raw.vertices), "the mesh")
     cleaned = clean(raw.vertices, raw.faces, raw.normals, raw.uvs, face_group)
     if len(cleaned.faces) == 0:
         raise InputError(f"none of its {len(raw.faces)} triangles has any area", path)

@@ -8,11 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.core.memory import require
 
 MAX_CORNERS = 1 << 12  # of a concave polygon: the time grows with their square
 AT_ONCE = 1 << 16  # triangles
-BYTES_OF_TRIANGLE, BYTES_OF_POLYGON = 50.0, 100.0  # of memory, measured
 LOOKS = 2  # at all corners of a polygon that seems to have no ear
 
 
@@ -25,11 +23,10 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
     the fan about their first corner. A polygon is concave where a triangle of that fan faces against the polygon's
     own area vector; it is projected along that vector and cut by ear clipping (Meisters 1975). Self-intersecting
     polygons have no right answer: they get triangles all the same. Raises InputError for a concave polygon of more than
-    MAX_CORNERS corners, and where the memory does not suffice.
+    MAX_CORNERS corners.
     """
     counts, corners = np.asarray(counts, dtype=np.int64), np.asarray(corners)
     fan = np.maximum(counts - 2, 0)
-    require(BYTES_OF_TRIANGLE * int(fan.sum()) + BYTES_OF_POLYGON * len(counts), "the mesh")
     small = np.int32 if max(len(corners), len(counts)) < 1 << 31 else np.int64
     if (counts == 3).all():
         return np.arange(3 * len(counts), dtype=small).reshape(-1, 3), np.arange(len(counts), dtype=small)

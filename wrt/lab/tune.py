@@ -1,30 +1,30 @@
-"""`wrt.tune`: which structure, which blocks and which place for the stack are fastest on the device at hand."""
+"""`wrt.tune`: which structure is fastest on a device, and on CUDA in which blocks and with which place for the stack."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.core import cuda
 from wrt.core.checks import as_one
 from wrt.core.device import start
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.tuned import BLOCK_DIMS, DEFAULT, STACKS, STRUCTURES, Choice, keep, place_for, using
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.hard_cases.contestants import Own
 
+STRUCTURES = ("bvh8", "bvh2", "bvh4", "bvh8c")  # the default first
 CELLS = 320  # a side of the terrain: 204,800 triangles, of which no GPU's first cache holds much
 KINDS = ("primary", "shadow", "diffuse")  # what a picture asks
 FAST, SLOW = 1 << 20, 1 << 15  # rays on CUDA, and on the CPU
@@ -34,53 +34,75 @@ COLUMNS: Columns = {"structure": "{accel}", "block": "{block}", "stack": "{stack
                     "Mray/s": lambda row: spread(row.mrays), "times as fast as the default": "{speed:.2f}"}
 LEGEND = """\
 Rays and answers are on the device; median of the runs by turns, the middle half of them in brackets. The last column: the geometric
-mean over the kinds of rays."""
+mean over the kinds of rays. Block and stack are settings of wrt.core.cuda."""
+
+
+class Choice(NamedTuple):
+    """accel: a name in ACCELERATORS; block_dim, stack: settings of wrt.core.cuda."""
+
+    accel: str = STRUCTURES[0]
+    block_dim: int = cuda.BLOCK_DIMS[0]
+    stack: str = cuda.STACKS[0]
+
+
+DEFAULT = Choice()
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """choice: what is kept, in `path`; speeds: of every choice that was measured, over the default's; rows: the measurements."""
+    """best: the fastest choice; speeds: of every choice that was measured, over the default's; rows: the measurements."""
 
-    choice: Choice
-    path: Path
+    device: str
+    best: Choice
     machine: str
     speeds: Mapping[Choice, float]
     rows: list[Row]
 
+    @property
+    def arguments(self) -> dict[str, str]:
+        """What `wrt.build` and `wrt.render` take."""
+        return {"accel": self.best.accel, "device": self.device}
+
     def text(self) -> str:
-        block = "" if self.rows[0].block == "" else f" in blocks of {self.choice.block_dim} threads, stack {self.choice.stack}"
-        found = f"Chosen: {self.choice.accel}{block}, kept in {self.path}; without that file it is the default again."
+        block = f" in blocks of {self.best.block_dim} threads, stack {self.best.stack}" if self.rows[0].block else ""
+        words = ", ".join(f'{name}="{value}"' for name, value in self.arguments.items())
+        options = " ".join(f"--{name} {value}" for name, value in self.arguments.items())
+        found = f"Fastest: {self.best.accel}{block}. In Python write {words}; for commands {options}."
         return markdown([tabled(COLUMNS, self.rows, "Tuning", f"Machine: {self.machine}\n\n{found}\n\n{LEGEND}")])
 
     def as_dict(self) -> dict[str, Any]:
-        return {"machine": self.machine, "choice": asdict(self.choice), "path": str(self.path),
+        return {"machine": self.machine, "arguments": self.arguments, "best": self.best._asdict(),
                 "rows": [row.as_dict() for row in self.rows]}
 
 
-def tune(device: str, seconds: float = 1.0, clock: Callable[[], float] = time.perf_counter) -> Tuning:
-    """Measure the structures of STRUCTURES, then on CUDA the winner in blocks of other sizes and with its stack in either place,
-    for so many seconds in all (after compiling and building, which take longer), and keep the best for this kind of device: "bvh"
-    then means that structure.
+def tune(device: str, seconds: float = 1.0) -> dict[str, str]:
+    """Return the arguments `accel` and `device` of the fastest structure there, for `wrt.build(mesh, **it)` and
+    `wrt.render(scene, **it)`.
 
-    Hits and pixels have the same bits whatever is chosen; what a picture's stats tell of nodes and seconds changes. Raises
-    InputError where there is no such device, and where the choice cannot be kept.
+    The structures of STRUCTURES are measured for so many seconds in all, after compiling and building, which take longer. bvh8 is
+    chosen unless another is 3 % faster. Hits and pixels have the same bits whatever is chosen. Raises InputError where there is no
+    such device.
     """
+    return measured(device, seconds).arguments
+
+
+def measured(device: str, seconds: float = 1.0, clock: Callable[[], float] = time.perf_counter) -> Tuning:
+    """As `tune`, with all that was measured; on CUDA also the fastest structure in blocks of other sizes and with its stack in
+    either place."""
     there = start(as_one(device, str, "device"))
     if not as_one(seconds, (int, float), "seconds") > 0.0:
         raise InputError(f"seconds must be more than 0, got {seconds}")
-    place_for(there)  # where nothing can be kept, that is told before anything is measured
     geometry = Geometry.of(terrain(CELLS))
     rays = ray_sets(build(geometry, DEFAULT.accel, device), FAST if there.is_cuda else SLOW)
     phases = 2 if there.is_cuda else 1
-    measured = measure([Choice(accel) for accel in STRUCTURES], geometry, rays, there, seconds / phases, clock)
-    rows, speeds = measured
+    rows, speeds = measure([Choice(accel) for accel in STRUCTURES], geometry, rays, there, seconds / phases, clock)
     best = fastest(speeds)
     if there.is_cuda:
-        others = [DEFAULT, *(Choice(best.accel, block, stack) for block in BLOCK_DIMS for stack in STACKS)]
-        measured = measure(list(dict.fromkeys(others)), geometry, rays, there, seconds / phases, clock)
-        rows, speeds = rows + measured[0], speeds | measured[1]
-        best = fastest(measured[1])
-    return Tuning(best, keep(there, best), machine_line(f"Warp {wp.__version__}", device=device), speeds, rows)
+        others = [DEFAULT, *(Choice(best.accel, block, stack) for block in cuda.BLOCK_DIMS for stack in cuda.STACKS)]
+        more = measure(list(dict.fromkeys(others)), geometry, rays, there, seconds / phases, clock)
+        rows, speeds = rows + more[0], speeds | more[1]
+        best = fastest(more[1])
+    return Tuning(device, best, machine_line(f"Warp {wp.__version__}", device=device), speeds, rows)
 
 
 def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet], device: Any, seconds: float,
@@ -111,6 +133,10 @@ def fastest(speeds: Mapping[Choice, float]) -> Choice:
 
 
 def ask(choice: Choice, search: Callable[[], Any], device: Any) -> None:
-    with using(device, choice):
+    before = cuda.block_dim, cuda.stack
+    cuda.block_dim, cuda.stack = choice.block_dim, choice.stack
+    try:
         search()
         wp.synchronize_device(device)
+    finally:
+        cuda.block_dim, cuda.stack = before

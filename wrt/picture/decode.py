@@ -12,23 +12,19 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.core.memory import require
 from wrt.core.packages import needed_by
 
 # Pillow has others, such as EPS, that run programs or have no place here.
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF")
 MAX_SIDE = 32768  # pixels
 MAX_PIXELS = 1 << 27  # of codes: 16384x8192
-# Of memory while it is decoded: Pillow's picture, its copy as RGBA, its bytes and the array; at 16 bits, two pictures and codes.
-BYTES_OF_PIXEL, BYTES_OF_PIXEL16 = 16.0, 24.0
 
 
-def check_size(width: int, height: int, bytes_of_pixel: float, most: int = MAX_PIXELS) -> None:
+def check_size(width: int, height: int, most: int = MAX_PIXELS) -> None:
     """Raise InputError where a picture is too large to be read, with its size and the limit."""
     if max(width, height) > MAX_SIDE or width * height > most:
         limits = f"at most {MAX_SIDE} a side and {most} pixels are read"
         raise InputError(f"cannot be read as an image: it is {width}x{height}; {limits}")
-    require(width * height * bytes_of_pixel, f"a picture of {width}x{height}")
 
 
 def decode_rgba8(data: bytes, formats: tuple[str, ...] = FORMATS) -> np.ndarray:
@@ -51,7 +47,7 @@ def decode_png16(data: bytes) -> np.ndarray:
     the other order. Grey with alpha has four bytes a pixel: as RGBA, they come all. (OpenImageIO keeps both, but its
     libpng writes to stderr what is wrong with a damaged file.)
     """
-    with _opened(data, ("PNG",), BYTES_OF_PIXEL16) as picture:
+    with _opened(data, ("PNG",)) as picture:
         order = picture.tile[0][3] if picture.tile else ""
         if picture.mode.startswith("I"):
             return np.repeat(np.asarray(picture).astype(np.uint16)[..., None], 3, axis=2)
@@ -76,7 +72,7 @@ def size_of(data: bytes, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
 
 
 @contextmanager
-def _opened(data: bytes, formats: tuple[str, ...], bytes_of_pixel: float = BYTES_OF_PIXEL) -> Iterator[Any]:
+def _opened(data: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
     """The picture, whose pixels are decoded when they are asked for."""
     with needed_by("a picture in a file"):
         from PIL import Image, UnidentifiedImageError
@@ -86,9 +82,9 @@ def _opened(data: bytes, formats: tuple[str, ...], bytes_of_pixel: float = BYTES
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of pictures above half of Pillow's own limit, of metadata that nobody asks for
             with Image.open(io.BytesIO(data), formats=[name for name in formats if name in Image.OPEN]) as picture:
-                check_size(*picture.size, bytes_of_pixel)
+                check_size(*picture.size)
                 yield picture
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except UnidentifiedImageError:
         raise InputError(f"cannot be read as an image: it is none of {', '.join(formats)}") from None

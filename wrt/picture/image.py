@@ -21,7 +21,6 @@ import numpy as np
 from wrt.core import write_file
 from wrt.core.errors import InputError, SceneWarning
 from wrt.core.files import open_regular, read_file
-from wrt.core.memory import require
 from wrt.core.packages import needed_by
 from wrt.core.write_file import replacing
 from wrt.picture.decode import FORMATS as FORMATS_READ
@@ -39,7 +38,6 @@ PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _MAGIC = {".exr": (b"\x76\x2f\x31\x01",), ".hdr": (b"#?RADIANCE", b"#?RGBE")}
 MAX_LINEAR_PIXELS = 1 << 28  # of an environment: 24576x10922, or 16384x16384
 HALF_MAX = 65504.0
-BYTES_OF_PIXEL = 13.0  # of memory, of a picture of colours
 EXACT_IN_FLOAT = 1 << 24  # every integer up to here is a float32
 
 
@@ -233,7 +231,6 @@ def read_image(path: PathLike) -> np.ndarray:
     with _told(path):
         deep = data[:8] == PNG_MAGIC and data[24:25] == b"\x10"
         codes = decode_png16(data) if deep else decode_rgba8(data, _formats(path))[..., :3]
-        require(BYTES_OF_PIXEL * codes.shape[0] * codes.shape[1], f"a picture of {codes.shape[1]}x{codes.shape[0]}")
     del data
     levels = np.iinfo(codes.dtype).max
     table = decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)
@@ -262,7 +259,7 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
     with _opened(path) as source:
         spec = source.spec()
         with _told(path):
-            check_size(spec.width, spec.height, 8.0 * spec.nchannels + BYTES_OF_PIXEL, MAX_LINEAR_PIXELS)
+            check_size(spec.width, spec.height, MAX_LINEAR_PIXELS)
         if spec.depth > 1 or spec.deep:
             raise InputError("cannot be read as an image: it has no flat pixels", path)
         pixels = source.read_image("float")

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.core.memory import require
 from wrt.core.packages import needed_by
 from wrt.picture.tonemap import encode_srgb, tone_map
 
@@ -21,8 +20,6 @@ PIXELS_PER_DEGREE = 3840 * math.pi / 180  # FLIP's default: a screen 3840 pixels
 FLIP_REACH = 10  # rows and columns to the farthest neighbour that counts, at that many pixels a degree
 HIGHER_IS_BETTER = ("psnr",)
 PIXELS_AT_ONCE, LEAST_ROWS = 1 << 17, 16  # of a band of rows
-# Of memory, measured: of a pixel of one picture; of a pixel in a comparison beside both pictures; of one of a band.
-BYTES_OF_PICTURE, BYTES_OF_PIXEL, BYTES_IN_BAND = 12.0, 26.0, 400.0
 
 
 def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str = "none") -> dict[str, Any]:
@@ -38,7 +35,6 @@ def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str
     InputError where the sizes differ.
     """
     a, b = _pair(a, b)
-    require(bytes_to_compare(a.shape[1], a.shape[0]), f"the comparison of two pictures of {a.shape[1]}x{a.shape[0]}")
     finite, result = _finite(a, b)
     if not finite.any():
         return result | dict.fromkeys(("mse", "relmse", "max_abs", "mean_ratio", "psnr", "flip"), math.nan)
@@ -91,17 +87,9 @@ def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str
 
 
 def check_sizes(a: tuple[int, int], b: tuple[int, int]) -> None:
-    """Raise InputError where two pictures of such widths and heights cannot be compared, or not in the memory that there is, before
-    they are read."""
+    """Raise InputError where two pictures of such widths and heights cannot be compared, before they are read."""
     if a != b:
         raise InputError(f"the pictures have different sizes, {a[0]}x{a[1]} and {b[0]}x{b[1]}")
-    require(2.0 * BYTES_OF_PICTURE * a[0] * a[1] + bytes_to_compare(*a), f"the comparison of two pictures of {a[0]}x{a[1]}")
-
-
-def bytes_to_compare(width: int, height: int) -> float:
-    """Memory that `compare` and `difference_image` take at most beside the pictures."""
-    rows = max(LEAST_ROWS, PIXELS_AT_ONCE // width) + 2 * FLIP_REACH
-    return BYTES_OF_PIXEL * width * height + BYTES_IN_BAND * width * min(rows, height)
 
 
 def _bands(picture: np.ndarray) -> Iterator[slice]:
@@ -201,7 +189,6 @@ def difference_image(a: np.ndarray, b: np.ndarray, *, limit: float | None = None
     Raises InputError where the sizes differ.
     """
     a, b = _pair(a, b)
-    require(bytes_to_compare(a.shape[1], a.shape[0]), f"the difference of two pictures of {a.shape[1]}x{a.shape[0]}")
     height, width = a.shape[:2]
     signed, finite = np.empty((height, width), np.float32), np.empty((height, width), dtype=bool)
     for rows in _bands(signed):

@@ -17,7 +17,8 @@ from wrt.scene.settings import Settings
 # Independent sequences a pixel where the error is asked for. Over a picture, four tell the error as well as eight do (what they
 # miss is averaged over the pixels), and long sequences are better than many: eight have up to 1.4 times the error of four.
 GROUPS = 4
-BYTES_OF_FILM, BYTES_OF_GROUP = 52, 20  # a pixel; of one film, and of each further group
+# A pixel: of one film, with the picture that becomes of it and is written; of each further group; of AOVs.
+BYTES_OF_FILM, BYTES_OF_GROUP, BYTES_OF_AOVS = 132, 20, 36
 OF_A_GROUP = {"mean": wp.vec3, "samples": wp.int32, "lost": wp.float32}
 # Of the brightness around: a difference that people see in a detail of some pixels (in a large patch, less than half of it).
 VISIBLE = 0.05

@@ -8,14 +8,14 @@ from typing import Any
 
 from wrt.accel.instancing import instanced_meshes
 from wrt.accel.structure import Structure
-from wrt.accel.structures import ACCELERATORS, chosen, meant, stack_on
-from wrt.core.device import made_once
+from wrt.accel.structures import ACCELERATORS, meant, stack_on
+from wrt.core.device import made_once, memory_of
 from wrt.core.errors import InputError
 from wrt.kernels import structs
 from wrt.kernels.shade import render as kernels
 from wrt.kernels.traverse.common import Units
 from wrt.renderer.features import Features, features_of
-from wrt.renderer.film_arrays import GROUPS
+from wrt.renderer.film_arrays import BYTES_OF_AOVS, BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS
 from wrt.renderer.options import Options
 from wrt.renderer.upload import camera_kind
 from wrt.renderer.waves import WaveKernels, wave_kernels
@@ -63,6 +63,14 @@ class Plan:
         """Pixels of the crop."""
         x0, y0, x1, y1 = self.crop
         return (x1 - x0) * (y1 - y0)
+
+    def require_memory(self, device: Any) -> None:
+        """Raise InputError where the film, with the picture that becomes of it, is larger than the memory of the device."""
+        x0, y0, x1, y1 = self.crop
+        pixel = BYTES_OF_FILM + BYTES_OF_GROUP * (self.groups - 1) + (BYTES_OF_AOVS if self.options.aov else 0)
+        if self.area * pixel > (there := memory_of(device)):
+            raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {self.area * pixel / 2**30:.1f} GiB of memory; {device} has"
+                             f" {there / 2**30:.1f}")
 
     @property
     def by_waves(self) -> bool:
@@ -117,15 +125,13 @@ class Plan:
 
 
 def plan_of(scene: Scene, options: Options) -> Plan:
-    """What the device is tuned for is for renders of this process alone: a checkpoint and other workers may go on elsewhere. Raises
-    InputError for a camera or a crop that there is not."""
-    alone = options.checkpoint is None and options.executor is None
-    accel = chosen(options.accel, options.device) if alone else meant(options.accel)
+    """Raises InputError for a camera or a crop that there is not."""
+    accel = meant(options.accel)
     camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
     meshes = instanced_meshes(scene, options.instancing)
     features = features_of(scene, camera, meshes)
     units = Units(options.triangle, options.box, features.spheres, instances=features.instances,
-                  stack=stack_on(options.device, tuned=alone))
+                  stack=stack_on(options.device))
     return Plan(scene, options, camera, accel, meshes, features, Structure(ACCELERATORS[accel], units),
                 _crop(scene.settings, options), scene.settings.max_depth)
 

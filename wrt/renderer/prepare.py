@@ -19,7 +19,6 @@ from wrt.core.seconds import Span, counted_once, loads_since
 from wrt.core.threads import thread_count
 from wrt.renderer.clear_boxes import put_clear_boxes
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
-from wrt.renderer.memory_estimate import require_memory
 from wrt.renderer.options import Progress
 from wrt.renderer.pixels import aov_launch, film_launch
 from wrt.renderer.plan import Plan
@@ -54,7 +53,7 @@ class Prepared:
         """For another camera and other settings: as Plan.aimed. angles_of: a size with the picture's shape, where the picture's
         own is rounded: that would change the angle of view."""
         plan = self.plan.aimed(camera, **settings)
-        require_memory(plan, self.device)
+        plan.require_memory(self.device)
         return replace(self, plan=plan, camera=camera_struct(camera, angles_of or plan.scene.settings.size))
 
     def kind(self) -> str:

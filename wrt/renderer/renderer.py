@@ -20,7 +20,6 @@ from wrt.core.errors import InputError, SceneWarning
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import checkpoint_of
 from wrt.renderer.clear_boxes import put_clear_boxes
-from wrt.renderer.memory_estimate import require_memory
 from wrt.renderer.options import Options
 from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import kind_of, prepare
@@ -41,7 +40,7 @@ class Renderer:
             raise InputError("an executor or several devices are for wrt.render; this runs on one device")
         device = start(options.device)
         plan = plan_of(scene, options)
-        require_memory(plan, device)
+        plan.require_memory(device)
         self.checkpoint = checkpoint_of(plan, kind_of(device))
         if once and (builder := builder_for(plan)):  # after the checkpoint: another render of it may take another tree
             plan = replace(plan, options=replace(options, accel_options=builder | options.accel_options))

@@ -10,13 +10,11 @@ import numpy as np
 
 from wrt.core.checks import as_integer
 from wrt.core.errors import InputError
-from wrt.core.memory import require
 from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh
 from wrt.scene.values import as_number, as_vector
 
 Point = Sequence[float] | np.ndarray
-BYTES_OF_FACE = 190.0  # of memory while a shape is made, measured
 MAX_FACES = 1 << 23  # of one shape: some words of a scene file must not ask for all memory, or for minutes
 
 
@@ -66,7 +64,6 @@ _BOX_FACES.flags.writeable = _BOX_UVS.flags.writeable = False  # all boxes share
 def icosphere(subdivisions: int = 3, radius: float = 1.0) -> Mesh:
     """A ball of 20 * 4^subdivisions nearly equal triangles around the origin, with exact normals and no uvs."""
     subdivisions = as_integer(subdivisions, "icosphere: subdivisions", 0, 9)
-    require(BYTES_OF_FACE * 20 * 4**subdivisions, f"an icosphere of {20 * 4**subdivisions} triangles")
     radius = as_number(radius, "icosphere radius", low=1e-30)
     golden = 0.5 + math.sqrt(1.25)
     corner = np.array([[a, b * golden, 0.0] for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
@@ -255,7 +252,6 @@ def _require_segments(shape: str, *segments: int, rows: int = 1) -> None:
     faces = 2 * rows * math.prod(segments)
     if faces > MAX_FACES:
         raise InputError(f"{shape}: {faces} triangles; at most {MAX_FACES} are made")
-    require(BYTES_OF_FACE * faces, f"a {shape} of {faces} triangles")
 
 
 SHAPES: dict[str, Callable[..., Mesh]] = {

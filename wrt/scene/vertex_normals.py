@@ -6,10 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wrt.core.memory import require
 from wrt.scene.mesh import Mesh
-
-BYTES_OF_FACE, BYTES_OF_VERTEX = 450.0, 100.0  # of memory, measured
 
 
 def smooth(mesh: Mesh) -> Mesh:
@@ -22,7 +19,6 @@ def smooth(mesh: Mesh) -> Mesh:
     """
     if mesh.normals is not None:
         return mesh
-    require(BYTES_OF_FACE * len(mesh.faces) + BYTES_OF_VERTEX * len(mesh.vertices), "smoothing a mesh")
     points = mesh.vertices.astype(np.float64)[mesh.faces]
     edges = np.roll(points, -1, axis=1) - points  # from each corner to the next
     normal = np.cross(edges[:, 0], edges[:, 1])

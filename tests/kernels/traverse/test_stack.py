@@ -16,8 +16,8 @@ import warp as wp
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import place
+from wrt.core.cuda import STACKS
 from wrt.core.device import launch_on
-from wrt.core.tuned import STACKS, Choice, using
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import ENTRY
 from wrt.kernels.traverse.stack import PLACES, SHARED, make_stack
@@ -46,11 +46,11 @@ def make_probe_kernel(where: str) -> Any:
 
 
 @pytest.mark.parametrize("where", PLACES)
-def test_what_is_put_is_there_and_each_thread_has_its_own(where: str) -> None:
+def test_what_is_put_is_there_and_each_thread_has_its_own(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     out = wp.zeros((THREADS, SIZE), dtype=wp.uint64, device=DEVICE)
     places = wp.zeros(THREADS, dtype=wp.uint64, device=DEVICE)
-    with using(DEVICE, Choice(block_dim=BLOCK)):
-        launch_on(DEVICE, make_probe_kernel(where), THREADS, out, places, None)
+    monkeypatch.setattr("wrt.core.cuda.block_dim", BLOCK)
+    launch_on(DEVICE, make_probe_kernel(where), THREADS, out, places, None)
     expected = 1000 * np.arange(THREADS)[:, None] + np.arange(SIZE)
     expected[:, 3] = 7
     assert (out.numpy() == expected).all()
@@ -65,7 +65,8 @@ def test_what_is_put_is_there_and_each_thread_has_its_own(where: str) -> None:
 
 @pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0: the CPU has one place")
 @pytest.mark.parametrize(("name", "entry", "instances"), [("bvh8", 8, False), ("bvh2", ENTRY, False), ("bvh2", ENTRY, True)])
-def test_walks_have_the_same_answers_wherever_the_stack_is(name: str, entry: int, instances: bool) -> None:
+def test_walks_have_the_same_answers_wherever_the_stack_is(name: str, entry: int, instances: bool,
+                                                              monkeypatch: pytest.MonkeyPatch) -> None:
     """Among triangles that overlap, so that stacks become deeper than shared memory has room for; of instances' two walks both are
     under way at a time."""
     rng = np.random.default_rng(5)
@@ -81,8 +82,8 @@ def test_walks_have_the_same_answers_wherever_the_stack_is(name: str, entry: int
     deepest = np.asarray(here.closest_hit(*rays, counters=True).counters.stack)
     assert (hits.prim_id >= 0).any() and occluded.any() and not occluded.all() and (deepest > SHARED // entry).mean() > 0.1
     for stack in STACKS:
-        with using(there.device, Choice(stack=stack)):
-            found = there.closest_hit(*rays)
-            assert (there.any_hit(*rays, 0.0, ends) == occluded).all()
+        monkeypatch.setattr("wrt.core.cuda.stack", stack)
+        found = there.closest_hit(*rays)
+        assert (there.any_hit(*rays, 0.0, ends) == occluded).all()
         for field in ("t", "u", "v", "prim_id"):
             assert getattr(found, field).tobytes() == getattr(hits, field).tobytes()

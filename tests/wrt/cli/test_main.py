@@ -19,7 +19,6 @@ from PIL import Image
 from tests.command_line import BOX_OBJ, Result, largest_file, without_compiling
 from tests.command_line import wrt as run
 from tests.data import ROOT
-from tests.device import NAME
 from tests.picture_metadata import read_metadata
 from wrt import __version__
 from wrt.cli import common as cli_common
@@ -287,13 +286,6 @@ def test_what_is_found_late_names_the_scene_and_leaves_the_old_picture() -> None
     Path("bad.png").write_bytes(b"old")
     refused(run("render", "bad.toml", *SMALL), "bad.toml: sphere 'sieve': a cut-out texture needs a mesh")
     assert new_files() == {"bad.png"} and Path("bad.png").read_bytes() == b"old"
-
-
-def test_a_picture_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.renderer.memory_estimate.free_memory", lambda device: 2.0**20)
-    result = run("render", "box.obj", "--size", "4000x2000")
-    refused(result, f"box.obj: a picture of 4000x2000 takes 1.0 GiB of memory, its scene 0 MiB; {NAME} has 1 MiB free")
-    assert ("(WRT_MEMORY can say otherwise)" in result.err) == (NAME == "cpu")
 
 
 def test_no_memory_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -188,12 +188,10 @@ preload_headers()
 """
 
 
-@pytest.mark.parametrize("is_limited", [False, True])
-def test_headers_are_made_beforehand_where_there_is_room(is_limited: bool, tmp_path: Path):
-    limit = "import resource; resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))\n" if is_limited else ""
-    subprocess.run([sys.executable, "-c", limit + PRELOADED], cwd=ROOT, check=True, timeout=120,
+def test_headers_are_made_beforehand(tmp_path: Path):
+    subprocess.run([sys.executable, "-c", PRELOADED], cwd=ROOT, check=True, timeout=120,
                    env=os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)})
-    assert len(list(tmp_path.glob("*/precompiled-*/*.pch"))) == (0 if is_limited else 1)
+    assert len(list(tmp_path.glob("*/precompiled-*/*.pch"))) == 1
 
 
 def test_all_threads_share_the_precompiled_headers():

@@ -14,7 +14,7 @@ from tests.data import ROOT
 from wrt.core.device import (
     _stderr_without,
     describe_devices,
-    free_memory,
+    memory_of,
     records,
     start,
     upload,
@@ -35,7 +35,7 @@ def test_an_unknown_device_is_refused_with_those_there_are(name: str, capfd: pyt
 def test_the_cpu_is_there() -> None:
     assert start("cpu").is_cpu and start("cpu") is start("cpu")
     assert describe_devices()[0].startswith("cpu: ") and len(describe_devices()) == 1 + len(wp.get_cuda_devices())
-    assert free_memory(start("cpu")) > 2**28
+    assert memory_of(start("cpu")) > 2**28
 
 
 def test_stderr_loses_only_the_lines_that_are_not_wanted(capfd: pytest.CaptureFixture[str]) -> None:

@@ -1,92 +1,98 @@
-"""What is free is told by the system, by control groups and by limits, and can be overruled."""
+"""Where the memory does not suffice, a command ends with one message, and Python gets a MemoryError."""
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from tests.data import ROOT
-from wrt.core import memory
-from wrt.core.errors import InputError
+from wrt.io.mesh_file import load_mesh
+from wrt.io.meshes import ply
+from wrt.scene.shapes import icosphere
+
+LIMITED = """
+import json, resource, sys, warnings
+from pathlib import Path
+from tests.command_line import wrt
+warnings.simplefilter("ignore")
+small, large, *arguments = sys.argv[1:]
+sound = wrt(*(each.replace("FILE", small) for each in arguments))  # imports, compiles
+assert sound.code == 0, sound.err
+before = set(Path().iterdir())
+size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + (64 << 20)
+resource.setrlimit(resource.RLIMIT_AS, (size, size))
+code, err = wrt(*(each.replace("FILE", large) for each in arguments))[::2]
+print(json.dumps([code, err, sorted(map(str, set(Path().iterdir()) - before))]))
+"""
 
 
-@pytest.fixture(autouse=True)
-def nothing_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("WRT_MEMORY", raising=False)
+def obj(path: Path, n: int) -> None:
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * n)
 
 
-def test_it_is_at_most_what_the_machine_has() -> None:
-    assert 2**26 < memory.available() <= os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+def stl(path: Path, n: int) -> None:
+    triangle = np.zeros(1, "12f4, u2")
+    triangle["f0"][0, 3:] = [0, 0, 0, 1, 0, 0, 0, 1, 0]
+    path.write_bytes(bytes(80) + n.to_bytes(4, "little") + triangle.tobytes() * n)
 
 
-@pytest.mark.parametrize(("text", "size"), [("24G", 24 * 2**30), ("24 GiB", 24 * 2**30), ("100", 100), ("1.5m", 1.5 * 2**20)])
-def test_it_can_be_said(text: str, size: float, say_memory: Callable[[str], None]) -> None:
-    say_memory(text)
-    assert memory.available() == size
+def toml(path: Path, n: int) -> None:
+    path.write_text("[[spheres]]\ncenter = [0, 0, 0]\nradius = 1\nmaterial = 'm'\n" * n + "[materials.m]\n")
 
 
-@pytest.mark.parametrize("text", ["much", "-1", "1e9", "G", "10 P"])
-def test_what_is_no_size(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WRT_MEMORY", text)
-    with pytest.raises(InputError, match="WRT_MEMORY: must be a number of bytes"):
-        memory.available()
+def png(path: Path, n: int) -> None:
+    side = int(n**0.5)
+    Image.fromarray(np.zeros((side, side, 3), np.uint8)).save(path, compress_level=1)
 
 
-def test_a_refusal_tells_both_numbers(say_memory: Callable[[str], None]) -> None:
-    say_memory("1G")
-    memory.require(2.0**30, "it")
-    with pytest.raises(InputError, match=r"^it takes 1\.5 GiB of memory; 1\.0 GiB are free \(WRT_MEMORY can say otherwise\)$"):
-        memory.require(1.5 * 2**30, "it")
+@pytest.mark.parametrize(("write", "suffix", "n", "command"), [
+    (obj, ".obj", 3_000_000, ("render", "FILE", "-o", "new.png", "--size", "8x8", "--spp", "1")),
+    (obj, ".obj", 3_000_000, ("build", "FILE", "-o", "new.accel")),
+    (stl, ".stl", 1_000_000, ("info", "FILE")),
+    (toml, ".toml", 200_000, ("validate", "FILE")),
+    (png, ".png", 80_000_000, ("compare", "FILE", "FILE")),
+], ids=["render", "build", "stl", "toml", "png"])
+def test_a_command_ends_with_one_message(write, suffix: str, n: int, command: tuple[str, ...], tmp_path: Path) -> None:
+    write(tmp_path / f"small{suffix}", 20)
+    write(tmp_path / f"large{suffix}", n)
+    done = subprocess.run([sys.executable, "-c", LIMITED, f"small{suffix}", f"large{suffix}", *command], cwd=tmp_path,
+                          env={**os.environ, "PYTHONPATH": str(ROOT)},
+                          capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    code, err, new = json.loads(done.stdout.splitlines()[-1])
+    assert code == 2 and new == []
+    assert err.startswith("error: not enough memory") and err.count("\n") == 1
 
 
-def test_what_is_said_is_for_all_that_the_process_takes(say_memory: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    say_memory("1G")
-    monkeypatch.setattr(memory, "resident", lambda: memory._AT_START + 0.75 * 2**30)
-    assert memory.available() == 2**28
-    with pytest.raises(InputError, match=r"^it takes 0\.3 GiB of memory; 0\.2 GiB are free"):
-        memory.require(0.3 * 2**30, "it")
-    monkeypatch.setattr(memory, "resident", lambda: memory._AT_START + 2.0**31)
-    assert memory.available() == 0.0
-    monkeypatch.setattr(memory, "resident", lambda: 0.0)  # the system does not tell, or it has been given back
-    assert memory.available() == 2**30
+def test_python_gets_a_memory_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def fail(path: Path) -> None:
+        raise MemoryError("no room")
+
+    obj(tmp_path / "a.obj", 1)
+    monkeypatch.setattr("wrt.io.meshes.obj.read_file", fail)
+    with pytest.raises(MemoryError, match="no room"):
+        load_mesh(tmp_path / "a.obj")
 
 
-def test_resident_is_what_is_in_use() -> None:
-    if not Path("/proc/self/statm").exists():
-        pytest.skip("only Linux tells")
-    before = memory.resident()
-    kept = b"x" * (100 << 20)
-    assert 0.9 * len(kept) < memory.resident() - before < 1.2 * len(kept)
+def test_lists_of_one_length_are_counted_once(tmp_path: Path) -> None:
+    """Rows of one byte: their lengths take no eight bytes each."""
+    import tracemalloc
 
-
-def test_the_limit_of_address_space_counts() -> None:
-    code = ("import resource; resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30)); from wrt.core.memory import available;"
-            " print(available())")
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True,
-                          env=os.environ | {"OPENBLAS_NUM_THREADS": "1"})
-    assert 2**26 < float(done.stdout) < 2**30
-
-
-@pytest.mark.parametrize(("line", "root", "files"), [
-    ("0::/a/b", "", {"memory.max": "max", "memory.current": "5"}),
-    ("4:memory:/a/b", "memory", {"memory.limit_in_bytes": "9223372036854771712", "memory.usage_in_bytes": "5"}),
-])
-def test_control_groups_and_those_that_hold_them_count(line: str, root: str, files: dict[str, str], tmp_path: Path,
-                                                       monkeypatch: pytest.MonkeyPatch) -> None:
-    limit, use = files
-    cache = "inactive_file" if root == "" else "total_inactive_file"
-    for name, most in (("a/b", files[limit]), ("a", "1000"), (".", files[limit])):
-        folder = tmp_path / "tree" / name
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / limit).write_text(most + "\n")
-        (folder / use).write_text("700\n")
-        (folder / "memory.stat").write_text(f"anon 3\n{cache} 200\n")
-    monkeypatch.setattr(memory, "_GROUPS", {root: (tmp_path / "tree", limit, use, cache)})
-    read_text = Path.read_text
-    monkeypatch.setattr(Path, "read_text", lambda self: line + "\n" if str(self) == "/proc/self/cgroup" else read_text(self))
-    assert memory.available() == 1000 - 700 + 200
+    header = ("ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+              "element face 1\nproperty list uchar int vertex_indices\n"
+              "element junk 4000000\nproperty list uchar uchar a\nend_header\n")
+    body = icosphere(0).vertices[:3].tobytes() + b"\3" + np.arange(3, dtype=np.int32).tobytes() + bytes(4_000_000)
+    (tmp_path / "a.ply").write_bytes(header.encode() + body)
+    tracemalloc.start()
+    try:
+        assert len(ply.read(tmp_path / "a.ply").faces) == 1
+        assert tracemalloc.get_traced_memory()[1] < 3 * 4_000_000
+    finally:
+        tracemalloc.stop()

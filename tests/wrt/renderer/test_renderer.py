@@ -513,9 +513,9 @@ def test_progress_is_told_of_a_structure_that_is_slow_to_build(monkeypatch: pyte
 
 
 def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.renderer.memory_estimate.free_memory", lambda device: 2.0**30)
+    monkeypatch.setattr("wrt.renderer.plan.memory_of", lambda device: 2.0**30)
     monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("work was done"))
-    with pytest.raises(InputError, match=rf"4096x4096 takes 2\.1 GiB of memory, its scene 0 MiB; {NAME} has 1\.0 GiB free"):
+    with pytest.raises(InputError, match=rf"4096x4096 takes 2\.1 GiB of memory; {NAME} has 1\.0"):
         render(SCENE, size=(4096, 4096))
 
 

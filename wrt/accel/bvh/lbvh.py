@@ -10,12 +10,11 @@ from wrt.accel.bvh.refit import Fitting, tree_of
 from wrt.accel.bvh.top_down import build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch_on, require_on, start
+from wrt.core.device import launch_on, start
 from wrt.core.errors import InputError
 from wrt.kernels.build import lbvh as kernels
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
-BYTES = 400.0  # of a GPU's memory for each primitive, at the peak: what is below, and as much as the keys for the sort
 MOST = 1 << 30  # the sort has room for two of each
 
 
@@ -34,7 +33,6 @@ def build_on(device: Any, shape: Any, options: BvhOptions, threads: int = 1) -> 
     n = len(shape.faces) + len(shape.spheres)
     if n >= MOST:
         raise InputError(f"the builder lbvh takes fewer than {MOST} primitives, got {n}")
-    require_on(device, n * BYTES, f"a tree over {n} primitives")
     number_bits, bits = kernels.bits_of(n)
     fitting = Fitting(device, n, n - 1)
     fitting.find_bounds(shape, threads)

@@ -57,7 +57,6 @@ class Bvh2Kdop(BinaryBvh):
 
     name = "bvh2_kdop"
     kernels = traverse_bvh2_kdop
-    bytes_to_build = 300.0
 
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         middle = middle_of(nodes)

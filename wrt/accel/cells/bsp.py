@@ -43,8 +43,6 @@ class Bsp(Accelerator):
 
     name = "bsp"
     kernels = kernels
-    bytes_to_build = 4000.0
-    bytes_on_device = 400.0
 
     def _build(self, cost_intersection: float = 75.0, cost_axis: float = 10.0, cost_plane: float = 20.0, samples: int = 128,
                max_depth: int = 0, max_growth: float = 16.0, max_triangles: int = 500_000,

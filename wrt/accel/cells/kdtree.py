@@ -23,8 +23,6 @@ class KdTree(Accelerator):
 
     name = "kdtree"
     kernels = kernels
-    bytes_to_build = 700.0
-    bytes_on_device = 400.0
 
     def _build(self, max_leaf: int = 1, max_depth: int | None = None, by_cost: bool = True, cost_traversal: float = 2.0,
                cost_intersection: float = 1.0, empty_bonus: float = 0.1, perfect_below: int = 65536, clip: bool = True,

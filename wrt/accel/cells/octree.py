@@ -22,7 +22,6 @@ class Octree(Accelerator):
 
     name = "octree"
     kernels = kernels
-    bytes_to_build = 450.0
 
     def _build(self, max_leaf: int = 8, max_depth: int = kernels.MAX_LEVELS, by_cost: bool = True, max_growth: float = 16.0,
                mailbox: bool = True) -> Built:

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError, at
-from wrt.core.memory import Meter
 from wrt.io.gltf.document import Document
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_COUNT = 2**31 - 1
-BYTES_OF_NORMALISED = 16.0  # of memory that a value takes while it becomes a float32
 _MAX_IMPLICIT_COUNT = 2**22  # zeros that no buffer stands behind: a file of a few bytes must not ask for all memory
 
 
@@ -26,7 +24,6 @@ class Accessors:
     def __init__(self, document: Document) -> None:
         self._document = document
         self._arrays: dict[int, np.ndarray] = {}
-        self._meter = Meter()
 
     def read(self, index: int, kind: str, place: str) -> np.ndarray:
         """Accessor `index` as (count, width of `kind`), float32 or its own integer type where it is not normalised.
@@ -51,14 +48,12 @@ class Accessors:
         if accessor.bufferView is not None:
             array = self._elements(accessor.bufferView, accessor.byteOffset or 0, dtype, (count, width), where)
         elif accessor.sparse is not None:
-            self._meter.take(2.0 * count * width * dtype.itemsize, "the accessors")
             array = np.zeros((count, width), dtype)
         else:
             raise InputError("has no data: neither a bufferView nor sparse values", None, where)
         if accessor.sparse is not None:
             array = self._with_sparse(array, accessor.sparse, f"{where}.sparse")
         if accessor.normalized:
-            self._meter.take(BYTES_OF_NORMALISED * array.size, "the accessors")
             array = _normalised(array, where)
         if array.dtype.kind == "f":
             bad = ~np.isfinite(array).all(axis=1)
@@ -80,7 +75,6 @@ class Accessors:
         if offset < 0 or end > len(data):
             raise InputError(f"{shape[0]} elements reach from byte {offset} to {end} of bufferViews[{view}], "
                              f"which has {len(data)}", None, where)
-        self._meter.take(2.0 * shape[0] * size, "the accessors")  # with what is asked of them
         elements = np.ndarray(shape, dtype, data.data, offset, (stride, dtype.itemsize))
         return elements.astype(dtype.newbyteorder("="))
 

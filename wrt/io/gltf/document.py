@@ -21,16 +21,10 @@ import numpy as np
 from wrt.core.checks import short
 from wrt.core.errors import InputError, at
 from wrt.core.files import read_file
-from wrt.core.memory import require
 from wrt.core.packages import needed_by
 from wrt.io.gltf.schema import read_as
 
 GLB_MAGIC = b"glTF"
-# Of memory, at most, measured: of a byte of JSON in ASCII, of one where a character can take four bytes, and of each of these
-# marks, which stand for what they begin or part: an object, an array, a member, an element, and half of a text.
-BYTES_OF_ASCII, BYTES_OF_JSON = 3.0, 9.0
-BYTES_OF_MARK = {b"{": 1000.0, b"[": 90.0, b":": 150.0, b",": 40.0, b'"': 30.0}
-BYTES_OF_PERCENT = 60.0  # of a %41 in a data: URI
 BASE64_AT_ONCE = 1 << 22  # characters; a multiple of 4
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 
@@ -195,10 +189,6 @@ def _read_glb(data: bytes) -> tuple[Any, bytes | memoryview | None]:
 
 
 def _parse_json(data: bytes) -> Any:
-    ascii_only = data.isascii() and b"\\u" not in data
-    marks = sum(size * data.count(mark) for mark, size in BYTES_OF_MARK.items())
-    require((BYTES_OF_ASCII if ascii_only else BYTES_OF_JSON) * len(data) + marks, "the JSON")
-
     def refuse(constant: str) -> None:
         raise InputError(f"is not valid JSON: it holds {constant}")
 
@@ -242,15 +232,12 @@ def _decode_data_uri(uri: str) -> bytes | bytearray:
     is_base64 = uri[:comma].lower().endswith(";base64")
     if is_base64 and "%" not in uri:
         return _decode_base64(uri, comma + 1)
-    escapes = uri.count("%")
-    require(3.0 * len(uri) + BYTES_OF_PERCENT * escapes, f"a data: URI of {len(uri)} characters")
     data = unquote_to_bytes(uri[comma + 1:])
     return _decode_base64(data.decode("latin-1"), 0) if is_base64 else data
 
 
 def _decode_base64(text: str, begin: int) -> bytearray:
     """What stands behind `begin`, piece by piece: it may be most of the memory."""
-    require(0.75 * (len(text) - begin), f"a data: URI of {len(text)} characters")
     end = len(text) - 2 if text.endswith("==") else len(text) - 1 if text.endswith("=") else len(text)
     data = bytearray()
     try:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError, at
-from wrt.core.memory import Meter
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.schema import (
     EmissiveStrength,
@@ -54,7 +53,6 @@ class Textures:
     def __init__(self, document: Document) -> None:
         self._document = document
         self._images: dict[int, np.ndarray] = {}
-        self._meter = Meter()
         self._textures: dict[tuple[Any, ...], Texture] = {}
 
     def texture(self, info: Any, srgb: bool, material: str, place: str) -> Texture | None:
@@ -119,7 +117,6 @@ class Textures:
                 raise InputError("has neither a uri nor a bufferView", None, place)
             with at(place):
                 self._images[index] = decode_rgba8(data)
-                self._meter.take(self._images[index].nbytes, "the images")
         return self._images[index]
 
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError, at
-from wrt.core.memory import Meter
 from wrt.io.gltf.accessors import Accessors
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.nodes import compose
@@ -23,7 +22,6 @@ from wrt.scene.values import require_count
 # Attributes that are read, or named by who wants them (skins, textures), or are the application's own (underscore).
 # TANGENT is named where a normal map would use it: tangents are made from the texture coordinates.
 _NAMED_ELSEWHERE = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_", "JOINTS_", "WEIGHTS_", "_")
-BYTES_OF_VERTEX, BYTES_OF_INDEX = 60.0, 150.0  # of memory, while a mesh is made; an index can be a triangle of its own
 # What a node's instances may set, and what holds where they do not.
 _INSTANCE_ATTRIBUTES: dict[str, tuple[str, tuple[float, ...]]] = {
     "TRANSLATION": ("VEC3", (0.0, 0.0, 0.0)),
@@ -58,7 +56,6 @@ class Meshes:
         self._document = document
         self._accessors = Accessors(document)
         self._meshes: dict[tuple[Any, ...], Mesh | None] = {}
-        self._meter = Meter()
         self._instances = 0
 
     def mesh(self, primitive: Any, name: str, place: str) -> Mesh | None:
@@ -91,8 +88,6 @@ class Meshes:
                 raise InputError(f"has {len(array)} elements, POSITION has {len(positions)}", None,
                                  f"{place}.attributes.{attribute}")
         indices = self._indices(primitive, len(positions), place)
-        with at(place):
-            self._meter.take(BYTES_OF_VERTEX * len(positions) + BYTES_OF_INDEX * len(indices), "the mesh")
         if primitive.mode == 4 and len(indices) % 3:
             self._document.left_out.add("incomplete last triangles", "mesh", name)
         with at(place):

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from wrt.core.errors import InputError, SceneWarning, at
-from wrt.core.memory import Meter
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.materials import Materials
 from wrt.io.gltf.meshes import Meshes
@@ -32,8 +31,6 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 from wrt.scene.settings import Settings
 from wrt.scene.values import require_count
-
-BYTES_OF_OBJECT = 1200.0  # of memory
 
 
 def load_gltf(path: str | os.PathLike[str], *, staged: bool = True) -> Scene:
@@ -96,7 +93,6 @@ class _Reader:
         self._meshes = Meshes(self.document)
         self._materials = Materials(self.document)
         self._parts: dict[int, list[tuple[Mesh, Material]]] = {}  # of each mesh
-        self._meter = Meter()
         lights = self.document.extension(self.document.gltf, "KHR_lights_punctual", PunctualLights, "")
         self._punctual = lights.lights if lights else []
 
@@ -131,7 +127,6 @@ class _Reader:
         for mesh, material in self._parts[node.mesh]:
             with at(place):
                 require_count(len(self.objects) + len(transforms), "objects")
-                self._meter.take(BYTES_OF_OBJECT * len(transforms), "the scene")
                 self.objects += [Object(mesh, (material,), transform, name=name) for transform in transforms]
 
     def _parts_of(self, source: Any, number: int) -> Iterator[tuple[Mesh, Material]]:

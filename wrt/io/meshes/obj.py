@@ -22,15 +22,11 @@ import numpy as np
 from wrt.core.checks import short
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
-from wrt.core.memory import Meter, require
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
 
 # What stands in a corner `v/vt/vn`, and how many numbers of a line of it are kept.
 _KEEP = {"v": 3, "vt": 2, "vn": 3}
-# Of memory, at most, measured: what a byte of the file takes while it is read, and a name or a corner that is like no other before.
-BYTES_OF_TEXT, BYTES_OF_NAME = 8.0, 300.0
-BYTES_OF_VERTEX, BYTES_OF_CORNER = 150.0, 8.0  # in arrays
 WORDS_AT_ONCE = 1 << 16  # as text; then they are numbers, which take a tenth of the memory
 _SPACE = re.compile(r"\s")
 _CORNER = "face corner {} is not v, v/vt, v//vn or v/vt/vn"
@@ -51,7 +47,6 @@ class _Text:
         self.spans = {key: (array("q"), array("i")) for key in self.names}
         self._new_numbers: dict[str, list[str]] = {key: [] for key in _KEEP}
         self._new_corners: list[str] = []
-        self._meter, self._metered = Meter(), 0
 
     def fail(self, line: int, message: str) -> NoReturn:
         raise InputError(message, None, f"line {line}")
@@ -128,25 +123,15 @@ class _Text:
     def _to_indices(self) -> None:
         self.corners.extend(map(self.different.__getitem__, self._new_corners))
         self._new_corners.clear()
-        self._count_names()
-
-    def _count_names(self) -> None:
-        """Ask for memory for the names and corners that were not known before."""
-        known = len(self.different) + sum(map(len, self.names.values()))
-        self._meter.take(BYTES_OF_NAME * (known - self._metered), "the mesh")
-        self._metered = known
 
     def _span(self, key: str, name: str) -> None:
         starts, which = self.spans[key]
-        known = len(self.names[key])
         number = self.names[key][name]
         if starts and starts[-1] == len(self.counts):  # nothing is in the one before
             which[-1] = number
         else:
             starts.append(len(self.counts))
             which.append(number)
-        if number == known and known % 1024 == 0:
-            self._count_names()
 
     def _absolute(self, corner: str, line: int) -> str:
         """A corner with relative indices (-1 is the latest) in absolute ones (1 is the first)."""
@@ -233,9 +218,8 @@ def read(path: Path) -> RawMesh:
     number for numbers that are none, indices out of range and positions that are not finite.
     """
     text = _Text()
-    text.read(read_file(path, BYTES_OF_TEXT))
+    text.read(read_file(path))
     positions = text.array("v")
-    require(BYTES_OF_VERTEX * len(text.different) + BYTES_OF_CORNER * len(text.corners), "the mesh")
     corner_triples, corners = text.triples()
     text.different.clear()
     counts = np.array(text.counts, dtype=np.int64)

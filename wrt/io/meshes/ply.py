@@ -17,7 +17,6 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
-from wrt.core.memory import require
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
 
@@ -31,9 +30,6 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
 WORDS_AT_ONCE = 1 << 16  # of a text, before they become numbers
-# Of memory, at most, measured: a byte of a text file; a value, or list, of rows that are read one by one; a vertex; a corner.
-BYTES_OF_TEXT, BYTES_OF_VALUE, BYTES_OF_VERTEX, BYTES_OF_CORNER = 6.0, 300.0, 130.0, 30.0
-BYTES_OF_SPLIT = 150.0  # of a corner with texture coordinates of its own
 _SPACE = re.compile(rb"\s")
 
 
@@ -69,7 +65,6 @@ def read(path: Path) -> RawMesh:
     if "vertex" not in elements or not {"x", "y", "z"} <= elements["vertex"].values.keys():
         source.fail(f"holds no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")
     vertex = elements["vertex"].values
-    require(BYTES_OF_VERTEX * elements["vertex"].rows, "the mesh")
     with np.errstate(over="ignore", invalid="ignore"):
         vertices = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32)
     corners, counts, texcoord = _faces(source, elements.get("face"), len(vertices))
@@ -143,7 +138,6 @@ def _indices(source: _Source, element: _Element) -> tuple[np.ndarray, np.ndarray
     name = next((name for name in _INDEX_NAMES if name in element.values), None)
     if name is None:
         source.fail(f"has no list {' or '.join(_INDEX_NAMES)}", f"element {element.name}")
-    require(BYTES_OF_CORNER * len(element.values[name]), "the mesh")
     return element.values[name], element.counts[name]
 
 
@@ -161,7 +155,6 @@ def _within(source: _Source, given: np.ndarray, counts: np.ndarray, vertices: in
 
 def _split(corners: np.ndarray, texcoord: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Make one vertex of each different (vertex, u, v): the vertex it comes from, the new corners, its uv."""
-    require(BYTES_OF_SPLIT * len(corners), "the mesh")
     order = np.lexsort((texcoord[:, 1], texcoord[:, 0], corners))
     rows = np.column_stack([corners, texcoord])[order]
     first = np.ones(len(rows), dtype=bool)
@@ -231,7 +224,6 @@ class _Source:
             self._truncated(element)
         if table is None or not self._take_table(element, table, sizes):
             self.stream.at = begin
-            require(BYTES_OF_VALUE * element.rows * len(element.properties), f"element {element.name}")
             rows = [self._row(element, row) for row in range(element.rows)]
             for i, p in enumerate(element.properties):
                 element.values[p.name] = np.concatenate([row[i] for row in rows])
@@ -244,7 +236,7 @@ class _Source:
             if p.count_type and (next(columns) != size).any():
                 return False
             element.values[p.name] = next(columns).reshape(-1)
-            element.counts[p.name] = np.full(element.rows, size, dtype=np.int64)
+            element.counts[p.name] = np.broadcast_to(np.int64(size), element.rows)
         return True
 
     def _row(self, element: _Element, row: int) -> list[np.ndarray]:
@@ -297,7 +289,6 @@ class _Text:
     """Values from words; None where the file ends before. All are float64, which holds every index exactly."""
 
     def __init__(self, source: _Source, begin: int) -> None:
-        require(BYTES_OF_TEXT * (len(source.data) - begin), "the mesh")
         numbers, self.at = array("d"), 0
         while begin < len(source.data):
             space = _SPACE.search(source.data, begin + 4 * WORDS_AT_ONCE)

@@ -15,13 +15,10 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
-from wrt.core.memory import Meter, require
 from wrt.io.mesh_file import RawMesh
 
 _LINE = re.compile(rb"[^\r\n]++(?:\r\n|[\r\n]|\Z)|\r\n|[\r\n]")
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-# Of memory, at most, measured: what a byte of a text file takes, and of a binary one; and a solid.
-BYTES_OF_TEXT, BYTES_OF_BINARY, BYTES_OF_SOLID = 8.0, 5.0, 500.0
 
 
 def read(path: Path) -> RawMesh:
@@ -34,10 +31,8 @@ def read(path: Path) -> RawMesh:
     groups: tuple[str, ...] = ()
     sizes: list[int] = []
     if _is_binary(data):
-        require(BYTES_OF_BINARY * len(data), "the mesh")
         vertices = np.frombuffer(data, _RECORD, (len(data) - 84) // 50, 84)["corners"].reshape(-1, 3)
     else:
-        require(BYTES_OF_TEXT * len(data), "the mesh")
         vertices, groups, sizes = _read_text(data)
     with np.errstate(over="ignore"):
         bad = np.nonzero(~np.isfinite(vertices.astype(np.float32)).all(axis=1))[0]
@@ -68,7 +63,6 @@ def _read_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
     numbers = array("d")
     names: list[str] = []
     ends: list[int] = []  # of each solid, in vertices
-    meter = Meter()
     number, inside = 1, False
     for number, found in enumerate(_LINE.finditer(data), 1):
         line = found[0]
@@ -83,7 +77,6 @@ def _read_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
         elif key == b"solid" and not inside:
             names.append(b" ".join(words[1:]).decode("utf-8", "replace"))
             inside = True
-            meter.take(BYTES_OF_SOLID, "the mesh")
         elif key == b"endsolid" and inside:
             ends.append(len(numbers) // 3)
             inside = False

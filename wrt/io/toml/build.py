@@ -14,7 +14,6 @@ import numpy as np
 from wrt.core.checks import unknown
 from wrt.core.errors import InputError, at
 from wrt.core.files import read_file
-from wrt.core.memory import Meter
 from wrt.io.toml.kinds import make, taken
 from wrt.io.toml.meshes import Meshes
 from wrt.io.toml.report import raise_all, unknown_materials
@@ -60,8 +59,7 @@ class _Builder:
         self._included_objects = 0
         self._images: dict[Path, np.ndarray] = {}
         self._textures: dict[tuple[Any, ...], Texture | Checkerboard] = {}
-        self.meter = Meter()
-        self.meshes = Meshes(path.parent, self.meter)
+        self.meshes = Meshes(path.parent)
 
     @contextlib.contextmanager
     def at(self, place: str) -> Iterator[None]:
@@ -209,7 +207,6 @@ class _Builder:
         if path not in self._images:
             with at(path=path):
                 self._images[path] = decode_rgba8(read_file(path))
-                self.meter.take(self._images[path].nbytes, "the images")
         return self._images[path]
 
     def background(self, table: tables.SceneTable) -> Background:

@@ -11,7 +11,6 @@ import numpy as np
 
 from wrt.core.checks import unknown
 from wrt.core.errors import InputError, at
-from wrt.core.memory import Meter
 from wrt.io.mesh_file import load_mesh
 from wrt.io.toml.transforms import transform
 from wrt.scene import shapes
@@ -28,8 +27,8 @@ if TYPE_CHECKING:
 class Meshes:
     """Makes the objects of [[meshes]]. A mesh that is asked for twice is one; files are looked for in `folder`."""
 
-    def __init__(self, folder: Path, meter: Meter) -> None:
-        self._folder, self._meter = folder, meter
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self._meshes: dict[tuple[Any, ...], Mesh] = {}
 
     def objects(self, table: MeshTable, place: str, materials: Mapping[str, Material]) -> list[Object]:
@@ -84,6 +83,5 @@ class Meshes:
 
     def _once(self, key: tuple[Any, ...], make: Callable[[], Mesh]) -> Mesh:
         if key not in self._meshes:
-            mesh = self._meshes[key] = make()
-            self._meter.take(32.0 * len(mesh.vertices) + 12.0 * len(mesh.faces), "the meshes")
+            self._meshes[key] = make()
         return self._meshes[key]

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wrt.core.checks import short, unknown
-from wrt.core.errors import InputError, at
-from wrt.core.memory import require
+from wrt.core.errors import InputError
 
 if TYPE_CHECKING:
     from wrt.io.toml.schema import SceneTable
 
 MOST = 20  # problems that are told of one file
-BYTES_OF_PROBLEM = 1500.0  # of memory, measured
 # What was expected, by pydantic's type of error; {} is filled from the error's context.
 _EXPECTED = {
     "float_type": "a number", "int_type": "a whole number", "string_type": "text", "bool_type": "true or false",
@@ -37,8 +35,6 @@ def check(data: dict[str, Any], path: Path) -> SceneTable:
     try:
         return scene_table().model_validate(data, context=known_keys)
     except ValidationError as error:
-        with at(path=path):
-            require(BYTES_OF_PROBLEM * error.error_count(), f"a list of {error.error_count()} errors")
         problems = _lines(error, data, known_keys)
     if not data.get("include"):
         materials = data.get("materials")

@@ -9,8 +9,6 @@ from functools import cache
 
 import numpy as np
 
-from wrt.core.address_space import require_scipy
-
 CONFIDENCE = 0.95
 
 
@@ -70,7 +68,6 @@ def jackknife(statistic: Callable[[np.ndarray], float], n: int) -> tuple[float, 
 @cache
 def student_t(freedom: int) -> float:
     """How many standard errors a two-sided interval of CONFIDENCE reaches."""
-    require_scipy()
     from scipy.stats import t
 
     return float(t.ppf(0.5 + 0.5 * CONFIDENCE, freedom))

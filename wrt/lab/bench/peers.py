@@ -13,7 +13,7 @@ import numpy as np
 
 from wrt.accel.answers import Hits
 from wrt.accel.geometry import Geometry
-from wrt.accel.structures import ACCELERATORS, chosen
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.threads import run_all, thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.accel import timing, warm_up
@@ -58,7 +58,7 @@ def contestants(plan: Plan, rivals: Sequence[str]) -> list[Any]:
     for structure in dict.fromkeys(plan.structures):
         warm_up(structure)
         out.append(Own(structure=structure))
-        out[-1].name = f"wrt {ACCELERATORS[chosen(structure, 'cpu')].name}"
+        out[-1].name = f"wrt {ACCELERATORS[structure].name}"
     return [*out, *(PEERS[rival]() for rival in rivals)]
 
 

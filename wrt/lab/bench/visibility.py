@@ -14,7 +14,6 @@ import numpy as np
 
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
-from wrt.core.address_space import require_scipy
 from wrt.core.threads import thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.plot import LogLogPlot, Series
@@ -146,7 +145,6 @@ def ready(plan: Plan, surface: Surface, geometry: Geometry) -> Callable[[str, in
 def fit(n: Sequence[float], seconds: Sequence[float]) -> dict[str, float]:
     """seconds ~ n^exponent, by least squares on logarithms; error: of the exponent, one standard deviation (NaN for two
     points); last: the exponent between the two largest n. Raises ValueError for fewer than two points."""
-    require_scipy()
     from scipy.stats import linregress
 
     x, y = np.log(np.asarray(n, np.float64)), np.log(np.asarray(seconds, np.float64))

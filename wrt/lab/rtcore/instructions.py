@@ -17,9 +17,9 @@ import warp as wp
 
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
+from wrt.core import cuda
 from wrt.core.device import start
 from wrt.core.errors import InputError
-from wrt.core.tuned import DEFAULT, STACKS
 from wrt.kernels.study.unit_probes import make_box_probe, make_triangle_probe, numbers_of
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import RAY_AABB
@@ -107,8 +107,8 @@ def units() -> list[UnitCode]:
 
 def traversals(names: Sequence[str]) -> dict[tuple[str, str, str, int], KernelCode]:
     """The queries' kernels in the default's blocks, by structure, query, place of the stack and architecture."""
-    return {(name, query, stack, arch): compiled(make(Structure(ACCELERATORS[name], Units(stack=stack))), arch, DEFAULT.block_dim)
-            for name in names for query, make in QUERIES.items() for stack in STACKS for arch in ARCHS}
+    return {(name, query, stack, arch): compiled(make(Structure(ACCELERATORS[name], Units(stack=stack))), arch, cuda.block_dim)
+            for name in names for query, make in QUERIES.items() for stack in cuda.STACKS for arch in ARCHS}
 
 
 SOFTWARE_LEGEND = """\
@@ -120,7 +120,7 @@ box or the triangle, the stack and the loop are left out of the units."""
 def tables(units: Sequence[UnitCode], codes: dict[tuple[str, str, str, int], KernelCode]) -> list[Part]:
     shown = [name for name in (*CLASSES, "other") if any(abs(unit.classes[name]) > 0.01 for unit in units)]
     lines = [(name, query, stack, f"sm_{arch}", str(code.registers), str(code.stack), str(code.shared),
-              str(resident_warps(code, arch, DEFAULT.block_dim)), str(len(code.opcodes())),
+              str(resident_warps(code, arch, cuda.block_dim)), str(len(code.opcodes())),
               *(str(code.classes()[each]) for each in (*CLASSES, "other"))) for (name, query, stack, arch), code in codes.items()]
     return [
         tabled({"unit": "{unit}", "test": "{test}", "instructions": lambda unit: f"{unit.instructions:.0f}",

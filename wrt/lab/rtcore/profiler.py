@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.core.device import free_memory, start, upload
+from wrt.core.device import memory_of, start, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.io.load import as_scene
@@ -20,7 +20,6 @@ from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
 from wrt.lab.rtcore.caches import distinct_lines
 from wrt.renderer.costs import COUNTERS, CostCounter
-from wrt.renderer.memory_estimate import require_memory
 from wrt.renderer.options import OPTIONS, Options
 from wrt.renderer.plan import plan_of
 from wrt.renderer.tiles import Rectangle
@@ -157,7 +156,7 @@ class Profiler:
 
     def __init__(self, scene: Scene, options: Options) -> None:
         device, plan = start(options.device), plan_of(scene, options)
-        require_memory(plan, device)
+        plan.require_memory(device)
         self.counter = CostCounter(plan, device)
         self.prepared, self.plan = self.counter.prepared, plan
 
@@ -169,7 +168,7 @@ class Profiler:
         self.counter.each(lambda rectangle: tiles.append(self._count(rectangle)), self.prepared.tiles(1))
         tiles.sort(key=lambda tile: tile.rectangle[1::-1])
         total = sum(int(tile.used.sum(dtype=np.int64)) for tile in tiles)
-        if total * BYTES_OF_RAY > 0.5 * free_memory(self.prepared.device):
+        if total * BYTES_OF_RAY > 0.5 * memory_of(self.prepared.device):
             raise InputError(f"a profile of {total / 1e6:.0f} million rays takes {total * BYTES_OF_RAY / 2**30:.0f} GiB;"
                              " take a smaller size, fewer samples or a crop")
         step = max(1, -(-sum(tile.fetches for tile in tiles) // TRACE_LIMIT))

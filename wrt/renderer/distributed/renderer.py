@@ -17,7 +17,6 @@ from wrt.picture.film import Film
 from wrt.renderer.checkpoint import checkpoint_of
 from wrt.renderer.distributed.workers import DeviceWorkers, ExecutorWorkers, Job, Reply, Workers, packaged
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
-from wrt.renderer.memory_estimate import require_memory
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import PREPARING_REPORTED
@@ -37,7 +36,7 @@ class DistributedRenderer:
     def __init__(self, scene: Scene, options: Options) -> None:
         self.device = start("cpu")  # of the film
         self.plan = plan_of(scene, options)
-        require_memory(self.plan, self.device)
+        self.plan.require_memory(self.device)
         tell_left_out(scene)
         self.workers = workers_for(self.plan)
         self.tiles_by: Counter[str] = Counter()

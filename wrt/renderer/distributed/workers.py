@@ -22,7 +22,6 @@ from typing import Any
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
 from wrt.renderer.distributed.installed import INSTALLED, Installed, difference
-from wrt.renderer.memory_estimate import require_memory
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
 from wrt.renderer.prepare import Prepared, prepare
@@ -222,7 +221,6 @@ def check_installed(there: Installed) -> None:
 
 def _made_ready(scene: Scene, options: Options) -> Prepared:
     plan, device = plan_of(scene, options), start(options.device)
-    require_memory(plan, device)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SceneWarning)  # reported where the render was asked for
         return prepare(plan, device)

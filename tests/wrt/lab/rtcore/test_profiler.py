@@ -130,7 +130,7 @@ def test_what_a_profile_cannot_do_is_refused(scene: Scene, monkeypatch: pytest.M
     for name in ("aov", "nonsense"):
         with pytest.raises(InputError, match=f"no argument '{name}'"):
             profile(scene, **{name: "depth"})
-    monkeypatch.setattr("wrt.lab.rtcore.profiler.free_memory", lambda device: 1000.0)
+    monkeypatch.setattr("wrt.lab.rtcore.profiler.memory_of", lambda device: 1000.0)
     with pytest.raises(InputError, match="million rays"):
         profile(scene)
 
