@@ -26,7 +26,7 @@ from wrt.io.mesh_file import load_mesh
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 # Which CI itself runs (.ci/run), or a test of their own.
 OTHERS = ("pip install ", "pytest", "python -m pdoc ", "dask ", "python -m tests.fuzz ", "python -m tests.virtual_gpu ",
-          "openssl req ", "export DASK_")
+          "openssl req ", "export DASK_", "ulimit -v ", "timeout -k ", "prlimit ")
 # What stands for something in a command line, and what it is here. The folder of each test has these files.
 STANDS_FOR = {"MESH...": "model.ply", "MESH": "model.ply", "SCENE": "scenes/whitted.toml", "FILE.gif": "file.gif", "STUDY": "order",
               "bunny.ply": "model.ply", "FOLDER|FILE.gif|.png": "frames", "FOLDER": "folder"}
