@@ -345,7 +345,6 @@ def checkpoint_seeds() -> list[Seed]:
                 film.put(array, np.full((4, 6), 3) if label.startswith("samples") else rng.random(film.view(array).shape) * 9)
             checkpoint.save(film, 1.5)
             found.append(Seed(f".checkpoint{groups}", checkpoint.path.read_bytes()))
-            checkpoint._release()
     return found
 
 

@@ -64,7 +64,7 @@ def save(structure: Structure, state: State, path: str | os.PathLike[str]) -> No
     header = {"accel": structure.accel.name, "triangle": units.triangle, "box": units.box, "wrt": VERSION,
               "geometry": state.geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
               "order": len(built.order)} | {name: getattr(built, name) for name in STATS}
-    with replacing(path) as temporary, open(temporary, "wb") as file:
+    with replacing(path) as file:
         write_checked(file, MAGIC, header, body)
 
 

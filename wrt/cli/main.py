@@ -44,7 +44,7 @@ from wrt.cli.compile import compile_kernels
 from wrt.cli.devices import devices
 from wrt.cli.measure import bench, profile, stability
 from wrt.cli.reporting import measured
-from wrt.cli.save import check_room, checkpoint_options, save_film
+from wrt.cli.save import checkpoint_options, remove_checkpoint, save_film
 from wrt.cli.view import view
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code, raise_on_termination
@@ -127,7 +127,6 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
         check_writable(aov_path(output, name))
     clock = {"import": time.perf_counter() - begin}
     loaded = load(scene, quiet, clock).with_settings(**settings)
-    check_room(output, loaded.settings.size, bits)
     checkpoint = options.get("checkpoint")
     if checkpoint is not None and options["resume"] and not (os.path.lexists(checkpoint) or quiet):
         say(f"{checkpoint}: no checkpoint yet, rendering from the beginning")
@@ -141,7 +140,7 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
         film.metadata["scene"] = plain_text(scene.name)
         paths, late, misplaced = save_film(film, output, bits, layers)
     if checkpoint is not None and not (misplaced or film.stats["interrupted"] or film.stats["timed_out"]):
-        checkpoint.unlink(missing_ok=True)  # it has done its work
+        remove_checkpoint(checkpoint)  # it has done its work
         film.stats["checkpoint"] = None
     if late:
         film.stats |= {"interrupted": True, "signal": film.stats["signal"] or late[0]}

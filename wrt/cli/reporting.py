@@ -15,6 +15,7 @@ import click
 from wrt.cli.common import ACCEL, CLUSTER, DURATION, SHARED, Names, OneOf, client_of, now_and_then, say, say_json, warnings_reported
 from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
+from wrt.core.write_file import check_writable, write_bytes
 from wrt.lab.plans import STRUCTURES, Plan
 
 TYPES: dict[str, Any] = {"int": int, "int | None": int, "bool": bool, "str": str, "Sequence[str]": Names(), "float": DURATION}
@@ -40,12 +41,15 @@ class Reporting:
 
     def check_markdown(self) -> None:
         """Raise InputError where a Markdown file cannot be written there, before any work is done for it."""
-        if self.output is not None and (self.output.suffix.lower() != ".md" or not self.output.parent.is_dir()):
-            raise InputError("the report is a .md file in a folder that is there", self.output)
+        if self.output is None:
+            return
+        if self.output.suffix.lower() != ".md":
+            raise InputError("the report is a .md file", self.output)
+        check_writable(self.output)
 
     def write(self, text: str) -> None:
         if self.output is not None:
-            self.output.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+            write_bytes(self.output, (text.rstrip("\n") + "\n").encode())
 
     def end(self, text: str, data: dict[str, Any], paths: Sequence[Path] = (), interrupted: int | None = None) -> None:
         """The result on stdout. interrupted: the signal that ended the work early, whose exit code this ends with."""

@@ -26,7 +26,6 @@ from wrt.core.compiler import empty_kernel, headers_missing, prepare_compiler
 from wrt.core.errors import InputError
 from wrt.core.seconds import loading
 from wrt.core.threads import run_all, thread_count
-from wrt.core.write_file import compiling
 
 MOST_ROWS = (1 << 31) - 1
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
@@ -182,9 +181,7 @@ def _load(kernel: Any, device: Any, block_dim: int) -> None:
             kernel.module.load(device, block_dim=block_dim)
         else:
             _require_room_to_compile(cache)
-            folder = f"{name}_p{os.getpid()}_t{threading.get_ident()}"  # as Warp calls it
-            with compiling(cache, folder):
-                kernel.module.load(device, block_dim=block_dim)
+            kernel.module.load(device, block_dim=block_dim)
 
 
 @contextmanager

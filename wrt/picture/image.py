@@ -83,8 +83,7 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
 def write_codes(path: PathLike, codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> None:
     """Write display codes, (H, W, 3) uint8 or uint16, to a PNG file as they are. Raises InputError as write_image."""
     data = encode_png(codes, metadata or {})
-    with replacing(path) as temporary:
-        temporary.write_bytes(data)
+    write_file.write_bytes(path, data)
 
 
 def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapping[str, Any] | None = None) -> None:
@@ -119,24 +118,28 @@ def _write_oiio(path: PathLike, spec: Any, rows: Callable[[int, int], np.ndarray
     with needed_by("an EXR or HDR picture, or one of 16 bits,"):
         import OpenImageIO as oiio
 
-    with replacing(path) as temporary:
-        out = oiio.ImageOutput.create(str(temporary))
+    with replacing(path) as file:
+        # By its descriptor where that has a name: whoever can rename files in the folder could put a link in the file's place.
+        name = f"/dev/fd/{file.fileno()}" if os.path.isdir("/dev/fd") else file.name
+        out = oiio.ImageOutput.create(file.name)
         if out is None:
             raise InputError(f"cannot be written: {oiio.geterror()}", path)
         try:
-            good = out.open(str(temporary), spec)
+            good = out.open(name, spec)
             for y in range(0, spec.height if good else 0, 64):
                 band = np.ascontiguousarray(rows(y, min(y + 64, spec.height)), dtype=np.float32)
                 good = good and out.write_scanlines(y, y + len(band), 0, band)
         finally:
             closed = out.close()
         # Some failures, such as a full disk, are told in the text only.
-        error = " ".join(out.geterror().split()).replace(str(temporary), os.fspath(path))
+        error = " ".join(out.geterror().split()).replace(name, os.fspath(path))
         if error or not (good and closed):
             raise InputError(f"cannot be written: {error or 'unknown error'}", path)
         if header:
-            first, rest = temporary.read_bytes().split(b"\n", 1)
-            temporary.write_bytes(first + b"\n" + header + rest)
+            file.seek(0)
+            first, rest = file.read().split(b"\n", 1)
+            file.seek(len(first) + 1)
+            file.write(header + rest)
 
 
 def _write_png(path: PathLike, pixels: np.ndarray, bits: int, exposure: float, tonemap: str,

@@ -118,6 +118,6 @@ def save_movie(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: 
     if kind == "GIF":
         pictures = [picture.quantize(256, dither=Image.Dither.FLOYDSTEINBERG) for picture in pictures]
     duration = 1000.0 / fps
-    with replacing(path) as temporary:
-        pictures[0].save(temporary, format=kind, save_all=True, append_images=pictures[1:], loop=0,
+    with replacing(path) as file:
+        pictures[0].save(file, format=kind, save_all=True, append_images=pictures[1:], loop=0,
                          duration=max(int(round(duration, -1)), 20) if kind == "GIF" else duration)

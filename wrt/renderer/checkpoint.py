@@ -1,31 +1,26 @@
-"""Long renders that survive: the film in a file, written aside, brought to the disk and renamed, so that the file is always whole.
+"""Long renders that survive: the film in a file that is whole at any moment (wrt.core.write_file).
 
 A checkpoint is a checked file (wrt.core.checked_file): who made it (IDENTITY: everything that can change a pixel), how far it is,
 and the film's arrays. How many samples each pixel has is one of them: rendering goes on from any state in which each pixel is done
-whole. Beside the file lies `.NAME.part`, which is locked while a render runs, and holds the room that the next one needs. The
-header's first entry says on which system it is written, by which a part that a killed render left is known (wrt.core.write_file).
+whole. Two renders that write one checkpoint replace each other's: what it holds is one of them, whole.
 """
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import json
 import math
 import os
-import shutil
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from wrt.core.checked_file import DIGEST_BYTES, MAX_HEADER, read_checked, write_checked
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
-from wrt.core.write_file import WINDOWS, is_file_of, remove_leftovers, sync_folder, this_system, try_lock
+from wrt.core.write_file import check_writable, replacing
 from wrt.renderer.film_arrays import OF_A_GROUP, SHARED, DeviceFilm
 from wrt.renderer.options import OPTIONS
 from wrt.renderer.plan import Plan
@@ -33,7 +28,6 @@ from wrt.scene.digest import camera_digest, scene_digest
 from wrt.scene.settings import SETTINGS
 
 MAGIC = b"wrt checkpoint 1\n"
-LOCK_SECONDS = 0.3  # for a lock that is only held for a moment
 # What may change between a checkpoint and going on with it; and the camera and the device, which are compared by what they are.
 NO_PIXEL = ("spp", "exposure", "tonemap", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size", "progress",
             "checkpoint", "checkpoint_every", "resume", "camera", "device", "devices", "executor")
@@ -68,27 +62,23 @@ class Checkpoint:
     """The file of one render. identity: what must be the same for going on, as JSON has it; area: pixels; groups: of samples.
 
     With `resume` a file that is there is read, and refused where it is not of this render; without, any file that is there is
-    refused. Both, and whether there is room for two (the old one stays until the new one is whole), are reported before the work.
+    refused. Both, and whether the file can be written, are reported before the work.
     """
 
     def __init__(self, path: Path, every: float, identity: dict[str, Any], *, area: int, groups: int, resume: bool) -> None:
-        self.path, self.every, self.groups = Path(os.path.realpath(path)), every, groups
-        self.part = self.path.with_name(f".{self.path.name}.part")
+        self.path, self.every, self.groups = path.absolute(), every, groups
         self.identity = json.loads(json.dumps(identity, default=str))
         pixel = sum(_bytes(kind) for kind in SHARED.values()) + groups * sum(_bytes(kind) for kind in OF_A_GROUP.values())
         self.body_bytes = area * pixel
         self.bytes = self.body_bytes + len(MAGIC) + MAX_HEADER + DIGEST_BYTES
         self.saved: Saved | None = None
         self.problem = ""
-        self._file: Any = None
-        if not self.path.parent.is_dir():
-            raise InputError("its folder does not exist", path)
+        check_writable(path)
         if os.path.lexists(self.path):
             if not resume:
                 raise InputError("is there already: resume it (--resume, resume=True), or remove it first", path)
             self.saved = self._checked(read(self.path, self.bytes))
-        with self.held():
-            pass
+        self._last, self._cost = 0.0, 0.0
 
     def _checked(self, saved: Saved) -> Saved:
         differ = [name for name in {**self.identity, **saved.identity} if self.identity.get(name) != saved.identity.get(name)]
@@ -108,59 +98,11 @@ class Checkpoint:
 
     # --- writing ------------------------------------------------------------------------------------------------------
 
-    @contextlib.contextmanager
-    def held(self) -> Iterator[Checkpoint]:
-        """Keep the part file, its lock and its room during the block. Raises InputError where the system refuses."""
-        try:
-            remove_leftovers(self.path.parent)
-            self._reserve(2 * self.bytes)
-            if self.saved is None and os.path.lexists(self.path):  # another render was faster
-                self._release()
-                raise InputError("is there already", self.path)
-        except OSError as error:
-            self._release()
-            raise InputError(f"a checkpoint cannot be written: {_reason(error)}", self.path) from error
-        self._last, self._cost = time.monotonic(), 0.0
-        try:
-            yield self
-        finally:
-            self._release()
-
-    def _reserve(self, room: int) -> None:
-        """Open and lock the part file, and take the room on the disk; at least so many bytes must be there."""
-        self._file = self._opened()
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(self._file.fileno(), 0, room)
-        elif shutil.disk_usage(self.part.parent).free < room:
-            raise OSError(errno.ENOSPC, f"no room for {room / 2**20:.0f} MiB")
-        os.ftruncate(self._file.fileno(), min(room, self.bytes))
-        self._file.write(MAGIC + json.dumps(_maker()).encode() + b"\n")
-        self._file.flush()
-
-    def _opened(self) -> BinaryIO:
-        """The part file, locked where there are locks."""
-        patience = time.monotonic() + LOCK_SECONDS
-        while True:
-            file = open(os.open(self.part, os.O_RDWR | os.O_CREAT, 0o666), "wb")
-            if not try_lock(file.fileno()):
-                file.close()
-                if time.monotonic() > patience:
-                    raise InputError("another render is writing it", self.path)
-                time.sleep(0.01)  # it may be somebody who looks for leftovers
-                continue
-            if is_file_of(self.part, file.fileno()):
-                return file
-            file.close()  # another render has just renamed it
-
-    def _release(self) -> None:
-        file, self._file = self._file, None
-        if file is None:
-            return
-        # Removed under its lock, or it could be another render's by now; Windows has no such lock, and removes no open file.
-        steps = (self.part.unlink, file.close)
-        for step in reversed(steps) if WINDOWS else steps:
-            with contextlib.suppress(OSError):  # a folder that is gone, a disk that is full or has become read-only
-                step()
+    def begin(self) -> None:
+        """Begin to count the time. Raises InputError where another render has written the file since this one looked for it."""
+        if self.saved is None and os.path.lexists(self.path):
+            raise InputError("is there already: another render wrote it meanwhile", self.path)
+        self._last = time.monotonic()
 
     def due(self) -> bool:
         """Whether it is time: a new file is to be there `every` seconds after the state that the last one holds."""
@@ -170,27 +112,13 @@ class Checkpoint:
         """Write the film. Where the system refuses, the old file stays, `problem` says why, and the render goes on in memory."""
         begin = time.monotonic()
         samples = film.view(film.groups[0].samples)
-        header = _maker() | {"samples": [int(samples.min()), int(samples.max())], "seconds": seconds, "identity": self.identity}
+        header = {"samples": [int(samples.min()), int(samples.max())], "seconds": seconds, "identity": self.identity}
         try:
-            if self._file is None:
-                self._reserve(self.bytes)
-            self._file.seek(0)
-            write_checked(self._file, MAGIC, header, (film.view(array) for _, array in film.arrays()))
-            self._file.truncate()
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            if WINDOWS:
-                self._file.close()  # it renames no open file
-            os.replace(self.part, self.path)
-            written, self._file = self._file, None
-            with contextlib.closing(written):  # its lock ends when that of the next is there
-                sync_folder(self.path.parent)
-                self.problem = ""
-                with contextlib.suppress(OSError, InputError):  # then the next one says so
-                    self._reserve(self.bytes)
-        except (OSError, InputError, MemoryError) as error:
-            self.problem = f"{self.path}: the checkpoint cannot be written: {_reason(error)}"
-            self._release()
+            with replacing(self.path) as file:
+                write_checked(file, MAGIC, header, (film.view(array) for _, array in film.arrays()))
+            self.problem = ""
+        except (InputError, MemoryError) as error:
+            self.problem = f"the checkpoint is not saved: {error}"
         self._last, self._cost = begin, time.monotonic() - begin
 
     # --- reading ------------------------------------------------------------------------------------------------------
@@ -234,11 +162,3 @@ def _bytes(kind: Any) -> int:
     import warp as wp
 
     return int(wp.types.type_size_in_bytes(kind))
-
-
-def _reason(error: Exception) -> str:
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)
-
-
-def _maker() -> dict[str, Any]:
-    return {"maker": this_system()}

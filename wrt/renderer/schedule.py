@@ -8,7 +8,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import closing, nullcontext
+from contextlib import closing
 from typing import Any, Protocol
 
 import numpy as np
@@ -185,7 +185,9 @@ class Run:
         """Take the samples, and give the film."""
         begin = self.begin = time.perf_counter()
         interrupted = False
-        with held_interrupts() as self.interrupts, self.checkpoint.held() if self.checkpoint else nullcontext():
+        with held_interrupts() as self.interrupts:
+            if self.checkpoint is not None:
+                self.checkpoint.begin()
             try:
                 if self.plan.options.aov:
                     self._take_aovs()

@@ -18,11 +18,10 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run
 from tests.data import ROOT
 from tests.device import NAME
-from wrt.cli import save as cli_save
 from wrt.core.errors import InputError
 from wrt.picture import film
-from wrt.picture.image import read_channels, read_image
-from wrt.renderer.checkpoint import read
+from wrt.picture.image import read_channels
+from wrt.renderer.checkpoint import Checkpoint, read
 
 SMALL = ("--size", "32x18", "--spp", 4)
 
@@ -128,7 +127,9 @@ def test_kills_lose_little_and_change_nothing() -> None:
         if Path("a.exr").exists():  # a fast machine was done before the kill
             assert channels("a.exr") == expected
             Path("a.exr").unlink()
-        assert new_files() <= {"a.exr.checkpoint", ".a.exr.checkpoint.part"}
+        for left in Path().glob(".wrt-*"):  # of a kill while a checkpoint was written
+            left.unlink()
+        assert new_files() <= {"a.exr.checkpoint"}
     assert run(*options).code == 0
     assert channels("a.exr") == expected and new_files() == {"a.exr"}
 
@@ -142,13 +143,16 @@ def test_twenty_kills_at_random_moments(extra: tuple[Any, ...], every: float, mo
     expected, start, traced = whole_render()
     rng = random.Random(20)
     options = (*RENDER, "--checkpoint", f"{every}s", "--resume")
-    losses, files, resumed, early = [], 0, 0, 0
+    losses, files, left, resumed, early = [], 0, 0, 0, 0
     for i in range(20):
         if i % 5 == 0:  # before tracing, as likely as not
             lines = killed_after(rng.uniform(0.0, start), *options)
         else:
             lines = killed_when(rng.uniform(0.0, 0.9 * traced), rng.uniform(0.0, 0.2), *options)
         losses.append(lost_seconds(lines))
+        for temporary in Path().glob(".wrt-*"):  # of a kill while a file was written
+            temporary.unlink()
+            left += 1
         files += len(new_files())
         early += not any(line.startswith("trace ") for line in lines)
         if Path("a.exr").exists():
@@ -157,7 +161,8 @@ def test_twenty_kills_at_random_moments(extra: tuple[Any, ...], every: float, mo
         assert result.code == 0 and channels("a.exr") == expected and new_files() == {"a.exr"}, i
         resumed += json.loads(result.out)["resumed"] is not None
         Path("a.exr").unlink()
-    print(f"20 kills ({early} before tracing, {resumed} with a checkpoint), {files} files, all readable; 20 resumes, bit-identical")
+    print(f"20 kills ({early} before tracing, {resumed} with a checkpoint), {files} files, all readable, {left}"
+          " temporary ones; 20 resumes, bit-identical")
     lost = f"at most {max(losses):.2f}, mean {np.mean(losses):.2f}, of {traced:.1f}"
     print(f"seconds of tracing lost at an interval of {every} s: {lost}")
     assert resumed >= 10 and max(losses) < 1.0
@@ -214,8 +219,7 @@ def test_what_is_refused_before_the_work(arguments: list[str], message: str, mon
 
 @pytest.fixture
 def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures can be written below tmp/ and roomy/ only: the disk fills up while a render runs."""
-    (folder / "roomy").mkdir()
+    """Pictures can be written below tmp/ only: the disk fills up while a render runs."""
     save = film.Film.save
 
     def failing(self: film.Film, path: Any, **options: Any) -> list[Path]:
@@ -234,50 +238,43 @@ def test_a_picture_that_cannot_be_written_is_kept_elsewhere() -> None:
     error = f"error: a.exr: cannot be written: No space left on device; the picture was written to {place} instead"
     assert result.errors == [error]
     assert {"R", "depth.Z"} <= read_channels(str(place)).keys() and place.parent.stat().st_mode & 0o077 == 0
-    assert new_files() == {"roomy", "a.exr.checkpoint"} and read("a.exr.checkpoint").samples == (4, 4)  # it can still be resumed
+    assert new_files() == {"a.exr.checkpoint"} and read("a.exr.checkpoint").samples == (4, 4)  # it can still be resumed
 
 
-@pytest.mark.usefixtures("full")
-def test_the_home_folder_is_the_last_resort(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(folder / "roomy"))
-    monkeypatch.setattr("tempfile.tempdir", str(folder / "nowhere"))
-    result = run("render", "box.obj", *SMALL)
-    assert result.code == 2 and Path(result.out.strip()).parent.parent == folder / "roomy"
-    monkeypatch.setenv("HOME", str(folder / "nowhere"))
+@pytest.mark.parametrize("place", ["nowhere", "tmp"])
+def test_where_no_place_takes_it_the_first_error_is_reported(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(self: film.Film, path: Any, **options: Any) -> list[Path]:
+        raise InputError("cannot be written: No space left on device", path)
+
+    monkeypatch.setattr(film.Film, "save", full)
+    monkeypatch.setattr("tempfile.tempdir", str(Path(place).absolute()))
     result = run("render", "box.obj", *SMALL)
     assert result.code == 2 and result.out == "" and result.errors == ["error: box.png: cannot be written: No space left on device"]
+    assert new_files() == set() and not list(Path("tmp").iterdir())
 
 
-@pytest.mark.usefixtures("full")
-def test_on_a_terminal_another_place_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = iter(["b.png", "roomy/c.png"])
-    asked = []
-    monkeypatch.setattr(cli_save, "_at_a_terminal", lambda: True)
-    monkeypatch.setattr("click.prompt", lambda text, **options: asked.append(text) or next(answers))
-    result = run("render", "box.obj", *SMALL, "-o", "a.png")
-    assert (result.code, result.out) == (0, "roomy/c.png\n") and len(asked) == 2
-    assert [line.split(":")[1].strip() for line in result.errors] == ["a.png", "b.png"]
-    assert read_image("roomy/c.png").shape == (18, 32, 3)
+def test_a_folder_in_the_place_of_the_checkpoint_costs_only_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    save = Checkpoint.save
+
+    def taken(self: Checkpoint, *arguments: Any) -> None:
+        self.path.unlink(missing_ok=True)
+        self.path.mkdir(exist_ok=True)
+        save(self, *arguments)
+
+    monkeypatch.setattr(Checkpoint, "save", taken)
+    result = run("render", "box.obj", *SMALL, "-o", "a.png", "--checkpoint", "60s")
+    assert (result.code, result.out) == (0, "a.png\n") and new_files() == {"a.png", "a.png.checkpoint"}
+    assert result.err.count("a.png.checkpoint: is a folder") == 1 and "--resume" not in result.err
+    result = run("render", "box.obj", *SMALL, "-o", "a.png", "--resume")
+    assert result.code == 2 and result.errors == ["error: a.png.checkpoint: is a folder"]
 
 
-@pytest.mark.usefixtures("full")
-@pytest.mark.parametrize("answer", ["", KeyboardInterrupt])
-def test_no_answer_is_no_loss(answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def prompt(text: str, **options: Any) -> str:
-        if answer == "":
-            return ""
-        raise answer
+def test_a_checkpoint_that_cannot_be_removed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(path: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(1, "Operation not permitted", str(path))
 
-    monkeypatch.setattr(cli_save, "_at_a_terminal", lambda: True)
-    monkeypatch.setattr("click.prompt", prompt)
-    result = run("render", "box.obj", *SMALL, "-o", "a.png")
-    assert result.code == 2 and Path(result.out.strip()).parent.parent == Path("tmp").resolve()
-
-
-def test_a_disk_without_room_for_the_picture_is_told_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("the work began"))
-    usage = cli_save.shutil.disk_usage(".")
-    monkeypatch.setattr("shutil.disk_usage", lambda path: usage._replace(free=100_000))
-    result = run("render", "box.obj", "--size", "640x480", "-o", "a.exr")
-    assert result.code == 2 and len(result.errors) == 1 and new_files() == set()
-    assert "a.exr: cannot be written: its disk has 0.1 MiB left, and a picture of 640x480 takes 0.9 or more" in result.err
+    monkeypatch.setattr(Path, "unlink", refused)
+    result = run("render", "box.obj", *SMALL, "-o", "a.png", "--checkpoint", "60s")
+    assert result.code == 2 and new_files() == {"a.png", "a.png.checkpoint"}
+    (error,) = result.errors
+    assert error.startswith("error: a.png.checkpoint: cannot be removed: Operation not permitted; ")

@@ -1,13 +1,13 @@
-"""Files are whole and on the disk; what a killed process leaves of them is removed, and nothing else."""
+"""Files are whole and on the disk, no link is followed, and a killed process leaves one file that can be told by its name."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import os
+import re
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,13 @@ import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import ROOT
-from tests.wrt.renderer.test_checkpoint import SCENE, same
+from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.accel.build import build, build_cached
-from wrt.core import write_file
+from wrt.cli.reporting import Reporting
 from wrt.core.errors import InputError
-from wrt.core.write_file import LONG_AGO, aside, check_writable, remove_leftovers, replacing, this_system
+from wrt.core.write_file import check_writable, replacing
 from wrt.lab.bench import timing
 from wrt.picture.image import write_codes, write_image
-from wrt.renderer import checkpoint
 from wrt.renderer.animate import save_movie
 from wrt.renderer.render import render
 from wrt.scene.shapes import icosphere
@@ -34,7 +33,14 @@ from wrt.scene.shapes import icosphere
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 PIXELS = np.full((4, 6, 3), 0.5, np.float32)
 linux_only = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="looks at files by /proc")
-with_locks = pytest.mark.skipif(write_file.fcntl is None, reason="without locks nothing is removed")
+WRITERS = {
+    "a.png": lambda path: write_image(path, PIXELS), "a.exr": lambda path: write_image(path, PIXELS),
+    "a.hdr": lambda path: write_image(path, PIXELS), "a.accel": lambda path: build(icosphere(0)).save(path),
+    "a.gif": lambda path: save_movie(path, [np.zeros((4, 4, 3), np.uint8)] * 2, 10.0),
+    "a.md": lambda path: Reporting(output=path).write("text" * 10),
+    "a.checkpoint": lambda path: render(SCENE, spp=1, checkpoint=path, resume=True),
+}
+each_writer = pytest.mark.parametrize(("name", "write"), WRITERS.items())
 
 
 def names(folder: Path) -> set[str]:
@@ -72,21 +78,17 @@ def test_a_picture_is_on_the_disk_before_its_checkpoint_goes(calls: list[tuple[s
     done = command("render", "box.obj", "--size", "16x9", "--spp", 1, "--aov", "depth", "-o", "a.png", "--checkpoint", "60s")
     assert done.code == 0, done.err
     begin = calls.index(("replace", "a.png"))
-    written = [(name, "(aside)" if told.startswith(".wrt-") else told) for name, told in calls[begin - 1:]]
-    folder = ("fsync", tmp_path.name)
-    pictures = [call for call in written if call != ("unlink", "(aside)")]
-    assert pictures == [("fsync", "(aside)"), ("replace", "a.png"), folder, ("fsync", "(aside)"), ("replace", "a.depth.png"),
-                        folder, ("unlink", "a.png.checkpoint")]
+    written = [(name, "(temporary)" if told.startswith(".wrt-") else told) for name, told in calls]
+    synced, folder = ("fsync", "(temporary)"), ("fsync", tmp_path.name)
+    pictures = [call for call in written[begin - 1:] if call != ("unlink", "(temporary)")]
+    assert pictures == [synced, ("replace", "a.png"), folder, synced, ("replace", "a.depth.png"), folder,
+                        ("unlink", "a.png.checkpoint")]
     saved = calls.index(("replace", "a.png.checkpoint"))
-    assert calls[saved - 1] == ("fsync", ".a.png.checkpoint.part") and calls[saved + 1] == folder and saved < begin
+    assert written[saved - 1] == synced and written[saved + 1] == folder and saved < begin
 
 
 @linux_only
-@pytest.mark.parametrize(("name", "write"), [
-    ("a.png", lambda path: write_image(path, PIXELS)), ("a.exr", lambda path: write_image(path, PIXELS)),
-    ("a.hdr", lambda path: write_image(path, PIXELS)), ("a.accel", lambda path: build(icosphere(0)).save(path)),
-    ("a.gif", lambda path: save_movie(path, [np.zeros((4, 4, 3), np.uint8)] * 2, 10.0)),
-])
+@each_writer
 def test_every_file_is_brought_to_the_disk(name: str, write: Callable[[Path], None], tmp_path: Path,
                                            calls: list[tuple[str, str]]) -> None:
     write(tmp_path / name)
@@ -116,23 +118,23 @@ def test_a_disk_that_does_not_take_a_picture_is_told(number: int, fine: bool, tm
 
 def refuse(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     """No file can be made in a folder, or be removed from it: permissions do not bind the superuser, as which tests may run."""
-    open_file, unlink = os.open, os.unlink
+    open_file, unlink = open, os.unlink
 
-    def refused(path: Any, *arguments: Any, **rest: Any) -> Any:
-        if isinstance(path, str | Path) and Path(path).parent == folder and (not arguments or arguments[0] & os.O_CREAT):
+    def refused(path: Any, mode: str = "r", *arguments: Any, **rest: Any) -> Any:
+        if isinstance(path, str | Path) and Path(path).parent == folder and mode[0] in "wx":
             raise OSError(errno.EROFS, os.strerror(errno.EROFS), path)
-        return (open_file if arguments else unlink)(path, *arguments, **rest)
+        return open_file(path, mode, *arguments, **rest)
 
-    monkeypatch.setattr(os, "open", refused)
-    monkeypatch.setattr(os, "unlink", refused)
+    def kept(path: Any, **rest: Any) -> None:
+        if Path(path).parent == folder:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), path)
+        unlink(path, **rest)
+
+    monkeypatch.setattr("builtins.open", refused)
+    monkeypatch.setattr(os, "unlink", kept)
 
 
-@pytest.mark.parametrize(("name", "write"), [
-    ("a.png", lambda path: wrt.Film(PIXELS, PIXELS, np.ones((4, 6), np.int32)).save(path)),
-    ("a.exr", lambda path: wrt.Film(PIXELS, PIXELS, np.ones((4, 6), np.int32)).save(path)),
-    ("a.accel", lambda path: build(icosphere(0)).save(path)), ("a.hdr", check_writable),
-    ("a.gif", lambda path: save_movie(path, [np.zeros((4, 4, 3), np.uint8)] * 2, 10.0)),
-])
+@pytest.mark.parametrize(("name", "write"), [*WRITERS.items(), ("b.hdr", check_writable)])
 def test_a_read_only_folder_is_told_with_the_name_that_somebody_gave(name: str, write: Callable[[Path], None], tmp_path: Path,
                                                                      monkeypatch: pytest.MonkeyPatch) -> None:
     refuse(monkeypatch, tmp_path)
@@ -160,10 +162,10 @@ def test_on_the_command_line_before_the_work(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a file system that takes no files from anybody")
 def test_a_disk_that_becomes_read_only_in_the_middle_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=rf"^{tmp_path / 'a.png'}: cannot be written: Read-only file system$"), \
-            replacing(tmp_path / "a.png") as temporary:
-        temporary.write_bytes(b"half")
+            replacing(tmp_path / "a.png") as file:
+        file.write(b"half")
         refuse(monkeypatch, tmp_path)
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(temporary))
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), file.name)
     with pytest.raises(InputError, match=r"^/proc/a\.exr: cannot be written: "):
         write_image("/proc/a.exr", PIXELS)
     with pytest.raises(InputError, match=r"^/proc/nowhere: cannot be made: No such file or directory$"):
@@ -179,150 +181,98 @@ def test_a_damaged_entry_of_a_cache_that_cannot_be_written_is_told(tmp_path: Pat
         build_cached(tmp_path, icosphere(0), "bvh2")
 
 
-# --- what killed processes leave --------------------------------------------------------------------------------------
+# --- links --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def diary(tmp_path: Path) -> Iterator[Path]:
+    """A file of the user's outside of the folder that is written to: at the end it is as it was, and alone."""
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "diary.txt").write_text("my diary")
+    yield home / "diary.txt"
+    assert (home / "diary.txt").read_text() == "my diary" and names(home) == {"diary.txt"}
+
+
+@pytest.mark.parametrize("target", ["diary.txt", "new.txt", "loop.png"])
+@pytest.mark.parametrize("name", [name for name in WRITERS if name != "a.checkpoint"])
+def test_a_link_is_replaced_and_not_followed(name: str, target: str, diary: Path, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.symlink_to(path if target == "loop.png" else diary.with_name(target))
+    WRITERS[name](path)
+    assert path.is_file() and not path.is_symlink() and names(tmp_path) == {"home", name}
+
+
+def test_nor_is_one_of_the_names_that_wrt_makes(diary: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a folder for all, anybody can put links there before a render."""
+    folder = tmp_path / "folder"
+    (folder / "frames").mkdir(parents=True)
+    (folder / "report").mkdir()
+    monkeypatch.chdir(folder)
+    Path("box.obj").write_text(BOX_OBJ)
+    links = [".box.png.checkpoint.part", "box.png", "box.depth.png", "frames/frame_000.png", "report/profile.md",
+             "report/counters.exr", "report/histograms.png", "report/nodes.png"]
+    for link in links:
+        Path(link).symlink_to(diary)
+    small = ("--size", "16x9", "--spp", 1)
+    assert command("render", "box.obj", *small, "--aov", "depth", "--checkpoint", "1s").code == 0
+    assert command("animate", "box.obj", *small, "--frames", 2, "-o", "frames").code == 0
+    assert command("profile", "box.obj", *small, "-o", "report").code == 0
+    assert [link for link in links if Path(link).is_symlink()] == [links[0]]  # which nothing is written to
+
+
+def test_a_checkpoint_follows_no_link(diary: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.checkpoint"
+    path.symlink_to(diary.with_name("new.txt"))
+    with pytest.raises(InputError, match="is there already"):
+        render(SCENE, spp=1, checkpoint=path)
+    path.unlink()
+
+    def link(progress: wrt.Progress) -> None:
+        path.unlink(missing_ok=True)
+        path.symlink_to(diary)
+
+    render(SCENE, spp=2, checkpoint=path, checkpoint_every=1e-9, progress=link)
+    assert path.is_file() and not path.is_symlink()
+
+
+@linux_only
+@pytest.mark.parametrize("suffix", [".png", ".exr", ".hdr"])
+def test_nor_does_a_temporary_file_that_is_exchanged_for_a_link(suffix: str, diary: Path, tmp_path: Path,
+                                                                 monkeypatch: pytest.MonkeyPatch) -> None:
+    """By somebody who may rename files in the folder, right after it was made."""
+    open_file = open
+
+    def exchanged(path: Any, mode: str = "r", *arguments: Any, **rest: Any) -> Any:
+        file = open_file(path, mode, *arguments, **rest)
+        if mode == "x+b":
+            os.unlink(path)
+            os.symlink(diary, path)
+        return file
+
+    monkeypatch.setattr("builtins.open", exchanged)
+    write_image(tmp_path / f"a{suffix}", PIXELS)
+
+
+# --- what a killed process leaves -------------------------------------------------------------------------------------
 
 WRITING = """
-import sys, time
+import os, signal, sys
 from wrt.core.write_file import replacing
-with replacing(sys.argv[1]) as temporary:
-    temporary.write_bytes(b"half")
-    print(temporary.name, flush=True)
-    time.sleep(600)
-"""
-SAVING = """
-import sys, time, wrt
-from tests.wrt.renderer.test_checkpoint import SCENE
-def wait(progress):
-    if progress.stage == "trace":  # before it there is no part
-        print("runs", flush=True)
-        time.sleep(600)
-wrt.render(SCENE, checkpoint=sys.argv[1], checkpoint_every=float(sys.argv[2]), progress=wait)
-"""
-COMPILING = """
-import numpy as np, wrt
-wrt.build(wrt.Mesh(np.eye(3), np.array([[0, 1, 2]])), "brute_force").closest_hit(np.zeros((1, 3)), np.ones((1, 3)))
+with replacing(sys.argv[1]) as file:
+    file.write(bytes(100_000))
+    os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@contextlib.contextmanager
-def running(program: str, *arguments: object, **environment: str) -> Iterator[subprocess.Popen[str]]:
-    with subprocess.Popen([sys.executable, "-c", program, *map(str, arguments)], env={**ENVIRONMENT, **environment}, text=True,
-                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-def told(process: subprocess.Popen[str]) -> str:
-    assert process.stdout is not None
-    return process.stdout.readline().strip()
-
-
-@with_locks
-def test_what_a_killed_process_was_writing_is_removed_by_the_next_one(tmp_path: Path) -> None:
-    with running(WRITING, tmp_path / "a.png") as killed, running(WRITING, tmp_path / "b.png") as other:
-        left, writing = told(killed), told(other)
-        killed.kill()
-        killed.wait()
-        assert names(tmp_path) == {left, writing}
-        write_codes(tmp_path / "c.png", np.zeros((2, 2, 3), np.uint8))
-        assert names(tmp_path) == {writing, "c.png"}  # who writes still is left alone
-
-
-def left_by(system: str, folder: Path, age: float, suffix: str = ".exr") -> Path:
-    path = folder / f".wrt-{system}-0123456789abcdef{suffix}"
-    path.write_bytes(b"half")
-    os.utime(path, (time.time() - age,) * 2)
-    return path
-
-
-@with_locks
-def test_of_other_systems_only_what_is_old_is_removed(tmp_path: Path) -> None:
-    young, old = left_by("0" * 16, tmp_path, 0.9 * LONG_AGO), left_by("1" * 16, tmp_path, 1.1 * LONG_AGO)
-    locked = left_by("2" * 16, tmp_path, 1.1 * LONG_AGO)
-    with open(locked, "rb+") as file:
-        assert write_file.try_lock(file.fileno())
-        remove_leftovers(tmp_path)
-    assert young.exists() and locked.exists() and not old.exists()
-
-
-@with_locks
-def test_nothing_of_a_stranger_s_is_removed(tmp_path: Path) -> None:
-    outside = tmp_path / "outside"
-    outside.mkdir()
-    kept = outside / f".wrt-{this_system()}-0123456789abcdef.exr"
-    kept.write_bytes(b"somebody's")
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    ours = f".wrt-{this_system()}-"
-    for name in (".d1d8d1d8d1d8d1d8d1d8d1d8d1d8d1d8.exr", ".wrt-notes", ours, ours + "0123456789abcdef0.exr",
-                 ours.upper() + "0" * 16, "x" + ours + "0123456789abcdef.exr", ".film.part",
-                 ".a.checkpoint.part", "wp_closest_hit_0a1b2c3d_p1_t2"):
-        (folder / name).write_bytes(b"somebody's")
-    (folder / ".b.part").write_bytes(checkpoint.MAGIC + b"{}\n")
-    (folder / (ours + "0123456789abcde1.exr")).symlink_to(kept)
-    (folder / (ours + "0123456789abcde2.exr")).mkdir()
-    os.mkfifo(folder / (ours + "0123456789abcde3.exr"))
-    for i, name in enumerate(("../outside", "/", str(outside), "wp_a_p1_t2/../../outside", "", "wp_\0_p1_t2")):
-        (folder / f"{ours}012345678900000{i}.compiling").write_text(name)  # which goes, but takes nothing with it
-    before = names(folder)
-    remove_leftovers(folder)
-    assert {name for name in before - names(folder)} == {f"{ours}012345678900000{i}.compiling" for i in range(6)}
-    assert names(outside) == {kept.name}
-
-
-@with_locks
-def test_a_file_that_is_removed_before_it_is_locked_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By somebody who takes it for a leftover: its maker has made it, and has no lock yet."""
-    open_file, removed = os.open, []
-
-    def slow(path: Any, *arguments: Any, **rest: Any) -> int:
-        descriptor = open_file(path, *arguments, **rest)
-        if arguments[0] & os.O_EXCL and len(removed) < 3:
-            removed.append(path)
-            Path(path).unlink()
-        return descriptor
-
-    monkeypatch.setattr(os, "open", slow)
-    with aside(tmp_path) as path:
-        assert path.exists() and len(removed) == 3 and path not in removed
-
-
-@with_locks
-@pytest.mark.parametrize("every", [600.0, 1e-9], ids=["reserved", "written"])
-def test_the_part_of_a_killed_render_is_removed_by_others(every: float, tmp_path: Path) -> None:
-    """By whoever writes there, whatever its own name: nobody may ever resume it."""
-    with running(SAVING, tmp_path / "a", every) as killed, running(SAVING, tmp_path / "b", every) as other:
-        assert told(killed) == told(other) == "runs"
-        assert {".a.part", ".b.part"} <= names(tmp_path)
-        killed.kill()
-        killed.wait()
-        before = names(tmp_path)
-        write_codes(tmp_path / "c.png", np.zeros((2, 2, 3), np.uint8))
-        assert names(tmp_path) == before - {".a.part"} | {"c.png"}
-    write_file._cleaned.discard(tmp_path)
-    film = render(SCENE, checkpoint=tmp_path / "a", resume=True, device="cpu")  # as the processes' own
-    assert same(film, render(SCENE, device="cpu")) and ".b.part" not in names(tmp_path)
-
-
-@with_locks
-def test_what_a_kill_leaves_in_the_kernel_cache_is_removed(tmp_path: Path) -> None:
-    def compilations() -> list[Path]:
-        return list(tmp_path.glob("*/wp_*_p*_t*"))
-
-    with running(COMPILING, WARP_CACHE_PATH=str(tmp_path)) as killed:
-        while not compilations() and killed.poll() is None:
-            time.sleep(0.01)
-        assert killed.poll() is None, killed.communicate()
-        killed.kill()
-    (left,) = compilations()
-    stranger = left.with_name("wp_closest_hit_0a1b2c3d_p1_t2")
-    stranger.mkdir()  # of a Warp program without wrt, which says nothing of it
-    with running(COMPILING, WARP_CACHE_PATH=str(tmp_path)) as next_one:
-        assert next_one.wait() == 0, next_one.communicate()
-    assert compilations() == [stranger] and not list(tmp_path.glob("*/.wrt-*"))
-    assert list(tmp_path.glob("*/wp_*/*.o"))
+def test_a_killed_process_leaves_the_old_file_and_one_temporary_file(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"old")
+    killed = subprocess.run([sys.executable, "-c", WRITING, tmp_path / "a.png"], env=ENVIRONMENT, check=False)
+    assert killed.returncode < 0 and (tmp_path / "a.png").read_bytes() == b"old"
+    (left,) = names(tmp_path) - {"a.png"}
+    assert re.fullmatch(r"\.wrt-[0-9a-f]{32}\.png", left)  # as docs/long_renders.md has it
+    write_codes(tmp_path / "a.png", np.zeros((2, 2, 3), np.uint8))
+    assert names(tmp_path) == {"a.png", left}
 
 
 # --- Windows ----------------------------------------------------------------------------------------------------------
@@ -330,7 +280,7 @@ def test_what_a_kill_leaves_in_the_kernel_cache_is_removed(tmp_path: Path) -> No
 
 @pytest.fixture
 def windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As far as wrt can tell: no file that is open is renamed, replaced or removed, no folder is opened, nothing is locked."""
+    """As far as wrt can tell: no file that is open is renamed, replaced or removed, and no folder is opened."""
 
     def check(path: Any) -> None:
         for descriptor in os.listdir("/proc/self/fd"):
@@ -352,10 +302,6 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> None:
         return open_file(path, *arguments, **rest)
 
     monkeypatch.setattr(os, "open", opened)
-    monkeypatch.delattr(os, "posix_fallocate", raising=False)
-    monkeypatch.setattr(write_file, "fcntl", None)
-    for module in (write_file, checkpoint):
-        monkeypatch.setattr(module, "WINDOWS", True)
 
 
 @linux_only

@@ -19,7 +19,7 @@ import wrt
 from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
 from wrt.core.html import Rows, html_table
-from wrt.core.write_file import replacing
+from wrt.core.write_file import write_bytes
 from wrt.lab.bench.plot import LogLogPlot, new_figure
 from wrt.lab.plans import Plan
 from wrt.picture.image import check_writable, write_codes
@@ -212,8 +212,7 @@ def check_folder(folder: Path, names: Iterable[str], *, parents: bool = False) -
 
 def write(path: Path, text: str, plots: Mapping[str, LogLogPlot]) -> list[Path]:
     """The text, and beside it plots by their file names; the paths. Raises InputError where the system refuses."""
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_bytes(path, text.encode())
     beside = [path.with_name(name) for name in plots]
     for target, plot in zip(beside, plots.values(), strict=True):
         write_codes(target, plot.draw())

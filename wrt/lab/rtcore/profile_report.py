@@ -11,6 +11,7 @@ import numpy as np
 
 from wrt.accel.answers import Counters
 from wrt.core.html import Rows
+from wrt.core.write_file import write_bytes
 from wrt.lab.bench.plot import histograms
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
 from wrt.lab.rtcore.model import LEGEND, MODEL_COLUMNS, SIMT_COLUMNS, Work, model_page, model_row, simt
@@ -125,5 +126,5 @@ def write_report(profile: Profile, text: str, folder: Path) -> list[Path]:
               {"scene": profile.scene, "spp": profile.spp})
     kinds = {TITLES[name]: by_kind(profile, name) for name in PER_RAY}
     write_codes(folder / HISTOGRAMS, histograms(kinds, f"{profile.scene}: what a ray costs, and the share of rays that cost it"))
-    (folder / REPORT).write_text(f"# Profile of {text}", encoding="utf-8")
+    write_bytes(folder / REPORT, f"# Profile of {text}".encode())
     return [*paths, folder / LAYERS, folder / HISTOGRAMS, folder / REPORT]
