@@ -2,16 +2,18 @@
 
 Rays by themselves: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits,
 first_hits, contains, winding_number, visible; closest_points, signed_distance.
-Rays from kernels of your own: kernel, ray_query. Gradients: Hits.gradients, wrt.torch, wrt.jax.
+Rays from kernels of your own: kernel, ray_query. Gradients: Hits.gradients, and the modules torch, jax.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
 FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; ConstantBackground, GradientBackground,
 EnvironmentBackground.
 What a picture costs: profile. What is fastest on a device: tune. What goes wrong: InputError, SceneWarning.
+Further modules: sensors, compat (trimesh, open3d), testing.
 """
 
 from __future__ import annotations
 
+import ast
 import gc
 import importlib
 import importlib.util
@@ -21,7 +23,13 @@ from typing import TYPE_CHECKING, Any
 
 from wrt.core.version import VERSION as __version__
 
+# Type checkers and editors see these imports. At run time each is made when the name is first used (__getattr__).
 if TYPE_CHECKING:
+    from wrt import compat as compat
+    from wrt import jax as jax
+    from wrt import sensors as sensors
+    from wrt import testing as testing
+    from wrt import torch as torch
     from wrt.accel.all_hits import all_hits as all_hits
     from wrt.accel.all_hits import count_hits as count_hits
     from wrt.accel.all_hits import first_hits as first_hits
@@ -70,40 +78,15 @@ if TYPE_CHECKING:
     from wrt.viewer.notebook import side_by_side as side_by_side
 
 
-# The same names at run time, each imported when it is first used: `python -m wrt --help` must not wait for Warp.
-_PUBLIC = {
-    "wrt.accel.all_hits": ("all_hits", "count_hits", "first_hits"),
-    "wrt.accel.build": ("build", "load_accel"),
-    "wrt.accel.closest_points": ("closest_points", "signed_distance"),
-    "wrt.accel.contains": ("contains",),
-    "wrt.accel.device_geometry": ("DeviceGeometry",),
-    "wrt.accel.ray_query": ("ray_query",),
-    "wrt.accel.structures": ("ACCELERATORS",),
-    "wrt.accel.visible": ("visible",),
-    "wrt.accel.winding": ("winding_number",),
-    "wrt.core.errors": ("InputError", "SceneWarning"),
-    "wrt.io.load": ("load_scene",),
-    "wrt.io.mesh_file": ("load_mesh",),
-    "wrt.kernels.structs": ("kernel",),
-    "wrt.lab.rtcore.profiler": ("profile",),
-    "wrt.lab.tune": ("tune",),
-    "wrt.picture.film": ("Film",),
-    "wrt.renderer.options": ("Options", "Progress"),
-    "wrt.renderer.pixel_rays": ("camera_rays",),
-    "wrt.renderer.render": ("render",),
-    "wrt.scene.backgrounds": ("ConstantBackground", "EnvironmentBackground", "GradientBackground"),
-    "wrt.scene.cameras": ("Camera", "FisheyeCamera", "OrthographicCamera", "PanoramaCamera"),
-    "wrt.scene.lights": ("DirectionalLight", "PointLight", "SpotLight"),
-    "wrt.scene.materials": ("Checkerboard", "Material", "Texture"),
-    "wrt.scene.mesh": ("Mesh",),
-    "wrt.scene.model": ("Object", "Scene", "Sphere"),
-    "wrt.scene.motion": ("Motion",),
-    "wrt.scene.settings": ("Settings",),
-    "wrt.viewer.notebook": ("LiveView", "side_by_side"),
-}
-_FOR_LIBRARIES = ("torch", "jax")  # modules of that name
-_HOME = {name: module for module, names in _PUBLIC.items() for name in names}
-__all__ = ["__version__", *_HOME]
+def _public() -> dict[str, str]:
+    """The module of each public name, as the imports above have it."""
+    imports = [node for node in ast.walk(ast.parse(Path(__file__).read_bytes())) if isinstance(node, ast.ImportFrom)]
+    return {each.name: node.module or "" for node in imports for each in node.names if each.asname == each.name}
+
+
+_HOME = _public()
+_MODULES = [name for name, module in _HOME.items() if module == __name__]
+__all__ = ["__version__", *(name for name in _HOME if name not in _MODULES)]
 
 
 def _find_kernels() -> None:
@@ -125,7 +108,7 @@ _find_kernels()
 
 
 def _imported(module: str) -> Any:
-    """What an import makes stays: to look through it for garbage again and again took a tenth of the start."""
+    """What an import makes stays: to look through it for garbage again and again took a seventh of the start."""
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -136,14 +119,14 @@ def _imported(module: str) -> Any:
 
 
 def __getattr__(name: str) -> Any:
-    if name in _FOR_LIBRARIES:
-        return importlib.import_module(f"wrt.{name}")
+    """Import a public name when it is first used: `python -m wrt --help` must not wait for Warp."""
+    if name in _MODULES:
+        return _imported(f"{__name__}.{name}")
     if name in _HOME:
-        value = getattr(_imported(_HOME[name]), name)
-        globals()[name] = value
+        value = globals()[name] = getattr(_imported(_HOME[name]), name)
         return value
-    raise AttributeError(f"module 'wrt' has no attribute {name!r}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, *_MODULES])
