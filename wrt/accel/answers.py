@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from wrt.core.arrays import taken, to_numpy, to_warp
 from wrt.core.checks import shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
-from wrt.core.html import html_facts, html_table
+from wrt.core.html import html_table
 
 HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
 ANY_HIT_TYPES = {"out": np.bool_}
@@ -35,9 +35,6 @@ class AccelStats:
     bytes: int
     sah_cost: float
 
-    def _repr_html_(self) -> str:
-        return html_facts("Structure", asdict(self))
-
 
 @dataclass(frozen=True)
 class Refit:
@@ -47,9 +44,6 @@ class Refit:
     seconds: float
     growth: float
     rebuilt: bool
-
-    def _repr_html_(self) -> str:
-        return html_facts("Refit", asdict(self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +102,7 @@ class Hits(HitPoints):
         facts: dict[str, Any] = {"rays": len(self), "hits": len(t), "misses": len(self) - len(t)}
         if len(t):
             facts |= {"nearest t": float(t.min()), "farthest t": float(t.max())}
-        return html_facts("Hits", facts) + (self.counters._repr_html_() if self.counters else "")
+        return html_table("Hits", (), facts.items()) + (self.counters._repr_html_() if self.counters else "")
 
     def numpy(self) -> Hits:
         """The same with NumPy arrays; of hits on the CPU they share the memory."""

@@ -8,7 +8,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -27,7 +27,6 @@ from wrt.accel.structure import Structure, check_options, check_units
 from wrt.core.arrays import check_no_gradients, taken
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
-from wrt.core.html import html_facts
 from wrt.core.seconds import seconds_without_loads
 from wrt.core.threads import thread_count
 from wrt.kernels.structs import Surfaces
@@ -214,11 +213,6 @@ class Accelerator(Queries, ABC):
         s = self.stats
         return (f"{type(self).__name__}({len(self.geometry)} primitives, {s.nodes} nodes, depth {s.depth}, "
                 f"{s.bytes / 1e6:.1f} MB, SAH {s.sah_cost:.1f}, built in {s.build_seconds:.3f} s)")
-
-    def _repr_html_(self) -> str:
-        units = self.structure.units
-        return html_facts(type(self).__name__, {"primitives": len(self.geometry), "triangle test": units.triangle,
-                                                "box test": units.box, "device": str(self.device), **asdict(self.stats)})
 
 
 def array_bytes(data: Any) -> int:

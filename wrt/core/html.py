@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -35,11 +35,6 @@ class Rows(list[T]):
 
     def _repr_html_(self) -> str:
         return self._page(self)
-
-
-def html_facts(title: str, facts: Mapping[str, Any]) -> str:
-    """A table of names and values."""
-    return html_table(title, (), facts.items())
 
 
 def number(value: Any) -> str:

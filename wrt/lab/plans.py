@@ -320,7 +320,7 @@ class Stability(Plan):
     """
 
     COMMAND = "stability"
-    REPORT = "Write a report: Markdown with plots beside it (.md), or one page (.html)"
+    REPORT = "Write a report: Markdown (.md) with plots beside it"
     cases: Sequence[str] = option((), "", form="argument")
     rays: int = option(10_000, "Rays of each case, for the default", (1, 2**40))
     sample: int = option(10_000, "How many of them the oracle judges, and the other tests and peers get", (1, 2**40))

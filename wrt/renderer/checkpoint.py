@@ -78,7 +78,7 @@ class Checkpoint:
             if not resume:
                 raise InputError("is there already: resume it (--resume, resume=True), or remove it first", path)
             self.saved = self._checked(read(self.path, self.bytes))
-        self._last, self._cost = 0.0, 0.0
+        self._last = 0.0
 
     def _checked(self, saved: Saved) -> Saved:
         differ = [name for name in {**self.identity, **saved.identity} if self.identity.get(name) != saved.identity.get(name)]
@@ -105,12 +105,11 @@ class Checkpoint:
         self._last = time.monotonic()
 
     def due(self) -> bool:
-        """Whether it is time: a new file is to be there `every` seconds after the state that the last one holds."""
-        return time.monotonic() - self._last >= max(self.every - self._cost, 0.5 * self.every)
+        """Whether it is time: `every` seconds after the last file was there."""
+        return time.monotonic() - self._last >= self.every
 
     def save(self, film: DeviceFilm, seconds: float) -> None:
         """Write the film. Where the system refuses, the old file stays, `problem` says why, and the render goes on in memory."""
-        begin = time.monotonic()
         samples = film.view(film.groups[0].samples)
         header = {"samples": [int(samples.min()), int(samples.max())], "seconds": seconds, "identity": self.identity}
         try:
@@ -119,7 +118,7 @@ class Checkpoint:
             self.problem = ""
         except (InputError, MemoryError) as error:
             self.problem = f"the checkpoint is not saved: {error}"
-        self._last, self._cost = begin, time.monotonic() - begin
+        self._last = time.monotonic()
 
     # --- reading ------------------------------------------------------------------------------------------------------
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from wrt.core.checks import LARGEST, as_array, shown
 from wrt.core.errors import InputError
-from wrt.core.html import html_facts
 from wrt.core.packages import needed_by
 
 if TYPE_CHECKING:
@@ -117,15 +116,6 @@ class Mesh:
         if len(self.vertices):
             parts.append(f"from {_corner(self.vertices.min(axis=0))} to {_corner(self.vertices.max(axis=0))}")
         return f"Mesh({', '.join(parts)})"
-
-    def _repr_html_(self) -> str:
-        facts: dict[str, object] = {"vertices": len(self.vertices), "faces": len(self.faces)}
-        facts |= {name: "yes" if getattr(self, name) is not None else "no" for name in ("normals", "uvs")}
-        facts |= {"groups": ", ".join(self.groups)} if self.groups else {}
-        facts |= {"faces without area, left out": self.dropped} if self.dropped else {}
-        if len(self.vertices):
-            facts |= {"from": _corner(self.vertices.min(axis=0)), "to": _corner(self.vertices.max(axis=0))}
-        return html_facts(f"Mesh {self.name}", facts)
 
 
 def _corner(point: np.ndarray) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 
 from wrt.core.checks import as_array, as_one, as_tuple, at_thing, unknown
 from wrt.core.errors import InputError
-from wrt.core.html import html_facts, html_table
+from wrt.core.html import html_table
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import CameraKind
 from wrt.scene.lights import LIGHTS, Light
@@ -133,8 +133,8 @@ class Scene:
         settings = {each.name: getattr(self.settings, each.name) for each in fields(Settings)}
         settings["size"] = f"{self.settings.size[0]}x{self.settings.size[1]}"
         return html_table(repr(self), ("shape", "kind", "primitives", "materials"), things) + html_table(
-            "", ("light", "kind"), lights) + html_table("", ("camera", "kind", "parameters"), cameras) + html_facts(
-            "Settings", settings)
+            "", ("light", "kind"), lights) + html_table("", ("camera", "kind", "parameters"), cameras) + html_table(
+            "Settings", (), settings.items())
 
     @property
     def materials(self) -> tuple[Material, ...]:

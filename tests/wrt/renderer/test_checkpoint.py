@@ -22,7 +22,7 @@ from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.renderer import checkpoint as module
-from wrt.renderer.checkpoint import MAGIC, Checkpoint, read
+from wrt.renderer.checkpoint import MAGIC, read
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import Plan
 from wrt.renderer.render import render
@@ -372,14 +372,13 @@ def test_a_checkpoint_that_appears_while_kernels_are_compiled_is_not_overwritten
 
 
 def test_when_the_next_is_due(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So early that what it takes to write falls within the interval, but never more than half of the time for writing."""
     now = 100.0
     monkeypatch.setattr(module.time, "monotonic", lambda: now)
-    file = Checkpoint(path, 60.0, {}, area=1, groups=1, resume=False)
-    file.begin()
-    for cost, expected in ((0.0, 60.0), (10.0, 50.0), (200.0, 30.0)):
-        file._last, file._cost = now, cost
-        now += expected - 0.01
+    film, file = checkpoint_of(path, 1)
+    film.put(film.groups[0].samples, np.zeros((4, 6), np.int32))
+    for begin in (file.begin, lambda: file.save(film, 1.0)):
+        begin()
+        now += file.every - 0.01
         assert not file.due()
         now += 0.02
         assert file.due()

@@ -19,10 +19,10 @@ import wrt
 from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
 from wrt.core.html import Rows, html_table
-from wrt.core.write_file import write_bytes
+from wrt.core.write_file import check_writable, write_bytes
 from wrt.lab.bench.plot import LogLogPlot, new_figure
 from wrt.lab.plans import Plan
-from wrt.picture.image import check_writable, write_codes
+from wrt.picture.image import write_codes
 
 
 def machine_line(used: str = "", *more: str, device: str = "cpu") -> str:

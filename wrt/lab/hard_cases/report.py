@@ -1,16 +1,13 @@
-"""What `stability` tells: tables for the terminal, and a report as Markdown with plots beside it or as one HTML file."""
+"""What `stability` tells: tables for the terminal, and a report as Markdown with plots beside it."""
 
 from __future__ import annotations
 
-import base64
-import html
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.core.html import html_table
 from wrt.core.threads import thread_count
 from wrt.lab.bench.plot import LogLogPlot, Series
 from wrt.lab.bench.report import Columns, Part, check_folder, machine_line, repeating, table, tabled, write
@@ -19,7 +16,6 @@ from wrt.lab.bench.report import markdown as as_markdown
 from wrt.lab.bench.timing import shown
 from wrt.lab.hard_cases.cases import Verdict
 from wrt.lab.hard_cases.stability import ASKED, COLUMNS, Plan, Result, Row
-from wrt.picture.image import encode_png
 
 PLOTS = {"lost": ("Rays lost or wrong, all hard cases", "rays lost or wrong per million"),
          "error": ("Error of t, the middle one of the hard cases", "99.9th percentile, float32 ulp")}
@@ -81,7 +77,7 @@ def _groups(result: Result) -> Part:
                            for name, mine in groups.items()], f"The default ({default}) by group")
 
 
-def parts(result: Result, plan: Plan, stem: str = "") -> list[Part]:
+def parts(result: Result, plan: Plan, stem: str) -> list[Part]:
     """The whole report, in order; stem: plots are STEM-lost.png and STEM-error.png."""
     told = "\n\n".join([f"Machine: {machine(plan)}; {result.seconds:.0f} s in all.", f"To repeat: `{repeating(plan)}`",
                         LEGEND.format(sample=plan.sample), *(f"{line}." for line in _notes(result))])
@@ -119,41 +115,16 @@ def plot(result: Result, which: str) -> LogLogPlot:
     return LogLogPlot(title, "ns a ray, one thread", label, series)
 
 
-STYLE = """body{font:15px/1.5 sans-serif;max-width:1300px;margin:2em auto;padding:0 1em}
-table{border-collapse:collapse;font-size:13px}td,th{padding:2px 9px;border-bottom:1px solid #ddd;text-align:right}
-img{max-width:100%}"""
-
-
-def page(result: Result, plan: Plan) -> str:
-    """All of it as one HTML file, plots within."""
-    out = [f"<!DOCTYPE html><html lang=en><meta charset=utf-8><title>wrt stability</title><style>{STYLE}</style>"]
-    for part in parts(result, plan):
-        out.append(f"<h2>{html.escape(part.title)}</h2>")
-        out += [f"<p>{html.escape(paragraph)}</p>" for paragraph in part.text.split("\n\n") if paragraph]
-        if part.plot:
-            image = base64.b64encode(encode_png(plot(result, _which(part.plot)).draw(), {})).decode()
-            out.append(f'<img alt="{html.escape(part.title)}" src="data:image/png;base64,{image}">')
-        out += [html_table("", part.head, part.lines, most=None)] if part.lines else []
-    return "\n".join(out) + "</html>\n"
-
-
-def _which(name: str) -> str:
-    """The plot of a file's name."""
-    return name.removesuffix(".png").rsplit("-", 1)[1]
-
-
 def check_report(path: Path) -> None:
     """Raise InputError where write_report could not write, before the work."""
-    if path.suffix.lower() not in (".md", ".html"):
-        raise InputError("the report is Markdown or HTML: use .md or .html", path)
+    if path.suffix.lower() != ".md":
+        raise InputError("the report is a .md file", path)
     if not path.parent.is_dir():
         raise InputError("no such folder", path.parent)
-    check_folder(path.parent, [f"{path.stem}-{which}.png" for which in PLOTS if path.suffix.lower() == ".md"])
+    check_folder(path.parent, [path.name, *(f"{path.stem}-{which}.png" for which in PLOTS)])
 
 
 def write_report(result: Result, plan: Plan, path: Path) -> list[Path]:
     """The files; the report is written whole or not at all. Raises InputError where the system refuses."""
-    if path.suffix.lower() == ".html":
-        return write(path, page(result, plan), {})
-    told = parts(result, plan, path.stem)
-    return write(path, as_markdown(told), {part.plot: plot(result, _which(part.plot)) for part in told if part.plot})
+    plots = {f"{path.stem}-{which}.png": plot(result, which) for which in PLOTS}
+    return write(path, as_markdown(parts(result, plan, path.stem)), plots)

@@ -24,7 +24,7 @@ from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
 from wrt.kernels.traverse.common import Units
-from wrt.lab.bench.report import Columns, tabled, tables_page
+from wrt.lab.bench.report import Columns
 from wrt.lab.bench.report import Row as Line
 from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
 from wrt.lab.bench.timing import alternate, quartiles
@@ -93,9 +93,6 @@ class Result(Line):
     """rows: by case and algorithm; speed: by algorithm, see `measure_speed`; not_installed: the peers that were asked for and are
     not; seconds that it took; interrupted: the number of the signal that ended it early; undone: the cases that it has not
     finished."""
-
-    def _repr_html_(self) -> str:
-        return tables_page([tabled(COLUMNS, self.rows, "Stability")])
 
 
 def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,

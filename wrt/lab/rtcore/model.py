@@ -18,7 +18,6 @@ import numpy as np
 from wrt.accel.answers import Counters
 from wrt.accel.base import Accelerator
 from wrt.core.errors import InputError
-from wrt.core.html import html_table
 from wrt.lab.bench.report import Columns, Part, Row, tabled, tables_page
 from wrt.lab.rtcore.caches import LINE, Misses, first_level, second_level
 from wrt.lab.rtcore.parameters import BASE, PARAMETERS, SWEEPS, Core, Gpu
@@ -65,11 +64,6 @@ class Work:
 class Prediction(Row):
     """clocks: a ray and RT core, that each part needs, by TERMS; limit: the part that needs most; utilisation: how busy each is
     while that one is at its limit, 0 to 1; rays_per_second; work, gpu: the names of what it was reckoned for."""
-
-    def _repr_html_(self) -> str:
-        title = f"{self.work} on {self.gpu}: {self.rays_per_second / 1e9:.3g} Gray/s, bound by {self.limit}"
-        rows = [(name, value, f"{self.utilisation[name]:.0%}") for name, value in self.clocks.items()]
-        return html_table(title, ("part", "clocks a ray", "busy"), rows)
 
 
 def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
