@@ -293,8 +293,7 @@ class Background:
 class Lighting:
     """Every source of light but the surfaces that are seen directly.
 
-    emitter_cdf: per emitter, the share of its light's power up to and with it. clear: boxes of all that light passes
-    through (wrt.renderer.clear_boxes), row by row; none: not known.
+    emitter_cdf: per emitter, the share of its light's power up to and with it.
     """
 
     count: int
@@ -303,7 +302,6 @@ class Lighting:
     emitter_cdf: wp.array(dtype=wp.float32)
     background: Background
     ambient: wp.vec3
-    clear: wp.array(dtype=wp.float32)
 
 
 @wp.struct

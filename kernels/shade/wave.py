@@ -9,7 +9,7 @@ scene compiles no traversal.
 Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once. trace_wave launches
 the others, so that a wave is a single launch to Python. What begins a wave is in wave_begin.py, the step in wave_shade.py; for many
 hits at a time, surfaces are in wave_surfaces.py, textures in wave_textures.py, normals in wave_normals.py, random numbers in
-wave_numbers.py, and lights in wave_lights.py. clear.py says which shadow rays need a closest hit.
+wave_numbers.py, and lights in wave_lights.py.
 """
 
 from functools import cache
@@ -61,9 +61,8 @@ class Wave:
 
     By place in the queue: number, rays, hits. By count of the surfaces that ask lights: asked (their sample's number), lit,
     scatter, and for light i from i * capacity on request: the place of its shadow ray, or -1. By place of a shadow ray, for light i
-    from i * capacity on: value, shadow_rays, occluded. Where shadows are transparent, these are rays that can meet what light
-    passes through; they have walks and shadow_hits in place of occluded, and waiting: which walks they are of. The others stand
-    from (i + 1) * capacity - 1 downwards. asking: shadow rays to each light, and plain: those others.
+    from i * capacity on: value, shadow_rays, occluded. Where shadows are transparent, walks and shadow_hits are in place of
+    occluded, and waiting: which walks the shadow rays are of. asking: the number of shadow rays to each light.
 
     met, missed: places in the queue of the rays that hit something and of the others, each in their order. By place in a block of
     BLOCK of the hits: rows (wave_surfaces.py), keys, indices, wanted (wave_textures.py), and sky_x, sky_y, sky_z, which before
@@ -89,7 +88,6 @@ class Wave:
     asked: wp.array(dtype=wp.int32)
     request: wp.array(dtype=wp.int32)
     asking: wp.array(dtype=wp.int32)
-    plain: wp.array(dtype=wp.int32)
     value: wp.array(dtype=wp.vec3)
     shadow_rays: Queue
     occluded: wp.array(dtype=wp.bool)
@@ -170,11 +168,7 @@ def make_gather(transparent_shadows: bool) -> Any:
                 slot = wave.request[i * wave.capacity + a]
                 if slot >= 0:
                     if wp.static(transparent_shadows):
-                        if slot >= (i + 1) * wave.capacity - wave.plain[i]:
-                            direct.transmittance += wp.where(wave.occluded[slot], 0.0, 1.0) * wave.value[slot]
-                            direct.rays += 1
-                        else:
-                            direct = lit_by(direct, wave.value[slot], wave.scatter[a], wave.walks[slot].shadow)
+                        direct = lit_by(direct, wave.value[slot], wave.scatter[a], wave.walks[slot].shadow)
                     else:
                         light += wp.where(wave.occluded[slot], 0.0, 1.0) * wave.value[slot]
                         rays += 1
@@ -185,7 +179,6 @@ def make_gather(transparent_shadows: bool) -> Any:
             put_sample(wave.done, number, add_up(wave.done[number], wave.lit[a], direct))
         for i in range(lights):
             wave.asking[i] = 0
-            wave.plain[i] = 0
         wave.job[0].asked = 0
 
     return gather
@@ -240,9 +233,6 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
                 while wave.asking[light] > 0:
                     run_range(launches.walk_hit, first, first + wave.asking[light])
                     run_with(launches.go_through, light)
-                end = first + wave.capacity
-                if wave.plain[light] > 0:
-                    run_range(launches.shadow_hit, end - wave.plain[light], end)
             elif wave.asking[light] > 0:
                 run_range(launches.shadow_hit, first, first + wave.asking[light])
         gather(wave, lights)

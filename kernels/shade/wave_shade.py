@@ -7,7 +7,6 @@ import warp as wp
 from wrt.kernels.launches import Launch, run_range
 from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
-from wrt.kernels.shade.clear import may_pass
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
 from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, make_step
@@ -45,20 +44,13 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
         return size
 
     @wp.func
-    def ask(wave: Wave, lighting: Lighting, i: int, request: ShadowRequest) -> int:
+    def ask(wave: Wave, i: int, request: ShadowRequest) -> int:
         """The place of a shadow ray to light i."""
         slot = i * wave.capacity + wave.asking[i]
-        plain = bool(False)
+        wave.asking[i] = wave.asking[i] + 1
         if wp.static(features.transparent_shadows):
-            plain = not may_pass(lighting, request.ray)
-        if plain:
-            wave.plain[i] = wave.plain[i] + 1
-            slot = (i + 1) * wave.capacity - wave.plain[i]
-        else:
-            wave.asking[i] = wave.asking[i] + 1
-            if wp.static(features.transparent_shadows):
-                wave.walks[slot] = begin_shadow(request.ray, request.end)
-                wave.waiting[slot] = slot
+            wave.walks[slot] = begin_shadow(request.ray, request.end)
+            wave.waiting[slot] = slot
         wave.value[slot] = request.value
         put_ray(wave.shadow_rays, slot, request.ray)
         return slot
@@ -197,7 +189,7 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
                         request = shadow_request(shaded, sample)
                         slot = int(-1)
                         if any_positive(request.value):
-                            slot = ask(wave, lighting, i, request)
+                            slot = ask(wave, i, request)
                             asks += 1
                         wave.request[i * wave.capacity + asked] = slot
             if asks > 0:

@@ -17,7 +17,6 @@ from wrt.accel.build import build, reports_progress
 from wrt.core.device import load_kernel
 from wrt.core.seconds import Span, counted_once, loads_since
 from wrt.core.threads import thread_count
-from wrt.renderer.clear_boxes import put_clear_boxes
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Progress
 from wrt.renderer.pixels import aov_launch, film_launch
@@ -123,7 +122,6 @@ def prepare(plan: Plan, device: Any, built: Prepared | None = None) -> Prepared:
     work = _Preparation(plan, device)
     work.run(([work.build] if built is None else []) + [partial(work.compile, kernel) for kernel in work.kernels])
     arrays, accel = (work.arrays, work.accel) if built is None else (built.arrays, built.accel)
-    put_clear_boxes(arrays, plan)
     lights = arrays.lighting.count + (1 if plan.features.sky_light else 0)
     waves = Waves(plan.wave_kernels, plan.features, lights) if plan.by_waves else None
     camera = camera_struct(plan.camera, plan.scene.settings.size)

@@ -19,7 +19,6 @@ from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import checkpoint_of
-from wrt.renderer.clear_boxes import put_clear_boxes
 from wrt.renderer.options import Options
 from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import kind_of, prepare
@@ -65,7 +64,6 @@ class Renderer:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", SceneWarning)  # reported when this was made
             arrays = upload_scene(scene, old.device, plan.meshes)
-        put_clear_boxes(arrays, plan)
         geometry: Any = arrays.world.geometry
         self.prepared = replace(old, plan=plan, arrays=arrays)
         if can_refit(old.accel, geometry):

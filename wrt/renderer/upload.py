@@ -253,7 +253,6 @@ def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()
     lighting.emitter_cdf = upload(cdf, wp.float32, device)
     lighting.background = background_struct(scene.background, device)
     lighting.ambient = wp.vec3(*scene.ambient)
-    lighting.clear = upload(np.zeros(0), wp.float32, device)  # wrt.renderer.clear_boxes
     return DeviceScene(world, s, lighting)
 
 

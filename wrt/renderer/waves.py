@@ -111,7 +111,7 @@ def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
         shade=shade,
         prepare=prepare,
         closest_hit=closest_hit,
-        any_hit=queue_kernel(structure, cutout, True)[0] if features.lit else None,
+        any_hit=queue_kernel(structure, cutout, True)[0] if features.lit and not transparent else None,
         shadow=shadow_kernel(surfaces) if transparent else None,
         begin=begin_kernel(some(features, OF_CAMERA)),
         loop=wave.make_loop_kernel(transparent),
@@ -166,7 +166,7 @@ class Buffers:
         w = self.wave = wave.Wave()
         w.capacity = n
         w.job, w.order = upload(self.job, wave.Job, "cpu"), upload(self.order, wp.int32, "cpu")
-        w.asking, w.plain = (wp.zeros(max(lights, 1), dtype=wp.int32, device="cpu") for _ in range(2))
+        w.asking = wp.zeros(max(lights, 1), dtype=wp.int32, device="cpu")
         w.xi, w.lens_xi = room(n + LANES, wp.vec2), room(n + LANES, wp.vec2)
         w.done, w.size, w.traced, w.number = room(n, Sample), room(n, wp.int32), room(n, wp.int32), room(n, wp.int32)
         w.paths = room(n * features.stack_size, wave.Path)
@@ -181,7 +181,8 @@ class Buffers:
         if features.transparent_shadows:
             w.scatter, w.walks, w.waiting = room(n, Scatter), room(shadows, ShadowWalk), room(shadows, wp.int32)
             w.shadow_hits = hit_arrays(shadows)
-        w.occluded = room(shadows, wp.bool)
+        else:
+            w.occluded = room(shadows, wp.bool)
         self.scratch = new_scratch(BatchTraversal.stream_sizes)
 
     def take(self, work: Work, each: Callable[[], None]) -> None:

@@ -16,15 +16,12 @@ from tests.data import ROOT
 from wrt.core.device import load_kernel, start
 from wrt.io.load import load_scene
 from wrt.kernels.shade import wave
-from wrt.kernels.shade.clear import BOXES
 from wrt.renderer import waves
-from wrt.renderer.clear_boxes import put_clear_boxes
 from wrt.renderer.film_arrays import OF_AOVS, AovFilm, DeviceFilm
 from wrt.renderer.options import Options
 from wrt.renderer.plan import aov_kernel, plan_of, render_kernel
 from wrt.renderer.prepare import Prepared, prepare
 from wrt.renderer.tiles import Work, corners
-from wrt.renderer.upload import upload_scene
 from wrt.scene.backgrounds import GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, PointLight
@@ -156,33 +153,6 @@ def test_nothing_is_read_before_it_is_written(name: str, monkeypatch: pytest.Mon
         films.append(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 3)))
     for film in films[1:]:
         assert_same(films[0], film)
-
-
-@pytest.mark.parametrize("name", ["tinted_shadows", "made"])
-def test_both_kinds_of_shadow_ray_have_one_answer(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those that can meet something clear are closest hits, the others any hits; where nothing is known, all are the former."""
-    ready = prepared(name, **({"glass_shadows": "tinted"} if name == "made" else {}))
-    untold = 0xCD
-    monkeypatch.setattr(waves, "room", filled_with(untold))
-    film = film_of(ready, (0, 3))
-    wave_of = ready.waves.free[0].wave
-    told = wave_of.occluded.numpy().view(np.uint8) != untold
-    walked = wave_of.walks.numpy().view(np.uint8).reshape(len(told), -1)[:, 0] != untold
-    assert ready.arrays.lighting.clear.shape == (6 * BOXES,) and told.sum() > 100 and walked.sum() > 100
-    assert not told[:64].any() and told[wave_of.capacity - 64 : wave_of.capacity].all()  # from the back of what a light has
-    ready.arrays.lighting.clear = wp.zeros(0, dtype=wp.float32, device="cpu")
-    assert_same(film, film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 3)))
-
-
-def test_boxes_are_for_those_who_ask() -> None:
-    def boxes(name: str, **options: Any) -> int:
-        plan = plan_of(load_scene(SCENES / f"{name}.toml"), replace(Options(device="cpu"), **options))
-        arrays = upload_scene(plan.scene, start("cpu"), plan.meshes)
-        put_clear_boxes(arrays, plan)
-        return len(arrays.lighting.clear)
-
-    assert boxes("tinted_shadows") == 6 * BOXES
-    assert boxes("glass_slab") == boxes("tinted_shadows", triangle="moeller_trumbore") == 0
 
 
 def test_groups_have_samples_of_their_own() -> None:
