@@ -135,7 +135,7 @@ def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, given: tuple[tuple[str, 
     """SCENE by wrt and by Mitsuba 3 (scalar_rgb and llvm_ad_rgb), on all threads: time to equal error, process start included and
     excluded.
 
-    llvm_ad_rgb gets the LLVM library that DRJIT_LIBLLVM_PATH names, else the newest in the usual places that passes a trial.
+    llvm_ad_rgb needs an LLVM library (19 works), named in the environment variable DRJIT_LIBLLVM_PATH.
     """
     from wrt.lab.mitsuba import equal_error
     from wrt.renderer.options import Options

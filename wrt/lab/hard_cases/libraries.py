@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +15,7 @@ from wrt.core.errors import InputError
 from wrt.lab.hard_cases.common import surface
 from wrt.lab.hard_cases.conformance import ClosestHit
 from wrt.lab.hard_cases.contestants import Embree, EmbreeFast, Open3D, Peer, WarpMesh
-from wrt.lab.mitsuba.process import PATH_VARIABLE, llvm_library
+from wrt.lab.mitsuba.process import require_llvm
 from wrt.lab.mitsuba.translate import mitsuba
 
 TRIMESH_RAYS = 64  # at once: it tests all triangles in a box around each ray
@@ -37,7 +36,7 @@ def peer(kind: type[Peer], vertices: np.ndarray, faces: np.ndarray, origins: np.
 
 def mitsuba_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Answer:
     """By its variant llvm_ad_rgb, which asks Embree."""
-    os.environ.setdefault(PATH_VARIABLE, llvm_library())
+    require_llvm()
     with mitsuba("llvm_ad_rgb") as mi:
         mesh = mi.Mesh("mesh", len(vertices), len(faces))
         parameters = mi.traverse(mesh)
@@ -96,7 +95,7 @@ def usable(name: str) -> str:
         return f"not installed: {', '.join(missing)}"
     if name == "mitsuba":
         try:
-            llvm_library()
+            require_llvm()
         except InputError as error:
             return str(error)
     return ""

@@ -12,7 +12,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -25,7 +25,7 @@ from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench.error import REFERENCE_SEEDS, finished, make_reference
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
 from wrt.lab.bench.timing import quartiles, shown, spread
-from wrt.lab.mitsuba.process import Job, MitsubaProcess, NotAvailable, environment_of
+from wrt.lab.mitsuba.process import Job, MitsubaProcess, NotAvailable
 from wrt.lab.plans import Mitsuba as Plan
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
@@ -83,7 +83,7 @@ class _Measured:
         """All that a process takes but for tracing, with its first picture at 1 spp, as wrt's process is timed. (It is handed
         the scene as arrays: reading files is not counted.)"""
         program = f"import mitsuba as mi; mi.set_variant({self.job.variant!r})"
-        imports = process_seconds(["-c", program], times, environment_of(self.job.variant))
+        imports = process_seconds(["-c", program], times)
         rest = [self._load_and_first_picture() for _ in range(times + 1 if times else 0)]
         self.start = imports + float(np.median(rest[1:])) if times else imports
 
@@ -168,12 +168,12 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
                not_available=rivals.not_available, reference=truth)
 
 
-def process_seconds(arguments: list[str], times: int, environment: Mapping[str, str] | None = None) -> float:
+def process_seconds(arguments: list[str], times: int) -> float:
     """The median wall clock of a Python process; one more run, before, is not counted (kernel caches, files). NaN: no times."""
     seconds = []
     for _ in range(times + 1 if times else 0):
         begin = time.perf_counter()
-        done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=environment)
+        done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
         if done.returncode != 0:
             raise InputError(f"python {' '.join(arguments)} ended with {done.returncode}: {done.stderr.strip()[-300:]}")
         seconds.append(time.perf_counter() - begin)

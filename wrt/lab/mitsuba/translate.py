@@ -1,8 +1,8 @@
 """Mitsuba 3 as an independent oracle and a rival: the same scene, rays and camera, answered by someone else's code.
 
 As an oracle the variant is scalar_rgb, in this process; as a rival also llvm_ad_rgb, which is faster, but ends the whole process
-where the LLVM library does not suit it (process.py chooses one). Both trace with Embree,
-which is asked for its robust mode; Mitsuba unasked takes the fast one.
+where the LLVM library does not suit it (process.py gives it one of its own). Both trace with Embree, which is asked for its robust
+mode; Mitsuba unasked takes the fast one.
 
 What can be compared exactly (Mitsuba's estimate has the same expectation as wrt's picture):
 - integrator "whitted" (whitted.py): any scene of diffuse, mirror, conductor and glass surfaces;

@@ -98,7 +98,7 @@ def test_a_variant_that_ends_on_its_way_is_left_out(monkeypatch) -> None:
     monkeypatch.setattr(equal_error, "MitsubaProcess", Mortal)
     result = equal_error.run(ROOM, replace(PLAN, integrator="direct"), Options())
     assert len(result.mitsuba["scalar_rgb"].seconds) == PLAN.repeats
-    assert set(result.not_available) == {"llvm_ad_rgb"} and "its process ended by SIGABRT" in result.not_available["llvm_ad_rgb"]
+    assert set(result.not_available) == {"llvm_ad_rgb"} and "its process ended with SIGABRT" in result.not_available["llvm_ad_rgb"]
 
 
 def test_starts_have_all_that_a_process_takes(tmp_path) -> None:

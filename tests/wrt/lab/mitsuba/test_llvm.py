@@ -1,4 +1,4 @@
-"""Mitsuba's variant llvm_ad_rgb: which LLVM library it gets, and that what ends its process ends nothing else."""
+"""Mitsuba in a process of its own: the variant llvm_ad_rgb needs an LLVM library, and what ends that process ends nothing else."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from tests.mitsuba_oracle import render_mitsuba
 from wrt.core.errors import InputError
 from wrt.lab.mitsuba import process as mitsuba_process
-from wrt.lab.mitsuba.process import PATH_VARIABLE, Job, MitsubaProcess, NotAvailable, candidates, llvm_library, trial
+from wrt.lab.mitsuba.process import PATH_VARIABLE, Job, MitsubaProcess, NotAvailable, require_llvm
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
@@ -28,83 +28,34 @@ SCENE = Scene(
 JOB = Job("scalar_rgb", SCENE, 0, "path", 2)
 
 
+@pytest.mark.parametrize(("named", "said"), [(None, "is not set"), ("/nowhere/libLLVM.so", "names no file: /nowhere/libLLVM.so")])
+def test_the_llvm_variant_needs_a_library(named: str | None, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')
+    monkeypatch.delenv(PATH_VARIABLE, raising=False)
+    if named:
+        monkeypatch.setenv(PATH_VARIABLE, named)
+    with pytest.raises(NotAvailable, match=f"needs an LLVM library, and {PATH_VARIABLE} {said}; set it"):
+        MitsubaProcess(JOB._replace(variant="llvm_ad_rgb"))
+
+
+def test_a_file_that_is_no_library_is_not_available(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')
+    (tmp_path / "libLLVM.so").write_text("not a library")
+    monkeypatch.setenv(PATH_VARIABLE, str(tmp_path / "libLLVM.so"))
+    with pytest.raises(NotAvailable, match="LLVM"):
+        MitsubaProcess(JOB._replace(variant="llvm_ad_rgb"))
+
+
 @pytest.fixture
-def library() -> str:
+def library() -> None:
     pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')
     try:
-        return llvm_library()
+        require_llvm()
     except NotAvailable as error:
         pytest.skip(str(error))
 
 
-@pytest.fixture
-def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder, the only one where libraries are looked for."""
-    monkeypatch.delenv(mitsuba_process.PATH_VARIABLE, raising=False)
-    monkeypatch.setattr(mitsuba_process, "PLACES", (str(tmp_path),))
-    monkeypatch.setattr(mitsuba_process.ctypes.util, "find_library", lambda name: None)
-    return tmp_path
-
-
-# --- which library ----------------------------------------------------------------------------------------------------
-
-
-def test_the_newest_library_comes_first_and_each_once(places: Path) -> None:
-    for name in ("libLLVM-9.so.1", "libLLVM-16.so.1", "libLLVM.so.19.1", "libLLVM-14.so.1", "libLLVMCore.so.16", "libLLVM-17.txt"):
-        (places / name).write_text("")
-    (places / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
-    (places / "libLLVM-14.0.6.so.1").symlink_to("libLLVM-14.so.1")
-    assert [Path(path).name for path in candidates()] == ["libLLVM.so.19.1", "libLLVM-16.so.1", "libLLVM-14.so.1", "libLLVM-9.so.1"]
-
-
-def test_what_the_linker_finds_is_tried_too(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (places / "libLLVM-18.so.1").write_text("")
-    monkeypatch.setattr(mitsuba_process.ctypes.util, "find_library", lambda name: "libLLVM.so.20.1")
-    assert candidates() == ["libLLVM.so.20.1", str(places / "libLLVM-18.so.1")]
-    monkeypatch.setattr(mitsuba_process.ctypes.util, "find_library", lambda name: "libLLVM-18.so.1")
-    assert candidates() == [str(places / "libLLVM-18.so.1")]
-
-
-def test_a_library_that_is_named_is_the_only_one(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (places / "libLLVM.so.19.1").write_text("")
-    monkeypatch.setenv(mitsuba_process.PATH_VARIABLE, "/nowhere/libLLVM.so")
-    assert candidates() == ["/nowhere/libLLVM.so"]
-
-
-def test_the_next_one_is_taken_where_one_ends_its_process(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("libLLVM-16.so.1", "libLLVM-15.so.1", "libLLVM-14.so.1"):
-        (places / name).write_text("")
-    monkeypatch.setattr(mitsuba_process, "TRIAL", f"import os\nif 'libLLVM-16' in os.environ['{PATH_VARIABLE}']: os.abort()")
-    assert Path(llvm_library()).name == "libLLVM-15.so.1"
-
-
-def test_every_library_is_named_with_what_came_of_it(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(NotAvailable, match=f"no LLVM library .* found.*{PATH_VARIABLE}"):
-        llvm_library()
-    for name in ("libLLVM-16.so.1", "libLLVM-15.so.1"):
-        (places / name).write_text("")
-    monkeypatch.setattr(mitsuba_process, "TRIAL", f"import os\nif 'libLLVM-16' in os.environ['{PATH_VARIABLE}']: os.abort()\n"
-                                       "raise ImportError('it lacks what is needed')")
-    with pytest.raises(NotAvailable, match=r"-16\.so\.1: ended by SIGABRT.*; .*-15\.so\.1: exit code 1 \(ImportError: it lacks"):
-        llvm_library()
-
-
-def test_a_trial_sees_no_kernels_of_another_library_and_ends() -> None:
-    assert trial("x", f"import os; assert os.listdir(os.environ['{mitsuba_process.CACHE_VARIABLE}']) == []", 60.0) is None
-    assert trial("x", "import time; time.sleep(60)", 0.5) == "not done after 0.5 s"
-
-
-def test_what_is_no_library_fails_the_trial(tmp_path: Path) -> None:
-    pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')
-    (tmp_path / "libLLVM.so").write_text("not a library")
-    reason = trial(str(tmp_path / "libLLVM.so"), mitsuba_process.TRIAL, mitsuba_process.TRIAL_SECONDS)
-    assert reason is not None and "libLLVM.so" in reason
-
-
-# --- its process ------------------------------------------------------------------------------------------------------
-
-
-def test_both_variants_draw_the_same_light(library: str) -> None:
+def test_both_variants_draw_the_same_light(library: None) -> None:
     with MitsubaProcess(JOB) as scalar, MitsubaProcess(JOB._replace(variant="llvm_ad_rgb")) as compiled:
         (_, one), (seconds, other) = scalar.render(256, 3), compiled.render(256, 3)
         assert scalar.load_seconds > 0.0 and seconds > 0.0
@@ -124,7 +75,7 @@ def test_a_process_that_ends_is_told_with_its_reason() -> None:
     pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')
     with MitsubaProcess(JOB) as process:
         os.kill(process._process.pid, signal.SIGABRT)
-        with pytest.raises(NotAvailable, match="its process ended by SIGABRT"):
+        with pytest.raises(NotAvailable, match="its process ended with SIGABRT"):
             process.render(1, 0)
 
 
