@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from wrt.core.errors import InputError
 
 # Where the name that is installed is not the one that is imported.
-INSTALLED_AS = {"OpenImageIO": "openimageio", "PIL": "pillow"}
+INSTALLED_AS = {"OpenImageIO": "openimageio", "PIL": "pillow", "elftools": "pyelftools"}
 
 
 @contextmanager

@@ -14,7 +14,8 @@ from tests.data import ROOT
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 
-ABSENT = ("scipy", "pydantic", "PIL", "OpenImageIO", "pygltflib", "rich", "click", "trimesh", "matplotlib", "viser", "distributed")
+ABSENT = ("scipy", "pydantic", "PIL", "OpenImageIO", "pygltflib", "rich", "click", "trimesh", "matplotlib", "viser", "distributed",
+          "elftools")
 WITHOUT = f"import sys; sys.modules.update(dict.fromkeys({ABSENT}))\n"
 QUERIES = """
 import numpy as np, wrt

@@ -10,8 +10,11 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from dataclasses import dataclass
+from io import BytesIO
+from typing import Any
 
 from wrt.core.errors import InputError
+from wrt.core.packages import needed_by
 
 # By class, the operations that Turing has for it.
 CLASSES: dict[str, dict[int, str]] = {
@@ -67,49 +70,30 @@ class KernelCode:
 
 def read_cubin(data: bytes) -> dict[str, KernelCode]:
     """Every kernel of a CUDA binary (an ELF file of 64 bits) by its name. Raises InputError where it is none."""
-    try:
-        return _read(data)
-    except (struct.error, IndexError, ValueError) as error:
-        raise InputError("is no CUDA binary that can be read") from error
-
-
-def _read(data: bytes) -> dict[str, KernelCode]:
-    if data[:5] != b"\x7fELF\x02":
-        raise ValueError(data[:5])
-    (offset,) = struct.unpack_from("<Q", data, 40)
-    size, count, names = struct.unpack_from("<HHH", data, 58)
-    sections = [struct.unpack_from("<IIQQQQIIQQ", data, offset + i * size) for i in range(count)]
-
-    def content(section: tuple[int, ...]) -> bytes:
-        return data[section[4]:section[4] + section[5]]
-
-    def text(table: bytes, at: int) -> str:
-        return table[at:table.index(b"\0", at)].decode()
-
-    by_name = {text(content(sections[names]), section[0]): section for section in sections}
-    symbols, strings = content(by_name[".symtab"]), content(by_name[".strtab"])
-    labels = [text(strings, struct.unpack_from("<I", symbols, at)[0]) for at in range(0, len(symbols), 24)]
-    facts = _facts(content(by_name[".nv.info"]))
+    with needed_by("reading CUDA binaries"):
+        from elftools.common.exceptions import ELFError
+        from elftools.elf.elffile import ELFFile
     out = {}
-    for name, section in by_name.items():
-        if name.startswith(".text."):
-            kernel = name.removeprefix(".text.")
-            number = labels.index(kernel)
-            shared = by_name.get(f".nv.shared.{kernel}")
-            out[kernel] = KernelCode(kernel, content(section), facts.get((_REGISTERS, number), 0), facts.get((_FRAME, number), 0),
-                                     shared[5] if shared else 0)
+    try:
+        sections: dict[str, Any] = {section.name: section for section in ELFFile(BytesIO(data)).iter_sections()}
+        numbers = {symbol.name: i for i, symbol in enumerate(sections[".symtab"].iter_symbols())}
+        facts = _facts(sections[".nv.info"].data())
+        for name in (name.removeprefix(".text.") for name in sections if name.startswith(".text.")):
+            number, shared = numbers[name], sections.get(f".nv.shared.{name}")
+            out[name] = KernelCode(name, sections[f".text.{name}"].data(), facts.get((_REGISTERS, number), 0),
+                                   facts.get((_FRAME, number), 0), shared.data_size if shared else 0)
+    except (ELFError, KeyError, struct.error) as error:
+        raise InputError("is no CUDA binary that can be read") from error
     return out
 
 
 def _facts(info: bytes) -> dict[tuple[int, int], int]:
     """(entry, symbol) -> value, of the section that tells of all kernels."""
     out, at = {}, 0
-    while at + 4 <= len(info):
+    while at < len(info):
         form, entry, size = struct.unpack_from("<BBH", info, at)
-        at += 4
-        if form == 4:  # `size` bytes follow
-            if size == 8:
-                symbol, value = struct.unpack_from("<II", info, at)
-                out[entry, symbol] = value
-            at += size
+        at += 4 + (size if form == 4 else 0)  # of form 4 `size` bytes follow
+        if form == 4 and size == 8:
+            symbol, value = struct.unpack_from("<II", info, at - 8)
+            out[entry, symbol] = value
     return out
