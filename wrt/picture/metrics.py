@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,7 @@ from wrt.picture.tonemap import encode_srgb, tone_map
 
 RELMSE_EPS = 0.01
 PIXELS_PER_DEGREE = 3840 * math.pi / 180  # FLIP's default: a screen 3840 pixels wide, seen from as far as it is wide
-FLIP_REACH = 10  # rows and columns to the farthest neighbour that counts, at that many pixels a degree
 HIGHER_IS_BETTER = ("psnr",)
-PIXELS_AT_ONCE, LEAST_ROWS = 1 << 17, 16  # of a band of rows
 
 
 def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str = "none") -> dict[str, Any]:
@@ -35,84 +33,45 @@ def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str
     InputError where the sizes differ.
     """
     a, b = _pair(a, b)
-    finite, result = _finite(a, b)
+    finite, equal = _finite_and_equal(a, b)
+    result: dict[str, Any] = {
+        "pixels": int(finite.size), **{f"nonfinite_{name}": int(np.count_nonzero(~np.isfinite(image).all(axis=-1)))
+                                       for name, image in (("a", a), ("b", b))},
+        "nonfinite_differ": int(np.count_nonzero(~finite & ~equal))}
     if not finite.any():
         return result | dict.fromkeys(("mse", "relmse", "max_abs", "mean_ratio", "psnr", "flip"), math.nan)
-
-    def linear(rows: slice) -> tuple[np.ndarray, np.ndarray]:
-        x, y = (image[rows][finite[rows]].astype(np.float64) for image in (a, b))
-        return x, y
-
-    def shown(rows: slice) -> tuple[np.ndarray, np.ndarray]:
-        # Pixels that are left out are black in both: FLIP, which filters over neighbours, then sees no difference there.
-        x, y = (tone_map(np.where(finite[rows][..., None], image[rows], np.float32(0.0)), exposure, tonemap) for image in (a, b))
-        return x, y
-
-    def shown_error(rows: slice) -> np.ndarray:
-        x, y = (encode_srgb(image[finite[rows]].astype(np.float64)) for image in shown(rows))
-        return x - y
-
-    def flip(rows: slice) -> np.ndarray:
-        """A pixel's is a matter of its neighbours: with rows around, all bands together are that of the whole."""
-        begin, end = max(0, rows.start - FLIP_REACH), min(len(finite), rows.stop + FLIP_REACH)
-        return flip_map(*shown(slice(begin, end)))[rows.start - begin:rows.stop - begin]
-
-    count = int(np.count_nonzero(finite))
-    values = np.empty(3 * count)
-
-    def mean(of: Callable[[slice], np.ndarray], length: int = 3 * count) -> float:
-        """Of all values, which `of` gives for a band; all at once, so that they are summed in the same order whatever the bands."""
-        begin = 0
-        for rows in _bands(finite):
-            part = of(rows).reshape(-1)
-            values[begin:begin + len(part)] = part
-            begin += len(part)
-        return float(np.mean(values[:length]))
-
-    def squared(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return (x - y) ** 2
-
-    def relative(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return (x - y) ** 2 / (y**2 + RELMSE_EPS)
-
-    shown_mse = mean(lambda rows: shown_error(rows) ** 2)
+    shown_mse, flip = _shown_errors(a, b, finite, exposure, tonemap)
+    x, y = (image[finite].astype(np.float64) for image in (a, b))
+    squared = (x - y) ** 2
     return result | {
-        "mse": mean(lambda rows: squared(*linear(rows))),
-        "relmse": mean(lambda rows: relative(*linear(rows))),
-        "max_abs": max(float(np.abs(x - y).max(initial=0.0)) for x, y in map(linear, _bands(finite))),
-        "mean_ratio": _ratio(mean(lambda rows: linear(rows)[0]), mean(lambda rows: linear(rows)[1])),
+        "mse": float(np.mean(squared)),
+        "relmse": float(np.mean(squared / (y**2 + RELMSE_EPS))),
+        "max_abs": float(np.abs(x - y).max()),
+        "mean_ratio": _ratio(float(np.mean(x)), float(np.mean(y))),
         "psnr": -10.0 * math.log10(shown_mse) if shown_mse > 0.0 else math.inf,
-        "flip": mean(lambda rows: flip(rows)[finite[rows]], count),
+        "flip": flip,
     }
 
 
+def _shown_errors(a: np.ndarray, b: np.ndarray, finite: np.ndarray, exposure: float, tonemap: str) -> tuple[float, float]:
+    """The mean squared error of sRGB-encoded values, and the mean of FLIP, both over finite pixels."""
+    # Pixels that are left out are black in both: FLIP, which filters over neighbours, then sees no difference there.
+    a, b = (tone_map(np.where(finite[..., None], image, np.float32(0.0)), exposure, tonemap) for image in (a, b))
+    flip = float(np.mean(flip_map(a, b)[finite], dtype=np.float64))
+    a, b = (encode_srgb(image[finite].astype(np.float64)) for image in (a, b))
+    return float(np.mean((a - b) ** 2)), flip
+
+
+def _finite_and_equal(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) each: whether all channels of both are finite; whether a and b are the same, of which NaN is the same as NaN."""
+    finite = np.isfinite(a).all(axis=-1) & np.isfinite(b).all(axis=-1)
+    return finite, ((a == b) | (np.isnan(a) & np.isnan(b))).all(axis=-1)
+
+
 def check_sizes(a: tuple[int, int], b: tuple[int, int]) -> None:
-    """Raise InputError where two pictures of such widths and heights cannot be compared, before they are read."""
+    """Raise InputError where two pictures have different widths and heights."""
     if a != b:
         raise InputError(f"the pictures have different sizes, {a[0]}x{a[1]} and {b[0]}x{b[1]}")
-
-
-def _bands(picture: np.ndarray) -> Iterator[slice]:
-    """Whole rows, some hundred thousand pixels at a time."""
-    height, width = picture.shape[:2]
-    rows = max(LEAST_ROWS, PIXELS_AT_ONCE // width)
-    for begin in range(0, height, rows):
-        yield slice(begin, min(begin + rows, height))
-
-
-def _finite(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-    """(H, W) whether both are, and how many pixels are not."""
-    finite = np.empty(a.shape[:2], dtype=bool)
-    counts = dict.fromkeys(("nonfinite_a", "nonfinite_b", "nonfinite_differ"), 0)
-    for rows in _bands(finite):
-        x, y = a[rows], b[rows]
-        in_a, in_b = np.isfinite(x).all(axis=-1), np.isfinite(y).all(axis=-1)
-        finite[rows] = in_a & in_b
-        same = ((x == y) | (np.isnan(x) & np.isnan(y))).all(axis=-1)
-        counts["nonfinite_a"] += int((~in_a).sum())
-        counts["nonfinite_b"] += int((~in_b).sum())
-        counts["nonfinite_differ"] += int((~finite[rows] & ~same).sum())
-    return finite, {"pixels": int(finite.size), **counts}
 
 
 def failures(result: Mapping[str, Any], limits: Mapping[str, float | None]) -> list[str]:
@@ -189,24 +148,17 @@ def difference_image(a: np.ndarray, b: np.ndarray, *, limit: float | None = None
     Raises InputError where the sizes differ.
     """
     a, b = _pair(a, b)
-    height, width = a.shape[:2]
-    signed, finite = np.empty((height, width), np.float32), np.empty((height, width), dtype=bool)
-    for rows in _bands(signed):
-        x, y = a[rows], b[rows]
-        with np.errstate(invalid="ignore"):  # inf - inf
-            difference = np.where((x == y) | (np.isnan(x) & np.isnan(y)), np.float32(0.0), x - y)
-        finite[rows] = np.all(np.isfinite(difference), axis=-1)
-        held = np.where(finite[rows][..., None], difference, np.float32(0.0))
-        signed[rows] = np.take_along_axis(held, np.abs(held).argmax(axis=-1)[..., None], axis=-1)[..., 0]
+    with np.errstate(invalid="ignore"):  # inf - inf
+        difference = np.where((a == b) | (np.isnan(a) & np.isnan(b)), np.float32(0.0), a - b)
+    finite = np.isfinite(difference).all(axis=-1)
+    difference[~finite] = 0.0
+    signed = np.take_along_axis(difference, np.abs(difference).argmax(axis=-1)[..., None], axis=-1)[..., 0]
     if limit is None:
         sizes = np.abs(signed[finite])
         limit = float(np.quantile(sizes, 0.999) or sizes.max()) if sizes.size else 0.0
     scale = limit if limit > 0.0 else 1.0
-    picture = np.empty((height + BAR_HEIGHT, width, 3), np.uint8)
-    for rows in _bands(signed):
-        picture[rows] = _heat(signed[rows] / scale)
-    picture[:height][~finite] = NONFINITE_COLOR
-    picture[height:] = _bar(width, scale)
+    picture = np.concatenate([_heat(signed / scale), _bar(signed.shape[1], scale)])
+    picture[: len(signed)][~finite] = NONFINITE_COLOR
     return picture
 
 
