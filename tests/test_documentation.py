@@ -39,7 +39,7 @@ CHEAP = {
     "bench accel": ("--structures", "bvh", "--kinds", "primary", "--rays", "200", "--runs", "1", "--max-triangles", "2000"),
 }
 SLOW = {  # run by `pytest -m slow`
-    "whatif": ("--rays", "200", "--kinds", "primary"),
+    "bench": (), "whatif": ("--rays", "200", "--kinds", "primary"),
     "stability": ("--rays", "200", "--sample", "50", "--runs", "1"), "bench peers": ("--rays", "500", "--runs", "1"),
     "bench rtcore": ("--rays", "500",), "bench units": ("--rays", "500", "--runs", "1"),
     "bench error": ("--size", "16x9", "--max-spp", "2", "--repeats", "3", "--reference-spp", "4", "--knobs", "max_depth"),
@@ -83,7 +83,7 @@ def arguments(line: str) -> list[str] | None:
 
 def command_of(words: list[str]) -> tuple[str, click.Command]:
     name, command = words[0], cli.commands[words[0]]
-    if isinstance(command, click.Group):
+    if isinstance(command, click.Group) and words[1] in command.commands:
         name, command = f"{words[0]} {words[1]}", command.commands[words[1]]
     return name, command
 

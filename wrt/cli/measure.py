@@ -9,15 +9,30 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import SIZE, Commands, Names, client_of, load, naming, settings_of, shared, warnings_reported
+from wrt.cli.common import SIZE, Commands, Names, client_of, load, naming, say, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, measured, planned, reporting
 from wrt.lab import plans
 from wrt.lab.plans import Error, Mitsuba, Stability
 
 
-@click.group(cls=Commands)
-def bench() -> None:
+@click.group(cls=Commands, invoke_without_command=True, no_args_is_help=True)
+@click.option("--quick", is_flag=True, help="With a command: as its own --quick. Without one: of all that need no file, one after"
+                                            " another, a minute on two cores")
+@click.pass_context
+def bench(context: click.Context, quick: bool) -> None:
     """Measure: speed against error, and one method against another."""
+    if not quick:
+        return
+    if context.invoked_subcommand is not None:
+        context.default_map = {name: {"quick": True} for name in bench.commands}
+        return
+    short = [name for name, command in bench.commands.items()
+             if any(each.name == "quick" for each in command.params) and not any(each.required for each in command.params)]
+    say(f"left out: {', '.join(name for name in bench.commands if name not in short)}")
+    for name in short:
+        command = bench.commands[name]
+        with command.make_context(name, ["--quick"], parent=context) as each:
+            command.invoke(each)
 
 
 for plan in (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, plans.Accel, plans.Bvh, plans.RtCore, plans.Float64,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from wrt.cli.common import ACCEL, CLUSTER, DURATION, SHARED, Names, OneOf, client_of, now_and_then, say, say_json, warnings_reported
 from wrt.core.errors import InputError
@@ -73,7 +74,29 @@ def reporting(report: str, *, cluster: bool = False, quiet: str = "No progress, 
 
 def planned(plan: type[Plan]) -> Callable[[Any], Any]:
     """A command with a plan's options, which it gets as one argument, `plan`."""
-    return gathering("plan", plan, [parameter(each) for each in dataclasses.fields(plan)][::-1])
+    gathered = gathering("plan", plan, [parameter(each) for each in dataclasses.fields(plan)][::-1])
+    return (lambda command: quick(plan)(gathered(command))) if plan.QUICK else gathered
+
+
+def quick(plan: type[Plan]) -> Callable[[Any], Any]:
+    """A command with --quick: the plan's QUICK stands in for the options that are not given, and one line says for which."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @click.option("--quick", is_flag=True, help="Rough figures soon: less of all that is not given here, as it says")
+        @functools.wraps(command)
+        def shortened(quick: bool, **given: Any) -> None:
+            if quick:
+                context = click.get_current_context()
+                less = {name: value for name, value in plan.QUICK.items()
+                        if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE}
+                told = [f"{name.replace('_', '-')} {value} instead of {given[name]}" for name, value in less.items()]
+                say(f"{context.info_name} --quick: {', '.join(told) or 'all is given, nothing is left out'}")
+                given |= less
+            command(**given)
+
+        return shortened
+
+    return decorate
 
 
 def gathering(name: str, kind: type, options: Sequence[Any]) -> Callable[[Any], Any]:

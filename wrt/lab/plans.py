@@ -6,7 +6,7 @@ A field of a Plan is an option of its command. Nothing heavy is imported here: t
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, ClassVar
 
@@ -40,12 +40,14 @@ def the_threads(text: str = "Threads on the CPU  [default: all cores]") -> Any:
 class Plan:
     """Raises InputError where a number is out of its range, and where there is nothing of a name.
 
-    COMMAND: what asks for it; STUDY: the module that measures it; REPORT: what -o writes.
+    COMMAND: what asks for it; STUDY: the module that measures it; REPORT: what -o writes; QUICK: with --quick, what takes the place
+    of a default.
     """
 
     COMMAND: ClassVar[str] = ""
     STUDY: ClassVar[str] = ""
     REPORT: ClassVar[str] = MARKDOWN
+    QUICK: ClassVar[Mapping[str, Any]] = {}
 
     def __post_init__(self) -> None:
         from wrt.core.checks import as_integer, require_known
@@ -75,6 +77,7 @@ class Visibility(Plan):
 
     COMMAND, STUDY = "bench visibility", "wrt.lab.bench.visibility"
     REPORT = FOLDER
+    QUICK = {"size": 128, "max_size": 512, "max_triangles": 50_000, "runs": 5}
     meshes: Sequence[Any] = the_meshes()
     size: int = option(512, "Pixels a side as triangles grow", (1, 16384))
     max_size: int = option(1024, "Pixels a side at the end of the sweep from 64 on", (64, 16384))
@@ -99,6 +102,7 @@ class Units(Plan):
     """
 
     COMMAND, STUDY = "bench units", "wrt.lab.bench.units"
+    QUICK = {"rays": 1 << 14, "runs": 5}
     meshes: Sequence[Any] = the_meshes()
     rays: int = option(2**17, "Rays of each kind", (1, 2**28))
     runs: int = option(9, "Runs of each unit, by turns", (1, 1000))
@@ -115,6 +119,7 @@ class Peers(Plan):
     """
 
     COMMAND, STUDY = "bench peers", "wrt.lab.bench.peers"
+    QUICK = {"rays": 20_000, "runs": 5}
     meshes: Sequence[Any] = the_meshes()
     structures: Sequence[str] = option(("bvh",), "Of wrt, by name; ratios are of the first", of=STRUCTURES)
     rivals: Sequence[str] = option((), "embree, embree_fast, embree16, embree16_incoherent, warp, open3d  [default: "
@@ -148,6 +153,7 @@ class HardCases(Plan):
     """
 
     COMMAND, STUDY = "bench hard-cases", "wrt.lab.hard_cases.comparison"
+    QUICK = {"rays": 100}
     cases: Sequence[str] = option((), "", form="argument")
     libraries: Sequence[str] = option((), "Which: wrt, embree ... (a wrong name lists them)  [default: all that are installed]",
                                       of=("library", "wrt.lab.hard_cases.libraries:LIBRARIES"))
@@ -170,6 +176,7 @@ class Closed(Plan):
     """
 
     COMMAND, STUDY = "bench closed", "wrt.lab.bench.closed"
+    QUICK = {"points": 1000, "rays": 1000, "others": 1000}
     meshes: Sequence[Any] = the_meshes()
     points: int = option(10_000, "Points of each mesh", (1, 2**28))
     rays: int = option(10_000, "Rays of each mesh", (1, 2**28))
@@ -186,6 +193,7 @@ class Accel(Plan):
 
     COMMAND, STUDY = "bench accel", "wrt.lab.bench.accel"
     REPORT = FOLDER
+    QUICK = {"rays": 20_000, "runs": 3, "max_triangles": 20_000}
     meshes: Sequence[Any] = the_meshes()
     structures: Sequence[str] = option((), "Which, by name  [default: all but brute_force]", of=STRUCTURES)
     kinds: Sequence[str] = the_kinds()
@@ -203,6 +211,7 @@ class Bvh(Plan):
     """Builders of binary BVHs over MESHES: quality, time and memory; and boxes, spheres and 14-DOPs around the same tree."""
 
     COMMAND, STUDY = "bench bvh", "wrt.lab.bench.bvh"
+    QUICK = {"rays": 1 << 14, "builds": 1, "runs": 3}
     meshes: Sequence[Any] = the_meshes(MISSING)
     builders: Sequence[str] = option((), "Which, by name  [default: all]", of=("builder", "wrt.accel.bvh.builders:BVH_BUILDERS"))
     rays: int = option(2**18, "Rays into each mesh", (1, 2**26))
@@ -217,6 +226,7 @@ class RtCore(Plan):
     """The model of the RT core on MESHES: what limits it, rays a second as ranges, and which assumption moves them most."""
 
     COMMAND, STUDY = "bench rtcore", "wrt.lab.rtcore.meshes"
+    QUICK = {"rays": 1 << 12}
     meshes: Sequence[Any] = the_meshes(MISSING)
     structures: Sequence[str] = option((), "Which, by name  [default: every BVH]", of=STRUCTURES)
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
@@ -232,6 +242,7 @@ class Float64(Plan):
     """How many triangle tests, and of how many rays, need float64 where a GPU runs the watertight test on MESHES."""
 
     COMMAND, STUDY = "bench float64", "wrt.lab.rtcore.hard_tests"
+    QUICK = {"rays": 1 << 12}
     meshes: Sequence[Any] = the_meshes(MISSING)
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
     rays: int = option(2**16, "Rays of each kind", (1, 2**22))
@@ -245,6 +256,7 @@ class Pictures(Plan):
     turns, and pixels that differ (none may)."""
 
     COMMAND, STUDY = "bench pictures", "wrt.lab.bench.pictures"
+    QUICK = {"size": "160x90", "spp": 4, "runs": 3}
     scenes: Sequence[Any] = option(MISSING, "", form="argument")
     size: str = option("640x360", "Pixels of each picture")
     spp: int = option(16, "Samples a pixel", (1, 1 << 16))
@@ -274,6 +286,7 @@ class WhatIf(Plan):
 class Error(Plan):
     """What to turn in a scene, and how often it is rendered."""
 
+    QUICK = {"max_spp": 4, "repeats": 3}
     knobs: Sequence[str] = option((), "Which to turn: sampler, max_depth, triangle ... (a wrong name lists them)  [default: all]",
                                   of=("knob", "wrt.lab.bench.error:KNOBS"))
     max_spp: int = option(64, "Samples a pixel: 1, 2, 4 ... up to this", (1, 1 << 16))
@@ -291,6 +304,7 @@ class Error(Plan):
 class Mitsuba(Plan):
     """How much each renderer draws."""
 
+    QUICK = {"spp": 8, "repeats": 3, "rival_seconds": 5.0, "starts": 1}
     spp: int = option(64, "wrt's samples a pixel; its error is what Mitsuba must reach", (1, 1 << 16))
     repeats: int = option(7, "Pictures of each, alternating, each with its own seed", (3, 1000))
     reference_spp: int | None = option(None, "Samples of each of the reference's 8 seeds  [default: 8 times --spp]")
@@ -321,6 +335,7 @@ class Stability(Plan):
 
     COMMAND = "stability"
     REPORT = "Write a report: Markdown (.md) with plots beside it"
+    QUICK = {"rays": 300, "sample": 300, "runs": 3}
     cases: Sequence[str] = option((), "", form="argument")
     rays: int = option(10_000, "Rays of each case, for the default", (1, 2**40))
     sample: int = option(10_000, "How many of them the oracle judges, and the other tests and peers get", (1, 2**40))

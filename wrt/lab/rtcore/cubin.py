@@ -35,7 +35,6 @@ CLASSES: dict[str, dict[int, str]] = {
 }
 CLASS_OF = {number: name for name, operations in CLASSES.items() for number in operations}
 OPERATIONS = {number: name for operations in CLASSES.values() for number, name in operations.items()}
-INSTRUCTION = 16  # bytes
 
 _REGISTERS, _FRAME = 0x2F, 0x11  # entries of .nv.info: registers a thread, bytes of stack
 

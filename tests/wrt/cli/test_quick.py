@@ -1,0 +1,67 @@
+"""--quick: less of what is not given, said in one line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests import command_line
+from wrt.cli.measure import bench
+from wrt.lab import plans
+from wrt.lab.bench import report
+from wrt.lab.hard_cases import stability
+
+WITHOUT_FILES = (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, plans.Accel, plans.Closed)
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The plans that `bench` would carry out, in their order; nothing is measured."""
+    plans: list[Any] = []
+
+    def noted(plan: Any, told: Any = None) -> list[Any]:
+        plans.append(plan)
+        return []
+
+    monkeypatch.setattr(report, "run", noted)
+    return plans
+
+
+@pytest.mark.parametrize("plan", [each for each in vars(plans).values() if isinstance(each, type) and getattr(each, "QUICK", {})])
+def test_quick_is_less_than_the_default(plan: Any) -> None:
+    defaults = {name: plan.__dataclass_fields__[name].default for name in plan.QUICK}
+    assert all(plan.QUICK[name] < default for name, default in defaults.items() if not isinstance(default, str))
+    assert any(plan.QUICK[name] != default for name, default in defaults.items())
+
+
+def test_stability_is_short_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stability, "SPEED_RAYS", 2000)
+    done = command_line.wrt("stability", "E_grid", "--quick", "--rays", "20", "--sample", "20", "-q")
+    assert done.code == 0 and " 20 " in done.out
+    assert done.err == f"stability --quick: runs {plans.Stability.QUICK['runs']} instead of {plans.Stability.runs}\n"
+
+
+@pytest.mark.parametrize("words", [("units", "--quick"), ("--quick", "units")])
+def test_a_bench_takes_what_is_given_and_of_all_else_less(measured: list[Any], words: tuple[str, ...]) -> None:
+    done = command_line.wrt("bench", *words, "--runs", "4", "-q")
+    assert done.code == 0, done.err
+    assert measured == [plans.Units(**plans.Units.QUICK | {"runs": 4})]
+    rays = plans.Units.QUICK["rays"]
+    assert done.err == f"units --quick: rays {rays} instead of {plans.Units.rays}\n"
+    assert f"--rays {rays} --runs 4" in done.out  # what repeats it
+
+
+def test_without_a_name_all_run_that_need_no_file(measured: list[Any]) -> None:
+    done = command_line.wrt("bench", "--quick")
+    assert done.code == 0, done.err
+    assert measured == [plan(**plan.QUICK) for plan in WITHOUT_FILES]
+    first, *others = done.err.splitlines()
+    assert len(others) == len(measured)
+    ran = {plan.COMMAND.removeprefix("bench ") for plan in WITHOUT_FILES}
+    assert set(first.removeprefix("left out: ").split(", ")) == set(bench.commands) - ran
+
+
+def test_without_quick_a_bench_needs_a_name(measured: list[Any]) -> None:
+    assert command_line.wrt("bench").code == 2 and not measured
+    assert command_line.wrt("bench", "units", "-q").err == "" and measured == [plans.Units()]
