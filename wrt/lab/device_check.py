@@ -46,7 +46,7 @@ FOLDER = Path(__file__).parents[2] / "scenes"  # of a checkout; an installed pac
 PICTURE: dict[str, Any] = {"size": (64, 36), "spp": 4, "seed": 3}
 MESHES: dict[str, Callable[[], Mesh]] = {
     "ball": partial(shapes.icosphere, 3), "torus": partial(shapes.torus, 1.0, 0.4, 64, 32), "terrain": partial(terrain, 48),
-    "teapot": partial(shapes.teapot, 32), "teapot in a ring": lambda: large_and_small(shapes.torus(500.0), shapes.teapot(16))}
+    "teapot": partial(shapes.teapot, 32), "teapot in a ring": lambda: shapes.merged([shapes.torus(500.0), shapes.teapot(16)], "")}
 CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")  # of Warp's BVH
 FAST, SLOW, RUNS = 1 << 20, 1 << 15, 7  # rays to time on CUDA, and on the CPU
 TIMED_CELLS = 192  # a side of the terrain for it
@@ -89,10 +89,6 @@ def built_in() -> Scene:
                  spheres=(Sphere((1.6, 0.7, 0.8), 0.7, glass), Sphere((-1.8, 0.5, 0.5), 0.5, Material(specular=(0.3, 0.3, 0.3)))),
                  lights=(PointLight((-4.0, 7.0, 5.0), (190.0, 185.0, 170.0)),),
                  background=GradientBackground((0.5, 0.7, 0.9), (0.1, 0.2, 0.5)), name="built in")
-
-
-def large_and_small(large: Mesh, small: Mesh) -> Mesh:
-    return Mesh(np.concatenate([large.vertices, small.vertices]), np.concatenate([large.faces, small.faces + len(large.vertices)]))
 
 
 def structures() -> list[str]:

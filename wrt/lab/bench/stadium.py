@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from wrt.scene.mesh import Mesh
+from wrt.scene.shapes import merged
 
 TIMES = 1000.0
 
@@ -31,5 +32,4 @@ def in_stadium(mesh: Mesh, times: float = TIMES) -> Mesh:
     around = stands()
     scale = times * 0.5 * float(np.linalg.norm(hi - lo))
     place = np.array([0.5 * (lo[0] + hi[0]), lo[1], 0.5 * (lo[2] + hi[2])])
-    return Mesh(np.concatenate([mesh.vertices, around.vertices * scale + place]).astype(np.float32),
-                np.concatenate([mesh.faces, around.faces + len(mesh.vertices)]).astype(np.int32), name=f"{mesh.name} in a stadium")
+    return merged([mesh, Mesh(around.vertices * scale + place, around.faces)], f"{mesh.name} in a stadium")
