@@ -45,7 +45,7 @@ FORMS: dict[str, Callable[[Any, str, Limits], Any]] = {
     "choice": lambda value, what, limits: as_choice(value, limits["among"], what),
     "size": lambda value, what, limits: as_size(value, what),
     "image": _image,  # (H, W, 3) float32 linear radiance; in a file the name of an image file
-    "texture": lambda value, what, limits: value if value is None else as_one(value, limits["among"], what),
+    "texture": lambda value, what, limits: as_one(value, limits["among"], what),
 }
 
 
@@ -61,10 +61,12 @@ def forms(kind: type[Any]) -> dict[str, Field[Any]]:
 
 
 def check_fields(thing: Any, at: str) -> None:
-    """Bring each of them to its form. Raises InputError, which begins with `at`, for a value that has not that form."""
+    """Bring each of them to its form; None stays where it is the default. Raises InputError, which begins with `at`, for a value
+    that has not that form."""
     for name, each in forms(type(thing)).items():
-        check = FORMS[each.metadata["form"]]
-        object.__setattr__(thing, name, check(getattr(thing, name), at + name, each.metadata["limits"]))
+        value = getattr(thing, name)
+        if value is not None or each.default is not None:
+            object.__setattr__(thing, name, FORMS[each.metadata["form"]](value, at + name, each.metadata["limits"]))
 
 
 class Kind:

@@ -25,7 +25,7 @@ from wrt.scene.lights import LIGHTS, Light
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.motion import Motion
-from wrt.scene.settings import SETTINGS, Settings
+from wrt.scene.settings import DEPTH, GLASS_DEPTH, SETTINGS, Settings
 from wrt.scene.values import BLACK, MAX_REACH, SMALLEST, Color, as_number, as_transform, as_vector, require_count
 
 MANY_VERTICES = 1 << 26  # of all objects together: beyond, where a scene ends is no longer asked of each
@@ -109,6 +109,9 @@ class Scene:
             require_count(len(getattr(self, name)), name)
         as_one(self.background, tuple(BACKGROUNDS.values()), "background")
         as_one(self.settings, Settings, "settings")
+        if self.settings.max_depth is None:
+            depth = GLASS_DEPTH if any(material.is_clear for material in self.materials) else DEPTH
+            object.__setattr__(self, "settings", replace(self.settings, max_depth=depth))
         object.__setattr__(self, "ambient", as_vector(self.ambient, "ambient", low=0.0))
 
     def __repr__(self) -> str:

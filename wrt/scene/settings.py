@@ -10,6 +10,7 @@ FILTERS = ("box", "gaussian", "blackman-harris")
 SAMPLERS = ("sobol", "independent")
 TONEMAPS = ("none", "reinhard", "aces", "agx")
 MAX_DEPTH = 64  # bounces
+DEPTH, GLASS_DEPTH = 8, 64  # bounces where nobody gives a depth: eight leave a black band in the rim of a glass vase
 FRESNELS = ("exact", "schlick")
 GLASS_SHADOWS = ("opaque", "tinted")
 
@@ -18,7 +19,8 @@ GLASS_SHADOWS = ("opaque", "tinted")
 class Settings:
     """How a scene wants to be rendered; every field can be overridden at the call of `render`.
 
-    max_depth: bounces after the first hit (0: only direct light). min_throughput: a ray that would carry less than this
+    max_depth: bounces after the first hit (0: only direct light). None, the default, is for the Scene to choose: GLASS_DEPTH
+    where light goes through one of its materials, else DEPTH. min_throughput: a ray that would carry less than this
     share (largest channel) is cut. fresnel: "exact", or "schlick" (cheaper, approximate). glass_shadows: solid glass
     "opaque" to shadow rays (right but for caustics, which a Whitted tracer does not see), or "tinted": shadow rays go
     straight through it, as they do in scenes from glTF files that have solid glass. sampler: "sobol" (Owen-scrambled, evenly
@@ -27,7 +29,9 @@ class Settings:
 
     size: tuple[int, int] = field(default=(640, 360), metadata=given("size", "width and height", "pixels"))
     spp: int = field(default=64, metadata=given("whole", "samples per pixel", ge=1, le=1 << 24))
-    max_depth: int = field(default=8, metadata=given("whole", "bounces after the first hit", ge=0, le=MAX_DEPTH))
+    max_depth: int = field(default=None, metadata=given(  # type: ignore[assignment]  # a Scene's is a number
+        "whole", f"bounces after the first hit (default: {GLASS_DEPTH} where light goes through a material, else {DEPTH})", ge=0,
+        le=MAX_DEPTH))
     min_throughput: float = field(default=1e-3, metadata=given("number", "a ray that carries less is cut", ge=0.0, le=1.0))
     filter: str = field(default="blackman-harris", metadata=given("choice", "pixel filter", among=FILTERS))
     fresnel: str = field(default="exact", metadata=given("choice", "of dielectrics", among=FRESNELS))

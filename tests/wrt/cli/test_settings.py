@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene
-from wrt.scene.settings import FILTERS, FRESNELS, GLASS_SHADOWS, MAX_DEPTH, SETTINGS, Settings
+from wrt.scene.settings import DEPTH, FILTERS, FRESNELS, GLASS_DEPTH, GLASS_SHADOWS, MAX_DEPTH, SETTINGS, Settings
 from wrt.scene.shapes import quad
 
 SMALL = ("--size", "32x18", "--spp", 2)
@@ -249,6 +250,17 @@ def test_more_bounces_do_not_help_where_a_ray_goes_through_too_many_surfaces() -
     film = wrt.render(Scene(panes, background=ConstantBackground((1, 1, 1)), cameras=(Camera.look_at((0, 0, 5), (0, 0, 0)),)),
                       size=(4, 3), spp=1)
     assert film.stats["cut_by_depth"] > 0 and film.stats["visibly_cut"] == 0.0
+
+
+@pytest.mark.parametrize("pane", [Material("glass", thin=True, albedo=(1, 1, 1)),
+                                  Material("metallic_roughness", transmission=1.0, thin=True, albedo=(1, 1, 1))])
+def test_glass_without_a_given_depth_is_followed_through_all_its_surfaces(pane: Material) -> None:
+    behind = tuple(Object(quad((-100, -100, -0.1 * i), (200, 0, 0), (0, 200, 0)), (pane,)) for i in range(20))
+    scene = replace(mirrors(0.5), objects=behind, settings=Settings(size=(8, 6), spp=4))
+    assert scene.settings.max_depth == GLASS_DEPTH
+    assert wrt.render(scene).stats["visibly_cut"] == 0.0 < wrt.render(scene, max_depth=8).stats["visibly_cut"]
+    assert scene.with_settings(max_depth=3).with_settings(spp=1).settings.max_depth == 3
+    assert mirrors(0.5).settings.max_depth == DEPTH == replace(scene, objects=(), settings=Settings()).settings.max_depth
 
 
 def test_the_hint_names_the_value_and_what_to_do() -> None:

@@ -127,7 +127,7 @@ radiance = [4, 3, 2]
 two_sided = true
 """)
     assert scene.name == "a test" and scene.ambient == (0.25, 0.25, 0.25)
-    assert scene.settings == Settings(size=(320, 200), spp=4, filter="gaussian")
+    assert scene.settings == Settings(size=(320, 200), spp=4, max_depth=8, filter="gaussian")
     near, lens, matrix = scene.cameras
     assert [camera.name for camera in scene.cameras] == ["near", "lens", "matrix"]
     assert near.fov_y == pytest.approx(math.radians(30)) and near.focus_distance == pytest.approx(4)

@@ -33,7 +33,7 @@ from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
 from wrt.scene.materials import Checkerboard, Material
 from wrt.scene.model import Object, Scene, Sphere
-from wrt.scene.settings import Settings
+from wrt.scene.settings import DEPTH, Settings
 from wrt.scene.shapes import box, icosphere, quad
 
 SIZE = (37, 22)  # no multiple of any tile
@@ -114,7 +114,7 @@ def test_scene_settings_count_and_arguments_override_them() -> None:
     film = render(SCENE, spp=2, size=(8, 6), settings={"exposure": 1.5, "tonemap": "aces"})
     assert film.pixels.shape == (6, 8, 3) and (film.samples == 2).all()
     assert (film.exposure, film.tonemap) == (1.5, "aces")
-    assert SCENE.settings == Settings(size=SIZE, spp=5)
+    assert SCENE.settings == Settings(size=SIZE, spp=5, max_depth=DEPTH)
 
 
 # --- what comes back --------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene, Sphere
-from wrt.scene.settings import Settings
+from wrt.scene.settings import GLASS_DEPTH, Settings
 from wrt.scene.shapes import box, quad
 
 
@@ -110,14 +110,14 @@ def leaf_of(path: Path, **settings: Any) -> float:
 
 def test_what_is_in_solid_glass_of_a_gltf_file_is_lit(tmp_path: Path) -> None:
     path = block_with_a_leaf(tmp_path)
-    assert wrt.load_scene(path).settings == Settings(glass_shadows="tinted")
+    assert wrt.load_scene(path).settings == Settings(glass_shadows="tinted", max_depth=GLASS_DEPTH)
     assert leaf_of(path) == pytest.approx(1.0, rel=1e-5)
     assert leaf_of(path, glass_shadows="opaque") == 0.0  # what is said outright counts
 
 
 def test_a_gltf_file_without_solid_glass_has_the_settings_of_any_scene(tmp_path: Path) -> None:
     path = block_with_a_leaf(tmp_path, thickness=0.0)
-    assert wrt.load_scene(path).settings == Settings()
+    assert wrt.load_scene(path).settings == Settings(max_depth=GLASS_DEPTH)
     assert leaf_of(path) == pytest.approx(1.0, rel=1e-5)
 
 

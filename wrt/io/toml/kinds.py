@@ -36,6 +36,8 @@ def described(kind: type[Any], types: dict[str, Callable[[Limits], Any]] = TYPES
         if each.metadata["unit"]:
             value = Annotated[value, unit(each.metadata["unit"])]
         default = ... if each.default is MISSING else _written(form, each.default)
+        if each.default is None:
+            value = value | None
         found["file" if form == "image" else key] = (value, Field(default, description=each.metadata["about"], **bounds))
     return found
 

@@ -75,6 +75,6 @@ def material_table(kinds: tuple[str, ...]) -> type[MaterialTable]:
     """MaterialTable with all that a Material has, and a choice between these kinds."""
     literal: Any = Literal
     about = "; ".join(f"{name}: {MATERIALS[name].about}" for name in kinds)
-    texture = {"texture": lambda limits: (ColorTextureTable if Checkerboard in limits["among"] else ImageTable) | None}
+    texture = {"texture": lambda limits: ColorTextureTable if Checkerboard in limits["among"] else ImageTable}
     return create_model("MaterialTable", __base__=MaterialTable, __doc__=MaterialTable.__doc__,
                         kind=(literal[kinds], Field("diffuse", description=about)), **described(Material, TYPES | texture))
