@@ -102,9 +102,14 @@ def unknown(name: str, what: str, known: Iterable[str]) -> str:
     """A sentence on a name that is not known, with the nearest one that is, and all of them; long names and lists are cut."""
     names = [str(each) for each in known]
     hint = did_you_mean(name, names)
-    more = f" and {len(names) - 100} more" if len(names) > 100 else ""
-    return f"unknown {what} {short(name)}; {hint}known are {', '.join(map(short, names[:100]))}{more}" if names else (
+    return f"unknown {what} {short(name)}; {hint}known are {listed(names, 100)}" if names else (
         f"unknown {what} {short(name)}; there are none")
+
+
+def listed(names: Collection[str], most: int = 5) -> str:
+    """The first of the names, each short, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(map(short, islice(names, most))) + more
 
 
 def did_you_mean(name: Any, known: Iterable[str]) -> str:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+_PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 LONGEST, END = 5000, 1000  # characters of a line of a message, which may quote what stands in a file; those kept of its end
 
 
@@ -38,3 +41,11 @@ def at(place: str | None = None, path: str | os.PathLike[str] | None = None) -> 
 
 class SceneWarning(UserWarning):
     """Something in a scene file that wrt leaves out or replaces; the picture may differ from the author's."""
+
+
+def warn(message: str) -> None:
+    """Give a SceneWarning, shown at the line outside of wrt that led to it."""
+    frame, level = sys._getframe(1), 2  # of warnings.warn: 1 is this function
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):  # skip_file_prefixes is of Python 3.12
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, SceneWarning, stacklevel=level)

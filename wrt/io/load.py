@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import tomllib
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from wrt.core.checks import as_path, shown
-from wrt.core.errors import InputError, SceneWarning, at
+from wrt.core.errors import InputError, at, warn
 from wrt.core.files import read_file, require_file
 from wrt.core.packages import needed_by
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh
@@ -134,5 +133,5 @@ def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = (
     with at(path=path):
         scene, added = stage(scene)
     if notes or added:
-        warnings.warn(f"{os.fspath(path)}: {'; '.join([*notes, *added])}", SceneWarning, stacklevel=4)
+        warn(f"{os.fspath(path)}: {'; '.join([*notes, *added])}")
     return scene

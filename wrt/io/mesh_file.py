@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from wrt.core.checks import as_path, shown
-from wrt.core.errors import InputError, SceneWarning, at
+from wrt.core.errors import InputError, at, warn
 from wrt.core.files import require_file
 from wrt.core.registry import Registry
 from wrt.io.meshes import PLACES
@@ -118,7 +117,6 @@ def _finite(array: np.ndarray | None, attribute: str, path: Path) -> np.ndarray 
     finite = np.isfinite(array)
     if not finite.all():
         bad = ~finite.all(axis=1)
-        warnings.warn(f"{path}: {int(bad.sum())} {attribute} are not finite and taken as zero", SceneWarning,
-                      stacklevel=3)
+        warn(f"{path}: {int(bad.sum())} {attribute} are not finite and taken as zero")
         array = np.where(bad[:, None], np.float32(0.0), array)
     return array

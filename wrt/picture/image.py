@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import struct
-import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from wrt.core import write_file
-from wrt.core.errors import InputError, SceneWarning
+from wrt.core.errors import InputError, warn
 from wrt.core.files import open_regular, read_file
 from wrt.core.packages import needed_by
 from wrt.core.write_file import replacing
@@ -108,8 +107,8 @@ def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapp
         spec.attribute(METADATA_PREFIX + key, _utf8(value).decode())
     for name, array in channels.items():
         if array.dtype.kind in "iu" and array.size and int(array.max()) > EXACT_IN_FLOAT:
-            warnings.warn(f"{os.fspath(path)}: {name} goes up to {array.max()} and is rounded: its channel is exact to"
-                          f" {EXACT_IN_FLOAT}", SceneWarning, stacklevel=2)
+            warn(f"{os.fspath(path)}: {name} goes up to {array.max()} and is rounded: its channel is exact to"
+                 f" {EXACT_IN_FLOAT}")
     _write_oiio(path, spec, lambda y0, y1: np.stack([a[y0:y1].astype(np.float32) for a in arrays], axis=-1))
 
 
@@ -188,7 +187,7 @@ def _utf8(value: Any) -> bytes:
 def _warn_replaced(path: PathLike, where: np.ndarray, what: str) -> None:
     if where.any():
         count = int(where.any(axis=-1).sum())
-        warnings.warn(f"{os.fspath(path)}: {count} pixel{'s' * (count != 1)} {what}", SceneWarning, stacklevel=2)
+        warn(f"{os.fspath(path)}: {count} pixel{'s' * (count != 1)} {what}")
 
 
 def encode_png(codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> bytes:

@@ -6,7 +6,7 @@ import os
 from typing import Any
 
 from wrt.core.checks import unknown
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, warn
 from wrt.io.load import as_scene
 from wrt.picture.film import Film
 from wrt.renderer.options import OPTIONS, Options
@@ -29,7 +29,8 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], *, spp: int | None = No
     With target_error the scene's own spp is no limit, but MAX_SPP is, unless spp is given.
     The same arguments give the same pixels, bit for bit, for any threads, tile_size and pass_size. Interrupted by Ctrl-C, it
     returns what it has, with stats["interrupted"] set. checkpoint, checkpoint_every, resume: a render that survives the end of
-    its process (Options). Raises InputError for anything that cannot be rendered.
+    its process (Options). A scene with lights whose picture is all black gets a SceneWarning. Raises InputError for anything that
+    cannot be rendered.
     """
     if options.get("target_error") is not None and spp is None:
         spp = MAX_SPP
@@ -41,7 +42,11 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], *, spp: int | None = No
     how = Options(**options)
     scene = as_scene(scene).with_settings(**changes)
     if how.executor is None and how.devices is None:
-        return Renderer(scene, how, once=True).run()
-    from wrt.renderer.distributed.renderer import DistributedRenderer
+        film = Renderer(scene, how, once=True).run()
+    else:
+        from wrt.renderer.distributed.renderer import DistributedRenderer
 
-    return DistributedRenderer(scene, how).run()
+        film = DistributedRenderer(scene, how).run()
+    if scene.lights and film.samples.all() and not film.pixels.any():
+        warn("the picture is all black: no light reaches what the camera sees (it may be enclosed, with all lights outside)")
+    return film

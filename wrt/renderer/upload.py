@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -13,8 +12,9 @@ import warp as wp
 
 from wrt.accel.flatten import World, world_of
 from wrt.accel.hit_points import instance_records
+from wrt.core.checks import listed
 from wrt.core.device import records, upload
-from wrt.core.errors import InputError, SceneWarning
+from wrt.core.errors import InputError, warn
 from wrt.kernels import structs
 from wrt.kernels.shade import backgrounds, lights, materials, textures
 from wrt.scene.backgrounds import Background
@@ -213,13 +213,12 @@ def tell_left_out(scene: Scene) -> None:
     bare = [thing.name or str(i) for i, thing in enumerate(scene.objects)
             if thing.mesh.uvs is None and any(m.textures for m in thing.materials)]
     if bare:
-        warnings.warn(f"no texture coordinates, so that a texture's first texel is everywhere: objects {', '.join(bare)}",
-                      SceneWarning, stacklevel=3)
+        warn(f"no texture coordinates, so that a texture's first texel is everywhere: objects {listed(bare)}")
     unreached = [m.name or str(i) for i, m in enumerate(scene.materials)
                  if m.is_emissive and m.emits_light and not m.lights_others]
     if unreached:
-        warnings.warn("emission that is seen but lights nothing, since a texture or alpha says where it is: materials"
-                      f" {', '.join(unreached)} (emits_light = false says that it is meant)", SceneWarning, stacklevel=3)
+        warn("emission that is seen but lights nothing, since a texture or alpha says where it is: materials"
+             f" {listed(unreached)} (emits_light = false says that it is meant)")
 
 
 def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()) -> DeviceScene:

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from wrt.core.checks import listed
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
+from wrt.scene.materials import Material
 from wrt.scene.model import Scene
 from wrt.scene.size import require_size
-from wrt.scene.values import BLACK, SMALLEST
+from wrt.scene.values import BLACK, LUMINANCE, SMALLEST
 
 FOV_Y = math.radians(40.0)
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # from the scene to the camera: glTF's front is +z, its up +y
@@ -20,6 +22,7 @@ _MARGIN = 1.05  # of the bounding sphere's radius
 
 # Together they give a white surface that faces both a radiance near 1: the sky lights surfaces too.
 _KEY_IRRADIANCE = 1.7
+DARK = 0.01  # radiance of what looks black beside it: 25 of 255 on a display
 _SKY = GradientBackground(bottom=(0.22, 0.21, 0.20), top=(0.50, 0.60, 0.75))
 
 
@@ -52,17 +55,47 @@ def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
 
 
 def is_lit(scene: Scene) -> bool:
-    """Whether anything in the scene gives light: a light, an emissive surface that lights others, a background."""
-    return bool(scene.lights) or scene.background != ConstantBackground(BLACK) or scene.ambient != BLACK or any(
-        material.lights_others for material in scene.materials)
+    """Whether anything lights the scene: a light, a background, or emission that would give a white sphere around the scene a
+    radiance of DARK or more."""
+    if scene.lights or scene.background != ConstantBackground(BLACK) or scene.ambient != BLACK:
+        return True
+    if not any(material.lights_others for material in scene.materials):
+        return False
+    return bool(_emitted_power(scene) >= DARK * 4.0 * math.pi * bounding_sphere(scene)[1] ** 2)
+
+
+def _emitted_power(scene: Scene) -> float:
+    """Luminance times area of all surfaces that light others. Areas are exact for transforms that scale all axes alike."""
+
+    def radiance(material: Material) -> float:
+        return float(LUMINANCE @ material.emission) * (1 + material.two_sided) * material.lights_others
+
+    power = sum(4.0 * math.pi * sphere.radius**2 * radiance(sphere.material) for sphere in scene.spheres)
+    areas: dict[int, np.ndarray] = {}
+    for thing in scene.objects:
+        emitted = np.array([radiance(material) for material in thing.materials])
+        if emitted.any():
+            mesh = thing.mesh
+            if id(mesh) not in areas:
+                a, b, c = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float64), 1, 0)
+                areas[id(mesh)] = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            of_face = emitted[0 if thing.face_material is None else thing.face_material]
+            power += float(np.sum(of_face * areas[id(mesh)])) * abs(np.linalg.det(thing.transform[:3, :3])) ** (2.0 / 3.0)
+    return power
+
+
+def emission_named(scene: Scene) -> str:
+    """The materials that light others, for a message; "" where there are none."""
+    names = [material.name for material in scene.materials if material.lights_others]
+    return f"the emission of {listed(names)}" if names else ""
 
 
 def stage(scene: Scene) -> tuple[Scene, list[str]]:
     """The scene with what it lacks to be seen, and a sentence on each thing that was added.
 
-    No camera: one that frames the scene. No light: a directional key light from above the first camera's right
-    shoulder, and a pale sky as the background. Raises InputError where a camera is missing and the scene has no shapes, and
-    for a scene that is too small to be rendered.
+    No camera: one that frames the scene. No light, or none but weak emission (`is_lit`): a directional key light from above the
+    first camera's right shoulder, and a pale sky as the background. Raises InputError where a camera is missing and the scene
+    has no shapes, and for a scene that is too small to be rendered.
     """
     require_size(scene)
     added = []
@@ -74,5 +107,7 @@ def stage(scene: Scene) -> tuple[Scene, list[str]]:
         direction = -(back + 0.6 * up + 0.4 * right)
         key = DirectionalLight(tuple(direction), (_KEY_IRRADIANCE,) * 3, name="key light")
         scene = replace(scene, lights=(key,), background=_SKY)
-        added.append("it has no lights: a key light from above the camera's shoulder and a pale sky were added")
+        weak = emission_named(scene)
+        lacks = f"no lights but {weak}, which is too weak to light it" if weak else "no lights"
+        added.append(f"it has {lacks}: a key light from above the camera's shoulder and a pale sky were added")
     return scene, added

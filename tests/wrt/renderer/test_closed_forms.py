@@ -177,6 +177,7 @@ def test_the_inverse_square_law_over_ten_decades(power: int) -> None:
     assert np.allclose(lit_floor((PointLight((0.0, distance, 0.0), intensity),)), [1.0, 2.0, 0.0], rtol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore:the picture is all black:wrt.SceneWarning")
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 60.0, 85.0, 89.9, 90.1, 120.0, 180.0])
 def test_the_cosine_law_to_grazing_light_and_none_from_below(degrees: float) -> None:
     angle = math.radians(degrees)

@@ -54,6 +54,7 @@ def test_solid_glass_tints_by_both_faces_and_the_way_between(degrees: float) -> 
     assert floor_below(glass, angle, "tinted") == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore:the picture is all black:wrt.SceneWarning")
 def test_solid_glass_is_opaque_to_shadow_rays_by_default() -> None:
     assert floor_below(Material("glass"), 0.5, "opaque") == 0.0
 
@@ -108,6 +109,7 @@ def leaf_of(path: Path, **settings: Any) -> float:
     return float(wrt.render(path, spp=1, size=(2, 2), filter="box", **settings).pixels.mean())
 
 
+@pytest.mark.filterwarnings("ignore:the picture is all black:wrt.SceneWarning")
 def test_what_is_in_solid_glass_of_a_gltf_file_is_lit(tmp_path: Path) -> None:
     path = block_with_a_leaf(tmp_path)
     assert wrt.load_scene(path).settings == Settings(glass_shadows="tinted", max_depth=GLASS_DEPTH)

@@ -244,7 +244,7 @@ def test_emission_that_light_samples_cannot_reach_is_told_once() -> None:
     with pytest.warns(SceneWarning) as told:
         upload_scene(Scene(objects=objects), DEVICE)
     assert len(told) == 1
-    assert "seen but lights nothing" in str(told[0].message) and "materials sign, veil, 2 (" in str(told[0].message)
+    assert "seen but lights nothing" in str(told[0].message) and "materials 'sign', 'veil', '2' (" in str(told[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         upload_scene(Scene(objects=objects[3:]), DEVICE)

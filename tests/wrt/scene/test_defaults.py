@@ -10,11 +10,12 @@ import pytest
 from wrt.core.errors import InputError
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera
-from wrt.scene.defaults import bounding_sphere, frame_camera, is_lit, stage
+from wrt.scene.defaults import DARK, bounding_sphere, frame_camera, is_lit, stage
 from wrt.scene.lights import DirectionalLight, PointLight
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.shapes import quad
 
 
 def cloud(seed: int, offset=(0.0, 0.0, 0.0), scale=1.0) -> Scene:
@@ -83,6 +84,26 @@ def test_emissive_surfaces_count_as_light_where_they_light_others(material, lit)
     scene = Scene(spheres=(Sphere((0, 0, 0), 1.0, material),))
     assert is_lit(scene) is lit
     assert len(stage(scene)[1]) == (1 if lit else 2)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_emission_lights_a_scene_where_it_would_light_a_white_sphere_around_it(seed: int) -> None:
+    """By the closed form: all power of a small lamp meets the sphere around the scene, whatever the units."""
+    rng = np.random.default_rng(seed)
+    scale, two_sided = 10.0 ** rng.uniform(-3, 3), bool(seed % 2)
+    far = Sphere((0, 0, 0), scale, Material())  # bounds the scene
+    power = DARK * 4.0 * np.pi * scale**2
+    edges = rng.normal(size=(2, 3)) * 0.01 * scale
+    transform = np.diag([3.0, 3.0, -3.0, 1.0])
+    area = 9.0 * np.linalg.norm(np.cross(*edges))
+    for factor, lit in ((0.99, False), (1.01, True)):
+        radiance = factor * power / area / (1 + two_sided)
+        lamp = Material(name="lamp", emission=(radiance,) * 3, two_sided=two_sided)
+        quads = Object(quad((0, 0, 0), *edges), (Material(), lamp), transform, face_material=[1, 1])
+        scene = Scene(objects=(quads,), spheres=(far,))
+        assert is_lit(scene) is lit
+        added = stage(scene)[1]
+        assert any("no lights but the emission of 'lamp', which is too weak" in each for each in added) is not lit
 
 
 def test_a_background_counts_as_light():

@@ -18,7 +18,7 @@ from urllib.parse import unquote_to_bytes
 
 import numpy as np
 
-from wrt.core.checks import short
+from wrt.core.checks import listed
 from wrt.core.errors import InputError, at
 from wrt.core.files import read_file
 from wrt.core.packages import needed_by
@@ -70,12 +70,11 @@ class LeftOut:
         return ", ".join(f"{feature} ({self._where(kinds)})" for feature, kinds in self._places.items())
 
     @staticmethod
-    def _where(kinds: dict[str, dict[str, None]], most: int = 5) -> str:
+    def _where(kinds: dict[str, dict[str, None]]) -> str:
         parts = []
         for kind, names in kinds.items():
-            more = f" and {len(names) - most} more" if len(names) > most else ""
             plural = {"mesh": "meshes"}.get(kind, kind + "s") if len(names) > 1 else kind
-            parts.append(f"{plural} {', '.join(map(short, list(names)[:most]))}{more}")
+            parts.append(f"{plural} {listed(names)}")
         return "; ".join(parts)
 
 

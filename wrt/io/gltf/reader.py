@@ -10,21 +10,20 @@ Source: Khronos, glTF 2.0 specification, section 3; KHR_lights_punctual, EXT_mes
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from wrt.core.errors import InputError, SceneWarning, at
+from wrt.core.errors import InputError, at, warn
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.materials import Materials
 from wrt.io.gltf.meshes import Meshes
 from wrt.io.gltf.nodes import walk
 from wrt.io.gltf.schema import PunctualLightOfNode, PunctualLights, SpotCone, exactly
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
-from wrt.scene.defaults import stage
+from wrt.scene.defaults import emission_named, stage
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
@@ -49,8 +48,10 @@ def load_gltf(path: str | os.PathLike[str], *, staged: bool = True) -> Scene:
         if not scene.objects and (staged or not (scene.lights or scene.cameras)):
             raise InputError("; ".join(["the scene has no triangles", *left_out]))
         scene, added = stage(scene) if staged else (scene, [])
+        if staged and not scene.lights:
+            added.append(f"it has no lights but {emission_named(scene)}: what that does not reach is black")
     if left_out or added:
-        warnings.warn(f"{os.fspath(path)}: {'; '.join(left_out + added)}", SceneWarning, stacklevel=2)
+        warn(f"{os.fspath(path)}: {'; '.join(left_out + added)}")
     return scene
 
 
