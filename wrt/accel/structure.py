@@ -6,7 +6,7 @@ from collections.abc import Callable
 from inspect import signature
 from typing import Any, ClassVar, NamedTuple, Protocol, get_type_hints
 
-from wrt.core.checks import accepts
+from wrt.core.checks import accepts, did_you_mean
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
 from wrt.kernels.query import make_any_hit_kernel, make_closest_hit_kernel, make_worlds_kernel
@@ -28,7 +28,8 @@ def check_options(name: str, build: Callable[..., Any], options: dict[str, Any])
     known = {option: kind for option, kind in get_type_hints(build).items() if option not in ("options", "return")}
     for option, value in options.items():
         if option not in known:
-            raise InputError(f"{name} has no option {option!r}; there is {', '.join([*known, 'triangle', 'box'])}")
+            names = [*known, "triangle", "box"]
+            raise InputError(f"{name} has no option {option!r}; {did_you_mean(option, names)}there is {', '.join(names)}")
         if not accepts(known[option], value):
             raise InputError(f"{option} must be {signature(build).parameters[option].annotation}, got {value!r}")
 

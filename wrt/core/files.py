@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import stat
 from pathlib import Path
@@ -44,3 +45,10 @@ def read_file(path: str | os.PathLike[str]) -> bytes:
             return file.read(os.fstat(file.fileno()).st_size)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}") from None
+
+
+def utf8(text: bytes) -> bytes:
+    """The bytes of a text file without the byte order mark of UTF-8. Raises InputError, without the path, for UTF-16 and UTF-32."""
+    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)):
+        raise InputError("is UTF-16 or UTF-32 text; save it as UTF-8")
+    return text.removeprefix(codecs.BOM_UTF8)

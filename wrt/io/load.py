@@ -13,7 +13,7 @@ import numpy as np
 
 from wrt.core.checks import as_path, shown
 from wrt.core.errors import InputError, at, warn
-from wrt.core.files import read_file, require_file
+from wrt.core.files import read_file, require_file, utf8
 from wrt.core.packages import needed_by
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh
 from wrt.scene.defaults import stage
@@ -97,7 +97,7 @@ LOADERS: dict[str, Callable[[Path], Scene]] = {".toml": _load_toml, ".gltf": _lo
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        data = tomllib.loads(read_file(path).decode("utf-8-sig"))
+        data = tomllib.loads(utf8(read_file(path)).decode())
         _require_sound(data)
         return data
     except InputError as error:

@@ -61,7 +61,8 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
     """
     path = as_path(path, "path")
     if path.suffix.lower() not in MESH_FORMATS:
-        raise InputError(f"is no mesh file: known are {', '.join(MESH_FORMATS)}", path)
+        scene = "; wrt.load_scene and wrt.build take scenes" if path.suffix.lower() in (".toml", ".gltf", ".glb") else ""
+        raise InputError(f"is no mesh file: known are {', '.join(MESH_FORMATS)}{scene}", path)
     require_file(path)
     with at(path=path):
         raw = MESH_FORMATS[path.suffix.lower()](path)

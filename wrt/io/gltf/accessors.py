@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from wrt.core.checks import short
 from wrt.core.errors import InputError, at
 from wrt.io.gltf.document import Document
 
@@ -33,7 +34,7 @@ class Accessors:
         """
         accessor = self._document.item("accessors", index, place)
         if accessor.type != kind:
-            raise InputError(f"must be of type {kind}, but accessors[{index}] is {accessor.type!r}", None, place)
+            raise InputError(f"must be of type {kind}, but accessors[{index}] is {short(accessor.type)}", None, place)
         if index not in self._arrays:
             with at(place):
                 self._arrays[index] = self._decode(accessor, f"accessors[{index}]")
@@ -47,10 +48,8 @@ class Accessors:
         width = _WIDTHS[accessor.type]
         if accessor.bufferView is not None:
             array = self._elements(accessor.bufferView, accessor.byteOffset or 0, dtype, (count, width), where)
-        elif accessor.sparse is not None:
+        else:  # zeros, says the specification
             array = np.zeros((count, width), dtype)
-        else:
-            raise InputError("has no data: neither a bufferView nor sparse values", None, where)
         if accessor.sparse is not None:
             array = self._with_sparse(array, accessor.sparse, f"{where}.sparse")
         if accessor.normalized:

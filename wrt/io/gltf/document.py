@@ -18,9 +18,9 @@ from urllib.parse import unquote_to_bytes
 
 import numpy as np
 
-from wrt.core.checks import listed
+from wrt.core.checks import listed, short
 from wrt.core.errors import InputError, at
-from wrt.core.files import read_file
+from wrt.core.files import read_file, utf8
 from wrt.core.packages import needed_by
 from wrt.io.gltf.schema import read_as
 
@@ -40,6 +40,7 @@ METADATA_EXTENSIONS = frozenset({
     "EXT_instance_features", "AGI_articulations", "AGI_stk_metadata", "FB_geometry_metadata", "MSFT_audio_emitter",
     "MSFT_lod",
 })
+DEFAULT_LOOK = frozenset({"KHR_materials_variants"})  # a choice between looks, of which wrt shows the default
 _CODECS = frozenset({
     "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_texture_basisu",
     "MSFT_texture_dds",
@@ -149,7 +150,7 @@ class Document:
         try:
             return read_file(self.path.parent / name)
         except InputError as error:
-            raise InputError(f"cannot read {name!r}: {str(error).removeprefix('cannot be read: ')}", None, place) from None
+            raise InputError(f"cannot read {short(name)}: {str(error).removeprefix('cannot be read: ')}", None, place) from None
 
 
 def _read_container(path: Path) -> tuple[Any, bytes | memoryview | None]:
@@ -192,7 +193,7 @@ def _parse_json(data: bytes) -> Any:
         raise InputError(f"is not valid JSON: it holds {constant}")
 
     try:
-        return json.loads(data.decode("utf-8-sig"), parse_constant=refuse)
+        return json.loads(utf8(data).decode(), parse_constant=refuse)
     except UnicodeDecodeError as error:
         raise InputError(f"is not a glTF file: not UTF-8 at byte {error.start}") from None
     except json.JSONDecodeError as error:
@@ -212,15 +213,15 @@ def _check_version(raw: dict[str, Any]) -> None:
     for key, readable in (("version", r"2\.\d+"), ("minVersion", r"2\.0")):  # a later 2.x may be read as 2.0
         version = asset.get(key)
         if version is not None and not re.fullmatch(readable, str(version)):
-            raise InputError(f"is {version!r}; wrt reads 2.0", None, f"asset.{key}")
+            raise InputError(f"is {short(version)}; wrt reads 2.0", None, f"asset.{key}")
 
 
 def _check_required_extensions(required: Iterable[str]) -> None:
-    unknown = sorted(set(required) - SUPPORTED_EXTENSIONS - METADATA_EXTENSIONS)
+    unknown = sorted(set(required) - SUPPORTED_EXTENSIONS - METADATA_EXTENSIONS - DEFAULT_LOOK)
     if unknown:
         codecs = [name for name in unknown if name in _CODECS]
         hint = f"; there is no decoder for {', '.join(codecs)}: save the file without compression" if codecs else ""
-        raise InputError(f"the file needs {', '.join(unknown)}, which wrt does not support{hint}", None,
+        raise InputError(f"the file needs {listed(unknown)}, which wrt does not support{hint}", None,
                          "extensionsRequired")
 
 

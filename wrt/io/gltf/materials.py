@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from wrt.core.checks import short
 from wrt.core.errors import InputError, at
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.schema import (
@@ -56,7 +57,7 @@ class Textures:
         self._textures: dict[tuple[Any, ...], Texture] = {}
 
     def texture(self, info: Any, srgb: bool, material: str, place: str) -> Texture | None:
-        """The texture of a textureInfo, or None where there is none or it wants a second set of coordinates."""
+        """The texture of a textureInfo, or None where there is none, it has no image, or it wants a second set of coordinates."""
         if info is None:
             return None
         document = self._document
@@ -70,6 +71,11 @@ class Textures:
         wrap = self._wrap(texture, material, f"textures[{info.index}]")
         matrix = _uv_transform(transform, f"{place}.extensions.KHR_texture_transform")
         source = self._source(texture, f"textures[{info.index}]")
+        if source is None:
+            others = ", ".join(map(short, texture.extensions or ()))
+            document.left_out.add(f"textures whose only image is that of {others}" if others else "textures without an image",
+                                  "material", material)
+            return None
         key = (source, srgb, wrap, matrix.tobytes())
         if key not in self._textures:
             image = document.gltf.images[source]
@@ -90,18 +96,15 @@ class Textures:
                                  f"samplers[{texture.sampler}].{axis}")
         return (_WRAPS[sampler.wrapS], _WRAPS[sampler.wrapT])
 
-    def _source(self, texture: Any, place: str) -> int:
-        """The image's index; the core's (PNG or JPEG) before the one of an extension."""
+    def _source(self, texture: Any, place: str) -> int | None:
+        """The image's index; the core's (PNG or JPEG) before the one of an extension; None where the texture has neither."""
         source = texture.source
         for name in ("EXT_texture_webp", "EXT_texture_avif"):
             if source is None:
                 extension = self._document.extension(texture, name, TextureSource, place)
                 source = extension.source if extension else None
-        if source is None:
-            others = ", ".join(texture.extensions or {})
-            but = f" but that of {others}, which wrt does not decode" if others else ""
-            raise InputError(f"has no image{but}", None, place)
-        self._document.item("images", source, f"{place}.source")
+        if source is not None:
+            self._document.item("images", source, f"{place}.source")
         return source
 
     def _image(self, index: int) -> np.ndarray:
@@ -177,7 +180,7 @@ class Materials:
         pbr = source.pbrMetallicRoughness
         factor = exactly(pbr.baseColorFactor, 4, f"{place}.pbrMetallicRoughness.baseColorFactor")
         if source.alphaMode not in _ALPHA_MODES:
-            raise InputError(f"must be one of {', '.join(_ALPHA_MODES)}, got {source.alphaMode!r}", None,
+            raise InputError(f"must be one of {', '.join(_ALPHA_MODES)}, got {short(source.alphaMode)}", None,
                              f"{place}.alphaMode")
         alpha, cutoff = factor[3], 0.5 if source.alphaCutoff is None else source.alphaCutoff
         if cutoff > 1.0:  # allowed, and means that nothing of it is seen

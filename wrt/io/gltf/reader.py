@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from wrt.core.checks import short
 from wrt.core.errors import InputError, at, warn
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.materials import Materials
@@ -177,7 +178,7 @@ class _Reader:
         source, where = self._punctual[link.light], f"extensions.KHR_lights_punctual.lights[{link.light}]"
         name = node.name or source.name or f"light {link.light}"
         if source.type not in LIGHTS:
-            raise InputError(f"must be one of {', '.join(LIGHTS)}, got {source.type!r}", None, f"{where}.type")
+            raise InputError(f"must be one of {', '.join(LIGHTS)}, got {short(source.type)}", None, f"{where}.type")
         if source.range is not None:
             self.document.left_out.add("range", "light", name)
         color = exactly(source.color, 3, f"{where}.color")

@@ -176,6 +176,8 @@ def _scalar(hint: Any, raw: Any, place: str) -> Any:
     fits = isinstance(raw, accepted) and (hint is bool or not isinstance(raw, bool))
     if not fits:
         raise _wrong(expected, raw, place)
+    if hint is int and not -(1 << 63) <= raw < 1 << 63:
+        raise _wrong("an integer of at most 64 bits", raw, place)
     if hint is float:
         try:
             number = float(raw)

@@ -20,8 +20,8 @@ from typing import NoReturn
 import numpy as np
 
 from wrt.core.checks import short
-from wrt.core.errors import InputError
-from wrt.core.files import read_file
+from wrt.core.errors import InputError, warn
+from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
 
@@ -45,6 +45,7 @@ class _Text:
         # Of each keyword: every different name, numbered as they come, and of every span the first polygon and which name it has.
         self.names: dict[str, dict[str, int]] = {key: defaultdict(count().__next__) for key in ("usemtl", "g", "o")}
         self.spans = {key: (array("q"), array("i")) for key in self.names}
+        self.absent: dict[str, None] = {}  # what faces refer to and the whole file has not: vt, vn
         self._new_numbers: dict[str, list[str]] = {key: [] for key in _KEEP}
         self._new_corners: list[str] = []
 
@@ -140,6 +141,8 @@ class _Text:
             if part.startswith("-"):
                 count = len(self.lines[key])
                 index = self.integer(part, corner, line)
+                if not count and key != "v":
+                    continue  # `triples` knows whether the file has any
                 if not -count <= index < 0:
                     self.fail(line, f"face corner {short(corner)}: {key} index {short(index)}, but only {count} {key} stand before")
                 parts[i] = str(count + 1 + index)
@@ -167,7 +170,9 @@ class _Text:
             for k, part in enumerate(corner.split("/")):
                 if k > 2 or (k == 0 and not part):
                     self.fail(self._first_line(index, i), _CORNER.format(short(corner)))
-                if part:
+                if part and k and not self.lines[keys[k]] and part.removeprefix("-").isdecimal():
+                    self.absent[keys[k]] = None
+                elif part:
                     number = int(part) if part.isdecimal() and len(part) < 19 else 0
                     different[i, k] = number
                     if not 1 <= number <= len(self.lines[keys[k]]):
@@ -212,16 +217,19 @@ def read(path: Path) -> RawMesh:
     """Read the faces of an OBJ file as it has them: nothing is merged or put in another order.
 
     Each different combination of position, texture coordinate and normal becomes one vertex. A corner without a
-    normal gets a zero normal (flat there), one without a texture coordinate (0, 0). Faces with fewer than three
+    normal gets a zero normal (flat there), one without a texture coordinate (0, 0). Where a file has no vt, or no vn, at all, their
+    indices are left out with a SceneWarning. Faces with fewer than three
     corners are left out and counted. Groups are the spans of `usemtl`, else of `g`, else of `o`; faces before the
     first have the name "". Vertex colours, lines, points and curves are not read. Raises InputError with the line's
     number for numbers that are none, indices out of range and positions that are not finite.
     """
     text = _Text()
-    text.read(read_file(path))
+    text.read(utf8(read_file(path)))
     positions = text.array("v")
     corner_triples, corners = text.triples()
     text.different.clear()
+    if text.absent:
+        warn(f"{path}: indices of {' and '.join(text.absent)} in its faces are left out: the file has no such lines")
     counts = np.array(text.counts, dtype=np.int64)
 
     with np.errstate(over="ignore"):

@@ -15,8 +15,9 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
+from wrt.core.checks import short
 from wrt.core.errors import InputError
-from wrt.core.files import read_file
+from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
 
@@ -168,7 +169,7 @@ class _Source:
     """A PLY file: its header, then the elements read with it."""
 
     def __init__(self, path: Path) -> None:
-        self.data = read_file(path)
+        self.data = utf8(read_file(path))
         form, self.elements, begin = self._header()
         binary = form != "ascii"
         self.stream: _Text | _Binary = _Binary(self.data, begin, _ORDERS[form]) if binary else _Text(self, begin)
@@ -297,7 +298,7 @@ class _Text:
                 numbers.extend(map(float, source.data[begin:end].split()))
             except ValueError:
                 line, word = _first_not_a_number(source.data, begin, end)
-                source.fail(f"{word!r} is not a number", f"line {line}")
+                source.fail(f"{short(word)} is not a number", f"line {line}")
             begin = end
         self.numbers = np.frombuffer(numbers, np.float64)
 

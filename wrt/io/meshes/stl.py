@@ -14,7 +14,7 @@ from typing import NoReturn
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.core.files import read_file
+from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 
 _LINE = re.compile(rb"[^\r\n]++(?:\r\n|[\r\n]|\Z)|\r\n|[\r\n]")
@@ -33,7 +33,7 @@ def read(path: Path) -> RawMesh:
     if _is_binary(data):
         vertices = np.frombuffer(data, _RECORD, (len(data) - 84) // 50, 84)["corners"].reshape(-1, 3)
     else:
-        vertices, groups, sizes = _read_text(data)
+        vertices, groups, sizes = _read_text(utf8(data))
     with np.errstate(over="ignore"):
         bad = np.nonzero(~np.isfinite(vertices.astype(np.float32)).all(axis=1))[0]
     if len(bad):

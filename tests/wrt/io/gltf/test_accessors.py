@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.gltf_files import COMPONENT, KIND, GltfFile
+from tests.gltf_files import COMPONENT, KIND, GltfFile, load_warned, one_triangle
 from wrt.core.errors import InputError
 from wrt.io.gltf.accessors import Accessors
 from wrt.io.gltf.document import Document
@@ -115,7 +115,8 @@ SPARSE = {"count": 1, "indices": {"bufferView": 1, "componentType": 5121}, "valu
     ({"type": "VEC9"}, r"here: must be of type VEC3, but accessors\[0\] is 'VEC9'"),
     ({"bufferView": 7}, r"accessors\[0\].bufferView: is 7, but there are 2 bufferViews"),
     ({"bufferView": -1}, r"accessors\[0\].bufferView: is -1"),
-    ({"bufferView": None}, r"accessors\[0\]: has no data"),
+    ({"bufferView": None, "count": 2**22 + 1}, r"accessors\[0\].count: must be 1 to 4194304, got 4194305"),
+    ({"count": 10**300}, r"accessors\[0\].count: must be an integer of at most 64 bits, got 1000*\.\.\.$"),
     ({"sparse": {**SPARSE, "count": 9}}, r"sparse.count: must be 1 to 4, got 9"),
     ({"sparse": {**SPARSE, "indices": {"bufferView": 1, "componentType": 5126}}}, "must be an unsigned integer type"),
     ({"sparse": SPARSE}, r"sparse.indices: holds 200, but there are 4 elements"),
@@ -130,6 +131,17 @@ def test_accessors_that_do_not_fit(tmp_path, changes, message):
     file.json["accessors"][0].update(changes)
     with pytest.raises(InputError, match=message):
         read(file, tmp_path, "VEC3")
+
+
+def test_an_accessor_without_data_is_zeros(tmp_path):
+    file = GltfFile()
+    file.add("accessors", {"componentType": 5126, "count": 5, "type": "VEC3"})
+    assert np.array_equal(read(file, tmp_path, "VEC3"), np.zeros((5, 3), np.float32))
+    file = one_triangle()
+    zeros = file.add("accessors", {"componentType": 5126, "count": 3, "type": "VEC3"})
+    file.node(mesh=file.mesh({"attributes": {"POSITION": zeros}}))
+    scene, told = load_warned(file.write(tmp_path), staged=False)
+    assert len(scene.objects) == 1 and "primitives without a triangle that has an area (mesh 'mesh 1')" in told[0]
 
 
 @pytest.mark.parametrize("changes, message", [

@@ -9,7 +9,7 @@ import struct
 import numpy as np
 import pytest
 
-from tests.gltf_files import TRIANGLE, one_triangle, pack_glb
+from tests.gltf_files import TRIANGLE, load_warned, one_triangle, pack_glb
 from wrt.core.errors import InputError
 from wrt.io.gltf.document import LeftOut
 from wrt.io.gltf.reader import load_gltf
@@ -35,7 +35,7 @@ def patched(data: bytes, offset: int, value: int) -> bytes:
     ("a.gltf", b"", "is not valid JSON"),
     ("a.gltf", b"solid cube", "is not valid JSON: Expecting value: line 1 column 1"),
     ("a.gltf", b'{"asset": {"version": "2.0"}', "is not valid JSON"),
-    ("a.gltf", b"\xff\xfe\x00", "is not a glTF file: not UTF-8"),
+    ("a.gltf", b"\xff\x00", "is not a glTF file: not UTF-8"),
     ("a.gltf", b"[" * 100000, "is not valid JSON: nested too deeply"),
     ("a.gltf", b"[]", "holds no object"),
     ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": NaN}', "holds NaN"),
@@ -128,10 +128,10 @@ def test_buffer_without_data(tmp_path):
 
 
 @pytest.mark.parametrize("required, message", [
-    (["KHR_draco_mesh_compression"], "needs KHR_draco_mesh_compression.*no decoder for KHR_draco_mesh_compression"),
+    (["KHR_draco_mesh_compression"], "needs 'KHR_draco_mesh_compression'.*no decoder for KHR_draco_mesh_compression"),
     (["EXT_meshopt_compression", "KHR_mesh_quantization"], "no decoder for EXT_meshopt_compression: save"),
     (["KHR_texture_basisu"], "no decoder for KHR_texture_basisu"),
-    (["KHR_materials_clearcoat", "ACME_unheard_of"], "needs ACME_unheard_of, KHR_materials_clearcoat, which"),
+    (["KHR_materials_clearcoat", "ACME_unheard_of"], "needs 'ACME_unheard_of', 'KHR_materials_clearcoat', which"),
 ])
 def test_required_extensions_that_are_not_supported(tmp_path, required, message):
     file = one_triangle()
@@ -144,6 +144,14 @@ def test_required_extensions_that_are_supported(tmp_path):
     file = one_triangle()
     file.json["extensionsRequired"] = ["KHR_materials_transmission", "KHR_lights_punctual", "KHR_xmp_json_ld"]
     assert len(load_gltf(file.write(tmp_path), staged=False).objects) == 1
+
+
+def test_of_variants_the_default_look_is_shown_even_where_they_are_required(tmp_path):
+    file = one_triangle(extensions={"KHR_materials_variants": {"mappings": [{"material": 0, "variants": [0]}]}})
+    file.json |= {"extensionsRequired": ["KHR_materials_variants"],
+                  "extensions": {"KHR_materials_variants": {"variants": [{"name": "red"}]}}}
+    scene, told = load_warned(file.write(tmp_path), staged=False)
+    assert len(scene.objects) == 1 and "KHR_materials_variants (mesh" in told[0]
 
 
 @pytest.mark.parametrize("hint, raw, message", [

@@ -253,16 +253,26 @@ def test_webp_by_its_extension(tmp_path):
 
 
 @pytest.mark.parametrize("texture, message", [
-    ({"extensions": {"KHR_texture_basisu": {"source": 0}}}, r"textures\[0\]: has no image but that of KHR_texture_b"),
-    ({}, r"textures\[0\]: has no image$"),
     ({"source": 4}, r"textures\[0\].source: is 4, but there are 0 images"),
     ({"source": 0, "sampler": 1}, r"textures\[0\].sampler: is 1, but there are 0 samplers"),
 ])
-def test_textures_without_an_image(tmp_path, texture, message):
+def test_textures_whose_parts_are_not_there(tmp_path, texture, message):
     file = one_material(base())
     file.add("textures", texture)
     with pytest.raises(InputError, match=message):
         load(file, tmp_path)
+
+
+@pytest.mark.parametrize("texture, message", [
+    ({"extensions": {"KHR_texture_basisu": {"source": 0}}}, "textures whose only image is that of 'KHR_texture_basisu' (material"),
+    ({}, "textures without an image (material"),
+])
+def test_a_texture_without_an_image_is_left_out_and_named(tmp_path, texture, message):
+    """glTF 2.0, texture.source: where it is not there, "behavior is undefined" but the file is valid."""
+    file = one_material(base())
+    file.add("textures", texture)
+    scene, told = load_warned(file.write(tmp_path), staged=False)
+    assert scene.materials[0].textures == () and len(told) == 1 and message in told[0]
 
 
 # --- images -----------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.data import data_path
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, SceneWarning
 from wrt.io.mesh_file import load_mesh
 from wrt.io.meshes.obj import read as read_obj
 
@@ -65,11 +65,22 @@ def test_groups(tmp_path: Path, lines: str, names: tuple[str, ...], index: list[
     assert (raw.face_group.tolist() if raw.face_group is not None else None) == index
 
 
+@pytest.mark.parametrize(("faces", "absent"), [
+    ("f 1//1 2//2 3//3\n", "vn"), ("f 1/7 2/7 3/7\n", "vt"), ("f -4/-4/-4 -3/-3/-3 -2/-2/-2\n", "vt and vn"),
+])
+def test_indices_of_what_the_file_has_none_of_are_left_out(tmp_path: Path, faces: str, absent: str) -> None:
+    with pytest.warns(SceneWarning, match=f"a.obj: indices of {absent} in its faces are left out") as told:
+        mesh = load_mesh(write(tmp_path, SQUARE + faces))
+    assert len(told) == 1 and mesh.normals is None and mesh.uvs is None
+    assert mesh.vertices[mesh.faces].tolist() == [[[0, 0, 0], [1, 0, 0], [1, 1, 0]]]
+
+
 @pytest.mark.parametrize(("lines", "line", "says"), [
     ("f 1 2 5\n", 5, "index 5 is not in 1 to 4"),
     ("f 1 2 0\n", 5, "index 0"),
     ("\nf 1 2 -5\n", 6, "index -5"),
-    ("f 1/1 2/1 3/1\n", 5, "vt index 1"),
+    ("vt 0 0\nf 1/1 2/2 3/1\n", 6, "vt index 2"), ("f 1//-1 2//-1 3//-1\nvn 0 0 1\n", 5, "vn index -1"),
+    ("f 1/x 2/x 3/x\n", 5, "vt index x"),
     ("f 1//2 2//2 3//2\nvn 0 0 1\n", 5, "vn index 2"),
     ("f 1 2 three\n", 5, "three"),
     ("f 1/2/3/4 2 3\n", 5, "1/2/3/4"),
