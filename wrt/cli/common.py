@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import difflib
 import functools
 import importlib
 import re
@@ -54,7 +55,13 @@ class Names(click.ParamType):
 
 
 class Commands(click.Group):
-    """Commands; a name that is none is answered with those that there are."""
+    """Commands; a name that is none is answered with those that there are, an option that is none with the nearest one."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except click.NoSuchOption as error:
+            raise click.UsageError(f"No such option {error.option_name!r}.{_meant(error)}", error.ctx) from None
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
         try:
@@ -66,6 +73,14 @@ class Commands(click.Group):
                 known = self.list_commands(ctx)
                 ctx.fail(f"No such command {args[0]!r}; {did_you_mean(args[0], known)}there is {', '.join(known)}")
             raise
+
+
+def _meant(error: click.NoSuchOption) -> str:
+    """A question with the command's nearest option. click compares with the dashes, which are always alike."""
+    known = [name for each in (error.ctx.command.params if error.ctx else ()) for name in each.opts if name.startswith("--")]
+    wrong = {"--width": "--size", "--height": "--size"}.get(error.option_name, error.option_name)
+    near = difflib.get_close_matches(wrong.strip("-"), [name.strip("-") for name in known], n=1)
+    return f" Did you mean '--{near[0]}'?" if near else ""
 
 
 class OneOf(click.ParamType):
@@ -266,10 +281,15 @@ def say_json(value: Any) -> None:
 
 
 def say(text: str) -> None:
-    """On stderr; that its terminal is gone is no reason to fail. What a stranger's file quotes gives the terminal no orders."""
-    text = re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", lambda control: f"\\x{ord(control[0]):02x}", text)
+    """On stderr; that its terminal is gone is no reason to fail."""
     with contextlib.suppress(OSError):
-        click.echo(text, err=True)
+        put(text, err=True)
+
+
+def put(text: object, err: bool = False) -> None:
+    """On stdout, or on stderr. Control characters that a stranger's file or its name holds are escaped: they give the terminal no
+    orders."""
+    click.echo(re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", lambda control: f"\\x{ord(control[0]):02x}", str(text)), err=err)
 
 
 def now_and_then(quiet: bool, every: float = 10.0) -> Callable[[str], None]:

@@ -33,6 +33,7 @@ from wrt.cli.common import (
     depth_hint,
     load,
     naming,
+    put,
     say,
     say_json,
     settings_of,
@@ -149,7 +150,7 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
         say_json({"output": [str(path) for path in paths], **film.metadata, **film.stats})
     else:
         for path in paths:
-            click.echo(path)
+            put(path)
     if not quiet:
         say(_summary(film))
     if misplaced:
@@ -206,10 +207,10 @@ def info(scene: Path, camera: str | None, given: tuple[tuple[str, Any], ...], as
     for name, value in facts.items():
         between = "; " if isinstance(value, list) and value and isinstance(value[0], str) else ", "  # names may have commas
         shown = "none" if value in (None, []) else between.join(map(str, value)) if isinstance(value, list) else value
-        click.echo(f"{name}: {shown}")
+        put(f"{name}: {shown}")
     for state in (True, False):
         names = [name for name, on in features.items() if on is state]
-        click.echo(f"features {'on' if state else 'off'}: {', '.join(names) or 'none'}")
+        put(f"features {'on' if state else 'off'}: {', '.join(names) or 'none'}")
 
 
 @cli.command()
@@ -234,7 +235,7 @@ def validate(scenes: tuple[Path, ...]) -> None:
     for scene in scenes:
         try:
             load(scene, quiet=False)
-            click.echo(f"{scene}: ok")
+            put(f"{scene}: ok")
         except InputError as error:
             bad += 1
             say(f"error: {error}")
@@ -274,7 +275,7 @@ def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float
         say_json(result)
     else:
         for name, value in result.items():
-            click.echo(f"{name}: {value:.6g}")
+            put(f"{name}: {value:.6g}")
     broken = metrics.failures(result, {name.split("_")[1]: limit for name, limit in limits.items()})
     for sentence in broken:
         say(sentence)

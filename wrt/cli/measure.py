@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import SIZE, Commands, Names, client_of, load, naming, say, settings_of, shared, warnings_reported
+from wrt.cli.common import SIZE, Commands, Names, client_of, load, naming, put, say, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, measured, planned, reporting
 from wrt.lab import plans
 from wrt.lab.plans import Error, Mitsuba, Stability
@@ -67,7 +67,7 @@ def instructions(structures: tuple[str, ...], as_json: bool) -> None:
 @click.option("--spp", type=int, default=1, show_default=True, help="Samples a pixel")
 @shared("max_depth", "given", "crop", "camera", "accel", "seed", "threads")
 @click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
-@reporting("Folder for heat maps, EXR layers, histograms and a report", quiet="No warnings")
+@reporting("Folder for heat maps, EXR layers, histograms and a report")
 def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu: str, **options: Any) -> None:
     """What every ray of SCENE costs: counters by pixel, kind and depth, and a model of the RT core."""
     from wrt.core.checks import require_known
@@ -75,14 +75,15 @@ def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu
     from wrt.lab.rtcore import profile_report as report
     from wrt.lab.rtcore.parameters import GPUS
     from wrt.lab.rtcore.profiler import profile as measure
+    from wrt.renderer.progress import progress_reporter
 
     require_known(gpu, GPUS, "GPU")
     if how.output is not None:
         check_folder(how.output, (report.LAYERS, report.HISTOGRAMS))
     settings = settings_of(given, {name: options.pop(name) for name in ("size", "max_depth")}, spp="--spp")
     loaded = load(scene, how.quiet).with_settings(**settings)
-    with warnings_reported(how.quiet), naming(scene):
-        found = measure(loaded, **options)
+    with warnings_reported(how.quiet), progress_reporter(how.quiet) as progress, naming(scene):
+        found = measure(loaded, progress=progress, **options)
     rows = report.model_rows(found, GPUS[gpu])
     text = report.summary(found, rows, GPUS[gpu])
     paths = [] if how.output is None else report.write_report(found, text, how.output)
@@ -100,14 +101,14 @@ def stability(how: Reporting, plan: Stability) -> None:
 
     def row_done(row: Any) -> None:
         if not how.as_json:
-            click.echo("  ".join(cells(study.COLUMNS, row)))
+            put("  ".join(cells(study.COLUMNS, row)))
 
     study.chosen(plan.cases)
     if how.output is not None:
         report.check_report(how.output)
     client = client_of(how.cluster)
     if not how.as_json:
-        click.echo("  ".join(study.COLUMNS))
+        put("  ".join(study.COLUMNS))
     result = study.run(plan, row_done, how.now_and_then, client)
     paths = [] if how.output is None else report.write_report(result, plan, how.output)
     data = {"machine": report.machine(plan), **result.as_dict(), "output": paths}

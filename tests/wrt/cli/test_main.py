@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -329,6 +330,19 @@ def test_warnings_while_writing_are_told_like_all_others(monkeypatch: pytest.Mon
     assert result.code == 0 and "warning: a.png: 1 pixel NaN or infinite, written as black or white\n" in result.err
     assert "SceneWarning" not in result.err
     assert run("render", "box.obj", *SMALL, "-o", "a.png", "-q").err == ""
+
+
+@pytest.mark.parametrize("command", [
+    ("info",), ("validate",), ("compile",), ("render", *SMALL), ("profile", *SMALL), ("build", "-o", "b\x1b[31m.accel"),
+    ("animate", "--frames", 1, *SMALL, "-o", "b\x07.gif"),
+], ids=lambda command: command[0])
+def test_control_characters_of_names_are_escaped_on_stdout(command: tuple[Any, ...]) -> None:
+    name = "a\x1b[31mred\x07\x9b.obj"
+    Path(name).write_bytes(Path("box.obj").read_bytes())
+    result = run(command[0], name, *command[1:])
+    assert result.code == 0, result
+    assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]", result.out + result.err)
+    assert "\\x1b" in result.out or "\\x07" in result.out
 
 
 # --- Ctrl-C -----------------------------------------------------------------------------------------------------------

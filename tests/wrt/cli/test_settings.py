@@ -221,6 +221,16 @@ def test_a_wrong_name_is_answered_with_the_nearest_and_all(arguments: list[str],
     assert result.code == 2 and len(result.errors) == 1 and message in result.errors[0], result
 
 
+@pytest.mark.parametrize(("wrong", "meant"), [
+    ("--width", "--size"), ("--height", "--size"), ("--sizes", "--size"), ("--max-dept", "--max-depth"), ("--up", None),
+    ("--bit", "--bits"),
+])
+def test_an_unknown_option_suggests_what_is_meant_or_nothing(wrong: str, meant: str | None) -> None:
+    result = run("render", "scene.toml", wrong, 1)
+    assert result.code == 2 and f"No such option '{wrong}'." in result.err
+    assert result.err.count("Did you mean") == (meant is not None) and (meant is None or f"Did you mean '{meant}'?" in result.err)
+
+
 # --- what max_depth cuts ----------------------------------------------------------------------------------------------
 
 

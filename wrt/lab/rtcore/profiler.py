@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from wrt.core.checks import did_you_mean
 from wrt.core.device import memory_of, start, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
@@ -20,7 +22,7 @@ from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
 from wrt.lab.rtcore.caches import distinct_lines
 from wrt.renderer.costs import COUNTERS, CostCounter
-from wrt.renderer.options import OPTIONS, Options
+from wrt.renderer.options import OPTIONS, Options, Progress
 from wrt.renderer.plan import plan_of
 from wrt.renderer.tiles import Rectangle
 from wrt.scene.mesh import Mesh
@@ -35,7 +37,7 @@ TITLES = {
     "stack": "most entries on the stack", "node_bytes": "bytes of nodes", "primitive_bytes": "bytes of triangles",
     "lines": "distinct cache lines, ray by ray", **{f"probes_{kind}": f"{kind} rays" for kind in KINDS},
 }
-LEFT_OUT = ("aov", "time_limit", "target_error", "progress", "pass_size", "checkpoint", "checkpoint_every",
+LEFT_OUT = ("aov", "time_limit", "target_error", "pass_size", "checkpoint", "checkpoint_every",
             "resume", "devices", "executor")  # options of a render that a profile has no use for
 TILE_SIZE = 64
 BYTES_OF_RAY = 200  # with what is made of it
@@ -126,14 +128,15 @@ class Profile:
 def profile(scene: Scene | Mesh | str | os.PathLike[str], **options: Any) -> Profile:
     """Render a scene and keep what every ray of it costs, and of evenly chosen tiles also what it fetches (TRACE_LIMIT).
 
-    Arguments: scene as for `wrt.render`; options: fields of Settings and of Options but LEFT_OUT. The rays are exactly those of
-    that render. Raises InputError for what cannot be rendered, and where that many rays do not fit into memory.
+    Arguments: scene as for `wrt.render`; options: fields of Settings and of Options but LEFT_OUT; spp is 1 where it is not given,
+    whatever the scene says. The rays are exactly those of that render. progress: as of a render, of three runs over the picture.
+    Raises InputError for what cannot be rendered, and where that many rays do not fit into memory.
     """
     changes = {name: options.pop(name) for name in SETTINGS if name in options}
-    changes = {name: value for name, value in changes.items() if value is not None}
+    changes = {"spp": 1, **{name: value for name, value in changes.items() if value is not None}}
     for name in options:
         if name in LEFT_OUT or name not in OPTIONS:
-            raise InputError(f"a profile has no argument {name!r}")
+            raise InputError(f"a profile has no argument {name!r}; {did_you_mean(name, set(OPTIONS) - set(LEFT_OUT))}".rstrip("; "))
     chosen = Options(**{"tile_size": TILE_SIZE, **options})
     return Profiler(as_scene(scene).with_settings(**changes), chosen).measure()
 
@@ -161,7 +164,7 @@ class Profiler:
         self.prepared, self.plan = self.counter.prepared, plan
 
     def measure(self) -> Profile:
-        begin = time.perf_counter()
+        self.begin, self.done, self.rays, self.lock = time.perf_counter(), 0, 0, threading.Lock()
         # The same samples three times over: only one film is looked at.
         self.films = [self.counter.film() for _ in range(3)]
         tiles: list[_Tile] = []
@@ -173,7 +176,7 @@ class Profiler:
                              " take a smaller size, fewer samples or a crop")
         step = max(1, -(-sum(tile.fetches for tile in tiles) // TRACE_LIMIT))
         self.counter.each(self._record, [(tile, i % step == step // 2) for i, tile in enumerate(tiles)])
-        seconds = {**self.prepared.seconds, "trace": time.perf_counter() - begin}
+        seconds = {**self.prepared.seconds, "trace": time.perf_counter() - self.begin}
         x0, y0, x1, y1 = self.plan.crop
         return Profile(self.plan.scene.name, (x1 - x0, y1 - y0), self.plan.scene.settings.spp,
                        self.films[0].pixels_and_variance()[0], self._gather(tiles), self.prepared.accel, seconds)
@@ -181,7 +184,17 @@ class Profiler:
     def _count(self, rectangle: Rectangle) -> _Tile:
         used, counts = self.counter.totals(rectangle, self.films[0])
         fetches = int(counts["nodes"].sum(dtype=np.int64) + counts["primitives"].sum(dtype=np.int64))
+        self._report(rectangle, 1, int(used.sum(dtype=np.int64)))
         return _Tile(rectangle, used.copy(), fetches)
+
+    def _report(self, rectangle: Rectangle, runs: int, rays: int) -> None:
+        """Tell `progress` that a tile has gone through so many more runs."""
+        progress, settings = self.plan.options.progress, self.plan.scene.settings
+        if progress is not None:
+            with self.lock:
+                self.done += runs * rectangle[2] * rectangle[3] * settings.spp
+                self.rays += runs * rays
+                progress(Progress(self.done, 3 * self.plan.area * settings.spp, self.rays, time.perf_counter() - self.begin))
 
     def _record(self, job: tuple[_Tile, bool]) -> None:
         tile, keep = job
@@ -208,6 +221,7 @@ class Profiler:
         trace = recorder.fetches.numpy()
         tile.lines = distinct_lines(at, trace // int(SIZE_RANGE), trace % int(SIZE_RANGE))
         tile.trace = trace.copy() if keep else None
+        self._report(tile.rectangle, 2, n)
 
     def _gather(self, tiles: list[_Tile]) -> Rays:
         rays = np.concatenate([tile.rays for tile in tiles])

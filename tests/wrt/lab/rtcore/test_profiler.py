@@ -20,6 +20,7 @@ from wrt.lab.rtcore.cubin import read_cubin
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
 from wrt.renderer.costs import COUNTERS
 from wrt.renderer.features import features_of
+from wrt.renderer.options import Progress
 from wrt.renderer.plan import render_kernel
 from wrt.renderer.upload import camera_kind
 from wrt.scene.model import Scene
@@ -124,6 +125,14 @@ def test_a_crop_is_a_part(scene: Scene, measured: Profile) -> None:
     assert part.size == (6, 5)
     for name, picture in part.maps.items():
         np.testing.assert_array_equal(picture, measured.maps[name][2:7, 6:12])
+
+
+def test_one_sample_is_taken_where_none_is_asked_for_and_progress_ends_at_all_samples(scene: Scene) -> None:
+    told: list[Progress] = []
+    found = profile(scene, tile_size=5, progress=told.append)
+    assert found.spp == 1 and scene.settings.spp > 1
+    assert [each.done for each in told] == sorted({each.done for each in told}) and len(told) > 2
+    assert told[-1].done == told[-1].total == 3 * found.size[0] * found.size[1] and told[-1].rays == 3 * len(found.rays)
 
 
 def test_what_a_profile_cannot_do_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
