@@ -67,6 +67,8 @@ def test_unknown_names_and_devices_are_refused() -> None:
         build(BALL, device="tpu")
     with pytest.raises(InputError, match="brute_force has no option 'max_leaf'"):
         build(BALL, "brute_force", max_leaf=3)
+    with pytest.raises(InputError, match=r"bvh8 has no option 'bulder'; did you mean 'builder'\? there is "):
+        build(BALL, bulder="sah")
     with pytest.raises(InputError, match="threads"):
         build(BALL, threads=0)
 

@@ -95,3 +95,11 @@ def test_odd_files_load_or_are_refused(path: Path) -> None:
     if mesh.normals is not None:
         length = np.linalg.norm(mesh.normals, axis=1)
         assert (np.isclose(length, 1.0, atol=1e-6) | (length == 0.0)).all()
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".GLTF", ".toml"])
+def test_a_scene_file_is_told_where_it_is_taken(suffix: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"is no mesh file: known are .*; wrt.load_scene and wrt.build take scenes$"):
+        load_mesh(tmp_path / f"a{suffix}")
+    with pytest.raises(InputError, match=r"is no mesh file: known are [^;]*$"):
+        load_mesh(tmp_path / "a.xyz")

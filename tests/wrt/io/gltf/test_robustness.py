@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import copy
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.data import DATA, data_path
+from tests.data import DATA, ROOT, data_path
 from tests.gltf_files import TRIANGLE, GltfFile, load_warned, one_triangle, rich_file, with_light
 from wrt.core.errors import InputError, SceneWarning
+from wrt.io import gltf
+from wrt.io.gltf.document import DEFAULT_LOOK, SUPPORTED_EXTENSIONS
+from wrt.io.gltf.meshes import _NOT_TRIANGLES
 from wrt.io.gltf.reader import load_gltf
 
 # --- what is left out, and what is added ------------------------------------------------------------------------------
@@ -204,3 +209,20 @@ def test_dragon_absorbs_and_its_vendor_cousins_are_named():
     assert np.exp(-0.155 * np.array(dragon.absorption)) == pytest.approx([0.921, 0.64, 0.064])
     assert "KHR_materials_variants (mesh 'Dragon')" in messages[0]
     assert "NV_materials_mdl" in load_warned(data_path("scenes/gltf/nvpro_cornellBox/cornellBox.gltf"))[1][0]
+
+
+def named_in(tree: ast.AST) -> Iterator[str]:
+    """The texts with which `left_out.add(...)` is called, each up to what differs from file to file."""
+    for call in ast.walk(tree):
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and ast.unparse(call.func).endswith("left_out.add"):
+            for text in ast.walk(call.args[0]):
+                if isinstance(text, ast.Constant) and isinstance(text.value, str):
+                    yield text.value.split(",")[0].strip()
+
+
+def test_the_page_on_materials_names_all_that_is_left_out_and_all_extensions_that_are_read():
+    page = (ROOT / "docs" / "materials.md").read_text().replace("`", "")
+    named = {text for path in Path(gltf.__path__[0]).glob("*.py") for text in named_in(ast.parse(path.read_text()))}
+    assert {"morph targets", "nearest-neighbour sampling", "textures without an image"} <= named
+    assert [text for text in sorted(named | set(_NOT_TRIANGLES.values())) if text not in page] == []
+    assert [name for name in sorted(SUPPORTED_EXTENSIONS | DEFAULT_LOOK) if name not in page] == []
