@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import depth_hint, load, naming, put, say, say_json, settings_of, shared, warnings_reported
+from wrt.cli.common import depth_hint, load, naming, say, say_json, settings_of, shared, warnings_reported
 from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
 
@@ -58,7 +58,7 @@ def animate(scene: Path, output: Path, fps: float, given: tuple[tuple[str, Any],
     if as_json:
         say_json({"output": str(target), "frames": rows, "seconds": time.perf_counter() - begin})
     elif rows:
-        put(target)
+        say(target, err=False)
     hint = depth_hint(visibly_cut, loaded.settings.max_depth, "--set max_depth")
     if hint and not quiet:
         say(hint)

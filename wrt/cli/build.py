@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import Setting, now_and_then, put, say, say_json, shared, warnings_reported
+from wrt.cli.common import Setting, now_and_then, say, say_json, shared, warnings_reported
 from wrt.core.errors import InputError
 from wrt.io.meshes import SUFFIXES
 
@@ -38,7 +38,7 @@ def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any],
         return
     if not quiet:
         say(repr(structure))
-    put(output)
+    say(output, err=False)
 
 
 def settled(settings: tuple[tuple[str, Any], ...]) -> dict[str, Any]:

@@ -60,8 +60,11 @@ class Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
-        except click.NoSuchOption as error:
-            raise click.UsageError(f"No such option {error.option_name!r}.{_meant(error)}", error.ctx) from None
+        except click.NoSuchOption as error:  # click compares with the dashes, which are always alike
+            known = {name.strip("-") for each in error.ctx.command.params for name in each.opts} if error.ctx else set()
+            meant = {"--width": "size", "--height": "size"}.get(error.option_name, error.option_name.strip("-"))
+            near = "".join(f" Did you mean '--{each}'?" for each in difflib.get_close_matches(meant, known, n=1))
+            raise click.UsageError(f"No such option {error.option_name!r}.{near}", error.ctx) from None
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
         try:
@@ -73,14 +76,6 @@ class Commands(click.Group):
                 known = self.list_commands(ctx)
                 ctx.fail(f"No such command {args[0]!r}; {did_you_mean(args[0], known)}there is {', '.join(known)}")
             raise
-
-
-def _meant(error: click.NoSuchOption) -> str:
-    """A question with the command's nearest option. click compares with the dashes, which are always alike."""
-    known = [name for each in (error.ctx.command.params if error.ctx else ()) for name in each.opts if name.startswith("--")]
-    wrong = {"--width": "--size", "--height": "--size"}.get(error.option_name, error.option_name)
-    near = difflib.get_close_matches(wrong.strip("-"), [name.strip("-") for name in known], n=1)
-    return f" Did you mean '--{near[0]}'?" if near else ""
 
 
 class OneOf(click.ParamType):
@@ -156,8 +151,7 @@ SHARED = {
     "scene": click.argument("scene", type=click.Path(path_type=Path)),
     "spp": click.option("--spp", type=int, help="Samples a pixel  [default: the scene's]"),
     "size": click.option("--size", type=SIZE, help="Pixels  [default: the scene's, 640x360]"),
-    "max_depth": click.option("--max-depth", type=int,
-                              help="Bounces after the first hit  [default: the scene's, else 64 with glass and 8 without]"),
+    "max_depth": click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's; 8, glass 64]"),
     "crop": click.option("--crop", type=CROP, help="Render only this rectangle, in pixels from the top left"),
     "camera": click.option("--camera", help="A camera's name or number  [default: the first]"),
     "given": SET,
@@ -280,16 +274,12 @@ def say_json(value: Any) -> None:
     click.echo(json_text(value))
 
 
-def say(text: str) -> None:
-    """On stderr; that its terminal is gone is no reason to fail."""
-    with contextlib.suppress(OSError):
-        put(text, err=True)
-
-
-def put(text: object, err: bool = False) -> None:
-    """On stdout, or on stderr. Control characters that a stranger's file or its name holds are escaped: they give the terminal no
-    orders."""
-    click.echo(re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", lambda control: f"\\x{ord(control[0]):02x}", str(text)), err=err)
+def say(text: object, err: bool = True) -> None:
+    """On stderr, where a terminal that is gone is no reason to fail, or on stdout. Control characters that a stranger's file or its
+    name holds are escaped: they give the terminal no orders."""
+    text = re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", lambda control: f"\\x{ord(control[0]):02x}", str(text))
+    with contextlib.suppress(OSError) if err else contextlib.nullcontext():
+        click.echo(text, err=err)
 
 
 def now_and_then(quiet: bool, every: float = 10.0) -> Callable[[str], None]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import load, naming, put, say_json, shared, warnings_reported
+from wrt.cli.common import load, naming, say, say_json, shared, warnings_reported
 
 
 @click.command("compile", help="Compile what queries of a structure, and pictures of SCENES with all AOVs, take: into Warp's cache"
@@ -24,7 +24,7 @@ def compile_kernels(scenes: tuple[Path, ...], accel: str, device: str, threads: 
     def tell(what: str, names: list[str], begin: float) -> None:
         done.append({"for": what, "kernels": names, "seconds": time.perf_counter() - begin})
         if not as_json:
-            put(f"{what}: {len(names)} kernels, {done[-1]['seconds']:.1f} s")
+            say(f"{what}: {len(names)} kernels, {done[-1]['seconds']:.1f} s", err=False)
 
     begin = time.perf_counter()
     tell(f"queries of {accel}", compile_queries(accel, device), begin)

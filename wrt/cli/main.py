@@ -33,7 +33,6 @@ from wrt.cli.common import (
     depth_hint,
     load,
     naming,
-    put,
     say,
     say_json,
     settings_of,
@@ -150,7 +149,7 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
         say_json({"output": [str(path) for path in paths], **film.metadata, **film.stats})
     else:
         for path in paths:
-            put(path)
+            say(path, err=False)
     if not quiet:
         say(_summary(film))
     if misplaced:
@@ -207,10 +206,10 @@ def info(scene: Path, camera: str | None, given: tuple[tuple[str, Any], ...], as
     for name, value in facts.items():
         between = "; " if isinstance(value, list) and value and isinstance(value[0], str) else ", "  # names may have commas
         shown = "none" if value in (None, []) else between.join(map(str, value)) if isinstance(value, list) else value
-        put(f"{name}: {shown}")
+        say(f"{name}: {shown}", err=False)
     for state in (True, False):
         names = [name for name, on in features.items() if on is state]
-        put(f"features {'on' if state else 'off'}: {', '.join(names) or 'none'}")
+        say(f"features {'on' if state else 'off'}: {', '.join(names) or 'none'}", err=False)
 
 
 @cli.command()
@@ -235,7 +234,7 @@ def validate(scenes: tuple[Path, ...]) -> None:
     for scene in scenes:
         try:
             load(scene, quiet=False)
-            put(f"{scene}: ok")
+            say(f"{scene}: ok", err=False)
         except InputError as error:
             bad += 1
             say(f"error: {error}")
@@ -275,7 +274,7 @@ def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float
         say_json(result)
     else:
         for name, value in result.items():
-            put(f"{name}: {value:.6g}")
+            say(f"{name}: {value:.6g}", err=False)
     broken = metrics.failures(result, {name.split("_")[1]: limit for name, limit in limits.items()})
     for sentence in broken:
         say(sentence)

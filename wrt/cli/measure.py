@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import SIZE, Commands, Names, client_of, load, naming, put, say, settings_of, shared, warnings_reported
+from wrt.cli.common import SIZE, Commands, Names, client_of, load, naming, say, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, measured, planned, reporting
 from wrt.lab import plans
 from wrt.lab.plans import Error, Mitsuba, Stability
@@ -101,14 +101,14 @@ def stability(how: Reporting, plan: Stability) -> None:
 
     def row_done(row: Any) -> None:
         if not how.as_json:
-            put("  ".join(cells(study.COLUMNS, row)))
+            say("  ".join(cells(study.COLUMNS, row)), err=False)
 
     study.chosen(plan.cases)
     if how.output is not None:
         report.check_report(how.output)
     client = client_of(how.cluster)
     if not how.as_json:
-        put("  ".join(study.COLUMNS))
+        say("  ".join(study.COLUMNS), err=False)
     result = study.run(plan, row_done, how.now_and_then, client)
     paths = [] if how.output is None else report.write_report(result, plan, how.output)
     data = {"machine": report.machine(plan), **result.as_dict(), "output": paths}

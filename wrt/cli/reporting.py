@@ -13,20 +13,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from wrt.cli.common import (
-    ACCEL,
-    CLUSTER,
-    DURATION,
-    SHARED,
-    Names,
-    OneOf,
-    client_of,
-    now_and_then,
-    put,
-    say,
-    say_json,
-    warnings_reported,
-)
+from wrt.cli.common import ACCEL, CLUSTER, DURATION, SHARED, Names, OneOf, client_of, now_and_then, say, say_json, warnings_reported
 from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
 from wrt.core.write_file import check_writable, write_bytes
@@ -71,7 +58,7 @@ class Reporting:
             say_json(data)
         else:
             for line in (text, *paths):
-                put(line)
+                say(line, err=False)
         if interrupted is not None:
             say("interrupted: what was done is kept")
             raise SystemExit(exit_code(interrupted))

@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import load, naming, put, say, settings_of, shared
+from wrt.cli.common import load, naming, say, settings_of, shared
 
 
 @click.command()
@@ -47,7 +47,7 @@ def view(scene: Path, port: int, host: str, allow_origin: tuple[str, ...], open_
     with naming(scene):
         loaded.camera(rendering.camera)  # told with the file's name
     page = Page(loaded, rendering, host, port, spp, allow_origins=origins, warn=(lambda text: None) if quiet else say)
-    put(page.url)
+    say(page.url, err=False)
     if not quiet:
         say("Ctrl-C ends it")
     try:

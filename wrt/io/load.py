@@ -115,17 +115,12 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError("holds a number of thousands of digits", path) from error
 
 
-def _require_sound(data: dict[str, Any]) -> None:
+def _require_sound(value: Any) -> None:
     """Raise InputError for an integer of more than 64 bits, as TOML demands (others cannot deal with thousands of digits)."""
-    values: list[Any] = [data]
-    while values:
-        value = values.pop()
-        if isinstance(value, dict):
-            values += value.values()
-        elif isinstance(value, list):
-            values += value
-        elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
-            raise InputError("holds an integer of more than 64 bits")
+    for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _require_sound(each)
+    if isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
+        raise InputError("holds an integer of more than 64 bits")
 
 
 def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = ()) -> Scene:

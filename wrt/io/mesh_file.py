@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wrt.core.checks import as_path, shown
+from wrt.core.checks import as_path, short, shown
 from wrt.core.errors import InputError, at, warn
 from wrt.core.files import require_file
 from wrt.core.registry import Registry
@@ -104,7 +104,8 @@ def _part_groups(parts: Sequence[tuple[int, int]], faces: int) -> tuple[tuple[st
     group = np.full(faces, len(parts), dtype=np.int32)
     for number, (first, count) in enumerate(parts):
         if first < 0 or count < 0 or first + count > faces:
-            raise InputError(f"triangles {first} to {first + count - 1}, but the file has {faces}", None, f"part {number}")
+            last = short(first + count - 1)
+            raise InputError(f"triangles {short(first)} to {last}, but the file has {faces}", None, f"part {number}")
         group[first:first + count] = number
     return (*(str(number) for number in range(len(parts))), "rest"), group
 

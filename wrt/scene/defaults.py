@@ -59,28 +59,23 @@ def is_lit(scene: Scene) -> bool:
     radiance of DARK or more."""
     if scene.lights or scene.background != ConstantBackground(BLACK) or scene.ambient != BLACK:
         return True
-    if not any(material.lights_others for material in scene.materials):
-        return False
-    return bool(_emitted_power(scene) >= DARK * 4.0 * math.pi * bounding_sphere(scene)[1] ** 2)
+    power = _emitted_power(scene)
+    return power > 0.0 and power >= DARK * 4.0 * math.pi * bounding_sphere(scene)[1] ** 2
 
 
 def _emitted_power(scene: Scene) -> float:
-    """Luminance times area of all surfaces that light others. Areas are exact for transforms that scale all axes alike."""
+    """Luminance times area of all surfaces that light others."""
 
     def radiance(material: Material) -> float:
         return float(LUMINANCE @ material.emission) * (1 + material.two_sided) * material.lights_others
 
     power = sum(4.0 * math.pi * sphere.radius**2 * radiance(sphere.material) for sphere in scene.spheres)
-    areas: dict[int, np.ndarray] = {}
     for thing in scene.objects:
         emitted = np.array([radiance(material) for material in thing.materials])
         if emitted.any():
-            mesh = thing.mesh
-            if id(mesh) not in areas:
-                a, b, c = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float64), 1, 0)
-                areas[id(mesh)] = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            a, b, c = np.moveaxis((thing.mesh.vertices @ thing.transform[:3, :3].T)[thing.mesh.faces], 1, 0)
             of_face = emitted[0 if thing.face_material is None else thing.face_material]
-            power += float(np.sum(of_face * areas[id(mesh)])) * abs(np.linalg.det(thing.transform[:3, :3])) ** (2.0 / 3.0)
+            power += float(np.sum(of_face * 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)))
     return power
 
 

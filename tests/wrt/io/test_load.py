@@ -221,6 +221,20 @@ def test_numbers_of_thousands_of_digits(tmp_path: Path) -> None:
         "holds a number of thousands of digits"]
 
 
+@pytest.mark.parametrize("value", [2**63, -(10**30), 10**400, int("9" * 4300)])
+@pytest.mark.parametrize("field", ["[settings]\nspp", "[settings]\nexposure", "ambient", "[[spheres]]\ncenter = [0, 0, 0]\nradius",
+                                   "[[meshes]]\nmaterial = 'm'\nfile = 'b.obj'\nparts = [{material = 'm', count = 9, first"])
+def test_integers_of_any_size_are_told_in_short(field: str, value: int, tmp_path: Path) -> None:
+    (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    end = "}]" if "parts" in field else ""
+    top, rest = (f"{field} = {value}\n", "") if field == "ambient" else ("", f"{field} = {value}{end}\n")
+    path = tmp_path / "a.toml"
+    path.write_text(f"{top}[materials.m]\n{rest}" if "settings" not in field else rest)
+    with pytest.raises(InputError) as error:
+        load_scene(path)
+    assert len(str(error.value)) < 400 and "a.toml" in str(error.value)
+
+
 def test_no_more_than_twenty_mistakes_are_told(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         load(tmp_path, CAMERA + "[[spheres]]\n" * 10 + "".join(f"wrong_{i} = 1\n" for i in range(5)))

@@ -6,7 +6,6 @@ Source: Khronos, glTF 2.0 specification, sections 2 (concepts), 3.6 (buffers) an
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import os
 import re
@@ -25,7 +24,6 @@ from wrt.core.packages import needed_by
 from wrt.io.gltf.schema import read_as
 
 GLB_MAGIC = b"glTF"
-BASE64_AT_ONCE = 1 << 22  # characters; a multiple of 4
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 
 SUPPORTED_EXTENSIONS = frozenset({
@@ -128,7 +126,7 @@ class Document:
         if index not in self._buffers:
             buffer = self.item("buffers", index, place)
             where = f"buffers[{index}]"
-            data: bytes | bytearray | memoryview
+            data: bytes | memoryview
             if buffer.uri is not None:
                 data = self.resource(buffer.uri, f"{where}.uri")
             elif index == 0 and self._binary is not None:
@@ -141,7 +139,7 @@ class Document:
             self._buffers[index] = np.frombuffer(data, dtype=np.uint8)[:max(buffer.byteLength, 0)]
         return self._buffers[index]
 
-    def resource(self, uri: str, place: str) -> bytes | bytearray:
+    def resource(self, uri: str, place: str) -> bytes:
         """The bytes behind a data: URI or a relative path; nothing outside of the glTF file's folder is read."""
         if uri[:5].lower() == "data:":
             with at(place):
@@ -196,14 +194,12 @@ def _parse_json(data: bytes) -> Any:
         return json.loads(utf8(data).decode(), parse_constant=refuse)
     except UnicodeDecodeError as error:
         raise InputError(f"is not a glTF file: not UTF-8 at byte {error.start}") from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"is not valid JSON: {error}") from None
     except RecursionError:
         raise InputError("is not valid JSON: nested too deeply") from None
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"is not valid JSON: {error}") from None  # an integer of thousands of digits
+    except InputError:
+        raise
+    except ValueError as error:  # JSONDecodeError; an integer of thousands of digits
+        raise InputError(f"is not valid JSON: {error}") from None
 
 
 def _check_version(raw: dict[str, Any]) -> None:
@@ -225,29 +221,15 @@ def _check_required_extensions(required: Iterable[str]) -> None:
                          "extensionsRequired")
 
 
-def _decode_data_uri(uri: str) -> bytes | bytearray:
-    comma = uri.find(",")
-    if comma < 0:
+def _decode_data_uri(uri: str) -> bytes:
+    head, comma, body = uri.partition(",")
+    if not comma:
         raise InputError("is a data: URI without a comma")
-    is_base64 = uri[:comma].lower().endswith(";base64")
-    if is_base64 and "%" not in uri:
-        return _decode_base64(uri, comma + 1)
-    data = unquote_to_bytes(uri[comma + 1:])
-    return _decode_base64(data.decode("latin-1"), 0) if is_base64 else data
-
-
-def _decode_base64(text: str, begin: int) -> bytearray:
-    """What stands behind `begin`, piece by piece: it may be most of the memory."""
-    end = len(text) - 2 if text.endswith("==") else len(text) - 1 if text.endswith("=") else len(text)
-    data = bytearray()
     try:
-        if text.find("=", begin, end) >= 0:
-            raise ValueError("a = that is not at its end")
-        for first in range(begin, len(text), BASE64_AT_ONCE):
-            data += base64.b64decode(text[first:first + BASE64_AT_ONCE], validate=True)
-    except (binascii.Error, ValueError) as error:
+        data = unquote_to_bytes(body)
+        return base64.b64decode(data, validate=True) if head.lower().endswith(";base64") else data
+    except ValueError as error:  # binascii.Error, and a lone surrogate
         raise InputError(f"is a data: URI that cannot be decoded: {error}") from None
-    return data
 
 
 def _local_name(uri: str, place: str) -> str:

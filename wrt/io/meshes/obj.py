@@ -9,10 +9,8 @@ scene file refers to.
 from __future__ import annotations
 
 import io
-import re
 from array import array
 from collections import defaultdict
-from collections.abc import Iterator
 from itertools import chain, count
 from pathlib import Path
 from typing import NoReturn
@@ -28,7 +26,6 @@ from wrt.io.polygons import triangulate
 # What stands in a corner `v/vt/vn`, and how many numbers of a line of it are kept.
 _KEEP = {"v": 3, "vt": 2, "vn": 3}
 WORDS_AT_ONCE = 1 << 16  # as text; then they are numbers, which take a tenth of the memory
-_SPACE = re.compile(r"\s")
 _CORNER = "face corner {} is not v, v/vt, v//vn or v/vt/vn"
 
 
@@ -53,31 +50,27 @@ class _Text:
         raise InputError(message, None, f"line {line}")
 
     def read(self, data: bytes) -> None:
-        pending = io.StringIO()  # lines that the next one continues: a string would be copied with each
-        number = 0
+        pending, number = "", 0  # lines that the next one continues
         for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace"), 1):
             if line.endswith(("\\\n", "\\")):
-                pending.write(line.removesuffix("\n")[:-1] + " ")
+                pending += line.removesuffix("\n")[:-1] + " "
                 continue
-            if pending.tell():
-                line = pending.getvalue() + line
-                pending = io.StringIO()
-            self._line(line, number)
-        self._line(pending.getvalue(), number)
+            self._line(pending + line, number)
+            pending = ""
+        self._line(pending, number)
         for key in _KEEP:
             self._to_numbers(key)
         self._to_indices()
 
     def _line(self, line: str, number: int) -> None:
-        words = (line.partition("#")[0] if "#" in line else line).split(None, WORDS_AT_ONCE)
+        words = (line.partition("#")[0] if "#" in line else line).split()
         if not words:
             return
         key = words[0]
         if key in _KEEP:
             self._numbers(key, words, number)
         elif key == "f":
-            rest = words.pop() if len(words) > WORDS_AT_ONCE else ""
-            self._face(words[1:], rest, number)
+            self._corners(words[1:], number)
         elif key in self.names:
             self._span(key, line.split(None, 1)[1].strip() if len(words) > 1 else "")
 
@@ -103,20 +96,11 @@ class _Text:
             self.fail(line, f"{key} holds {short(words[bad - done])}, which is not a number")
         words.clear()
 
-    def _face(self, corners: list[str], rest: str, line: int) -> None:
-        """rest: further corners, not yet taken apart."""
-        self._corners(corners, line)
-        total = len(corners)
-        for part in _parts(rest):
-            corners = part.split()
-            self._corners(corners, line)
-            total += len(corners)
-        self.counts.append(total)
-        self.face_lines.append(line)
-
     def _corners(self, corners: list[str], line: int) -> None:
         if "-" in "".join(corners):
             corners = [self._absolute(corner, line) for corner in corners]
+        self.counts.append(len(corners))
+        self.face_lines.append(line)
         self._new_corners += corners
         if len(self._new_corners) > WORDS_AT_ONCE:
             self._to_indices()
@@ -201,16 +185,6 @@ class _Text:
         polygon_group = numbers[np.searchsorted(starts, np.arange(len(self.counts)), side="right")]
         used, polygon_group = np.unique(polygon_group, return_inverse=True)
         return tuple(names[i] for i in used), polygon_group
-
-
-def _parts(text: str) -> Iterator[str]:
-    """Parts of a long line, cut between words."""
-    begin = 0
-    while begin < len(text):
-        space = _SPACE.search(text, begin + 4 * WORDS_AT_ONCE)
-        end = space.start() if space else len(text)
-        yield text[begin:end]
-        begin = end
 
 
 def read(path: Path) -> RawMesh:

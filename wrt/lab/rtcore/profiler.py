@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.core.checks import did_you_mean
 from wrt.core.device import memory_of, start, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
@@ -136,7 +135,7 @@ def profile(scene: Scene | Mesh | str | os.PathLike[str], **options: Any) -> Pro
     changes = {"spp": 1, **{name: value for name, value in changes.items() if value is not None}}
     for name in options:
         if name in LEFT_OUT or name not in OPTIONS:
-            raise InputError(f"a profile has no argument {name!r}; {did_you_mean(name, set(OPTIONS) - set(LEFT_OUT))}".rstrip("; "))
+            raise InputError(f"a profile has no argument {name!r}")
     chosen = Options(**{"tile_size": TILE_SIZE, **options})
     return Profiler(as_scene(scene).with_settings(**changes), chosen).measure()
 
