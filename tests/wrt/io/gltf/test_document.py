@@ -96,6 +96,7 @@ def test_external_buffers(tmp_path, name, uri):
     ("data:application/octet-stream;base64", "without a comma"),
     ("data:;base64,abc", "cannot be decoded"),
     ("data:;base64,ab!=", "cannot be decoded"),
+    ("data:,\ud800", "cannot be decoded"), ("data:;base64,\ud800", "cannot be decoded"), ("data:;base64,a=bc", "cannot be decoded"),
     ("data:,abc", "is truncated: byteLength is 36, but there are 3 bytes"),
     (5, "must be a string, got 5"),
 ])
