@@ -8,9 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.query import HitArrays, RayArrays, direction_scale, put_hit, scaled_ray
-from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
-from wrt.kernels.units.triangle import is_crossed, seen, triangle_ray
+from wrt.kernels.query import direction_scale, scaled_ray
+from wrt.kernels.structs import Hit, Ray, Surfaces
 
 
 @wp.struct
@@ -115,69 +114,11 @@ def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, 
     @wp.func
     def next_hit(world: World, ray: QueryRay, hit: QueryHit) -> QueryHit:
         """The first hit after one that this ray gave, in the order of t and, where that is equal, of prim_id: from the closest hit
-        on, each hit of the segment once."""
+        on, each hit of the segment once. It walks from the root and tests again all that is hit at the same t: k hits at one t take
+        k^2 tests in all (wrt.all_hits, which has storage, takes k log k steps)."""
         going = traversed(ray, world.kind != kind)
         going.t_min = hit.scaled_t
         going.slot = hit.prim_id + 1
         return as_asked(resuming(world.accel, world.surfaces, going), ray.direction)
 
     return World, closest_hit, any_hit, next_hit
-
-
-@wp.func
-def crosses(surfaces: Surfaces, ray: Ray, prim_id: int) -> bool:
-    """Whether a ray goes through a triangle that it hits, or only touches it: units.triangle.is_crossed."""
-    shear = triangle_ray(ray)
-    face = surfaces.faces[prim_id]
-    return is_crossed(seen(surfaces.vertices[face[0]] - ray.origin, shear), seen(surfaces.vertices[face[1]] - ray.origin, shear),
-                      seen(surfaces.vertices[face[2]] - ray.origin, shear))
-
-
-def make_hit_kernels(query: Any) -> tuple[Any, Any]:
-    """count_hits: how many each ray has; write_hits: what they are, those of ray i in rows first[i] .. first[i + 1] - 1. crossings:
-    only those where it crosses a triangle; then surfaces has vertices and faces. query: of make_ray_query."""
-    world_struct, closest_hit, _, next_hit = query
-
-    @wp.func
-    def loaded(rays: RayArrays, i: int) -> QueryRay:
-        ray = QueryRay()
-        ray.origin = rays.origin[i]
-        ray.direction = rays.direction[i]
-        ray.t_min = rays.t_min[i]
-        ray.t_max = rays.t_max[i]
-        return ray
-
-    @wp.func
-    def counts(surfaces: Surfaces, ray: QueryRay, hit: QueryHit, crossings: bool) -> bool:
-        if not crossings:
-            return True
-        return crosses(surfaces, scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max), hit.prim_id)
-
-    @kernel
-    def count_hits(world: world_struct, rays: RayArrays, crossings: bool, counted: wp.array(dtype=wp.int32), start: int):
-        i = start + wp.tid()
-        ray = loaded(rays, i)
-        hit = closest_hit(world, ray)
-        n = int(0)
-        while hit.prim_id >= 0:
-            if counts(world.surfaces, ray, hit, crossings):
-                n += 1
-            hit = next_hit(world, ray, hit)
-        counted[i] = n
-
-    @kernel
-    def write_hits(world: world_struct, rays: RayArrays, crossings: bool, first: wp.array(dtype=wp.int64), hits: HitArrays,
-                   start: int):
-        i = start + wp.tid()
-        ray = loaded(rays, i)
-        at = first[i]
-        end = first[i + 1]
-        hit = closest_hit(world, ray)
-        while at < end:
-            if hit.prim_id < 0 or counts(world.surfaces, ray, hit, crossings):
-                put_hit(hits, at, hit, 1.0)
-                at += wp.int64(1)
-            if hit.prim_id >= 0 and at < end:  # after a miss there are misses
-                hit = next_hit(world, ray, hit)
-
-    return count_hits, write_hits

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
+from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, add_counts, make_counters
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
@@ -98,7 +98,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
     new_counts, shared_counts, put_count, count_at = make_stack(units.stack, STACK_SIZE, wp.int32, ENTRY)
 
     @wp.func
-    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+    def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         prepared = set_up(accel, probe)
         best = no_hit(ray)

@@ -12,9 +12,9 @@ from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay, triangle_ray
 
 class Units(NamedTuple):
     """What a traversal unit is made of: names in RAY_TRIANGLE and RAY_AABB, whether there are spheres, whether it counts, whether
-    it walks instances (Ray.first_prim is then added to each prim_id), and whether it goes on behind a hit: at t_min, only
-    primitives from Ray.slot on are hit. Spheres have two hits, and cannot be gone on from. stack: in kernels.traverse.stack.PLACES,
-    for those who look there."""
+    it walks instances (Ray.first_prim is then added to each prim_id), whether it goes on behind a hit: at t_min, only primitives
+    from Ray.slot on are hit; spheres have two hits, and cannot be gone on from. lists: whether it lists all hits
+    (kernels.hit_lists) instead of keeping the best. stack: in kernels.traverse.stack.PLACES, for those who look there."""
 
     triangle: str = "watertight"
     box: str = "conservative"
@@ -22,6 +22,7 @@ class Units(NamedTuple):
     counters: bool = False
     instances: bool = False
     resumes: bool = False
+    lists: bool = False
     stack: str = "local"
 
     @property
@@ -74,11 +75,12 @@ def make_probe(units: Units) -> Any:
 def make_better(units: Units, accepts: Any = None) -> Any:
     """The unit that keeps the better of two hits.
 
-    accepts(surfaces, prim_id, u, v) -> bool may refuse a hit (cut-outs); None takes all.
+    accepts(surfaces, prim_id, u, v) -> bool may refuse a hit (cut-outs); None takes all. Where units.lists, it is
+    accepts(lists, ray, hit, best) -> Hit, which takes the hit and gives the next `best`; `surfaces` is what it lists them in.
     """
 
     @wp.func
-    def better(ray: Ray, surfaces: Surfaces, hit: Hit, prim_id: int, best: Hit) -> Hit:
+    def better(ray: Ray, surfaces: Any, hit: Hit, prim_id: int, best: Hit) -> Hit:
         """The closer of `best` and a primitive's hit (prim_id: NO_HIT where there is none) in [t_min, best.t]; at equal t the lower
         prim_id."""
         if hit.prim_id == NO_HIT or not (hit.t >= ray.t_min and hit.t <= best.t):
@@ -88,7 +90,10 @@ def make_better(units: Units, accepts: Any = None) -> Any:
         if wp.static(units.resumes):
             if hit.t == ray.t_min and prim_id < ray.slot:
                 return best
-        if wp.static(accepts is not None):
+        if wp.static(units.lists):
+            hit.prim_id = prim_id
+            return accepts(surfaces, ray, hit, best)
+        if wp.static(accepts is not None and not units.lists):
             if not accepts(surfaces, prim_id, hit.u, hit.v):
                 return best
         hit.prim_id = prim_id
@@ -110,7 +115,7 @@ def make_intersect(units: Units, accepts: Any = None) -> Any:
     better = make_better(units, accepts)
 
     @wp.func
-    def intersect(probe: Probe, surfaces: Surfaces, primitive: record, best: Hit) -> Hit:
+    def intersect(probe: Probe, surfaces: Any, primitive: record, best: Hit) -> Hit:
         prim_id = primitive.prim_id
         if wp.static(units.instances):
             prim_id = primitive.prim_id + probe.ray.first_prim

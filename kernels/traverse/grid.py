@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
+from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.cell_ray import cell_slack, earlier, later, parallel
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
@@ -118,7 +118,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
-    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+    def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
         counts = Counts()

@@ -15,7 +15,7 @@ import warp as wp
 
 from wrt.kernels.native import source
 from wrt.kernels.query import LARGEST
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
@@ -92,7 +92,7 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, width: int) -> Any:
     culled = units.triangle == "watertight"
 
     @wp.func
-    def test_row(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces, probe: Probe, ray: LaneRay,
+    def test_row(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Any, probe: Probe, ray: LaneRay,
                  best: Hit) -> Hit:
         if wp.static(culled):
             mask = mask & cull(rows, first, ray)
@@ -154,7 +154,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compre
         return counts
 
     @wp.func
-    def test_leaf(accel: struct, surfaces: Surfaces, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
+    def test_leaf(accel: struct, surfaces: Any, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
         begin = leaf_first(reference) * unit
         end = begin + leaf_count(reference)
         while begin < end:
@@ -187,7 +187,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compre
         return counts
 
     @wp.func
-    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+    def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         rows = lane_ray(probe, wp.static(far_pad(units.box)))
         best = no_hit(ray)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,15 +14,20 @@ from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
 from wrt.accel.batches import RAYS_PER_LAUNCH
 from wrt.accel.hit_points import surroundings
-from wrt.accel.ray_query import query_of, require_one_mesh, world_of
+from wrt.accel.ray_query import require_one_mesh
 from wrt.accel.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
 from wrt.core.arrays import returned, to_numpy, to_warp
 from wrt.core.checks import as_integer, as_one, shown
-from wrt.core.device import launch_on, made_once
+from wrt.core.device import MOST_ROWS, launch_on, made_once, upload
+from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
+from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, list_hit, make_list_hits_kernel
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.ray_query import make_hit_kernels
+from wrt.kernels.structs import Hit, fields_of
+
+ALL = (1 << 30) - 1
+RAYS_AT_ONCE = 1 << 18  # for whose first walk there are 32 MiB
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +46,7 @@ class AllHits:
 
     @property
     def counts(self) -> Any:
-        """(N,) int64."""
+        """(N,) int64, as of count_hits."""
         return self.first[1:] - self.first[:-1]
 
     @property
@@ -55,20 +61,21 @@ class AllHits:
 
 
 class Asked:
-    """A structure that is asked, as it is now: `of` gives it rays, and launches over them follow."""
+    """A structure that is asked, as it is now: `of` gives it rays, and `all`, `first` or `counts` answers."""
 
     n = 0
     rays: RayArrays
     give: Any = to_numpy  # what answers become, which are Warp's
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
-        structure = require_one_mesh(getattr(accel, "structure", None),
-                                     f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
+        self.structure = require_one_mesh(getattr(accel, "structure", None),
+                                          f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
         self.threads, self.device, self.state = thread_count(threads), accel.device, accel._state
-        self.crossings = as_one(crossings, bool, "crossings")
-        surfaces = surroundings(accel, self.state).surfaces if crossings else accel._surfaces
-        self.world = world_of(structure, self.state.data, surfaces)
-        self.count_hits, self.write_hits = hit_kernels(structure)
+        self.lists: Any = HitLists()
+        self.lists.crossings = as_one(crossings, bool, "crossings")
+        if crossings:
+            surfaces = surroundings(accel, self.state).surfaces
+            self.lists.vertices, self.lists.faces = surfaces.vertices, surfaces.faces
 
     def of(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Asked:
         """Raises InputError that names the argument."""
@@ -77,29 +84,96 @@ class Asked:
         self.give = returned(origins, directions) or to_numpy
         return self
 
-    def launch(self, kernel: Any, *inputs: Any) -> None:
-        asked = self.world, self.rays, self.crossings
-        launch_on(self.device, kernel, self.n, *asked, *inputs, None, threads=self.threads, step=RAYS_PER_LAUNCH)
+    def all(self, limit: int = ALL) -> AllHits:
+        """The hits of each ray, `limit` at most."""
+        counts, parts = [np.zeros(0, np.int64)], []
+        for rays, lists, of_each in self._listed(limit):
+            begin = np.concatenate([[0], np.cumsum(of_each)])
+            parts.append(self._arrays(begin[-1]))
+            counts.append(of_each)
+            self._copy(rays, lists, begin, parts[-1])
+        first = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+        hits = parts[0] if len(parts) == 1 else self._joined(parts)
+        return AllHits(*map(self.give, (upload(first, wp.int64, self.device), hits.t, hits.u, hits.v, hits.prim_id)))
 
-    def counts(self) -> Any:
-        """Of the hits of each ray: a Warp array."""
-        counts = wp.zeros(self.n, dtype=wp.int32, device=self.device)
-        self.launch(self.count_hits, counts)
-        return counts
+    def first(self, k: int) -> Hits:
+        """The first k hits of each ray: (N, k)."""
+        hits = self._arrays(self.n * k)
+        hits.t.fill_(np.inf)
+        hits.u.zero_()
+        hits.v.zero_()
+        hits.prim_id.fill_(-1)
+        begin = np.arange(0, self.n * k, k, dtype=np.int64)
+        for rays, lists, of_each in self._listed(k):
+            self._copy(rays, lists, begin[:len(of_each)], hits)
+            begin = begin[len(of_each):]
+        return Hits(*(self.give(array.reshape((self.n, k))) for array in (hits.t, hits.u, hits.v, hits.prim_id)))
 
-    def rows(self, first: np.ndarray) -> list[Any]:
-        """first, t, u, v, prim_id of so many hits of each ray, misses where it has fewer: Warp arrays."""
-        empty = partial(wp.empty, int(first[-1]), device=self.device)
+    def counts(self) -> np.ndarray:
+        """How many hits each ray has, (N,) int64."""
+        return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL))])
+
+    def _listed(self, limit: int) -> Iterator[tuple[Any, list[Any], np.ndarray]]:
+        """Of so many rays at a time: the rays; lists, in one of which a ray has its hits, `limit` at most; and how many."""
+        limit = min(limit, ALL)
+        for begin in range(0, self.n, RAYS_AT_ONCE):
+            n, rays = min(RAYS_AT_ONCE, self.n - begin), RayArrays()
+            for name in fields_of(RayArrays):
+                setattr(rays, name, getattr(self.rays, name)[begin:begin + n])
+            lists = [self._filled(rays, np.full(n, FEW), limit)]
+            counts = lists[0].count.numpy().astype(np.int64)
+            many = counts > FEW
+            if many.any():
+                lists[0].count = upload(np.where(many, 0, counts), wp.int32, self.device)
+                lists.append(self._filled(rays, np.where(many, np.minimum(counts, 2 * limit), 0), limit))
+                counts = np.where(many, lists[1].count.numpy(), counts)
+            yield rays, lists, counts
+
+    def _filled(self, rays: RayArrays, room: np.ndarray, limit: int) -> Any:
+        """HitLists with room for so many hits of each ray, after the walk."""
+        lists: Any = HitLists()
+        lists.limit, lists.crossings = limit, self.lists.crossings
+        lists.vertices, lists.faces = self.lists.vertices, self.lists.faces
+        first = np.concatenate([[0], np.cumsum(room)])
+        lists.rows = wp.empty(rows_of(first[-1]), dtype=Hit, device=self.device)
+        lists.first = upload(first, wp.int32, self.device)
+        lists.count = wp.zeros(len(room), dtype=wp.int32, device=self.device)
+        self._launch(list_hits_kernel(self.structure), len(room), self.state.data, rays, lists)
+        return lists
+
+    def _copy(self, rays: RayArrays, lists: list[Any], begin: np.ndarray, hits: Any) -> None:
+        for each in lists:
+            self._launch(copy_hits, len(rays.origin), rays, each, upload(begin, wp.int32, self.device), hits)
+
+    def _arrays(self, n: int) -> Any:
+        empty = partial(wp.empty, rows_of(n), device=self.device)
         hits: Any = HitArrays()
         hits.t, hits.u, hits.v, hits.prim_id = *(empty(dtype=wp.float32) for _ in range(3)), empty(dtype=wp.int32)
-        begin = wp.array(first, dtype=wp.int64, device=self.device)
-        self.launch(self.write_hits, begin, hits)
-        return [begin, hits.t, hits.u, hits.v, hits.prim_id]
+        return hits
+
+    def _joined(self, parts: list[Any]) -> Any:
+        out, at = self._arrays(sum(len(part.t) for part in parts)), 0
+        for part in parts:
+            for name in fields_of(HitArrays):
+                wp.copy(getattr(out, name), getattr(part, name), dest_offset=at, count=len(part.t))
+            at += len(part.t)
+        return out
+
+    def _launch(self, kernel: Any, n: int, *inputs: Any) -> None:
+        launch_on(self.device, kernel, n, *inputs, None, threads=self.threads, step=RAYS_PER_LAUNCH)
+
+
+def rows_of(hits: int) -> int:
+    """Raise InputError for more than kernels, whose indices are int32, can reach."""
+    if hits > MOST_ROWS:
+        raise InputError(f"{hits} hits are more than an array can have, 2^31 - 1; ask fewer rays at a time")
+    return int(hits)
 
 
 @made_once
-def hit_kernels(structure: Structure) -> tuple[Any, Any]:
-    return make_hit_kernels(query_of(structure))
+def list_hits_kernel(structure: Structure) -> Any:
+    listing = structure._replace(units=structure.units._replace(lists=True))
+    return make_list_hits_kernel(structure.struct, listing.traversal(any_hit=False, accepts=list_hit))
 
 
 def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
@@ -107,29 +181,25 @@ def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0
     """Every hit of each ray in its segment, in order. Arguments as in Accelerator.closest_hit; the answer is of NumPy, or of
     torch or JAX if the rays are.
 
-    None is lost and none is there twice: a ray through an edge hits both triangles there, at a corner all of them. crossings: only
-    where the ray goes through, as if it stood aside of edges and corners by as little as one likes: where a surface goes on, one
-    triangle of them, and none or two at an outline. So it crosses a closed surface an even number of times from outside to outside,
-    with the watertight test exactly. A hit takes one walk from the root, and the count another; each walk tests all that is hit at
-    the same t. Raises InputError.
+    Each triangle is there once. Between two triangles no ray is lost: one through their common edge hits one of them or both,
+    depending on rounding (float32, of the ray against the mesh). crossings: only where the ray goes through, as if it stood aside
+    of edges and corners by as little as one likes: where a surface goes on, one triangle, and none or two at an outline. So a ray
+    crosses a closed surface an even number of times from outside to outside, with the watertight test exactly. One walk finds all
+    hits of most rays, and two those of the others; n hits take n log n steps, also where many are at the same t. Raises InputError.
     """
-    asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
-    first = np.concatenate([[0], np.cumsum(asked.counts().numpy(), dtype=np.int64)])
-    return AllHits(*map(asked.give, asked.rows(first)))
+    return Asked(accel, threads, crossings).of(origins, directions, t_min, t_max).all()
 
 
 def count_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                threads: int | None = None, crossings: bool = False) -> Any:
-    """How many hits each ray has in its segment, (N,) int32; as all_hits."""
+    """How many hits each ray has in its segment, (N,) int64; as all_hits."""
     asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
-    return asked.give(asked.counts())
+    return asked.give(upload(asked.counts(), wp.int64, asked.device))
 
 
 def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                threads: int | None = None, crossings: bool = False) -> Hits:
-    """The first k hits of each ray in order, as Hits of (N, k) arrays; what a ray has not is a miss. As all_hits."""
+    """The first k hits of each ray in order, as Hits of (N, k) arrays; what a ray has not is a miss. As all_hits, but what lies
+    beyond the k-th is not walked to."""
     k = as_integer(k, "k", 1, (1 << 31) - 1)
-    asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
-    rows = asked.rows(np.arange(asked.n + 1, dtype=np.int64) * k)[1:]
-    t, u, v, prim_id = (asked.give(row.reshape((asked.n, k))) for row in rows)
-    return Hits(t, u, v, prim_id)
+    return Asked(accel, threads, crossings).of(origins, directions, t_min, t_max).first(k)

@@ -34,6 +34,11 @@ def open_edges(geometry: Geometry) -> int:
     return int((count % 2 == 1).sum())
 
 
+def open_edges_of(state: State) -> int:
+    """open_edges of a structure's mesh, counted once."""
+    return once(_open_edges, state, partial(open_edges, state.geometry))
+
+
 def used_bounds(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest corner of all faces, of which there is one or more."""
     used = geometry.vertices[geometry.faces].reshape(-1, 3)
@@ -49,7 +54,7 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any
     """
     rows, give = vectors(points, "points", FARTHEST), returned(points)
     asked = Asked(accel, threads, crossings=True)
-    if count := once(_open_edges, asked.state, partial(open_edges, asked.state.geometry)):
+    if count := open_edges_of(asked.state):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces"
                          "; wrt.winding_number tells what is mostly inside")
     inside = odd_crossings(asked, rows)
@@ -64,5 +69,5 @@ def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
         within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
         direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
         counts = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts()
-        inside[within] = counts.numpy() % 2 == 1
+        inside[within] = counts % 2 == 1
     return inside
