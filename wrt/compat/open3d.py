@@ -17,6 +17,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.closest_points import closest_points
 from wrt.accel.contains import odd_crossings
+from wrt.accel.rays import vectors
 from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
@@ -47,7 +48,8 @@ class RaycastingScene:
     rays: (..., 6), origin and direction of any length; query_points: (..., 3); tensors or arrays of real numbers, as float32. A
     ray or a point that is not finite hits nothing, nor does a direction of 0. Answers are Open3D's tensors where the program has
     imported open3d, as there, and else NumPy arrays. nthreads: 0 for one a core. device: "cpu" or "cuda:0", also as Open3D writes
-    it. Raises InputError, a ValueError, that names the argument.
+    it. Raises InputError, a ValueError, that names the argument; also for a point or an origin with a finite coordinate beyond
+    1e37.
     """
 
     INVALID_ID: ClassVar[int] = 0xFFFFFFFF
@@ -236,18 +238,23 @@ def _normals(mesh: Mesh) -> np.ndarray:
 def _asked_rays(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:
     """The leading shape, which rays can hit something (None: all), and origins and directions of these."""
     shape, rays = _rows(value, "rays", 6)
-    longest = np.abs(rays[:, 3:]).max(axis=1, initial=0.0)
-    good = (np.abs(rays[:, :3]).max(axis=1, initial=0.0) <= FARTHEST) & (longest > 0.0) & (longest < np.inf)  # False for NaN
-    if good.all():
-        return shape, None, rays[:, :3], rays[:, 3:]
-    return shape, good, rays[good, :3], rays[good, 3:]
+    good = _finite(rays, "rays") & rays[:, 3:].any(axis=1)
+    rays = rays if good.all() else rays[good]
+    return shape, None if good.all() else good, rays[:, :3], rays[:, 3:]
 
 
 def _asked_points(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
     """The same of points."""
     shape, points = _rows(value, "query_points", 3)
-    good = np.abs(points).max(axis=1, initial=0.0) <= FARTHEST
+    good = _finite(points, "query_points")
     return (shape, None, points) if good.all() else (shape, good, points[good])
+
+
+def _finite(array: np.ndarray, name: str) -> np.ndarray:
+    """Which rows are finite. Raises InputError for a point or an origin that is finite and too far away, as wrt's queries do."""
+    good = np.isfinite(array).all(axis=1)
+    vectors(array[:, :3] if good.all() else np.where(good[:, None], array[:, :3], 0.0), name, FARTHEST)
+    return good
 
 
 def _spread(array: np.ndarray, good: np.ndarray | None, missing: Any) -> np.ndarray:

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from trimesh.ray.ray_util import contains_points
 
 from wrt.accel.answers import Hits
 from wrt.accel.build import build
-from wrt.accel.contains import contains, open_edges
-from wrt.compat.surfaces import every_hit, ranks
+from wrt.accel.contains import contains, open_edges_of
+from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
@@ -55,12 +54,12 @@ class RayMeshIntersector:
         """Faces that are hit, (M,) int64, and by which ray, (M,) int64; return_locations: also where, (M, 3) float64.
 
         First hits in the order of the rays, then second ones ...; multiple_hits: more than the first; max_hits: of a ray, at
-        most. At an edge or a corner, a surface is hit once.
+        most. At an edge or a corner, a surface is hit once (docs/compat.md).
         """
         origins, directions = _rays(ray_origins, ray_directions)
         placed, most = self._placed, max_hits if multiple_hits else min(max_hits, 1)
-        ray, face, u, v = placed.every_hit(origins, directions) if most > 1 else placed.first_hit(origins, directions)
-        number = ranks(ray)
+        ray, face, u, v = placed.every_hit(origins, directions, most) if most > 1 else placed.first_hit(origins, directions)
+        number = np.arange(len(ray)) - np.searchsorted(ray, ray)  # of each hit among those of its ray
         order = np.argsort(number, kind="stable")
         order = order[:np.searchsorted(number[order], most)]
         ray, face = ray[order], face[order]
@@ -134,9 +133,9 @@ class _Placed:
         box = self.moved(np.stack([self.low, self.high]))
         self.center, self.radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
 
-    @cached_property
+    @property
     def closed(self) -> bool:
-        return open_edges(self.accel.geometry) == 0
+        return open_edges_of(self.accel._state) == 0
 
     def moved(self, points: np.ndarray) -> np.ndarray:
         return np.ldexp(points - self.shift, self.exponent)
@@ -170,10 +169,10 @@ class _Placed:
         hit = np.flatnonzero(hits.prim_id >= 0)
         return _of(rows, hit), hits.prim_id[hit].astype(np.int64), hits.u[hit], hits.v[hit]
 
-    def every_hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """The same of all hits, those of a ray together and in order."""
+    def every_hit(self, origins: np.ndarray, directions: np.ndarray, limit: int) -> tuple[np.ndarray, ...]:
+        """The same of all hits, `limit` of a ray at most, those of a ray together and in order."""
         rows, origins, directions = self.asked(origins, directions)
-        ray, face, _, u, v = every_hit(self.accel, origins, directions, self.threads)
+        ray, face, _, u, v = every_hit(self.accel, origins, directions, self.threads, limit)
         return _of(rows, ray), face.astype(np.int64), u, v
 
     def any_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -12,8 +12,8 @@ import pytest
 import trimesh
 
 import wrt
-from wrt.compat.surfaces import FEW
 from wrt.compat.trimesh import RayMeshIntersector
+from wrt.kernels.hit_lists import FEW
 from wrt.scene import shapes
 
 DOWN = np.array([[0.0, 0.0, -1.0]])
