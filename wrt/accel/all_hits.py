@@ -94,7 +94,7 @@ class Asked:
             self._copy(rays, lists, begin, parts[-1])
         first = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
         hits = parts[0] if len(parts) == 1 else self._joined(parts)
-        return AllHits(*map(self.give, (upload(first, wp.int64, self.device), hits.t, hits.u, hits.v, hits.prim_id)))
+        return AllHits(self.given(first), *map(self.give, (hits.t, hits.u, hits.v, hits.prim_id)))
 
     def first(self, k: int) -> Hits:
         """The first k hits of each ray: (N, k)."""
@@ -113,13 +113,19 @@ class Asked:
         """How many hits each ray has, (N,) int64."""
         return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL))])
 
+    def given(self, numbers: np.ndarray) -> Any:
+        """int64 as an answer."""
+        return numbers if self.give is to_numpy else self.give(upload(numbers, wp.int64, self.device))
+
     def _listed(self, limit: int) -> Iterator[tuple[Any, list[Any], np.ndarray]]:
         """Of so many rays at a time: the rays; lists, in one of which a ray has its hits, `limit` at most; and how many."""
         limit = min(limit, ALL)
         for begin in range(0, self.n, RAYS_AT_ONCE):
-            n, rays = min(RAYS_AT_ONCE, self.n - begin), RayArrays()
-            for name in fields_of(RayArrays):
-                setattr(rays, name, getattr(self.rays, name)[begin:begin + n])
+            n, rays = min(RAYS_AT_ONCE, self.n - begin), self.rays
+            if n < self.n:
+                rays = RayArrays()
+                for name in fields_of(RayArrays):
+                    setattr(rays, name, getattr(self.rays, name)[begin:begin + n])
             lists = [self._filled(rays, np.full(n, FEW), limit)]
             counts = lists[0].count.numpy().astype(np.int64)
             many = counts > FEW
@@ -194,7 +200,7 @@ def count_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0
                threads: int | None = None, crossings: bool = False) -> Any:
     """How many hits each ray has in its segment, (N,) int64; as all_hits."""
     asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
-    return asked.give(upload(asked.counts(), wp.int64, asked.device))
+    return asked.given(asked.counts())
 
 
 def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,

@@ -19,7 +19,8 @@ def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, t
     crossed = Asked(accel, threads, crossings=True).of(origins, directions).all(limit)
     found = [crossed.ray_id, crossed.prim_id, crossed.t, crossed.u, crossed.v]
     rays = np.flatnonzero(crossed.counts == 0)
-    rays = rays[accel.any_hit(origins[rays], directions[rays], threads=threads)]
+    if len(rays):
+        rays = rays[accel.any_hit(origins[rays], directions[rays], threads=threads)]
     if len(rays):
         touched = first_hits(accel, 1 if open_edges_of(accel._state) else 2, origins[rays], directions[rays], threads=threads)
         row, column = np.nonzero(np.broadcast_to(touched.prim_id[:, -1:] >= 0, touched.prim_id.shape))
