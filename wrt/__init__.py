@@ -23,6 +23,9 @@ from typing import TYPE_CHECKING, Any
 
 from wrt.core.version import VERSION as __version__
 
+if not Path(__file__).is_file():
+    raise ImportError("wrt cannot be imported from a zip file, because it reads files beside its code: unpack or install it")
+
 # Type checkers and editors see these imports. At run time each is made when the name is first used (__getattr__).
 if TYPE_CHECKING:
     from wrt import compat as compat

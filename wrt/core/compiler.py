@@ -1,45 +1,57 @@
-"""What wrt changes about Warp's compiler for the CPU. All of it saves time alone; where a release of Warp has other insides, it
-does nothing (tests/wrt/core/test_compiler.py then says so)."""
+"""What wrt changes about Warp's compiler for the CPU, and how it knows a damaged object.
+
+Each change names the processor time that it saves of a first render of scenes/whitted.toml with an empty kernel cache (6.5 s).
+Where a release of Warp has other insides, the change is left out (tests/wrt/core/test_compiler.py then says so)."""
 
 from __future__ import annotations
 
+import atexit
+import os
+import re
+import shutil
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import suppress
 from functools import wraps
+from hashlib import sha256
 from inspect import signature
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import warp as wp
 
-POLL = 0.02  # seconds
-_first = threading.Lock()
+DAY = 86400.0  # seconds: no kernel takes so long to compile
+FLAGS = "-fpch-instantiate-templates", "-discard-value-names"
+_LEFTOVER = re.compile(r"wp_\w+_p\d+_t\d+|precompiled-.+")
+_lock = threading.Lock()
+_headers: list[Path] = []  # the last is in use
+_seals = threading.Event()  # set where objects are sealed
 
 
-def prepare_compiler(cores: int) -> None:
-    """After wp.init(), before the first kernel is compiled; at most `cores` will be compiled at a time."""
+def prepare_compiler() -> None:
+    """After wp.init(), before the first kernel is compiled."""
     inside = getattr(wp, "_src", None)
-    _drop_unused_helpers(getattr(inside, "codegen", None))
-    _compile_once(getattr(inside, "codegen", None))
-    _resolve_once(getattr(getattr(inside, "codegen", None), "Adjoint", None))
-    shared = _share_headers(getattr(getattr(inside, "context", None), "runtime", None))
-    _compile_well(getattr(inside, "build", None), threading.BoundedSemaphore(cores), shared)
+    codegen = getattr(inside, "codegen", None)
+    _drop_unused_helpers(codegen)
+    _compile_once(codegen)
+    _resolve_once(getattr(codegen, "Adjoint", None))
+    _compile_well(getattr(inside, "build", None))
+    _share_headers(getattr(getattr(inside, "context", None), "runtime", None))
 
 
 def _drop_unused_helpers(codegen: Any) -> None:
-    """Warp 1.19 writes two helpers for gradients beside every struct, which are not `static`: the compiler keeps them in each
-    kernel, although nothing calls them. That was 0.5 s of 1.8 for a kernel that shades."""
+    """Saves 1.1 s. Warp 1.19 writes two helpers for gradients beside every struct. They are not `static`, so the compiler keeps
+    them in each kernel, although nothing calls them."""
     template = getattr(codegen, "struct_template", None)
     if isinstance(template, str):
         codegen.struct_template = template.replace("\nCUDA_CALLABLE", "\nstatic CUDA_CALLABLE")
 
 
 def _compile_once(codegen: Any) -> None:
-    """Of wrt's own kernels, which are large. Warp 1.19 writes one whose threads have an index and which is given arrays twice: for
-    arrays without gaps, and for all; that took half as long again. And each is a function that is optimised by itself, and once
-    more where it is copied to: into a loop over threads. One that is a single thread need not be there (a tenth of the time)."""
+    """For wrt's own kernels. Warp 1.19 writes a kernel twice: for arrays without gaps, and for all. Once saves 0.2 s (0.5 s of
+    scenes/lens.toml, which has a builder's kernels too). And Warp compiles each kernel as a function, and again where that is
+    inlined into the loop over threads. A kernel with a single thread needs only the function, which saves 0.4 s."""
     twice, write = (getattr(codegen, name, None) for name in ("cpu_linear_contiguous_specialization_candidate", "codegen_kernel"))
     if twice is None or write is None:
         return
@@ -55,9 +67,13 @@ def _compile_once(codegen: Any) -> None:
     codegen.codegen_kernel = written
 
 
+def _is_own(adj: Any) -> bool:
+    return str(adj.func.__module__).startswith("wrt.")
+
+
 def _resolve_once(writer: Any) -> None:
-    """Warp 1.19 tries one overload of a built-in function after another at each call of it, which took a third of the time in which
-    a source is written. The types of the arguments tell which it is, and ten calls of eleven have had theirs before."""
+    """Saves 0.4 s. Warp 1.19 tries one overload of a built-in function after another at each call of it. The types of the arguments
+    tell which it is, and ten calls of eleven have had theirs before."""
     plain = getattr(writer, "resolve_func", None)
     if plain is None or list(signature(plain).parameters) != ["adj", "func", "arg_types", "kwarg_types", "min_outputs"]:
         return
@@ -79,76 +95,77 @@ def _resolve_once(writer: Any) -> None:
     writer.resolve_func = resolve_func
 
 
-def _is_own(adj: Any) -> bool:
-    return str(adj.func.__module__).startswith("wrt.")
-
-
-def _compile_well(build: Any, free: threading.Semaphore, shared_headers: bool) -> None:
-    """As many at a time as there are cores, while other threads write the sources of what comes next: three on two cores took 1.1
-    times as long as two.
-
-    And with flags that Clang's own driver would pass, or that are for what Warp 1.19 precompiles, its headers: without bfloat16,
-    where a kernel's source says that it needs none, they take a third less time; templates that they use themselves are compiled
-    with them, and not with each kernel (0.04 s of each); and values need no names (a twelfth of a kernel's time)."""
+def _compile_well(build: Any) -> None:
+    """Flags that save 1.7 s: templates of the headers are compiled with them, not with each kernel (0.6 s); values need no names
+    (0.4 s); the headers have no bfloat16, where the kernel's source says that it needs none (0.7 s). And each object is sealed with
+    its SHA-256, behind all that a linker reads."""
     plain = getattr(build, "build_cpu", None)
-    if plain is None or "extra_flags" not in signature(plain).parameters:
+    if plain is None or not {"extra_flags", "use_precompiled_headers", "pch_dir"} <= set(signature(plain).parameters):
         return
 
     @wraps(plain)
     def build_cpu(obj_path: str, cpp_path: str, *, extra_flags: str = "", **options: Any) -> Any:
         with open(cpp_path, encoding="utf-8") as source:
             without = source.readline().strip() == "#define WP_NO_BFLOAT16"
-        flags = ["-fpch-instantiate-templates", "-discard-value-names", *(["-DWP_NO_BFLOAT16="] if without else []), extra_flags]
-        waits = shared_headers and options.get("use_precompiled_headers")
-        with free, _first_with_headers() if waits else nullcontext():
-            return plain(obj_path, cpp_path, extra_flags=" ".join(flags), **options)
+        options["extra_flags"] = " ".join([*FLAGS, *(["-DWP_NO_BFLOAT16="] if without else []), extra_flags])
+        if options.get("use_precompiled_headers"):
+            _precompile_headers(plain, options)
+        done = plain(obj_path, cpp_path, **options)
+        with open(obj_path, "r+b") as compiled:
+            compiled.write(sha256(compiled.read()).digest())
+        return done
 
     build.build_cpu = build_cpu
+    _seals.set()
 
 
-def _headers() -> Path:
-    """Where they are, for Warp's release and the processor."""
-    return Path(wp.config.kernel_cache_dir) / f"precompiled-{wp.get_cpu_kernel_cache_key()}"
+def _precompile_headers(build_cpu: Any, options: dict[str, Any]) -> None:
+    """With an empty source. The first thread to come does it; others wait."""
+    folder = Path(options["pch_dir"])
+    with _lock:
+        if not any(folder.glob("*.pch")):
+            (folder / "empty.cpp").touch()
+            build_cpu(str(folder / "empty.o"), str(folder / "empty.cpp"), **options)
 
 
-def _share_headers(runtime: Any) -> bool:
-    """Warp 1.19 precompiles its headers anew for every thread that compiles, in every process: 3.5 s, when a kernel takes 1 to 3.
-    Clang writes that file aside and renames it, and looks whether it fits before it takes it, so that all can share one. Returns
-    whether they do."""
+def _share_headers(runtime: Any) -> None:
+    """Saves 2.4 s. Warp 1.19 precompiles its headers in every thread that compiles; here all threads of a process share a folder.
+
+    The folder ends with the process: what Clang writes names paths and times of the headers, so it is wrong for another copy of
+    Warp. It stands in the kernel cache, where a caller has looked for room; what a killed process left there goes a day later.
+    """
     own = getattr(runtime, "get_clang_pch_dir", None)
-    if own is None or getattr(runtime, "llvm", None) is None:
-        return False
+    if own is None:
+        return
 
-    def shared() -> str | None:
-        folder = _headers()
-        try:
-            folder.mkdir(exist_ok=True)
-        except OSError:
-            return own()
-        return str(folder)
+    def shared() -> Any:
+        cache = Path(wp.config.kernel_cache_dir)
+        with _lock, suppress(OSError):  # a cache that is read-only, and a kernel that is compiled elsewhere
+            if not _headers or not _headers[-1].is_dir():  # the first, or somebody has emptied the cache
+                for path in cache.iterdir():
+                    with suppress(OSError):  # another process was faster
+                        if _LEFTOVER.fullmatch(path.name) and time.time() - path.lstat().st_mtime > DAY:
+                            shutil.rmtree(path)
+                _headers.append(Path(mkdtemp(prefix="precompiled-", dir=cache)))
+                atexit.register(_remove_headers, _headers[-1], os.getpid())
+            return str(_headers[-1])
+        return own()
 
     runtime.get_clang_pch_dir = shared
-    return True
 
 
-def headers_missing() -> bool:
-    return bool(wp.config.use_precompiled_headers) and not any(_headers().glob("*.pch"))
+def _remove_headers(folder: Path, process: int) -> None:
+    if os.getpid() == process:  # not a forked one, which used them too
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file of the kernel cache is there; of an object, whether its last bytes are the digest of the others. LLVM crashes
+    on a damaged object, or runs it."""
+    data = path.read_bytes() if path.is_file() else b""
+    return len(data) > 0 and (path.suffix != ".o" or not _seals.is_set() or sha256(data[:-32]).digest() == data[-32:])
 
 
 @wp.kernel(module="unique", enable_backward=False)  # type: ignore[call-arg]
 def empty_kernel() -> None:
     """To compile it takes nothing but the headers."""
-
-
-@contextmanager
-def _first_with_headers() -> Iterator[None]:
-    """While a kernel is compiled for the CPU. Where the headers are not there yet, the first thread to come makes them, and the
-    others wait for that: side by side, each would be slower."""
-    mine = False
-    while headers_missing() and not (mine := _first.acquire(blocking=False)):
-        time.sleep(POLL)
-    try:
-        yield
-    finally:
-        if mine:
-            _first.release()

@@ -22,15 +22,17 @@ import numpy as np
 import warp as wp
 
 from wrt.core import cuda
-from wrt.core.compiler import empty_kernel, headers_missing, prepare_compiler
+from wrt.core.compiler import empty_kernel, is_whole, prepare_compiler
 from wrt.core.errors import InputError
 from wrt.core.seconds import loading
 from wrt.core.threads import run_all, thread_count
 
 MOST_ROWS = (1 << 31) - 1
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
+FILES_TO_COMPILE = 64  # likewise, files and folders
 
-wp.config.log_level = wp.LOG_WARNING if hasattr(wp, "LOG_WARNING") else 30
+if wp.config.log_level == wp.LOG_INFO:  # Warp's default; another level is the user's
+    wp.config.log_level = wp.LOG_WARNING
 
 
 T = TypeVar("T")
@@ -62,11 +64,15 @@ def made_once(make: Callable[..., T]) -> Callable[..., T]:
 def _stderr_without(text: bytes) -> Iterator[None]:
     """Hold stderr back during the block, and let it out again without the lines that have `text` in them: Warp's C++ side
     writes past Python."""
-    if sys.stderr is None:  # closed by who started us
+    try:
+        held = tempfile.TemporaryFile()
+    except OSError:
+        held = None
+    if held is None or sys.stderr is None:  # nowhere to write; or closed by the caller
         yield
         return
     sys.stderr.flush()
-    with tempfile.TemporaryFile() as held:
+    with held:
         stderr = os.dup(2)
         os.dup2(held.fileno(), 2)
         try:
@@ -75,14 +81,18 @@ def _stderr_without(text: bytes) -> Iterator[None]:
             os.dup2(stderr, 2)
             os.close(stderr)
             held.seek(0)
-            os.write(2, b"".join(line for line in held.read().splitlines(keepends=True) if text not in line))
+            if kept := b"".join(line for line in held.read().splitlines(keepends=True) if text not in line):
+                with contextlib.suppress(OSError):  # a full disk
+                    os.write(2, kept)
 
 
 @made_once
 def _start_warp() -> None:
     with _stderr_without(b"NVIDIA CUDA driver"), _cache_told():  # where there is no GPU, it says so each time
+        if not os.environ.get("WARP_CACHE_PATH"):
+            os.environ.pop("WARP_CACHE_PATH", None)  # empty: Warp would keep its kernels in the current folder
         wp.init()
-        prepare_compiler(thread_count(None))
+        prepare_compiler()
 
 
 @made_once
@@ -161,37 +171,50 @@ def preloading(*kernels: Any) -> Iterator[None]:
 
 
 def preload_headers() -> None:
-    """Begin to precompile Warp's headers, where that has not been done: beside what comes before the first kernel. For a process of
-    wrt's own: one that was forked meanwhile would wait for ever."""
-    start("cpu")
-    if headers_missing():
-        threading.Thread(target=_load_nothing, name="wrt headers").start()
-
-
-def _load_nothing() -> None:
-    with contextlib.suppress(Exception):  # told where a kernel cannot be compiled
-        load_kernel(empty_kernel, wp.get_device("cpu"))
+    """Begin to precompile Warp's headers, where the cache is empty: beside what comes before the first kernel. For a process of
+    wrt's own: one that was forked meanwhile would wait for ever. Errors are told where a kernel cannot be compiled."""
+    cpu = start("cpu")
+    if not any(Path(wp.config.kernel_cache_dir).glob("wp_*")):
+        ThreadPoolExecutor(1, "wrt headers").submit(load_kernel, empty_kernel, cpu)
 
 
 def _load(kernel: Any, device: Any, block_dim: int) -> None:
+    """Load a kernel; what of it is damaged in the cache is compiled anew."""
+    module = kernel.module
     with _cache_told():
-        cache, name = Path(wp.config.kernel_cache_dir), kernel.module.get_module_identifier(block_dim)
-        compiled = ("*.o",) if device.is_cpu else ("*.cubin", "*.ptx")
-        if any(any((cache / name).glob(pattern)) for pattern in compiled):
-            kernel.module.load(device, block_dim=block_dim)
-        else:
-            _require_room_to_compile(cache)
-            kernel.module.load(device, block_dim=block_dim)
+        folder = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim)
+        files = [folder / module._get_compile_output_name(device, block_dim=block_dim), folder / module._get_meta_name(block_dim)]
+        before = [path for path in (files if folder.is_dir() else [folder]) if os.path.lexists(path)]
+        with contextlib.suppress(Exception):  # told below, if it happens again
+            if all(map(is_whole, files)):
+                module.load(device, block_dim=block_dim)
+                return
+        for path in before:  # not what another process has compiled since
+            _remove(path)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        _require_room_to_compile(folder.parent)
+        module.load(device, block_dim=block_dim)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, a link or a folder that may be there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 @contextmanager
 def _cache_told() -> Iterator[None]:
-    """What the system refuses Warp's cache is told with the way out."""
+    """What the system refuses Warp's cache, and what Warp cannot make or load there, is told with the way out."""
     try:
         yield
-    except OSError as error:
-        raise InputError(f"kernels cannot be compiled: {error.strerror or error} (WARP_CACHE_PATH names another folder)",
-                         wp.config.kernel_cache_dir or error.filename) from error
+    except Exception as error:
+        if not isinstance(error, OSError | UnicodeError) and type(error) is not Exception:  # Warp's own are plain ones
+            raise
+        reason = "its name is not UTF-8" if isinstance(error, UnicodeError) else getattr(error, "strerror", None) or error
+        raise InputError(f"kernels cannot be compiled: {reason} (WARP_CACHE_PATH names another folder)",
+                         wp.config.kernel_cache_dir or getattr(error, "filename", None)) from error
 
 
 def _require_room_to_compile(cache: Path) -> None:
@@ -204,6 +227,8 @@ def _require_room_to_compile(cache: Path) -> None:
         room = min(room, float("inf") if most == resource.RLIM_INFINITY else most)
     if room < ROOM_TO_COMPILE:
         raise OSError(errno.ENOSPC, f"room for {room / 2**20:.1f} MiB, and {ROOM_TO_COMPILE >> 20} are needed")
+    if hasattr(os, "statvfs") and (disk := os.statvfs(cache)).f_files and disk.f_favail < FILES_TO_COMPILE:
+        raise OSError(errno.ENOSPC, f"room for {disk.f_favail} files, and {FILES_TO_COMPILE} are needed")
 
 
 def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:

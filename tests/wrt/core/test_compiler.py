@@ -1,9 +1,11 @@
 """The measures against Warp's compile times take hold, and change no kernel."""
 
 import os
+import shutil
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +18,7 @@ from tests.kernel_tools import cpu_only, launch, zeros  # isort: skip
 import warp as wp
 
 from wrt.core import compiler
-from wrt.core.device import load_kernel, preloading, start
+from wrt.core.device import preloading, start
 from wrt.kernels.structs import kernel
 
 pytestmark = cpu_only
@@ -88,37 +90,51 @@ def test_a_kernel_of_bfloat16_has_headers_with_it():
     assert sums.numpy().tolist() == [1.5, 2.5, -3.5]
 
 
-def test_as_many_are_compiled_at_a_time_as_there_are_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(compiler, "_headers", lambda: tmp_path)
-    (tmp_path / "made.pch").write_text("")
+def test_the_first_thread_precompiles_headers_and_objects_are_sealed(tmp_path: Path):
+    """Warp's compiler precompiles what it does not find in its folder."""
     without, with_it = tmp_path / "without.cpp", tmp_path / "with.cpp"
     without.write_text("#define WP_NO_BFLOAT16\n")
     with_it.write_text("\n")
-    together, taken, lock, given = [0], [0], threading.Lock(), set()
+    given, precompiled, lock = set(), [], threading.Lock()
 
-    def build_cpu(obj_path, cpp_path, extra_flags="", use_precompiled_headers=False):
+    def build_cpu(obj_path, cpp_path, extra_flags="", use_precompiled_headers=False, pch_dir=None):
         with lock:
-            given.add((cpp_path, extra_flags, use_precompiled_headers))
-            taken[0] += 1
-            together[0] = max(together[0], taken[0])
-        threading.Event().wait(0.02)
-        with lock:
-            taken[0] -= 1
+            given.add((Path(cpp_path).name, extra_flags, use_precompiled_headers, pch_dir))
+        if use_precompiled_headers and not any(Path(pch_dir).glob("*.pch")):
+            threading.Event().wait(0.02)
+            (Path(pch_dir) / "made.pch").write_text("")
+            precompiled.append(pch_dir)
+        Path(obj_path).write_text("object")
 
     build = SimpleNamespace(build_cpu=build_cpu)
-    compiler._compile_well(build, threading.BoundedSemaphore(2), True)
-    options = {"extra_flags": "-O2", "use_precompiled_headers": True}
-    threads = [threading.Thread(target=build.build_cpu, args=("out.o", str(path)), kwargs=options)
-               for path in (without, with_it) for _ in range(3)]
+    compiler._compile_well(build)
+    options = {"extra_flags": "-O2", "use_precompiled_headers": True, "pch_dir": str(tmp_path)}
+    threads = [threading.Thread(target=build.build_cpu, args=(str(tmp_path / f"{i}.o"), str(path)), kwargs=options)
+               for i, path in enumerate([without, with_it] * 3)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
     always = "-fpch-instantiate-templates -discard-value-names"
-    assert together == [2]
-    assert given == {(str(without), f"{always} -DWP_NO_BFLOAT16= -O2", True), (str(with_it), f"{always} -O2", True)}
-    (tmp_path / "made.pch").unlink()
-    build.build_cpu("out.o", str(with_it))  # who wants no headers does not wait for them
+    assert precompiled == [str(tmp_path)] and {each for each in given if each[0] != "empty.cpp"} == {
+        ("without.cpp", f"{always} -DWP_NO_BFLOAT16= -O2", True, str(tmp_path)), ("with.cpp", f"{always} -O2", True, str(tmp_path))}
+    assert all(compiler.is_whole(tmp_path / f"{i}.o") for i in range(6))
+    build.build_cpu(str(tmp_path / "out.o"), str(with_it))  # without headers
+    assert ("with.cpp", always + " ", False, None) in given
+
+
+def test_all_threads_have_one_folder_of_headers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(compiler, "_headers", [])
+    runtime = SimpleNamespace(get_clang_pch_dir=lambda: "Warp's own")
+    compiler._share_headers(runtime)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "no" / "cache"))
+    assert runtime.get_clang_pch_dir() == "Warp's own"  # for a kernel that is compiled elsewhere
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    with ThreadPoolExecutor(4) as pool:
+        (folder,) = {each.result() for each in [pool.submit(runtime.get_clang_pch_dir) for _ in range(8)]}
+    assert list(tmp_path.iterdir()) == [Path(folder)]
+    shutil.rmtree(folder)
+    assert Path(runtime.get_clang_pch_dir()).is_dir()
 
 
 @kernel
@@ -151,10 +167,11 @@ def test_an_overload_is_looked_for_once(monkeypatch: pytest.MonkeyPatch):
 def test_a_warp_with_other_insides_is_left_as_it_is():
     plain = SimpleNamespace(build_cpu=lambda source: source)
     before = plain.build_cpu
-    compiler._compile_well(plain, threading.BoundedSemaphore(1), True)
-    compiler._compile_well(SimpleNamespace(), threading.BoundedSemaphore(1), True)
-    compiler._compile_once(SimpleNamespace())
-    assert plain.build_cpu is before and not compiler._share_headers(SimpleNamespace())
+    compiler._compile_well(plain)
+    for change in (compiler._compile_well, compiler._compile_once, compiler._drop_unused_helpers, compiler._resolve_once,
+                   compiler._share_headers):
+        change(SimpleNamespace())
+    assert plain.build_cpu is before
 
 
 @kernel
@@ -183,73 +200,20 @@ def test_what_is_preloaded_is_loaded_at_the_end_of_the_block():
 
 
 PRELOADED = """
+import threading, warp
+from pathlib import Path
 from wrt.core.device import preload_headers
 preload_headers()
+for thread in threading.enumerate():
+    if thread.name.startswith("wrt headers"):
+        thread.join()
+print(len(list(Path(warp.config.kernel_cache_dir).glob("precompiled-*/*.pch"))))
 """
 
 
-def test_headers_are_made_beforehand(tmp_path: Path):
-    subprocess.run([sys.executable, "-c", PRELOADED], cwd=ROOT, check=True, timeout=120,
-                   env=os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)})
-    assert len(list(tmp_path.glob("*/precompiled-*/*.pch"))) == 1
-
-
-def test_all_threads_share_the_precompiled_headers():
-    start("cpu")
-    folders = []
-    asked = [threading.Thread(target=lambda: folders.append(wp._src.context.runtime.get_clang_pch_dir())) for _ in range(2)]
-    for thread in asked:
-        thread.start()
-    for thread in asked:
-        thread.join()
-    load_kernel(add_pairs, start("cpu"))
-    assert folders[0] == folders[1] and Path(folders[0]).parent == Path(wp.config.kernel_cache_dir)
-    assert list(Path(folders[0]).glob("*.pch"))
-
-
-def test_a_folder_that_cannot_be_made_is_not_needed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    start("cpu")
-    (tmp_path / "file").write_text("")
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "file"))
-    folder = wp._src.context.runtime.get_clang_pch_dir()
-    assert Path(folder).is_dir() and tmp_path not in Path(folder).parents
-
-
-def test_others_wait_for_the_first_until_the_headers_are_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr(compiler, "_headers", lambda: tmp_path)
-    inside, left = threading.Event(), threading.Event()
-
-    def compile_second():
-        with compiler._first_with_headers():
-            inside.set()
-        left.set()
-
-    with compiler._first_with_headers():
-        second = threading.Thread(target=compile_second)
-        second.start()
-        assert not inside.wait(5 * compiler.POLL)
-        (tmp_path / "made.pch").write_text("")
-        assert inside.wait(30.0)
-    assert left.wait(30.0)
-    second.join()
-
-
-def test_where_no_headers_are_made_one_compiles_after_another(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr(compiler, "_headers", lambda: tmp_path)
-    most, now, lock = [0], [0], threading.Lock()
-
-    def compile_one():
-        with compiler._first_with_headers():
-            with lock:
-                now[0] += 1
-                most[0] = max(most[0], now[0])
-            threading.Event().wait(compiler.POLL)
-            with lock:
-                now[0] -= 1
-
-    threads = [threading.Thread(target=compile_one) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert most == [1]
+def test_headers_are_made_beforehand_where_the_cache_is_empty(tmp_path: Path):
+    for made in ("1\n", "0\n"):
+        done = subprocess.run([sys.executable, "-c", PRELOADED], cwd=ROOT, capture_output=True, text=True, timeout=120,
+                              env=os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)})
+        assert (done.stdout, done.stderr) == (made, "")
+    assert not list(tmp_path.glob("*/precompiled-*"))
