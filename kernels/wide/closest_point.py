@@ -1,5 +1,8 @@
 """Closest points: a walk over a wide BVH by distance instead of along a ray.
 
+The records hold NaN for the first corner of a triangle without area, which no ray may hit. A point has a distance to it all the
+same, that of a segment or a point: its corners are read from the mesh.
+
 A point's distance to a triangle is float64's (Ericson 2005, "Real-Time Collision Detection", section 5.1, has the problem), held to
 that of the triangle's padded box: as rounding never turns an order round, no box on the way is farther than the triangle in it, and
 which triangle is the nearest does not depend on the tree.
@@ -10,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import Primitive, kernel
+from wrt.kernels.structs import Primitive, Surfaces, kernel, noinline
 from wrt.kernels.traverse.stack import key_of, make_uninitialized, reference_of, t_of
 from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
 from wrt.kernels.units.triangle import lower, upper
@@ -68,7 +71,8 @@ def before(a: wp.vec3d, b: wp.vec3d) -> bool:
 
 @wp.func
 def along_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d) -> wp.float64:
-    """Where between two points the closest one to p is: 0 at a, 1 at b."""
+    """Where between two points the closest one to p is: 0 at a, 1 at b. Where both are one point, 1: the smaller of
+    NaN and a number is the number."""
     edge = b - a
     t = wp.dot(p - a, edge) / wp.dot(edge, edge)
     return wp.max(wp.min(t, wp.float64(1.0)), wp.float64(0.0))
@@ -98,22 +102,32 @@ def nearer_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, best: Nearest, corner_a: 
 
 
 @wp.func
+def on_edges(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> Nearest:
+    """The closest point of a triangle's three edges."""
+    out = Nearest()
+    out.d2 = wp.float64(wp.inf)
+    out = nearer_edge(p, a, b, out, 0, 1)
+    out = nearer_edge(p, b, c, out, 1, 2)
+    return nearer_edge(p, c, a, out, 2, 0)
+
+
+@wp.func
 def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
-    """The closest point of a triangle: within it where the point is above it, else on one of its edges. Where corners are NaN (a
-    triangle without area), d2 is infinite."""
+    """The closest point of a triangle: within it where the point is above it, else on one of its edges. Where a corner is NaN
+    or infinite, d2 is infinite: so it is in the record of a triangle without area."""
     p = wp.vec3d(point)
     a = wp.vec3d(triangle.v0)
     b = wp.vec3d(triangle.v1)
     c = wp.vec3d(triangle.v2)
     out = Nearest()
     out.d2 = wp.float64(wp.inf)
-    if wp.isnan(triangle.v0[0]):
-        return out
     ab = b - a
     ac = c - a
     ap = p - a
     normal = wp.cross(ab, ac)
     area = wp.dot(normal, normal)
+    if not area < wp.float64(wp.inf):  # of finite corners it is far from overflow
+        return out
     v = wp.dot(wp.cross(ab, ap), normal)
     u = wp.dot(wp.cross(ap, ac), normal)
     if u > wp.float64(0.0) and v > wp.float64(0.0) and u + v < area:
@@ -123,23 +137,36 @@ def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
         out.d2 = height * height / area
         out.point = a + out.u * ab + out.v * ac
         return out
-    out = nearer_edge(p, a, b, out, 0, 1)
-    out = nearer_edge(p, b, c, out, 1, 2)
-    return nearer_edge(p, c, a, out, 2, 0)
+    return on_edges(p, a, b, c)
 
 
 @wp.func
-def nearer(p: wp.vec3, triangle: Primitive, best: Nearest) -> Nearest:
-    """The nearer of `best` and this triangle; of equal ones the lower prim_id."""
+def nearer_of(p: wp.vec3, triangle: Primitive, on: Nearest, best: Nearest) -> Nearest:
+    """The nearer of `best` and the point `on` this triangle; of equal ones the lower prim_id."""
     lo = lower(lower(triangle.v0, triangle.v1), triangle.v2)
     hi = upper(upper(triangle.v0, triangle.v1), triangle.v2)
     pad = box_pad(lo, hi)
-    found = on_triangle(p, triangle)
+    found = on
     found.d2 = wp.max(found.d2, squared_distance(p, padded_lo(lo, pad), padded_hi(hi, pad)))
     found.prim_id = triangle.prim_id
     if found.d2 < best.d2 or (found.d2 == best.d2 and best.prim_id >= 0 and found.prim_id < best.prim_id):
         return found
     return best
+
+
+@noinline
+def nearer_flat(p: wp.vec3, surfaces: Surfaces, prim_id: int, best: Nearest) -> Nearest:
+    """As nearer_of, of a triangle without area, all of which is on its edges; its record does not hold its corners."""
+    face = surfaces.faces[prim_id]
+    triangle = Primitive()
+    triangle.v0 = surfaces.vertices[face[0]]
+    triangle.v1 = surfaces.vertices[face[1]]
+    triangle.v2 = surfaces.vertices[face[2]]
+    triangle.prim_id = prim_id
+    if not (wp.isfinite(triangle.v0) and wp.isfinite(triangle.v1) and wp.isfinite(triangle.v2)):
+        return best
+    on = on_edges(wp.vec3d(p), wp.vec3d(triangle.v0), wp.vec3d(triangle.v1), wp.vec3d(triangle.v2))
+    return nearer_of(p, triangle, on, best)
 
 
 @cache
@@ -151,15 +178,20 @@ def make_closest_point_kernel(width: int, compressed: bool) -> Any:
     unit = 1 if compressed else width  # of primitives, in which references count
 
     @wp.func
-    def nearest_in_leaf(accel: struct, reference: int, p: wp.vec3, best: Nearest) -> Nearest:
+    def nearest_in_leaf(accel: struct, surfaces: Surfaces, reference: int, p: wp.vec3, best: Nearest) -> Nearest:
         begin = leaf_first(reference) * unit
         for i in range(begin, begin + leaf_count(reference)):
             row = i / width
-            best = nearer(p, gather(accel.primitives, row * wp.static(row_size(Primitive, width)) + i - row * width), best)
+            record = gather(accel.primitives, row * wp.static(row_size(Primitive, width)) + i - row * width)
+            found = on_triangle(p, record)
+            if found.d2 < wp.float64(wp.inf):
+                best = nearer_of(p, record, found, best)
+            else:
+                best = nearer_flat(p, surfaces, record.prim_id, best)
         return best
 
     @wp.func
-    def closest_point(accel: struct, p: wp.vec3) -> Nearest:
+    def closest_point(accel: struct, surfaces: Surfaces, p: wp.vec3) -> Nearest:
         best = Nearest()
         best.d2 = wp.float64(wp.inf)
         best.prim_id = -1
@@ -169,7 +201,7 @@ def make_closest_point_kernel(width: int, compressed: bool) -> Any:
         while True:
             near = wp.uint64(NOTHING)
             if reference < 0:
-                best = nearest_in_leaf(accel, reference, p, best)
+                best = nearest_in_leaf(accel, surfaces, reference, p, best)
             else:
                 first = reference * wp.static(size_of_node)
                 for j in range(width):
@@ -198,9 +230,9 @@ def make_closest_point_kernel(width: int, compressed: bool) -> Any:
         return best
 
     @kernel
-    def closest_points(accel: struct, points: wp.array(dtype=wp.vec3), out: PointArrays, first: int):
+    def closest_points(accel: struct, surfaces: Surfaces, points: wp.array(dtype=wp.vec3), out: PointArrays, first: int):
         i = first + wp.tid()
-        found = closest_point(accel, points[i])
+        found = closest_point(accel, surfaces, points[i])
         out.distance[i] = float(wp.sqrt(found.d2))
         out.point[i] = wp.vec3(found.point)
         out.u[i] = float(found.u)

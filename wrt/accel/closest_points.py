@@ -11,6 +11,7 @@ import warp as wp
 
 from wrt.accel.base import Accelerator
 from wrt.accel.contains import contains
+from wrt.accel.hit_points import surroundings
 from wrt.accel.ray_query import require_one_mesh
 from wrt.accel.rays import vectors
 from wrt.core.checks import shown
@@ -49,8 +50,9 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
 
     accel: a bvh4, bvh8 or bvh8c over one mesh, with the watertight triangle test. points: (N, 3) real numbers, taken as float32.
     All is reckoned in float64 and rounded once: distance is off by no more than 2^-23 of itself, and 1e-15 of the mesh's largest
-    coordinate times how much longer a triangle is than high; distances that differ by less may change places. Faces without area
-    are left out. Raises InputError that names the argument.
+    coordinate times how much longer a triangle is than high; distances that differ by less may change places. A face without area
+    counts as the segment or the point that it is, though no ray hits it; one with a corner that is not finite is left out. Raises
+    InputError that names the argument.
     """
     structure = require_one_mesh(getattr(accel, "structure", None),
                                  f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
@@ -58,13 +60,14 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
     if not isinstance(kernels, WideTraversal) or structure.units.triangle != "watertight":
         raise InputError("closest points are asked of a bvh4, bvh8 or bvh8c with the watertight triangle test, not of a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
-    data, device = accel._state.data, accel.device
+    state, device = accel._state, accel.device
     rows = vectors(points, "points", FARTHEST)
     n, out = len(rows), PointArrays()
     for name, field in fields_of(PointArrays).items():
         setattr(out, name, wp.empty(n, dtype=field.type.dtype, device=device))
     kernel, given = make_closest_point_kernel(kernels.width, kernels.compressed), upload(rows, wp.vec3, device)
-    launch_on(device, kernel, n, data, given, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
+    surfaces = surroundings(accel, state).surfaces
+    launch_on(device, kernel, n, state.data, surfaces, given, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
     return ClosestPoints(*(getattr(out, name).numpy() for name in fields_of(PointArrays)))
 
 

@@ -23,11 +23,15 @@ _bounds: WeakKeyDictionary[State, tuple[np.ndarray, np.ndarray]] = WeakKeyDictio
 _open_edges: WeakKeyDictionary[State, int] = WeakKeyDictionary()
 
 
+def finite_faces(geometry: Geometry) -> np.ndarray:
+    """(F, 3): those of the faces that have no corner that is not finite; no ray hits the others."""
+    return geometry.faces[np.isfinite(geometry.vertices).all(axis=1)[geometry.faces].all(axis=1)]
+
+
 def open_edges(geometry: Geometry) -> int:
-    """Edges with an odd number of faces; corners with the same coordinates are one. 0: the mesh is closed. Faces with
-    a corner that is not finite, which no ray hits, are left out."""
+    """Number of edges with an odd number of finite faces; corners with the same coordinates are one. 0: the mesh is closed."""
     _, corner = np.unique(geometry.vertices + np.float32(0.0), axis=0, return_inverse=True)  # -0 is 0
-    faces = corner.reshape(-1)[geometry.faces[np.isfinite(geometry.vertices).all(axis=1)[geometry.faces].all(axis=1)]]
+    faces = corner.reshape(-1)[finite_faces(geometry)]
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges = edges[edges[:, 0] != edges[:, 1]]
     _, count = np.unique(edges, axis=0, return_counts=True)
@@ -40,9 +44,9 @@ def open_edges_of(state: State) -> int:
 
 
 def used_bounds(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner of all faces, of which there is one or more."""
-    used = geometry.vertices[geometry.faces].reshape(-1, 3)
-    return used.min(axis=0), used.max(axis=0)
+    """Lowest and highest corner of all finite faces, two (3,); inf and -inf where there are none."""
+    used = geometry.vertices[finite_faces(geometry)].reshape(-1, 3)
+    return used.min(axis=0, initial=np.inf), used.max(axis=0, initial=-np.inf)
 
 
 def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any:
@@ -64,10 +68,9 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any
 def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
     """As `contains`, of (N, 3) float32 and a mesh that may be open: then it depends on the rays' direction, that is on `seed`."""
     inside = np.zeros(len(rows), bool)
-    if asked.state.geometry.n_triangles:
-        low, high = once(_bounds, asked.state, partial(used_bounds, asked.state.geometry))
-        within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
-        direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
-        counts = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts()
-        inside[within] = counts % 2 == 1
+    low, high = once(_bounds, asked.state, partial(used_bounds, asked.state.geometry))
+    within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
+    direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
+    counts = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts()
+    inside[within] = counts % 2 == 1
     return inside

@@ -63,12 +63,6 @@ class DeviceGeometry(Geometry):
         """With points that nobody else writes to."""
         return DeviceGeometry.moved(wp.clone(self.points), self.indices, self.spheres)
 
-    def write_bounds(self, lo: np.ndarray, hi: np.ndarray, threads: int = 1) -> None:
-        """As Geometry's; around a triangle with a point that is no number, all of space, as kernels.build.shape has it."""
-        super().write_bounds(lo, hi, threads)
-        nowhere = np.isnan(lo).any(axis=1) | np.isnan(hi).any(axis=1)
-        lo[nowhere], hi[nowhere] = -np.inf, np.inf
-
     def __len__(self) -> int:
         return len(self.indices) + len(self.spheres)
 

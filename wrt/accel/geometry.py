@@ -78,7 +78,8 @@ class Geometry:
     def write_bounds(self, lo: np.ndarray, hi: np.ndarray, threads: int = 1) -> None:
         """The same into arrays that there are, (N, 3) float32.
 
-        To the last bit what the units take (kernels.units.triangle.within_bounds): a hit is never outside its box.
+        To the last bit what the units take (kernels.units.triangle.within_bounds): a hit is never outside its box. Around a
+        triangle with a corner that is not finite, all of space, as kernels.build.shape has it.
         """
         def fill(first: int) -> None:
             some, n = slice(first, first + RECORDS_PER_JOB), len(self.faces)
@@ -91,6 +92,9 @@ class Geometry:
                 pad = np.float32(PAD_EXTENT) * np.maximum(np.maximum(x, y), z)[:, None] + np.float32(PAD_SMALLEST)
                 lo[some] = low - (pad + np.float32(PAD_COORDINATE) * np.abs(low))
                 hi[some] = high + (pad + np.float32(PAD_COORDINATE) * np.abs(high))
+            if not np.isfinite(pad.max(initial=0.0)):
+                nowhere = np.isnan(lo[some]).any(axis=1) | np.isnan(hi[some]).any(axis=1)
+                lo[some][nowhere], hi[some][nowhere] = -np.inf, np.inf
 
         run_all([partial(fill, first) for first in range(0, len(self), RECORDS_PER_JOB)], threads)
 

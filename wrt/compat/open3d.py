@@ -17,13 +17,13 @@ from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.closest_points import closest_points
 from wrt.accel.contains import odd_crossings
+from wrt.accel.geometry import Geometry
 from wrt.accel.rays import vectors
 from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
-from wrt.scene.mesh import Mesh
 from wrt.scene.values import LARGEST, as_number
 
 MOST_SAMPLES = 1 << 16
@@ -76,11 +76,8 @@ class RaycastingScene:
                 raise InputError(f"{name} must be (N, 3), got {array.shape}")
         if not ((faces == indices) & (faces >= 0) & (faces < len(vertices))).all():
             raise InputError(f"triangle_indices must be 0 to {len(vertices) - 1}, whole numbers")
-        bad = np.logical_not(np.isfinite(vertices).all(axis=1))
-        if (np.abs(vertices[~bad]) > LARGEST).any():
+        if (np.abs(vertices[np.isfinite(vertices).all(axis=1)]) > LARGEST).any():
             raise InputError(f"vertex_positions must be at most {LARGEST:g}")
-        faces[bad[faces].any(axis=1)] = 0  # hit no more, and all keep their numbers
-        vertices[bad] = 0.0
         self._meshes.append((vertices, faces))
         self._built = None
         return len(self._meshes) - 1
@@ -171,7 +168,7 @@ class RaycastingScene:
                 faces.append(indices + sum(map(len, vertices)))
                 vertices.append(positions)
             first = np.cumsum([0, *(len(indices) for _, indices in self._meshes)])[:-1]
-            mesh = Mesh(np.concatenate(vertices), np.concatenate(faces))
+            mesh = Geometry(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.zeros((0, 4), np.float32))
             self._built = build(mesh, "bvh8", device=self._device, threads=self._threads), first, _normals(mesh)
         return self._built
 
@@ -226,12 +223,13 @@ def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarra
     return array.shape[:-1], float32(array.reshape(-1, width))
 
 
-def _normals(mesh: Mesh) -> np.ndarray:
+def _normals(mesh: Geometry) -> np.ndarray:
     """See RaycastingScene._scene."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0.0)
+    with np.errstate(invalid="ignore"):  # of corners that are not finite
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0.0)
     return np.concatenate([unit, np.zeros((1, 3))]).astype(np.float32)
 
 

@@ -74,10 +74,10 @@ def corners_have_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray
     others are taken again in whole numbers.
     """
     a, b, c = (_columns(corner) for corner in (p, q, r))
-    e, f = b - a, c - a
     out = np.ones(len(p), dtype=bool)
     unknown: np.ndarray | slice = slice(None)
     with np.errstate(invalid="ignore"):
+        e, f = b - a, c - a
         for i, j in ((1, 2), (2, 0), (0, 1)):
             left, right = e[i, unknown] * f[j, unknown], e[j, unknown] * f[i, unknown]
             # Two roundings in each product's factors and one in itself. NaN is not below anything: has area.

@@ -9,24 +9,31 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 import wrt
+from wrt.accel.device_geometry import DeviceGeometry
+from wrt.accel.geometry import Geometry
+from wrt.scene.clean import has_area
 from wrt.scene.shapes import icosphere, torus
 
 
 def oracle(mesh: Any, points: np.ndarray) -> np.ndarray:
-    """Distance to each triangle, (N, F) in long double: that to its plane where the point is above it, else that to its sides."""
+    """Distance to each triangle, (N, F) in long double: that to its plane where the point is above it, else that to its sides.
+    All of a triangle without area is on its sides."""
     p = points.astype(np.longdouble)[:, None]
     a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.longdouble) for i in range(3))
     normal = np.cross(b - a, c - a)
-    above, nearest = np.ones((len(points), len(a)), bool), np.full((len(points), len(a)), np.longdouble(np.inf))
+    area = (normal * normal).sum(axis=1)
+    above, nearest = np.tile(area > 0.0, (len(points), 1)), np.full((len(points), len(a)), np.longdouble(np.inf))
     for start, end in ((a, b), (b, c), (c, a)):
         edge = end - start
         above &= (np.cross(edge, p - start) * normal).sum(axis=2) >= 0
-        t = np.clip(((p - start) * edge).sum(axis=2) / (edge * edge).sum(axis=1), 0, 1)
+        size = (edge * edge).sum(axis=1)
+        t = np.clip(((p - start) * edge).sum(axis=2) / np.where(size > 0.0, size, 1.0), 0, 1)
         nearest = np.minimum(nearest, np.linalg.norm((p - start - t[..., None] * edge).astype(float), axis=2))
-    height = np.abs(((p - a) * normal).sum(axis=2)) / np.sqrt((normal * normal).sum(axis=1))
+    height = np.abs(((p - a) * normal).sum(axis=2)) / np.sqrt(np.where(area > 0.0, area, 1.0))
     return np.where(above, height, nearest)
 
 
@@ -117,10 +124,77 @@ def test_signed_distances() -> None:
     np.testing.assert_allclose(found, [-0.5, -0.1, 1.5, np.sqrt(2.0)], rtol=1e-6)
 
 
-def test_faces_without_area_are_left_out() -> None:
-    mesh = wrt.Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 5, 0], [1, 5, 0], [0, 6, 0]], [[0, 1, 2], [0, 0, 1], [3, 4, 5]])
-    found = wrt.closest_points(wrt.build(mesh, "bvh8"), [[1.0, 0.0, 0.0]])
-    assert found.prim_id.tolist() == [2] and found.point.tolist() == [[1.0, 5.0, 0.0]] and found.distance.tolist() == [5.0]
+def half_flat(n: int, seed: int) -> wrt.Mesh:
+    """Triangles on a lattice, of which every second one is a segment (its corners in any order, two in one place or none) or a
+    point."""
+    rng = np.random.default_rng(seed)
+    start, step = rng.integers(-64, 65, (n, 3)), rng.integers(-3, 4, (n, 3))
+    along = rng.permuted(np.array([[0, 0, 0], [0, 0, 4], [0, 1, 3], [0, 3, 7]])[rng.integers(0, 4, n)], axis=1)
+    flat = start[:, None] + along[..., None] * step[:, None]
+    corners = np.where((np.arange(n) % 2 == 0)[:, None, None], flat, start[:, None] + rng.integers(-16, 17, (n, 3, 3)))
+    return wrt.Mesh(corners.reshape(-1, 3) / 32.0, np.arange(3 * n).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_face_without_area_is_the_segment_or_the_point_that_it_is(seed: int) -> None:
+    mesh = half_flat(400, seed)
+    flat, points = ~has_area(mesh.vertices, mesh.faces), around(mesh, 1000, seed)
+    distances = oracle(mesh, points)
+    nearest = distances.min(axis=1)
+    assert 200 <= flat.sum() < 250 and 0.2 < flat[distances.argmin(axis=1)].mean() < 0.8
+    answers = set()
+    for kind in ("bvh8", "bvh4", "bvh8c"):
+        accel = wrt.build(mesh, kind)
+        found = wrt.closest_points(accel, points)
+        assert (np.abs(found.distance - nearest) <= 2.0**-23 * nearest + 1e-13).all()
+        own = np.take_along_axis(distances, found.prim_id[:, None].astype(np.int64), axis=1)[:, 0]
+        assert (own <= nearest * (1 + 1e-9) + 1e-13).all()
+        weights = np.stack([1.0 - found.u - found.v, found.u, found.v], axis=1)
+        assert np.abs((mesh.vertices[mesh.faces[found.prim_id]] * weights[..., None]).sum(axis=1) - found.point).max() < 2e-6
+        answers.add(tuple(array.tobytes() for array in (found.distance, found.point, found.u, found.v, found.prim_id)))
+        assert not flat[accel.closest_hit(points, mesh.vertices[:1000] - points + np.float32(1e-3)).prim_id].any()
+    assert len(answers) == 1
+
+
+def test_of_segments_and_points_alone() -> None:
+    mesh = wrt.Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 5, 0]], [[0, 1, 2], [2, 0, 0], [3, 3, 3]])
+    accel = wrt.build(mesh, "bvh8")
+    found = wrt.closest_points(accel, [[1.0, 1.0, 0.0], [0.0, 7.0, 0.0], [9.0, 0.0, 0.0]])
+    assert found.prim_id.tolist() == [0, 2, 0] and found.distance.tolist() == [1.0, 2.0, 7.0]
+    assert found.point.tolist() == [[1.0, 0.0, 0.0], [0.0, 5.0, 0.0], [2.0, 0.0, 0.0]]
+    accel.refit(mesh.vertices + np.float32([0, 1, 0]))
+    assert wrt.closest_points(accel, [[1.0, 0.0, 0.0]]).distance.tolist() == [1.0]
+
+
+def spoilt(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (F, 3, 3) of triangles, and which of these, (F,) bool, have numbers that are not finite, in one corner or in more."""
+    rng = np.random.default_rng(seed)
+    corners = np.float32(rng.uniform(-1.0, 1.0, (60, 1, 3)) + 0.3 * rng.normal(size=(60, 3, 3)))
+    bad = rng.random((60, 3, 3)) < 0.02
+    bad[::11, seed % 3, 1] = True
+    corners[bad] = rng.choice(np.float32([np.nan, np.inf, -np.inf]), int(bad.sum()))
+    return corners, bad.any(axis=(1, 2))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_face_with_a_corner_that_is_not_finite_is_in_no_answer(seed: int) -> None:
+    """Whichever corner it is: as if the face were not there. Nobody checks the numbers of a Geometry or of arrays on a device."""
+    corners, bad = spoilt(seed)
+    vertices, faces = corners.reshape(-1, 3), np.arange(180, dtype=np.int32).reshape(-1, 3)
+    none = np.zeros((0, 4), np.float32)
+    rest, number = wrt.build(Geometry(vertices, faces[~bad], none), "bvh8"), np.append(np.flatnonzero(~bad), -1)
+    points = np.random.default_rng(seed).uniform(-2.0, 2.0, (400, 3))
+    expected, hits = wrt.closest_points(rest, points), rest.closest_hit(points, points[::-1] - points)
+    turns, crossings = wrt.winding_number(rest, points), wrt.count_hits(rest, points, points[::-1] - points)
+    on_device = wp.array(vertices, dtype=wp.vec3, device="cpu"), wp.array(faces.reshape(-1), dtype=wp.int32, device="cpu")
+    for geometry in (Geometry(vertices, faces, none), DeviceGeometry(*on_device)):
+        for kind in ("bvh8", "bvh4", "bvh8c"):
+            accel = wrt.build(geometry, kind)
+            found = wrt.closest_points(accel, points)
+            assert np.array_equal(found.prim_id, number[expected.prim_id]) and np.array_equal(found.distance, expected.distance)
+            assert np.array_equal(accel.closest_hit(points, points[::-1] - points).prim_id, number[hits.prim_id])
+            assert np.array_equal(wrt.count_hits(accel, points, points[::-1] - points), crossings)
+            assert np.array_equal(wrt.winding_number(accel, points), turns)
 
 
 def test_a_signed_distance_is_of_one_shape_whatever_is_refitted_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ import warp as wp
 
 import wrt
 from tests.device import NAME as DEVICE
+from wrt.accel.geometry import Geometry
 from wrt.scene import shapes
 
 
@@ -55,6 +56,19 @@ def test_after_a_refit_it_is_the_new_mesh() -> None:
     assert not wrt.contains(accel, points)[0]
     accel.refit(2.0 * accel.geometry.vertices)
     assert wrt.contains(accel, points)[0]
+
+
+@pytest.mark.parametrize("corner", range(3))
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_a_face_with_a_corner_that_is_not_finite_is_not_there(corner: int, number: float) -> None:
+    box, points = shapes.box(), lattice(-1.45, 1.45, 12)
+    vertices = np.concatenate([box.vertices, np.full((1, 3), number, np.float32)])
+    faces = np.concatenate([box.faces, np.roll(np.int32([[len(box.vertices), 0, 1]]), corner)])
+    accel = wrt.build(Geometry(vertices, faces, np.zeros((0, 4), np.float32)))
+    assert np.array_equal(wrt.contains(accel, points), wrt.contains(wrt.build(box), points))
+    assert np.array_equal(wrt.signed_distance(accel, points), wrt.signed_distance(wrt.build(box), points))
+    nothing = wrt.build(Geometry(vertices, faces[-1:], np.zeros((0, 4), np.float32)))
+    assert not wrt.contains(nothing, points).any()
 
 
 def points_of(array: np.ndarray) -> Any:

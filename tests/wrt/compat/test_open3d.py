@@ -184,6 +184,16 @@ def test_faces_that_cannot_be_hit_keep_their_numbers() -> None:
                           numpy(scene_of(BOX).cast_rays(down(lattice()))).primitive_ids + 2)
 
 
+def test_distances_to_faces_without_area_and_with_nan() -> None:
+    """The segment from x = 5 to 6 counts; the face with a NaN is nowhere, and its finite corners at x = 8 are not either."""
+    scene = RaycastingScene()
+    scene.add_triangles(np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [6, 0, 0], [8, 0, 0], [8, 1, np.nan]]),
+                        [[0, 1, 2], [3, 4, 4], [5, 5, 6]])
+    points = np.float32([[5.5, 1.0, 0.0], [8.0, 0.0, 0.0]])
+    assert scene.compute_distance(points).numpy().tolist() == scene.compute_signed_distance(points).numpy().tolist() == [1.0, 2.0]
+    assert numpy(scene.compute_closest_points(points)).primitive_ids.tolist() == [1, 1]
+
+
 def test_a_scene_without_meshes_is_never_hit() -> None:
     scene, rays = RaycastingScene(), down([[0.1, 0.2]])
     found = numpy(scene.cast_rays(rays))
