@@ -4,21 +4,32 @@ import warp as wp
 
 from wrt.kernels.query import RayArrays
 from wrt.kernels.shade.surface import corners_at, spawn_point, triangle_normal
-from wrt.kernels.structs import Surfaces, gamma, kernel, largest
+from wrt.kernels.structs import Surfaces, gamma, kernel, largest, unit
 
-END = 64.0  # roundings of the largest coordinate: so near to an end nothing is looked for
+END = 64.0  # roundings, see `segments`
 
 
 @wp.func
-def lifted(surfaces: Surfaces, face: int, point: wp.vec3, towards: wp.vec3) -> wp.vec3:
-    """A point of that face, to rounding, moved off the face's plane as far as rounding may have put it on the other side; -1: as it
-    is. A face beside it in the same plane is then not met."""
-    if face < 0:
+def lifted(surfaces: Surfaces, prim_id: int, point: wp.vec3, towards: wp.vec3) -> wp.vec3:
+    """A point of that primitive, to rounding, moved off its plane, or off the sphere, as far as rounding may have put it on the
+    other side. A face beside it in the same plane is then not met. As it is where prim_id is -1 or the face has no plane."""
+    if prim_id < 0:
         return point
-    c = corners_at(surfaces, face)
-    size = wp.max(largest(c.v1 - c.v0), largest(c.v2 - c.v0))
-    error = gamma(8.0) * (wp.max(wp.max(wp.abs(c.v0), wp.abs(c.v1)), wp.abs(c.v2)) + wp.vec3(size, size, size))
-    return spawn_point(point, error, triangle_normal(c), towards - point)
+    error = wp.vec3()
+    normal = wp.vec3()
+    if prim_id < surfaces.n_triangles:
+        c = corners_at(surfaces, prim_id)
+        size = wp.max(largest(c.v1 - c.v0), largest(c.v2 - c.v0))
+        error = gamma(8.0) * (wp.max(wp.max(wp.abs(c.v0), wp.abs(c.v1)), wp.abs(c.v2)) + wp.vec3(size, size, size))
+        normal = triangle_normal(c)
+    else:
+        s = surfaces.spheres[prim_id - surfaces.n_triangles]
+        center = wp.vec3(s[0], s[1], s[2])
+        error = gamma(8.0) * (wp.abs(center) + wp.vec3(s[3], s[3], s[3]))
+        normal = unit((point - center) / largest(point - center))
+    if largest(normal) == 0.0:
+        return point
+    return spawn_point(point, error, normal, towards - point)
 
 
 @wp.func
@@ -33,9 +44,18 @@ def is_before(p: wp.vec3, q: wp.vec3) -> bool:
 
 @kernel
 def segments(surfaces: Surfaces, a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), on_a: wp.array(dtype=wp.int32),
-             on_b: wp.array(dtype=wp.int32), rays: RayArrays, first: int):
+             on_b: wp.array(dtype=wp.int32), size: float, rays: RayArrays, first: int):
     """Rays between a and b, without their ends: the same ray whichever of the two is called a. on_a, on_b: as of `lifted`, or
-    nothing (length 0). A segment that is all ends, or not finite, has a ray that hits nothing."""
+    nothing (length 0). size: of the largest primitive. A segment that is all ends, or not finite, has a ray that hits nothing.
+
+    What may be left out at an end p is what rounding may do to a surface through p. With u = 2^-24, |p| the largest coordinate of p
+    and S the size of the primitive there: p is off the surface by a few u |p|. The ray begins at the end with the smaller |p|; at
+    its origin no rounding of the direction counts, and a triangle unit is off by 7 u S (the corners relative to the origin are
+    rounded once, u S, and their shear is, 6 u S). At the other end q the direction is off by u |q - p| <= 2 u |q|, and what the unit
+    loses grows with the distance likewise. All of it is divided by the cosine at which the ray meets the surface. So END u
+    max(|p|, S) are left out at the origin, END u |q| at the other end, and never more at the origin than there: enough for cosines
+    above 0.15.
+    """
     i = first + wp.tid()
     p = a[i]
     q = b[i]
@@ -43,14 +63,16 @@ def segments(surfaces: Surfaces, a: wp.array(dtype=wp.vec3), b: wp.array(dtype=w
         p = lifted(surfaces, on_a[i], a[i], b[i])
     if on_b.shape[0] > 0:
         q = lifted(surfaces, on_b[i], b[i], a[i])
-    origin = wp.where(is_before(q, p), q, p)
-    way = wp.where(is_before(q, p), p, q) - origin
-    end = gamma(END) * wp.max(largest(p), largest(q)) / largest(way)
+    turned = largest(q) < largest(p) or (largest(q) == largest(p) and is_before(q, p))
+    origin = wp.where(turned, q, p)
+    target = wp.where(turned, p, q)
+    way = target - origin
+    length = largest(way)
     rays.origin[i] = origin
     rays.direction[i] = way
-    rays.t_min[i] = end
-    rays.t_max[i] = 1.0 - end
-    if not end < 0.5:
+    rays.t_min[i] = gamma(END) * wp.min(wp.max(largest(origin), size), largest(target)) / length
+    rays.t_max[i] = 1.0 - gamma(END) * largest(target) / length
+    if not rays.t_min[i] < rays.t_max[i]:
         rays.origin[i] = wp.vec3()
         rays.direction[i] = wp.vec3(1.0, 0.0, 0.0)
         rays.t_min[i] = 0.0

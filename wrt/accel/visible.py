@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
@@ -11,8 +13,9 @@ import warp as wp
 from wrt.accel.all_hits import first_hits
 from wrt.accel.answers import ANY_HIT_TYPES, room_for
 from wrt.accel.base import Accelerator
+from wrt.accel.geometry import Geometry
 from wrt.accel.hit_points import surroundings
-from wrt.accel.ray_query import require_one_mesh
+from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.rays import vectors
 from wrt.core.arrays import check_no_gradients, real_numbers, returned, taken, to_numpy
 from wrt.core.checks import shown
@@ -24,6 +27,7 @@ from wrt.kernels.shade.segments import see, segments
 from wrt.kernels.structs import Surfaces
 
 PAIRS_PER_LAUNCH = 65536
+_kept_extents: WeakKeyDictionary[Geometry, tuple[float, float]] = WeakKeyDictionary()
 
 
 def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = None, threads: int | None = None, *,
@@ -31,12 +35,14 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
     """Whether the open segment between each point of `a` and that of `b` meets nothing, (N,) bool.
 
     a, b: (N, 3) real numbers, taken as float32, or Warp arrays of vec3; the answer is the same with a and b exchanged, to the bit.
-    What is nearer to an end than 3.8e-6 of the pair's largest coordinate is not seen: a surface that the point lies on, to
-    rounding; points nearer to each other than twice that always see each other, a point itself too. Along a surface that is not
-    enough. on_a, on_b: (N,) prim_ids of triangles on which the points lie (hits.prim_id of hits.point), -1 for none: these are
-    not in the way, and the point is moved off their plane by its rounding, as a shadow ray of a picture is (structures over one
-    mesh). threads, out and the answer's library: as in any_hit. Raises InputError that names the argument; of Warp arrays on a GPU
-    no values are looked at, and what is not finite sees nothing.
+    Surfaces that are nearer to an end than its margin are ignored, so that a point on a surface sees off it: 3.8e-6 times the
+    end's own largest coordinate or the size of the largest primitive, whichever is larger, but no more than at the other end if
+    that has larger coordinates. Points that are nearer to each other than both margins always see each other, a point itself too.
+    Along a surface the margin is not enough. on_a, on_b: (N,) prim_ids of what the points lie on (hits.prim_id of hits.point), -1
+    for none. The point is moved off that triangle's plane, or off that sphere, by its rounding, as a shadow ray of a picture is; and
+    over one mesh that triangle is not in the way. Structures with instances do not take them, and structures over several worlds
+    are not taken. threads, out and the answer's library: as in any_hit. Raises InputError that names the argument; of Warp arrays
+    on a GPU no values are looked at, and what is not finite sees nothing.
     """
     if not isinstance(accel, Accelerator):
         raise InputError(f"accel must be a structure (wrt.build), got {shown(accel)}")
@@ -49,10 +55,13 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
         raise InputError(f"b must have as many rows as a ({n}), got {len(q)}")
     array = room_for(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None, give is not None)[0]
     state, known, surfaces = accel._state, on_a is not None or on_b is not None, Surfaces()
+    if len(getattr(state.geometry, "first_instance", ())) > 2:
+        raise InputError("visible does not take a structure over several worlds yet")
     if known:
-        require_one_mesh(accel.structure, "on_a and on_b are for structures over one mesh")
+        if accel.structure.units.instances:
+            raise InputError("on_a and on_b are for structures without instances")
         surfaces = surroundings(accel, state).surfaces
-    ids = [_prim_ids(value, name, n, len(accel.geometry.faces)) if known else np.zeros(0, np.int32)
+    ids = [_prim_ids(value, name, n, len(state.geometry)) if known else np.zeros(0, np.int32)
            for value, name in ((on_a, "on_a"), (on_b, "on_b"))]
 
     def run(kernel: Any, *inputs: Any) -> None:
@@ -61,18 +70,39 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
     rays: Any = RayArrays()
     rays.origin, rays.direction = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(2))
     rays.t_min, rays.t_max = (wp.empty(n, dtype=wp.float32, device=device) for _ in range(2))
-    run(segments, surfaces, p, q, *(upload(each, wp.int32, device) for each in ids), rays)
+    size = np.inf if state.changes else largest_size(state.geometry)
+    run(segments, surfaces, p, q, *(upload(each, wp.int32, device) for each in ids), size, rays)
     given = rays.origin, rays.direction, rays.t_min, rays.t_max
     seen = accel.any_hit(*given, threads=threads)
     run(see, p, q, seen)
     answer = np.array(to_numpy(seen)) if known else seen
-    if known:
+    if known and not accel.structure.units.spheres:
         _without(accel, given, ids, answer, threads)
     if as_warp:
         array.assign(answer)
     else:
         array[:] = to_numpy(answer)
     return array if give is None else give(array)
+
+
+def largest_size(geometry: Geometry | InstancedGeometry) -> float:
+    """The largest extent of a finite primitive along an axis. Of instances, whose rays are rounded once more in the space of a mesh,
+    the largest coordinate there, as long as it is in the world."""
+    if isinstance(geometry, InstancedGeometry):
+        reach = np.array([_extents(part)[1] for part in geometry.parts])
+        scale = np.abs(geometry.to_world[:, :, :3]).sum(axis=2).max(axis=1)
+        return float((scale * reach[geometry.part]).max(initial=0.0))
+    return _extents(geometry)[0]
+
+
+def _extents(geometry: Geometry) -> tuple[float, float]:
+    """The largest extent of a primitive's box, and the largest coordinate; of what is finite."""
+    if geometry not in _kept_extents:
+        low, high = geometry.bounds()
+        finite = np.isfinite(high - low).all(axis=1)
+        low, high = low[finite], high[finite]
+        _kept_extents[geometry] = (float((high - low).max(initial=0.0)), float(np.maximum(-low, high).max(initial=0.0)))
+    return _kept_extents[geometry]
 
 
 def _without(accel: Accelerator, rays: tuple[Any, ...], ids: list[np.ndarray], seen: np.ndarray, threads: int) -> None:

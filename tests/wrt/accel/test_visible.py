@@ -27,6 +27,15 @@ def soup(seed: int = 0) -> wrt.Mesh:
     return wrt.Mesh(corners.reshape(-1, 3), np.arange(180).reshape(-1, 3))
 
 
+def unit_vectors(n: int, seed: int) -> np.ndarray:
+    way = np.random.default_rng(seed).normal(size=(n, 3))
+    return way / np.linalg.norm(way, axis=1, keepdims=True)
+
+
+def sphere(center: float, radius: float) -> Geometry:
+    return Geometry(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.float32([[center] * 3 + [radius]]))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_between_points_in_space_it_is_what_testing_every_triangle_says(seed: int) -> None:
     """Plücker coordinates in float64: pairs that are nearer to an edge than rounding are left out."""
@@ -116,6 +125,54 @@ def test_the_ends_are_left_out() -> None:
     assert wrt.visible(accel, np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
 
 
+@pytest.mark.parametrize("far", [1e3, 3e5, 1e6, 1e12, 1e30])
+def test_an_end_far_away_takes_nothing_from_what_is_near_the_other(far: float) -> None:
+    """Between two ends on either side of a ball is the ball, however far away one of them is; beside it there is nothing."""
+    ball, rng = shapes.icosphere(3), np.random.default_rng(4)
+    accels = [wrt.build(ball), wrt.build(place((Geometry.of(ball), np.eye(4)))), wrt.build(sphere(0.0, 1.0))]
+    near, way = np.float32(2.0 * unit_vectors(500, 5)), unit_vectors(500, 6)
+    aside = way - (way * near).sum(axis=1, keepdims=True) * near / 4.0
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    through = np.float32(far * (-near / 2.0 + 0.3 * rng.random((500, 1)) * aside))  # within 20 degrees of the centre: it is 30 wide
+    past = np.float32(far * (-near / 2.0 + 0.8 * aside))
+    for accel in accels:
+        for p, q, seen in ((near, through, False), (near, past, True)):
+            assert (wrt.visible(accel, p, q) == seen).all() and (wrt.visible(accel, q, p) == seen).all()
+
+
+@pytest.mark.parametrize("far", [2.0, 1e3, 1e6])
+@pytest.mark.parametrize("name", ["ball", "floor", "patch"])
+def test_a_hit_sees_where_it_was_seen_from(name: str, far: float) -> None:
+    """Also near the origin of coordinates on a large triangle through it, whose corners are far away."""
+    turn = np.linalg.qr(np.random.default_rng(7).normal(size=(3, 3)))[0]
+    floor = shapes.quad()
+    mesh = shapes.icosphere(3) if name == "ball" else wrt.Mesh(floor.vertices @ turn.T, floor.faces)
+    at = 0.9 * unit_vectors(5000, 8) if name == "ball" else np.random.default_rng(9).uniform(-0.9, 0.9, (5000, 3)) * [1, 1, 0] @ turn.T
+    at = np.float32(at * (1e-3 if name == "patch" else 1.0))
+    eye = np.float32(at + far * unit_vectors(5000, 10))
+    accel = wrt.build(mesh)
+    hits = accel.closest_hit(eye, at - eye)
+    cosine = np.abs((hits.normal * (at - eye)).sum(axis=1)) / np.linalg.norm(at - eye, axis=1)
+    rows = np.flatnonzero((hits.prim_id >= 0) & (cosine > 0.2))
+    assert len(rows) > 1000
+    assert wrt.visible(accel, hits.point[rows], eye[rows]).all() and wrt.visible(accel, eye[rows], hits.point[rows]).all()
+
+
+@pytest.mark.parametrize("center, radius", [(0.0, 1.0), (3.0, 1e-2), (-50.0, 2e3), (700.0, 0.1)])
+def test_points_of_a_sphere_see_all_that_is_outwards_and_nothing_through_it(center: float, radius: float) -> None:
+    accel, way, outwards = wrt.build(sphere(center, radius)), unit_vectors(20_000, 11), unit_vectors(20_000, 12)
+    origin = np.float32(center + 3.0 * radius * way)
+    hits = accel.closest_hit(origin, center - origin + 0.5 * radius * outwards)
+    hit = hits.prim_id == 0
+    point, normal, on = hits.point[hit], hits.normal[hit].astype(np.float64), hits.prim_id[hit]
+    outwards = outwards[hit] * np.sign((outwards[hit] * normal).sum(axis=1, keepdims=True))
+    other = np.float32(point + 5.0 * radius * (outwards + 0.01 * normal))
+    assert hit.sum() > 10_000 and wrt.visible(accel, point, other, on).all() and wrt.visible(accel, other, point, None, on).all()
+    across = np.float32(point - 3.0 * radius * normal)
+    assert not wrt.visible(accel, point, across, on).any() and not wrt.visible(accel, across, point, None, on).any()
+    assert wrt.visible(accel, point, np.float32(point - 0.5 * radius * normal), on).all()  # within it
+
+
 def test_only_the_triangle_that_is_told_is_not_in_the_way() -> None:
     wall = shapes.quad()
     vertices = np.concatenate([wall.vertices, wall.vertices + np.float32([0, 0, 1e-6])])
@@ -178,5 +235,8 @@ def test_what_takes_no_prim_ids() -> None:
     points = np.zeros((1, 3))
     with pytest.raises(wrt.InputError, match="accel must be a structure"):
         wrt.visible("bvh", points, points)  # type: ignore[arg-type]
-    with pytest.raises(wrt.InputError, match="on_a and on_b are for structures over one mesh"):
+    with pytest.raises(wrt.InputError, match="on_a and on_b are for structures without instances"):
         wrt.visible(wrt.build(place((Geometry.of(shapes.box()), np.eye(4)))), points, points, [0])
+    with pytest.raises(wrt.InputError, match="visible does not take a structure over several worlds yet"):
+        wrt.visible(wrt.build([shapes.box(), shapes.box()]), points, points)
+    assert wrt.visible(wrt.build([shapes.box()]), points, points + 3.0).tolist() == [False]

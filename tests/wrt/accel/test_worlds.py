@@ -138,8 +138,9 @@ def test_points_and_instances_of_hits() -> None:
     for name in ("normal", "point_error"):
         assert np.array_equal(getattr(hits, name)[world == 3], getattr(alone, name), equal_nan=True)
     assert np.array_equal(hits.instance[world == 3], np.where(alone.prim_id >= 0, alone.instance + first[3], -1))
-    with pytest.raises(wrt.InputError, match="there is no object"):
-        _ = hits.object
+    for name in ("object", "material"):
+        with pytest.raises(wrt.InputError, match=f"hits over worlds do not know their {name} yet; hits.instance is known"):
+            getattr(hits, name)
 
 
 def test_a_ray_costs_what_it_costs_in_its_world_alone() -> None:
