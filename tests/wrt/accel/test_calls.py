@@ -134,6 +134,29 @@ def test_room_that_does_not_fit_is_named(ball: Accelerator, field: str, array: A
         ball.closest_hit(*rays, out=Hits(**room))
 
 
+@pytest.mark.parametrize("as_warp", [False, True])
+def test_arrays_that_share_memory_are_refused(ball: Accelerator, as_warp: bool) -> None:
+    """Also where they have the same bytes as other types, and where only a part is shared; one behind the other is right."""
+    rays: tuple[Any, ...] = some_rays(4)
+    memory, own = np.zeros(16, np.float32), [np.zeros(4, np.float32) for _ in range(2)]
+    whole: Any = to_warp(memory).to(DEVICE) if as_warp else memory
+    if as_warp:
+        rays, own = tuple(to_warp(a, wp.vec3) for a in rays), [to_warp(a).to(DEVICE) for a in own]
+
+    def ids(begin: int) -> Any:
+        part = whole[begin:begin + 4]
+        return part.view(wp.int32) if as_warp else part.view(np.int32)
+
+    t = whole[:4]
+    for room, named in (((t, own[0], t, ids(8)), "out.t and out.v"), ((own[0], own[1], t, ids(0)), "out.v and out.prim_id"),
+                        ((own[0], t, whole[3:7], ids(8)), "out.u and out.v"), ((whole[5:9], own[0], own[1], ids(2)),
+                                                                             "out.t and out.prim_id")):
+        with pytest.raises(InputError, match=f"{named} share memory"):
+            ball.closest_hit(*rays, out=Hits(*room))
+    room = t, whole[4:8], whole[12:], ids(8)
+    assert bits(ball.closest_hit(*rays, out=Hits(*room))) == bits(ball.closest_hit(*rays))
+
+
 def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
     rays = some_rays(3)
     on_warp = tuple(to_warp(a, wp.vec3) for a in rays)
