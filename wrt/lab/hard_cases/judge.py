@@ -17,6 +17,7 @@ from wrt.lab.hard_cases.common import ASK, HIT, MISS, HardCase
 from wrt.lab.oracle.oracle import AllHits, Place, Reference, reference_of, sure
 
 RAYS_AT_ONCE = 1 << 16
+FACES_AT_ONCE = 4096  # whose float64 temporaries stay in the cache
 EXAMPLES = 8
 BINS_PER_OCTAVE, LOWEST_OCTAVE, N_BINS = 8, -12, 8 * 160
 
@@ -281,16 +282,18 @@ def _leaks(case: HardCase, skipped: AllHits, bound: np.ndarray, row: np.ndarray,
     """(n,) bool for the case's rays `row`: those that pass through a closed surface by crossings that were left out. The
     winding number behind one of them, before the next or before end[i], is not that of the segment's start. Crossings that
     their bounds on t do not part are taken together: a ray may shave off a corner by less than the bound."""
-    leaks = np.zeros(len(row), bool)
-    for i in np.unique(skipped.ray):
+    leaks, rays, points = np.zeros(len(row), bool), np.unique(skipped.ray), [np.zeros((0, 3))]
+    for i in rays:
         mine = skipped.ray == i
         low, high = skipped.t[mine] - bound[mine], np.maximum.accumulate(skipped.t[mine] + bound[mine])
         low = np.append(np.minimum.accumulate(low[::-1])[::-1], end[i] if np.isfinite(end[i]) else 2.0 * high[-1] + 1.0)
         gap = np.flatnonzero(high < low[1:])
         at = np.array([float(case.t_min[row[i]]), *(0.5 * (high[gap] + low[gap + 1]))])
         o, d = (x[row[i]].astype(np.float64) for x in (case.origins, case.directions))
-        winding = np.round(winding_number(case, o + at[:, None] * d))
-        leaks[i] = bool((winding[1:] != winding[0]).any())
+        points.append(o + at[:, None] * d)
+    winding = np.round(winding_number(case, np.concatenate(points)))
+    for i, mine in zip(rays, np.split(winding, np.cumsum([len(each) for each in points]))[1:], strict=False):
+        leaks[i] = bool((mine[1:] != mine[0]).any())
     return leaks
 
 
@@ -298,12 +301,15 @@ def winding_number(case: HardCase, points: np.ndarray) -> np.ndarray:
     """How often the surface goes round each point: the signed solid angle over 4 pi (van Oosterom and Strackee 1983)."""
     corners = case.geometry.vertices[case.geometry.faces].astype(np.float64)
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any(axis=1)
-    out = np.empty(len(points))
-    for i, point in enumerate(points):
-        a, b, c = np.moveaxis(corners[area] - point, 1, 0)
-        la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
-        below = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
-        out[i] = 2.0 * np.arctan2((a * np.cross(b, c)).sum(axis=1), below).sum() / (4.0 * np.pi)
+    corners, out = corners[area], np.zeros(len(points))
+    for first in range(0, len(corners), FACES_AT_ONCE):
+        part = np.ascontiguousarray(corners[first:first + FACES_AT_ONCE].transpose(1, 2, 0))  # corner, axis, face
+        for i, point in enumerate(points):
+            a, b, c = part - point[:, None]
+            la, lb, lc = (np.sqrt((x * x).sum(axis=0)) for x in (a, b, c))
+            below = la * lb * lc + (a * b).sum(axis=0) * lc + (b * c).sum(axis=0) * la + (c * a).sum(axis=0) * lb
+            cross = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
+            out[i] += np.arctan2(a[0] * cross[0] + a[1] * cross[1] + a[2] * cross[2], below).sum() / (2.0 * np.pi)
     return out
 
 
