@@ -8,7 +8,7 @@ import os
 from hashlib import sha256
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -36,6 +36,10 @@ def reports_progress(accel: str) -> bool:
     return accel in ACCELERATORS and "progress" in signature(ACCELERATORS[accel]._build).parameters
 
 
+@overload
+def build(mesh: list[Any], accel: str = "bvh", device: str = "cpu", threads: int | None = None, **options: Any) -> Instances: ...
+@overload
+def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | None = None, **options: Any) -> Accelerator: ...
 def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | None = None, **options: Any) -> Accelerator:
     """An acceleration structure over a mesh or a scene, ready for `closest_hit` and `any_hit`.
 
