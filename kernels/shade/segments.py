@@ -48,13 +48,13 @@ def segments(surfaces: Surfaces, a: wp.array(dtype=wp.vec3), b: wp.array(dtype=w
     """Rays between a and b, without their ends: the same ray whichever of the two is called a. on_a, on_b: as of `lifted`, or
     nothing (length 0). size: of the largest primitive. A segment that is all ends, or not finite, has a ray that hits nothing.
 
-    What may be left out at an end p is what rounding may do to a surface through p. With u = 2^-24, |p| the largest coordinate of p
-    and S the size of the primitive there: p is off the surface by a few u |p|. The ray begins at the end with the smaller |p|; at
-    its origin no rounding of the direction counts, and a triangle unit is off by 7 u S (the corners relative to the origin are
-    rounded once, u S, and their shear is, 6 u S). At the other end q the direction is off by u |q - p| <= 2 u |q|, and what the unit
-    loses grows with the distance likewise. All of it is divided by the cosine at which the ray meets the surface. So END u
-    max(|p|, S) are left out at the origin, END u |q| at the other end, and never more at the origin than there: enough for cosines
-    above 0.15.
+    What is left out at an end p is what rounding may do to a surface through p. Let u = 2^-24, |p| the largest coordinate of p,
+    and S the size of the primitive there. Then p is off the surface by a few u |p|. The ray begins at the end with the smaller
+    |p|. At its origin no rounding of the direction counts, and a triangle unit is off by 7 u S: corners relative to the origin
+    are rounded once, u S, and sheared, 6 u S. At the other end q the direction is off by u |q - p| <= 2 u |q|, and the unit's
+    loss grows with the distance likewise. All of it is divided by the cosine at which the ray meets the surface. So END u
+    max(|p|, S) are left out at the origin, and END u |q| at the other end, and never more at the origin than there. That suffices
+    for cosines above 0.15.
     """
     i = first + wp.tid()
     p = a[i]

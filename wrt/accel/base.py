@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -64,11 +65,27 @@ class Accelerator(Queries, ABC):
         self = cls.__new__(cls)
         self._begin(geometry, device, threads, triangle, box)
         begin = time.perf_counter()
-        if not np.array_equal(np.unique(built.order), np.arange(len(geometry))):
+        order, count = built.order, len(geometry)
+        within = order.min(initial=0) >= 0 and order.max(initial=-1) < count
+        if not (within and np.bincount(order, minlength=count).all()):
             raise InputError(f"is no {cls.name} over this geometry: its primitives are not in it, or not all of them")
         self._check(built)
         self._take(built, begin, built.sah_cost)
         return self
+
+    def __reduce__(self) -> Any:
+        """For pickle: what `save` writes, and what the structure is over. A refit there measures growth from the shape of now."""
+        state, units, of = self._state, self.structure.units, self._state.geometry
+        make = partial(type(self).restore, triangle=units.triangle, box=units.box)
+        options = {name: value for name, value in self._options.items() if name != "progress"}
+        return (make, (state.built.on_host(), Geometry(of.vertices, of.faces, of.spheres), str(self.device), self.threads),
+                {"attributes": self.attributes, "_options": options})
+
+    def __copy__(self) -> Accelerator:
+        """The same structure, which a refit of this one leaves as it is."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
 
     def _begin(self, geometry: Geometry, device: str, threads: int | None, triangle: str, box: str) -> None:
         check_units(triangle, box)

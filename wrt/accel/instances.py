@@ -118,6 +118,9 @@ class Instances(Accelerator):
         """Raises InputError: one array of vertices cannot say where instances go."""
         raise InputError("instances cannot follow vertices that move; move them, or build them again")
 
+    def __reduce__(self) -> Any:
+        raise TypeError("structures with instances cannot be pickled yet: pickle the scene, and build it again (wrt.build)")
+
     def save(self, path: Any) -> None:
         """Raises InputError: files hold one structure."""
         raise InputError("instances cannot be written to a file", path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import copy
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -39,10 +38,10 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
     end's own largest coordinate or the size of the largest primitive, whichever is larger, but no more than at the other end if
     that has larger coordinates. Points that are nearer to each other than both margins always see each other, a point itself too.
     Along a surface the margin is not enough. on_a, on_b: (N,) prim_ids of what the points lie on (hits.prim_id of hits.point), -1
-    for none. The point is moved off that triangle's plane, or off that sphere, by its rounding, as a shadow ray of a picture is; and
-    over one mesh that triangle is not in the way. Structures with instances do not take them, and structures over several worlds
-    are not taken. threads, out and the answer's library: as in any_hit. Raises InputError that names the argument; of Warp arrays
-    on a GPU no values are looked at, and what is not finite sees nothing.
+    for none. The point is moved off that triangle's plane, or off that sphere, by its rounding, as a shadow ray of a picture is;
+    and over one mesh that triangle is not in the way. They are refused for structures with instances, and structures over several
+    worlds are refused. threads, out and the answer's library: as in any_hit. Raises InputError that names the argument; of Warp
+    arrays on a GPU no values are looked at, and what is not finite sees nothing.
     """
     if not isinstance(accel, Accelerator):
         raise InputError(f"accel must be a structure (wrt.build), got {shown(accel)}")
@@ -86,8 +85,8 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
 
 
 def largest_size(geometry: Geometry | InstancedGeometry) -> float:
-    """The largest extent of a finite primitive along an axis. Of instances, whose rays are rounded once more in the space of a mesh,
-    the largest coordinate there, as long as it is in the world."""
+    """The largest extent of a finite primitive along an axis. Of instances, the largest coordinate in a mesh's own space, where
+    rays are rounded once more, in the world's lengths."""
     if isinstance(geometry, InstancedGeometry):
         reach = np.array([_extents(part)[1] for part in geometry.parts])
         scale = np.abs(geometry.to_world[:, :, :3]).sum(axis=2).max(axis=1)

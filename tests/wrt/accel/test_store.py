@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import pickle
+from copy import deepcopy
 from hashlib import sha256
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from wrt.accel.store import MAGIC, check_binary
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import DIGEST_BYTES
 from wrt.core.errors import InputError
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 BALL = icosphere(2)
@@ -41,6 +44,35 @@ def same(a, b) -> None:
 def signed(data: bytes) -> bytes:
     """With a checksum that fits, as somebody with bad intentions would write it."""
     return data + sha256(data).digest()
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_a_structure_goes_through_pickle(name: str) -> None:
+    """Also copied deeply; with the options that it was built with, and after a refit."""
+    ball = Mesh(BALL.vertices, BALL.faces, normals=BALL.vertices)
+    before = build(ball, name, **({"triangle": "moeller_trumbore", "max_leaf": 2} if name == "bvh2" else {}))
+    for after in (pickle.loads(pickle.dumps(before)), deepcopy(before)):
+        same(before, after)
+        assert after.structure == before.structure and after._options == before._options
+        hits, again = before.closest_hit(*rays()), after.closest_hit(*rays())
+        assert np.array_equal(hits.shading_normal, again.shading_normal, equal_nan=True)
+    if name == "bvh2":
+        before.refit(2.0 * BALL.vertices)
+        after = pickle.loads(pickle.dumps(before))
+        same(before, after)
+        before.refit(3.0 * BALL.vertices)
+        after.refit(3.0 * BALL.vertices)
+        same(before, after)
+
+
+def test_a_scene_goes_through_pickle_and_instances_say_that_they_do_not() -> None:
+    material = wrt.Material()
+    scene = wrt.Scene((wrt.Object(BALL, (material,)),), spheres=(wrt.Sphere((0.0, 0.0, 3.0), 1.0, material),))
+    before = build(scene)
+    hits = pickle.loads(pickle.dumps(before)).closest_hit(*rays())
+    assert np.array_equal(hits.object, before.closest_hit(*rays()).object) and set(hits.object) == {-1, 0, 1}
+    with pytest.raises(TypeError, match="structures with instances cannot be pickled yet"):
+        pickle.dumps(build([BALL]))
 
 
 @pytest.fixture
@@ -122,7 +154,8 @@ def set_child(i: int, first: int, count: int):
 @pytest.mark.parametrize("change", [
     set_child(0, 0, 0), set_child(3, 1, 0), set_child(3, 10**9, 0), set_child(3, -5, 0), set_child(3, 10**6, 4),
     set_child(3, 0, 2**31 - 1), set_child(3, 0, -1), set_child(0, 5, 0),
-    lambda nodes, order, header: order.__setitem__(0, 10**6), lambda nodes, order, header: order.__setitem__(0, order[1]),
+    lambda nodes, order, header: order.__setitem__(0, 10**6), lambda nodes, order, header: order.__setitem__(0, -1),
+    lambda nodes, order, header: order.__setitem__(0, order[1]),
     lambda nodes, order, header: header.update(order=-1), lambda nodes, order, header: header["bytes"].update(nodes=-64),
     lambda nodes, order, header: header.update(accel="brute_force"), lambda nodes, order, header: header.update(triangle="x"),
     lambda nodes, order, header: header.update(depth="deep"),

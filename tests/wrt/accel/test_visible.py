@@ -147,7 +147,8 @@ def test_a_hit_sees_where_it_was_seen_from(name: str, far: float) -> None:
     turn = np.linalg.qr(np.random.default_rng(7).normal(size=(3, 3)))[0]
     floor = shapes.quad()
     mesh = shapes.icosphere(3) if name == "ball" else wrt.Mesh(floor.vertices @ turn.T, floor.faces)
-    at = 0.9 * unit_vectors(5000, 8) if name == "ball" else np.random.default_rng(9).uniform(-0.9, 0.9, (5000, 3)) * [1, 1, 0] @ turn.T
+    on_floor = np.random.default_rng(9).uniform(-0.9, 0.9, (5000, 3)) * [1.0, 1.0, 0.0] @ turn.T
+    at = 0.9 * unit_vectors(5000, 8) if name == "ball" else on_floor
     at = np.float32(at * (1e-3 if name == "patch" else 1.0))
     eye = np.float32(at + far * unit_vectors(5000, 10))
     accel = wrt.build(mesh)
