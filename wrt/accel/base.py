@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
-from functools import partial
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -23,7 +22,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries import Queries
 from wrt.accel.ray_query import world_of
 from wrt.accel.rays import vectors
-from wrt.accel.store import save
+from wrt.accel.store import check_order, pickled, save
 from wrt.accel.structure import Structure, check_options, check_units
 from wrt.core.arrays import check_no_gradients, taken
 from wrt.core.device import start, upload
@@ -65,21 +64,14 @@ class Accelerator(Queries, ABC):
         self = cls.__new__(cls)
         self._begin(geometry, device, threads, triangle, box)
         begin = time.perf_counter()
-        order, count = built.order, len(geometry)
-        within = order.min(initial=0) >= 0 and order.max(initial=-1) < count
-        if not (within and np.bincount(order, minlength=count).all()):
-            raise InputError(f"is no {cls.name} over this geometry: its primitives are not in it, or not all of them")
+        check_order(built.order, len(geometry), cls.name)
         self._check(built)
         self._take(built, begin, built.sah_cost)
         return self
 
     def __reduce__(self) -> Any:
         """For pickle: what `save` writes, and what the structure is over. A refit there measures growth from the shape of now."""
-        state, units, of = self._state, self.structure.units, self._state.geometry
-        make = partial(type(self).restore, triangle=units.triangle, box=units.box)
-        options = {name: value for name, value in self._options.items() if name != "progress"}
-        return (make, (state.built.on_host(), Geometry(of.vertices, of.faces, of.spheres), str(self.device), self.threads),
-                {"attributes": self.attributes, "_options": options})
+        return pickled(self, self._state)
 
     def __copy__(self) -> Accelerator:
         """The same structure, which a refit of this one leaves as it is."""

@@ -92,7 +92,8 @@ class HitPoints:
 
     @property
     def instance(self) -> Any:
-        """(N,) int32: row of accel.geometry.to_world; -1 on a miss."""
+        """(N,) int32: what Instances.move takes: over a scene the same as `object`, else a row of accel.geometry.to_world; -1 on a
+        miss."""
         return self._filled("instance")
 
     @property
@@ -125,6 +126,8 @@ class HitPoints:
         if name == "shading" and world.normals is None:
             name = "normal"
         _require(world, name)
+        if name == "instance" and world.objects is not None:
+            name = "object"
         n, device = len(self.t), accel.device
         out: Any = HitPlaces()
         setattr(out, name, array := wp.empty(n, dtype=fields_of(HitPlaces)[name].type.dtype, device=device))

@@ -13,6 +13,7 @@ import warp as wp
 from wrt.accel.answers import AccelStats, Refit
 from wrt.accel.base import Accelerator, array_bytes
 from wrt.accel.built import Built, State
+from wrt.accel.flatten import World
 from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of
 from wrt.accel.instancing import MAX_SPREAD
 from wrt.accel.structure import Structure, check_units
@@ -84,8 +85,9 @@ class Instances(Accelerator):
         """Put an instance in another place, or several at once: boxes of the upper level are fitted anew, its trees stay as they
         are, and the meshes are not touched.
 
-        instance: a row of geometry.to_world, as hits.instance tells it (over worlds, row geometry.first_instance[w] + k is object k
-        of world w), or (R,) of them, none twice; matrix: to the world, (4, 4) or (R, 4, 4), affine. The hits are those of a
+        instance: what hits.instance tells, or (R,) of them, none twice: over a scene the number of an object, as hits.object; else
+        a row of geometry.to_world (over worlds, row geometry.first_instance[w] + k is object k of world w). matrix: to the world,
+        (4, 4) or (R, 4, 4), affine. The hits are those of a
         structure that is built anew, to the last bit. rebuild_at, and what other threads may do meanwhile: as in refit; growth is
         that of the upper level. Raises InputError for other shapes and rows, for what is not an instance, and for matrices that
         flatten or shear more than wrt.build takes for instances.
@@ -93,7 +95,7 @@ class Instances(Accelerator):
         with self._refitting:
             begin, before = time.perf_counter(), self._state
             geometry: Any = before.geometry
-            rows, matrices = moves(geometry, instance, matrix)
+            rows, matrices = moves(rows_of(geometry, self.attributes), instance, matrix)
             to_world = geometry.to_world.copy()
             to_world[rows] = matrices
             geometry = replace(geometry, to_world=to_world)
@@ -131,8 +133,21 @@ class Instances(Accelerator):
                 f"{len(self.bottoms)} {self.structure.accel.name}, {s.bytes / 1e6:.1f} MB, built in {s.build_seconds:.3f} s)")
 
 
-def moves(geometry: InstancedGeometry, instance: Any, matrix: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The arguments of Instances.move as (R,) rows and (R, 3, 4) float64. Raises InputError that names the argument."""
+def rows_of(geometry: InstancedGeometry, world: World | None) -> np.ndarray:
+    """Row of geometry.to_world by the number that a caller has: over a scene that of the object, whose rows are fewer where several
+    objects are joined. -1: it has no place of its own."""
+    placed = np.flatnonzero(geometry.is_placed)
+    if world is None or world.objects is None:
+        rows, numbers = np.full(len(geometry.part), -1), placed
+    else:
+        rows, numbers = np.full(len(world.objects), -1), np.searchsorted(world.objects, geometry.first_prim[placed], "right") - 1
+    rows[numbers] = placed
+    return rows
+
+
+def moves(row_of: np.ndarray, instance: Any, matrix: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The arguments of Instances.move as (R,) rows and (R, 3, 4) float64; row_of: of `rows_of`. Raises InputError that names
+    the argument."""
     rows = real_numbers(instance, "instance", "a whole number, or (R,)")
     if rows.ndim > 1 or (rows.dtype.kind not in "iu" and rows.size):
         raise InputError(f"instance must be a whole number, or (R,) of them, got {shown(instance)}")
@@ -141,17 +156,18 @@ def moves(geometry: InstancedGeometry, instance: Any, matrix: Any) -> tuple[np.n
         raise InputError(f"matrix must be {(*rows.shape, 4, 4)}, got {matrices.shape}")
     if matrices.shape[-2] == 4 and (matrices[..., 3, :] != [0.0, 0.0, 0.0, 1.0]).any():
         raise InputError("matrix must be affine: its last row 0, 0, 0, 1")
-    rows, matrices = rows.reshape(-1).astype(np.int64), matrices[..., :3, :].reshape(-1, 3, 4)
-    if len(rows) and not (rows.min() >= 0 and rows.max() < len(geometry.part)):
-        raise InputError(f"instance must be 0 to {len(geometry.part) - 1}")
-    if len(np.unique(rows)) < len(rows):
-        raise InputError("instance has a row twice")
-    if not geometry.is_placed[rows].all():
-        raise InputError(f"instance {rows[np.argmin(geometry.is_placed[rows])]} is all that has no place of its own, and no matrix")
+    numbers, matrices = rows.reshape(-1).astype(np.int64), matrices[..., :3, :].reshape(-1, 3, 4)
+    if len(numbers) and not (numbers.min() >= 0 and numbers.max() < len(row_of)):
+        raise InputError(f"instance must be 0 to {len(row_of) - 1}")
+    if len(np.unique(numbers)) < len(numbers):
+        raise InputError("instance has a number twice")
+    rows = row_of[numbers]
+    if (rows < 0).any():
+        raise InputError(f"instance {numbers[np.argmin(rows)]} has no place of its own: it was joined with others, or is a sphere")
     with np.errstate(all="ignore"):
         linear = matrices[:, :, :3]
         good = np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(np.linalg.det(linear)) > 0.0)
         good[good] = spread_of(matrices[good], inverse_of(matrices[good])) <= MAX_SPREAD
     if not good.all():
-        raise InputError(f"matrix must be finite and flatten nothing; that of instance {rows[np.argmin(good)]} is or does not")
+        raise InputError(f"matrix must be finite and flatten nothing; that of instance {numbers[np.argmin(good)]} is or does not")
     return rows, matrices

@@ -7,6 +7,7 @@ structure's class, and indices are checked before a ray follows them.
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,15 @@ def save(structure: Structure, state: State, path: str | os.PathLike[str]) -> No
         write_checked(file, MAGIC, header, body)
 
 
+def pickled(accel: Any, state: State) -> tuple[Any, ...]:
+    """What Accelerator.__reduce__ gives: how to restore it, from what, and what else it knows."""
+    units, of = accel.structure.units, state.geometry
+    make = partial(type(accel).restore, triangle=units.triangle, box=units.box)
+    given = state.built.on_host(), Geometry(of.vertices, of.faces, of.spheres), str(accel.device), accel.threads
+    options = {name: value for name, value in accel._options.items() if name != "progress"}
+    return make, given, {"attributes": accel.attributes, "_options": options}
+
+
 def read(path: str | os.PathLike[str], geometry: Geometry, device: str = "cpu", threads: int | None = None) -> Any:
     """An Accelerator from a file that `save` wrote, over the same geometry. Raises InputError for a file that is missing, foreign,
     damaged, of another version or over another mesh."""
@@ -101,6 +111,13 @@ def read_arrays(cls: type[Kind], header: dict[str, Any], body: memoryview) -> Bu
     order = np.frombuffer(body[at:], "<i4").astype(np.int32)
     nodes, leaves, depth, sah_cost = (header[name] for name in STATS)
     return Built(arrays, order, int(nodes), int(leaves), int(depth), float(sah_cost))
+
+
+def check_order(order: np.ndarray, count: int, name: str) -> None:
+    """Raise InputError unless all primitives 0 .. count - 1 are there, and no others."""
+    within = order.min(initial=0) >= 0 and order.max(initial=-1) < count
+    if not (within and np.bincount(order, minlength=count).all()):
+        raise InputError(f"is no {name} over this geometry: its primitives are not in it, or not all of them")
 
 
 def check_binary(nodes: np.ndarray, n_primitives: int, max_depth: int) -> None:

@@ -15,6 +15,8 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry, place
 from wrt.accel.instances import Instances
 from wrt.core.errors import InputError
+from wrt.scene.materials import Material
+from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import icosphere, torus
 
 
@@ -126,8 +128,8 @@ def with_a_part_in_the_world() -> Instances:
     ([[1], [1, 2]], np.eye(4), "instance must be a whole number"),
     (3, "no", r"matrix must be \(4, 4\) of real numbers"),
     (4, np.eye(4), "instance must be 0 to 3"), (-1, np.eye(4), "instance must be 0 to 3"),
-    (0.5, np.eye(4), "instance must be a whole number"), ([2, 2], np.tile(np.eye(4), (2, 1, 1)), "instance has a row twice"),
-    (0, np.eye(4), "instance 0 is all that has no place of its own"),
+    (0.5, np.eye(4), "instance must be a whole number"), ([2, 2], np.tile(np.eye(4), (2, 1, 1)), "instance has a number twice"),
+    (0, np.eye(4), "instance 0 has no place of its own"),
     (1, np.diag([1.0, 1.0, 0.0, 1.0]), "flatten nothing; that of instance 1"),
     (1, np.full((3, 4), np.nan), "matrix must be finite"), (1, 2.0 * np.eye(4), "matrix must be affine"),
     (1, np.diag([1e25, 1e25, 1e25, 1.0]), "farther than 1e"),
@@ -169,3 +171,35 @@ def test_moved_by_turns_while_others_ask() -> None:
     jobs: list[Callable[[], None]] = [flip, flip, ask]
     at_a_time(*jobs)
     assert known[0] != known[1]
+
+
+def test_over_a_scene_an_instance_is_an_object() -> None:
+    """Two objects, the first and one between, are joined in the world, so that rows of geometry.to_world are numbered otherwise."""
+    grey, ball, large = (Material(),), icosphere(1), icosphere(5)
+    alone = {0: icosphere(2), 4: ball}
+    scene = Scene(tuple(Object(alone.get(k, large), grey, shifted(10.0 * k)) for k in range(20)),
+                  spheres=(Sphere((-10.0, 0.0, 0.0), 1.0, grey[0]),))
+    accel = build(scene)
+    assert isinstance(accel, Instances) and len(accel.geometry.part) < 20  # type: ignore[attr-defined]
+    origins, down = np.float32([[10.0 * k, 0.0, 5.0] for k in (*range(20), -1)]), np.float32([[0.0, 0.0, -1.0]] * 21)
+    before = accel.closest_hit(origins, down)
+    assert before.object.tolist() == before.instance.tolist() == list(range(21))
+    for k in range(20):
+        if k in alone:
+            with pytest.raises(InputError, match=f"instance {k} has no place of its own"):
+                accel.move(k, shifted(1000.0))
+            continue
+        accel.move(k, shifted(1000.0))
+        assert np.flatnonzero(np.isinf(accel.closest_hit(origins, down).t)).tolist() == [k]
+        accel.move(int(before.instance[k]), shifted(10.0 * k))
+        assert np.array_equal(accel.closest_hit(origins, down).t, before.t)
+    with pytest.raises(InputError, match="instance 20 has no place of its own"):
+        accel.move(20, shifted(1000.0))
+    with pytest.raises(InputError, match="instance must be 0 to 20"):
+        accel.move(21, shifted(1000.0))
+
+
+def shifted(x: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[0, 3] = x
+    return matrix
