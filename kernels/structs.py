@@ -22,8 +22,12 @@ if TYPE_CHECKING:  # device code is not for type checkers: its annotations are W
     from typing import no_type_check as noinline
 else:
     def kernel(function):
-        """A Warp kernel in a module of its own, without fused multiply-add and without the code for gradients."""
-        return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+        """A Warp kernel in a module of its own, without fused multiply-add and without the code for gradients.
+
+        wrt's own kernels are compiled in release mode, whatever wp.config.mode is: a kernel of Warp 1.19 in debug mode ends the
+        process where several threads launch it. A kernel of the user follows wp.config.mode."""
+        own = {"mode": "release"} if function.__module__.startswith("wrt.") else {}
+        return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS | own, enable_backward=False)
 
     def noinline(function):
         """A Warp function that is called, and not copied to where it is called."""

@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 import warp as wp
 
 from wrt.accel.geometry import Geometry
+from wrt.core.device import on_host
 
 T = TypeVar("T")
 
@@ -35,7 +36,7 @@ class Built:
         """The same with NumPy arrays."""
         if not isinstance(self.order, wp.array):
             return self
-        return replace(self, arrays={name: array.numpy() for name, array in self.arrays.items()}, order=self.order.numpy(),
+        return replace(self, arrays={name: on_host(array) for name, array in self.arrays.items()}, order=on_host(self.order),
                        parents=None)
 
     @property

@@ -10,7 +10,7 @@ import warp as wp
 
 from wrt.accel.answers import Counters
 from wrt.accel.structure import Structure
-from wrt.core.device import upload
+from wrt.core.device import on_host, upload
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts
 
 
@@ -27,7 +27,7 @@ def counted(trace: Callable[[Structure, Any], None], structure: Structure, data:
         own.recorder.first = upload(first, wp.int64, device)
         own.recorder.fetches = wp.zeros(int(first[-1]) if len(first) else 0, dtype=wp.int64, device=device)
         trace(counting, own)
-        return own.recorder.counts.numpy(), own.recorder.fetches.numpy()
+        return on_host(own.recorder.counts), on_host(own.recorder.fetches)
 
     counts, fetches = run(np.zeros(0, np.int64))
     first = np.zeros(n + 1, np.int64)

@@ -19,6 +19,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.structure import Kind, Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import read_checked, write_checked
+from wrt.core.device import record_dtype
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
 from wrt.core.write_file import check_writable, replacing
@@ -42,7 +43,7 @@ def array_types(accel: type[Kind], triangle: str = "watertight") -> dict[str, np
 def row_type(kind: Any) -> np.dtype[Any]:
     """The NumPy type of one row of a Warp type: a struct, a vector or a number."""
     if hasattr(kind, "numpy_dtype"):
-        return np.dtype(kind.numpy_dtype())
+        return record_dtype(kind)
     scalar = wp.dtype_to_numpy(getattr(kind, "_wp_scalar_type_", kind))
     return np.dtype((scalar, getattr(kind, "_shape_", ())))
 

@@ -13,7 +13,7 @@ from wrt.accel.bvh.top_down import build_options, in_order
 from wrt.accel.bvh.tree import BvhOptions, half_areas, squeeze
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of
-from wrt.core.device import launch, records, start, upload
+from wrt.core.device import launch, on_host, records, start, upload
 from wrt.kernels.build import bvh2 as build_bvh2
 from wrt.kernels.build import fit
 from wrt.kernels.build.records import BuildData, BuildOptions, BuildTask
@@ -101,8 +101,8 @@ def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[
     launch(build_bvh2.make_build_ranges(build_bvh2.SPLIT["binned"]), len(tasks), data, upload(tasks, BuildTask, cpu),
            build_options(BvhOptions(max_leaf=1)), 0, wp.empty(1, dtype=BuildTask, device=cpu), none, depth)
     used = data.used.numpy() != 0
-    order = data.records.numpy()["prim_id"].copy() if n else np.zeros(0, np.int32)
-    return squeeze(data.nodes.numpy(), used), order, (np.cumsum(used) - 1)[slot[:-1]].astype(np.int32), int(depth.numpy()[0]) + 1
+    order = on_host(data.records)["prim_id"].copy() if n else np.zeros(0, np.int32)
+    return squeeze(on_host(data.nodes), used), order, (np.cumsum(used) - 1)[slot[:-1]].astype(np.int32), int(depth.numpy()[0]) + 1
 
 
 def write_placements(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray) -> TopLevel:
@@ -136,7 +136,7 @@ def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low:
     tree.arrived = wp.zeros(len(top.nodes), dtype=wp.int32, device=cpu)
     tree.below = wp.empty(len(top.nodes), dtype=fit.Below, device=cpu)
     launch(fit.fit, len(top.nodes), tree, options)
-    return write_placements(replace(top, nodes=tree.nodes.numpy(), low=all_low, high=all_high), geometry, rows)
+    return write_placements(replace(top, nodes=on_host(tree.nodes), low=all_low, high=all_high), geometry, rows)
 
 
 def world_boxes(geometry: InstancedGeometry, rows: np.ndarray, boxes: list[Boxes]) -> tuple[np.ndarray, np.ndarray]:

@@ -10,9 +10,9 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import wait
 from contextlib import contextmanager
-from functools import cache, partial, wraps
+from functools import partial, wraps
 from math import prod
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,7 +25,7 @@ from wrt.core import cuda
 from wrt.core.compiler import empty_kernel, is_whole, prepare_compiler
 from wrt.core.errors import InputError
 from wrt.core.seconds import loading
-from wrt.core.threads import run_all, thread_count
+from wrt.core.threads import run_all, submit, thread_count, with_stack
 
 MOST_ROWS = (1 << 31) - 1
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
@@ -152,7 +152,7 @@ def load_kernel(kernel: Any, device: Any) -> None:
     if place not in loaded.devices:
         with loading(), loaded.lock:
             if place not in loaded.devices:
-                _load(kernel, device, place[1])
+                with_stack(partial(_load, kernel, device, place[1]))
                 loaded.devices.add(place)
 
 
@@ -164,10 +164,11 @@ def preloading(*kernels: Any) -> Iterator[None]:
     if not missing:
         yield
         return
-    with ThreadPoolExecutor(len(missing), "wrt preloads") as pool:
-        for kernel in missing:
-            pool.submit(load_kernel, kernel, start("cpu"))
+    loads = [submit(load_kernel, kernel, start("cpu")) for kernel in missing]
+    try:
         yield
+    finally:
+        wait(loads)
 
 
 def preload_headers() -> None:
@@ -175,7 +176,7 @@ def preload_headers() -> None:
     wrt's own: one that was forked meanwhile would wait for ever. Errors are told where a kernel cannot be compiled."""
     cpu = start("cpu")
     if not any(Path(wp.config.kernel_cache_dir).glob("wp_*")):
-        ThreadPoolExecutor(1, "wrt headers").submit(load_kernel, empty_kernel, cpu)
+        submit(partial(load_kernel, empty_kernel, cpu))
 
 
 def _load(kernel: Any, device: Any, block_dim: int) -> None:
@@ -238,11 +239,28 @@ def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:
         raise InputError(f"{len(array)} rows of {dtype.__name__ if isinstance(dtype, type) else dtype.key} are more than an array"
                          f" on a device can have, 2^31 - 1; a binary tree (bvh2) has the fewest")
     if hasattr(dtype, "numpy_dtype"):  # a struct
-        array = np.ascontiguousarray(array)
-    else:
-        array = np.ascontiguousarray(array, dtype=wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype)))
+        assert array.dtype == record_dtype(dtype)
+        rows = np.ascontiguousarray(array).view(np.uint8)
+        return _seen_as(wp.array(rows, dtype=wp.uint8, device=device, copy=not rows.flags.writeable), dtype, array.shape)
+    array = np.ascontiguousarray(array, dtype=wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype)))
     # A frozen NumPy array (a scene's) cannot be aliased: Warp wants to be able to write.
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
+
+
+def on_host(array: Any) -> np.ndarray:
+    """A Warp array, also of structs, as a NumPy array: of the same memory on the CPU, a copy of what is on a GPU."""
+    if not hasattr(array.dtype, "numpy_dtype"):
+        return np.asarray(array.numpy())
+    layout = record_dtype(array.dtype)
+    rows: np.ndarray = _seen_as(array, wp.uint8, (array.size * layout.itemsize,)).numpy()
+    return rows.view(layout).reshape(array.shape)
+
+
+def _seen_as(array: Any, dtype: Any, shape: tuple[int, ...]) -> Any:
+    """A Warp array of the same memory, which it keeps."""
+    out = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device)
+    out.memory = array
+    return out
 
 
 def empty_aligned(shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
@@ -253,12 +271,12 @@ def empty_aligned(shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
     return memory[first : first + size].view(dtype).reshape(shape)
 
 
-@cache
+@made_once
 def record_dtype(struct: Any) -> np.dtype:
     """The memory layout of a Warp struct.
 
-    NumPy parses it by way of `ast`, which two threads cannot do at the same time (CPython 3.11): what is asked for here before
-    threads start, they may ask for again. A Warp array of structs is not for threads to make, either.
+    NumPy parses it by way of `ast`, and CPython 3.11 raises SystemError where two threads do so at the same time. Warp would parse
+    it again for each array: `upload` makes and `on_host` reads arrays of structs without that.
     """
     return np.dtype(struct.numpy_dtype())
 

@@ -1,4 +1,4 @@
-"""Threads of the CPU: how many, and tasks on them."""
+"""Threads of the CPU: how many, the size of their stacks, and tasks on them."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ import operator
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from functools import cache
-from queue import SimpleQueue
+from functools import cache, partial
 from typing import Any, TypeVar
 
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
 
-MOST_HELPERS = 1 << 10
+MOST_THREADS = 1 << 10
+# Bytes of a stack. With 256 KiB queries crash, whose kernels have arrays on it, with 512 renders, and with 768 the compiler
+# (Linux, x86-64).
+STACK = 2 << 20
 T = TypeVar("T")
 
 
@@ -32,55 +34,116 @@ def thread_count(threads: int | None) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-class _Helper:
-    """A thread that does what it is given, one thing after another: to start one takes as long as to trace thousands of rays. (One
-    of concurrent.futures takes 0.03 ms longer to begin and to end, of 1 for 100,000 rays on two threads.)"""
-
-    def __init__(self, idle: deque[_Helper]) -> None:
-        self.idle, self.given = idle, threading.Lock()
-        self.given.acquire()
-        threading.Thread(target=self._wait, name="wrt helper", daemon=True).start()
-
-    def do(self, work: Callable[[], None]) -> None:
-        """work raises nothing."""
-        self.work = work
-        self.given.release()
-
-    def _wait(self) -> None:
-        while True:
-            self.given.acquire()
-            self.work()
-            del self.work
-            self.idle.append(self)
+# --- stacks ------------------------------------------------------------------------------------------------------------
 
 
 @cache
-def _idle(process: int) -> deque[_Helper]:
-    """Those that wait. A process that was forked has none of its parent's."""
-    return deque()
+def _stack_limit() -> float:
+    """Bytes of the main thread's stack, and of a new thread's where threading.stack_size() is 0; infinite where the system has no
+    limit that is known."""
+    with contextlib.suppress(ImportError):
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_STACK)[0]
+        return float("inf") if limit == resource.RLIM_INFINITY else limit
+    return float("inf")
 
 
-def _helper() -> _Helper:
-    idle = _idle(os.getpid())
-    try:
-        return idle.pop()
-    except IndexError:
-        return _Helper(idle)
+@cache
+def _changing_size(process: int) -> threading.Lock:
+    """A process that was forked has one that nobody holds."""
+    return threading.Lock()
 
 
-def taken_from(things: deque[T]) -> list[T]:
-    """All of them; other threads may take or add some meanwhile."""
-    out = []
-    with contextlib.suppress(IndexError):
-        while True:
-            out.append(things.popleft())
-    return out
+@contextlib.contextmanager
+def _large_stacks() -> Iterator[bool]:
+    """Threads that start in the block have stacks of STACK bytes or more; it yields whether they would have anyway. If not, threads
+    that the user starts meanwhile have them too. (threading.stack_size() cannot be asked without setting it.)"""
+    with _changing_size(os.getpid()):
+        before = threading.stack_size(STACK)
+        large = (before or _stack_limit()) >= STACK
+        if large:
+            threading.stack_size(before)
+        try:
+            yield large
+        finally:
+            if not large:
+                threading.stack_size(before)
+
+
+_here = threading.local()  # large: whether this thread's stack is
+
+
+def _has_stack() -> bool:
+    """Whether this thread's stack has STACK bytes. A thread of the user counts as having what threads have that start now."""
+    if not hasattr(_here, "large"):
+        if threading.current_thread() is threading.main_thread():
+            _here.large = _stack_limit() >= STACK
+        else:
+            with _large_stacks() as _here.large:
+                pass
+    return bool(_here.large)
+
+
+def with_stack(task: Callable[[], T]) -> T:
+    """Run a task that kernels or their compiler are part of: here, or on a thread with a large stack where this one's is small
+    (they would end the process with a segmentation fault)."""
+    return task() if _has_stack() else submit(task).result()
+
+
+# --- tasks -------------------------------------------------------------------------------------------------------------
+
+
+class Pool(ThreadPoolExecutor):
+    """Threads with large stacks. They start when they are needed, and are kept.
+
+    The standard pool takes no tasks when Python's main thread has ended; then each task has a thread of its own, or runs at once in
+    the thread that submits it, where Python starts no more threads.
+    """
+
+    def __init__(self, threads: int, name: str = "wrt") -> None:
+        super().__init__(threads, name, initializer=partial(setattr, _here, "large", True))
+
+    def submit(self, task: Callable[..., T], /, *arguments: Any, **named: Any) -> Future[T]:
+        with _large_stacks():
+            if threading.main_thread().is_alive():
+                return super().submit(task, *arguments, **named)
+            future = Future[T]()
+            alone = partial(_complete, future, partial(task, *arguments, **named))
+            try:
+                threading.Thread(target=alone, name="wrt").start()
+            except RuntimeError:
+                alone()
+            return future
+
+
+def _complete(future: Future[T], task: Callable[[], T]) -> None:
+    """Run the task, and let its future know."""
+    if future.set_running_or_notify_cancel():
+        try:
+            future.set_result(task())
+        except BaseException as error:
+            future.set_exception(error)
+
+
+@cache
+def _pool(process: int) -> Pool:
+    """Shared by all that the process runs. A process that was forked has a pool of its own."""
+    return Pool(MOST_THREADS)
+
+
+def submit(task: Callable[..., T], *arguments: Any) -> Future[T]:
+    """Run a task on a thread of the process's pool."""
+    return _pool(os.getpid()).submit(task, *arguments)
 
 
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
     """Run all tasks on so many threads, this one among them; after the first error none is begun, and it is raised when those
     that run have ended."""
-    jobs = list(tasks)
+    with_stack(partial(_run_all, list(tasks), threads))
+
+
+def _run_all(jobs: list[Callable[[], None]], threads: int) -> None:
     if threads == 1 or len(jobs) <= 1:
         for job in jobs:
             job()
@@ -100,25 +163,14 @@ def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
                 errors[i] = error
                 left.clear()
 
-    places, ended = deque(range(min(threads, len(jobs), MOST_HELPERS) - 1)), SimpleQueue[None]()
-
-    def help_out() -> None:
-        try:
-            places.pop()
-        except IndexError:  # too late
-            return
-        work()
-        ended.put(None)
-
-    helpers = len(places)
+    helpers: list[Future[None]] = []
     try:
-        for _ in range(helpers):
-            _helper().do(help_out)
+        for _ in range(min(threads, len(jobs)) - 1):
+            helpers.append(submit(work))
         work()
     finally:
         left.clear()
-        for _ in range(helpers - len(taken_from(places))):
-            ended.get()
+        wait([helper for helper in helpers if not helper.cancel()])  # none that has not begun
     if errors:
         raise errors.pop(min(errors))
 
@@ -130,18 +182,16 @@ def run_growing(begin: Callable[[Any], tuple[Callable[[], Any], Callable[[], Ite
     begin(task) gives the job to run on a thread, and what to call afterwards, which gives more tasks. Both calls are made on this
     thread. The first error is raised after the jobs that run have ended.
     """
-    with ThreadPoolExecutor(threads) as pool:
-        running: dict[Future[Any], Callable[[], Iterable[Any]]] = {}
-
-        def submit(task: Any) -> None:
-            job, after = begin(task)
-            running[pool.submit(job)] = after
-
-        for task in tasks:
-            submit(task)
-        while running:
+    waiting, running = deque(tasks), dict[Future[Any], Callable[[], Iterable[Any]]]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < threads:
+                job, after = begin(waiting.popleft())
+                running[submit(job)] = after
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
+                after = running.pop(future)
                 future.result()
-                for task in running.pop(future)():
-                    submit(task)
+                waiting.extend(after())
+    finally:
+        wait(running)

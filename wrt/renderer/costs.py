@@ -12,8 +12,9 @@ import warp as wp
 
 from wrt.accel.counting import copied
 from wrt.accel.structure import Structure
-from wrt.core.device import record_dtype
+from wrt.core.device import on_host
 from wrt.core.threads import run_all
+from wrt.kernels.structs import fields_of
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import Counts, Recorder
 from wrt.renderer.film_arrays import DeviceFilm
@@ -22,7 +23,7 @@ from wrt.renderer.prepare import Prepared, prepare
 from wrt.renderer.tiles import Rectangle, Work
 from wrt.scene.cameras import CameraKind
 
-COUNTERS = record_dtype(Counts).names or ()
+COUNTERS = tuple(fields_of(Counts))
 
 
 class LoggedStructure(NamedTuple):
@@ -78,7 +79,7 @@ class CostCounter:
         recorder, log = Recorder(), ray_log.RayLog()
         recorder.counts, log.used = self.zeros(n, Counts), self.zeros(n, wp.int32)
         self.trace(rectangle, film, recorder, log)
-        return log.used.numpy(), recorder.counts.numpy()
+        return log.used.numpy(), on_host(recorder.counts)
 
     def costs(self, go_on: Callable[[int], bool] = lambda done: True) -> dict[str, np.ndarray] | None:
         """COUNTERS, (H, W) int32 each: of each pixel summed over its rays (stack: the deepest).

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from wrt.core.checks import as_one, as_size
-from wrt.core.device import load_kernel, made_once, start, upload
+from wrt.core.device import launch, made_once, start, upload
 from wrt.kernels.shade.pixel_rays import make_camera_rays_kernel
 from wrt.renderer.upload import camera_kind, camera_struct
 from wrt.scene.cameras import CameraKind
@@ -33,9 +33,8 @@ def film_rays(camera: CameraKind, size: tuple[int, int], film: np.ndarray) -> tu
     right one."""
     device = start("cpu")
     kernel = _kernel(camera_kind(as_one(camera, CameraKind, "camera").device))
-    load_kernel(kernel, device)
     origins, directions = (wp.empty(len(film), dtype=wp.vec3, device=device) for _ in range(2))
-    wp.launch(kernel, len(film), [camera_struct(camera, size), upload(film, wp.vec2, device)], [origins, directions], device=device)
+    launch(kernel, len(film), camera_struct(camera, size), upload(film, wp.vec2, device), origins, directions)
     return origins.numpy(), directions.numpy()
 
 

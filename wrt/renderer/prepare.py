@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, wait
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,7 +16,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.build import build, reports_progress
 from wrt.core.device import load_kernel
 from wrt.core.seconds import Span, counted_once, loads_since
-from wrt.core.threads import thread_count
+from wrt.core.threads import Pool, thread_count
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Progress
 from wrt.renderer.pixels import aov_launch, film_launch
@@ -144,7 +144,7 @@ class _Preparation:
     def run(self, jobs: list[Callable[[], None]]) -> None:
         """Neither Ctrl-C nor an error waits for the compiler, and no wait is long: Python may hear of Ctrl-C only between two."""
         begin, reported = time.perf_counter(), ("", 0.0)
-        pool = ThreadPoolExecutor(1 + min(self.threads, len(self.kernels)), thread_name_prefix=PREPARING)
+        pool = Pool(1 + min(self.threads, len(self.kernels)), PREPARING)
         pending = {pool.submit(job) for job in jobs}
         try:
             while pending:

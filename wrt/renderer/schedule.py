@@ -7,8 +7,9 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from contextlib import closing
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,7 +17,7 @@ import warp as wp
 
 from wrt.core.errors import InputError
 from wrt.core.interrupts import held_interrupts
-from wrt.core.threads import taken_from
+from wrt.core.threads import submit, with_stack
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import Checkpoint
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
@@ -30,6 +31,7 @@ MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C has to wait for on a G
 # Times as many samples a pixel after a pass as before it. On the CPU waves of many samples of few pixels are the fastest (16 spp: 4
 # is up to 1.15 times as fast as 2, and 16 up to 1.1 times as fast as 4), but pictures that end early are the less even.
 GROWTH = 4
+STEP_SECONDS = 0.1
 # Samples (summed over pixels) that are done, and whether no tile runs at the moment: then each pixel is done whole.
 Steps = Generator[tuple[int, bool], None, None]
 
@@ -64,7 +66,6 @@ class LocalTracer:
     def __init__(self, prepared: Prepared) -> None:
         self.prepared, self.plan, self.device, self.seconds = prepared, prepared.plan, prepared.device, prepared.seconds
         self.facts, self.tiles = prepared.facts, prepared.tiles
-        self.pool = ThreadPoolExecutor(prepared.threads)  # for all passes: threads take a while to start; they end with this object
 
     def trace(self, film: DeviceFilm | AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
         trace = self.prepared.launch(film)
@@ -73,39 +74,45 @@ class LocalTracer:
             wp.synchronize_device(self.device)
             yield done, True
             return
-        left, samples = deque(work), deque[int]()  # a future for each job would take a tenth of a short picture's time
-        running, done = self._begin(trace, left, samples), 0
-        try:
-            while running:
-                wait(running, timeout=0.1)
-                at_rest = due()
-                waiting = taken_from(left) if at_rest else []
-                if at_rest:
-                    wait(running)
-                for future in [future for future in running if future.done()]:
-                    running.remove(future)
-                    future.result()
-                done += sum(taken_from(samples))
-                yield done, at_rest or not running
-                if waiting:
-                    left.extend(waiting)
-                    running = self._begin(trace, left, samples)
-        finally:
-            left.clear()
-            wait(running)
-
-    def _begin(self, trace: Callable[[Work], int], left: deque[Work], samples: deque[int]) -> list[Future[None]]:
-        """Threads that take what is left, one after another."""
+        if min(self.prepared.threads, len(work)) == 1:  # this one
+            yield from self._trace_here(trace, work, due)
+            return
+        left, samples = deque(work), list[int]()  # a future for each job would take a tenth of a short picture's time
+        at_rest = False
 
         def trace_left() -> None:
-            while True:
+            while not at_rest:
                 try:
                     job = left.popleft()
                 except IndexError:
                     return
                 samples.append(trace(job))
 
-        return [self.pool.submit(trace_left) for _ in range(min(self.prepared.threads, len(left)))]
+        running: list[Future[None]] = []
+        try:
+            while left or running:
+                running = running or [submit(trace_left) for _ in range(min(self.prepared.threads, len(left)))]
+                wait(running, timeout=STEP_SECONDS)
+                at_rest = due()
+                if at_rest:
+                    wait(running)
+                for future in [future for future in running if future.done()]:
+                    running.remove(future)
+                    future.result()
+                yield sum(samples), not running
+                at_rest = False
+        finally:
+            left.clear()
+            wait(running)
+
+    def _trace_here(self, trace: Callable[[Work], int], work: list[Work], due: Callable[[], bool]) -> Steps:
+        done, next_step = 0, time.monotonic() + STEP_SECONDS
+        for job in work:
+            done += with_stack(partial(trace, job))
+            if time.monotonic() >= next_step or due():
+                yield done, True
+                next_step = time.monotonic() + STEP_SECONDS
+        yield done, True
 
 
 class Passes:

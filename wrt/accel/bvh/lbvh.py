@@ -10,7 +10,7 @@ from wrt.accel.bvh.refit import Fitting, tree_of
 from wrt.accel.bvh.top_down import build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch_on, start
+from wrt.core.device import launch_on, on_host, start
 from wrt.core.errors import InputError
 from wrt.kernels.build import lbvh as kernels
 from wrt.kernels.traverse.bvh2 import Bvh2Node
@@ -24,7 +24,7 @@ def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
         return small_tree(*geometry.bounds())
     cpu = start("cpu")
     nodes, _, order, root = build_on(cpu, geometry.on(cpu), options, threads)
-    return BinaryTree(nodes.numpy().copy(), order.numpy().copy(), root.height)
+    return BinaryTree(on_host(nodes).copy(), order.numpy().copy(), root.height)
 
 
 def build_on(device: Any, shape: Any, options: BvhOptions, threads: int = 1) -> tuple[Any, Any, Any, Any]:

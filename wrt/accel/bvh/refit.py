@@ -10,7 +10,7 @@ import warp as wp
 
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch_on, start, upload
+from wrt.core.device import launch_on, on_host, start, upload
 from wrt.kernels.build import fit as kernels
 from wrt.kernels.build.records import BuildOptions
 from wrt.kernels.build.shape import bounds
@@ -57,7 +57,7 @@ class Fitting:
 
     def root(self) -> Root:
         """Of the tree that was fitted last."""
-        root = self.below[:1].numpy()[0]
+        root = on_host(self.below[:1])[0]
         area, plain = float(half_areas(root["lo"], root["hi"])), float(root["plain"])
         return Root(int(root["used"]), int(root["height"]), plain / area if area > 0.0 else float(root["size"]))
 
@@ -85,4 +85,4 @@ def refit_nodes(nodes: np.ndarray, order: np.ndarray, geometry: Geometry) -> np.
     there = upload(nodes.copy(), Bvh2Node, cpu)
     fitting = Fitting(cpu, len(geometry), len(nodes))
     fitting.refit(tree_of(fitting, there, parents_of(there), upload(order.copy(), wp.int32, cpu)), geometry.on(cpu))
-    return np.asarray(there.numpy()).copy()
+    return on_host(there).copy()

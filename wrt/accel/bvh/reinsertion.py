@@ -11,7 +11,7 @@ import warp as wp
 from wrt.accel.bvh.top_down import build_binned, build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch, preloading, records, start, upload
+from wrt.core.device import launch, on_host, preloading, records, start, upload
 from wrt.kernels.build import reinsertion as kernels
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
@@ -53,7 +53,7 @@ def build_refined(geometry: Geometry, options: BvhOptions, threads: int) -> Bina
         if len(tree.nodes) < 2:
             return tree
         links, walk, fell = optimized(tree, LARGEST_NODES, threads)
-    return tree if fell < LARGEST_NODES.least_gain else with_leaves(tree, links.numpy(), walk)
+    return tree if fell < LARGEST_NODES.least_gain else with_leaves(tree, on_host(links), walk)
 
 
 def leaf_begins(tree: BinaryTree) -> np.ndarray:
@@ -116,7 +116,7 @@ def move(links: Any, effort: Effort, rounds: int, threads: int) -> float:
     """Rounds: the best place of each large node is searched for, then the moves are made, the best first. The share of the areas
     that is gone in the end."""
     cpu = start("cpu")
-    view = links.numpy()
+    view = on_host(links)
     scale = scale_of(view)
     areas = half_areas(view, scale)
     area = first = float(areas.sum(dtype=np.float64))
@@ -126,7 +126,7 @@ def move(links: Any, effort: Effort, rounds: int, threads: int) -> float:
         moves["node"] = nodes
         found = upload(moves, kernels.Move, cpu)
         launch(kernels.find_moves, len(nodes), links, found, None, scale, threads=threads, step=NODES_PER_LAUNCH)
-        moves = found.numpy()
+        moves = on_host(found)
         moves = moves[moves["gain"] > 0.0]
         moves = moves[np.argsort(-moves["gain"], kind="stable")]
         touched = wp.zeros(len(view), dtype=wp.uint8, device=cpu)
@@ -178,11 +178,11 @@ def collapse(tree: BinaryTree, links: Any, walk: Any, options: BvhOptions) -> Bi
     """Subtrees become leaves wherever that costs no more; the depth is that of what is left. tree: with one record a leaf."""
     cpu = start("cpu")
     n_inner = len(tree.nodes)
-    launch(kernels.weigh, 1, links, walk, build_options(options), scale_of(links.numpy()))
+    launch(kernels.weigh, 1, links, walk, build_options(options), scale_of(on_host(links)))
     order = wp.empty(len(tree.order), dtype=wp.int32, device=cpu)
     nodes = wp.empty(n_inner, dtype=Bvh2Node, device=cpu)
     count = wp.zeros(1, dtype=wp.int32, device=cpu)
     launch(kernels.write_nodes, 1, links, walk, n_inner, upload(tree.order, wp.int32, cpu), order, nodes, count)
-    inner = (walk.index.numpy()[:n_inner] >= 0) & (links.numpy()["left"][:n_inner] >= 0)
+    inner = (walk.index.numpy()[:n_inner] >= 0) & (on_host(links)["left"][:n_inner] >= 0)
     depth = int(walk.level.numpy()[:n_inner][inner].max())
-    return BinaryTree(nodes.numpy()[: int(count.numpy()[0])].copy(), order.numpy(), depth)
+    return BinaryTree(on_host(nodes)[: int(count.numpy()[0])].copy(), order.numpy(), depth)

@@ -8,7 +8,7 @@ import warp as wp
 from wrt.accel.bvh.top_down import build_options, in_order, run_tasks
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.accel.geometry import Geometry
-from wrt.core.device import records, start, upload
+from wrt.core.device import on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import records as build_records
 from wrt.kernels.build.bvh2 import make_build_ranges
@@ -54,9 +54,9 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
 def compact(data: build_records.BuildData, depth: int) -> BinaryTree:
     """The tree without the room between its leaves."""
     used = data.left.numpy() != 0
-    nodes = squeeze(data.nodes.numpy(), data.used.numpy() != 0)
+    nodes = squeeze(on_host(data.nodes), data.used.numpy() != 0)
     index = np.cumsum(used, dtype=np.int32) - 1
     for side in ("0", "1"):
         leaf = nodes["count_" + side] > 0
         nodes["first_" + side][leaf] = index[nodes["first_" + side][leaf]]
-    return BinaryTree(nodes, data.records.numpy()["prim_id"][used], depth)
+    return BinaryTree(nodes, on_host(data.records)["prim_id"][used], depth)

@@ -10,7 +10,7 @@ import warp as wp
 
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, records, start, upload
+from wrt.core.device import load_kernel, on_host, records, start, upload
 from wrt.core.threads import run_growing
 from wrt.kernels.build import bvh2 as build_bvh2
 from wrt.kernels.build import records as build_records
@@ -65,7 +65,7 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
     for name, array in arrays.items():
         setattr(data, name, upload(array, data._cls.vars[name].type.dtype, cpu))
     depth = run_tasks(build_bvh2.make_build_ranges(build_bvh2.SPLIT[builder]), data, build_options(options), n, threads)
-    return BinaryTree(squeeze(data.nodes.numpy(), data.used.numpy() != 0), data.records.numpy()["prim_id"].copy(), depth)
+    return BinaryTree(squeeze(on_host(data.nodes), data.used.numpy() != 0), on_host(data.records)["prim_id"].copy(), depth)
 
 
 def build_options(options: BvhOptions) -> Any:
@@ -98,7 +98,7 @@ def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int, room:
 
         def parts() -> list[np.ndarray]:
             depths.append(int(depth.numpy()[0]))
-            return [left_over.numpy()[i : i + 1] for i in range(int(count.numpy()[0]))]
+            return [on_host(left_over)[i : i + 1] for i in range(int(count.numpy()[0]))]
 
         return partial(wp.launch, kernel, dim=1, device=cpu, inputs=inputs), parts
 

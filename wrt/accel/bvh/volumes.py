@@ -14,7 +14,7 @@ from wrt.accel.bvh.refit import refit_nodes
 from wrt.accel.bvh.tree import expected_cost, root_area
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import check_links
-from wrt.core.device import launch, records, start, upload
+from wrt.core.device import launch, on_host, records, start, upload
 from wrt.kernels.build import volumes as fits
 from wrt.kernels.traverse import bvh2_kdop as traverse_bvh2_kdop
 from wrt.kernels.traverse import bvh2_sphere as traverse_bvh2_sphere
@@ -112,7 +112,7 @@ def fit_spheres(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, thread
     out = upload(with_links(traverse_bvh2_sphere.SphereNode, nodes), traverse_bvh2_sphere.SphereNode, cpu)
     launch(fits.fit_spheres, len(nodes), upload(nodes, Bvh2Node, cpu), spans_of(nodes), upload(order.copy(), wp.int32, cpu),
            upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu), out, None, threads=threads, step=NODES_PER_LAUNCH)
-    return np.asarray(out.numpy())
+    return on_host(out)
 
 
 def middle_of(nodes: np.ndarray) -> np.ndarray:
@@ -154,4 +154,4 @@ def fit_kdops(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, middle: 
     out = upload(with_links(traverse_bvh2_kdop.KdopNode, nodes), traverse_bvh2_kdop.KdopNode, cpu)
     launch(fits.fit_kdops, 1, spans_of(nodes), upload(order.copy(), wp.int32, cpu), upload(cut_lo, wp.vec4, cpu),
            upload(cut_hi, wp.vec4, cpu), out)
-    return np.asarray(out.numpy())
+    return on_host(out)

@@ -14,7 +14,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
 from wrt.accel.cells.common import check_tree, require_between
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, records, start, upload
+from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.kernels.build import bsp as build_bsp
@@ -94,10 +94,9 @@ class Launch:
 
     def run(self, source: Any, tasks: Any, cells: Any, which: int) -> bool:
         """False where there was no room."""
-        wp.launch(build_bsp.build_cells, dim=1, device=self.cpu,
-                  inputs=[source, tasks, cells, which, self.tools, self.stack, self.output])
+        launch(build_bsp.build_cells, 1, source, tasks, cells, which, self.tools, self.stack, self.output)
         self.results = self.output.results.numpy().copy()
-        self.nodes = self.output.nodes.numpy()[: self.results[build_bsp.N_NODES]].copy()
+        self.nodes = on_host(self.output.nodes)[: self.results[build_bsp.N_NODES]].copy()
         self.order = self.output.order.numpy()[: self.results[build_bsp.N_ORDER]].copy()
         self.cost = float(self.output.cost.numpy()[0])
         return not self.results[build_bsp.FULL]
@@ -136,13 +135,12 @@ class Builder:
             room *= 2
 
     def build(self) -> Built:
-        load_kernel(build_bsp.build_cells, start("cpu"))
         keep = max(self.n // 64, 512)
         root = records(build_bsp.BspTask, 1)
         root["end"], root["budget"] = self.n, self.budget
         top = self.launch(self.source, upload(root, build_bsp.BspTask, start("cpu")), cells_of(0), 0, self.n,
                           keep if self.n > keep else 0)
-        tasks = top.output.left_over.numpy()[: top.results[build_bsp.N_LEFT_OVER]]
+        tasks = on_host(top.output.left_over)[: top.results[build_bsp.N_LEFT_OVER]]
         size = tasks["end"] - tasks["begin"]
         subtrees: list[Subtree | None] = [None] * len(tasks)
 

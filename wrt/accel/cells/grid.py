@@ -13,7 +13,7 @@ from wrt.accel.built import Built
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.cells.common import cell_source, check_numbers, check_references, one_row, require_between, triangle_reach
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch, records, start, upload
+from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import grid as build_grid
 from wrt.kernels.traverse import grid as kernels
@@ -141,7 +141,7 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
     cells = upload(records(kernels.GridCell, int(np.prod(layout.n))), kernels.GridCell, cpu)
     references = wp.zeros(total, dtype=wp.int32, device=cpu)
     launch(build_grid.sort_by_cell, 1, device_begin, cell_of, cells, references)
-    return cells.numpy(), references.numpy()
+    return on_host(cells), references.numpy()
 
 
 def sah_cost(layout: Any, visits: int) -> float:

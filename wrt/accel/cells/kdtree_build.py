@@ -11,7 +11,7 @@ import warp as wp
 
 from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch, load_kernel, records, start, upload
+from wrt.core.device import launch, load_kernel, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.kernels.build import kdtree as kernels
@@ -234,8 +234,8 @@ def build_subtree(cell: Cell, shapes: Any, options: Any) -> tuple[np.ndarray, np
     root.lo, root.hi = wp.vec3(*cell.cell_lo), wp.vec3(*cell.cell_hi)
     root.budget, root.depth = cell.budget, cell.depth
     launch(kernels.build_subtree, 1, shapes, work, root, options, out)
-    totals = out.totals.numpy()[0].copy()
-    return out.nodes.numpy()[: totals["nodes"]].copy(), out.references.numpy()[: totals["references"]].copy(), totals
+    totals = on_host(out.totals)[0].copy()
+    return on_host(out.nodes)[: totals["nodes"]].copy(), out.references.numpy()[: totals["references"]].copy(), totals
 
 
 def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[Part], root: Cell, area: float,

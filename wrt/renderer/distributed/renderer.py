@@ -20,14 +20,13 @@ from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import PREPARING_REPORTED
-from wrt.renderer.schedule import Run, Steps
+from wrt.renderer.schedule import STEP_SECONDS, Run, Steps
 from wrt.renderer.tiles import Rectangle, Work, tiles
 from wrt.renderer.upload import tell_left_out
 from wrt.scene.model import Scene
 
 TILES_EACH = 4  # of a pass, for each that traces: the last one to come must not be long
 SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # pixels: smaller tiles are not worth sending, larger ones take long
-STEP_SECONDS = 0.1
 
 
 class DistributedRenderer:

@@ -13,7 +13,7 @@ import time
 import warnings
 from collections import OrderedDict, deque
 from collections.abc import Generator, Iterable
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from dataclasses import replace
 from hashlib import sha256
 from queue import SimpleQueue
@@ -21,6 +21,7 @@ from typing import Any
 
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
+from wrt.core.threads import Pool
 from wrt.renderer.distributed.installed import INSTALLED, Installed, difference
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
@@ -101,7 +102,7 @@ class DeviceWorkers(Workers):
     def __init__(self, scene: Scene, options: Options) -> None:
         assert options.devices is not None
         self.scene, self.options, self.names = scene, replace(options, **LOCAL), options.devices
-        self.pool = ThreadPoolExecutor(len(self.names))
+        self.pool = Pool(len(self.names))
         self.free: SimpleQueue[tuple[int, Prepared | None]] = SimpleQueue()  # one is for every thread
         for i in range(len(self.names)):
             self.free.put((i, None))

@@ -1,0 +1,134 @@
+"""wrt inside programs that set what holds for the whole process, call it from threads of their own, or while Python ends."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import wrt
+from tests.data import ROOT
+from wrt.kernels.build.volumes import find_spans
+from wrt.scene.shapes import icosphere
+
+SCENE = ROOT / "scenes" / "whitted.toml"
+BALL = icosphere(3)
+# Prints the sums of a query's distances and of a picture: those of the CPU are the same everywhere, to the last bit.
+WORK = f"""
+import threading, numpy as np, wrt
+from wrt.scene.shapes import icosphere
+wrt.build, wrt.render  # which imports the standard pool: Python does not let it be imported while it ends
+def work(threads=2):
+    ball, rays = icosphere(3), np.random.default_rng(0).normal(size=(50000, 3))
+    accel = wrt.build((ball.vertices, ball.faces), NAME, threads=threads)
+    found = accel.closest_hit(rays, -rays, threads=threads)
+    picture = wrt.render({str(SCENE)!r}, spp=2, size=(40, 30), threads=threads)
+    print(repr(float(found.t.sum())), repr(float(picture.pixels.sum())))
+"""
+
+
+def printed(code: str, name: str = "bvh") -> list[str]:
+    """What a process of its own prints that runs the code. It must end well and say nothing on stderr."""
+    done = subprocess.run([sys.executable, "-c", f"NAME = {name!r}\n{WORK}\n{code}"], capture_output=True, text=True, timeout=600,
+                          check=False, cwd=ROOT)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout.splitlines()
+
+
+@pytest.fixture(scope="module")
+def expected() -> str:
+    return printed("work()")[0]
+
+
+def test_debug_mode_is_not_for_kernels_of_wrt(expected: str) -> None:
+    """Warp 1.19 crashes where several threads launch a kernel of that mode."""
+    assert printed("import warp as wp; wp.config.mode = 'debug'; work(4)") == [expected]
+
+
+@pytest.mark.parametrize("decorator", [wp.kernel, wrt.kernel])
+def test_debug_mode_is_for_kernels_of_the_user(decorator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    query = wrt.ray_query("bvh2")
+
+    @decorator  # type: ignore[untyped-decorator]
+    def mine(world: query.World, t: wp.array(dtype=float)) -> None:  # type: ignore[name-defined, valid-type]
+        t[0] = query.closest_hit(world, query.ray(wp.vec3(0.0, 0.0, 3.0), wp.vec3(0.0, 0.0, -1.0))).t
+
+    monkeypatch.setattr(wp.config, "mode", "debug")
+    assert mine.module.resolve_options(wp.config)["mode"] == "debug"
+    assert find_spans.module.resolve_options(wp.config)["mode"] == "release"
+
+
+@pytest.mark.parametrize("kib", [64, 512])
+@pytest.mark.parametrize("where", ["there", "here"])
+def test_small_stacks_of_threads_are_not_for_kernels(kib: int, where: str, expected: str) -> None:
+    call = "thread = threading.Thread(target=work); thread.start(); thread.join()" if where == "there" else "work()"
+    assert printed(f"threading.stack_size({kib} << 10); {call}; print(threading.stack_size() >> 10)") == [expected, str(kib)]
+
+
+@pytest.mark.parametrize("name", ["bvh2_kdop", "kdtree"])
+def test_a_thread_with_a_small_stack_builds_and_asks(name: str, expected: str) -> None:
+    code = "threading.stack_size(64 << 10); thread = threading.Thread(target=work); thread.start(); thread.join()"
+    assert printed(code, name) == [expected]
+
+
+@pytest.mark.slow
+def test_kernels_are_compiled_for_threads_with_small_stacks(tmp_path: Path, expected: str) -> None:
+    code = f"""if True:
+        import warp as wp
+        wp.config.kernel_cache_dir = {str(tmp_path)!r}
+        threading.stack_size(64 << 10)
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+    """
+    assert printed(code) == [expected]
+
+
+def test_a_small_stack_of_the_main_thread(expected: str) -> None:
+    done = subprocess.run(["sh", "-c", f"ulimit -s 256; exec {sys.executable} -c \"$CODE\""], check=True, capture_output=True,
+                          text=True, timeout=600, cwd=ROOT, env={**os.environ, "CODE": f"NAME = 'bvh'\n{WORK}\nwork()"})
+    assert done.stdout.splitlines() == [expected]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("before", [False, True])
+def test_what_is_asked_while_python_ends_is_answered(threads: int, before: bool, expected: str) -> None:
+    code = f"import atexit; atexit.register(work, {threads}); {f'work({threads})' if before else ''}"
+    assert printed(code) == [expected] * (1 + before)
+
+
+def test_threads_that_outlive_the_main_thread_are_answered(expected: str) -> None:
+    code = """if True:
+        def wait_and_work():
+            threading.main_thread().join()
+            work()
+        threading.Thread(target=wait_and_work).start()
+    """
+    assert printed(code) == [expected]
+
+
+def test_arrays_of_structs_are_made_and_read_without_parsing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """CPython 3.11 raises SystemError where two threads parse at a time, which NumPy does for the layout of a struct. (Kernels are
+    made under a lock.)"""
+    def work() -> None:
+        for name in wrt.ACCELERATORS:
+            accel = wrt.build((BALL.vertices, BALL.faces), name)
+            accel.closest_hit(BALL.vertices, -BALL.vertices, counters=name != "bvh2_sphere")
+        accel = wrt.build((BALL.vertices, BALL.faces), "bvh2", builder="sbvh")
+        accel.save(tmp_path / "ball.accel")
+        wrt.load_accel(tmp_path / "ball.accel", (BALL.vertices, BALL.faces)).refit(np.float32(2.0) * BALL.vertices)
+        wrt.render(ROOT / "scenes" / "instances.toml", spp=1, size=(16, 12))
+
+    work()
+    parsed, parse = list[Any](), ast.parse
+    with monkeypatch.context() as patch:
+        patch.setattr(ast, "parse", lambda *arguments, **named: (parsed.append(arguments), parse(*arguments, **named))[1])
+        work()
+    assert not parsed
