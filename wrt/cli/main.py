@@ -161,11 +161,12 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
 def _summary(film: Any) -> str:
     s = film.stats
     cut = f"cut: {s['cut_by_depth']} rays by depth, {s['cut_by_throughput']} by throughput"
-    note = " (interrupted)" if s["interrupted"] else " (time limit)" if s["timed_out"] else ""
+    end = "interrupted" if s["interrupted"] else "time limit" if s["timed_out"] else ""
+    note = f" ({end})" if end else ""
     if s.get("resumed"):
         note += f", {s['resumed']['samples']} of them from the checkpoint"
     if film.samples.min() == 0:
-        note = f" (interrupted: {(film.samples == 0).mean():.0%} of the pixels are still black)"
+        note = f" ({end}: {(film.samples == 0).mean():.0%} of the pixels are still black)"
     lost = f"; {s['not_finite']} samples were not finite and count as black" if s["not_finite"] else ""
     if s.get("target_error") is not None:
         note += f", estimated error {s['estimated_error']:.3g}"

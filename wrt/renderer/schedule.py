@@ -32,8 +32,14 @@ MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C has to wait for on a G
 # is up to 1.15 times as fast as 2, and 16 up to 1.1 times as fast as 4), but pictures that end early are the less even.
 GROWTH = 4
 STEP_SECONDS = 0.1
+OVERTIME = 5.0  # seconds after the time limit, all of them without an answer, after which a pass is given up
+SILENT = 20.0  # seconds without an answer that are told; and OVERTIME of the first pass, without which pixels are black
 # Samples (summed over pixels) that are done, and whether no tile runs at the moment: then each pixel is done whole.
 Steps = Generator[tuple[int, bool], None, None]
+
+
+class OutOfTime(Exception):
+    """A pass is given up: whoever traces it does not answer."""
 
 
 class Tracer(Protocol):
@@ -128,12 +134,13 @@ class Passes:
         self.spp = max(1, spp // len(film.groups))
         self.largest = MAX_PASS // len(film.groups)
         self.fewest, self.most = samples
-        self.expected_spp, self.timed_out = self.spp, False
+        self.expected_spp, self.timed_out, self.deadline = self.spp, False, math.inf
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         limit = self.options.time_limit or math.inf
         first = known = self.fewest  # the speed is that of the samples since `known`, when `since`
         begin = since = time.perf_counter()
+        self.deadline = begin + limit
         count = self._size(first)
         while first < self.spp and (first < self.most or not self._precise_enough(first)):
             count = min(count, (self.most if first < self.most else self.spp) - first)
@@ -141,7 +148,7 @@ class Passes:
                 count = min(count, (1 << first.bit_length()) - first)  # no farther than to the next power of 2
             if first > 0 and min(limit, self.every) < math.inf:
                 now = time.perf_counter()
-                left = limit - (now - begin)
+                left = self.deadline - now
                 if left <= 0.0:
                     self.timed_out = True
                     return
@@ -204,6 +211,8 @@ class Run:
                     self._take(first, count)
             except KeyboardInterrupt:  # from _follow, or from a progress callback that wants the end
                 interrupted = True
+            except OutOfTime:
+                self.passes.timed_out = True
             except Exception as error:
                 self._keep(error)
                 raise
@@ -244,34 +253,42 @@ class Run:
         if first < self.passes.most:  # of a resumed render
             samples = self.arrays.view(self.arrays.groups[0].samples)
             work, before = work_left(work, samples, self.plan.crop), int(samples.sum(dtype=np.int64))
-        self._follow(self.arrays, work, lambda done: self._report(before + done))
+        self._follow(self.arrays, work, lambda done, silent: self._report(before + done, silent), OVERTIME if first else SILENT)
 
     def _take_aovs(self) -> None:
         arrays = AovFilm(self.plan.scene.settings, self.plan.crop, self.tracer.device)
         work = [Work(tile, 0, 1) for tile in self.tracer.tiles(1)]
-        self._follow(arrays, work, lambda done: None)
+        self._follow(arrays, work, lambda done, silent: None, SILENT)
         self.aov = {name: arrays.picture(name) for name in self.plan.options.aov}
 
-    def _follow(self, film: DeviceFilm | AovFilm, work: list[Work], report: Callable[[int], None]) -> None:
+    def _follow(self, film: DeviceFilm | AovFilm, work: list[Work], report: Callable[[int, float], None], overtime: float) -> None:
         """Trace, save and report. KeyboardInterrupt where Ctrl-C came: tiles that run come to their end, so that
-        a pixel is never half done."""
+        a pixel is never half done. OutOfTime where the time limit is over, and there was no answer for so long."""
         total = sum(job.total for job in work)
         if self.interrupts:
             raise KeyboardInterrupt
+        before, heard = 0, time.perf_counter()
         with closing(self.tracer.trace(film, work, self._due)) as steps:
             for done, at_rest in steps:
+                now = time.perf_counter()
+                if done > before:
+                    before, heard = done, now
                 if self.checkpoint is not None and at_rest and self.checkpoint.due():
                     self.checkpoint.save(self.arrays, self._elapsed())
-                report(done)
-                if self.interrupts and done < total:
+                report(done, now - heard)
+                if done < total and self.interrupts:
                     raise KeyboardInterrupt
+                if done < total and now - max(heard, self.passes.deadline) > overtime:
+                    raise OutOfTime
 
-    def _report(self, done: int) -> None:
-        """done: samples of a group, summed over the pixels."""
+    def _report(self, done: int, silent: float) -> None:
+        """done: samples of a group, summed over the pixels; silent: seconds without an answer."""
         plan = self.plan
         if plan.options.progress is None:
             return
         total = plan.area * self.passes.expected_spp * plan.groups
         note = "" if self.checkpoint is None else self.checkpoint.problem
+        if silent > SILENT and not note:
+            note = f"a worker has not answered for {silent:.0f} s"
         plan.options.progress(Progress(done * plan.groups, total, self.arrays.rays, self._elapsed(), note=note,
                                        picture=lambda: film_so_far(plan, self.arrays)))

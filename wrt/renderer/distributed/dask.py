@@ -11,7 +11,8 @@ import logging
 import pkgutil
 import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import CancelledError
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future
+from concurrent.futures import wait as wait_here
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -129,6 +130,7 @@ class ClusterWorkers(ExecutorWorkers):
         super().__init__(self.submitter, key, package)
         self.client, self.address = client, self.submitter.address
         self.scattered: Any = None
+        self.fetches: dict[Future[list[Any]], list[Any]] = {}  # replies that are on their way, and what they are the results of
         self.fetched: dict[str, Reply | None] = {}
         self.anybody, self.ask_again = True, 0.0
         self.alone_since: float | None = None
@@ -169,32 +171,40 @@ class ClusterWorkers(ExecutorWorkers):
         return False
 
     def cancel(self, futures: Iterable[Any]) -> None:
+        for fetch in self.fetches:
+            fetch.cancel()
+        self.fetches.clear()
         self.submitter.cancel(futures)
 
     def finished(self, pending: Iterable[Any]) -> Iterable[Any]:
         from distributed import wait
 
-        waiting = list(pending)
+        coming = {future.key for futures in self.fetches.values() for future in futures}
+        waiting = [future for future in pending if future.key not in coming]
         self.ready()
-        if not waiting:
+        if self.fetches:
+            wait_here(self.fetches, timeout=0.1, return_when=FIRST_COMPLETED)
+        elif waiting:
+            with self.submitter.guarded(), suppress(TimeoutError, CancelledError), self.client.as_current():
+                wait(waiting, timeout=0.1, return_when="FIRST_COMPLETED")
+        else:
             time.sleep(0.1)
-        with self.submitter.guarded(), suppress(TimeoutError, CancelledError), self.client.as_current():
-            wait(waiting, timeout=0.1, return_when="FIRST_COMPLETED")
-        done = [future for future in waiting if future.status != "pending"]
-        self.fetched = self._fetched([future for future in done if future.status == "finished"])
+        done = [future for future in waiting if future.status not in ("pending", "finished")]
+        computed = [future for future in waiting if future.status == "finished"]
+        if computed:
+            self.fetches[asyncio.run_coroutine_threadsafe(self._fetch(computed), self.client.loop.asyncio_loop)] = computed
+        for fetch in [fetch for fetch in self.fetches if fetch.done()]:
+            futures = self.fetches.pop(fetch)
+            with self.submitter.guarded(), suppress(TimeoutError, CancelledError):
+                replies = fetch.result()
+                if len(replies) == len(futures):  # else a worker died before it gave its own away
+                    self.fetched |= {future.key: reply for future, reply in zip(futures, replies, strict=True)}
+            done += futures
         return done
 
-    def _fetched(self, futures: list[Any]) -> dict[str, Reply | None]:
-        """Replies by key, all in one call; none where a worker died before it gave its own away."""
-
-        async def together() -> list[Any]:
-            return await self.client.gather(futures, errors="skip", asynchronous=True)
-
-        with self.submitter.guarded(), suppress(TimeoutError, CancelledError):
-            replies = self.client.sync(together, callback_timeout=RESULT_SECONDS) if futures else []
-            if len(replies) == len(futures):
-                return {future.key: reply for future, reply in zip(futures, replies, strict=True)}
-        return {}
+    async def _fetch(self, futures: list[Any]) -> list[Any]:
+        """Replies, all in one call, which a worker that hangs makes a long one."""
+        return await asyncio.wait_for(self.client.gather(futures, errors="skip", asynchronous=True), RESULT_SECONDS)
 
     def result(self, future: Any) -> Reply | None:
         from distributed import KilledWorker

@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,8 +28,10 @@ from wrt.core.errors import InputError
 from wrt.lab.bench import sweep
 from wrt.picture.film import Film
 from wrt.picture.image import read_channels
+from wrt.renderer import schedule
 from wrt.renderer.distributed import dask as cluster
 from wrt.renderer.distributed import installed, workers
+from wrt.renderer.options import Progress
 from wrt.renderer.render import render
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
@@ -94,6 +97,33 @@ def test_killed_workers_cost_only_their_tiles(client: Any, whole: Film, tmp_path
     assert sorted(os.listdir(tmp_path)) == [str(i) for i in range(killed)]
     assert same(film, whole) and seen == sorted(seen)
     assert len(before - set(client.run(os.getpid).values())) == killed
+
+
+def test_a_worker_that_hangs_does_not_stop_the_time_limit(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(schedule, "OVERTIME", 2.0)
+    monkeypatch.setattr(schedule, "SILENT", 1.0)
+    hung = client.run(os.getpid).popitem()[1]
+    notes: set[str] = set()
+
+    def hang(progress: Progress) -> None:
+        notes.add(progress.note)
+        if progress.stage == "trace" and progress.done > pixels:  # after the first pass
+            os.kill(hung, signal.SIGSTOP)
+
+    pixels = SCENE.settings.size[0] * SCENE.settings.size[1]
+    late = threading.Timer(60.0, os.kill, (hung, signal.SIGCONT))
+    late.start()
+    try:
+        film = render(SCENE, executor=client, spp=1 << 16, time_limit=0.5, progress=hang, tile_size=24, pass_size=8)
+        assert not late.finished.is_set()  # it was not waited for
+    finally:
+        late.cancel()
+        os.kill(hung, signal.SIGCONT)
+    assert film.stats["timed_out"] and not film.stats["interrupted"]
+    assert any(note.startswith("a worker has not answered for ") for note in notes)
+    least = int(film.samples.min())
+    alike = film.samples == least
+    assert least >= 8 and (film.pixels[alike] == render(SCENE, spp=least).pixels[alike]).all()
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
