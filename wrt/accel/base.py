@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
@@ -27,7 +26,7 @@ from wrt.accel.structure import Structure, check_options, check_units
 from wrt.core.arrays import check_no_gradients, taken
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
-from wrt.core.seconds import seconds_without_loads
+from wrt.core.seconds import build_clock
 from wrt.core.threads import thread_count
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
@@ -53,7 +52,7 @@ class Accelerator(Queries, ABC):
         self._begin(geometry, device, threads, triangle, box)
         check_options(self.name, self._build, options)
         self._options = options
-        begin = time.perf_counter()
+        begin = build_clock()
         built = self._build(**options)
         self._take(built, begin, built.sah_cost)
 
@@ -63,7 +62,7 @@ class Accelerator(Queries, ABC):
         """What was built before over the same geometry. Raises InputError where `built` is no such structure."""
         self = cls.__new__(cls)
         self._begin(geometry, device, threads, triangle, box)
-        begin = time.perf_counter()
+        begin = build_clock()
         check_order(built.order, len(geometry), cls.name)
         self._check(built)
         self._take(built, begin, built.sah_cost)
@@ -120,7 +119,7 @@ class Accelerator(Queries, ABC):
     def _take(self, built: Built, begin: float, built_cost: float) -> None:
         """built_cost: as in State."""
         data = self._upload(built)
-        stats = AccelStats(seconds_without_loads(begin), built.nodes, built.leaves, built.depth, built.references,
+        stats = AccelStats(build_clock() - begin, built.nodes, built.leaves, built.depth, built.references,
                            array_bytes(data), built.sah_cost)
         self._state = State(self.geometry, built, data, stats, built_cost)
 
@@ -164,11 +163,11 @@ class Accelerator(Queries, ABC):
         """
         vertices = taken(vertices, "vertices")
         with self._refitting:
-            begin, before = time.perf_counter(), self._state
+            begin, before = build_clock(), self._state
             if in_place:
                 check_no_gradients("a refit in place", vertices=vertices)
                 self._refit_in_place(vertices)
-                return Refit(time.perf_counter() - begin, float("nan"), False)
+                return Refit(build_clock() - begin, float("nan"), False)
             beside = copy(self)  # has the new shape while others still ask for the old one
             beside._state = State(self._moved(vertices))
             built, built_cost = beside._refit(before.built), before.built_cost

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +21,7 @@ from wrt.core.arrays import real_numbers
 from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
-from wrt.core.seconds import seconds_without_loads
+from wrt.core.seconds import build_clock
 from wrt.core.threads import thread_count
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
@@ -43,7 +42,7 @@ class Instances(Accelerator):
     def __init__(self, kind: type[Accelerator], geometry: InstancedGeometry, device: str = "cpu", threads: int | None = None, *,
                  triangle: str = "watertight", box: str = "conservative", **options: Any) -> None:
         check_units(triangle, box)
-        begin = time.perf_counter()
+        begin = build_clock()
         self.device = start(device)
         self._refitting, self._kept = threading.Lock(), {}
         self._state = State(geometry)  # type: ignore[arg-type]  # it has what a Geometry is asked for here
@@ -76,7 +75,7 @@ class Instances(Accelerator):
         data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)
         stats = [state.stats for state in self._placed]
         told = AccelStats(
-            seconds_without_loads(begin), len(top.nodes) + sum(s.nodes for s in stats), top.leaves + sum(s.leaves for s in stats),
+            build_clock() - begin, len(top.nodes) + sum(s.nodes for s in stats), top.leaves + sum(s.leaves for s in stats),
             top.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
             array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
         self._state = State(geometry, None, data, told, built_cost)
@@ -93,7 +92,7 @@ class Instances(Accelerator):
         flatten or shear more than wrt.build takes for instances.
         """
         with self._refitting:
-            begin, before = time.perf_counter(), self._state
+            begin, before = build_clock(), self._state
             geometry: Any = before.geometry
             rows, matrices = moves(rows_of(geometry, self.attributes), instance, matrix)
             to_world = geometry.to_world.copy()

@@ -179,12 +179,9 @@ def _summary(film: Any) -> str:
 
 
 def _seconds(stats: dict[str, Any]) -> str:
-    """Each second once: what is built while kernels compile stands in brackets."""
+    """Of each stage: upload and build run beside compile."""
     seconds = stats["seconds"]
     notes = dict.fromkeys(seconds, "")
-    meanwhile = min(stats["accel"]["build_seconds"] - seconds["build"], seconds["compile"])
-    if meanwhile >= 0.005:
-        notes["build"] = f" (and {meanwhile:.2f} while kernels compiled)"
     if stats.get("resumed"):
         notes["trace"] = f" ({stats['resumed']['seconds']:.2f} of them before it was resumed)"
     return "seconds: " + ", ".join(f"{name} {value:.2f}{notes[name]}" for name, value in seconds.items())

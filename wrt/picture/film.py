@@ -45,9 +45,9 @@ class Film:
         "albedo" (H, W, 3) float32: the material's, with its texture; 0 on a miss;
         "prim_id" (H, W) int32: index of the triangle (all objects in order, then the spheres); -1 on a miss;
         "material_id" (H, W) int32: index into `scene.materials`; -1 on a miss.
-    stats: counts and seconds of the render. Of stats["seconds"], each second is counted once, so that their sum is at most what
-        the clock showed: while kernels compile, the structure is built, and these seconds count as "compile"
-        (stats["accel"]["build_seconds"] has the builder's own); "trace" has those before a resume too.
+    stats: counts and seconds of the render. stats["seconds"] has the seconds of each stage by the clock: "compile" until the last
+        kernel of the scene was there, and beside it "upload" and "build" (with kernels of the builder's own, which
+        stats["accel"]["build_seconds"] does not count); then "aov" and "trace", with those before a resume.
         "lost_throughput_per_sample": what rays that were cut would have added in a room of radiance 1; "visibly_cut": the share
         of the pixels that lack 5 % or more of that radiance because of max_depth.
     metadata: what a file says about it (scene, spp, seed, seconds, version).

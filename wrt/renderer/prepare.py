@@ -15,7 +15,6 @@ import numpy as np
 from wrt.accel.base import Accelerator
 from wrt.accel.build import build, reports_progress
 from wrt.core.device import load_kernel
-from wrt.core.seconds import Span, counted_once, loads_since
 from wrt.core.threads import Pool, thread_count
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Progress
@@ -35,8 +34,8 @@ PREPARING_REPORTED = 1.0  # seconds of compiling and building before `progress` 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """kernels: as Plan.kernels, compiled; arrays: the scene on the device; camera: the device's record of plan.camera; waves:
-    what makes pictures on the CPU (Plan.by_waves); seconds: of
-    "compile", "upload" and "build"."""
+    what makes pictures on the CPU (Plan.by_waves); seconds: of "upload" and "build", and until the last kernel was there "compile",
+    which runs beside them."""
 
     plan: Plan
     device: Any
@@ -133,17 +132,16 @@ class _Preparation:
 
     arrays: DeviceScene
     accel: Accelerator
-    seconds: dict[str, float]
 
     def __init__(self, plan: Plan, device: Any) -> None:
         self.plan, self.device, self.kernels = plan, device, plan.kernels
         self.threads = thread_count(plan.options.threads)
-        self.spans: dict[str, list[Span]] = {}
+        self.begin, self.seconds = time.perf_counter(), {"compile": 0.0}
         self.compiled, self.fraction_built = list[Any](), 0.0
 
     def run(self, jobs: list[Callable[[], None]]) -> None:
         """Neither Ctrl-C nor an error waits for the compiler, and no wait is long: Python may hear of Ctrl-C only between two."""
-        begin, reported = time.perf_counter(), ("", 0.0)
+        reported = ("", 0.0)
         pool = Pool(1 + min(self.threads, len(self.kernels)), PREPARING)
         pending = {pool.submit(job) for job in jobs}
         try:
@@ -151,12 +149,11 @@ class _Preparation:
                 finished, pending = wait(pending, timeout=0.1, return_when=FIRST_EXCEPTION)
                 for job in finished:
                     job.result()
-                seconds = time.perf_counter() - begin
+                seconds = time.perf_counter() - self.begin
                 if pending and seconds >= PREPARING_REPORTED:
                     reported = self._report(seconds, reported)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
-        self.seconds = counted_once({"compile": loads_since(begin), **self.spans})
 
     def _report(self, seconds: float, before: tuple[str, float]) -> tuple[str, float]:
         """Call `progress` where there is something new."""
@@ -170,6 +167,7 @@ class _Preparation:
     def compile(self, kernel: Any) -> None:
         load_kernel(kernel, self.device)
         self.compiled.append(kernel)
+        self.seconds["compile"] = time.perf_counter() - self.begin
 
     def build(self) -> None:
         options = self.plan.options
@@ -180,7 +178,7 @@ class _Preparation:
         if reports_progress(self.plan.accel):
             chosen = {"progress": self._built, **chosen}
         self.accel = build(self.arrays.world.geometry, self.plan.accel, options.device, self.threads, **chosen)
-        self.spans = {"upload": [(begin, uploaded)], "build": [(uploaded, time.perf_counter())]}
+        self.seconds |= {"upload": uploaded - begin, "build": time.perf_counter() - uploaded}
 
     def _built(self, fraction: float) -> None:
         self.fraction_built = fraction

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import time
 from abc import abstractmethod
 from copy import copy
 from dataclasses import replace
@@ -23,6 +22,7 @@ from wrt.accel.rays import vectors
 from wrt.accel.store import check_binary, save
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
+from wrt.core.seconds import build_clock
 from wrt.kernels.build.shape import write_corners
 from wrt.kernels.structs import Primitive
 from wrt.kernels.traverse import bvh2 as kernels
@@ -136,7 +136,7 @@ class Bvh2(BinaryBvh):
         built = replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])}, sah_cost=float("nan"))
         beside = copy(self)
         beside._state = State(DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres))
-        beside._take(built, time.perf_counter(), self._state.built_cost)
+        beside._take(built, build_clock(), self._state.built_cost)
         fitting, shape = Fitting(self.device, len(self.geometry), built.nodes), beside._shape()
         self._state = replace(beside._state, changes=True)
         return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)

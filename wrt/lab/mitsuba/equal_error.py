@@ -161,7 +161,8 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
                 ours.append(our_picture(seed))
         report("whole processes")
         rivals.each(lambda name: rivals.measured[name].time_starts(starts))
-    prepare = sum(renderer.prepared.seconds.get(part, 0.0) for part in ("compile", "upload", "build"))
+    ready = renderer.prepared.seconds
+    prepare = max(ready["compile"], ready["upload"] + ready["build"])  # beside each other
     side = side_of(plan.spp, ours, truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
     found = {variant: measured.result(side, truth) for variant, measured in rivals.measured.items()}
     return Row(scene=scene.name, size=scene.settings.size, integrator=plan.integrator, threads=threads, wrt=side, mitsuba=found,

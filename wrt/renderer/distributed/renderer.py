@@ -119,10 +119,9 @@ def workers_for(plan: Plan) -> Workers:
 
 
 def _waited_for(replies: list[Reply], waited: float) -> dict[str, float]:
-    """The seconds of the worker that took longest; less where it was ready before and nobody waited for it so long."""
-    seconds: dict[str, float] = max((reply[2]["seconds"] for reply in replies), key=lambda each: sum(each.values()))
-    share = min(1.0, waited / max(sum(seconds.values()), 1e-9))
-    return {name: share * value for name, value in seconds.items()}
+    """The seconds of the worker that took longest; no more than was waited, as it may have been ready before."""
+    seconds: dict[str, float] = max((reply[2]["seconds"] for reply in replies), key=lambda each: max(each.values()))
+    return {name: min(value, waited) for name, value in seconds.items()}
 
 
 def _check_kind(reply: Reply, kind: str) -> None:
