@@ -52,7 +52,8 @@ def from_viewport(camera: CameraKind, viewport: Any, unit: float) -> CameraKind:
                          [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
     pose = np.eye(4)
     pose[:3, :3] = rotation * (1.0, -1.0, -1.0)
-    pose[:3, 3] = np.asarray(viewport.position, np.float64) * unit
+    with np.errstate(over="ignore"):  # a camera refuses what is not finite
+        pose[:3, 3] = np.asarray(viewport.position, np.float64) * unit
     if isinstance(camera, Camera):
         camera = replace(camera, fov_y=float(viewport.fov))
     return replace(camera, camera_to_world=pose)

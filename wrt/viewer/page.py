@@ -28,7 +28,7 @@ from wrt.viewer.access import access_for
 from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
 from wrt.viewer.refine import COSTS, Viewer
 from wrt.viewer.renderers import Shown
-from wrt.viewer.server import Door, import_viser, listen, quiet, to_stderr
+from wrt.viewer.server import Door, import_viser, listen, to_stderr
 
 MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser one
 RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}
@@ -39,15 +39,16 @@ FARTHEST_FOCUS = 1e9  # in units of the viewport
 MOST_FILES = 4  # that are made at a time
 
 
-def status(shown: Shown, viewer: Viewer) -> str:
-    """What the panel says of a picture, as Markdown."""
+def status(shown: Shown, viewer: Viewer, full: tuple[int, int]) -> str:
+    """What the panel says of a picture, as Markdown. full: the size of the viewport in pixels."""
     height, width = shown.codes.shape[:2]
     rays = f"{shown.speed / 1e6:.2f} Mray/s, {shown.rays_per_sample:.1f} rays a sample"
     if shown.view.cost:
         what = f"**{shown.view.cost}** a pixel: mean {short(shown.mean)}, largest {short(shown.largest)}"
     else:
         what = f"**{shown.spp} of {viewer.spp} spp**"
-    size = f"{width}x{height}{', coarse' if shown.scale > 1 else ''}"
+    whole = "" if (width, height) == full else f" of {full[0]}x{full[1]}"
+    size = f"{width}x{height}{whole}{', coarse' if shown.scale > 1 else ''}"
     return f"{what}, {size}  \n{rays}  \n{viewer.structure(shown.view.accel)}"
 
 
@@ -64,6 +65,7 @@ class Page:
         self.viewer = Viewer(scene, options, self._show, self._report, spp)
         start = self.viewer.view.camera
         self.unit, self.watching, self.name = unit_of(scene, start), -1, scene.name or "picture"
+        self.full = (0, 0)
         self._saving = threading.BoundedSemaphore(MOST_FILES)
         listening = listen(host, port)
         try:
@@ -98,15 +100,21 @@ class Page:
 
     def close(self) -> None:
         self.viewer.stop()
-        with quiet():
-            self.server.stop()
+        self.door.close()
 
     # --- the viewport -------------------------------------------------------------------------------------------------
 
     async def _connected(self, client: Any) -> None:
         client.camera.on_update(self._moved)
+        self._count_browsers()
+
+    def _count_browsers(self) -> None:
+        many = len(self.server.get_clients())
+        self.browsers.content = f"{many} browsers look: the picture follows the camera that moved last"
+        self.browsers.visible = many > 1
 
     async def _gone(self, client: Any) -> None:
+        self._count_browsers()
         if client.client_id != self.watching:
             return
         others = self.server.get_clients()
@@ -122,6 +130,9 @@ class Page:
             return
         newcomer = self.watching != viewport.client.client_id
         self.watching = viewport.client.client_id
+        # Where a browser draws slowly, viser gives its canvas fewer pixels, of the same shape.
+        if newcomer or width > self.full[0] or abs(width * self.full[1] - height * self.full[0]) > max(self.full):
+            self.full = width, height
         coarser = max(RESOLUTIONS[self.resolution.value], math.sqrt(width * height / MOST_PIXELS))
         size = max(1, round(width / coarser)), max(1, round(height / coarser))
         try:
@@ -138,7 +149,7 @@ class Page:
             return
         form = {"format": "png"} if shown.done else {"format": "jpeg", "jpeg_quality": QUALITY[shown.scale == 1]}
         client.scene.set_background_image(shown.codes, **form)
-        self.status.content = status(shown, self.viewer)
+        self.status.content = status(shown, self.viewer, self.full)
         self.legend.visible = self.marks.visible = bool(shown.view.cost)
         self.exr.disabled = bool(shown.view.cost)
         if shown.view.cost:
@@ -153,6 +164,7 @@ class Page:
         gui = self.server.gui
         self.status = gui.add_markdown("waiting for the first picture")
         self.doing = gui.add_markdown("", visible=False)
+        self.browsers = gui.add_markdown("", visible=False)
         if isinstance(camera, Camera):
             self._lens_folder(camera)
         with gui.add_folder("Light"):

@@ -29,6 +29,7 @@ COARSE = 0.08  # seconds that the first picture after a change should take
 PATIENCE = 0.5  # seconds after which it is given up, where the next change is waiting
 EVERY = 0.25  # seconds between two pictures of the same view, while it is refined
 SCALES = (1, 2, 4, 8, 16, 32)  # pixels a side of the picture to one of a coarse one
+REST = 0.4  # seconds without a change of exposure or tone mapping after which the picture is put out as done again
 DEEPEST = 12  # bounces that can be chosen, if the scene has no more itself
 COSTS = ("nodes", "primitives", "probes", "boxes", "stack", "node_bytes")  # counters that are offered as heat maps
 
@@ -85,6 +86,7 @@ class Viewer:
         self._condition = threading.Condition()
         self._number = self._done = 0  # of changes, so far and rendered
         self._looked_at = self._toned = self._stopped = False
+        self._changing = False  # whether the last picture was put out in another way, and not as done
         self._work: _Work | None = None
         self._film: Film | None = None  # of `shown`, where that is no heat map
 
@@ -160,7 +162,7 @@ class Viewer:
         self._prepare(self.view)
         while True:
             with self._condition:
-                self._condition.wait_for(lambda: self._stopped or self._toned or self._asked)
+                self._condition.wait_for(lambda: self._stopped or self._toned or self._asked, REST if self._changing else None)
             if self._stopped:
                 return
             self.step()
@@ -170,17 +172,18 @@ class Viewer:
         return self._looked_at and self._number != self._done
 
     def step(self) -> None:
-        """Render what was asked for last until it is as fine as it gets, or until something else is asked for."""
+        """Render what was asked for last until it is as fine as it gets, or until something else is asked for. Or show the picture
+        in another way: not as done while exposure or tone mapping change, so that it is sent faster; and again when they rest."""
         with self._condition:
             toned, self._toned = self._toned, False
             work = _Work(self.view, self._number) if self._asked else None
         if work is not None:
             self._refine(work)
             self._done = work.number
-        elif toned and self.shown is not None:
+        elif self.shown is not None and (toned or self._changing):
             film = self._film
             codes = self.shown.codes if film is None else to_codes(film.pixels, self.exposure, self.tonemap)
-            self._put(replace(self.shown, codes=codes), film)
+            self._put(replace(self.shown, codes=codes), film, rests=not toned)
 
     def _refine(self, work: _Work) -> None:
         if not self._prepare(work.view) or self._number != work.number:
@@ -237,10 +240,11 @@ class Viewer:
                         rays / max(int(film.samples.sum()), 1), done), film)
         work.shown = time.perf_counter()
 
-    def _put(self, shown: Shown, film: Film | None) -> None:
+    def _put(self, shown: Shown, film: Film | None, rests: bool = True) -> None:
         with self._condition:
             self.shown, self._film = shown, film
-        self.show(shown)
+        self._changing = shown.done and not rests
+        self.show(shown if rests else replace(shown, done=False))
 
     def _count(self, work: _Work) -> bool:
         """The heat map at one scale, if it was not given up."""

@@ -12,6 +12,7 @@ import contextlib
 import importlib
 import io
 import logging
+import os
 import re
 import socket
 import sys
@@ -20,6 +21,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from http import HTTPStatus
 from typing import Any
+from weakref import WeakSet
 
 from wrt.core.errors import InputError
 from wrt.viewer.access import Access, Refused, shown
@@ -31,6 +33,7 @@ MOST_MESSAGES = 200  # a second, of one connection; a browser sends about 50
 MOST_CONNECTIONS = 64  # open at a time, with those that have not shown a token yet
 LONGEST_PATH = 200
 LONGEST_LINE = 300  # characters of what is reported
+CONNECTING = 0  # websockets.protocol.State of a connection without a WebSocket yet
 CLOSING = 1.0  # seconds that a browser has to say goodbye
 QUIET = logging.getLogger("wrt.viewer.refine.connections")  # what goes wrong in one connection is no matter of the others
 QUIET.propagate = False
@@ -56,7 +59,8 @@ def listen(host: str, port: int) -> socket.socket:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address, family=family)
     except (OSError, OverflowError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
+        number = getattr(error, "errno", None) or 0
+        reason = os.strerror(number) if number > 0 else getattr(error, "strerror", None) or str(error)
         raise InputError(f"cannot listen on port {port} of {host} ({reason}); --port and --host choose another") from error
 
 
@@ -81,7 +85,9 @@ class Door:
     def __init__(self, access: Access, warn: Callable[[str], None] = to_stderr) -> None:
         self.access, self.warn = access, warn
         self.viser: Any = None  # the ViserServer, when there is one
+        self.connections: WeakSet[Any] = WeakSet()
         self._thread = 0  # in which viser serves
+        self._loop: Any = None  # of that thread
         self._told: set[str] = set()
         self._lock = threading.Lock()
 
@@ -97,7 +103,8 @@ class Door:
             if self._thread != threading.get_ident():
                 return serve(handler, *address, **settings)  # of somebody else who begins at the same time
             settings = {key: value for key, value in settings.items() if key not in ("host", "port", "sock")}
-            asyncio.get_running_loop().set_exception_handler(self._failed)
+            self._loop = asyncio.get_running_loop()
+            self._loop.set_exception_handler(self._failed)
             return serve(self._greeting(handler), sock=listening, **settings | self._settings(settings.get("process_request")))
 
         with quiet():
@@ -113,6 +120,18 @@ class Door:
             raise InputError(f"viser {viser.__version__} does not let itself be guarded; the viewer knows 1.1.1")
         self.viser = server
         return server
+
+    def close(self) -> None:
+        """Stop viser's server. It would wait for connections that have not sent their request yet."""
+        with contextlib.suppress(RuntimeError):  # it has stopped
+            self._loop.call_soon_threadsafe(self._abort_half_open)
+        with quiet():
+            self.viser.stop()
+
+    def _abort_half_open(self) -> None:
+        for connection in self.connections:
+            if connection.protocol.state == CONNECTING:
+                connection.transport.abort()
 
     def report(self, about: str, text: str) -> None:
         """In one line, once of each kind."""
@@ -204,6 +223,7 @@ class _Paced:
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)  # type: ignore[misc]
+        self.door.connections.add(self)
         if len(self.server.handlers) > MOST_CONNECTIONS:  # type: ignore[attr-defined]
             self.door.report("connections", f"closed a connection; there are {MOST_CONNECTIONS} already")
             transport.abort()

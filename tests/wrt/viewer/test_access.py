@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import socket
 import threading
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.wrt.viewer.client import Client, answer, client, raw_answer, upgrade, wait
+from tests.wrt.viewer.client import PATIENCE, Client, answer, client, raw_answer, upgrade, wait
 from tests.wrt.viewer.test_refine import SCENE
 from wrt.core.errors import InputError
 from wrt.renderer.options import Options
@@ -108,6 +109,15 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
     yield served
     served.page.close()
     served.page.thread.join()
+
+
+def test_a_connection_without_a_request_does_not_hold_up_the_end(served: Served) -> None:
+    with socket.create_connection(("127.0.0.1", served.port), timeout=PATIENCE) as silent:
+        assert answer(served.port, "/", [])  # so that it has been accepted
+        served.page.close()
+        assert not served.page.server._websock_server._server_thread.is_alive()
+        with contextlib.suppress(ConnectionResetError):
+            assert silent.recv(1) == b""
 
 
 def attempts(port: int, token: str) -> list[tuple[str, list[str]]]:

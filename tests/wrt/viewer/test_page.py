@@ -46,7 +46,7 @@ def test_without_viser_there_is_one_message(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize(("host", "port", "part"), [
-    ("127.0.0.1", None, "Address already in use"), ("no.such.host.invalid", 0, "no.such.host.invalid")])
+    ("127.0.0.1", None, "(Address already in use);"), ("no.such.host.invalid", 0, "no.such.host.invalid")])
 def test_where_nobody_can_listen(host: str, port: int | None, part: str) -> None:
     pytest.importorskip("viser")
     with socket.socket() as taken:
@@ -328,9 +328,11 @@ def test_a_second_browser_gets_the_picture_and_leaves_it_to_the_first(page: Any,
     other.goto(browser_page.url)
     until(lambda: page.watching != first, other)
     settle(page, other)
+    assert other.get_by_text("2 browsers look").is_visible()
     assert difference(other, finished(page, other, size=shown.view.size)) < ROUGHLY
     other.close()
     until(lambda: page.watching == first, browser_page)
+    until(lambda: not browser_page.get_by_text("browsers look").is_visible(), browser_page)
     set_number(browser_page, "bounces", "1")
     assert difference(browser_page, finished(page, browser_page, max_depth=1)) < ROUGHLY
 

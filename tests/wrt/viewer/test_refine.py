@@ -187,7 +187,11 @@ def test_another_tone_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     eye.viewer.step()
     assert isinstance(film, Film)
     expected = replace(film, exposure=-1.5, tonemap="aces")
-    np.testing.assert_array_equal(eye.pictures[-1].codes, expected.to_srgb8())
+    eye.viewer.step()  # nothing has changed since
+    changing, rests = eye.pictures[-2:]
+    assert not changing.done and rests.done and eye.viewer.shown is not None and eye.viewer.shown.done
+    np.testing.assert_array_equal(changing.codes, expected.to_srgb8())
+    np.testing.assert_array_equal(rests.codes, expected.to_srgb8())
     saved = eye.viewer.picture()
     assert isinstance(saved, Film) and (saved.exposure, saved.tonemap) == (-1.5, "aces")
     with pytest.raises(InputError, match="tonemap must be one of"):
