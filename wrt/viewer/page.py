@@ -39,8 +39,14 @@ FARTHEST_FOCUS = 1e9  # in units of the viewport
 MOST_FILES = 4  # that are made at a time
 
 
-def status(shown: Shown, viewer: Viewer, full: tuple[int, int]) -> str:
-    """What the panel says of a picture, as Markdown. full: the size of the viewport in pixels."""
+def full_size(size: tuple[int, int], before: tuple[int, int]) -> tuple[int, int]:
+    """Of a viewport whose canvas has that size: where a browser draws slowly, viser gives it fewer pixels, of the same shape."""
+    smaller = size[0] <= before[0] and abs(size[0] * before[1] - size[1] * before[0]) <= max(before)
+    return before if smaller else size
+
+
+def status(shown: Shown, viewer: Viewer, full: tuple[int, int], browsers: int) -> str:
+    """What the panel says of a picture, as Markdown. full: the size of the viewport in pixels; browsers: how many look."""
     height, width = shown.codes.shape[:2]
     rays = f"{shown.speed / 1e6:.2f} Mray/s, {shown.rays_per_sample:.1f} rays a sample"
     if shown.view.cost:
@@ -49,7 +55,8 @@ def status(shown: Shown, viewer: Viewer, full: tuple[int, int]) -> str:
         what = f"**{shown.spp} of {viewer.spp} spp**"
     whole = "" if (width, height) == full else f" of {full[0]}x{full[1]}"
     size = f"{width}x{height}{whole}{', coarse' if shown.scale > 1 else ''}"
-    return f"{what}, {size}  \n{rays}  \n{viewer.structure(shown.view.accel)}"
+    others = f"  \n{browsers} browsers look: the picture follows the camera that moved last" if browsers > 1 else ""
+    return f"{what}, {size}  \n{rays}  \n{viewer.structure(shown.view.accel)}{others}"
 
 
 class Page:
@@ -106,15 +113,8 @@ class Page:
 
     async def _connected(self, client: Any) -> None:
         client.camera.on_update(self._moved)
-        self._count_browsers()
-
-    def _count_browsers(self) -> None:
-        many = len(self.server.get_clients())
-        self.browsers.content = f"{many} browsers look: the picture follows the camera that moved last"
-        self.browsers.visible = many > 1
 
     async def _gone(self, client: Any) -> None:
-        self._count_browsers()
         if client.client_id != self.watching:
             return
         others = self.server.get_clients()
@@ -130,9 +130,7 @@ class Page:
             return
         newcomer = self.watching != viewport.client.client_id
         self.watching = viewport.client.client_id
-        # Where a browser draws slowly, viser gives its canvas fewer pixels, of the same shape.
-        if newcomer or width > self.full[0] or abs(width * self.full[1] - height * self.full[0]) > max(self.full):
-            self.full = width, height
+        self.full = full_size((width, height), (0, 0) if newcomer else self.full)
         coarser = max(RESOLUTIONS[self.resolution.value], math.sqrt(width * height / MOST_PIXELS))
         size = max(1, round(width / coarser)), max(1, round(height / coarser))
         try:
@@ -149,7 +147,7 @@ class Page:
             return
         form = {"format": "png"} if shown.done else {"format": "jpeg", "jpeg_quality": QUALITY[shown.scale == 1]}
         client.scene.set_background_image(shown.codes, **form)
-        self.status.content = status(shown, self.viewer, self.full)
+        self.status.content = status(shown, self.viewer, self.full, len(self.server.get_clients()))
         self.legend.visible = self.marks.visible = bool(shown.view.cost)
         self.exr.disabled = bool(shown.view.cost)
         if shown.view.cost:
@@ -164,7 +162,6 @@ class Page:
         gui = self.server.gui
         self.status = gui.add_markdown("waiting for the first picture")
         self.doing = gui.add_markdown("", visible=False)
-        self.browsers = gui.add_markdown("", visible=False)
         if isinstance(camera, Camera):
             self._lens_folder(camera)
         with gui.add_folder("Light"):

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.structures import ACCELERATORS
+from wrt.core.checks import require_known
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.picture.heatmap import colored, top_of
@@ -99,8 +100,8 @@ class Viewer:
         """
         if "accel" in changes:
             ACCELERATORS.check(changes["accel"])
-        if changes.get("cost") and changes["cost"] not in COUNTERS:
-            raise InputError(f"no counter {changes['cost']!r}; there is {', '.join(COUNTERS)}")
+        if changes.get("cost"):
+            require_known(changes["cost"], COUNTERS, "counter")
         with self._condition:
             if callable(changes.get("camera")):
                 changes["camera"] = changes["camera"](self.view.camera)
@@ -117,8 +118,7 @@ class Viewer:
         with self._condition:
             self.scene = self.scene.with_settings(exposure=exposure, tonemap=tonemap)  # raises where they are none
             self.exposure, self.tonemap = exposure, tonemap
-            self._toned = True
-            self._condition.notify_all()
+        self.again()
 
     def again(self) -> None:
         """Show the last picture once more: somebody else looks."""
