@@ -151,6 +151,7 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
 
         report("pilot")
         target = statistics.mse_of(statistics.gram([our_picture(pictures[0])[1]], truth.pixels), truth.variance)
+        require_error(target)
         rivals.each(lambda name: rivals.measured[name].choose_spp(pictures[0], truth, target, plan.rival_seconds))
         for turn, seed in enumerate(pictures):
             report(f"picture {turn + 1} of {plan.repeats}")
@@ -164,9 +165,16 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
     ready = renderer.prepared.seconds
     prepare = max(ready["compile"], ready["upload"] + ready["build"])  # beside each other
     side = side_of(plan.spp, ours, truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
+    require_error(side.rmse)
     found = {variant: measured.result(side, truth) for variant, measured in rivals.measured.items()}
     return Row(scene=scene.name, size=scene.settings.size, integrator=plan.integrator, threads=threads, wrt=side, mitsuba=found,
                not_available=rivals.not_available, reference=truth)
+
+
+def require_error(error: float) -> None:
+    """Raise InputError where wrt's error is not above 0: the reference's own noise is taken out of it."""
+    if not error > 0.0:
+        raise InputError("wrt's pictures are as exact as the reference: no error that Mitsuba could reach; try a lower --spp")
 
 
 def process_seconds(arguments: list[str], times: int) -> float:

@@ -21,6 +21,7 @@ from wrt.lab.mitsuba import equal_error
 from wrt.lab.mitsuba.equal_error import Plan, matte
 from wrt.lab.mitsuba.process import PATH_VARIABLE, VARIANTS, MitsubaProcess, NotAvailable
 from wrt.renderer.options import Options
+from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import PointLight
 from wrt.scene.materials import Material
@@ -77,6 +78,12 @@ def test_a_variant_without_its_library_is_left_out_and_named(monkeypatch) -> Non
     assert "Mitsuba llvm_ad_rgb is not available: " in equal_error.text(result)
     with pytest.raises(InputError, match=r"Mitsuba llvm_ad_rgb: .*/nowhere/libLLVM\.so"):
         equal_error.run(ROOM, replace(PLAN, integrator="direct", variants=("llvm_ad_rgb",)), Options())
+
+
+def test_a_picture_without_error_has_nothing_to_be_equal_to() -> None:
+    empty = Scene(cameras=ROOM.cameras, background=ConstantBackground((0.5, 0.5, 0.5)), settings=ROOM.settings)
+    with pytest.raises(InputError, match="no error that Mitsuba could reach"):
+        equal_error.run(empty, replace(PLAN, variants=("scalar_rgb",)), Options())
 
 
 def test_a_variant_that_ends_on_its_way_is_left_out(monkeypatch) -> None:
