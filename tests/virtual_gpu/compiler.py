@@ -9,6 +9,8 @@ from __future__ import annotations
 import ctypes
 import os
 import re
+import tempfile
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -41,6 +43,12 @@ def for_host(source: str, arch: int) -> str:
     return "".join((headers, LAST_HEADER, device, text, *entries))
 
 
+@cache
+def precompiled_headers() -> tempfile.TemporaryDirectory[str]:
+    """The folder for what Clang precompiles, removed at the end of the process."""
+    return tempfile.TemporaryDirectory()
+
+
 def compile_module(source: str, arch: int, path: str, *, fuse_fp: bool) -> int:
     """Write the object file. Zero, or an error, which Clang has told on stderr."""
     runtime = context.runtime
@@ -49,4 +57,4 @@ def compile_module(source: str, arch: int, path: str, *, fuse_fp: bool) -> int:
         for_host(source, arch).encode(), os.fsencode(Path(path).with_suffix(".cpp").name),
         os.fsencode(os.path.join(build.warp_home, "native")), os.fsencode(path), False, False, fuse_fp, True,
         (ctypes.c_char_p * (len(flags) + 1))(*map(str.encode, flags), None), LEVEL, False,
-        True, os.fsencode(runtime.get_clang_pch_dir()), 1))
+        True, os.fsencode(precompiled_headers().name), 1))

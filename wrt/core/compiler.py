@@ -5,14 +5,13 @@ Where a release of Warp has other insides, the change is left out (tests/wrt/cor
 
 from __future__ import annotations
 
-import atexit
 import os
 import re
 import shutil
 import threading
 import time
 from contextlib import suppress
-from functools import wraps
+from functools import cache, wraps
 from hashlib import sha256
 from inspect import signature
 from pathlib import Path
@@ -25,7 +24,7 @@ DAY = 86400.0  # seconds: no kernel takes so long to compile
 FLAGS = "-fpch-instantiate-templates", "-discard-value-names"
 _LEFTOVER = re.compile(r"wp_\w+_p\d+_t\d+|precompiled-.+")
 _lock = threading.Lock()
-_headers: list[Path] = []  # the last is in use
+_whole: set[Path] = set()  # folders of headers that this process has looked at
 _seals = threading.Event()  # set where objects are sealed
 
 
@@ -36,8 +35,7 @@ def prepare_compiler() -> None:
     _drop_unused_helpers(codegen)
     _compile_once(codegen)
     _resolve_once(getattr(codegen, "Adjoint", None))
-    _compile_well(getattr(inside, "build", None))
-    _share_headers(getattr(getattr(inside, "context", None), "runtime", None))
+    _compile_well(getattr(inside, "build", None), getattr(getattr(inside, "context", None), "runtime", None))
 
 
 def _drop_unused_helpers(codegen: Any) -> None:
@@ -95,12 +93,13 @@ def _resolve_once(writer: Any) -> None:
     writer.resolve_func = resolve_func
 
 
-def _compile_well(build: Any) -> None:
+def _compile_well(build: Any, runtime: Any) -> None:
     """Flags that save 1.7 s: templates of the headers are compiled with them, not with each kernel (0.6 s); values need no names
     (0.4 s); the headers have no bfloat16, where the kernel's source says that it needs none (0.7 s). And each object is sealed with
     its SHA-256, behind all that a linker reads."""
     plain = getattr(build, "build_cpu", None)
-    if plain is None or not {"extra_flags", "use_precompiled_headers", "pch_dir"} <= set(signature(plain).parameters):
+    own_headers = getattr(runtime, "get_clang_pch_dir", None)
+    if plain is None or own_headers is None or not {"extra_flags", "pch_dir"} <= set(signature(plain).parameters):
         return
 
     @wraps(plain)
@@ -109,54 +108,83 @@ def _compile_well(build: Any) -> None:
             without = source.readline().strip() == "#define WP_NO_BFLOAT16"
         options["extra_flags"] = " ".join([*FLAGS, *(["-DWP_NO_BFLOAT16="] if without else []), extra_flags])
         if options.get("use_precompiled_headers"):
-            _precompile_headers(plain, options)
+            try:
+                options["pch_dir"] = str(_headers(plain, options))
+            except OSError:  # a cache that is read-only, and a kernel that is compiled elsewhere
+                options["pch_dir"] = own_headers()
         done = plain(obj_path, cpp_path, **options)
         with open(obj_path, "r+b") as compiled:
             compiled.write(sha256(compiled.read()).digest())
         return done
 
     build.build_cpu = build_cpu
+    runtime.get_clang_pch_dir = lambda: None  # it makes a folder in each thread
     _seals.set()
 
 
-def _precompile_headers(build_cpu: Any, options: dict[str, Any]) -> None:
-    """With an empty source. The first thread to come does it; others wait."""
-    folder = Path(options["pch_dir"])
-    with _lock:
-        if not any(folder.glob("*.pch")):
-            (folder / "empty.cpp").touch()
-            build_cpu(str(folder / "empty.o"), str(folder / "empty.cpp"), **options)
+def _headers(build_cpu: Any, options: dict[str, Any]) -> Path:
+    """Return the folder of precompiled headers for a compilation with these options. Raises OSError where it cannot be made.
 
-
-def _share_headers(runtime: Any) -> None:
-    """Saves 2.4 s. Warp 1.19 precompiles its headers in every thread that compiles; here all threads of a process share a folder.
-
-    The folder ends with the process: what Clang writes names paths and times of the headers, so it is wrong for another copy of
-    Warp. It stands in the kernel cache, where a caller has looked for room; what a killed process left there goes a day later.
+    Saves 2.4 s, and 1.3 s of each later process that compiles: Warp 1.19 precompiles its headers in every thread that compiles.
+    Here all threads share them, and all processes of a user with the same copy of Warp. What Clang writes names paths and times of
+    the headers, so it is wrong for any other copy. Headers that nobody has used for a day are removed.
     """
-    own = getattr(runtime, "get_clang_pch_dir", None)
-    if own is None:
-        return
-
-    def shared() -> Any:
-        cache = Path(wp.config.kernel_cache_dir)
-        with _lock, suppress(OSError):  # a cache that is read-only, and a kernel that is compiled elsewhere
-            if not _headers or not _headers[-1].is_dir():  # the first, or somebody has emptied the cache
-                for path in cache.iterdir():
-                    with suppress(OSError):  # another process was faster
-                        if _LEFTOVER.fullmatch(path.name) and time.time() - path.lstat().st_mtime > DAY:
-                            shutil.rmtree(path)
-                _headers.append(Path(mkdtemp(prefix="precompiled-", dir=cache)))
-                atexit.register(_remove_headers, _headers[-1], os.getpid())
-            return str(_headers[-1])
-        return own()
-
-    runtime.get_clang_pch_dir = shared
+    user = os.getuid() if hasattr(os, "getuid") else ""
+    key = sha256(repr((_copy_of_warp(), user, sorted({**options, "pch_dir": None}.items()))).encode()).hexdigest()[:16]
+    folder = Path(wp.config.kernel_cache_dir) / f"precompiled-{key}"
+    with _lock:
+        if folder not in _whole or not folder.is_dir():  # the first that asks, or somebody has emptied the cache
+            for path in folder.parent.iterdir():
+                with suppress(OSError):  # another process was faster
+                    if _LEFTOVER.fullmatch(path.name) and path != folder and time.time() - path.lstat().st_mtime > DAY:
+                        shutil.rmtree(path)
+            if not _is_sealed(folder):
+                _precompile_headers(build_cpu, folder, options)
+            os.utime(folder)
+            _whole.add(folder)
+    return folder
 
 
-def _remove_headers(folder: Path, process: int) -> None:
-    if os.getpid() == process:  # not a forked one, which used them too
-        shutil.rmtree(folder, ignore_errors=True)
+@cache
+def _copy_of_warp() -> tuple[Any, ...]:
+    """The place of Warp's headers, and their names, sizes and times."""
+    native = Path(wp.__file__).resolve().parent / "native"
+    return native, *((str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(native.rglob("*.h")))
+
+
+def _precompile_headers(build_cpu: Any, folder: Path, options: dict[str, Any]) -> None:
+    """With an empty source, in a folder aside that is renamed when it is whole. Threads wait for the first; of processes that start
+    at once each has its own, and the last stays."""
+    aside = Path(mkdtemp(prefix=f"{folder.name}-", dir=folder.parent))
+    try:
+        (aside / "empty.cpp").touch()
+        build_cpu(str(aside / "empty.o"), str(aside / "empty.cpp"), **{**options, "pch_dir": str(aside)})
+        (aside / "seal").write_bytes(_digest(aside))
+        with suppress(FileNotFoundError):
+            folder.rename(folder.with_name(f"{aside.name}-old"))  # a damaged one, or what is in the way
+        aside.rename(folder)
+    finally:
+        for path in folder.parent.glob(f"{aside.name}*"):
+            remove(path)
+
+
+def _digest(folder: Path) -> bytes:
+    return sha256(b"".join(path.read_bytes() for path in sorted(folder.glob("*.pch")))).digest()
+
+
+def _is_sealed(folder: Path) -> bool:
+    try:
+        return not folder.is_symlink() and (folder / "seal").read_bytes() == _digest(folder)
+    except OSError:
+        return False
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a link or a folder that may be there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def is_whole(path: Path) -> bool:
@@ -166,6 +194,7 @@ def is_whole(path: Path) -> bool:
     return len(data) > 0 and (path.suffix != ".o" or not _seals.is_set() or sha256(data[:-32]).digest() == data[-32:])
 
 
-@wp.kernel(module="unique", enable_backward=False)  # type: ignore[call-arg]
+# To compile it takes nothing but the headers: those of wrt's own kernels, which have these options.
+@wp.kernel(module="unique", enable_backward=False, module_options={"fuse_fp": False, "mode": "release"})  # type: ignore[call-arg]
 def empty_kernel() -> None:
-    """To compile it takes nothing but the headers."""
+    pass

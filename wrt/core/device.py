@@ -22,7 +22,7 @@ import numpy as np
 import warp as wp
 
 from wrt.core import cuda
-from wrt.core.compiler import empty_kernel, is_whole, prepare_compiler
+from wrt.core.compiler import empty_kernel, is_whole, prepare_compiler, remove
 from wrt.core.errors import InputError
 from wrt.core.seconds import loading
 from wrt.core.threads import run_all, submit, thread_count, with_stack
@@ -191,18 +191,10 @@ def _load(kernel: Any, device: Any, block_dim: int) -> None:
                 module.load(device, block_dim=block_dim)
                 return
         for path in before:  # not what another process has compiled since
-            _remove(path)
+            remove(path)
         folder.parent.mkdir(parents=True, exist_ok=True)
         _require_room_to_compile(folder.parent)
         module.load(device, block_dim=block_dim)
-
-
-def _remove(path: Path) -> None:
-    """Remove a file, a link or a folder that may be there."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 @contextmanager

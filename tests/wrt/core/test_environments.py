@@ -38,7 +38,7 @@ wp.launch(own.double_it, dim=2, inputs=[a], device="cpu")
 print(a.numpy().tolist())
 """
 TOLD = QUERY.replace("print(", "try:\n    print(") + "except wrt.InputError as error:\n    print(error)"
-LEFTOVER = re.compile(r"wp_\w+_p\d+_t\d+|precompiled-.*")
+LEFTOVER = re.compile(r"wp_\w+_p\d+_t\d+|precompiled-\w+-.*")
 RENDER = ["-m", "wrt", "render", "--spp", "1", "--size", "24x16", "-q"]
 
 
@@ -113,7 +113,7 @@ def test_a_small_disk_is_one_message_or_room_enough(options: str, cache: Path):
     first, second, *left = done.stdout.splitlines()
     assert done.stderr == "" and first == second
     assert f"{first}\n" == ANSWER or first.endswith(MESSAGE.strip())
-    assert not [name for name in left if ("_p" in name and "_t" in name) or name.startswith("precompiled")]
+    assert not [name for name in left if LEFTOVER.fullmatch(name)]
 
 
 def test_a_read_only_disk(cache: Path):

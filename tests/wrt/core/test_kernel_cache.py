@@ -148,7 +148,7 @@ def test_what_killed_processes_have_left_goes_after_a_day(cache: Path, monkeypat
     for name in names:
         os.utime(cache / name, (1.6e9, 1.6e9))
     (cache / "precompiled-link").symlink_to(cache / "lto")
-    monkeypatch.setattr(compiler, "_headers", [])
+    monkeypatch.setattr(compiler, "_whole", set())
     assert answer() == RIGHT
     left = {path.name for path in cache.iterdir()}
     assert not left & set(names[:3]) and left >= {*names[3:], *(f"{name}9" for name in names)}
@@ -183,7 +183,7 @@ def test_after_a_power_cut_a_process_is_right_and_silent(tmp_path: Path):
             path.write_bytes(bytes(path.stat().st_size))
     check_silent(run("-c", QUERY, env=environment))
     check_silent(run("-c", QUERY, env=environment))
-    assert not list(tmp_path.glob("*/precompiled-*"))
+    assert len(list(tmp_path.glob("*/precompiled-*"))) == 1
 
 
 def test_an_empty_name_of_the_cache_is_none(tmp_path: Path):
