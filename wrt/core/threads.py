@@ -102,19 +102,26 @@ class Pool(ThreadPoolExecutor):
     """
 
     def __init__(self, threads: int, name: str = "wrt") -> None:
-        super().__init__(threads, name, initializer=partial(setattr, _here, "large", True))
+        super().__init__(threads, name, initializer=_with_large_stack)
 
     def submit(self, task: Callable[..., T], /, *arguments: Any, **named: Any) -> Future[T]:
-        with _large_stacks():
-            if threading.main_thread().is_alive():
+        if threading.main_thread().is_alive():
+            with _large_stacks():
                 return super().submit(task, *arguments, **named)
-            future = Future[T]()
-            alone = partial(_complete, future, partial(task, *arguments, **named))
-            try:
-                threading.Thread(target=alone, name="wrt").start()
-            except RuntimeError:
-                alone()
-            return future
+        future = Future[T]()
+        alone = partial(_complete, future, partial(task, *arguments, **named))
+        try:
+            with _large_stacks():
+                threading.Thread(target=_with_large_stack, args=(alone,), name="wrt").start()
+        except RuntimeError:
+            alone()
+        return future
+
+
+def _with_large_stack(task: Callable[[], object] = lambda: None) -> None:
+    """In a thread of wrt's."""
+    _here.large = True
+    task()
 
 
 def _complete(future: Future[T], task: Callable[[], T]) -> None:

@@ -98,6 +98,23 @@ def test_threads_are_kept() -> None:
     assert 2 <= len(seen) < 20
 
 
+@pytest.mark.parametrize("start", [True, False])
+def test_without_the_main_thread_all_is_run(start: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The standard pool takes nothing then, and Python 3.12 starts no threads in atexit."""
+    ended = threading.Thread()
+    ended.start()
+    ended.join()
+    monkeypatch.setattr(threading, "main_thread", lambda: ended)
+    if not start:
+        def refuse(thread: threading.Thread) -> None:
+            raise RuntimeError("can't create new thread at interpreter shutdown")
+
+        monkeypatch.setattr(threading.Thread, "start", refuse)
+    done: list[int] = []
+    run_all([lambda: run_all([lambda: done.append(1)] * 5, 3)] * 20, 4)
+    assert len(done) == 100
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_run_growing_also_runs_what_tasks_give(threads: int) -> None:
     done: list[int] = []
