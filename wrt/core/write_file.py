@@ -67,6 +67,10 @@ def _reported(path: str | os.PathLike[str]) -> Iterator[None]:
 def _target(path: str | os.PathLike[str]) -> Path:
     """The path, if a file can be put there; raises InputError if not."""
     target = Path(path).absolute()  # whatever becomes the current folder meanwhile
+    try:
+        os.access(target, os.F_OK)
+    except ValueError as error:  # a zero byte or a lone surrogate: Path.exists() says only that there is no such file
+        raise InputError(f"cannot be written: {error}", path) from None
     if not target.parent.is_dir():
         raise InputError("its folder does not exist", path)
     if target.is_dir():

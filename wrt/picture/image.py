@@ -120,7 +120,7 @@ def _write_oiio(path: PathLike, spec: Any, rows: Callable[[int, int], np.ndarray
     with replacing(path) as file:
         # By its descriptor where that has a name: whoever can rename files in the folder could put a link in the file's place.
         name = f"/dev/fd/{file.fileno()}" if os.path.isdir("/dev/fd") else file.name
-        out = oiio.ImageOutput.create(file.name)
+        out = oiio.ImageOutput.create(os.path.basename(file.name))  # takes no name of a folder that is no UTF-8
         if out is None:
             raise InputError(f"cannot be written: {oiio.geterror()}", path)
         try:
@@ -298,7 +298,10 @@ def _opened(path: PathLike) -> Iterator[Any]:
         import OpenImageIO as oiio
 
     oiio.attribute("try_all_readers", 0)
-    source = oiio.ImageInput.open(os.fspath(path))
+    try:
+        source = oiio.ImageInput.open(os.fspath(path))
+    except TypeError:  # it takes UTF-8 alone
+        raise InputError("cannot be read: OpenImageIO needs a path in UTF-8", path) from None
     if source is None:
         raise InputError(f"cannot be read as an image: {_reason(oiio.geterror)}", path)
     try:

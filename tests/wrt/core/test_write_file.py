@@ -97,6 +97,15 @@ def test_every_file_is_brought_to_the_disk(name: str, write: Callable[[Path], No
     assert calls[at + 1][1] == tmp_path.name and names(tmp_path) == {name} and (tmp_path / name).stat().st_size > 20
 
 
+@linux_only
+@each_writer
+def test_into_a_folder_whose_name_is_no_utf_8(name: str, write: Callable[[Path], None], tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"b\xff")
+    folder.mkdir()
+    write(folder / name)
+    assert names(folder) == {name}
+
+
 @pytest.mark.parametrize(("number", "fine"), [(errno.EIO, False), (errno.ENOSPC, False), (errno.EINVAL, True)])
 def test_a_disk_that_does_not_take_a_picture_is_told(number: int, fine: bool, tmp_path: Path,
                                                      monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,6 +150,14 @@ def test_a_read_only_folder_is_told_with_the_name_that_somebody_gave(name: str, 
     with pytest.raises(InputError) as caught:
         write(tmp_path / name)
     assert str(caught.value) == f"{tmp_path / name}: cannot be written: Read-only file system"
+
+
+@pytest.mark.parametrize("odd", ["a\0b", "\ud800"])
+@pytest.mark.parametrize(("name", "write"), [*WRITERS.items(), ("b.hdr", check_writable)])
+def test_a_name_that_no_system_takes_is_told(name: str, write: Callable[[Path], None], odd: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot be written: .*(null byte|surrogates)"):
+        write(tmp_path / f"{odd}{name}")
+    assert not names(tmp_path)
 
 
 def test_on_the_command_line_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,6 +116,15 @@ def test_exr_is_exact_and_mitsuba_agrees(pixels: np.ndarray, tmp_path: Path) -> 
     assert read_metadata(path) == {key: str(value) for key, value in METADATA.items()}
 
 
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a file system that takes any name")
+@pytest.mark.parametrize("suffix", [".exr", ".hdr"])
+def test_a_name_that_openimageio_cannot_open_is_told(suffix: str, pixels: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode(b"b\xff" + suffix.encode())
+    write_image(path, pixels)
+    with pytest.raises(InputError, match="needs a path in UTF-8"):
+        read_image(path)
+
+
 def test_half_exr_is_rounded_to_half(pixels: np.ndarray, tmp_path: Path) -> None:
     write_image(tmp_path / "a.exr", pixels, bits=16)
     half = mitsuba_bitmap(tmp_path / "a.exr")
