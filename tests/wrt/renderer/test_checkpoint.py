@@ -269,12 +269,13 @@ def forged(path: Path, body_change: Callable[[bytes], bytes] = bytes, **changes:
 @pytest.mark.parametrize(("changes", "message"), [
     ({"samples": [0, float("inf")]}, "is no checkpoint"), ({"seconds": 10**400}, "is no checkpoint"),
     ({"seconds": float("nan")}, "is no checkpoint"), ({"seconds": -1.0}, "is no checkpoint"), ({"samples": {}}, "is no checkpoint"),
-    ({"samples": [1]}, "is no checkpoint"), ({"samples": "ab"}, "is no checkpoint"), ({"samples": [-1, 1]}, "do not fit"),
+    ({"samples": [1]}, "is no checkpoint"), ({"samples": "ab"}, "is no checkpoint"), ({"samples": [-1, 1]}, "is no checkpoint"),
+    ({"samples": [0, 9 * 10**4299]}, "is no checkpoint"), ({"samples": [1, 0]}, "is no checkpoint"),
     ({"samples": [0, 1]}, "samples do not fit"), ({"seconds": None}, "is no checkpoint"), ({"identity": 5}, "is no checkpoint"),
     ({"identity": {}}, "of another render"), ({"body_change": lambda body: body[:-4]}, "arrays do not fit"),
     ({"body_change": lambda body: body + bytes(4)}, "arrays do not fit"),
     ({"body_change": lambda body: bytes(len(body))}, "do not fit"),
-], ids=range(15))
+], ids=range(17))
 def test_a_forged_file_is_refused(changes: dict[str, Any], message: str, path: Path) -> None:
     render(SCENE, spp=1, checkpoint=path)
     forged(path, **changes)
