@@ -71,7 +71,6 @@ def instructions(structures: tuple[str, ...], as_json: bool) -> None:
 def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu: str, **options: Any) -> None:
     """What every ray of SCENE costs: counters by pixel, kind and depth, and a model of the RT core."""
     from wrt.core.checks import require_known
-    from wrt.lab.bench.report import check_folder
     from wrt.lab.rtcore import profile_report as report
     from wrt.lab.rtcore.parameters import GPUS
     from wrt.lab.rtcore.profiler import profile as measure
@@ -79,7 +78,7 @@ def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu
 
     require_known(gpu, GPUS, "GPU")
     if how.output is not None:
-        check_folder(how.output, (report.LAYERS, report.HISTOGRAMS))
+        report.check_folder(how.output)
     settings = settings_of(given, {name: options.pop(name) for name in ("size", "max_depth")}, spp="--spp")
     loaded = load(scene, how.quiet).with_settings(**settings)
     with warnings_reported(how.quiet), progress_reporter(how.quiet) as progress, naming(scene):
@@ -93,7 +92,7 @@ def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu
 
 @click.command(help=Stability.__doc__)
 @planned(Stability)
-@reporting(Stability.REPORT, cluster=True, quiet="No progress")
+@reporting(cluster=True, quiet="No progress")
 def stability(how: Reporting, plan: Stability) -> None:
     from wrt.lab.bench.report import cells
     from wrt.lab.hard_cases import report
@@ -104,15 +103,14 @@ def stability(how: Reporting, plan: Stability) -> None:
             say("  ".join(cells(study.COLUMNS, row)), err=False)
 
     study.chosen(plan.cases)
-    if how.output is not None:
-        report.check_report(how.output)
+    how.check_markdown()
     client = client_of(how.cluster)
     if not how.as_json:
         say("  ".join(study.COLUMNS), err=False)
     result = study.run(plan, row_done, how.now_and_then, client)
-    paths = [] if how.output is None else report.write_report(result, plan, how.output)
-    data = {"machine": report.machine(plan), **result.as_dict(), "output": paths}
-    how.end(f"\n{report.summary(result)}", data, paths, result.interrupted)
+    how.write(report.text(result, plan))
+    data = {"machine": report.machine(plan), **result.as_dict(), "output": how.output}
+    how.end(f"\n{report.summary(result)}", data, interrupted=result.interrupted)
 
 
 @bench.command()
@@ -120,7 +118,7 @@ def stability(how: Reporting, plan: Stability) -> None:
 @planned(Error)
 @click.option("--size", type=SIZE, default="128x72", show_default=True, help="Pixels")
 @shared("camera", "given", "seed", "device", "threads")
-@reporting("Folder for a report: Markdown, plot and data")
+@reporting()
 def error(how: Reporting, plan: Error, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int],
           **options: Any) -> None:
     """Speed against error of SCENE over the knobs that a render has: each picture against a converged reference."""
@@ -130,13 +128,13 @@ def error(how: Reporting, plan: Error, scene: Path, given: tuple[tuple[str, Any]
 
     rendering = Options(**options)
     settings = settings_of(given, size="--size", spp="--max-spp")
-    paths = {} if how.output is None else report.report_paths(how.output, scene.stem)
+    how.check_markdown()
     loaded = load(scene, how.quiet).with_settings(size=size, **settings)
     with warnings_reported(how.quiet), naming(scene):
         result = study.sweep(loaded, plan, rendering, how.progress)
-    if paths:
-        report.write_report(result, paths, f"python -m wrt {click.get_current_context().command_path}")
-    how.end(report.text(result), {**result.as_dict(), "output": list(paths.values())}, list(paths.values()), result.interrupted)
+    text = report.text(result)
+    how.write(text)
+    how.end(text, {**result.as_dict(), "output": how.output}, interrupted=result.interrupted)
 
 
 @bench.command()
@@ -145,7 +143,7 @@ def error(how: Reporting, plan: Error, scene: Path, given: tuple[tuple[str, Any]
 @click.option("--size", type=SIZE, default="320x180", show_default=True, help="Pixels")
 @click.option("--matte", is_flag=True, help="Make every surface diffuse, for the integrator direct, which draws the same light")
 @shared("camera", "given")
-@reporting("Write the table as Markdown (.md)")
+@reporting()
 def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int], matte: bool,
             camera: str | None) -> None:
     """SCENE by wrt and by Mitsuba 3 (scalar_rgb and llvm_ad_rgb), on all threads: time to equal error, process start included and

@@ -53,18 +53,20 @@ class Reporting:
             write_bytes(self.output, (text.rstrip("\n") + "\n").encode())
 
     def end(self, text: str, data: dict[str, Any], paths: Sequence[Path] = (), interrupted: int | None = None) -> None:
-        """The result on stdout. interrupted: the signal that ended the work early, whose exit code this ends with."""
+        """The result on stdout, and what was written: `paths`, or the output. interrupted: the signal that ended the work early,
+        whose exit code this ends with."""
         if self.as_json:
             say_json(data)
         else:
-            for line in (text, *paths):
+            for line in (text, *(paths or filter(None, [self.output]))):
                 say(line, err=False)
         if interrupted is not None:
             say("interrupted: what was done is kept")
             raise SystemExit(exit_code(interrupted))
 
 
-def reporting(report: str, *, cluster: bool = False, quiet: str = "No progress, no warnings") -> Callable[[Any], Any]:
+def reporting(report: str = "Write the tables as Markdown (.md)", *, cluster: bool = False,
+              quiet: str = "No progress, no warnings") -> Callable[[Any], Any]:
     """A command with these options, which it gets as one argument, `how`. report: help of -o."""
     options = [SHARED["as_json"],
                click.option("-q", "--quiet", is_flag=True, help=quiet),
@@ -136,17 +138,13 @@ def measured(group: click.Group, plan: type[Plan]) -> None:
 
     @group.command(plan.COMMAND.split()[-1], help=plan.__doc__)
     @planned(plan)
-    @reporting(plan.REPORT, cluster="meshes" in plan.__annotations__)
+    @reporting(cluster="meshes" in plan.__annotations__)
     def command(how: Reporting, plan: Any) -> None:
         from wrt.lab.bench import report
         from wrt.lab.bench.sweep import by_mesh
 
         study = importlib.import_module(plan.STUDY)
-        plots = getattr(study, "PLOTS", None)
-        if plots is None:
-            how.check_markdown()
-        elif how.output is not None:
-            report.check_folder(how.output, plots)
+        how.check_markdown()
         client = client_of(how.cluster)
         machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
         if client is not None:
@@ -155,9 +153,6 @@ def measured(group: click.Group, plan: type[Plan]) -> None:
             machine = f"a cluster, each mesh on one worker: {machines(client)}; started from {machine}"
         with warnings_reported(how.quiet):
             rows = by_mesh(report.run, plan, lambda row: how.progress(report.line(plan, row)), client)
-        text, paths = report.text(rows, plan, machine), []
-        if plots is None:
-            how.write(text)
-        elif how.output is not None:
-            paths = report.write_report(rows, plan, how.output, machine)
-        how.end(text, {"machine": machine, **report.data(rows, plan), "output": how.output if plots is None else paths}, paths)
+        text = report.text(rows, plan, machine)
+        how.write(text)
+        how.end(text, {"machine": machine, **report.data(rows, plan), "output": how.output})

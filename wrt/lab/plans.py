@@ -13,7 +13,6 @@ from typing import Any, ClassVar
 STRUCTURES = ("structure", "wrt.accel.structures:ACCELERATORS")
 KINDS = ("kind of ray", "wrt.lab.bench.rays:RAY_KINDS")
 GPUS = ("GPU", "wrt.lab.rtcore.parameters:GPUS")
-FOLDER, MARKDOWN = "Folder for a report with plots", "Write the tables as Markdown (.md)"
 
 
 def option(default: Any, text: str, between: tuple[int, int] | None = None, of: tuple[str, str] | None = None, flag: str = "",
@@ -40,13 +39,11 @@ def the_threads(text: str = "Threads on the CPU  [default: all cores]") -> Any:
 class Plan:
     """Raises InputError where a number is out of its range, and where there is nothing of a name.
 
-    COMMAND: what asks for it; STUDY: the module that measures it; REPORT: what -o writes; QUICK: with --quick, what takes the place
-    of a default.
+    COMMAND: what asks for it; STUDY: the module that measures it; QUICK: with --quick, what takes the place of a default.
     """
 
     COMMAND: ClassVar[str] = ""
     STUDY: ClassVar[str] = ""
-    REPORT: ClassVar[str] = MARKDOWN
     QUICK: ClassVar[Mapping[str, Any]] = {}
 
     def __post_init__(self) -> None:
@@ -76,7 +73,6 @@ class Visibility(Plan):
     """
 
     COMMAND, STUDY = "bench visibility", "wrt.lab.bench.visibility"
-    REPORT = FOLDER
     QUICK = {"size": 128, "max_size": 512, "max_triangles": 50_000, "runs": 5}
     meshes: Sequence[Any] = the_meshes()
     size: int = option(512, "Pixels a side as triangles grow", (1, 16384))
@@ -192,7 +188,6 @@ class Accel(Plan):
     """
 
     COMMAND, STUDY = "bench accel", "wrt.lab.bench.accel"
-    REPORT = FOLDER
     QUICK = {"rays": 20_000, "runs": 3, "max_triangles": 20_000}
     meshes: Sequence[Any] = the_meshes()
     structures: Sequence[str] = option((), "Which, by name  [default: all but brute_force]", of=STRUCTURES)
@@ -334,7 +329,6 @@ class Stability(Plan):
     """
 
     COMMAND = "stability"
-    REPORT = "Write a report: Markdown (.md) with plots beside it"
     QUICK = {"rays": 300, "sample": 300, "runs": 3}
     cases: Sequence[str] = option((), "", form="argument")
     rays: int = option(10_000, "Rays of each case, for the default", (1, 2**40))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
@@ -17,7 +17,6 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.plot import LogLogPlot, Series
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled
 from wrt.lab.bench.report import run as run
@@ -42,8 +41,6 @@ REFUSED: Columns = {"structure": "{structure}", "mesh": "{mesh}", "reason": "{re
 GROWTH: Columns = {
     "structure": "{structure}", "mesh": "{mesh}", "rays": "{kind}", "cost": "{cost}",
     "triangles": lambda row: f"{vars(row)['from']} to {row.to}", "exponent": "{exponent:.3f} ± {error:.3f}", "times": "{times:.2f}"}
-PLOTS = {"accel-build.png": "microseconds of build a triangle", "accel-memory.png": "bytes a triangle",
-         "accel-growth.png": "triangles"}
 LEGEND = f"""\
 build: median of the builds, all cores. B/triangle: of the whole structure, triangles included; peak B: what the process grew by
 at the first build, a triangle. SAH: expected nodes and triangles of a random line through the root, costing 1 each. refs:
@@ -180,18 +177,3 @@ def line(row: Row) -> str:
 def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
     return {"rows": [row.as_dict() for row in measured(rows)],
             "refused": [row.as_dict() for row in rows if "reason" in vars(row)], "growth": growth(rows)}
-
-
-def plot(rows: Sequence[Row], name: str) -> LogLogPlot:
-    """Time to build or memory against time to search (one point a mesh; the last kind of ray that was measured), or the cost of
-    a ray as triangles grow."""
-    rows = measured(rows)
-    kind = rows[-1].kind if rows else ""
-    across: dict[str, Callable[[Row], float]] = {
-        "accel-build.png": lambda row: row.build_median / row.triangles * 1e6,
-        "accel-memory.png": lambda row: row.bytes_per_triangle, "accel-growth.png": lambda row: float(row.triangles)}
-    lines = []
-    for (structure,), group in grouped([row for row in rows if row.kind == kind], "structure").items():
-        points = [(across[name](row), 1.0 / row.mrays_median) for row in group]
-        lines.append(Series(structure, sorted(points) if name == "accel-growth.png" else points))
-    return LogLogPlot(f"Structures, {kind} rays", PLOTS[name], "microseconds a ray", lines)

@@ -1,15 +1,11 @@
-"""What `bench error` finds, and what is shown of it: tables for the terminal and a notebook, a report with a plot for a folder."""
+"""What `bench error` finds, and what is shown of it: tables for the terminal, a report and a notebook."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
-from wrt.core.json_text import json_text
 from wrt.lab.bench.error_statistics import CONFIDENCE, Estimate
-from wrt.lab.bench.plot import LogLogPlot, Series
-from wrt.lab.bench.report import Columns, Part, Row, check_folder, grouped, tabled, tables_page, write
-from wrt.lab.bench.report import markdown as as_markdown
+from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled, tables_page
 
 BASE = "as it is"
 # Of the variance. Independent samples: -1. Scrambled nets: -3 where the integrand is smooth (Owen 1997, "Scrambled Net Variance
@@ -31,8 +27,7 @@ class Sweep(Row):
     """
 
     def _repr_html_(self) -> str:
-        return tables_page([tabled(COLUMNS, self.rows, f"Speed against error: {self.scene}"),
-                            tabled(SLOPE_COLUMNS, self.slopes, "How fast the error falls")])
+        return tables_page(tables(self))
 
 
 def number(value: float) -> str:
@@ -81,40 +76,11 @@ def notes(sweep: Sweep) -> list[str]:
     return lines + [f"Left out: {line}." for line in sweep.left_out]
 
 
+def tables(sweep: Sweep) -> list[Part]:
+    return [tabled(COLUMNS, sweep.rows, f"Speed against error: {sweep.scene}"),
+            tabled(SLOPE_COLUMNS, sweep.slopes, "How fast the error falls", "Log MSE, and log variance alone, over log spp.")]
+
+
 def text(sweep: Sweep) -> str:
-    """For the terminal."""
-    tables = tabled(COLUMNS, sweep.rows), tabled(SLOPE_COLUMNS, sweep.slopes)
-    return as_markdown([*tables, Part("", "\n".join(notes(sweep)))]).rstrip()
-
-
-def markdown(sweep: Sweep, picture: str, command: str) -> str:
-    """The whole report; `picture` is the plot's file name beside it, `command` what repeats it."""
-    front = sorted((row for row in sweep.rows if row.pareto), key=lambda row: row.seconds.value)
-    told = "\n\n".join([f"`{command}`", *(note.replace("*", "\\*") for note in notes(sweep))])
-    return as_markdown([
-        Part(f"Speed against error: {sweep.scene}", told), Part("Error over seconds", plot=picture),
-        tabled(COLUMNS, front, "The Pareto front"),
-        tabled(SLOPE_COLUMNS, sweep.slopes, "How fast the error falls", "Log MSE, and log variance alone, over log spp."),
-        tabled(COLUMNS, sweep.rows, "Everything")])
-
-
-def plot(sweep: Sweep) -> LogLogPlot:
-    """RMSE over seconds: a line a variant, a colour a knob, the Pareto front on top."""
-    series = [Series(rows[0].knob or variant, [(row.seconds.value, row.rmse.value) for row in rows])
-              for (variant,), rows in grouped(sweep.rows, "variant").items()]
-    front = sorted((row.seconds.value, row.rmse.value) for row in sweep.rows if row.pareto)
-    return LogLogPlot(sweep.scene, "seconds of tracing", "RMSE (linear radiance)", series, front, "Pareto front")
-
-
-def report_paths(folder: Path, stem: str) -> dict[str, Path]:
-    """Where a report's files go; makes the folder. Raises InputError where nothing can be written there."""
-    paths = {suffix: folder / f"{stem}_error.{suffix}" for suffix in ("md", "png", "json")}
-    check_folder(folder, [paths["png"].name], parents=True)
-    return paths
-
-
-def write_report(sweep: Sweep, paths: dict[str, Path], command: str) -> None:
-    """Markdown, plot and data. Raises InputError where one cannot be written."""
-    picture = paths["png"].name
-    write(paths["md"], markdown(sweep, picture, command), {picture: plot(sweep)})
-    write(paths["json"], json_text(sweep.as_dict(), indent=1), {})
+    """For the terminal and a report, as Markdown."""
+    return markdown([*tables(sweep), Part("", "\n\n".join(notes(sweep)))]).rstrip()

@@ -1,56 +1,17 @@
-"""Plots by matplotlib, as arrays of pixels: logarithmic ones of points by series, and histograms side by side."""
+"""Histograms by matplotlib, side by side, as an array of pixels."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from wrt.core.errors import InputError
 
-Point = tuple[float, float]
 DPI = 100
 BINS = 60
-
-
-@dataclass(frozen=True)
-class Series:
-    """Points in the order in which a line joins them. Series with the same label have one colour and one legend entry."""
-
-    label: str
-    points: Sequence[Point]
-
-
-@dataclass(frozen=True)
-class LogLogPlot:
-    """What is shown; x and y must be positive (points that are not, or not finite, are left out). front: a line on top."""
-
-    title: str
-    x_label: str
-    y_label: str
-    series: Sequence[Series]
-    front: Sequence[Point] = ()
-    front_label: str = "front"
-
-    def draw(self) -> np.ndarray:
-        """(H, W, 3) uint8."""
-        figure = new_figure(9.0, 6.0)
-        axes = figure.subplots()
-        axes.set(title=self.title, xlabel=self.x_label, ylabel=self.y_label, xscale="log", yscale="log")
-        axes.grid(alpha=0.3)
-        colors: dict[str, str] = {}
-        for series in self.series:
-            label = "_" if series.label in colors else series.label  # "_": not in the legend again
-            color = colors.setdefault(series.label, f"C{len(colors) % 10}")
-            axes.plot(*_columns(series.points), "o-", color=color, label=label, markersize=4, linewidth=1)
-        if self.front:
-            axes.plot(*_columns(self.front), "o-", color="black", markerfacecolor="none", markersize=9, label=self.front_label)
-        if self.series:
-            figure.legend(loc="outside right upper", frameon=False)
-        return pixels(figure)
 
 
 def histograms(panels: Mapping[str, Mapping[str, np.ndarray]], title: str) -> np.ndarray:
@@ -95,8 +56,3 @@ def pixels(figure: Any) -> np.ndarray:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def _columns(points: Sequence[Point]) -> tuple[list[float], list[float]]:
-    good = [point for point in points if all(math.isfinite(x) and x > 0.0 for x in point)]
-    return [x for x, _ in good], [y for _, y in good]

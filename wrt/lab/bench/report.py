@@ -1,4 +1,4 @@
-"""What all measurements share: the machine, rows, tables as Markdown and as HTML, a report's files."""
+"""What all measurements share: the machine, rows, tables as Markdown and as HTML."""
 
 from __future__ import annotations
 
@@ -17,12 +17,8 @@ import numpy as np
 
 import wrt
 from wrt.core.device import describe_devices
-from wrt.core.errors import InputError
 from wrt.core.html import Rows, html_table
-from wrt.core.write_file import check_writable, write_bytes
-from wrt.lab.bench.plot import LogLogPlot, new_figure
 from wrt.lab.plans import Plan
-from wrt.picture.image import write_codes
 
 
 def machine_line(used: str = "", *more: str, device: str = "cpu") -> str:
@@ -90,8 +86,7 @@ def study_of(plan: Plan) -> Any:
     """The module that measures what is planned.
 
     It has rows(plan), which yields each Row as it is done; parts(rows, plan), tables and text; a TITLE and a LEGEND. It may have
-    machine(plan); line(row), for the progress; facts(rows, plan), for JSON beside the rows; PLOTS, by the names of their files,
-    with plot(rows, name).
+    machine(plan); line(row), for the progress; facts(rows, plan), for JSON beside the rows.
     """
     return importlib.import_module(plan.STUDY)
 
@@ -125,11 +120,11 @@ def data(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
     return {"rows": [row.as_dict() for row in rows], **facts(rows, plan)}
 
 
-def text(rows: Sequence[Row], plan: Plan, machine: str, plots: Iterable[str] = ()) -> str:
-    """Everything as Markdown. plots: names of files beside it."""
+def text(rows: Sequence[Row], plan: Plan, machine: str) -> str:
+    """Everything as Markdown."""
     study = study_of(plan)
     head = f"# {study.TITLE}\n\nMachine: {machine}\n\nTo repeat: `{repeating(plan)}`\n\n"
-    return f"{head}{markdown([*study.parts(rows, plan), *(Part(plot=name) for name in plots)])}\n{study.LEGEND}"
+    return f"{head}{markdown(study.parts(rows, plan))}\n{study.LEGEND}"
 
 
 def repeating(plan: Plan) -> str:
@@ -148,25 +143,17 @@ def repeating(plan: Plan) -> str:
     return " ".join(words)
 
 
-def write_report(rows: Sequence[Row], plan: Plan, folder: Path, machine: str) -> list[Path]:
-    """The text and the plots of a study in a folder; the paths. Raises InputError where the system refuses."""
-    study = study_of(plan)
-    plots = {name: study.plot(rows, name) for name in study.PLOTS}
-    return write(folder / f"{plan.STUDY.split('.')[-1]}.md", text(rows, plan, machine, plots) + "\n", plots)
-
-
 # --- its report -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Part:
-    """A piece of a report: a heading, paragraphs, a table (head, lines), a plot by its file's name."""
+    """A piece of a report: a heading, paragraphs, a table (head, lines)."""
 
     title: str = ""
     text: str = ""
     head: Sequence[str] = ()
     lines: Sequence[Sequence[str]] = ()
-    plot: str = ""
 
 
 def tables_page(parts: Iterable[Part]) -> str:
@@ -189,31 +176,10 @@ def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 def markdown(parts: Iterable[Part]) -> str:
     pieces = []
     for part in parts:
-        pieces += [f"## {part.title}" if part.title else "", part.text, table(part.head, part.lines) if part.lines else "",
-                   f"![{part.title or part.plot}]({part.plot})" if part.plot else ""]
+        pieces += [f"## {part.title}" if part.title else "", part.text, table(part.head, part.lines) if part.lines else ""]
     return "\n\n".join(filter(None, pieces)) + "\n"
 
 
 def tabled(columns: Columns, rows: Iterable[Any], title: str = "", text: str = "") -> Part:
     """A part with the table of some rows."""
     return Part(title, text, tuple(columns), [cells(columns, row) for row in rows])
-
-
-def check_folder(folder: Path, names: Iterable[str], *, parents: bool = False) -> None:
-    """Make the folder if it is not there; InputError where files of these names, plots among them, cannot be written to it."""
-    try:
-        folder.mkdir(parents=parents, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"no folder to write to: {error.strerror}", folder) from error
-    for name in names:
-        check_writable(folder / name)
-    new_figure(1.0, 1.0)  # there is matplotlib
-
-
-def write(path: Path, text: str, plots: Mapping[str, LogLogPlot]) -> list[Path]:
-    """The text, and beside it plots by their file names; the paths. Raises InputError where the system refuses."""
-    write_bytes(path, text.encode())
-    beside = [path.with_name(name) for name in plots]
-    for target, plot in zip(beside, plots.values(), strict=True):
-        write_codes(target, plot.draw())
-    return [path, *beside]

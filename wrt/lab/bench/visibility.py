@@ -16,7 +16,6 @@ from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.core.threads import thread_count
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.plot import LogLogPlot, Series
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
 from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled
 from wrt.lab.bench.report import run as run
@@ -34,7 +33,6 @@ MIN_SIDE = 64  # pixels; the sweep over pixels doubles it
 SWEEP_TRIANGLES = 80_000  # about as many in the sweep over pixels
 MAX_BUILDS = 3
 SPHERES, TERRAINS = range(3, 10), [22 * 2**k for k in range(8)]  # subdivisions, cells a side
-PLOTS = {"visibility-triangles.png": "triangles", "visibility-pixels.png": "pixels"}
 TITLE = "Rasterising against ray casting"
 COLUMNS: Columns = {
     "surface": lambda row: Path(row.surface).name, "triangles": "{triangles}", "pixels": "{pixels}",
@@ -195,7 +193,7 @@ def machine(plan: Plan) -> str:
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
     out = []
-    for sweep in PLOTS.values():
+    for sweep in ("triangles", "pixels"):
         lines = [row for key, group in series(rows).items() if key[0] == sweep for row in group]
         out += [tabled(COLUMNS, lines, f"As {sweep} grow")] if lines else []
     found = [Row(**each) for each in fits(rows)]
@@ -209,16 +207,3 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
 
 def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
     return {"exponents": fits(rows), "crossings": crossings(rows)}
-
-
-def plot(rows: Sequence[Row], name: str) -> LogLogPlot:
-    """Medians over what grows; on the sweep over triangles also with the build."""
-    sweep = PLOTS[name]
-    costs: dict[str, Callable[[Row], float]] = {"raster": lambda row: row.raster_median, "cast": lambda row: row.cast_median}
-    if sweep == "triangles":
-        costs["build + cast"] = lambda row: row.cast_median + row.build_median
-    lines = [Series(f"{Path(surface).name}: {cost}", [(float(getattr(row, sweep)), of(row)) for row in group])
-             for (which, surface), group in series(rows).items() if which == sweep for cost, of in costs.items()]
-    other = "pixels" if sweep == "triangles" else "triangles"
-    held = sorted({getattr(row, other) for row in rows if row.sweep == sweep})
-    return LogLogPlot(f"Primary visibility, {' or '.join(map(str, held))} {other}", sweep, "seconds a picture", lines)

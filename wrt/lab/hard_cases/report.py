@@ -1,25 +1,18 @@
-"""What `stability` tells: tables for the terminal, and a report as Markdown with plots beside it."""
+"""What `stability` tells: tables for the terminal, and a report as Markdown."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.lab.bench.plot import LogLogPlot, Series
-from wrt.lab.bench.report import Columns, Part, check_folder, machine_line, repeating, table, tabled, write
+from wrt.lab.bench.report import Columns, Part, machine_line, markdown, repeating, table, tabled
 from wrt.lab.bench.report import Row as Line
-from wrt.lab.bench.report import markdown as as_markdown
 from wrt.lab.bench.timing import shown
 from wrt.lab.hard_cases.cases import Verdict
 from wrt.lab.hard_cases.stability import ASKED, COLUMNS, Plan, Result, Row
 
-PLOTS = {"lost": ("Rays lost or wrong, all hard cases", "rays lost or wrong per million"),
-         "error": ("Error of t, the middle one of the hard cases", "99.9th percentile, float32 ulp")}
-NO_LOSS = 0.3  # where "none" is drawn: as if a third of a ray had been lost
 LEGEND = f"""\
 rays: of which the oracle judged the first ones ("judged", {{sample}} of a case at most); the others have an answer that is known
 without it (a closed surface must be hit, corners on a line never, a ray must not hit the triangle that it leaves), and were held
@@ -77,15 +70,12 @@ def _groups(result: Result) -> Part:
                            for name, mine in groups.items()], f"The default ({default}) by group")
 
 
-def parts(result: Result, plan: Plan, stem: str) -> list[Part]:
-    """The whole report, in order; stem: plots are STEM-lost.png and STEM-error.png."""
+def text(result: Result, plan: Plan) -> str:
+    """The whole report, as Markdown."""
     told = "\n\n".join([f"Machine: {machine(plan)}; {result.seconds:.0f} s in all.", f"To repeat: `{repeating(plan)}`",
                         LEGEND.format(sample=plan.sample), *(f"{line}." for line in _notes(result))])
-    lost, error = (f"{stem}-{which}.png" for which in PLOTS)
-    return [Part("Stability of the intersection tests", told), _summary(result),
-            Part("Speed against rays lost or wrong", f"None is drawn at {NO_LOSS} rays: the more rays, the lower.", plot=lost),
-            Part("Speed against error of t", "", plot=error), _groups(result),
-            tabled(COLUMNS, result.rows, "Every case")]
+    return markdown([Part("Stability of the intersection tests", told), _summary(result), _groups(result),
+                     tabled(COLUMNS, result.rows, "Every case")])
 
 
 def summary(result: Result) -> str:
@@ -102,29 +92,3 @@ def _notes(result: Result) -> list[str]:
 
 def machine(plan: Plan) -> str:
     return machine_line(f"{thread_count(plan.threads)} used")
-
-
-def plot(result: Result, which: str) -> LogLogPlot:
-    """A point an algorithm: time a ray against rays lost or wrong per million ("lost"), or the error of t ("error")."""
-    series = []
-    for name, v in sums(result.rows).items():
-        lost = 1e6 * max(wrong(v), NO_LOSS) / max(v.rays, 1)
-        error = lost if which == "lost" else usual_error(result.rows, name)
-        series.append(Series(name, [(1e3 / result.speed[name].mrays_per_second[1], error)]))
-    title, label = PLOTS[which]
-    return LogLogPlot(title, "ns a ray, one thread", label, series)
-
-
-def check_report(path: Path) -> None:
-    """Raise InputError where write_report could not write, before the work."""
-    if path.suffix.lower() != ".md":
-        raise InputError("the report is a .md file", path)
-    if not path.parent.is_dir():
-        raise InputError("no such folder", path.parent)
-    check_folder(path.parent, [path.name, *(f"{path.stem}-{which}.png" for which in PLOTS)])
-
-
-def write_report(result: Result, plan: Plan, path: Path) -> list[Path]:
-    """The files; the report is written whole or not at all. Raises InputError where the system refuses."""
-    plots = {f"{path.stem}-{which}.png": plot(result, which) for which in PLOTS}
-    return write(path, as_markdown(parts(result, plan, path.stem)), plots)

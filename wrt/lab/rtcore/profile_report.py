@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from wrt.accel.answers import Counters
+from wrt.core.errors import InputError
 from wrt.core.html import Rows
-from wrt.core.write_file import write_bytes
-from wrt.lab.bench.plot import histograms
+from wrt.core.write_file import check_writable, write_bytes
+from wrt.lab.bench.plot import histograms, new_figure
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
 from wrt.lab.rtcore.model import LEGEND, MODEL_COLUMNS, SIMT_COLUMNS, Work, model_page, model_row, simt
 from wrt.lab.rtcore.parameters import Gpu
@@ -113,6 +114,17 @@ def summary(profile: Profile, rows: Sequence[Row], gpu: Gpu) -> str:
         percentiles(profile), tabled(MODEL_COLUMNS, rows, f"Model of {gpu.name} ({traced})"), Part("", LEGEND),
         tabled(SIMT_COLUMNS, rows, "SIMT efficiency",
                "Warps of 8 x 4 pixels as they come, without gaps, and sorted by origin and direction.")])
+
+
+def check_folder(folder: Path) -> None:
+    """Make the folder if it is not there; InputError where write_report could not write to it, or there is no matplotlib."""
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"no folder to write to: {error.strerror}", folder) from error
+    for name in (LAYERS, HISTOGRAMS):
+        check_writable(folder / name)
+    new_figure(1.0, 1.0)
 
 
 def write_report(profile: Profile, text: str, folder: Path) -> list[Path]:

@@ -118,4 +118,4 @@ def test_the_command_prints_and_writes(box, tmp_path) -> None:
     assert [row["name"] for row in told["rows"]] == ["wrt bvh8", "Warp mesh_query_ray"]
     assert "Warp mesh_query_ray" in told["means"] and "differ" in (tmp_path / "out.md").read_text()
     done = command("bench", "peers", box, "-o", tmp_path / "no" / "out.md")
-    assert done.code == 2 and "report" in done.err
+    assert done.code == 2 and "no/out.md: its folder does not exist" in done.err

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import wrt
 from tests.command_line import BOX_OBJ
@@ -327,15 +326,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_command_prints_tables_and_writes_a_report(folder: Path) -> None:
-    result = command(*QUICK, "-o", "report")
+    result = command(*QUICK, "-o", "report.md")
     assert result.code == 0, result.err
     assert "## As triangles grow" in result.out and "| cast   | box.obj |" in result.out
-    told = Path("report/visibility.md").read_text()
+    told = (folder / "report.md").read_text()
     assert "python -m wrt bench visibility box.obj --size 32 --max-size 64" in told
-    for name in visibility.PLOTS:
-        assert f"]({name})" in told
-        picture = np.asarray(Image.open(folder / "report" / name))
-        assert picture.ndim == 3 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
 
 
 def test_the_command_prints_json(folder: Path) -> None:
@@ -351,7 +346,7 @@ def test_the_command_prints_json(folder: Path) -> None:
 @pytest.mark.parametrize(("arguments", "message"), [
     (("nothing.obj",), "nothing.obj"),
     (("box.obj", "-o", "box.obj"), "box.obj"),
-    (("box.obj", "-o", "no/folder"), "no/folder"),
+    (("box.obj", "-o", "no/folder.md"), "no/folder"),
     (("--accel", "kd"), "no structure 'kd'"),
     (("--device", "gpu"), "no device 'gpu'"),
 ])

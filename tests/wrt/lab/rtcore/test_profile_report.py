@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from tests.wrt.lab.rtcore.test_profiler import MIRRORS
 from wrt.core.errors import InputError
 from wrt.lab.bench.plot import bins, histograms
 from wrt.lab.rtcore.parameters import GPUS
-from wrt.lab.rtcore.profile_report import GROUPS, model_rows, warp_order, work_of
+from wrt.lab.rtcore.profile_report import GROUPS, check_folder, model_rows, warp_order, work_of
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
 from wrt.picture.heatmap import colors, heatmap, short, step_of, top_of
 from wrt.picture.image import read_channels, read_image
@@ -101,6 +102,15 @@ def test_histograms_are_drawn_of_anything() -> None:
     kinds = {"primary": rng.geometric(0.1, 1000), "shadow": np.zeros(3, int)}
     picture = histograms({"nodes": kinds, "stack": kinds, "one more": {"none": np.zeros(0)}}, "what a ray costs")
     assert picture.shape == (550, 800, 3) and len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
+
+
+def test_what_cannot_be_written_is_told_before_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="no folder to write to"):
+        check_folder(tmp_path / "file")
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(InputError, match=r'plots need matplotlib .*pip install "wrt\[plots\]"'):
+        check_folder(tmp_path)
 
 
 def test_the_command_writes_what_it_says(tmp_path: Path, measured: Profile) -> None:
