@@ -19,7 +19,7 @@ from wrt.accel.contains import contains, open_edges
 from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.report import Columns, Part, Row, cells, tabled
+from wrt.lab.bench.report import Columns, Part, Row, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.hard_cases.common import targets, unit_vectors
 from wrt.lab.oracle.oracle import Place, Reference
@@ -51,11 +51,11 @@ def rows(plan: Plan) -> Iterator[Row]:
         reference, accel = Reference(geometry), build(geometry)
         known = {"mesh": Path(mesh.name).name, "triangles": len(geometry.faces)}
         for who, n in asked(plan, plan.points):
-            answer = INSIDE[who](geometry) if who in INSIDE else partial(contains, accel)
+            answer = partial(contains, accel) if who == "wrt" else OTHERS[who][1](geometry)[0]
             answer(np.zeros((2, 3), np.float32))
             yield Row(what="inside", who=who, **known, **points_wrong(geometry, reference, answer, n, plan.seed))
         for who, n in asked(plan, plan.rays):
-            count = CROSSINGS[who](geometry) if who in CROSSINGS else None
+            count = None if who == "wrt" else OTHERS[who][1](geometry)[1]
             (count or own_crossings(accel))(np.full((2, 3), 9.0, np.float32), np.ones((2, 3), np.float32))
             yield Row(what="crossings", who=who, **known, **crossed(geometry, accel, count, n, plan.seed))
 
@@ -73,8 +73,7 @@ def made() -> list[Mesh]:
 def asked(plan: Plan, n: int) -> Iterator[tuple[str, int]]:
     """Who, and how many: the others fewer."""
     yield "wrt", n
-    needs = {"Open3D": "open3d", "trimesh, Embree": "embreex", "trimesh": "rtree"}
-    for name, package in needs.items():
+    for name, (package, _) in OTHERS.items():
         most = plan.others // (100 if name == "trimesh" else 1)
         if most and importlib.util.find_spec(package) is not None:
             yield name, min(n, most)
@@ -201,49 +200,30 @@ def _angles(corners: np.ndarray, d: np.ndarray, k: np.ndarray) -> np.ndarray:
 # --- who --------------------------------------------------------------------------------------------------------------
 
 
-def _open3d(geometry: Geometry) -> tuple[Any, Any]:
+def open3d_answers(geometry: Geometry) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Which points are inside, and how many hits rays have; as trimesh_answers."""
     import open3d
 
     tensor = open3d.core.Tensor.from_numpy
     scene = open3d.t.geometry.RaycastingScene()
     scene.add_triangles(tensor(geometry.vertices.copy()), tensor(geometry.faces.astype(np.uint32)))
-    return scene, tensor
+    return (lambda points: scene.compute_occupancy(tensor(points)).numpy() > 0.5,
+            lambda origins, directions: scene.count_intersections(tensor(np.concatenate([origins, directions], axis=1))).numpy())
 
 
-def open3d_inside(geometry: Geometry) -> Any:
-    scene, tensor = _open3d(geometry)
-    return lambda points: scene.compute_occupancy(tensor(points)).numpy() > 0.5
-
-
-def open3d_crossings(geometry: Geometry) -> Any:
-    scene, tensor = _open3d(geometry)
-    return lambda origins, directions: scene.count_intersections(tensor(np.concatenate([origins, directions], axis=1))).numpy()
-
-
-def _trimesh(module: str, geometry: Geometry) -> Any:
+def trimesh_answers(module: str, geometry: Geometry) -> tuple[Callable[..., Any], Callable[..., Any]]:
     import trimesh
 
-    return importlib.import_module(f"trimesh.ray.{module}").RayMeshIntersector(
-        trimesh.Trimesh(geometry.vertices, geometry.faces, process=False))
+    mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)
+    rays = importlib.import_module(f"trimesh.ray.{module}").RayMeshIntersector(mesh)
+    return rays.contains_points, lambda origins, directions: np.bincount(
+        rays.intersects_id(origins, directions)[1], minlength=len(origins))
 
 
-def trimesh_inside(module: str, geometry: Geometry) -> Any:
-    return _trimesh(module, geometry).contains_points
-
-
-def trimesh_crossings(module: str, geometry: Geometry) -> Any:
-    ask = _trimesh(module, geometry)
-    return lambda origins, directions: np.bincount(ask.intersects_id(origins, directions)[1], minlength=len(origins))
-
-
-INSIDE: dict[str, Any] = {"Open3D": open3d_inside, "trimesh, Embree": partial(trimesh_inside, "ray_pyembree"),
-                          "trimesh": partial(trimesh_inside, "ray_triangle")}
-CROSSINGS: dict[str, Any] = {"Open3D": open3d_crossings, "trimesh, Embree": partial(trimesh_crossings, "ray_pyembree"),
-                             "trimesh": partial(trimesh_crossings, "ray_triangle")}
-
-
-def line(row: Row) -> str:
-    return "  ".join(cells(COLUMNS, row))
+# By name: the package that it needs, and its answers for a geometry.
+OTHERS: dict[str, tuple[str, Callable[[Geometry], tuple[Callable[..., Any], Callable[..., Any]]]]] = {
+    "Open3D": ("open3d", open3d_answers), "trimesh, Embree": ("embreex", partial(trimesh_answers, "ray_pyembree")),
+    "trimesh": ("rtree", partial(trimesh_answers, "ray_triangle"))}
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:

@@ -111,7 +111,7 @@ def line(plan: Plan, row: Row) -> str:
     study = study_of(plan)
     if hasattr(study, "line"):
         return study.line(row)
-    return "  ".join([*([row.mesh] if "mesh" in vars(row) else []), *cells(study.COLUMNS, row)])
+    return "  ".join([*([row.mesh] if "mesh" in vars(row) and "mesh" not in study.COLUMNS else []), *cells(study.COLUMNS, row)])
 
 
 def data(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:

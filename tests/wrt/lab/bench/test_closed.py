@@ -87,13 +87,15 @@ def test_an_open_mesh_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.code == 2 and "the mesh is not closed" in result.err
 
 
-@pytest.mark.parametrize("who", sorted({*closed.INSIDE, *closed.CROSSINGS}))
+@pytest.mark.parametrize("who", closed.OTHERS)
 def test_others_are_asked(who: str) -> None:
-    pytest.importorskip({"Open3D": "open3d", "trimesh, Embree": "embreex", "trimesh": "rtree"}[who])
+    package, answers = closed.OTHERS[who]
+    pytest.importorskip(package)
     geometry = Geometry.of(shapes.icosphere(1))
     points = np.float32([[0.1, 0.2, 0.3], [0.1, 2.0, 0.2]])  # Open3D counts both triangles at an edge
-    assert np.asarray(closed.INSIDE[who](geometry)(points)).tolist() == [True, False]
-    assert np.asarray(closed.CROSSINGS[who](geometry)(points * 10.0, -points)).tolist() == [2, 2]
+    inside, crossings = answers(geometry)
+    assert np.asarray(inside(points)).tolist() == [True, False]
+    assert np.asarray(crossings(points * 10.0, -points)).tolist() == [2, 2]
 
 
 def test_who_is_asked_nothing_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
