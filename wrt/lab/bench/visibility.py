@@ -167,25 +167,6 @@ def fits(rows: Sequence[Row]) -> list[dict[str, Any]]:
             for cost in (("raster", "cast", "build") if sweep == "triangles" else ("raster", "cast"))]
 
 
-def crossings(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """For every sweep of two points or more, the n from which on the other way of seeing costs less (the structure is there;
-    between two points by interpolation of logarithms), and which that is; n is None where one is cheaper throughout."""
-    out = []
-    for (sweep, surface), group in series(rows).items():
-        if len(group) < 2:
-            continue
-        n = np.log([getattr(row, sweep) for row in group])
-        ratio = np.log([row.cast_over_raster for row in group])
-        cheaper = np.where(ratio > 0.0, "raster", "cast")
-        change = np.flatnonzero(cheaper[1:] != cheaper[:-1])
-        found = None
-        if len(change):
-            i = change[-1]
-            found = math.exp(n[i] + (n[i + 1] - n[i]) * ratio[i] / (ratio[i] - ratio[i + 1]))
-        out.append({"sweep": sweep, "surface": surface, "n": found, "cheaper": str(cheaper[-1])})
-    return out
-
-
 def machine(plan: Plan) -> str:
     threads = f"{thread_count(plan.threads)} used" if plan.device == "cpu" else ""
     return machine_line(threads, f"structure {plan.accel}, {plan.runs} runs", device=plan.device)
@@ -199,11 +180,8 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
     found = [Row(**each) for each in fits(rows)]
     told = "seconds ~ n^exponent over the whole sweep (± one standard deviation), and between its two last points."
     out += [tabled(EXPONENTS, found, "Exponents", told)] if found else []
-    for c in crossings(rows):
-        since = "throughout" if c["n"] is None else f"from about {c['n']:.2g} {c['sweep']} on"
-        out.append(Part("", f"{Path(c['surface']).name}, as {c['sweep']} grow: {c['cheaper']} costs less {since}."))
     return out
 
 
 def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
-    return {"exponents": fits(rows), "crossings": crossings(rows)}
+    return {"exponents": fits(rows)}
