@@ -71,44 +71,40 @@ def reporting(report: str = "Write the tables as Markdown (.md)", *, cluster: bo
     options = [SHARED["as_json"],
                click.option("-q", "--quiet", is_flag=True, help=quiet),
                click.option("-o", "--output", type=click.Path(path_type=Path), help=report)]
-    return gathering("how", Reporting, [*options, CLUSTER] if cluster else options)
+    return gathering("how", Reporting, names_of(Reporting), [*options, CLUSTER] if cluster else options)
 
 
 def planned(plan: type[Plan]) -> Callable[[Any], Any]:
-    """A command with a plan's options, which it gets as one argument, `plan`."""
-    gathered = gathering("plan", plan, [parameter(each) for each in dataclasses.fields(plan)][::-1])
-    return (lambda command: quick(plan)(gathered(command))) if plan.QUICK else gathered
+    """A command with a plan's options, which it gets as one argument, `plan`. With --quick the plan's QUICK stands in for the
+    options that are not given, and one line says for which."""
+
+    def make(quick: bool, **given: Any) -> Plan:
+        if quick:
+            context = click.get_current_context()
+            less = {name: value for name, value in plan.QUICK.items()
+                    if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE}
+            told = [f"{name.replace('_', '-')} {value} instead of {given[name]}" for name, value in less.items()]
+            say(f"{context.info_name} --quick: {', '.join(told) or 'all is given, nothing is left out'}")
+            given |= less
+        return plan(**given)
+
+    flag = click.option("--quick", is_flag=True, help="Rough figures soon: less of all that is not given here, as it says")
+    return gathering("plan", make, ["quick", *names_of(plan)], [*map(parameter, dataclasses.fields(plan)[::-1]), flag])
 
 
-def quick(plan: type[Plan]) -> Callable[[Any], Any]:
-    """A command with --quick: the plan's QUICK stands in for the options that are not given, and one line says for which."""
-
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        @click.option("--quick", is_flag=True, help="Rough figures soon: less of all that is not given here, as it says")
-        @functools.wraps(command)
-        def shortened(quick: bool, **given: Any) -> None:
-            if quick:
-                context = click.get_current_context()
-                less = {name: value for name, value in plan.QUICK.items()
-                        if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE}
-                told = [f"{name.replace('_', '-')} {value} instead of {given[name]}" for name, value in less.items()]
-                say(f"{context.info_name} --quick: {', '.join(told) or 'all is given, nothing is left out'}")
-                given |= less
-            command(**given)
-
-        return shortened
-
-    return decorate
+def names_of(kind: type[Any]) -> list[str]:
+    return [each.name for each in dataclasses.fields(kind)]
 
 
-def gathering(name: str, kind: type, options: Sequence[Any]) -> Callable[[Any], Any]:
-    """A command with these options, of which it gets a dataclass as one argument of that name."""
+def gathering(name: str, make: Callable[..., Any], names: Sequence[str], options: Sequence[Any]) -> Callable[[Any], Any]:
+    """A command with these options, of which it gets what `make` makes as one argument of that name. names: those of the options,
+    and perhaps of others."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
         def gathered(**given: Any) -> None:
-            of_kind = {each.name: given.pop(each.name) for each in dataclasses.fields(kind) if each.name in given}
-            command(**given, **{name: kind(**of_kind)})
+            own = {each: given.pop(each) for each in names if each in given}
+            command(**given, **{name: make(**own)})
 
         return functools.reduce(lambda wrapped, option: option(wrapped), options, gathered)
 
@@ -119,11 +115,11 @@ def parameter(each: dataclasses.Field[Any]) -> Any:
     """A field of a plan as an argument or an option of a command."""
     known, needed = each.metadata, each.default is MISSING
     kind = TYPES.get(str(each.type), click.Path(path_type=Path))
-    if known["form"] == "argument":
+    if not known["text"]:
         several: Any = {"nargs": -1, "required": needed} if str(each.type).startswith("Sequence") else {}
         kind = OneOf(known["of"][1]) if known["of"] else str if each.name == "cases" else kind
         return click.argument(each.name, type=kind, metavar=each.name.upper() if known["of"] else None, **several)
-    flag = f"--{known['flag'] or each.name.replace('_', '-')}"
+    flag = f"--{each.name.replace('_', '-')}"
     if kind is bool:
         return click.option(flag, each.name, is_flag=True, help=known["text"])
     if known["of"] == STRUCTURES and kind is str:

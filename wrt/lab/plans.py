@@ -15,16 +15,15 @@ KINDS = ("kind of ray", "wrt.lab.bench.rays:RAY_KINDS")
 GPUS = ("GPU", "wrt.lab.rtcore.parameters:GPUS")
 
 
-def option(default: Any, text: str, between: tuple[int, int] | None = None, of: tuple[str, str] | None = None, flag: str = "",
-           form: str = "") -> Any:
-    """A field of a Plan. text: of --help; between: the least and the most that it may be (None is not looked at); of: what it
-    names, and the table that has the names; flag: where it is not called as the field is; form: "argument", or "duration"."""
-    return field(default=default, metadata={"text": text, "between": between, "of": of, "flag": flag, "form": form})
+def option(default: Any, text: str = "", between: tuple[int, int] | None = None, of: tuple[str, str] | None = None) -> Any:
+    """A field of a Plan. text: of --help, "" for an argument; between: the least and the most that it may be (None is not looked
+    at); of: what it names, and the table that has the names."""
+    return field(default=default, metadata={"text": text, "between": between, "of": of})
 
 
 def the_meshes(default: Any = ()) -> Any:
     """Files, or from Python Meshes."""
-    return option(default, "", form="argument")
+    return option(default)
 
 
 def the_kinds(*default: str) -> Any:
@@ -150,7 +149,7 @@ class HardCases(Plan):
 
     COMMAND, STUDY = "bench hard-cases", "wrt.lab.hard_cases.comparison"
     QUICK = {"rays": 100}
-    cases: Sequence[str] = option((), "", form="argument")
+    cases: Sequence[str] = option(())
     libraries: Sequence[str] = option((), "Which: wrt, embree ... (a wrong name lists them)  [default: all that are installed]",
                                       of=("library", "wrt.lab.hard_cases.libraries:LIBRARIES"))
     rays: int = option(1000, "Rays of each case", (1, 2**40))
@@ -252,7 +251,7 @@ class Pictures(Plan):
 
     COMMAND, STUDY = "bench pictures", "wrt.lab.bench.pictures"
     QUICK = {"size": "160x90", "spp": 4, "runs": 3}
-    scenes: Sequence[Any] = option(MISSING, "", form="argument")
+    scenes: Sequence[Any] = option(MISSING)
     size: str = option("640x360", "Pixels of each picture")
     spp: int = option(16, "Samples a pixel", (1, 1 << 16))
     runs: int = option(5, "Runs of each, by turns", (1, 1000))
@@ -268,8 +267,8 @@ class WhatIf(Plan):
     """
 
     COMMAND, STUDY = "whatif", "wrt.lab.rtcore.whatif"
-    study: str = option(MISSING, "", of=("study", "wrt.lab.rtcore.whatif:STUDIES"), form="argument")
-    mesh: Any = option(MISSING, "", form="argument")  # noqa: RUF009
+    study: str = option(MISSING, of=("study", "wrt.lab.rtcore.whatif:STUDIES"))
+    mesh: Any = option(MISSING)  # noqa: RUF009
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
     rays: int = option(2**15, "Rays of each kind", (1, 2**22))
     gpu: str = option("rtx2080ti", "What the model reckons for: rtx2080ti or rtx2060", of=GPUS)
@@ -287,8 +286,7 @@ class Error(Plan):
     max_spp: int = option(64, "Samples a pixel: 1, 2, 4 ... up to this", (1, 1 << 16))
     repeats: int = option(8, "Seeds of each picture, for the intervals", (3, 1000))  # 2 seeds have no spread
     reference_spp: int | None = option(None, "Samples of each of the reference's seeds  [default: 8 times --max-spp]", (1, 1 << 24))
-    row_seconds: float = option(120.0, "Leave out what would take longer than this, with all its seeds  [default: 120s]",
-                                flag="row-limit", form="duration")
+    row_limit: float = option(120.0, "Leave out what would take longer than this, with all its seeds  [default: 120s]")
 
     @property
     def levels(self) -> list[int]:
@@ -299,11 +297,11 @@ class Error(Plan):
 class Mitsuba(Plan):
     """How much each renderer draws."""
 
-    QUICK = {"spp": 8, "repeats": 3, "rival_seconds": 5.0, "starts": 1}
+    QUICK = {"spp": 8, "repeats": 3, "rival_limit": 5.0, "starts": 1}
     spp: int = option(64, "wrt's samples a pixel; its error is what Mitsuba must reach", (1, 1 << 16))
     repeats: int = option(7, "Pictures of each, alternating, each with its own seed", (3, 1000))
     reference_spp: int | None = option(None, "Samples of each of the reference's 8 seeds  [default: 8 times --spp]")
-    rival_seconds: float = option(60.0, "No picture of Mitsuba's takes longer  [default: 60s]", flag="rival-limit", form="duration")
+    rival_limit: float = option(60.0, "No picture of Mitsuba's takes longer  [default: 60s]")
     integrator: str = option("auto", "Mitsuba's: path, volpath, direct or whitted (in Python, scalar_rgb only)")
     variants: Sequence[str] = option(("scalar_rgb", "llvm_ad_rgb"), "Mitsuba's; llvm_ad_rgb needs an LLVM library")
     starts: int = option(3, "How often to time whole processes; 0: not at all")
@@ -330,7 +328,7 @@ class Stability(Plan):
 
     COMMAND = "stability"
     QUICK = {"rays": 300, "sample": 300, "runs": 3}
-    cases: Sequence[str] = option((), "", form="argument")
+    cases: Sequence[str] = option(())
     rays: int = option(10_000, "Rays of each case, for the default", (1, 2**40))
     sample: int = option(10_000, "How many of them the oracle judges, and the other tests and peers get", (1, 2**40))
     peers: bool = option(False, "Also Embree (robust, fast, in packets), Warp's mesh_query_ray and Open3D, where installed")

@@ -228,7 +228,7 @@ def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], No
             finished(renderer.run(spp=1))  # what a first launch costs is not the variant's
             for spp in plan.levels:
                 likely = 2.0 * rows[variant.label][-1].seconds.value * plan.repeats if rows[variant.label] else 0.0
-                if likely > plan.row_seconds:
+                if likely > plan.row_limit:
                     result.left_out.append(f"{variant.label} from {spp} spp on: a row would take some {likely:.0f} s")
                     break
                 report(f"{number + 1}/{len(found)} {variant.label}: {spp} spp{left}")

@@ -131,9 +131,8 @@ def repeating(plan: Plan) -> str:
     """The command line that measures the same; of files only the names."""
     words = [f"python -m wrt {plan.COMMAND}"]
     for each in fields(plan):
-        value, known = getattr(plan, each.name), each.metadata
-        flag = f"--{known['flag'] or each.name.replace('_', '-')}"
-        if known["form"] == "argument":
+        value, flag = getattr(plan, each.name), f"--{each.name.replace('_', '-')}"
+        if not each.metadata["text"]:
             things = value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
             words += [Path(getattr(thing, "name", thing) or "mesh").name for thing in things]
         elif isinstance(value, bool):

@@ -152,7 +152,7 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
         report("pilot")
         target = statistics.mse_of(statistics.gram([our_picture(pictures[0])[1]], truth.pixels), truth.variance)
         require_error(target)
-        rivals.each(lambda name: rivals.measured[name].choose_spp(pictures[0], truth, target, plan.rival_seconds))
+        rivals.each(lambda name: rivals.measured[name].choose_spp(pictures[0], truth, target, plan.rival_limit))
         for turn, seed in enumerate(pictures):
             report(f"picture {turn + 1} of {plan.repeats}")
             if turn % 2 == 0:

@@ -237,7 +237,7 @@ def test_a_sweep_can_be_repeated_and_seeds_differ() -> None:
 
 
 def test_rows_that_take_too_long_are_left_out_and_told() -> None:
-    plan = bench.Plan(knobs=("sampler",), max_spp=64, repeats=3, reference_spp=4, row_seconds=1e-9)
+    plan = bench.Plan(knobs=("sampler",), max_spp=64, repeats=3, reference_spp=4, row_limit=1e-9)
     result = bench.sweep(edge_scene(), plan, Options())
     assert [row.spp for row in result.rows] == [1, 1] and len(result.left_out) == 2
     assert "from 2 spp on" in result.left_out[0]

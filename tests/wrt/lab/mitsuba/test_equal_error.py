@@ -37,7 +37,7 @@ ROOM = Scene(
     spheres=(Sphere((0.3, -0.4, 0.0), 0.6, WHITE),), lights=(PointLight((1.0, 1.5, 1.0), (9.0, 9.0, 9.0)),),
     cameras=(Camera.look_at((0.0, 0.0, 1.9), (0.0, 0.0, 0.0), fov_y=math.radians(70)),),
     settings=Settings(size=(32, 18), spp=8))
-PLAN = Plan(spp=8, repeats=3, reference_spp=64, rival_seconds=1.0, starts=0)
+PLAN = Plan(spp=8, repeats=3, reference_spp=64, rival_limit=1.0, starts=0)
 
 
 def measured(integrator: str, variant: str) -> Row:
