@@ -3,7 +3,6 @@ for (random)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,9 @@ import numpy as np
 from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 
+RAY_KINDS = ("primary", "shadow", "diffuse", "random")
 SEEN = 0.55  # half of the picture's height, over distance: a field of view of 58 degrees
+OFFSET = 1e-4  # of the radius: how far rays start above what is seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,18 +32,6 @@ class RaySet:
         return RaySet(self.kind, self.origins[rows], self.directions[rows], self.t_max[rows], self.any_hit)
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
-    """What all kinds start from: the sphere around the mesh, and the hits of rays from a camera outside or inside of it."""
-
-    center: np.ndarray
-    radius: float
-    primary: RaySet
-    points: np.ndarray
-    normals: np.ndarray
-    rng: np.random.Generator
-
-
 def unit(v: np.ndarray) -> np.ndarray:
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
@@ -58,49 +47,26 @@ def endless(n: int) -> np.ndarray:
     return np.full(n, np.inf, np.float32)
 
 
-def primary(view: _View, n: int) -> RaySet:
-    """From a camera through a square of pixels, in rows: neighbours in the array are neighbours in the picture."""
-    return view.primary
-
-
-def shadow(view: _View, n: int) -> RaySet:
+def shadow(origins: np.ndarray, outward: np.ndarray, center: np.ndarray, radius: float) -> RaySet:
     """From what the camera sees towards one point above the mesh, as far as that point: any hit."""
-    light = view.center + view.radius * np.array([0.8, 1.7, 0.6])
-    origins, outward = _starts(view, n)
+    light = center + radius * np.array([0.8, 1.7, 0.6])
     directions = light - origins
     turned = (directions * outward).sum(axis=1) < 0.0
-    origins = np.where(turned[:, None], origins - 2.0 * _offset(view) * outward, origins)
-    return RaySet("shadow", origins.astype(np.float32), (light - origins).astype(np.float32), np.ones(n, np.float32), any_hit=True)
+    origins = np.where(turned[:, None], origins - 2.0 * OFFSET * radius * outward, origins)
+    return RaySet("shadow", origins.astype(np.float32), (light - origins).astype(np.float32), np.ones(len(origins), np.float32),
+                  any_hit=True)
 
 
-def diffuse(view: _View, n: int) -> RaySet:
+def diffuse(origins: np.ndarray, outward: np.ndarray, rng: np.random.Generator) -> RaySet:
     """From what the camera sees into all directions above the surface, more of them near its normal (cosine)."""
-    origins, outward = _starts(view, n)
-    directions = unit(outward + 0.999 * unit(view.rng.normal(size=(n, 3))))
-    return RaySet("diffuse", origins.astype(np.float32), directions.astype(np.float32), endless(n))
+    directions = unit(outward + 0.999 * unit(rng.normal(size=origins.shape)))
+    return RaySet("diffuse", origins.astype(np.float32), directions.astype(np.float32), endless(len(origins)))
 
 
-def random(view: _View, n: int) -> RaySet:
+def random(n: int, center: np.ndarray, radius: float, rng: np.random.Generator) -> RaySet:
     """Between two random points on the sphere around the mesh: uniform lines."""
-    a, b = (view.center + view.radius * unit(view.rng.normal(size=(n, 3))) for _ in range(2))
+    a, b = (center + radius * unit(rng.normal(size=(n, 3))) for _ in range(2))
     return RaySet("random", a.astype(np.float32), unit(b - a).astype(np.float32), endless(n))
-
-
-def _offset(view: _View) -> float:
-    return 1e-4 * view.radius
-
-
-def _starts(view: _View, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points just above what is seen, repeated to n in their order, and the normals towards the camera."""
-    if not len(view.points):  # nothing is seen: the sphere's surface, inwards
-        normals = -unit(view.rng.normal(size=(n, 3)))
-        return view.center - view.radius * normals, normals
-    row = np.arange(n) * len(view.points) // n
-    return view.points[row] + _offset(view) * view.normals[row], view.normals[row]
-
-
-RAY_KINDS: dict[str, Callable[[_View, int], RaySet]] = {
-    "primary": primary, "shadow": shadow, "diffuse": diffuse, "random": random}
 
 
 def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) -> dict[str, RaySet]:
@@ -124,11 +90,21 @@ def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) ->
     length = np.linalg.norm(normals, axis=1)
     points, normals = points[length > 0.0], normals[length > 0.0] / length[length > 0.0, None]
     normals = np.where(((points - eye) * normals).sum(axis=1, keepdims=True) > 0.0, -normals, normals)
-    view = _View(center, radius, seen, points, normals, rng)
-    return {kind: make(view, len(seen)) for kind, make in RAY_KINDS.items()}
+
+    def starts() -> tuple[np.ndarray, np.ndarray]:
+        """Points just above what is seen, as many as pixels and in their order, and the normals towards the camera."""
+        if not len(points):  # nothing is seen: the sphere's surface, inwards
+            inwards = -unit(rng.normal(size=(len(seen), 3)))
+            return center - radius * inwards, inwards
+        row = np.arange(len(seen)) * len(points) // len(seen)
+        return points[row] + OFFSET * radius * normals[row], normals[row]
+
+    return {"primary": seen, "shadow": shadow(*starts(), center, radius), "diffuse": diffuse(*starts(), rng),
+            "random": random(len(seen), center, radius, rng)}
 
 
 def _camera(eye: np.ndarray, target: np.ndarray, n: int) -> RaySet:
+    """From a camera through a square of pixels, in rows: neighbours in the array are neighbours in the picture."""
     side = max(int(np.sqrt(n)), 1)
     forward = unit(target - eye)
     right = unit(np.cross(forward, [0.0, 1.0, 0.0]))
