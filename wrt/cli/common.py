@@ -7,6 +7,8 @@ import contextlib
 import difflib
 import functools
 import importlib
+import json
+import math
 import re
 import sys
 import time
@@ -233,16 +235,12 @@ CLUSTER = click.option("--cluster", metavar="ADDRESS",
                        help="Spread over the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
 
 
-def load(path: Path, quiet: bool, clock: dict[str, float] | None = None) -> Any:
+def load(path: Path, quiet: bool) -> Any:
     """The scene, with the loader's warnings on stderr."""
-    begin = time.perf_counter()
     from wrt.io.load import load_scene
 
     with warnings_reported(quiet):
-        scene = load_scene(path)
-    if clock is not None:
-        clock["load"] = time.perf_counter() - begin
-    return scene
+        return load_scene(path)
 
 
 @contextlib.contextmanager
@@ -267,10 +265,21 @@ def naming(path: Path) -> Iterator[None]:
         raise error.at(path) from error
 
 
+def json_text(value: Any) -> str:
+    """As JSON, which has no NaN and no infinity: they become null; what it has no form for becomes text."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {str(key): plain(each) for key, each in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(each) for each in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(plain(value), default=str, allow_nan=False)
+
+
 def say_json(value: Any) -> None:
     """As JSON on stdout."""
-    from wrt.core.json_text import json_text
-
     click.echo(json_text(value))
 
 

@@ -19,7 +19,7 @@ def compile_kernels(scenes: tuple[Path, ...], accel: str, device: str, threads: 
     from wrt.core.threads import thread_count
     from wrt.renderer.compile import compile_picture, compile_queries
 
-    count, clock, done = thread_count(threads), dict[str, float](), list[dict[str, Any]]()
+    count, done = thread_count(threads), list[dict[str, Any]]()
 
     def tell(what: str, names: list[str], begin: float) -> None:
         done.append({"for": what, "kernels": names, "seconds": time.perf_counter() - begin})
@@ -29,7 +29,7 @@ def compile_kernels(scenes: tuple[Path, ...], accel: str, device: str, threads: 
     begin = time.perf_counter()
     tell(f"queries of {accel}", compile_queries(accel, device), begin)
     for path in scenes:
-        begin, scene = time.perf_counter(), load(path, quiet, clock)
+        begin, scene = time.perf_counter(), load(path, quiet)
         with warnings_reported(quiet), naming(path):
             tell(str(path), compile_picture(scene, accel, device, count), begin)
     if as_json:

@@ -125,8 +125,9 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
     layers = aov if output.suffix.lower() != ".exr" else None  # in an EXR file they are channels, all of them
     for name in layers or ():
         check_writable(aov_path(output, name))
-    clock = {"import": time.perf_counter() - begin}
-    loaded = load(scene, quiet, clock).with_settings(**settings)
+    clock, begin = {"import": time.perf_counter() - begin}, time.perf_counter()
+    loaded = load(scene, quiet).with_settings(**settings)
+    clock["load"] = time.perf_counter() - begin
     checkpoint = options.get("checkpoint")
     if checkpoint is not None and options["resume"] and not (os.path.lexists(checkpoint) or quiet):
         say(f"{checkpoint}: no checkpoint yet, rendering from the beginning")

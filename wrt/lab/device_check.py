@@ -30,7 +30,6 @@ from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.hard_cases.cases import HARD_CASES, generate
 from wrt.lab.hard_cases.contestants import Own, WarpMesh
-from wrt.picture.film import Film
 from wrt.renderer.compile import compile_queries
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
@@ -181,12 +180,8 @@ def hard_row(plan: Check) -> Row:
 
 
 def picture_row(plan: Check, name: str, scene: Scene) -> Row:
-    here, there = (pixels(render(scene, device=device, **PICTURE)) for device in ("cpu", plan.device))
+    here, there = (render(scene, device=device, **PICTURE).pixels.reshape(-1, 3) for device in ("cpu", plan.device))
     return row("pixels", name, len(here), {"": different(here, there)})
-
-
-def pixels(film: Film) -> np.ndarray:
-    return film.pixels.reshape(-1, 3)
 
 
 def row(part: str, what: str, count: int, differ: dict[str, np.ndarray]) -> Row:

@@ -27,7 +27,7 @@ from wrt.kernels.traverse.bvh2_kdop import kdop_volumes
 from wrt.kernels.traverse.bvh2_sphere import sphere_volumes
 from wrt.lab.bench.accel import differing
 from wrt.lab.bench.rays import RaySet, ball_around, endless, unit
-from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, load_average, tabled
+from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.bench.timing import alternate, peak_bytes, spread
 from wrt.lab.plans import Bvh as Plan
@@ -83,7 +83,6 @@ def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[
     small = Geometry(geometry.vertices, geometry.faces[:64], geometry.spheres)
     for name in plan.builders or BVH_BUILDERS:
         build_binary(small, BvhOptions(name), 1)  # the kernels are compiled
-        busy = load_average()
         grow = partial(build_binary, geometry, BvhOptions(name), thread_count(plan.threads))
         _, peak = peak_bytes(grow)
         seconds, cpu_begin = [], process_time()
@@ -98,7 +97,7 @@ def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[
         yield {"builder": name, "sah_cost": accel.stats.sah_cost, "cost": published_cost(accel, rays),
                "nodes": float(c.nodes.mean()), "leaves": float(c.leaves.mean()), "triangles": float(c.primitives.mean()),
                "depth": accel.stats.depth, "references": accel.stats.references, "seconds": seconds, "cpu_seconds": cpu_seconds,
-               "peak_bytes": peak, "load": busy}
+               "peak_bytes": peak}
 
 
 def published_cost(accel: Accelerator, rays: RaySet) -> float:
@@ -178,10 +177,8 @@ def line(row: Row) -> str:
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    loads = [row.load for row in rows if "load" in vars(row)]
-    return [*(tabled(kind, [row for row in group if columns(row) is kind], f"{mesh}, {n} triangles")
-              for (mesh, n), group in grouped(rows, "mesh", "n_triangles").items() for kind in (BUILDERS, VOLUME)),
-            Part("", f"Load average at the builds: {min(loads):.1f} to {max(loads):.1f}.")]
+    return [tabled(kind, [row for row in group if columns(row) is kind], f"{mesh}, {n} triangles")
+            for (mesh, n), group in grouped(rows, "mesh", "n_triangles").items() for kind in (BUILDERS, VOLUME)]
 
 
 def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:

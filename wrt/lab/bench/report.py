@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -24,7 +23,7 @@ from wrt.lab.plans import Plan
 def machine_line(used: str = "", *more: str, device: str = "cpu") -> str:
     """The device, the threads that are used, how busy it is, and wrt's version: without them no time means anything."""
     line = next((line for line in describe_devices() if line.startswith(f"{device}:")), device)
-    load = "" if math.isnan(load_average()) else f"load average {load_average():.1f} at the start"
+    load = f"load average {os.getloadavg()[0]:.1f} at the start" if hasattr(os, "getloadavg") else ""
     return "; ".join([", ".join(filter(None, [line, used, load])), f"wrt {wrt.__version__}", *more])
 
 
@@ -37,11 +36,6 @@ def versions(*packages: str) -> str:
         with suppress(PackageNotFoundError):
             told.append(f"{package} {version(package)}")
     return ", ".join(told)
-
-
-def load_average() -> float:
-    """NaN where the system has none."""
-    return os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
 
 
 # --- a study ----------------------------------------------------------------------------------------------------------

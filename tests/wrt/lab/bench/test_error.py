@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as run_command
 from wrt.accel.structures import ACCELERATORS
+from wrt.cli.common import json_text
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted
-from wrt.core.json_text import json_text
 from wrt.lab.bench import error as bench
 from wrt.lab.bench import error_report as report
 from wrt.lab.bench import error_statistics as statistics
