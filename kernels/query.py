@@ -4,8 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, kernel
-from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 
 LARGEST = wp.constant(3.4028234663852886e38)  # of float32
 FARTHEST = 1e37  # of an origin's coordinates that arrays of NumPy may have: differences of such are finite
@@ -196,37 +195,3 @@ def make_queue_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
             put_hit(out, i, hit, 1.0)
 
     return trace_queue
-
-
-@wp.struct
-class HitList:
-    """Up to `capacity` hits a ray, in the order of prim_id; count may be larger than capacity."""
-
-    capacity: int
-    count: wp.array(dtype=wp.int32)
-    prim_id: wp.array(dtype=wp.int32)
-    t: wp.array(dtype=wp.float32)
-
-
-def make_all_hits_kernel(units: Units) -> Any:
-    """Every primitive that each ray hits in its segment, by testing all of them: what the units say, without a structure."""
-    probe_of = make_probe(units)
-    intersect = make_intersect(units)
-    record = units.triangle_test.record
-
-    @kernel
-    def all_hits(primitives: wp.array(dtype=record), surfaces: Surfaces, rays: RayArrays, out: HitList, first: int):
-        i = first + wp.tid()
-        ray = load_ray(rays, i)
-        probe = probe_of(ray)
-        n = int(0)
-        for j in range(primitives.shape[0]):
-            hit = intersect(probe, surfaces, primitives[j], no_hit(ray))
-            if hit.prim_id != NO_HIT:
-                if n < out.capacity:
-                    out.prim_id[i * out.capacity + n] = hit.prim_id
-                    out.t[i * out.capacity + n] = hit.t * direction_scale(rays.direction[i])
-                n = n + 1
-        out.count[i] = n
-
-    return all_hits

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
+from tests.kernels.every_hit import HitList, make_all_hits_kernel
 from wrt.core.device import load_kernel, upload
-from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
+from wrt.kernels.query import RayArrays
 from wrt.kernels.traverse.kdtree import HELD_GRAZING, HELD_RELATIVE
 from wrt.kernels.units.bounding_sphere import SMALLEST, SPHERE_PAD
 from wrt.kernels.units.box import FAR_PAD

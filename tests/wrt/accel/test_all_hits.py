@@ -11,11 +11,12 @@ import warp as wp
 import wrt
 from tests.data import data_path
 from tests.kernel_tools import floats, launch, vec3s, zeros
+from tests.kernels.every_hit import HitList, make_all_hits_kernel
 from tests.structures import families_first
 from tests.wrt.accel.test_structures_agree import mixed_rays
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
-from wrt.kernels.query import HitList, RayArrays, make_all_hits_kernel
+from wrt.kernels.query import RayArrays
 from wrt.kernels.traverse.common import Units
 from wrt.lab.hard_cases.cases import ASK, HARD_CASES, HardCase, generate, judge_all_hits
 from wrt.lab.hard_cases.common import hard_case

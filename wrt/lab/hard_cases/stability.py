@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -15,15 +15,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from wrt.accel.all_hits import all_hits
 from wrt.accel.structure import Structure
 from wrt.core.device import load_kernel, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.kernels.query import HitList, make_all_hits_kernel
 from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
-from wrt.kernels.traverse.common import Units
 from wrt.lab.bench.report import Columns
 from wrt.lab.bench.report import Row as Line
 from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
@@ -70,20 +69,14 @@ COLUMNS: Columns = {
 
 @dataclass
 class Row:
-    """One case with one algorithm. judged: how many of the rays the oracle judged; the others have a known answer.
-    offset_self_hits: re-hits of the start triangle if only the offset kept rays off it. refused: for input that is not
-    finite, whether the host said so."""
+    """One case with one algorithm. judged: how many of the rays the oracle judged; the others have a known answer. refused: for
+    input that is not finite, whether the host said so."""
 
     case: str
     algorithm: str
     verdict: Verdict = field(default_factory=Verdict)
     judged: int = 0
-    offset_self_hits: int = 0
     refused: bool | None = None
-
-    def add(self, verdict: Verdict, offset_self_hits: int) -> None:
-        """Of more rays."""
-        self.verdict, self.offset_self_hits = self.verdict + verdict, self.offset_self_hits + offset_self_hits
 
     def as_dict(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "verdict"} | self.verdict.as_dict()
@@ -148,7 +141,8 @@ def _rows(names: list[str], algorithms: list[str], plan: Plan, progress: Callabl
             if row is None:
                 continue
             if algorithm == algorithms[0] and row.refused is None:
-                row.add(*(_sum(result(pool, part) for part in more[name]) if pool is not None else run_more(name, plan, progress)))
+                rest = (result(pool, part) for part in more[name]) if pool is not None else run_more(name, plan, progress)
+                row.verdict = sum(rest, row.verdict)
             yield row
     finally:
         if pool is not None:
@@ -181,35 +175,28 @@ def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row |
         row.judged += len(case)
         if isinstance(algorithm, Own):
             if case.next_directions is not None:
-                row.verdict += judge_next(case, *respawn(algorithm, case, exclude=True))
-                row.offset_self_hits += judge_next(case, *respawn(algorithm, case, exclude=False)).self_hits
+                row.verdict += judge_next(case, *respawn(algorithm, case))
             if not len(case.geometry.spheres) and len(case.geometry) * ALL_HITS_RAYS <= ALL_HITS_TESTS:
                 row.verdict += _judge_all(algorithm, case)
     return row
 
 
-def run_more(name: str, plan: Plan, progress: Callable[[str], None]) -> tuple[Verdict, int]:
-    """The rays of a case beyond the sample through the default units, on all threads, held to what is known of them; and
-    self-hits if only the offset kept rays off. Nothing where nothing is known of them: a case that only the oracle can judge.
-    """
-    count, left = parts(name, plan), fewer(name, plan.rays) - fewer(name, plan.sample)
-    own, lock = threading.local(), threading.Lock()
-    done, begin = 0, time.perf_counter()
+def run_more(name: str, plan: Plan, progress: Callable[[str], None]) -> Iterator[Verdict]:
+    """The verdicts on the rays of a case beyond the sample through the default units, on all threads, by what is known of them.
+    None where nothing is known of them: a case that only the oracle can judge."""
+    left, begin = fewer(name, plan.rays) - fewer(name, plan.sample), time.perf_counter()
+    own = threading.local()  # a structure for each thread, which several parts may use
 
-    def part(index: int) -> tuple[Verdict, int]:
-        nonlocal done
-        if not hasattr(own, "default"):
-            own.default = Own()
-        found = more_part(name, plan, index, own.default)
-        with lock:
-            done += min(CHUNK, left - index * CHUNK)
-            rate = done / (time.perf_counter() - begin) / 1e6
-            progress(f"{name}, {done / 1e6:.1f} of {left / 1e6:.1f} M rays more, {rate:.2f} Mray/s")
-        return found
+    def part(index: int) -> Verdict:
+        own.default = getattr(own, "default", None) or Own()
+        return more_part(name, plan, index, own.default)
 
     pool = ThreadPoolExecutor(thread_count(plan.threads))
     try:
-        return _sum(pool.map(part, range(count)))
+        for i, verdict in enumerate(pool.map(part, range(parts(name, plan))), 1):
+            done = min(CHUNK * i, left) / 1e6
+            progress(f"{name}, {done:.1f} of {left / 1e6:.1f} M rays more, {done / (time.perf_counter() - begin):.2f} Mray/s")
+            yield verdict
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -223,8 +210,8 @@ def parts(name: str, plan: Plan) -> int:
     return 0 if (probe.expected == ASK).all() and probe.next_directions is None else -(-left // CHUNK)
 
 
-def more_part(name: str, plan: Plan, index: int, own: Own | None = None) -> tuple[Verdict, int]:
-    """One chunk of the rays beyond the sample: verdict, and self-hits if only the offset kept rays off."""
+def more_part(name: str, plan: Plan, index: int, own: Own | None = None) -> Verdict:
+    """The verdict on one chunk of the rays beyond the sample."""
     own = own or Own()
     left = fewer(name, plan.rays) - fewer(name, plan.sample)
     first = -(-fewer(name, plan.sample) // CHUNK)  # `chunks` has used the seeds below it
@@ -233,16 +220,8 @@ def more_part(name: str, plan: Plan, index: int, own: Own | None = None) -> tupl
     verdict = check(case, own.closest(case.origins, case.directions, case.t_min, case.t_max))
     if case.next_directions is None:
         verdict.rays -= int((case.expected == ASK).sum())  # nothing was checked of them
-        return verdict, 0
-    verdict += judge_next(case, *respawn(own, case, exclude=True))
-    return verdict, judge_next(case, *respawn(own, case, exclude=False)).self_hits
-
-
-def _sum(found: Iterable[tuple[Verdict, int]]) -> tuple[Verdict, int]:
-    total, offsets = Verdict(), 0
-    for verdict, offset in found:
-        total, offsets = total + verdict, offsets + offset
-    return total, offsets
+        return verdict
+    return verdict + judge_next(case, *respawn(own, case))
 
 
 def _is_refused(case: HardCase, algorithm: Algorithm) -> bool:
@@ -275,7 +254,7 @@ def _respawn_kernel(structure: Structure) -> Any:
     return make_respawn_kernel(structure.struct, structure.traversal(any_hit=False), surface_at)
 
 
-def respawn(algorithm: Own, case: HardCase, *, exclude: bool) -> tuple[np.ndarray, np.ndarray]:
+def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
     """prim_id of each ray's hit, and of the ray that goes on from it towards case.next_directions."""
     accel, n = algorithm.accel, len(case)
     assert accel is not None and case.next_directions is not None
@@ -283,37 +262,20 @@ def respawn(algorithm: Own, case: HardCase, *, exclude: bool) -> tuple[np.ndarra
     load_kernel(kernel, accel.device)
     out = Respawn()
     out.direction = upload(case.next_directions, wp.vec3, accel.device)
-    out.exclude = int(exclude)
+    out.exclude = 1
     out.first_prim_id, out.next_prim_id = (wp.empty(n, dtype=wp.int32, device=accel.device) for _ in range(2))
     wp.launch(kernel, dim=n, inputs=[accel.data, _surfaces(case, accel.device), case.on(accel.device), out, 0],
               device=accel.device)
     return out.first_prim_id.numpy(), out.next_prim_id.numpy()
 
 
-@cache
-def _all_hits_kernel(units: Units) -> Any:
-    return make_all_hits_kernel(units)
-
-
 def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
     """All hits along the first ALL_HITS_RAYS rays; only what concerns duplicates is added to the case's verdict."""
-    accel, n = algorithm.accel, min(len(case), ALL_HITS_RAYS)
-    assert accel is not None
-    units = accel.structure.units
-    out = HitList()
-    out.capacity = max(64, len(case.geometry))
-    out.count = wp.zeros(n, dtype=wp.int32, device=accel.device)
-    out.prim_id = wp.zeros(n * out.capacity, dtype=wp.int32, device=accel.device)
-    out.t = wp.zeros(n * out.capacity, dtype=wp.float32, device=accel.device)
-    primitives = upload(case.geometry.primitives(units), units.triangle_test.record, accel.device)
-    part = replace(case, origins=case.origins[:n], directions=case.directions[:n], t_min=case.t_min[:n], t_max=case.t_max[:n],
-                   expected=case.expected[:n])
-    wp.launch(_all_hits_kernel(units), dim=n, device=accel.device,
-              inputs=[primitives, _surfaces(case, accel.device), part.on(accel.device), out, 0])
-    count = out.count.numpy()
-    told = np.arange(out.capacity)[None, :] < count[:, None]
-    prim_id, t = (array.numpy().reshape(n, -1)[told] for array in (out.prim_id, out.t))
-    verdict = judge_all_hits(part, np.nonzero(told)[0], prim_id, t)
+    assert algorithm.accel is not None
+    part = replace(case, **{name: getattr(case, name)[:ALL_HITS_RAYS]
+                            for name in ("origins", "directions", "t_min", "t_max", "expected")})
+    hits = all_hits(algorithm.accel, part.origins, part.directions, part.t_min, part.t_max)
+    verdict = judge_all_hits(part, hits.ray_id, hits.prim_id, hits.t)
     return Verdict(duplicate_hits=verdict.duplicate_hits, examples=[e for e in verdict.examples if "twice" in e["why"]])
 
 

@@ -16,7 +16,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.hard_cases import report, stability
-from wrt.lab.hard_cases.cases import generate
+from wrt.lab.hard_cases.cases import Verdict, generate
 from wrt.lab.hard_cases.contestants import PEERS, Embree, EmbreeFast, Open3D, Own, WarpMesh, own_algorithms
 
 
@@ -104,11 +104,15 @@ def test_names_and_letters_choose_cases() -> None:
         stability.chosen(["Q"])
 
 
+def beyond_the_sample(name: str) -> Verdict:
+    return sum(stability.run_more(name, stability.Plan(rays=1000, sample=300), lambda line: None), Verdict())
+
+
 def test_rays_beyond_the_sample_are_held_to_what_is_known_of_them() -> None:
     for name, more in (("E_grid", 700), ("C_spheres", 700), ("D_published", 700), ("E_beside", 0), ("G_fan_edges", 7)):
-        verdict, _ = stability.run_more(name, stability.Plan(rays=1000, sample=300), lambda line: None)
+        verdict = beyond_the_sample(name)
         assert verdict.rays == more and verdict.ok
-    only_some = stability.run_more("F_edge_on", stability.Plan(rays=1000, sample=300), lambda line: None)[0]
+    only_some = beyond_the_sample("F_edge_on")
     assert 100 < only_some.rays < 600  # those exactly in the triangles' planes
     # They are other rays than the sample's, and the same each time.
     assert np.unique(np.concatenate([generate("E_grid", 50, (0, i)).origins for i in (0, 1)]), axis=0).shape[0] > 50
@@ -122,7 +126,7 @@ def test_what_is_wrong_beyond_the_sample_is_seen(monkeypatch) -> None:
             return hits
 
     monkeypatch.setattr(stability, "Own", Lossy)
-    verdict, _ = stability.run_more("B_jittered_uniform", stability.Plan(rays=1000, sample=300), lambda line: None)
+    verdict = beyond_the_sample("B_jittered_uniform")
     assert verdict.misses == 5 and verdict.rays == 700
 
 
