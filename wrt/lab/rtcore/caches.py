@@ -11,7 +11,6 @@ import warp as wp
 
 from wrt.accel.answers import Counters
 from wrt.core.device import load_kernel, start, upload
-from wrt.core.errors import InputError
 from wrt.core.threads import run_all, thread_count
 from wrt.kernels.study.cache_lru import Caches, Missed, Trace, replay_lru, replay_warps
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
@@ -25,10 +24,6 @@ class Cache:
 
     size: int
     ways: int
-
-    def __post_init__(self) -> None:
-        if self.ways < 1 or self.size < LINE * self.ways:
-            raise InputError(f"a cache of {self.ways} ways has at least {LINE * max(self.ways, 1)} bytes, got {self.size}")
 
     @property
     def sets(self) -> int:

@@ -17,7 +17,6 @@ import numpy as np
 
 from wrt.accel.answers import Counters
 from wrt.accel.base import Accelerator
-from wrt.core.errors import InputError
 from wrt.lab.bench.report import Columns, Part, Row, tabled, tables_page
 from wrt.lab.rtcore.caches import LINE, Misses, first_level, second_level
 from wrt.lab.rtcore.parameters import BASE, PARAMETERS, SWEEPS, Core, Gpu
@@ -34,10 +33,6 @@ class Work:
     name: str
     counters: Counters
     warp: np.ndarray
-
-    def __post_init__(self) -> None:
-        if not len(self.warp):
-            raise InputError(f"{self.name}: there are no rays to tell anything of")
 
     def __len__(self) -> int:
         return len(self.warp)
@@ -149,8 +144,6 @@ MODEL_COLUMNS: Columns = {
     "moved most by": lambda row: ", ".join(f"{name} {factor:.2g}x" for name, factor in list(row.factors.items())[:2])}
 SIMT_COLUMNS: Columns = {
     "rays": "{name}", **{name: f"{{simt_efficiency[{name}]:.0%}}" for name in ("as they come", "packed", "sorted")}}
-PARAMETER_COLUMNS: Columns = {"parameter": "{name}", "value": "{value}", "status": "{status}", "swept over": "{range}",
-                              "source": "{source}"}
 LEGEND = f"""\
 nodes, boxes, triangles: a ray; lines: cache lines a ray that its warp asks for. {", ".join(TERMS)}: clocks a ray and RT core that
 each part needs by itself, and in brackets how busy it is while the slowest (limit) is at its limit. Grays/s: with the assumptions
@@ -180,4 +173,4 @@ def model_page(rows: Sequence[Row]) -> str:
 
 def parameters() -> Part:
     """Every number that the model starts from, with its status and source."""
-    return tabled(PARAMETER_COLUMNS, PARAMETERS, "The parameters of the model")
+    return Part("The parameters of the model", "", ("parameter", "value", "status", "swept over", "source"), PARAMETERS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wrt.core.errors import InputError
 from wrt.lab.rtcore.caches import Cache
 
 PUBLISHED, DERIVED, ASSUMED = "published", "derived", "assumed"
@@ -13,53 +12,42 @@ PASCAL = "NVIDIA GeForce GTX 1080 Ti, product data (2017)"
 VULKAN_SIM = "Vulkan-Sim, configs/tested-cfgs/SM75_RTX2060/gpgpusim.config (Saed et al., MICRO 2022)"
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """value: as the source has it; range: what is swept where nobody knows; status: published, derived (from published numbers)
-    or assumed."""
-
-    name: str
-    value: str
-    status: str
-    source: str
-    range: str = ""
-
-
+# What a number is, its value as the source has it, its status (derived: from published numbers), what is swept where nobody knows,
+# and the source.
 PARAMETERS = (
-    Parameter("RTX 2080 Ti: SMs, RT cores", "68, one a SM", PUBLISHED, TURING),
-    Parameter("RTX 2080 Ti: clock", "1.545 GHz (boost)", PUBLISHED, TURING),
-    Parameter("RTX 2080 Ti: DRAM", "616 GB/s", PUBLISHED, TURING),
-    Parameter("RTX 2080 Ti: L2", "5632 KB", PUBLISHED, TURING),
-    Parameter("Turing: L1 with shared memory", "96 KB a SM", PUBLISHED, TURING),
-    Parameter("RTX 2080 Ti: rays", "10 Grays/s claimed", PUBLISHED, TURING),
-    Parameter("RTX 2080 Ti: clocks a ray and RT core", "10.5", DERIVED, "68 x 1.545 GHz / 10 Grays/s"),
-    Parameter("GTX 1080 Ti: rays in software", "1.1 Grays/s claimed", PUBLISHED, TURING),
-    Parameter("GTX 1080 Ti: FP32 lanes, clock", "28 SMs x 128, 1.582 GHz (boost)", PUBLISHED, PASCAL),
-    Parameter("GTX 1080 Ti: instructions of a lane a ray", "5154", DERIVED, "28 x 128 x 1.582 GHz / 1.1 Grays/s"),
-    Parameter("RTX 2060: SMs, clock", "30, 1.365 GHz (base)", PUBLISHED, VULKAN_SIM),
-    Parameter("RTX 2060: DRAM, L2", "336 GB/s, 3 MB", PUBLISHED, "NVIDIA GeForce RTX 2060, product data (2019)"),
-    Parameter("cache line", "128 bytes", PUBLISHED, VULKAN_SIM),
-    Parameter("L2: ways", "16", ASSUMED, VULKAN_SIM),
-    Parameter("L1: ways", "4", ASSUMED, "nobody; Vulkan-Sim has a fully associative one"),
-    Parameter("L1: lines a clock", "1", ASSUMED, "128 bytes a clock, as Turing's L1 gives to a SM", "0.5, 1, 2"),
-    Parameter("L2: bytes a clock and SM", "32", ASSUMED, "nobody; Vulkan-Sim's crossbar moves flits of about that", "16, 32, 64"),
-    Parameter("R_box: boxes a clock and RT core", "4", ASSUMED, "never published; RayFlex (2024) has 4", "1, 2, 4, 8"),
-    Parameter("R_tri: triangles a clock and RT core", "1", ASSUMED, "never published; RayFlex (2024) has 1", "0.5, 1, 2"),
-    Parameter("node: children", "2", ASSUMED, "never published", "every structure of the registry"),
-    Parameter("warps at a time in a RT core", "4", ASSUMED, VULKAN_SIM + "; Arches: 64 rays", "2, 4, 8, 16, 32"),
-    Parameter("latency of a box operation", "8 clocks", ASSUMED, VULKAN_SIM + "; Arches: 3, GauTracer: 13", "3, 8, 13"),
-    Parameter("latency of a triangle test", "8 clocks", ASSUMED, VULKAN_SIM + "; Arches: 22, GauTracer: 37", "8, 22, 37"),
-    Parameter("latency of the L1", "20 clocks", ASSUMED, VULKAN_SIM),
-    Parameter("latency of the L2, more", "160 clocks", ASSUMED, VULKAN_SIM),
-    Parameter("latency of DRAM, more", "100 clocks", ASSUMED, VULKAN_SIM),
-    Parameter("L2 at the beginning", "empty", ASSUMED, "warm: it has seen the same rays once before", "empty, warm"),
+    ("RTX 2080 Ti: SMs, RT cores", "68, one a SM", PUBLISHED, "", TURING),
+    ("RTX 2080 Ti: clock", "1.545 GHz (boost)", PUBLISHED, "", TURING),
+    ("RTX 2080 Ti: DRAM", "616 GB/s", PUBLISHED, "", TURING),
+    ("RTX 2080 Ti: L2", "5632 KB", PUBLISHED, "", TURING),
+    ("Turing: L1 with shared memory", "96 KB a SM", PUBLISHED, "", TURING),
+    ("RTX 2080 Ti: rays", "10 Grays/s claimed", PUBLISHED, "", TURING),
+    ("RTX 2080 Ti: clocks a ray and RT core", "10.5", DERIVED, "", "68 x 1.545 GHz / 10 Grays/s"),
+    ("GTX 1080 Ti: rays in software", "1.1 Grays/s claimed", PUBLISHED, "", TURING),
+    ("GTX 1080 Ti: FP32 lanes, clock", "28 SMs x 128, 1.582 GHz (boost)", PUBLISHED, "", PASCAL),
+    ("GTX 1080 Ti: instructions of a lane a ray", "5154", DERIVED, "", "28 x 128 x 1.582 GHz / 1.1 Grays/s"),
+    ("RTX 2060: SMs, clock", "30, 1.365 GHz (base)", PUBLISHED, "", VULKAN_SIM),
+    ("RTX 2060: DRAM, L2", "336 GB/s, 3 MB", PUBLISHED, "", "NVIDIA GeForce RTX 2060, product data (2019)"),
+    ("cache line", "128 bytes", PUBLISHED, "", VULKAN_SIM),
+    ("L2: ways", "16", ASSUMED, "", VULKAN_SIM),
+    ("L1: ways", "4", ASSUMED, "", "nobody; Vulkan-Sim has a fully associative one"),
+    ("L1: lines a clock", "1", ASSUMED, "0.5, 1, 2", "128 bytes a clock, as Turing's L1 gives to a SM"),
+    ("L2: bytes a clock and SM", "32", ASSUMED, "16, 32, 64", "nobody; Vulkan-Sim's crossbar moves flits of about that"),
+    ("R_box: boxes a clock and RT core", "4", ASSUMED, "1, 2, 4, 8", "never published; RayFlex (2024) has 4"),
+    ("R_tri: triangles a clock and RT core", "1", ASSUMED, "0.5, 1, 2", "never published; RayFlex (2024) has 1"),
+    ("node: children", "2", ASSUMED, "every structure of the registry", "never published"),
+    ("warps at a time in a RT core", "4", ASSUMED, "2, 4, 8, 16, 32", VULKAN_SIM + "; Arches: 64 rays"),
+    ("latency of a box operation", "8 clocks", ASSUMED, "3, 8, 13", VULKAN_SIM + "; Arches: 3, GauTracer: 13"),
+    ("latency of a triangle test", "8 clocks", ASSUMED, "8, 22, 37", VULKAN_SIM + "; Arches: 22, GauTracer: 37"),
+    ("latency of the L1", "20 clocks", ASSUMED, "", VULKAN_SIM),
+    ("latency of the L2, more", "160 clocks", ASSUMED, "", VULKAN_SIM),
+    ("latency of DRAM, more", "100 clocks", ASSUMED, "", VULKAN_SIM),
+    ("L2 at the beginning", "empty", ASSUMED, "empty, warm", "warm: it has seen the same rays once before"),
 )
 
 
 @dataclass(frozen=True)
 class Gpu:
-    """clock in Hz, as its source has it: the RTX 2080 Ti's boost clock, the RTX 2060's base clock; dram in bytes a second;
-    claimed: rays a second that its maker says it traces (0: none said)."""
+    """clock in Hz, as its source has it: the RTX 2080 Ti's boost clock, the RTX 2060's base clock; dram in bytes a second."""
 
     name: str
     sms: int
@@ -67,11 +55,10 @@ class Gpu:
     dram: float
     l1: Cache
     l2: Cache
-    claimed: float = 0.0
 
 
 GPUS = {
-    "rtx2080ti": Gpu("RTX 2080 Ti", 68, 1.545e9, 616e9, Cache(96 << 10, 4), Cache(5632 << 10, 16), 10e9),
+    "rtx2080ti": Gpu("RTX 2080 Ti", 68, 1.545e9, 616e9, Cache(96 << 10, 4), Cache(5632 << 10, 16)),
     "rtx2060": Gpu("RTX 2060", 30, 1.365e9, 336e9, Cache(96 << 10, 4), Cache(3 << 20, 16)),
 }
 
@@ -92,13 +79,6 @@ class Core:
     l1_lines: float = 1.0
     l2_bytes: float = 32.0
     warm: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("boxes", "triangles", "l1_lines", "l2_bytes"):
-            if not getattr(self, name) > 0.0:
-                raise InputError(f"{name} a clock must be more than 0, got {getattr(self, name)}")
-        if self.warps < 1:
-            raise InputError(f"warps must be 1 or more, got {self.warps}")
 
 
 BASE = Core()

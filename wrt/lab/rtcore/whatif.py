@@ -49,8 +49,7 @@ def with_traversal(accel: Accelerator, study: Study) -> Accelerator:
     return studied(study).restore(accel.built, accel.geometry)
 
 
-def quantised(lo: np.ndarray, hi: np.ndarray, bits: int, reference_bytes: int = REFERENCE_BYTES
-              ) -> tuple[np.ndarray, np.ndarray, int]:
+def quantised(lo: np.ndarray, hi: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray, int]:
     """Planes of so many bits in the frame of their node: its lowest corner, and for each axis a step that is a power of two, as
     in compressed wide BVHs (Ylitie, Karras and Laine 2017, section 3.1). lo, hi: (N, C, 3) float32, of C children; empty
     ones (lo = inf) stay as they are. Gives the boxes as they come out of their few bits, and the bytes of a node.
@@ -74,7 +73,7 @@ def quantised(lo: np.ndarray, hi: np.ndarray, bits: int, reference_bytes: int = 
         below -= (plane(below) > lo) & (below > 0)
         above += (plane(above) < hi) & (above < (1 << bits) - 1)
     out_lo, out_hi = np.where(empty, lo, plane(below)), np.where(empty, hi, plane(above))
-    size = -(-lo.shape[1] * 6 * bits // 8) + FRAME_BYTES + reference_bytes
+    size = -(-lo.shape[1] * 6 * bits // 8) + FRAME_BYTES + REFERENCE_BYTES
     return out_lo.astype(np.float32), out_hi.astype(np.float32), size
 
 
@@ -96,11 +95,6 @@ def resized(counters: Counters, before: int, after: int) -> Counters:
     counts["node_bytes"] = counts["nodes"] * after
     return Counters(counts, counters.first, np.where(node, counters.address // before * after, counters.address),
                     np.where(node, after, counters.size))
-
-
-def base(geometry: Geometry) -> Accelerator:
-    """The binary BVH that all studies start from."""
-    return Bvh2(geometry)
 
 
 MANY_WARPS = replace(BASE, warps=32, warm=True)  # beside BASE: where latency is hidden and the L2 full, units and lines decide
@@ -162,14 +156,14 @@ def width(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
 
 def stack(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
     """Entries of the stack: all that it needs, or a few with restarts."""
-    tree = base(geometry)
+    tree = Bvh2(geometry)
     for entries in ENTRIES:
         yield traced("full stack" if entries == STACK_SIZE else f"{entries} entries", with_traversal(tree, Study(entries)), rays)
 
 
 def planes(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
     """Bits of a box plane: fp32, or few in the frame of the node, rounded outwards."""
-    tree = base(geometry)
+    tree = Bvh2(geometry)
     first = traced("fp32", tree, rays)
     yield first
     for bits in BITS:
@@ -179,7 +173,7 @@ def planes(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
 
 def order(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
     """Nearer child first, and the early stop: on and off."""
-    tree = base(geometry)
+    tree = Bvh2(geometry)
     for name, study in (("both", Study()), ("early stop alone", Study(ordered=False)), ("order alone", Study(early=False)),
                         ("neither", Study(ordered=False, early=False))):
         yield traced(name, with_traversal(tree, study), rays)
@@ -187,7 +181,7 @@ def order(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
 
 def sorting(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
     """Rays in the order of the picture, sorted by origin and direction, and shuffled."""
-    tree = base(geometry)
+    tree = Bvh2(geometry)
     orders = {"as they come": np.arange(len(rays)), "sorted": by_coherence(rays.origins, rays.directions),
               "shuffled": np.random.default_rng(0).permutation(len(rays))}
     for name, which in orders.items():
@@ -196,18 +190,14 @@ def sorting(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
         yield replace(variant, prim_id=variant.prim_id[back], t=variant.t[back])
 
 
-def rates(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
-    """Box rate against triangle rate: every BVH of the registry, and no new rays, only the model."""
-    yield from width(geometry, rays)
-
-
+# Rates, of boxes against triangles, ask the model about the variants of width.
 STUDIES: dict[str, Callable[[Geometry, RaySet], Iterator[Variant]]] = {
-    "width": width, "stack": stack, "planes": planes, "order": order, "sorting": sorting, "rates": rates}
+    "width": width, "stack": stack, "planes": planes, "order": order, "sorting": sorting, "rates": width}
 
 
 def rows(plan: Plan) -> Iterator[Row]:
     geometry = Geometry.of(as_mesh(plan.mesh))
-    tree = base(geometry)
+    tree = Bvh2(geometry)
     sets = in_warps(tree, ray_sets(tree, plan.rays, plan.seed, plan.inside))
     for kind in dict.fromkeys(plan.kinds):
         first = None

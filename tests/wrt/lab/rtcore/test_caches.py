@@ -9,7 +9,6 @@ import pytest
 
 from wrt.accel.answers import Counters
 from wrt.accel.build import build
-from wrt.core.errors import InputError
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.rtcore.caches import LINE, Cache, Misses, distinct_lines, first_level, lines_of, replay, second_level
 from wrt.scene.shapes import icosphere
@@ -144,9 +143,3 @@ def test_a_recorded_trace_in_the_order_of_warps() -> None:
     ordered = [event for event, hit in sorted(below, key=lambda each: each[0][:2]) if not hit]
     dram = {(e[0], e[1], e[2], e[4]) for e, hit in zip(ordered, deep, strict=True) if not hit}
     assert found.wait_dram == sum(key in dram for key, _ in lanes)
-
-
-def test_what_is_no_cache_is_refused() -> None:
-    for size, ways in ((100, 1), (1024, 0), (1024, 16)):
-        with pytest.raises(InputError, match="a cache of"):
-            Cache(size, ways)

@@ -12,13 +12,14 @@ import pytest
 from tests.command_line import wrt as command
 from tests.kernel_tools import rounded
 from wrt.accel.build import build
+from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.kernels.study.bvh2_study import STACK_SIZE, Study
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.bench.report import text
 from wrt.lab.rtcore.parameters import SWEEPS
-from wrt.lab.rtcore.whatif import STUDIES, Plan, base, quantised, resized, run, with_planes, with_traversal
+from wrt.lab.rtcore.whatif import STUDIES, Plan, quantised, resized, run, with_planes, with_traversal
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
@@ -41,7 +42,7 @@ def rays() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("entries", [0, 1, 4])  # of ENTRIES: kernels that the study has too
 def test_a_short_stack_finds_the_same_with_more_nodes(entries: int, soup: Geometry, rays: tuple[np.ndarray, np.ndarray]) -> None:
-    tree = base(soup)
+    tree = Bvh2(soup)
     full = tree.closest_hit(*rays, counters=True)
     short = with_traversal(tree, Study(entries)).closest_hit(*rays, counters=True)
     for name in BITS:
@@ -59,7 +60,7 @@ def test_a_short_stack_finds_the_same_with_more_nodes(entries: int, soup: Geomet
 
 
 def test_order_and_early_stop_save_work_and_change_nothing(soup: Geometry, rays: tuple[np.ndarray, np.ndarray]) -> None:
-    tree = base(soup)
+    tree = Bvh2(soup)
     found = {study: with_traversal(tree, study).closest_hit(*rays, counters=True)
              for study in (Study(), Study(ordered=False), Study(early=False), Study(ordered=False, early=False))}
     plain = tree.closest_hit(*rays, counters=True)
@@ -95,7 +96,7 @@ def test_planes_of_few_bits_contain_the_box_that_they_stand_for() -> None:
 
 @pytest.mark.parametrize("bits", [16, 8, 4])
 def test_quantised_planes_lose_no_ray(bits: int, soup: Geometry, rays: tuple[np.ndarray, np.ndarray]) -> None:
-    tree = base(soup)
+    tree = Bvh2(soup)
     few, size = with_planes(tree, bits)
     a, b = tree.closest_hit(*rays, counters=True), few.closest_hit(*rays, trace=True)
     for name in BITS:
@@ -160,7 +161,7 @@ def test_what_there_is_not_is_refused(ball: Path) -> None:
                          ({"rays": 0}, "rays")):
         with pytest.raises(InputError, match=words):
             Plan(**{"study": "order", "mesh": ball, **wrong})  # type: ignore[arg-type]
-    deep = base(Geometry.of(icosphere(1)))
+    deep = Bvh2(Geometry.of(icosphere(1)))
     deep._state = replace(deep._state, stats=replace(deep.stats, depth=63))
     with pytest.raises(InputError, match="63 deep"):
         with_traversal(deep, Study(4))
