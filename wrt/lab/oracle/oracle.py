@@ -31,8 +31,7 @@ from wrt.scene.exact import (
     triangle_crossings,
 )
 
-__all__ = ["AllHits", "Answer", "Bounds", "Crossings", "Place", "Reference", "all_hits", "closest", "cross",
-           "reference_of", "sure", "t_bound"]
+__all__ = ["AllHits", "Answer", "Bounds", "Crossings", "Place", "Reference", "closest", "reference_of", "sure", "t_bound"]
 
 WIDTH = 4  # children of a node
 RAYS_AT_ONCE = 8192
@@ -331,27 +330,10 @@ def closest(geometry: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_ma
     return reference_of(geometry).closest(origins, directions, t_min, t_max)
 
 
-def all_hits(geometry: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> AllHits:
-    """Every hit of each ray in the closed segment [t_min, t_max]; arguments as for `closest`."""
-    return reference_of(geometry).all_hits(origins, directions, t_min, t_max)
-
-
-def cross(origins: Any, directions: Any, triangles: Any) -> Crossings:
-    """Ray i's line against triangle i: the exact place, and t, u, v of the plane. triangles: (N, 3, 3), taken as float32."""
-    rays = _Rays.of(origins, directions, 0.0, np.inf)
-    return triangle_crossings(rays.origin, rays.direction, _columns(triangles), all_rows=True)
-
-
 def t_bound(origins: Any, directions: Any, triangles: Any) -> np.ndarray:
     """How far the t that the watertight test reports for ray i and triangle i may be from the exact one: (N,) float64, inf
     where it may be anything. See `wrt.lab.oracle.bounds`."""
     rays = _Rays.of(origins, directions, 0.0, np.inf)
-    corners = _columns(triangles)
-    return triangle_bounds(rays.origin, rays.direction, corners,
-                           triangle_crossings(rays.origin, rays.direction, corners, all_rows=True)).t
-
-
-def _columns(triangles: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    corners = np.asarray(triangles, dtype=np.float32).astype(np.float64)
-    a, b, c = (np.ascontiguousarray(corners[:, i].T) for i in range(3))
-    return a, b, c
+    a, b, c = (np.ascontiguousarray(each.T) for each in np.asarray(triangles, np.float32).astype(np.float64).transpose(1, 0, 2))
+    found = triangle_crossings(rays.origin, rays.direction, (a, b, c), all_rows=True)
+    return triangle_bounds(rays.origin, rays.direction, (a, b, c), found).t

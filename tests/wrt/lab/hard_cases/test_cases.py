@@ -36,7 +36,7 @@ from wrt.lab.hard_cases.cases import (
 )
 from wrt.lab.hard_cases.common import sphere
 from wrt.lab.hard_cases.judge import winding_number
-from wrt.lab.oracle.oracle import Place, Reference, all_hits, reference_of
+from wrt.lab.oracle.oracle import Place, Reference, reference_of
 from wrt.scene.mesh import Mesh
 
 REFUSED = ("I_rays_not_finite", "I_mesh_not_finite")
@@ -128,7 +128,7 @@ def test_what_aimed_at_a_vertex_means(name: str) -> None:
         rows = np.flatnonzero(((vertices - origin).astype(np.float32) == direction).all(axis=1))
         assert len(rows)
         exactly = (vertices[rows] - origin == direction.astype(np.float64)).all(axis=1).any()
-        hits = all_hits(case.geometry, origin[None], direction[None], 0.99, 1.01)
+        hits = reference_of(case.geometry).all_hits(origin[None], direction[None], 0.99, 1.01)
         assert exactly <= (hits.place == Place.VERTEX).any()
         through += exactly
     assert through == 40 if name.startswith("A") else 0 < through < 20
@@ -137,7 +137,7 @@ def test_what_aimed_at_a_vertex_means(name: str) -> None:
 def test_theorems_agree_with_the_oracle() -> None:
     for name in HARD_CASES:
         case = generate(name, 4 if name.startswith("G_fan") else 60, seed=5)
-        hits = all_hits(case.geometry, case.origins, case.directions, case.t_min, case.t_max)
+        hits = reference_of(case.geometry).all_hits(case.origins, case.directions, case.t_min, case.t_max)
         has_hit = np.isin(np.arange(len(case)), hits.ray)
         assert has_hit[case.expected == HIT].all(), name
         assert not has_hit[case.expected == MISS].any(), name

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from wrt.lab.oracle.bounds import triangle_bounds
-from wrt.lab.oracle.oracle import Place, Reference, all_hits, closest, cross, reference_of, sure, t_bound
+from wrt.lab.oracle.oracle import Place, Reference, closest, reference_of, sure, t_bound
 from wrt.scene.exact import sphere_crossings, triangle_crossings
 
 Row = list[Fraction]
@@ -134,6 +134,15 @@ class Shape:
 def geometry_of(triangles: np.ndarray, spheres: np.ndarray | None = None) -> Shape:
     corners = np.asarray(triangles, np.float32).reshape(-1, 3)
     return Shape(corners, np.arange(len(corners)).reshape(-1, 3), np.zeros((0, 4)) if spheres is None else spheres)
+
+
+def cross(origin, direction, triangles):
+    """Ray i's line against triangle i."""
+    return Reference(geometry_of(triangles)).against(origin, direction, np.arange(len(triangles)))[0]
+
+
+def all_hits(geometry, *asked):
+    return reference_of(geometry).all_hits(*asked)
 
 
 def brute_force(origin, direction, triangles, t_min, t_max):
