@@ -14,6 +14,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
+from wrt.core.packages import needed_by
 from wrt.core.registry import Registry
 from wrt.lab.bench.rays import RaySet
 
@@ -103,11 +104,9 @@ class Embree(Peer):
     robust: ClassVar[bool] = True
 
     def load(self, geometry: Geometry) -> None:
-        try:
+        with needed_by(self.name):
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
-        except ImportError as error:
-            raise InputError(f'embreex is not usable ({error}); pip install "wrt[peers]" installs it') from error
         try:
             self.scene = EmbreeScene(robust=self.robust)
         except TypeError as error:

@@ -12,7 +12,7 @@ import numpy as np
 
 from wrt.accel.answers import Hits
 from wrt.accel.geometry import Geometry
-from wrt.core.errors import InputError
+from wrt.core.packages import needed_by
 from wrt.lab.bench.rays import RaySet
 from wrt.lab.hard_cases.contestants import Peer, cut
 
@@ -23,11 +23,9 @@ SLACK = 16  # bytes that Embree may read behind the last vertex
 
 @cache
 def library() -> Any:
-    """Embree 4. Raises InputError where embreex is not usable."""
-    try:
+    """Embree 4. Raises InputError where there is no embreex."""
+    with needed_by("Embree"):
         from embreex import rtcore_scene
-    except ImportError as error:
-        raise InputError(f'embreex is not usable ({error}); pip install "wrt[peers]" installs it') from error
     embree = ctypes.CDLL(rtcore_scene.__file__)  # a symbol is looked for in what it is linked to, too
     pointer = ctypes.c_void_p
     for name in ("rtcNewDevice", "rtcNewScene", "rtcNewGeometry"):

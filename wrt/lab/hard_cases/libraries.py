@@ -16,6 +16,7 @@ from wrt.lab.hard_cases.common import surface
 from wrt.lab.hard_cases.conformance import ClosestHit
 from wrt.lab.hard_cases.contestants import Embree, EmbreeFast, Open3D, Peer, WarpMesh
 from wrt.lab.mitsuba.process import require_llvm
+from wrt.lab.mitsuba.shapes import Triangles, make_mesh
 from wrt.lab.mitsuba.translate import mitsuba
 
 TRIMESH_RAYS = 64  # at once: it tests all triangles in a box around each ray
@@ -38,10 +39,7 @@ def mitsuba_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray
     """By its variant llvm_ad_rgb, which asks Embree."""
     require_llvm()
     with mitsuba("llvm_ad_rgb") as mi:
-        mesh = mi.Mesh("mesh", len(vertices), len(faces))
-        parameters = mi.traverse(mesh)
-        parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), faces.ravel().astype(np.uint32)
-        parameters.update()
+        mesh = make_mesh(mi, "mesh", Triangles(vertices, faces, None, None), {})
         scene = mi.load_dict({"type": "scene", "mesh": mesh})
         rays = mi.Ray3f(mi.Point3f(origins.T.copy()), mi.Vector3f(directions.T.copy()))
         hits = scene.ray_intersect_preliminary(rays)
@@ -72,10 +70,6 @@ class Library:
     closest_hit: ClosestHit
     needs: Sequence[str] = ()
 
-    @property
-    def missing(self) -> list[str]:
-        return [package for package in self.needs if importlib.util.find_spec(package) is None]
-
 
 LIBRARIES = {
     "wrt": Library("wrt", own),
@@ -90,7 +84,7 @@ LIBRARIES = {
 
 def usable(name: str) -> str:
     """Why a library cannot be asked here; empty where it can."""
-    missing = LIBRARIES[name].missing
+    missing = [package for package in LIBRARIES[name].needs if importlib.util.find_spec(package) is None]
     if missing:
         return f"not installed: {', '.join(missing)}"
     if name == "mitsuba":
