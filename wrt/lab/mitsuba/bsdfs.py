@@ -1,8 +1,7 @@
-"""Materials and textures for Mitsuba: one function a kind of material, in the table BSDFS; what has no counterpart is refused."""
+"""Materials and textures for Mitsuba; what has no counterpart is refused."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NoReturn
 
 import numpy as np
@@ -11,6 +10,11 @@ from wrt.core.errors import InputError
 from wrt.picture.tonemap import decode_srgb
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.values import Color
+
+BSDFS: dict[str, dict[str, Any]] = {"diffuse": {"type": "diffuse"}, "mirror": {"type": "conductor", "material": "none"},
+                                    "conductor": {"type": "conductor"}, "glass": {"ext_ior": 1.0}}
+# What the albedo is there.
+COLORED = {"diffuse": "reflectance", "mirror": "specular_reflectance", "glass": "specular_transmittance"}
 
 
 def refuse(what: str, where: str = "") -> NoReturn:
@@ -27,7 +31,7 @@ def bsdf(mi: Any, material: Material) -> dict[str, Any]:
         refuse("normal texture (Mitsuba has tangents of its own)", where)
     if max(material.specular) > 0.0:
         refuse("Blinn-Phong highlight", where)
-    result = BSDFS[material.kind](mi, material)
+    result = _bsdf(mi, material)
     if material.kind != "glass":  # which has two sides by nature; everything else answers light on its back as on its front
         result = {"type": "twosided", "bsdf": result}
     elif not material.thin and material.alpha_mode == "blend":
@@ -44,37 +48,20 @@ def emission(mi: Any, material: Material) -> dict[str, Any]:
     return {"type": "area", "radiance": radiance, "sampling_weight": 1.0 if material.lights_others else 0.0}
 
 
-def _diffuse(mi: Any, material: Material) -> dict[str, Any]:
-    return {"type": "diffuse", "reflectance": _color(mi, material.albedo, material.albedo_texture)}
-
-
-def _mirror(mi: Any, material: Material) -> dict[str, Any]:
-    reflectance = _color(mi, material.albedo, material.albedo_texture)
-    return {"type": "conductor", "material": "none", "specular_reflectance": reflectance}
-
-
-def _conductor(mi: Any, material: Material) -> dict[str, Any]:
-    result: dict[str, Any] = {"type": "conductor", "eta": rgb(material.eta), "k": rgb(material.k)}
-    return result | _ggx("roughconductor", material) if material.is_rough else result
-
-
-def _glass(mi: Any, material: Material) -> dict[str, Any]:
-    transmittance = _color(mi, material.albedo, material.albedo_texture)
-    result: dict[str, Any] = {"type": "dielectric", "int_ior": material.ior, "ext_ior": 1.0,
-                              "specular_transmittance": transmittance}
-    if material.thin:
-        if material.is_rough:
+def _bsdf(mi: Any, material: Material) -> dict[str, Any]:
+    """Without its back side and its opacity."""
+    result = dict(BSDFS[material.kind])
+    if material.kind == "conductor":
+        result |= {"eta": rgb(material.eta), "k": rgb(material.k)}
+    else:
+        result[COLORED[material.kind]] = _color(mi, material.albedo, material.albedo_texture)
+    if material.kind == "glass":
+        result |= {"type": "thindielectric" if material.thin else "dielectric", "int_ior": material.ior}
+        if material.thin and material.is_rough:
             refuse("a thin pane with roughness", f"material {material.name!r}")
-        return result | {"type": "thindielectric"}
-    return result | _ggx("roughdielectric", material) if material.is_rough else result
-
-
-def _ggx(plugin: str, material: Material) -> dict[str, Any]:
-    return {"type": plugin, "distribution": "ggx", "alpha": material.roughness**2}
-
-
-BSDFS: dict[str, Callable[[Any, Material], dict[str, Any]]] = {
-    "diffuse": _diffuse, "mirror": _mirror, "conductor": _conductor, "glass": _glass}
+    if material.is_rough:
+        result |= {"type": f"rough{result['type']}", "distribution": "ggx", "alpha": material.roughness**2}
+    return result
 
 
 # --- textures ---------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 from wrt.core.errors import InputError
 from wrt.lab.mitsuba.bsdfs import refuse, rgb
 from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
-from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
+from wrt.scene.lights import Light, SpotLight
 
 # Rows of a gradient's picture: linear interpolation of a cosine over steps of pi / 1024 errs by at most 1.2e-6.
 GRADIENT_ROWS = 1025
@@ -24,14 +24,6 @@ def light_emitter(mi: Any, light: Light) -> dict[str, Any]:
     if light.kind not in LIGHTS:
         refuse(f"light {light.name!r} of kind {light.kind!r}")
     return LIGHTS[light.kind](mi, light)
-
-
-def _point(mi: Any, light: PointLight) -> dict[str, Any]:
-    return {"type": "point", "position": list(light.position), "intensity": rgb(light.intensity)}
-
-
-def _directional(mi: Any, light: DirectionalLight) -> dict[str, Any]:
-    return {"type": "directional", "direction": list(light.direction), "irradiance": rgb(light.irradiance)}
 
 
 def _spot(mi: Any, light: SpotLight) -> dict[str, Any]:
@@ -57,7 +49,10 @@ def _spot(mi: Any, light: SpotLight) -> dict[str, Any]:
 
 
 LIGHTS: dict[str, Callable[[Any, Any], dict[str, Any]]] = {
-    "point": _point, "directional": _directional, "spot": _spot,
+    "point": lambda mi, light: {"type": "point", "position": list(light.position), "intensity": rgb(light.intensity)},
+    "directional": lambda mi, light: {
+        "type": "directional", "direction": list(light.direction), "irradiance": rgb(light.irradiance)},
+    "spot": _spot,
 }
 
 

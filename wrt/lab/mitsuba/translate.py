@@ -171,14 +171,11 @@ def _sensor(mi: Any, scene: Scene, camera: CameraKind) -> dict[str, Any]:
 
 
 def _farthest(scene: Scene, camera: CameraKind) -> float:
-    """An upper bound of the distance from the camera to any shape."""
+    """An upper bound of the distance from the camera to any shape, and to where it is focused."""
+    focus = camera.focus_distance if isinstance(camera, Camera) else 1.0
     if not scene.objects and not scene.spheres:
-        return _focus(camera)
+        return focus
     low, high = scene.bounds()
     position = camera.camera_to_world[:3, 3]
     reach = np.linalg.norm(np.maximum(np.abs(low - position), np.abs(high - position)))
-    return max(float(reach), _focus(camera) if camera.switches().get("lens") else 0.0)
-
-
-def _focus(camera: CameraKind) -> float:
-    return camera.focus_distance if isinstance(camera, Camera) else 1.0
+    return max(float(reach), focus if camera.switches().get("lens") else 0.0)
