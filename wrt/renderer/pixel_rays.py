@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from importlib import import_module
 
 import numpy as np
 import warp as wp
@@ -10,8 +10,10 @@ import warp as wp
 from wrt.core.checks import as_one, as_size
 from wrt.core.device import launch, made_once, start, upload
 from wrt.kernels.shade.pixel_rays import make_camera_rays_kernel
-from wrt.renderer.upload import camera_kind, camera_struct
+from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import CameraKind
+
+camera_rays_kernel = made_once(make_camera_rays_kernel)
 
 
 def camera_rays(camera: CameraKind, size: tuple[int, int] | str) -> tuple[np.ndarray, np.ndarray]:
@@ -32,12 +34,7 @@ def film_rays(camera: CameraKind, size: tuple[int, int], film: np.ndarray) -> tu
     """As `camera_rays`, through points (N, 2) of a picture of `size` pixels: (0, 0) is its top left corner, (1, 1) the bottom
     right one."""
     device = start("cpu")
-    kernel = _kernel(camera_kind(as_one(camera, CameraKind, "camera").device))
+    kernel = camera_rays_kernel(import_module(as_one(camera, CameraKind, "camera").device))
     origins, directions = (wp.empty(len(film), dtype=wp.vec3, device=device) for _ in range(2))
     launch(kernel, len(film), camera_struct(camera, size), upload(film, wp.vec2, device), origins, directions)
     return origins.numpy(), directions.numpy()
-
-
-@made_once
-def _kernel(kind: Any) -> Any:
-    return make_camera_rays_kernel(kind)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Any
 
 from wrt.accel.instancing import instanced_meshes
@@ -17,7 +18,6 @@ from wrt.kernels.traverse.common import Units
 from wrt.renderer.features import Features, features_of
 from wrt.renderer.film_arrays import BYTES_OF_AOVS, BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS
 from wrt.renderer.options import Options
-from wrt.renderer.upload import camera_kind
 from wrt.renderer.waves import WaveKernels, wave_kernels
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
@@ -28,12 +28,12 @@ AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  #
 
 @made_once
 def render_kernel(features: Features, structure: Any) -> Any:
-    return kernels.make_render_kernel(features, structure, camera_kind(features.camera))
+    return kernels.make_render_kernel(features, structure, import_module(features.camera))
 
 
 @made_once
 def aov_kernel(features: Features, structure: Any) -> Any:
-    return kernels.make_aov_kernel(features, structure, camera_kind(features.camera))
+    return kernels.make_aov_kernel(features, structure, import_module(features.camera))
 
 
 @dataclass(frozen=True, eq=False)

@@ -255,14 +255,9 @@ def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()
     return DeviceScene(world, s, lighting)
 
 
-def camera_kind(device: str) -> Any:
-    """The device's side of a kind of camera: the module of that name (wrt.kernels.shade.cameras)."""
-    return import_module(device)
-
-
 def camera_struct(camera: CameraKind, size: tuple[int, int]) -> Any:
     """The camera for a picture of so many pixels."""
-    c = camera_kind(camera.device).Camera()
+    c = import_module(camera.device).Camera()
     pose = camera.camera_to_world
     c.origin = wp.vec3(*pose[:3, 3])
     c.right, c.up, c.forward = wp.vec3(*pose[:3, 0]), wp.vec3(*pose[:3, 1]), wp.vec3(*(-pose[:3, 2]))

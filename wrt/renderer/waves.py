@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from wrt.renderer.features import Features
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.launches import Launches
 from wrt.renderer.tiles import Work
-from wrt.renderer.upload import camera_kind
 
 # Samples of a wave: 4,096 to 32,768 are 0.92 to 1.06 times as fast, by the scene. Fewer where each has room for many paths or asks
 # many lights: ROOM is for all of them together.
@@ -41,29 +41,11 @@ def some(features: Features, names: tuple[str, ...]) -> Features:
     return Features(**{name: getattr(features, name) for name in names})
 
 
-@made_once
-def begin_kernel(features: Features) -> Any:
-    return wave_begin.make_begin_kernel(features, camera_kind(features.camera))
-
-
-@made_once
-def shade_kernels(features: Features) -> tuple[Any, Any]:
-    return wave_shade.make_shade_kernels(features)
-
-
-@made_once
-def shadow_kernel(features: Features) -> Any:
-    return wave.make_shadow_kernel(features)
-
-
-@made_once
-def see_kernel(features: Features) -> Any:
-    return wave.make_see_kernel(features)
-
-
-@made_once
-def begin_aov_kernel(camera: str) -> Any:
-    return wave_begin.make_begin_aov_kernel(camera_kind(camera))
+begin_kernel = made_once(wave_begin.make_begin_kernel)
+shade_kernels = made_once(wave_shade.make_shade_kernels)
+shadow_kernel = made_once(wave.make_shadow_kernel)
+see_kernel = made_once(wave.make_see_kernel)
+begin_aov_kernel = made_once(wave_begin.make_begin_aov_kernel)
 
 
 @made_once
@@ -103,7 +85,7 @@ def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
     """aov: whether AOVs are asked for."""
     default = Features()
     surfaces = replace(features, camera=default.camera, lens=False, blades=False, filter=False, stack_size=default.stack_size)
-    cutout = some(features, OF_CUTOUT)
+    cutout, camera = some(features, OF_CUTOUT), import_module(features.camera)
     transparent = features.transparent_shadows
     closest_hit, block = queue_kernel(structure, cutout, False)
     shade, prepare = shade_kernels(surfaces)
@@ -113,9 +95,9 @@ def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
         closest_hit=closest_hit,
         any_hit=queue_kernel(structure, cutout, True)[0] if features.lit and not transparent else None,
         shadow=shadow_kernel(surfaces) if transparent else None,
-        begin=begin_kernel(some(features, OF_CAMERA)),
+        begin=begin_kernel(some(features, OF_CAMERA), camera),
         loop=wave.make_loop_kernel(transparent),
-        begin_aov=begin_aov_kernel(features.camera) if aov else None,
+        begin_aov=begin_aov_kernel(camera) if aov else None,
         see=see_kernel(surfaces) if aov else None,
         block=block,
     )

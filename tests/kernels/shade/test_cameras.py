@@ -2,6 +2,7 @@
 where they meet."""
 
 from functools import cache
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -11,13 +12,13 @@ import warp as wp
 
 from wrt.kernels.structs import Ray, kernel
 from wrt.renderer.features import Features
-from wrt.renderer.upload import camera_kind, camera_struct
+from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera, FisheyeCamera, OrthographicCamera, PanoramaCamera
 
 
 @cache
 def camera_kernel(device, features):
-    kind = camera_kind(device)
+    kind = import_module(device)
     camera_struct, camera_ray = kind.Camera, kind.make_camera_ray(features)
 
     @kernel

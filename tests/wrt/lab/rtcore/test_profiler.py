@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import sys
 from pathlib import Path
@@ -22,7 +23,6 @@ from wrt.renderer.costs import COUNTERS
 from wrt.renderer.features import features_of
 from wrt.renderer.options import Progress
 from wrt.renderer.plan import render_kernel
-from wrt.renderer.upload import camera_kind
 from wrt.scene.model import Scene
 
 # Left, a matte wall under one lamp; right, two mirrors that face each other with the camera between them.
@@ -159,7 +159,7 @@ def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None
         modules[name] = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = modules[name]
         spec.loader.exec_module(modules[name])
-    codes, bare = [], modules["render"].make_render_kernel(features, structure, camera_kind(features.camera))
+    codes, bare = [], modules["render"].make_render_kernel(features, structure, importlib.import_module(features.camera))
     for kernel in (render_kernel(features, structure), bare):
         (binary,) = wp.compile_aot_module(kernel.module, arch=75, module_dir=tmp_path / str(len(codes)))
         (code,) = read_cubin(Path(binary).read_bytes()).values()
