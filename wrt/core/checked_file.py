@@ -29,19 +29,14 @@ def write_checked(file: BinaryIO, magic: bytes, header: dict[str, Any], parts: I
     file.write(digest.digest())
 
 
-def read_checked(path: str | os.PathLike[str], magic: bytes, what: str,
-                 largest: int | None = None) -> tuple[dict[str, Any], memoryview]:
-    """The header and the bytes of the arrays. Raises InputError, which calls it `what`, where it is missing, foreign, damaged,
-    or has more than `largest` bytes, of which none is read then."""
+def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> tuple[dict[str, Any], memoryview]:
+    """The header and the bytes of the arrays. Raises InputError, which calls it `what`, where it is missing, foreign or damaged."""
     try:
         with open_regular(path) as file:
             if file.read(len(magic)) != magic:
                 raise InputError(f"is no {what} of this version")
-            size = os.fstat(file.fileno()).st_size
-            if largest is not None and size > largest:
-                raise InputError(f"is damaged: it has {size} bytes, and cannot have more than {largest}")
             file.seek(0)
-            data = memoryview(file.read(size))
+            data = memoryview(file.read(os.fstat(file.fileno()).st_size))
     except OSError as error:
         raise InputError(error.strerror or str(error), path) from error
     except InputError as error:

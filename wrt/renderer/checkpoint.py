@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.checked_file import DIGEST_BYTES, MAX_HEADER, read_checked, write_checked
+from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
 from wrt.core.write_file import check_writable, replacing
@@ -45,9 +45,9 @@ class Saved:
     body: memoryview
 
 
-def read(path: str | os.PathLike[str], largest: int | None = None) -> Saved:
-    """Raises InputError where the file is missing, foreign, damaged, of another version or larger than so many bytes."""
-    header, body = read_checked(path, MAGIC, "checkpoint", largest)
+def read(path: str | os.PathLike[str]) -> Saved:
+    """Raises InputError where the file is missing, foreign, damaged or of another version."""
+    header, body = read_checked(path, MAGIC, "checkpoint")
     try:
         low, high = map(int, header["samples"])
         if not 0 <= low <= high < 1 << 31:  # the film's counts are int32, and a message could not hold thousands of digits
@@ -72,14 +72,13 @@ class Checkpoint:
         self.identity = json.loads(json.dumps(identity, default=str))
         pixel = sum(_bytes(kind) for kind in SHARED.values()) + groups * sum(_bytes(kind) for kind in OF_A_GROUP.values())
         self.body_bytes = area * pixel
-        self.bytes = self.body_bytes + len(MAGIC) + MAX_HEADER + DIGEST_BYTES
         self.saved: Saved | None = None
         self.problem = ""
         check_writable(path)
         if os.path.lexists(self.path):
             if not resume:
                 raise InputError("is there already: resume it (--resume, resume=True), or remove it first", path)
-            self.saved = self._checked(read(self.path, self.bytes))
+            self.saved = self._checked(read(self.path))
         self._last = 0.0
 
     def _checked(self, saved: Saved) -> Saved:
