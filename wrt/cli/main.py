@@ -256,7 +256,7 @@ def validate(scenes: tuple[Path, ...]) -> None:
 def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float, as_json: bool, **limits: Any) -> None:
     """Measure the error of picture A against the reference B."""
     from wrt.picture import metrics
-    from wrt.picture.image import check_writable, picture_size, read_image, write_codes
+    from wrt.picture.image import check_writable, read_image, write_codes
     from wrt.scene.settings import Settings
 
     Settings(tonemap=tonemap, exposure=exposure)  # told before the pictures are read
@@ -264,7 +264,6 @@ def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float
         if output.suffix.lower() != ".png":
             raise InputError("a picture of the difference is a .png", output)
         check_writable(output)
-    metrics.check_sizes(picture_size(a), picture_size(b))
     first, second = read_image(a), read_image(b)
     result = metrics.compare(first, second, exposure=exposure, tonemap=tonemap)
     if output is not None:

@@ -65,12 +65,6 @@ def decode_png16(data: bytes) -> np.ndarray:
         return codes
 
 
-def size_of(data: bytes, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
-    """Width and height that an encoded picture has by its header. Raises InputError as decode_rgba8 does."""
-    with _opened(data, formats) as picture:
-        return picture.size
-
-
 @contextmanager
 def _opened(data: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
     """The picture, whose pixels are decoded when they are asked for."""

@@ -23,7 +23,7 @@ from wrt.core.files import open_regular, read_file
 from wrt.core.packages import needed_by
 from wrt.core.write_file import replacing
 from wrt.picture.decode import FORMATS as FORMATS_READ
-from wrt.picture.decode import check_size, decode_png16, decode_rgba8, size_of
+from wrt.picture.decode import check_size, decode_png16, decode_rgba8
 from wrt.picture.tonemap import decode_srgb, to_codes
 
 PathLike = str | os.PathLike[str]
@@ -76,13 +76,18 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
         raise InputError(f"pixels must be (H, W, 3), got {pixels.shape}", path)
     suffix, bits = output_format(path, bits)
-    WRITERS[suffix](path, pixels, bits, exposure, tonemap, metadata or {})
+    if suffix == ".png":
+        _warn_replaced(path, ~np.isfinite(pixels), "NaN or infinite, written as black or white")
+        write_codes(path, to_codes(pixels, exposure, tonemap, bits), metadata)
+    elif suffix == ".exr":
+        write_exr(path, color_channels("", as_half(path, pixels) if bits == 16 else pixels), metadata)
+    else:
+        _write_hdr(path, pixels, metadata or {})
 
 
 def write_codes(path: PathLike, codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> None:
     """Write display codes, (H, W, 3) uint8 or uint16, to a PNG file as they are. Raises InputError as write_image."""
-    data = encode_png(codes, metadata or {})
-    write_file.write_bytes(path, data)
+    write_file.write_bytes(path, encode_png(codes, metadata))
 
 
 def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapping[str, Any] | None = None) -> None:
@@ -92,9 +97,7 @@ def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapp
     to 2^24 (OpenEXR has integer channels, but OpenImageIO's Python binding rounds them where others are float); beyond
     that a SceneWarning says so. Raises InputError as write_image does.
     """
-    with needed_by("an EXR or HDR picture, or one of 16 bits,"):
-        import OpenImageIO as oiio
-
+    oiio = _oiio()
     arrays = list(channels.values())
     height, width = arrays[0].shape
     types = ["half" if array.dtype == np.float16 else "float" for array in arrays]
@@ -109,14 +112,19 @@ def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapp
         if array.dtype.kind in "iu" and array.size and int(array.max()) > EXACT_IN_FLOAT:
             warn(f"{os.fspath(path)}: {name} goes up to {array.max()} and is rounded: its channel is exact to"
                  f" {EXACT_IN_FLOAT}")
-    _write_oiio(path, spec, lambda y0, y1: np.stack([a[y0:y1].astype(np.float32) for a in arrays], axis=-1))
+    _write_oiio(path, spec, np.stack(arrays, axis=-1, dtype=np.float32, casting="unsafe"))
 
 
-def _write_oiio(path: PathLike, spec: Any, rows: Callable[[int, int], np.ndarray], header: bytes = b"") -> None:
-    """Write rows y0 to y1, (y1 - y0, W, C) float32, in bands; `header` is put in behind the file's first line."""
-    with needed_by("an EXR or HDR picture, or one of 16 bits,"):
-        import OpenImageIO as oiio
+def _oiio() -> Any:
+    with needed_by("an EXR or HDR picture"):
+        import OpenImageIO
 
+    return OpenImageIO
+
+
+def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b"") -> None:
+    """Write (H, W, C) float32; `header` is put in behind the file's first line."""
+    oiio = _oiio()
     with replacing(path) as file:
         # By its descriptor where that has a name: whoever can rename files in the folder could put a link in the file's place.
         name = f"/dev/fd/{file.fileno()}" if os.path.isdir("/dev/fd") else file.name
@@ -124,10 +132,7 @@ def _write_oiio(path: PathLike, spec: Any, rows: Callable[[int, int], np.ndarray
         if out is None:
             raise InputError(f"cannot be written: {oiio.geterror()}", path)
         try:
-            good = out.open(name, spec)
-            for y in range(0, spec.height if good else 0, 64):
-                band = np.ascontiguousarray(rows(y, min(y + 64, spec.height)), dtype=np.float32)
-                good = good and out.write_scanlines(y, y + len(band), 0, band)
+            good = out.open(name, spec) and out.write_image(pixels)
         finally:
             closed = out.close()
         # Some failures, such as a full disk, are told in the text only.
@@ -141,30 +146,13 @@ def _write_oiio(path: PathLike, spec: Any, rows: Callable[[int, int], np.ndarray
             file.write(header + rest)
 
 
-def _write_png(path: PathLike, pixels: np.ndarray, bits: int, exposure: float, tonemap: str,
-               metadata: Mapping[str, Any]) -> None:
-    _warn_replaced(path, ~np.isfinite(pixels), "NaN or infinite, written as black or white")
-    write_codes(path, to_codes(pixels, exposure, tonemap, bits), metadata)
-
-
-def _write_exr(path: PathLike, pixels: np.ndarray, bits: int, exposure: float, tonemap: str,
-               metadata: Mapping[str, Any]) -> None:
-    write_exr(path, color_channels("", as_half(path, pixels) if bits == 16 else pixels), metadata)
-
-
-def _write_hdr(path: PathLike, pixels: np.ndarray, bits: int, exposure: float, tonemap: str,
-               metadata: Mapping[str, Any]) -> None:
-    with needed_by("an EXR or HDR picture, or one of 16 bits,"):
-        import OpenImageIO as oiio
-
+def _write_hdr(path: PathLike, pixels: np.ndarray, metadata: Mapping[str, Any]) -> None:
+    oiio = _oiio()
     _warn_replaced(path, ~(np.isfinite(pixels) & (pixels >= 0.0)), "negative, NaN or infinite, which .hdr cannot hold")
     held = np.clip(np.nan_to_num(pixels, nan=0.0, posinf=1e38, neginf=0.0), 0.0, 1e38)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "float")
     header = "".join(f"# {METADATA_PREFIX}{key}={' '.join(str(value).split())}\n" for key, value in metadata.items())
-    _write_oiio(path, spec, lambda y0, y1: held[y0:y1], _utf8(header))
-
-
-WRITERS = {".png": _write_png, ".exr": _write_exr, ".hdr": _write_hdr}
+    _write_oiio(path, spec, held, _utf8(header))
 
 
 def color_channels(layer: str, pixels: np.ndarray, names: str = "RGB") -> dict[str, np.ndarray]:
@@ -232,25 +220,10 @@ def read_image(path: PathLike) -> np.ndarray:
         raise InputError(f"not an image format that wrt reads ({', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)})", path)
     with _told(path):
         deep = data[:8] == PNG_MAGIC and data[24:25] == b"\x10"
-        codes = decode_png16(data) if deep else decode_rgba8(data, _formats(path))[..., :3]
-    del data
+        formats = ("TGA",) if suffix == ".tga" else FORMATS_READ  # only where the name says so, since nothing in TGA does
+        codes = decode_png16(data) if deep else decode_rgba8(data, formats)[..., :3]
     levels = np.iinfo(codes.dtype).max
-    table = decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)
-    pixels = np.empty(codes.shape, np.float32)
-    for row, line in zip(pixels, codes, strict=True):  # at once, NumPy would make indices of eight bytes of all codes
-        row[:] = table[line]
-    return pixels
-
-
-def picture_size(path: PathLike) -> tuple[int, int]:
-    """Width and height of the picture that `read_image` would read, from the file's header. Raises InputError as it does."""
-    if Path(path).suffix.lower() in LINEAR_SUFFIXES:
-        with _opened(path) as source:
-            return source.spec().width, source.spec().height
-    if Path(path).suffix.lower() not in DISPLAY_SUFFIXES:
-        read_image(path)  # says why not
-    with _told(path):
-        return size_of(read_file(path), _formats(path))
+    return decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)[codes]
 
 
 def read_channels(path: PathLike) -> dict[str, np.ndarray]:
@@ -268,11 +241,6 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
         if pixels is None:
             raise InputError(f"cannot be read as an image: {_reason(source.geterror)}", path)
         return {name: pixels[..., i] for i, name in enumerate(spec.channelnames)}
-
-
-def _formats(path: PathLike) -> tuple[str, ...]:
-    """What a file of that name may hold; TGA only where it says so, since nothing in it does."""
-    return ("TGA",) if Path(path).suffix.lower() == ".tga" else FORMATS_READ
 
 
 @contextlib.contextmanager
@@ -294,9 +262,7 @@ def _opened(path: PathLike) -> Iterator[Any]:
         raise InputError(f"cannot be read: {error.strerror or error}", path) from error
     if not first.startswith(_MAGIC[Path(path).suffix.lower()]):
         raise InputError(f"cannot be read as an image: it is no {Path(path).suffix.lower()} file", path)
-    with needed_by("an EXR or HDR picture, or one of 16 bits,"):
-        import OpenImageIO as oiio
-
+    oiio = _oiio()
     oiio.attribute("try_all_readers", 0)
     try:
         source = oiio.ImageInput.open(os.fspath(path))

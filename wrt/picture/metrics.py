@@ -33,7 +33,8 @@ def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str
     InputError where the sizes differ.
     """
     a, b = _pair(a, b)
-    finite, equal = _finite_and_equal(a, b)
+    finite = np.isfinite(a).all(axis=-1) & np.isfinite(b).all(axis=-1)
+    equal = ((a == b) | (np.isnan(a) & np.isnan(b))).all(axis=-1)
     result: dict[str, Any] = {
         "pixels": int(finite.size), **{f"nonfinite_{name}": int(np.count_nonzero(~np.isfinite(image).all(axis=-1)))
                                        for name, image in (("a", a), ("b", b))},
@@ -60,18 +61,6 @@ def _shown_errors(a: np.ndarray, b: np.ndarray, finite: np.ndarray, exposure: fl
     flip = float(np.mean(flip_map(a, b)[finite], dtype=np.float64))
     a, b = (encode_srgb(image[finite].astype(np.float64)) for image in (a, b))
     return float(np.mean((a - b) ** 2)), flip
-
-
-def _finite_and_equal(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) each: whether all channels of both are finite; whether a and b are the same, of which NaN is the same as NaN."""
-    finite = np.isfinite(a).all(axis=-1) & np.isfinite(b).all(axis=-1)
-    return finite, ((a == b) | (np.isnan(a) & np.isnan(b))).all(axis=-1)
-
-
-def check_sizes(a: tuple[int, int], b: tuple[int, int]) -> None:
-    """Raise InputError where two pictures have different widths and heights."""
-    if a != b:
-        raise InputError(f"the pictures have different sizes, {a[0]}x{a[1]} and {b[0]}x{b[1]}")
 
 
 def failures(result: Mapping[str, Any], limits: Mapping[str, float | None]) -> list[str]:
@@ -105,7 +94,8 @@ def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
             raise InputError(f"a picture must be (H, W, 3), got {image.shape}")
     if a.shape != b.shape:
-        check_sizes(a.shape[1::-1], b.shape[1::-1])
+        sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in (a, b))
+        raise InputError(f"the pictures have different sizes, {sizes}")
     return a, b
 
 
