@@ -97,40 +97,25 @@ def with_stack(task: Callable[[], T]) -> T:
 class Pool(ThreadPoolExecutor):
     """Threads with large stacks. They start when they are needed, and are kept.
 
-    The standard pool takes no tasks when Python's main thread has ended; then each task has a thread of its own, or runs at once in
-    the thread that submits it, where Python starts no more threads.
+    The standard pool takes no tasks when Python's main thread has ended. Then each task runs at once, in the thread that submits
+    it; InputError where that one's stack is small.
     """
 
     def __init__(self, threads: int, name: str = "wrt") -> None:
-        super().__init__(threads, name, initializer=_with_large_stack)
+        super().__init__(threads, name, initializer=partial(setattr, _here, "large", True))
 
     def submit(self, task: Callable[..., T], /, *arguments: Any, **named: Any) -> Future[T]:
         if threading.main_thread().is_alive():
             with _large_stacks():
                 return super().submit(task, *arguments, **named)
+        if not _has_stack():
+            raise InputError("Python's main thread has ended, and the stack of this one is too small for kernels")
         future = Future[T]()
-        alone = partial(_complete, future, partial(task, *arguments, **named))
         try:
-            with _large_stacks():
-                threading.Thread(target=_with_large_stack, args=(alone,), name="wrt").start()
-        except RuntimeError:
-            alone()
-        return future
-
-
-def _with_large_stack(task: Callable[[], object] = lambda: None) -> None:
-    """In a thread of wrt's."""
-    _here.large = True
-    task()
-
-
-def _complete(future: Future[T], task: Callable[[], T]) -> None:
-    """Run the task, and let its future know."""
-    if future.set_running_or_notify_cancel():
-        try:
-            future.set_result(task())
+            future.set_result(task(*arguments, **named))
         except BaseException as error:
             future.set_exception(error)
+        return future
 
 
 @cache
