@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING
 
 from wrt.core.packages import needed_by
@@ -49,21 +48,14 @@ def progress_reporter(quiet: bool) -> Iterator[Callable[[Progress], None] | None
     """A callback for `wrt.render(progress=...)` that writes to stderr; None where quiet, or where that is closed."""
     if quiet or sys.stderr is None:  # print would then write among the data
         yield None
-    elif sys.stderr.isatty():
-        with _bar() as report:
-            yield report
-    else:
-        yield _lines()
+        return
+    with _bar() if sys.stderr.isatty() else nullcontext(_lines()) as report:
 
+        def careful(progress: Progress) -> None:
+            with suppress(OSError):  # a terminal that is gone (SIGHUP) is no reason to lose the picture
+                report(progress)
 
-def _while_there_is_a_terminal(report: Callable[[Progress], None]) -> Callable[[Progress], None]:
-    """One that is gone (SIGHUP) is no reason to lose the picture."""
-
-    def careful(progress: Progress) -> None:
-        with contextlib.suppress(OSError):
-            report(progress)
-
-    return careful
+        yield careful
 
 
 @contextmanager
@@ -77,7 +69,6 @@ def _bar() -> Iterator[Callable[[Progress], None]]:
     bar = RichProgress(*columns, console=Console(stderr=True), transient=True)
     task = bar.add_task("render", total=None, note="")
 
-    @_while_there_is_a_terminal
     def report(progress: Progress) -> None:
         if progress.stage == "compile":
             bar.update(task, description=COMPILING)
@@ -90,14 +81,13 @@ def _bar() -> Iterator[Callable[[Progress], None]]:
     try:
         yield report
     finally:
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             bar.stop()
 
 
 def _lines() -> Callable[[Progress], None]:
     due = {"build": LINE_EVERY, "trace": LINE_EVERY}
 
-    @_while_there_is_a_terminal
     def report(progress: Progress) -> None:
         if progress.stage == "compile":
             print(COMPILING, file=sys.stderr, flush=True)
