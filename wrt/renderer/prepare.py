@@ -54,10 +54,6 @@ class Prepared:
         plan.require_memory(self.device)
         return replace(self, plan=plan, camera=camera_struct(camera, angles_of or plan.scene.settings.size))
 
-    def kind(self) -> str:
-        """Of the device: pictures of two of the same kind have the same bits."""
-        return kind_of(self.device)
-
     def facts(self) -> dict[str, Any]:
         """Counts of the scene and its structure."""
         return {"triangles": self.accel.geometry.n_triangles, "stored_triangles": len(self.arrays.world.faces),
@@ -111,6 +107,7 @@ class Prepared:
 
 
 def kind_of(device: Any) -> str:
+    """Pictures of two devices of the same kind have the same bits."""
     return f"cuda, sm_{device.arch}" if device.is_cuda else "cpu"
 
 

@@ -15,7 +15,7 @@ from wrt.core.device import start
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import checkpoint_of
-from wrt.renderer.distributed.workers import DeviceWorkers, ExecutorWorkers, Job, Reply, Workers, packaged
+from wrt.renderer.distributed.workers import DeviceWorkers, ExecutorWorkers, Job, Reply, packaged
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import Plan, plan_of
@@ -105,7 +105,7 @@ class DistributedRenderer:
         return slice(y, y + height), slice(x, x + width)
 
 
-def workers_for(plan: Plan) -> Workers:
+def workers_for(plan: Plan) -> ExecutorWorkers:
     """Those that the plan's options name."""
     scene, options = replace(plan.scene, cameras=(plan.camera,)), replace(plan.options, camera=None, accel=plan.accel)
     if options.devices is not None:

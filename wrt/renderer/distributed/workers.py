@@ -25,7 +25,7 @@ from wrt.core.threads import Pool
 from wrt.renderer.distributed.installed import INSTALLED, Installed, difference
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
-from wrt.renderer.prepare import Prepared, prepare
+from wrt.renderer.prepare import Prepared, kind_of, prepare
 from wrt.scene.digest import scene_digest
 from wrt.scene.model import Scene
 from wrt.scene.pack import pack, unpack
@@ -38,27 +38,58 @@ OPTIONS_SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "in
 LOCAL: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, "resume": False, "progress": None}
 
 Job = tuple[Any, ...]  # the name of a method of Prepared, and its arguments
-Reply = tuple[str, str, Any]  # who answers, on what kind of device (Prepared.kind), and what
+Reply = tuple[str, str, Any]  # who answers, on what kind of device (kind_of), and what
 
 
-class Workers:
-    """Whoever can do many jobs at once."""
+class ExecutorWorkers:
+    """The workers of any concurrent.futures.Executor: threads, processes, or those of other machines that have wrt.
+
+    Jobs go with the scene's digest alone; a worker process that does not know it asks for the scene.
+    """
+
+    def __init__(self, executor: Any, key: str, package: dict[str, Any]) -> None:
+        self.executor, self.key, self.package = executor, key, package
+        self.asked = 0  # for the scene
+        self.dead_since: float | None = None
 
     def slots(self) -> int:
-        """How many."""
-        raise NotImplementedError
+        """How many jobs they can do at once."""
+        return int(getattr(self.executor, "_max_workers", None) or SLOTS)
 
-    def submit(self, job: Job) -> Any:
+    def _scene(self) -> Any:
+        if not self.asked:
+            return None
+        self.asked -= 1
+        return self.package
+
+    def submit(self, job: Job) -> Future[Any]:
         """A future of its reply."""
-        raise NotImplementedError
+        try:
+            return self.executor.submit(call, self.key, self._scene(), *job)
+        except (BrokenExecutor, RuntimeError) as error:
+            raise InputError(f"executor: {error}") from error
 
     def finished(self, pending: Iterable[Any]) -> Iterable[Any]:
         """Futures that are done, after a tenth of a second or earlier."""
-        return wait(pending, timeout=0.1, return_when=FIRST_COMPLETED).done
+        done = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED).done
+        processes = dict(getattr(self.executor, "_processes", None) or {})
+        if done or all(process.is_alive() for process in processes.values()):
+            self.dead_since = None
+        elif self.dead_since is None:
+            self.dead_since = time.monotonic()
+        elif time.monotonic() - self.dead_since > DEAD_SECONDS:
+            # Killed in the middle of writing a reply: the pool waits for the rest of it, for ever.
+            raise InputError("executor: a process of the pool was killed")
+        return done
 
-    def result(self, future: Any) -> Reply | None:
+    def result(self, future: Future[Any]) -> Reply | None:
         """What came of one that is done; None: its job must be submitted again. Raises what the worker raised."""
-        return future.result()
+        try:
+            reply = future.result()
+        except BrokenExecutor as error:
+            raise InputError(f"executor: {error}") from error
+        self.asked += reply is None
+        return reply
 
     def ready(self) -> bool:
         """Whether anybody is there to take jobs. Raises InputError where that will not change."""
@@ -96,23 +127,20 @@ class Workers:
             future.cancel()
 
 
-class DeviceWorkers(Workers):
+class DeviceWorkers(ExecutorWorkers):
     """Several devices of this machine: a thread for each, which makes the scene ready on its device and keeps it."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         assert options.devices is not None
+        super().__init__(Pool(len(options.devices)), "", {})
         self.scene, self.options, self.names = scene, replace(options, **LOCAL), options.devices
-        self.pool = Pool(len(self.names))
         self.free: SimpleQueue[tuple[int, Prepared | None]] = SimpleQueue()  # one is for every thread
         for i in range(len(self.names)):
             self.free.put((i, None))
         self.lock = threading.Lock()
 
-    def slots(self) -> int:
-        return len(self.names)
-
     def submit(self, job: Job) -> Future[Any]:
-        return self.pool.submit(self._call, *job)
+        return self.executor.submit(self._call, *job)
 
     def _call(self, method: str, *arguments: Any) -> Reply:
         i, prepared = self.free.get()
@@ -120,56 +148,10 @@ class DeviceWorkers(Workers):
             if prepared is None:
                 with self.lock:  # the second device of a kind finds the kernels compiled
                     prepared = _made_ready(self.scene, replace(self.options, device=self.names[i]))
-            return f"{self.names[i]} ({i})", prepared.kind(), getattr(prepared, method)(*arguments)
+            return f"{self.names[i]} ({i})", kind_of(prepared.device), getattr(prepared, method)(*arguments)
         finally:
             self.free.put((i, prepared))
 
-
-class ExecutorWorkers(Workers):
-    """The workers of any concurrent.futures.Executor: threads, processes, or those of other machines that have wrt.
-
-    Jobs go with the scene's digest alone; a worker process that does not know it asks for the scene.
-    """
-
-    def __init__(self, executor: Any, key: str, package: dict[str, Any]) -> None:
-        self.executor, self.key, self.package = executor, key, package
-        self.asked = 0  # for the scene
-        self.dead_since: float | None = None
-
-    def slots(self) -> int:
-        return int(getattr(self.executor, "_max_workers", None) or SLOTS)
-
-    def _scene(self) -> Any:
-        if not self.asked:
-            return None
-        self.asked -= 1
-        return self.package
-
-    def submit(self, job: Job) -> Future[Any]:
-        try:
-            return self.executor.submit(call, self.key, self._scene(), *job)
-        except (BrokenExecutor, RuntimeError) as error:
-            raise InputError(f"executor: {error}") from error
-
-    def finished(self, pending: Iterable[Any]) -> Iterable[Any]:
-        done = super().finished(pending)
-        processes = dict(getattr(self.executor, "_processes", None) or {})
-        if done or all(process.is_alive() for process in processes.values()):
-            self.dead_since = None
-        elif self.dead_since is None:
-            self.dead_since = time.monotonic()
-        elif time.monotonic() - self.dead_since > DEAD_SECONDS:
-            # Killed in the middle of writing a reply: the pool waits for the rest of it, for ever.
-            raise InputError("executor: a process of the pool was killed")
-        return done
-
-    def result(self, future: Future[Any]) -> Reply | None:
-        try:
-            reply = future.result()
-        except BrokenExecutor as error:
-            raise InputError(f"executor: {error}") from error
-        self.asked += reply is None
-        return reply
 
 
 # --- what is sent, and the worker's side ------------------------------------------------------------------------------
@@ -203,7 +185,7 @@ def call(key: str, package: dict[str, Any] | None, method: str, *arguments: Any)
         while len(_ready) > KEPT_READY:
             _ready.popitem(last=False)
         prepared = _ready[key]
-    return worker_name(), prepared.kind(), getattr(prepared, method)(*arguments)
+    return worker_name(), kind_of(prepared.device), getattr(prepared, method)(*arguments)
 
 
 def _unpacked(package: dict[str, Any]) -> Prepared:

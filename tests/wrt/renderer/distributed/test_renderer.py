@@ -266,7 +266,7 @@ def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
 def test_workers_on_devices_of_several_kinds_are_refused(alike: int, threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that are there first, and those that come later."""
     asked: list[str] = []
-    monkeypatch.setattr(Prepared, "kind", lambda self: asked.append("") or f"cuda, sm_{80 + (len(asked) > alike)}")
+    monkeypatch.setattr(workers, "kind_of", lambda device: asked.append("") or f"cuda, sm_{80 + (len(asked) > alike)}")
     with pytest.raises(InputError, match=r"several kinds.*: cuda, sm_8., and at .* cuda, sm_8."):
         render(SCENE, executor=threads, **HOW)
 
