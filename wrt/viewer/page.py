@@ -36,7 +36,6 @@ PICTURE = "picture"
 QUALITY = {True: 92, False: 80}  # of JPEG: at full resolution, and coarse
 LEGEND_SIZE = (12, 256)
 FARTHEST_FOCUS = 1e9  # in units of the viewport
-MOST_FILES = 4  # that are made at a time
 
 
 def full_size(size: tuple[int, int], before: tuple[int, int]) -> tuple[int, int]:
@@ -73,7 +72,6 @@ class Page:
         start = self.viewer.view.camera
         self.unit, self.watching, self.name = unit_of(scene, start), -1, scene.name or "picture"
         self.full = (0, 0)
-        self._saving = threading.BoundedSemaphore(MOST_FILES)
         listening = listen(host, port)
         try:
             address, port = listening.getsockname()[:2]
@@ -244,15 +242,8 @@ class Page:
 
     def _save(self, client: Any, suffix: str) -> None:
         picture = self.viewer.picture()
-        if client is None or picture is None:
-            return
-        if not self._saving.acquire(blocking=False):
-            self.door.report("saving", f"did not save a picture; {MOST_FILES} are being made")
-            return
-        try:
+        if client is not None and picture is not None:
             client.send_file_download(f"{self.name}{suffix}", encoded(picture, suffix), save_immediately=True)
-        finally:
-            self._saving.release()
 
 
 def place_camera(server: Any, camera: CameraKind, target: np.ndarray, unit: float) -> None:

@@ -29,7 +29,6 @@ from wrt.viewer.messages import check_message
 
 VERSIONS = (1, 1, 1), (1, 2)  # from the first on, to before the second
 LARGEST_MESSAGE = 1 << 16  # bytes; a browser sends some hundreds
-MOST_MESSAGES = 200  # a second, of one connection; a browser sends about 50
 MOST_CONNECTIONS = 64  # open at a time, with those that have not shown a token yet
 LONGEST_PATH = 200
 LONGEST_LINE = 300  # characters of what is reported
@@ -147,7 +146,7 @@ class Door:
         """Of websockets' `serve`, in place of viser's. page: viser's answer to requests for its files."""
         from websockets.asyncio.server import ServerConnection
 
-        class Connection(_Paced, ServerConnection):
+        class Connection(_Checked, ServerConnection):
             door = self
 
         return {"process_request": lambda connection, request: self._answer(connection, request, page), "server_header": None,
@@ -215,11 +214,10 @@ class Door:
         self.report(f"failure {type(error).__name__}", f"error: {what}")
 
 
-class _Paced:
-    """A connection whose messages are checked, and read no faster than a browser sends them. For a subclass of ServerConnection."""
+class _Checked:
+    """A connection whose messages are checked. For a subclass of ServerConnection."""
 
     door: Door
-    _since, _count = 0.0, 0
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)  # type: ignore[misc]
@@ -230,19 +228,9 @@ class _Paced:
 
     async def recv(self, *arguments: Any, **settings: Any) -> Any:
         while True:
-            await self._pace()
             data = await super().recv(*arguments, **settings)  # type: ignore[misc]
             if self.door.lets_in(data):
                 return data
-
-    async def _pace(self) -> None:
-        now = asyncio.get_running_loop().time()
-        if now - self._since >= 1.0:
-            self._since, self._count = now, 0
-        self._count += 1
-        if self._count > MOST_MESSAGES:
-            self.door.report("pace", f"slowed down a browser that sends more than {MOST_MESSAGES} messages a second")
-            await asyncio.sleep(self._since + 1.0 - now)
 
 
 COMMON = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff", "Connection": "close"}
