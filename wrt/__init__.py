@@ -14,7 +14,6 @@ Further modules: sensors, compat (trimesh, open3d), testing.
 from __future__ import annotations
 
 import ast
-import gc
 import importlib
 import importlib.util
 import sys
@@ -110,23 +109,12 @@ def _find_kernels() -> None:
 _find_kernels()
 
 
-def _imported(module: str) -> Any:
-    """What an import makes stays: to look through it for garbage again and again took a seventh of the start."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        return importlib.import_module(module)
-    finally:
-        if collects:
-            gc.enable()
-
-
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used: `python -m wrt --help` must not wait for Warp."""
     if name in _MODULES:
-        return _imported(f"{__name__}.{name}")
+        return importlib.import_module(f"{__name__}.{name}")
     if name in _HOME:
-        value = globals()[name] = getattr(_imported(_HOME[name]), name)
+        value = globals()[name] = getattr(importlib.import_module(_HOME[name]), name)
         return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
