@@ -129,13 +129,12 @@ NONFINITE_COLOR = (0, 200, 0)
 BAR_HEIGHT = 24
 
 
-def difference_image(a: np.ndarray, b: np.ndarray, *, limit: float | None = None) -> np.ndarray:
+def difference_image(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Where and which way `a` differs from `b`: (H + 24, W, 3) uint8, with the colour scale below the picture.
 
     Each pixel shows the linear difference of the channel that differs most: black where equal, to red, yellow and white
     where a is brighter, to blue, cyan and white where it is darker; green where a and b are not both finite and not the
-    same. limit: the difference at white (default: the 99.9th percentile of |a - b|; larger ones stay white).
-    Raises InputError where the sizes differ.
+    same. White is the 99.9th percentile of |a - b|; larger ones stay white. Raises InputError where the sizes differ.
     """
     a, b = _pair(a, b)
     with np.errstate(invalid="ignore"):  # inf - inf
@@ -143,10 +142,8 @@ def difference_image(a: np.ndarray, b: np.ndarray, *, limit: float | None = None
     finite = np.isfinite(difference).all(axis=-1)
     difference[~finite] = 0.0
     signed = np.take_along_axis(difference, np.abs(difference).argmax(axis=-1)[..., None], axis=-1)[..., 0]
-    if limit is None:
-        sizes = np.abs(signed[finite])
-        limit = float(np.quantile(sizes, 0.999) or sizes.max()) if sizes.size else 0.0
-    scale = limit if limit > 0.0 else 1.0
+    sizes = np.abs(signed[finite])
+    scale = float(np.quantile(sizes, 0.999) or sizes.max() or 1.0) if sizes.size else 1.0
     picture = np.concatenate([_heat(signed / scale), _bar(signed.shape[1], scale)])
     picture[: len(signed)][~finite] = NONFINITE_COLOR
     return picture

@@ -173,7 +173,7 @@ def test_difference_image_tells_sign_and_size() -> None:
     a[:, 50:100, 1] += 0.1
     a[:, 100:150, 2] -= 0.1
     a[:, 150:] -= 0.4
-    picture = difference_image(a, b, limit=0.4)
+    picture = difference_image(a, b)
     assert picture.shape == (40 + BAR_HEIGHT, 200, 3) and picture.dtype == np.uint8
     equal, brighter, darker, darkest = picture[5, [10, 60, 110, 160]].astype(int)
     assert equal.max() == 0
