@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import html
-import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-NUMERIC = re.compile(r"[-<±]? ?\d+([.,]\d+)*(e[-+]?\d+)?[%xk]?( |$)")  # how a formatted number begins
 SHOWN_ROWS = 200  # of one table; more make a notebook slow
 
 
@@ -18,8 +16,8 @@ def html_table(title: str, head: Sequence[Any], rows: Iterable[Sequence[Any]], m
     out = [f"<b>{html.escape(title)}</b>"] if title else []
     out.append("<table>")
     if head:
-        out.append(_row(head, "th", rows[0] if rows else head))
-    out += [_row(row, "td", row) for row in rows[:most]]
+        out.append(_row(head, "th"))
+    out += [_row(row, "td") for row in rows[:most]]
     out.append("</table>")
     if most is not None and len(rows) > most:
         out.append(f"<p>and {len(rows) - most} more</p>")
@@ -44,8 +42,5 @@ def number(value: Any) -> str:
     return f"{value:,}" if hasattr(value, "__index__") else f"{value:.4g}"
 
 
-def _row(cells: Sequence[Any], tag: str, below: Sequence[Any]) -> str:
-    """below: the cells that say on which side these stand. Jupyter draws all on the right, but names are read from the left."""
-    sides = (' style="text-align:left"' if isinstance(cell, str) and not NUMERIC.match(cell) else "" for cell in below)
-    return "<tr>" + "".join(
-        f"<{tag}{side}>{html.escape(number(cell))}</{tag}>" for cell, side in zip(cells, sides, strict=True)) + "</tr>"
+def _row(cells: Sequence[Any], tag: str) -> str:
+    return "<tr>" + "".join(f"<{tag}>{html.escape(number(cell))}</{tag}>" for cell in cells) + "</tr>"

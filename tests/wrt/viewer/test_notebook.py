@@ -214,11 +214,7 @@ def test_every_shipped_kind_of_scene_has_a_table() -> None:
 def test_a_list_of_rows_is_a_list_with_a_page() -> None:
     rows = Rows([2, 1], lambda rows: html_table("", ("n", "text"), [(n, f"{n}.5 ± 1") for n in rows]))
     assert rows == [2, 1] and sorted(rows) == [1, 2] and rows[0] == 2
-    page = rows._repr_html_()
-    assert Tables(page).rows == [["n", "text"], ["2", "2.5 ± 1"], ["1", "1.5 ± 1"]]
-    assert "text-align" not in page  # formatted numbers stand on the right as well, and so does the head of their column
-    page = html_table("", ("name", "n"), [("bvh2", "1.2x"), ("1 of them", "1,000"), ("2nd", "< 3%")])
-    assert page.count("text-align:left") == 3  # "name", "bvh2", "2nd"
+    assert Tables(rows._repr_html_()).rows == [["n", "text"], ["2", "2.5 ± 1"], ["1", "1.5 ± 1"]]
 
 
 def test_reports_are_tables(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -87,7 +87,7 @@ def test_a_structure_that_refuses_is_named_and_the_others_go_on(box, monkeypatch
     rows = run(plan(box, structures=("refusing", "bvh2"), kinds=("random",)))
     assert rows[0] == Row(mesh="box.obj", structure="refusing", reason="more than 11 triangles") and rows[1].structure == "bvh2"
     assert "| refusing  | box.obj | more than 11 triangles |" in text(rows, Plan(), "")
-    assert "<td style=\"text-align:left\">more than 11 triangles</td>" in rows._repr_html_()
+    assert "<td>more than 11 triangles</td>" in rows._repr_html_()
 
 
 def test_the_build_that_is_timed_is_not_the_first(box, monkeypatch) -> None:
