@@ -17,6 +17,7 @@ from wrt.core.device import records, upload
 from wrt.core.errors import InputError, warn
 from wrt.kernels import structs
 from wrt.kernels.shade import backgrounds, lights, materials, textures
+from wrt.picture.tonemap import decode_srgb
 from wrt.scene.backgrounds import Background
 from wrt.scene.cameras import CameraKind
 from wrt.scene.materials import ALPHA_MODES, Checkerboard, Material, Texture, kinds_that_use
@@ -73,8 +74,7 @@ class TextureTable:
 def srgb_table() -> np.ndarray:
     """(512,) float32: linear values of the 256 sRGB codes (IEC 61966-2-1), then i / 255."""
     code = np.arange(256) / 255.0
-    linear = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
-    return np.concatenate([linear, code]).astype(np.float32)
+    return np.concatenate([decode_srgb(code), code]).astype(np.float32)
 
 
 def number(kind: str, table: dict[str, Any], what: str) -> int:
