@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.defaults import bounding_sphere
@@ -46,12 +47,8 @@ def up_of(camera: CameraKind) -> np.ndarray:
 
 def from_viewport(camera: CameraKind, viewport: Any, unit: float) -> CameraKind:
     """The camera with the pose and, if it is a perspective one, the angle of view of viser's CameraHandle (wxyz, position, fov)."""
-    w, x, y, z = np.asarray(viewport.wxyz, np.float64) / np.linalg.norm(viewport.wxyz)
-    rotation = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
     pose = np.eye(4)
-    pose[:3, :3] = rotation * (1.0, -1.0, -1.0)
+    pose[:3, :3] = Rotation.from_quat(np.roll(viewport.wxyz, -1)).as_matrix() * (1.0, -1.0, -1.0)
     with np.errstate(over="ignore"):  # a camera refuses what is not finite
         pose[:3, 3] = np.asarray(viewport.position, np.float64) * unit
     if isinstance(camera, Camera):

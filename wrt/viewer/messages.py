@@ -72,35 +72,24 @@ def _check_update(message: dict[str, Any], control_of: Callable[[str], Any]) -> 
         raise Refused("no control", "a change of a control that there is not")
     if updates.keys() != {"value"}:
         raise Refused(f"control {control.label}", f"{control.label}: a change of something else than its value")
-    check_value(control, updates["value"])
+    if not can_have(control, updates["value"]):
+        raise Refused(f"control {control.label}", f"{control.label}: it cannot have the value {shown(updates['value'])}")
 
 
-def check_value(control: Any, value: Any) -> None:
-    """Raise Refused unless a control can have the value."""
+def can_have(control: Any, value: Any) -> bool:
+    """Whether a browser may set a control to the value."""
     import viser
 
     if control.disabled or not control.visible:
-        problem = "comes while it is disabled"
-    elif isinstance(control, viser.GuiSliderHandle | viser.GuiNumberHandle):
-        problem = _number_problem(control, value)
-    elif isinstance(control, viser.GuiDropdownHandle):
-        problem = "" if isinstance(value, str) and value in control.options else f"is none of {', '.join(control.options)}"
-    elif isinstance(control, viser.GuiCheckboxHandle):
-        problem = "" if isinstance(value, bool) else "is neither true nor false"
-    elif isinstance(control, viser.GuiButtonHandle):
-        problem = "" if value is True else "is no click"
-    else:
-        problem = "is for a control of an unknown kind"
-    if problem:
-        raise Refused(f"control {control.label}", f"{control.label}: {shown(value)} {problem}")
-
-
-def _number_problem(control: Any, value: Any) -> str:
-    low, high = (bound if bound is not None else sign * math.inf for bound, sign in ((control.min, -1.0), (control.max, 1.0)))
-    # The page rounds to seven decimals, and so may the ends be rounded.
-    if not _is_number(value, low - 1e-6 * abs(low), high + 1e-6 * abs(high)):
-        return f"is no number from {low:g} to {high:g}"
-    return "is no whole number" if isinstance(control.value, int) and value != int(value) else ""
+        return False
+    if isinstance(control, viser.GuiSliderHandle | viser.GuiNumberHandle):
+        low, high = (sign * math.inf if end is None else end for end, sign in ((control.min, -1.0), (control.max, 1.0)))
+        # The page rounds to seven decimals, and so may the ends be rounded.
+        return (_is_number(value, low - 1e-6 * abs(low), high + 1e-6 * abs(high))
+                and (value == int(value) or not isinstance(control.value, int)))
+    if isinstance(control, viser.GuiDropdownHandle):
+        return isinstance(value, str) and value in control.options
+    return isinstance(value, bool) if isinstance(control, viser.GuiCheckboxHandle) else value is True  # a button's click
 
 
 def _is_number(value: Any, low: float, high: float) -> bool:

@@ -55,7 +55,7 @@ def status(shown: Shown, viewer: Viewer, full: tuple[int, int], browsers: int) -
     whole = "" if (width, height) == full else f" of {full[0]}x{full[1]}"
     size = f"{width}x{height}{whole}{', coarse' if shown.scale > 1 else ''}"
     others = f"  \n{browsers} browsers look: the picture follows the camera that moved last" if browsers > 1 else ""
-    return f"{what}, {size}  \n{rays}  \n{viewer.structure(shown.view.accel)}{others}"
+    return f"{what}, {size}  \n{rays}  \n{viewer.renderers.describe(shown.view.accel)}{others}"
 
 
 class Page:
@@ -235,7 +235,7 @@ class Page:
         self.viewer.change(camera=lambda camera: replace(camera, **fields))
 
     def _clicked(self, event: Any) -> None:
-        distance = self.viewer.focus_at(*event.screen_pos) if self.by_click.value else None
+        distance = self.viewer.renderers.focus_at(self.viewer.view, *event.screen_pos) if self.by_click.value else None
         if distance is not None:
             self.focus.value = distance
             self._set_lens(focus_distance=distance)

@@ -45,23 +45,18 @@ class _Work:
     shown: float = -np.inf
 
 
-class Pace:
-    """seconds: that a sample took last, by structure, and of the picture (False) or of heat maps (True)."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[tuple[str, bool], float] = {}
+class Pace(dict[tuple[str, bool], float]):
+    """Seconds that a sample took last, by structure, and of the picture (False) or of heat maps (True)."""
 
     def note(self, view: View, samples: int, seconds: float) -> None:
         if samples:
-            self.seconds[view.accel, bool(view.cost)] = seconds / samples
+            self[view.accel, bool(view.cost)] = seconds / samples
 
     def scales(self, view: View) -> list[int]:
-        """From the first that is likely to take no longer than COARSE down to 1."""
-        pace = self.seconds.get((view.accel, bool(view.cost)))
-        first = SCALES[3]
-        if pace is not None:
-            seconds = pace * view.size[0] * view.size[1]
-            first = next((scale for scale in SCALES if seconds / scale**2 <= COARSE), SCALES[-1])
+        """From the first that is likely to take no longer than COARSE down to 1; 8 where no sample was taken yet."""
+        pace = self.get((view.accel, bool(view.cost)))
+        seconds = COARSE * 8**2 if pace is None else pace * view.size[0] * view.size[1]
+        first = next((scale for scale in SCALES if seconds / scale**2 <= COARSE), SCALES[-1])
         return [scale for scale in SCALES[::-1] if scale <= first]
 
 
@@ -138,14 +133,6 @@ class Viewer:
             self._stopped = True
             self._number += 1
             self._condition.notify_all()
-
-    def focus_at(self, x: float, y: float) -> float | None:
-        """What a camera must focus on to see a place of the picture sharp: as Renderers.focus_at."""
-        return self.renderers.focus_at(self.view, x, y)
-
-    def structure(self, accel: str) -> str:
-        """A structure in a few words."""
-        return self.renderers.describe(accel)
 
     def picture(self) -> Film | np.ndarray | None:
         """What was shown last, to be saved: a Film (with exposure and tone mapping), or the codes (h, w, 3) of a heat map."""

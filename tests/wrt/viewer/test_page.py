@@ -300,7 +300,7 @@ def test_a_click_focuses(page: Any, browser_page: Any) -> None:
     until(lambda: page.by_click.value, browser_page)
     assert page.viewer.view.camera.focus_distance == shown.view.camera.focus_distance  # the first click was none
     browser_page.mouse.click(150, 440)
-    wanted = page.viewer.focus_at(150.5 / SIZE["width"], 440.5 / SIZE["height"])
+    wanted = page.viewer.renderers.focus_at(page.viewer.view, 150.5 / SIZE["width"], 440.5 / SIZE["height"])
     until(lambda: page.viewer.view.camera.focus_distance == pytest.approx(wanted, rel=0.01), browser_page)
     assert page.focus.value == page.viewer.view.camera.focus_distance != shown.view.camera.focus_distance
 

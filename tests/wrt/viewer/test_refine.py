@@ -140,9 +140,9 @@ def test_the_first_picture_is_as_fine_as_there_is_time_for() -> None:
     eye = Eye()
     view = replace(eye.viewer.view, size=(1280, 720))
     for scale in SCALES:
-        eye.viewer._pace.seconds["bvh", False] = 0.99 * COARSE * scale**2 / (1280 * 720)
+        eye.viewer._pace["bvh", False] = 0.99 * COARSE * scale**2 / (1280 * 720)
         assert eye.viewer._pace.scales(view) == [each for each in SCALES[::-1] if each <= scale]
-    eye.viewer._pace.seconds["bvh", False] = 1.0
+    eye.viewer._pace["bvh", False] = 1.0
     assert eye.viewer._pace.scales(view) == list(SCALES[::-1])
 
 
@@ -221,7 +221,7 @@ def test_a_heat_map_is_the_profile_of_the_picture() -> None:
     order = np.argsort(values[below], kind="stable")
     assert (np.diff(brightness[below][order]) >= -2).all() and brightness[~below].min() >= brightness[below].max()
     eye.react = lambda shown: eye.viewer.change(cost="")
-    eye.viewer._pace.seconds["bvh", True] = 1.0
+    eye.viewer._pace["bvh", True] = 1.0
     assert eye.see(cost="primitives").scale == SCALES[-1]  # the rest was given up
     eye.viewer.step()
     assert isinstance(eye.viewer.picture(), Film)
@@ -229,14 +229,14 @@ def test_a_heat_map_is_the_profile_of_the_picture() -> None:
 
 def test_what_a_click_focuses_on() -> None:
     eye = Eye()
-    assert eye.viewer.focus_at(0.5, 0.5) is None  # nothing is built yet
+    assert eye.viewer.renderers.focus_at(eye.viewer.view, 0.5, 0.5) is None  # nothing is built yet
     eye.see(size=(61, 34))
     corner = CAMERA.camera_to_world[:3, :3].T @ (SCENE.objects[0].mesh.vertices.max(axis=0) - CAMERA.camera_to_world[:3, 3])
     tangent = np.tan(0.5 * CAMERA.fov_y)
     x, y = 0.5 + 0.5 * corner[0] / -corner[2] / tangent * 34 / 61, 0.5 - 0.5 * corner[1] / -corner[2] / tangent
-    distance = eye.viewer.focus_at(x, y + 1e-4)  # just below the box's nearest corner
+    distance = eye.viewer.renderers.focus_at(eye.viewer.view, x, y + 1e-4)  # just below the box's nearest corner
     assert distance is not None and distance == pytest.approx(-corner[2], rel=1e-3)
-    assert eye.viewer.focus_at(0.5, 0.0) is None  # sky
+    assert eye.viewer.renderers.focus_at(eye.viewer.view, 0.5, 0.0) is None  # sky
 
 
 def test_what_there_is_not_is_refused_and_what_cannot_be_built_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
