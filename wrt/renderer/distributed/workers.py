@@ -22,7 +22,7 @@ from typing import Any
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
 from wrt.core.threads import Pool
-from wrt.renderer.distributed.installed import INSTALLED, Installed, difference
+from wrt.renderer.distributed.installed import INSTALLED, difference
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
 from wrt.renderer.prepare import Prepared, kind_of, prepare
@@ -189,17 +189,12 @@ def call(key: str, package: dict[str, Any] | None, method: str, *arguments: Any)
 
 
 def _unpacked(package: dict[str, Any]) -> Prepared:
-    check_installed(package["installed"])
+    if differs := difference(package["installed"], INSTALLED):
+        raise InputError(f"worker {worker_name()} has {differs}: all must have the same")
     prepared = _made_ready(unpack(package["scene"], package["arrays"]), Options(**package["options"]))
     if prepared.plan.kernels_hash() != package["kernels"]:
         raise InputError(f"worker {worker_name()} makes other kernels of the same code: install the same warp-lang everywhere")
     return prepared
-
-
-def check_installed(there: Installed) -> None:
-    """On a worker: raise InputError where what is installed here is not what is there, with those who ask."""
-    if differs := difference(there, INSTALLED):
-        raise InputError(f"worker {worker_name()} has {differs}: all must have the same")
 
 
 def _made_ready(scene: Scene, options: Options) -> Prepared:
