@@ -19,7 +19,7 @@ def test_entries_become_what_they_name() -> None:
     assert list(table) == ["fraction", "decimal"] and "decimal" in table and len(table) == 2
     assert table["fraction"] is Fraction and table.get("decimal") is Decimal and table.get("float") is None
     assert list(table.values()) == [Fraction, Decimal]
-    assert list(reversed(table.items())) == [("decimal", Decimal), ("fraction", Fraction)]
+    assert list(table.items()) == [("fraction", Fraction), ("decimal", Decimal)]
     with pytest.raises(KeyError):
         table["float"]
     table.check("decimal")

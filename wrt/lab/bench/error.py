@@ -75,7 +75,7 @@ def has_triangles(scene: Scene, features: Features) -> bool:
 
 def structures(scene: Scene) -> list[str]:
     """One name a structure; brute force where it ends in a lifetime."""
-    first = {cls: name for name, cls in reversed(ACCELERATORS.items())}.values()
+    first = {cls: name for name, cls in reversed(list(ACCELERATORS.items()))}.values()
     return [name for name in ACCELERATORS if name in first and (name != "brute_force" or primitives(scene) <= BRUTE_FORCE_LIMIT)]
 
 
