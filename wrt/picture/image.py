@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from wrt.core import write_file
-from wrt.core.errors import InputError, warn
+from wrt.core.errors import InputError, at, warn
 from wrt.core.files import open_regular, read_file
 from wrt.core.packages import needed_by
 from wrt.core.write_file import replacing
@@ -214,11 +214,10 @@ def read_image(path: PathLike) -> np.ndarray:
     suffix = Path(path).suffix.lower()
     if suffix in LINEAR_SUFFIXES:
         return _pick_colors(read_channels(path), path)
-    with _told(path):
+    with at(path=path):
         data = read_file(path)
-    if suffix not in DISPLAY_SUFFIXES:
-        raise InputError(f"not an image format that wrt reads ({', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)})", path)
-    with _told(path):
+        if suffix not in DISPLAY_SUFFIXES:
+            raise InputError(f"not an image format that wrt reads ({', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)})")
         deep = data[:8] == PNG_MAGIC and data[24:25] == b"\x10"
         formats = ("TGA",) if suffix == ".tga" else FORMATS_READ  # only where the name says so, since nothing in TGA does
         codes = decode_png16(data) if deep else decode_rgba8(data, formats)[..., :3]
@@ -233,7 +232,7 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
     """
     with _opened(path) as source:
         spec = source.spec()
-        with _told(path):
+        with at(path=path):
             check_size(spec.width, spec.height, MAX_LINEAR_PIXELS)
         if spec.depth > 1 or spec.deep:
             raise InputError("cannot be read as an image: it has no flat pixels", path)
@@ -244,19 +243,10 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
 
 
 @contextlib.contextmanager
-def _told(path: PathLike) -> Iterator[None]:
-    """Errors name the file, once."""
-    try:
-        yield
-    except InputError as error:
-        raise error if error.path is not None else error.at(path) from error
-
-
-@contextlib.contextmanager
 def _opened(path: PathLike) -> Iterator[Any]:
     """An EXR or HDR file in OpenImageIO. Its first bytes are looked at first: it would try all the formats that it knows."""
     try:
-        with _told(path), open_regular(path) as file:
+        with at(path=path), open_regular(path) as file:
             first = file.read(16)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", path) from error
