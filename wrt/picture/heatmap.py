@@ -34,9 +34,7 @@ def colors() -> np.ndarray:
 
 def top_of(values: np.ndarray) -> float:
     """The value that gets the last colour: a round number at or above nearly all values, 1 where all are 0."""
-    most = float(np.percentile(values, BRIGHTEST)) if values.size else 0.0
-    if most <= 0.0:
-        most = float(values.max(initial=0.0))
+    most = float(np.percentile(values, BRIGHTEST) or values.max()) if values.size else 0.0
     if most <= 0.0:
         return 1.0
     step = step_of(most)
