@@ -6,7 +6,7 @@ import math
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, wait
 from contextlib import closing
 from functools import partial
@@ -50,14 +50,9 @@ class Tracer(Protocol):
     that run end and begins no others.
     """
 
-    @property
-    def plan(self) -> Plan: ...
-
-    @property
-    def device(self) -> Any: ...
-
-    @property
-    def seconds(self) -> Mapping[str, float]: ...
+    plan: Plan
+    device: Any
+    seconds: dict[str, float]
 
     def facts(self) -> dict[str, Any]: ...
 
