@@ -39,11 +39,6 @@ def luminance(linear: np.ndarray) -> np.ndarray:
 # --- curves: (..., 3) linear, finite and >= 0, to display-linear; `tone_map` clips what leaves [0, 1] -----------------
 
 
-def none(linear: np.ndarray) -> np.ndarray:
-    """No curve: what is brighter than 1 is clipped."""
-    return linear
-
-
 REINHARD_WHITE = 4.0  # two stops above 1
 
 
@@ -118,7 +113,7 @@ def agx(linear: np.ndarray) -> np.ndarray:
 
 
 TONEMAPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "none": none,
+    "none": lambda linear: linear,  # what is brighter than 1 is clipped
     "reinhard": reinhard,
     "aces": aces,
     "agx": agx,
