@@ -279,23 +279,20 @@ def records(struct: Any, count: int) -> np.ndarray:
 
 
 def launch(kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -> None:
-    """Launch a kernel over n on the CPU; with a step over ranges of so many, on that many threads: the first of each is the input
-    that is None."""
-    cpu = start("cpu")
-    load_kernel(kernel, cpu)
-
-    def job(first: int) -> None:
-        wp.launch(kernel, dim=min(step or n, n - first), device=cpu, inputs=[first if each is None else each for each in inputs],
-                  record_tape=False)
-
-    run_all([partial(job, first) for first in range(0, n, step or max(n, 1))], threads)
+    """As `launch_on` the CPU."""
+    launch_on(start("cpu"), kernel, n, *inputs, threads=threads, step=step)
 
 
 def launch_on(device: Any, kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -> None:
-    """As `launch` on the CPU; on a GPU one launch over all of n, in blocks of wrt.core.cuda.block_dim threads."""
-    if device.is_cpu:
-        launch(kernel, n, *inputs, threads=threads, step=step)
-    elif n:
-        load_kernel(kernel, device)
-        wp.launch(kernel, dim=n, device=device, inputs=[0 if each is None else each for each in inputs], record_tape=False,
-                  block_dim=block_dim(device))
+    """Launch a kernel over n; with a step, on the CPU over ranges of so many, on that many threads: the first of each is the input
+    that is None. On a GPU it is one launch over all of n, in blocks of wrt.core.cuda.block_dim threads."""
+    if n == 0:
+        return
+    load_kernel(kernel, device)
+    step = step if step and device.is_cpu else n
+
+    def job(first: int) -> None:
+        wp.launch(kernel, dim=min(step, n - first), device=device, inputs=[first if each is None else each for each in inputs],
+                  record_tape=False, block_dim=block_dim(device))
+
+    run_all([partial(job, first) for first in range(0, n, step)], threads)
