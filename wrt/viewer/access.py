@@ -32,15 +32,6 @@ class Refused(Exception):
 
 
 @dataclass(frozen=True)
-class Inside:
-    """What a request with the token asks for: a path without the token; `moved` is the address, relative to it, where it has to ask
-    again, or ""."""
-
-    path: str
-    moved: str = ""
-
-
-@dataclass(frozen=True)
 class Access:
     """What a request must carry. origins: such as "http://127.0.0.1:8080"; the values of Host that go with them are taken. port:
     where the server listens."""
@@ -58,18 +49,18 @@ class Access:
         if origins and (len(origins) != 1 or origins[0] not in own):
             raise Refused("origin", f"a request by a page of {shown(origins)}; --allow-origin would let it in")
 
-    def inside(self, target: str) -> Inside:
-        """Where a request's target leads. Raises Refused unless it carries the token, as the first part of its path or as
-        `?token=`."""
+    def inside(self, target: str) -> tuple[str, str]:
+        """Where a request's target leads: a path without the token; and the address, relative to it, where it has to ask again,
+        or "". Raises Refused unless it carries the token, as the first part of its path or as `?token=`."""
         path, _, query = target.partition("?")
         first, slash, rest = path[1:].partition("/")
         if path.startswith("/") and self._is_token(first):
-            return Inside("/" + rest, "" if slash else self._page(query))
+            return "/" + rest, "" if slash else self._page(query)
         pairs = parse_qsl(query, keep_blank_values=True)
         tokens = [value for name, value in pairs if name == "token"]
         if path.startswith("/") and len(tokens) == 1 and self._is_token(tokens[0]):
             others = [pair for pair in pairs if pair[0] != "token"]
-            return Inside(path, self._page(urlencode(others)) if path == "/" else "")
+            return path, self._page(urlencode(others)) if path == "/" else ""
         raise Refused("token", "a request without the token of the printed address")
 
     def _page(self, query: str) -> str:

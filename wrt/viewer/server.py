@@ -159,18 +159,18 @@ class Door:
         headers = request.headers
         try:
             self.access.check(headers.get_all("Host"), headers.get_all("Origin"), connection.local_address[0].partition("%")[0])
-            inside = self.access.inside(request.path)
+            path, moved = self.access.inside(request.path)
         except Refused as refused:
             self.report(refused.about, f"refused {refused}")
             return _response(HTTPStatus.FORBIDDEN)
         if [value.lower() for value in headers.get_all("Upgrade")] == ["websocket"]:
             return None
-        if inside.moved:
-            return _response(HTTPStatus.SEE_OTHER, Location=inside.moved)
-        if page is None or len(inside.path) > LONGEST_PATH or "\0" in inside.path or "%00" in inside.path:
+        if moved:
+            return _response(HTTPStatus.SEE_OTHER, Location=moved)
+        if page is None or len(path) > LONGEST_PATH or "\0" in path or "%00" in path:
             return _response(HTTPStatus.NOT_FOUND)
         encodings = {"Accept-Encoding": "gzip"} if any("gzip" in value for value in headers.get_all("Accept-Encoding")) else {}
-        answer = page(connection, Request(inside.path, type(headers)(encodings)))
+        answer = page(connection, Request(path, type(headers)(encodings)))
         if answer is None or answer.status_code != HTTPStatus.OK:
             return _response(HTTPStatus.NOT_FOUND)
         answer.headers.update(COMMON)
