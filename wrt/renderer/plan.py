@@ -84,19 +84,17 @@ class Plan:
     @property
     def kernels(self) -> list[Any]:
         """All that are compiled; without waves first the render kernel, then the AOV kernel where AOVs are asked for."""
-        return self._kernels(bool(self.options.aov))
-
-    def _kernels(self, aov: bool) -> list[Any]:
         if self.by_waves:
-            return wave_kernels(self.features, self.structure, aov).all()
-        makes = [render_kernel, aov_kernel] if aov else [render_kernel]
+            return self.wave_kernels.all()
+        makes = [render_kernel, aov_kernel] if self.options.aov else [render_kernel]
         folds = [] if self.options.device == "cpu" else [kernels.add_samples]
         return [make(self.features, self.structure) for make in makes] + folds
 
     def kernels_hash(self) -> str:
         """Of the whole code that makes pixels, the same in every process."""
         block_dim = 1 if self.options.device == "cpu" else None
-        hashes = [kernel.module.get_module_hash(block_dim) for kernel in self._kernels(aov=False)]
+        kernels = replace(self, options=replace(self.options, aov=())).kernels
+        hashes = [kernel.module.get_module_hash(block_dim) for kernel in kernels]
         return hashlib.sha256(b"".join(hashes)).hexdigest()
 
     def limits(self, seed: int) -> Any:

@@ -134,11 +134,10 @@ class _Preparation:
         self.plan, self.device, self.kernels = plan, device, plan.kernels
         self.threads = thread_count(plan.options.threads)
         self.begin, self.seconds = time.perf_counter(), {"compile": 0.0}
-        self.compiled, self.fraction_built = list[Any](), 0.0
+        self.compiled, self.fraction_built, self.reported = list[Any](), 0.0, ("", 0)
 
     def run(self, jobs: list[Callable[[], None]]) -> None:
         """Neither Ctrl-C nor an error waits for the compiler, and no wait is long: Python may hear of Ctrl-C only between two."""
-        reported = ("", 0.0)
         pool = Pool(1 + min(self.threads, len(self.kernels)), PREPARING)
         pending = {pool.submit(job) for job in jobs}
         try:
@@ -148,18 +147,17 @@ class _Preparation:
                     job.result()
                 seconds = time.perf_counter() - self.begin
                 if pending and seconds >= PREPARING_REPORTED:
-                    reported = self._report(seconds, reported)
+                    self._report(seconds)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def _report(self, seconds: float, before: tuple[str, float]) -> tuple[str, float]:
+    def _report(self, seconds: float) -> None:
         """Call `progress` where there is something new."""
-        state = ("build", self.fraction_built) if self.fraction_built > 0.0 else ("compile", 0.0)
-        progress = self.plan.options.progress
-        if progress is None or state == before or (state[0] == "compile" and len(self.compiled) == len(self.kernels)):
-            return before
-        progress(Progress(int(100.0 * state[1]), 100, 0, seconds, stage=state[0]))
-        return state
+        stage, done = ("build", int(100.0 * self.fraction_built)) if self.fraction_built > 0.0 else ("compile", 0)
+        progress, compiling = self.plan.options.progress, len(self.compiled) < len(self.kernels)
+        if progress is not None and (stage, done) != self.reported and (compiling or stage == "build"):
+            self.reported = stage, done
+            progress(Progress(done, 100, 0, seconds, stage=stage))
 
     def compile(self, kernel: Any) -> None:
         load_kernel(kernel, self.device)
@@ -173,9 +171,6 @@ class _Preparation:
         uploaded = time.perf_counter()
         chosen = {"triangle": options.triangle, "box": options.box, **options.accel_options}
         if reports_progress(self.plan.accel):
-            chosen = {"progress": self._built, **chosen}
+            chosen = {"progress": partial(setattr, self, "fraction_built"), **chosen}
         self.accel = build(self.arrays.world.geometry, self.plan.accel, options.device, self.threads, **chosen)
         self.seconds |= {"upload": uploaded - begin, "build": time.perf_counter() - uploaded}
-
-    def _built(self, fraction: float) -> None:
-        self.fraction_built = fraction
