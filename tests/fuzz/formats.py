@@ -331,7 +331,7 @@ def checkpoint_of(path: Path, groups: int) -> tuple[Any, Any]:
     from wrt.scene.settings import Settings
 
     film = DeviceFilm(Settings(size=(6, 4)), (0, 0, 6, 4), start("cpu"), 0, groups)
-    return film, Checkpoint(path, 60.0, {**IDENTITY, "groups": groups}, area=24, groups=groups, resume=True)
+    return film, Checkpoint(path, 60.0, {**IDENTITY, "groups": groups}, groups=groups, resume=True)
 
 
 @cache

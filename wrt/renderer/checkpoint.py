@@ -21,7 +21,7 @@ from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
 from wrt.core.write_file import check_writable, replacing
-from wrt.renderer.film_arrays import OF_A_GROUP, SHARED, DeviceFilm
+from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.options import OPTIONS
 from wrt.renderer.plan import Plan
 from wrt.scene.digest import camera_digest, scene_digest
@@ -61,17 +61,15 @@ def read(path: str | os.PathLike[str]) -> Saved:
 
 
 class Checkpoint:
-    """The file of one render. identity: what must be the same for going on, as JSON has it; area: pixels; groups: of samples.
+    """The file of one render. identity: what must be the same for going on, as JSON has it; groups: of samples.
 
     With `resume` a file that is there is read, and refused where it is not of this render; without, any file that is there is
     refused. Both, and whether the file can be written, are reported before the work.
     """
 
-    def __init__(self, path: Path, every: float, identity: dict[str, Any], *, area: int, groups: int, resume: bool) -> None:
+    def __init__(self, path: Path, every: float, identity: dict[str, Any], *, groups: int, resume: bool) -> None:
         self.path, self.every, self.groups = path.absolute(), every, groups
         self.identity = json.loads(json.dumps(identity, default=str))
-        pixel = sum(_bytes(kind) for kind in SHARED.values()) + groups * sum(_bytes(kind) for kind in OF_A_GROUP.values())
-        self.body_bytes = area * pixel
         self.saved: Saved | None = None
         self.problem = ""
         check_writable(path)
@@ -88,8 +86,6 @@ class Checkpoint:
         reported = [OTHER.get(name, f"{name} was {saved.identity.get(name)}, is {self.identity.get(name)}") for name in differ]
         if reported:
             raise InputError(f"is a checkpoint of another render: {'; '.join(reported)}", self.path)
-        if len(saved.body) != self.body_bytes:
-            raise InputError("is damaged: its arrays do not fit", self.path)
         return saved
 
     def facts(self) -> dict[str, Any]:
@@ -126,6 +122,8 @@ class Checkpoint:
     def restore(self, film: DeviceFilm) -> None:
         """Put what was read into an empty film."""
         assert self.saved is not None
+        if len(self.saved.body) != sum(film.view(array).nbytes for _, array in film.arrays()):
+            raise InputError("is damaged: its arrays do not fit", self.path)
         at = 0
         for name, array in film.arrays():
             there = film.view(array)
@@ -150,15 +148,8 @@ def checkpoint_of(plan: Plan, kind: str) -> Checkpoint | None:
     identity |= {name: getattr(options, name) for name in OPTIONS if name not in NO_PIXEL}
     identity |= {"crop": plan.crop, "groups of samples": plan.groups, "scene": scene_digest(plan.scene),
                  "camera": camera_digest(plan.camera), "device": kind, "version": VERSION, "kernels": plan.kernels_hash()}
-    file = Checkpoint(Path(options.checkpoint), options.checkpoint_every, identity, area=plan.area, groups=plan.groups,
-                      resume=options.resume)
+    file = Checkpoint(Path(options.checkpoint), options.checkpoint_every, identity, groups=plan.groups, resume=options.resume)
     taken = 0 if file.saved is None else file.saved.samples[1]
     if taken > max(1, settings.spp // plan.groups):
         raise InputError(f"holds {taken * plan.groups} samples a pixel already; spp is {settings.spp}", file.path)
     return file
-
-
-def _bytes(kind: Any) -> int:
-    import warp as wp
-
-    return int(wp.types.type_size_in_bytes(kind))
