@@ -26,7 +26,7 @@ else:
 
         wrt's own kernels are compiled in release mode, whatever wp.config.mode is: a kernel of Warp 1.19 in debug mode ends the
         process where several threads launch it. A kernel of the user follows wp.config.mode."""
-        own = {"mode": "release"} if function.__module__.startswith("wrt.") else {}
+        own = {"mode": "release"} if str(function.__module__).startswith("wrt.") else {}  # None where code was made by exec
         return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS | own, enable_backward=False)
 
     def noinline(function):
