@@ -3,12 +3,10 @@ from __future__ import annotations
 import time
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wrt.core.errors import InputError
-from wrt.io.polygons import MAX_CORNERS, triangulate
+from wrt.io.polygons import triangulate
 
 
 def area_vectors(points: np.ndarray) -> np.ndarray:
@@ -74,14 +72,25 @@ def test_broken_polygons_end() -> None:
 
 
 def test_a_polygon_of_many_corners() -> None:
-    """A convex one is a fan, whatever its size; a concave one takes time, and ends at a limit."""
+    """A convex one is a fan, whatever its size; a concave one is covered once."""
     angle = np.linspace(0.0, 2.0 * np.pi, 1_000_000, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     assert len(triangulate(np.arange(len(circle)), np.array([len(circle)]), circle)[0]) == len(circle) - 2
-    n = MAX_CORNERS + 2
-    star = circle[:: len(circle) // n][:n] * np.where(np.arange(n) % 2, 1.0, 0.5)[:, None]
-    with pytest.raises(InputError, match=f"polygon 0: is concave and has {n} corners; at most {MAX_CORNERS} can be cut"):
-        triangulate(np.arange(n), np.array([n]), star)
+    n = 8000
+    star = circle[:: len(circle) // n] * np.where(np.arange(n) % 2, 1.0, 0.5)[:, None]
+    each = area_vectors(star[triangulate(np.arange(n), np.array([n]), star)[0]])[:, 2]
+    assert len(each) == n - 2 and (each > 0.0).all()
+    np.testing.assert_allclose(each.sum(), polygon_area(star)[2])
+
+
+def test_corners_on_straight_edges_are_covered_once() -> None:
+    for turn in (0.0, 0.7):
+        flat = np.array([[0, 0], [1, 0], [2, 0], [3, 0], [3, 1], [3, 2], [2, 2], [2, 1], [1, 1], [1, 2], [1, 3], [0, 3],
+                         [0, 2], [0, 1]])
+        outline = np.column_stack([flat @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]], np.ones(len(flat))])
+        each = area_vectors(outline[triangulate(np.arange(len(flat)), np.array([len(flat)]), outline)[0]])[:, 2]
+        assert (each > -1e-12).all()
+        np.testing.assert_allclose(each.sum(), 6.0)
 
 
 def test_tangled_polygons_end_soon() -> None:
