@@ -69,10 +69,8 @@ def _areas(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray, triang
 
 
 def _ears(outline: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(n - 2, 3) indices into the (n, 3) outline of one polygon, seen along `normal`.
-
-    Where a self-intersecting polygon has fewer ears, triangles without area make up the number.
-    """
+    """(n - 2, 3) indices into the (n, 3) outline of one polygon, seen along `normal`; a fan where it has fewer ears, as
+    self-intersecting ones have."""
     with needed_by("a concave polygon"):
         from mapbox_earcut import triangulate_float64
 
@@ -80,5 +78,5 @@ def _ears(outline: np.ndarray, normal: np.ndarray) -> np.ndarray:
     keep = [(1, 2), (2, 0), (0, 1)][drop]
     flat = outline[:, keep] * np.array([1.0, 1.0 if normal[drop] > 0.0 else -1.0])
     ears = triangulate_float64(flat, np.array([n], dtype=np.uint32)).reshape(-1, 3)
-    unused = np.resize(np.setdiff1d(np.arange(n), ears), n - 2 - len(ears))
-    return np.concatenate([ears, np.repeat(unused[:, None], 3, axis=1)])
+    i = np.arange(1, n - 1)
+    return ears if len(ears) == n - 2 else np.stack([np.zeros_like(i), i, i + 1], axis=1)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 from array import array
 from collections import defaultdict
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from typing import NoReturn
 
@@ -25,7 +25,6 @@ from wrt.io.polygons import triangulate
 
 # What stands in a corner `v/vt/vn`, and how many numbers of a line of it are kept.
 _KEEP = {"v": 3, "vt": 2, "vn": 3}
-WORDS_AT_ONCE = 1 << 16  # as text; then they are numbers, which take a tenth of the memory
 _CORNER = "face corner {} is not v, v/vt, v//vn or v/vt/vn"
 
 
@@ -39,12 +38,12 @@ class _Text:
         # Every different corner by its text, numbered as they come, and which one each corner is.
         self.different: dict[str, int] = defaultdict(count().__next__)
         self.corners = array("i")
-        # Of each keyword: every different name, numbered as they come, and of every span the first polygon and which name it has.
-        self.names: dict[str, dict[str, int]] = {key: defaultdict(count().__next__) for key in ("usemtl", "g", "o")}
+        # Of each keyword: every different name, numbered as they come ("" before the first), and of every span the first polygon
+        # and which name it has; where several begin with one polygon, the last counts.
+        self.names: dict[str, dict[str, int]] = {
+            key: defaultdict(count(1).__next__, {"": 0}) for key in ("usemtl", "g", "o")}
         self.spans = {key: (array("q"), array("i")) for key in self.names}
         self.absent: dict[str, None] = {}  # what faces refer to and the whole file has not: vt, vn
-        self._new_numbers: dict[str, list[str]] = {key: [] for key in _KEEP}
-        self._new_corners: list[str] = []
 
     def fail(self, line: int, message: str) -> NoReturn:
         raise InputError(message, None, f"line {line}")
@@ -58,9 +57,6 @@ class _Text:
             self._line(pending + line, number)
             pending = ""
         self._line(pending, number)
-        for key in _KEEP:
-            self._to_numbers(key)
-        self._to_indices()
 
     def _line(self, line: str, number: int) -> None:
         words = (line.partition("#")[0] if "#" in line else line).split()
@@ -80,43 +76,25 @@ class _Text:
         if len(given) < keep:
             if key != "vt" or not given:
                 self.fail(line, f"{key} needs {keep} numbers, got {len(given)}")
-            given = [*given, "0"]  # a 1D texture coordinate
-        self._new_numbers[key] += given
+            given.append("0")  # a 1D texture coordinate
         self.lines[key].append(line)
-        if len(self._new_numbers[key]) > WORDS_AT_ONCE:
-            self._to_numbers(key)
-
-    def _to_numbers(self, key: str) -> None:
-        words, done = self._new_numbers[key], len(self.numbers[key])
         try:
-            self.numbers[key].extend(map(float, words))
+            self.numbers[key].extend(map(float, given))
         except ValueError:
-            bad = len(self.numbers[key])  # those before it are in
-            line = self.lines[key][bad // _KEEP[key]]
-            self.fail(line, f"{key} holds {short(words[bad - done])}, which is not a number")
-        words.clear()
+            bad = given[len(self.numbers[key]) % keep]  # those before it are in
+            self.fail(line, f"{key} holds {short(bad)}, which is not a number")
 
     def _corners(self, corners: list[str], line: int) -> None:
         if "-" in "".join(corners):
             corners = [self._absolute(corner, line) for corner in corners]
         self.counts.append(len(corners))
         self.face_lines.append(line)
-        self._new_corners += corners
-        if len(self._new_corners) > WORDS_AT_ONCE:
-            self._to_indices()
-
-    def _to_indices(self) -> None:
-        self.corners.extend(map(self.different.__getitem__, self._new_corners))
-        self._new_corners.clear()
+        self.corners.extend(map(self.different.__getitem__, corners))
 
     def _span(self, key: str, name: str) -> None:
         starts, which = self.spans[key]
-        number = self.names[key][name]
-        if starts and starts[-1] == len(self.counts):  # nothing is in the one before
-            which[-1] = number
-        else:
-            starts.append(len(self.counts))
-            which.append(number)
+        starts.append(len(self.counts))
+        which.append(self.names[key][name])
 
     def _absolute(self, corner: str, line: int) -> str:
         """A corner with relative indices (-1 is the latest) in absolute ones (1 is the first)."""
@@ -124,19 +102,16 @@ class _Text:
         for i, (part, key) in enumerate(zip(parts, _KEEP, strict=False)):
             if part.startswith("-"):
                 count = len(self.lines[key])
-                index = self.integer(part, corner, line)
+                try:
+                    index = int(part)
+                except ValueError:
+                    self.fail(line, _CORNER.format(short(corner)))
                 if not count and key != "v":
                     continue  # `triples` knows whether the file has any
                 if not -count <= index < 0:
                     self.fail(line, f"face corner {short(corner)}: {key} index {short(index)}, but only {count} {key} stand before")
                 parts[i] = str(count + 1 + index)
         return "/".join(parts)
-
-    def integer(self, part: str, corner: str, line: int) -> int:
-        try:
-            return int(part)
-        except ValueError:
-            self.fail(line, _CORNER.format(short(corner)))
 
     def array(self, key: str) -> np.ndarray:
         """(N, 2 or 3) float64 of all `key` lines."""
@@ -178,10 +153,7 @@ class _Text:
         if key is None:
             return (), None
         starts, which = self.spans[key]
-        names = list(dict.fromkeys(chain([""], self.names[key])))
-        number = {name: i for i, name in enumerate(names)}
-        renumbered = np.array([number[name] for name in self.names[key]])
-        numbers = np.concatenate([[0], renumbered[np.frombuffer(which, np.int32)]])
+        names, numbers = list(self.names[key]), np.concatenate([[0], np.frombuffer(which, np.int32)])
         polygon_group = numbers[np.searchsorted(starts, np.arange(len(self.counts)), side="right")]
         used, polygon_group = np.unique(polygon_group, return_inverse=True)
         return tuple(names[i] for i in used), polygon_group

@@ -7,9 +7,11 @@ texture coordinates.
 
 from __future__ import annotations
 
+import io
 import re
 from array import array
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -30,8 +32,8 @@ _SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # what a lis
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
-WORDS_AT_ONCE = 1 << 16  # of a text, before they become numbers
-_SPACE = re.compile(rb"\s")
+BYTES_AT_ONCE = 1 << 18  # of a text, before they become numbers
+_WORD = re.compile(rb"\S+")
 
 
 class _Property(NamedTuple):
@@ -291,15 +293,16 @@ class _Text:
 
     def __init__(self, source: _Source, begin: int) -> None:
         numbers, self.at = array("d"), 0
-        while begin < len(source.data):
-            space = _SPACE.search(source.data, begin + 4 * WORDS_AT_ONCE)
-            end = space.start() if space else len(source.data)
+        stream = io.BytesIO(source.data)
+        stream.seek(begin)
+        while text := b"".join(stream.readlines(BYTES_AT_ONCE)):
+            before = len(numbers)
             try:
-                numbers.extend(map(float, source.data[begin:end].split()))
+                numbers.extend(map(float, text.split()))
             except ValueError:
-                line, word = _first_not_a_number(source.data, begin, end)
-                source.fail(f"{short(word)} is not a number", f"line {line}")
-            begin = end
+                bad = next(islice(_WORD.finditer(text), len(numbers) - before, None))  # those before it are in
+                line = source.data.count(b"\n", 0, stream.tell() - len(text) + bad.start()) + 1
+                source.fail(f"{short(bad[0].decode('latin-1'))} is not a number", f"line {line}")
         self.numbers = np.frombuffer(numbers, np.float64)
 
     def take(self, kind: str, count: int) -> np.ndarray | None:
@@ -315,14 +318,3 @@ class _Text:
         table = self.numbers[self.at:self.at + rows * sum(widths)].reshape(rows, sum(widths))
         self.at += table.size
         return np.split(table, np.cumsum(widths)[:-1], axis=1)
-
-
-def _first_not_a_number(data: bytes, begin: int, end: int) -> tuple[int, str]:
-    """The line and the word, in these bytes; there must be one."""
-    for number, line in enumerate(data[begin:end].split(b"\n"), data.count(b"\n", 0, begin) + 1):
-        for word in line.split():
-            try:
-                float(word)
-            except ValueError:
-                return number, word.decode("latin-1")
-    raise AssertionError("every word is a number")
