@@ -29,9 +29,12 @@ def kinds() -> dict[str, type[Any]]:
 LEFT_OUT: dict[type, tuple[str, ...]] = {Object: ("motion",)}  # a picture shows the object without
 
 
-def pack(scene: Scene) -> tuple[str, list[np.ndarray]]:
-    """The text, and the arrays that it counts on: each once, as each mesh, material and texture is that others share."""
-    packer = _Packer()
+def pack(scene: Any, left_out: dict[type, tuple[str, ...]] = LEFT_OUT) -> tuple[str, list[np.ndarray]]:
+    """The text, and the arrays that it counts on: each once, as each mesh, material and texture is that others share.
+
+    left_out: fields by their class (object: of every class), which are None in it.
+    """
+    packer = _Packer(left_out)
     packer.plain(scene)
     return json.dumps(packer.things), packer.arrays
 
@@ -66,7 +69,8 @@ def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
 class _Packer:
     """things: [kind, {field: value}], each after those that it holds."""
 
-    def __init__(self) -> None:
+    def __init__(self, left_out: dict[type, tuple[str, ...]]) -> None:
+        self.left_out = left_out
         self.things: list[tuple[str, dict[str, Any]]] = []
         self.arrays: list[np.ndarray] = []
         self.known: dict[int, dict[str, int]] = {}
@@ -84,7 +88,7 @@ class _Packer:
                 self.arrays.append(value)
                 place = {"array": len(self.arrays) - 1}
             else:
-                left_out = LEFT_OUT.get(type(value), ())
+                left_out = (*self.left_out.get(object, ()), *self.left_out.get(type(value), ()))
                 content = {each.name: None if each.name in left_out else self.plain(getattr(value, each.name))
                            for each in fields(value)}
                 self.things.append((type(value).__name__, content))
