@@ -158,13 +158,6 @@ def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of faces without area, those with corners in three places; the ends (N, 2) of their longest edge; the third corner."""
-    parts = [_longest_edges_of_few(vertices, faces, flat[first:first + AT_ONCE]) for first in range(0, max(len(flat), 1), AT_ONCE)]
-    flat, ends, middle = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return flat, ends, middle
-
-
-def _longest_edges_of_few(vertices: np.ndarray, faces: np.ndarray,
-                          flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     corners = vertices[faces[flat]].astype(np.float64)
     edges = np.stack([corners[:, (i + 2) % 3] - corners[:, (i + 1) % 3] for i in range(3)], axis=1)  # opposite of corner i
     apart = (edges != 0.0).any(axis=2).all(axis=1)

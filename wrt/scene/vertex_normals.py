@@ -27,7 +27,8 @@ def smooth(mesh: Mesh) -> Mesh:
     sine = np.linalg.norm(np.cross(edges, back), axis=2)
     angle = np.arctan2(sine, (edges * back).sum(axis=2))
 
-    place = _places(mesh.vertices)
+    _, place = np.unique(mesh.vertices + np.float32(0.0), axis=0, return_inverse=True)  # -0 is 0
+    place = place.reshape(-1)
     weighted = normal[:, None, :] * angle[:, :, None]
     count = int(place.max()) + 1
     where = place[mesh.faces].reshape(-1)
@@ -35,14 +36,3 @@ def smooth(mesh: Mesh) -> Mesh:
     length = np.linalg.norm(total, axis=1, keepdims=True)
     total = np.where(length > 1e-6, total / np.maximum(length, 1e-300), 0.0)
     return replace(mesh, normals=total[place].astype(np.float32))
-
-
-def _places(vertices: np.ndarray) -> np.ndarray:
-    """(V,) a number for each vertex, equal for those at the same position."""
-    vertices = vertices + np.float32(0.0)  # -0 is 0
-    order = np.lexsort(vertices.T)
-    new = np.ones(len(order), dtype=bool)
-    new[1:] = (vertices[order[1:]] != vertices[order[:-1]]).any(axis=1)
-    place = np.empty(len(order), dtype=np.int64)
-    place[order] = np.cumsum(new) - 1
-    return place
