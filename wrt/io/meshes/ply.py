@@ -29,7 +29,7 @@ _TYPES = {
     "int64": "i8", "uint64": "u8", "float": "f4", "double": "f8", "float32": "f4", "float64": "f8",
 }
 _SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # what a list's length may be
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
 BYTES_AT_ONCE = 1 << 18  # of a text, before they become numbers
@@ -158,13 +158,8 @@ def _within(source: _Source, given: np.ndarray, counts: np.ndarray, vertices: in
 
 def _split(corners: np.ndarray, texcoord: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Make one vertex of each different (vertex, u, v): the vertex it comes from, the new corners, its uv."""
-    order = np.lexsort((texcoord[:, 1], texcoord[:, 0], corners))
-    rows = np.column_stack([corners, texcoord])[order]
-    first = np.ones(len(rows), dtype=bool)
-    first[1:] = (rows[1:] != rows[:-1]).any(axis=1)
-    renumbered = np.empty(len(order), dtype=np.int64)
-    renumbered[order] = np.cumsum(first) - 1
-    return rows[first, 0].astype(np.int64), renumbered, rows[first, 1:]
+    rows, renumbered = np.unique(np.column_stack([corners, texcoord]), axis=0, return_inverse=True)
+    return rows[:, 0].astype(np.int64), renumbered.reshape(-1), rows[:, 1:]
 
 
 class _Source:
@@ -172,9 +167,12 @@ class _Source:
 
     def __init__(self, path: Path) -> None:
         self.data = utf8(read_file(path))
-        form, self.elements, begin = self._header()
-        binary = form != "ascii"
-        self.stream: _Text | _Binary = _Binary(self.data, begin, _ORDERS[form]) if binary else _Text(self, begin)
+        form, self.elements, self.at = self._header()
+        self.order = _ORDERS[form]
+        if form == "ascii":  # from here on as a binary file that has float64 everywhere, which holds every index exactly
+            self.data, self.at = self._numbers(), 0
+            for element in self.elements:
+                element.properties = [p._replace(type="f8", count_type=p.count_type and "f8") for p in element.properties]
         for element in self.elements:
             if element.rows and element.properties:
                 self._read(element)
@@ -196,7 +194,7 @@ class _Source:
                     break
                 case [] | ["ply" | "comment" | "obj_info", *_]:
                     pass
-                case ["format", name, *_] if name == "ascii" or name in _ORDERS:
+                case ["format", name, *_] if name in _ORDERS:
                     form = name
                 case ["element", name, rows] if rows.isdecimal() and len(rows) < 19:
                     elements.append(_Element(name, int(rows)))
@@ -214,19 +212,19 @@ class _Source:
 
     def _read(self, element: _Element) -> None:
         """Read all rows at once where their lists are as long as the first row's (nearly always), else row by row."""
-        begin = self.stream.at
+        begin = self.at
         if element.rows > len(self.data):  # a row has at least one byte
             self._truncated(element)
         sizes = [len(part) for part in self._row(element, 0)]
-        self.stream.at = begin
+        self.at = begin
         fields: list[tuple[str, int]] = []
         for p, size in zip(element.properties, sizes, strict=True):
             fields += [(p.count_type, 1), (p.type, size)] if p.count_type else [(p.type, 1)]
-        table = self.stream.table(fields, element.rows)
+        table = self._table(fields, element.rows)
         if table is None and not any(p.count_type for p in element.properties):
             self._truncated(element)
         if table is None or not self._take_table(element, table, sizes):
-            self.stream.at = begin
+            self.at = begin
             rows = [self._row(element, row) for row in range(element.rows)]
             for i, p in enumerate(element.properties):
                 element.values[p.name] = np.concatenate([row[i] for row in rows])
@@ -248,13 +246,13 @@ class _Source:
         for p in element.properties:
             size = 1
             if p.count_type:
-                count = self.stream.take(p.count_type, 1)
+                count = self._take(p.count_type, 1)
                 if count is None:
                     self._truncated(element, row)
                 if not (0 <= count[0] < np.inf and count[0] == int(count[0])):
                     self.fail(f"a list of {count[0]:g} values", f"{element.name} {row}")
                 size = int(count[0])
-            values = self.stream.take(p.type, size)
+            values = self._take(p.type, size)
             if values is None:
                 self._truncated(element, row)
             parts.append(values)
@@ -264,22 +262,16 @@ class _Source:
         ends = f"the file ends in number {row}" if row is not None else "the file ends before"
         self.fail(f"truncated: the header promises {element.rows}, but {ends}", f"element {element.name}")
 
-
-class _Binary:
-    """Values from bytes; None where the file ends before."""
-
-    def __init__(self, data: bytes, at: int, order: str) -> None:
-        self.data, self.at, self.order = data, at, order
-
-    def take(self, kind: str, count: int) -> np.ndarray | None:
+    def _take(self, kind: str, count: int) -> np.ndarray | None:
+        """The next values; None where the file ends before."""
         dtype = np.dtype(self.order + kind)
         if self.at + count * dtype.itemsize > len(self.data):
             return None
         self.at += count * dtype.itemsize
         return np.frombuffer(self.data, dtype, count, self.at - count * dtype.itemsize)
 
-    def table(self, fields: list[tuple[str, int]], rows: int) -> list[np.ndarray] | None:
-        """(rows, n) of each field (type, n), of records one behind the other."""
+    def _table(self, fields: list[tuple[str, int]], rows: int) -> list[np.ndarray] | None:
+        """(rows, n) of each field (type, n), of records one behind the other; None where the file ends before."""
         record = np.dtype([(f"f{i}", self.order + kind, (n,)) for i, (kind, n) in enumerate(fields)])
         if self.at + rows * record.itemsize > len(self.data):
             return None
@@ -287,34 +279,16 @@ class _Binary:
         self.at += rows * record.itemsize
         return [table[f"f{i}"] for i in range(len(fields))]
 
-
-class _Text:
-    """Values from words; None where the file ends before. All are float64, which holds every index exactly."""
-
-    def __init__(self, source: _Source, begin: int) -> None:
-        numbers, self.at = array("d"), 0
-        stream = io.BytesIO(source.data)
-        stream.seek(begin)
+    def _numbers(self) -> bytes:
+        """The words of a text as float64."""
+        numbers, stream = array("d"), io.BytesIO(self.data)
+        stream.seek(self.at)
         while text := b"".join(stream.readlines(BYTES_AT_ONCE)):
             before = len(numbers)
             try:
                 numbers.extend(map(float, text.split()))
             except ValueError:
                 bad = next(islice(_WORD.finditer(text), len(numbers) - before, None))  # those before it are in
-                line = source.data.count(b"\n", 0, stream.tell() - len(text) + bad.start()) + 1
-                source.fail(f"{short(bad[0].decode('latin-1'))} is not a number", f"line {line}")
-        self.numbers = np.frombuffer(numbers, np.float64)
-
-    def take(self, kind: str, count: int) -> np.ndarray | None:
-        if self.at + count > len(self.numbers):
-            return None
-        self.at += count
-        return self.numbers[self.at - count:self.at]
-
-    def table(self, fields: list[tuple[str, int]], rows: int) -> list[np.ndarray] | None:
-        widths = [n for _, n in fields]
-        if self.at + rows * sum(widths) > len(self.numbers):
-            return None
-        table = self.numbers[self.at:self.at + rows * sum(widths)].reshape(rows, sum(widths))
-        self.at += table.size
-        return np.split(table, np.cumsum(widths)[:-1], axis=1)
+                line = self.data.count(b"\n", 0, stream.tell() - len(text) + bad.start()) + 1
+                self.fail(f"{short(bad[0].decode('latin-1'))} is not a number", f"line {line}")
+        return numbers.tobytes()
