@@ -4,7 +4,7 @@ person."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,14 +65,7 @@ def setting_choices(name: str) -> tuple[str, ...]:
 
 
 def _lines(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> list[str]:
-    """A line for each problem; beyond MOST different ones the rest are only counted: each takes a look at all names."""
-    told: dict[str, None] = {}
-    errors = error.errors(include_url=False)
-    for i, each in enumerate(errors):
-        if len(told) > MOST:
-            return [*told, *(f"problem {j}" for j in range(i, len(errors)))]
-        told[_line(each, data, known_keys)] = None
-    return list(told)
+    return [_line(each, data, known_keys) for each in error.errors(include_url=False)]
 
 
 def raise_all(problems: Sequence[str], path: Path) -> None:
@@ -87,9 +80,8 @@ def raise_all(problems: Sequence[str], path: Path) -> None:
         raise InputError("\n  ".join([f"{count} errors", *problems]), path)
 
 
-def unknown_materials(data: dict[str, Any], known: Iterable[str]) -> list[str]:
+def unknown_materials(data: dict[str, Any], known: Collection[str]) -> list[str]:
     """A line for each reference to a material that is not known; values of the wrong type are left to the schema."""
-    names = list(known)
     found: list[tuple[str, Any]] = []
     for kind in ("spheres", "quads", "boxes", "meshes"):
         for i, table in enumerate(_tables(data.get(kind))):
@@ -100,10 +92,7 @@ def unknown_materials(data: dict[str, Any], known: Iterable[str]) -> list[str]:
                 found += [(f"{at}.materials.{group}", name) for group, name in groups.items()]
             found += [(f"{at}.parts[{j}].material", part.get("material"))
                       for j, part in enumerate(_tables(table.get("parts")))]
-    known_names = set(names)
-    wrong = [(place, name) for place, name in found if isinstance(name, str) and name not in known_names]
-    lines = [f"{place}: {unknown(name, 'material', names)}" for place, name in wrong[:MOST + 1]]
-    return lines + [f"{place}: unknown material" for place, _ in wrong[MOST + 1:]]  # raise_all counts them
+    return [f"{place}: {unknown(name, 'material', known)}" for place, name in found if isinstance(name, str) and name not in known]
 
 
 def _tables(value: Any) -> list[dict[str, Any]]:
