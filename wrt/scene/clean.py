@@ -73,7 +73,7 @@ def corners_have_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray
     The cross product of two edges is taken in float64 and believed where a component exceeds its rounding error; the few
     others are taken again in whole numbers.
     """
-    a, b, c = (_columns(corner) for corner in (p, q, r))
+    a, b, c = (np.array(corner.T, np.float64, order="C") for corner in (p, q, r))
     out = np.ones(len(p), dtype=bool)
     unknown: np.ndarray | slice = slice(None)
     with np.errstate(invalid="ignore"):
@@ -86,14 +86,6 @@ def corners_have_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray
             if not len(unknown):
                 return out
     out[unknown] = _has_area_exactly(a[:, unknown], b[:, unknown], c[:, unknown])
-    return out
-
-
-def _columns(points: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 -> (3, N) float64, one coordinate after the other."""
-    out = np.empty((3, len(points)))
-    for axis in range(3):
-        out[axis] = points[:, axis]
     return out
 
 

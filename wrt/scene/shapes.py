@@ -43,19 +43,10 @@ def box(low: Point = (-0.5, -0.5, -0.5), high: Point = (0.5, 0.5, 0.5)) -> Mesh:
     return Mesh(np.where(_BOX_TOP, top, bottom), _BOX_FACES, uvs=_BOX_UVS, name="box")
 
 
-def _box_corners() -> np.ndarray:
-    """(24, 3) bool: which corners of a box are at `high` in which axis; four for each side, in the order of a quad's."""
-    corners = np.zeros((3, 2, 4, 3), dtype=bool)  # axis of the side, low and high, corner, axis
-    along_u, along_v = np.array([False, True, True, False]), np.array([False, False, True, True])
-    for axis in range(3):
-        corners[axis, 1, :, axis] = True
-        corners[axis, 0, :, (axis + 1) % 3] = ~along_u  # u runs back there, so that the side faces out
-        corners[axis, 1, :, (axis + 1) % 3] = along_u
-        corners[axis, :, :, (axis + 2) % 3] = along_v
-    return corners.reshape(24, 3)
-
-
-_BOX_TOP = _box_corners()
+# Which of its 24 corners are at `high` in which axis: of the low and the high side across x, four each in the order of a quad's (u
+# runs back on the low one, so that it faces out), and the same across y and z.
+_BOX_SIDES = np.array([[[0, 1, 0], [0, 0, 0], [0, 0, 1], [0, 1, 1]], [[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1]]], dtype=bool)
+_BOX_TOP = np.concatenate([np.roll(_BOX_SIDES, axis, axis=2) for axis in range(3)]).reshape(24, 3)
 _BOX_FACES = (np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]).reshape(12, 3).astype(np.int32)
 _BOX_UVS = np.tile(np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32), (6, 1))
 _BOX_FACES.flags.writeable = _BOX_UVS.flags.writeable = False  # all boxes share them
