@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
@@ -18,7 +18,6 @@ import numpy as np
 
 from wrt.core.checks import as_array, as_one, as_tuple, at_thing, unknown
 from wrt.core.errors import InputError
-from wrt.core.html import html_table
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import CameraKind
 from wrt.scene.lights import LIGHTS, Light
@@ -123,21 +122,6 @@ class Scene:
             low, high = ("({})".format(", ".join(f"{value:.4g}" for value in corner)) for corner in self.bounds())
             parts.append(f"from {low} to {high}")
         return f"Scene({', '.join([repr(self.name)] * bool(self.name) + parts)})"
-
-    def _repr_html_(self) -> str:
-        things = [(thing.name, "mesh", len(thing.mesh.faces), ", ".join(m.name or m.kind for m in thing.materials))
-                  for thing in self.objects]
-        things += [(sphere.name, "sphere", 1, sphere.material.name or sphere.material.kind) for sphere in self.spheres]
-        lights = [(light.name, type(light).__name__) for light in self.lights]
-        lights += [(m.name, "emissive material") for m in self.materials if m.lights_others]
-        lights.append(("", type(self.background).__name__))
-        cameras = [(each.name, each.kind, ", ".join(f"{key} {value:.4g}" for key, value in each.as_in_files().items()))
-                   for each in self.cameras]
-        settings = {each.name: getattr(self.settings, each.name) for each in fields(Settings)}
-        settings["size"] = f"{self.settings.size[0]}x{self.settings.size[1]}"
-        return html_table(repr(self), ("shape", "kind", "primitives", "materials"), things) + html_table(
-            "", ("light", "kind"), lights) + html_table("", ("camera", "kind", "parameters"), cameras) + html_table(
-            "Settings", (), settings.items())
 
     @property
     def materials(self) -> tuple[Material, ...]:

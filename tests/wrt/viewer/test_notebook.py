@@ -21,8 +21,6 @@ from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.core.errors import InputError
 from wrt.core.html import SHOWN_ROWS, Rows, html_table, number
 from wrt.renderer.options import Progress
-from wrt.scene.materials import Material
-from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import box
 from wrt.viewer.notebook import LiveView
 
@@ -176,12 +174,6 @@ EVIL = "<script>alert('\"&')</script>"
 
 def test_nothing_in_a_table_is_markup() -> None:
     assert Tables(html_table(EVIL, (EVIL,), [(EVIL,), (1,)])).rows == [[EVIL], [EVIL], ["1"]]
-    material = Material(name=EVIL, emission=(1.0, 1.0, 1.0))
-    mesh = wrt.Mesh(box().vertices, box().faces, groups=(EVIL,), name=EVIL)
-    scene = Scene(objects=(Object(mesh, (material,), name=EVIL),), spheres=(Sphere((0, 0, 0), 1.0, material, name=EVIL),),
-                  cameras=SCENE.cameras, name=EVIL)
-    rows = Tables(scene._repr_html_()).rows
-    assert [EVIL, "mesh", "12", EVIL] in rows and [EVIL, "sphere", "1", EVIL] in rows and [EVIL, "emissive material"] in rows
 
 
 def test_numbers_and_long_tables() -> None:
@@ -203,12 +195,6 @@ def test_hits_and_counters_as_tables() -> None:
     assert ["nodes", number(float(nodes.mean())), str(nodes.max()), str(nodes.sum())] in rows3
     empty = accel.closest_hit(np.zeros((0, 3)), np.zeros((0, 3)), counters=True)
     assert ["rays", "0"] in Tables(empty._repr_html_()).rows
-
-
-def test_every_shipped_kind_of_scene_has_a_table() -> None:
-    rows = Tables(SCENE._repr_html_()).rows
-    assert ["spp", "24"] in rows and ["size", "61x34"] in rows and ["", "GradientBackground"] in rows
-    assert Tables(Scene()._repr_html_()).rows
 
 
 def test_a_list_of_rows_is_a_list_with_a_page() -> None:
