@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.scene.kinds import Kind, given
+from wrt.scene.kinds import Kind, forms, given
 from wrt.scene.values import BLACK, LUMINANCE, WHITE, Color
 
 
@@ -22,8 +22,9 @@ class Background(Kind):
 
     @property
     def is_black(self) -> bool:
-        """Whether it lights nothing: then it is not sampled."""
-        return False
+        """Whether it lights nothing: all its colours, if it has some, are black. Then it is not sampled."""
+        colors = [getattr(self, name) for name, each in forms(type(self)).items() if each.metadata["form"] == "color"]
+        return bool(colors) and not np.any(colors)
 
 
 @dataclass(frozen=True)
@@ -32,10 +33,6 @@ class ConstantBackground(Background):
 
     kind = "constant"
     color: Color = field(default=BLACK, metadata=given("color", "from every direction", "radiance"))
-
-    @property
-    def is_black(self) -> bool:
-        return max(self.color) == 0.0
 
     def record(self) -> dict[str, Any]:
         return {"bottom": self.color, "top": self.color}
@@ -48,10 +45,6 @@ class GradientBackground(Background):
     kind = "gradient"
     bottom: Color = field(default=WHITE, metadata=given("color", "from straight below (-y)", "radiance"))
     top: Color = field(default=(0.5, 0.7, 1.0), metadata=given("color", "from straight above (+y)", "radiance"))
-
-    @property
-    def is_black(self) -> bool:
-        return max(*self.bottom, *self.top) == 0.0
 
     def record(self) -> dict[str, Any]:
         return {"bottom": self.bottom, "top": self.top}
