@@ -27,34 +27,30 @@ _EXPECTED = {
 
 def check(data: dict[str, Any], path: Path) -> SceneTable:
     """The file's tables as models. Raises one InputError that lists everything that is wrong."""
-    from pydantic import ValidationError
-
     from wrt.io.toml.schema import scene_table
 
-    known_keys: dict[int, list[str]] = {}
-    try:
-        return scene_table().model_validate(data, context=known_keys)
-    except ValidationError as error:
-        problems = _lines(error, data, known_keys)
-    if not data.get("include"):
-        materials = data.get("materials")
-        problems += unknown_materials(data, materials if isinstance(materials, dict) else {})
-    raise_all(problems, path)
-    raise AssertionError("unreachable: there is at least one problem")
+    materials = data.get("materials")
+    known = materials if isinstance(materials, dict) else {}
+    return _models(scene_table(), data, path, [] if data.get("include") else unknown_materials(data, known))
 
 
 def check_settings(values: dict[str, Any], origin: str) -> dict[str, Any]:
     """Settings by name, checked as [settings] of a file is. Raises one InputError that lists everything that is wrong."""
-    from pydantic import ValidationError
-
     from wrt.io.toml.schema import SettingsTable
+
+    return _models(SettingsTable, values, Path(origin)).given()
+
+
+def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[str] = ()) -> Any:
+    """`data` as that table. Where it is none, the InputError lists the `others` too."""
+    from pydantic import ValidationError
 
     known_keys: dict[int, list[str]] = {}
     try:
-        return SettingsTable.model_validate(values, context=known_keys).given()
+        return table.model_validate(data, context=known_keys)
     except ValidationError as error:
-        raise_all(_lines(error, values, known_keys), Path(origin))
-    raise AssertionError("unreachable: there is at least one problem")
+        problems = [_line(each, data, known_keys) for each in error.errors(include_url=False)]
+    raise_all([*problems, *others], path)
 
 
 def setting_choices(name: str) -> tuple[str, ...]:
@@ -62,10 +58,6 @@ def setting_choices(name: str) -> tuple[str, ...]:
     from wrt.io.toml.schema import SettingsTable
 
     return tuple(SettingsTable.model_json_schema()["properties"].get(name, {}).get("enum", ()))
-
-
-def _lines(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> list[str]:
-    return [_line(each, data, known_keys) for each in error.errors(include_url=False)]
 
 
 def raise_all(problems: Sequence[str], path: Path) -> None:
