@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from wrt.core.packages import needed_by
-
-AT_ONCE = 1 << 16  # triangles
 
 
 def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -26,15 +22,11 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
     small = np.int32 if max(len(corners), len(counts)) < 1 << 31 else np.int64
     if (counts == 3).all():
         return np.arange(3 * len(counts), dtype=small).reshape(-1, 3), np.arange(len(counts), dtype=small)
-    start = np.cumsum(counts) - counts
+    start = (np.cumsum(counts) - counts).astype(small)
     polygon = np.repeat(np.arange(len(counts), dtype=small), fan)
     step = np.arange(len(polygon), dtype=small) - np.repeat((np.cumsum(fan) - fan).astype(small), fan)
-    triangles = np.empty((len(polygon), 3), small)
-    triangles[:, 0] = start[polygon]
-    for i in (1, 2):
-        np.add(triangles[:, 0], step, out=triangles[:, i])
-        triangles[:, i] += i
-    del step
+    first = start[polygon]
+    triangles = np.stack([first, first + step + 1, first + step + 2], axis=1)
     if len(polygon) == 0 or counts.max() == 3:
         return triangles, polygon
 
@@ -47,24 +39,25 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
     return triangles, polygon
 
 
+def strip(indices: np.ndarray) -> np.ndarray:
+    """(N,) -> (N - 2, 3): a triangle of each vertex and the two before it."""
+    i = np.arange(max(len(indices) - 2, 0), dtype=indices.dtype)
+    odd = i & 1  # every second triangle swaps two corners, so that all face one way
+    return indices[np.stack([i, i + 1 + odd, i + 2 - odd], axis=1)]
+
+
 def _areas(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray, triangles: np.ndarray,
            polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The area vectors (P, 3) of the polygons of more than three corners (twice the area long), and the numbers of those that have
     a triangle which faces against theirs."""
     area, against = np.zeros((len(counts), 3)), np.zeros(len(counts), dtype=bool)
-
-    def normals() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for begin in range(0, len(polygon), AT_ONCE):
-            part = slice(begin, begin + AT_ONCE)
-            several = counts[polygon[part]] > 3  # triangles need no second look
-            points = vertices[corners[triangles[part][several]]]
-            yield polygon[part][several], np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-
+    large = counts > 3  # triangles need no second look
+    size, several = counts[large] - 2, large[polygon]
+    a, b, c = (vertices.take(corners.take(triangles[several, i]), axis=0) for i in range(3))
     with np.errstate(invalid="ignore", over="ignore"):
-        for of, normal in normals():
-            np.add.at(area, of, normal)
-        for of, normal in normals():
-            against[of[(normal * area[of]).sum(axis=1) < 0.0]] = True
+        normal = np.cross(b - a, c - a)
+        area[large] = np.add.reduceat(normal, np.cumsum(size) - size)
+        against[polygon[several][np.einsum("ij,ij->i", normal, np.repeat(area[large], size, axis=0)) < 0.0]] = True
     return area, np.flatnonzero(against)
 
 

@@ -15,6 +15,7 @@ from wrt.io.gltf.accessors import Accessors
 from wrt.io.gltf.document import Document
 from wrt.io.gltf.nodes import compose
 from wrt.io.gltf.schema import Instancing
+from wrt.io.polygons import strip
 from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.values import require_count
@@ -34,18 +35,12 @@ def _list_of_triangles(indices: np.ndarray) -> np.ndarray:
     return indices[:len(indices) // 3 * 3].reshape(-1, 3)
 
 
-def _strip(indices: np.ndarray) -> np.ndarray:
-    i = np.arange(max(len(indices) - 2, 0), dtype=indices.dtype)
-    odd = i & 1  # every second triangle swaps two corners, so that all face the same way
-    return indices[np.stack([i, i + 1 + odd, i + 2 - odd], axis=1)]
-
-
 def _fan(indices: np.ndarray) -> np.ndarray:
     i = np.arange(max(len(indices) - 2, 0), dtype=indices.dtype)
     return indices[np.stack([i + 1, i + 2, np.zeros_like(i)], axis=1)]
 
 
-TRIANGULATE: dict[int, Callable[[np.ndarray], np.ndarray]] = {4: _list_of_triangles, 5: _strip, 6: _fan}
+TRIANGULATE: dict[int, Callable[[np.ndarray], np.ndarray]] = {4: _list_of_triangles, 5: strip, 6: _fan}
 _NOT_TRIANGLES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 
 

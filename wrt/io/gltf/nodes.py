@@ -42,14 +42,7 @@ def _roots(document: Document) -> list[tuple[int, str]]:
     number = gltf.scene or 0
     scene = document.item("scenes", number, "scene")
     document.left_out.add_extensions(scene.extensions, "scene", scene.name or str(number))
-    roots: dict[int, str] = {}
-    for i, index in enumerate(scene.nodes):
-        place = f"scenes[{number}].nodes[{i}]"
-        if index in roots:
-            raise InputError(f"nodes[{index}] is in the scene twice", None, place)
-        document.item("nodes", index, place)
-        roots[index] = place
-    return list(roots.items())
+    return [(index, f"scenes[{number}].nodes[{i}]") for i, index in enumerate(scene.nodes)]
 
 
 def _check_forest(document: Document) -> None:
@@ -73,8 +66,6 @@ def _check_forest(document: Document) -> None:
 
 def local_matrix(node: Any, place: str) -> np.ndarray:
     """A node's own transform (4, 4) float64: its matrix, or translation * rotation * scale."""
-    if node.matrix is None and node.translation is None and node.scale is None and node.rotation is None:
-        return np.eye(4)
     if node.matrix is not None:
         with at(f"{place}.matrix"):
             return as_transform(np.array(exactly(node.matrix, 16, "")).reshape(4, 4).T, "it")

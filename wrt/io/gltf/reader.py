@@ -59,29 +59,15 @@ def load_gltf(path: str | os.PathLike[str], *, staged: bool = True) -> Scene:
 # --- lights -----------------------------------------------------------------------------------------------------------
 
 
-def _point(source: Any, color: Any, world: np.ndarray, name: str) -> Light:
-    return PointLight(tuple(world[:3, 3]), color, name)
-
-
-def _directional(source: Any, color: Any, world: np.ndarray, name: str) -> Light:
-    return DirectionalLight(tuple(-world[:3, 2]), color, name)
-
-
-def _spot(source: Any, color: Any, world: np.ndarray, name: str) -> Light:
-    cone = source.spot or SpotCone()
-    return SpotLight(tuple(world[:3, 3]), tuple(-world[:3, 2]), color, cone.innerConeAngle, cone.outerConeAngle, name)
-
-
-LIGHTS: dict[str, Callable[..., Light]] = {"point": _point, "directional": _directional, "spot": _spot}
+LIGHTS: dict[str, Callable[..., Light]] = {
+    "point": lambda place, direction, color, cone, name: PointLight(place, color, name),
+    "directional": lambda place, direction, color, cone, name: DirectionalLight(direction, color, name),
+    "spot": lambda place, direction, color, cone, name: SpotLight(
+        place, direction, color, cone.innerConeAngle, cone.outerConeAngle, name),
+}
 
 
 # --- the scene --------------------------------------------------------------------------------------------------------
-
-
-def _settings(scene: Scene) -> Settings:
-    """A glTF file has no settings. Other viewers light what stands in its glass, and so do shadow rays that go through glass."""
-    solid_glass = any(material.transmission > 0.0 and not material.thin for material in scene.materials)
-    return Settings(glass_shadows="tinted" if solid_glass else "opaque")
 
 
 @dataclass
@@ -114,7 +100,9 @@ class _Reader:
             if extension not in left_out:
                 left_out.add_extensions({extension: raw}, "file", document.path.name)
         scene = Scene(tuple(self.objects), (), tuple(self.lights), tuple(self.cameras), name=document.path.stem)
-        return replace(scene, settings=_settings(scene))
+        # Other viewers light what stands in glass, and so do shadow rays that go through it.
+        solid_glass = any(material.transmission > 0.0 and not material.thin for material in scene.materials)
+        return replace(scene, settings=Settings(glass_shadows="tinted" if solid_glass else "opaque"))
 
     def _add_mesh(self, node: Any, world: np.ndarray, name: str, place: str) -> None:
         source = self.document.item("meshes", node.mesh, f"{place}.mesh")
@@ -183,4 +171,5 @@ class _Reader:
             self.document.left_out.add("range", "light", name)
         color = exactly(source.color, 3, f"{where}.color")
         with at(where):
-            self.lights.append(LIGHTS[source.type](source, tuple(c * source.intensity for c in color), world, name))
+            self.lights.append(LIGHTS[source.type](tuple(world[:3, 3]), tuple(-world[:3, 2]),
+                                                   tuple(c * source.intensity for c in color), source.spot or SpotCone(), name))

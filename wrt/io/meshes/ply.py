@@ -21,7 +21,7 @@ from wrt.core.checks import short
 from wrt.core.errors import InputError
 from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
-from wrt.io.polygons import triangulate
+from wrt.io.polygons import strip, triangulate
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -124,16 +124,9 @@ def _strips(source: _Source, strips: _Element, vertices: int) -> np.ndarray:
     given, counts = _indices(source, strips)
     ends = given == -1
     indices = _within(source, np.where(ends, 0, given), counts, vertices, "tristrips")
-    # The strip of each place: lists and -1 part them.
-    first = np.zeros(len(given), dtype=bool)
-    first[(np.cumsum(counts) - counts)[counts > 0]] = True
-    first[1:] |= ends[:-1]
-    begin = np.flatnonzero(first)
-    strip = np.cumsum(first) - 1
-    last = np.arange(2, max(len(given), 2))
-    last = last[(strip[last] == strip[last - 2]) & ~ends[last]]
-    odd = (last - begin[strip[last]]) & 1  # every second triangle swaps two corners, so that all face one way
-    return indices[np.stack([last - 2, last - 1 + odd, last - odd], axis=1)].reshape(-1)
+    begin = np.union1d(np.cumsum(counts), np.flatnonzero(ends))
+    runs = zip(np.split(indices, begin), np.split(ends, begin), strict=True)
+    return np.concatenate([strip(run[~end]).reshape(-1) for run, end in runs])
 
 
 def _indices(source: _Source, element: _Element) -> tuple[np.ndarray, np.ndarray]:
@@ -213,16 +206,12 @@ class _Source:
     def _read(self, element: _Element) -> None:
         """Read all rows at once where their lists are as long as the first row's (nearly always), else row by row."""
         begin = self.at
-        if element.rows > len(self.data):  # a row has at least one byte
-            self._truncated(element)
         sizes = [len(part) for part in self._row(element, 0)]
         self.at = begin
         fields: list[tuple[str, int]] = []
         for p, size in zip(element.properties, sizes, strict=True):
             fields += [(p.count_type, 1), (p.type, size)] if p.count_type else [(p.type, 1)]
         table = self._table(fields, element.rows)
-        if table is None and not any(p.count_type for p in element.properties):
-            self._truncated(element)
         if table is None or not self._take_table(element, table, sizes):
             self.at = begin
             rows = [self._row(element, row) for row in range(element.rows)]
@@ -258,9 +247,8 @@ class _Source:
             parts.append(values)
         return parts
 
-    def _truncated(self, element: _Element, row: int | None = None) -> NoReturn:
-        ends = f"the file ends in number {row}" if row is not None else "the file ends before"
-        self.fail(f"truncated: the header promises {element.rows}, but {ends}", f"element {element.name}")
+    def _truncated(self, element: _Element, row: int) -> NoReturn:
+        self.fail(f"truncated: the header promises {element.rows}, but the file ends in number {row}", f"element {element.name}")
 
     def _take(self, kind: str, count: int) -> np.ndarray | None:
         """The next values; None where the file ends before."""

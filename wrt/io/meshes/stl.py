@@ -30,7 +30,7 @@ def read(path: Path) -> RawMesh:
     data = read_file(path)
     groups: tuple[str, ...] = ()
     sizes: list[int] = []
-    if _is_binary(data):
+    if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):  # as its header says
         vertices = np.frombuffer(data, _RECORD, (len(data) - 84) // 50, 84)["corners"].reshape(-1, 3)
     else:
         vertices, groups, sizes = _read_text(utf8(data))
@@ -45,11 +45,6 @@ def read(path: Path) -> RawMesh:
         face_group=np.repeat(np.arange(len(groups)), sizes) if len(groups) > 1 else None,
         positions=len(vertices),
     )
-
-
-def _is_binary(data: bytes) -> bool:
-    """Whether the length is just that of a binary file with as many triangles as the header says."""
-    return len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
 
 
 def _read_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
