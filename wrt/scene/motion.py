@@ -9,6 +9,7 @@ import numpy as np
 
 from wrt.core.checks import as_array, as_one
 from wrt.core.errors import InputError
+from wrt.core.packages import needed_by
 from wrt.scene.mesh import Mesh
 
 
@@ -48,12 +49,14 @@ class Motion:
         """(4, 4) float64 at a time in [0, 1]; the identity without keys."""
         matrix = np.eye(4)
         if self.keys is not None:
+            with needed_by("a motion"):
+                from scipy.spatial.transform import Rotation
+
             place = min(max(time, 0.0), 1.0) * (len(self.keys) - 1)
             first = min(int(place), len(self.keys) - 2)
             share = place - first
             translate, rotate, scale = (1.0 - share) * self.keys[first] + share * self.keys[first + 1]
-            x, y, z = (_turn(axis, angle) for axis, angle in enumerate(np.radians(rotate)))
-            matrix[:3, :3] = z @ y @ x * scale
+            matrix[:3, :3] = Rotation.from_euler("xyz", rotate, degrees=True).as_matrix() * scale
             matrix[:3, 3] = translate
         return matrix
 
@@ -71,10 +74,3 @@ class Motion:
         elif mesh.normals is not None:
             normals = np.zeros_like(mesh.vertices)  # flat, in a scene that has smooth meshes
         return replace(mesh, vertices=vertices, normals=normals)
-
-
-def _turn(axis: int, angle: float) -> np.ndarray:
-    matrix, i, j = np.eye(3), (axis + 1) % 3, (axis + 2) % 3
-    matrix[i, i] = matrix[j, j] = math.cos(angle)
-    matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
-    return matrix
