@@ -97,7 +97,9 @@ LOADERS: dict[str, Callable[[Path], Scene]] = {".toml": _load_toml, ".gltf": _lo
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(utf8(read_file(path)).decode())
+        data = tomllib.loads(utf8(read_file(path)).decode())
+        _require_sound(data)
+        return data
     except InputError as error:
         raise error.at(path) from error
     except UnicodeDecodeError as error:
@@ -111,6 +113,14 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError(message, path, place) from error
     except ValueError as error:  # Python's int refuses thousands of digits
         raise InputError("holds a number of thousands of digits", path) from error
+
+
+def _require_sound(value: Any) -> None:
+    """Raise InputError for an integer of more than 64 bits, as TOML demands (others cannot deal with thousands of digits)."""
+    for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _require_sound(each)
+    if isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
+        raise InputError("holds an integer of more than 64 bits")
 
 
 def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = ()) -> Scene:
