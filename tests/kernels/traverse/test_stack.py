@@ -14,8 +14,8 @@ from tests.kernel_tools import DEVICE
 from wrt.accel.build import build  # isort: skip (starts Warp)
 import warp as wp
 
+from tests.placed import place
 from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import place
 from wrt.core.cuda import STACKS
 from wrt.core.device import launch_on
 from wrt.kernels.structs import kernel

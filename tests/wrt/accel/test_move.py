@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.placed import place
 from tests.wrt.accel.test_threads import at_a_time
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry, place
+from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
 from wrt.accel.instances import Instances
 from wrt.core.errors import InputError
 from wrt.scene.materials import Material

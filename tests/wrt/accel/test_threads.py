@@ -13,12 +13,12 @@ import pytest
 import warp as wp
 
 import wrt
+from tests.placed import place
 from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
 from wrt.accel.batches import RAYS_PER_LAUNCH
 from wrt.accel.build import build, load_accel
 from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import place
 from wrt.accel.instances import Instances
 from wrt.accel.store import array_types
 from wrt.accel.structures import ACCELERATORS

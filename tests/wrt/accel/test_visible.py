@@ -10,8 +10,8 @@ import warp as wp
 
 import wrt
 from tests.kernel_tools import DEVICE, cpu_only, vec3s
+from tests.placed import place
 from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import place
 from wrt.core.arrays import to_numpy
 from wrt.scene import shapes
 

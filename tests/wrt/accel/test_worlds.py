@@ -11,10 +11,10 @@ import warp as wp
 
 import wrt
 from tests.kernel_tools import DEVICE
+from tests.placed import place
 from tests.wrt.accel.test_move import matrices
 from tests.wrt.core.test_arrays import Library, OnDevice
 from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import place
 from wrt.accel.instances import Instances
 from wrt.core.arrays import to_numpy
 from wrt.scene.materials import Material
