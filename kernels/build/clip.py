@@ -81,6 +81,25 @@ def cut_by_plane(polygon: wp.array(dtype=wp.vec3d), n: int, clipped: wp.array(dt
 
 
 @wp.func
+def clip_triangle(polygon: wp.array(dtype=wp.vec3d), clipped: wp.array(dtype=wp.vec3d), lo: wp.vec3d, hi: wp.vec3d) -> int:
+    """The part in the box lo, hi of the triangle that `polygon` begins with, in `polygon`; how many corners that has: MAX_CORNERS
+    where it is not finished, as there may be more. clipped: room."""
+    low = wp.min(wp.min(polygon[0], polygon[1]), polygon[2])
+    high = wp.max(wp.max(polygon[0], polygon[1]), polygon[2])
+    n = int(3)
+    planes = int(6)
+    for plane in range(planes):
+        axis = plane / 2
+        sign = wp.where(plane % 2 == 0, wp.float64(1.0), wp.float64(-1.0))
+        wall = wp.where(plane % 2 == 0, lo[axis], hi[axis])
+        if wp.where(plane % 2 == 0, low[axis] < wall, high[axis] > wall):
+            n = cut_by_plane(polygon, n, clipped, axis, sign, wall)
+            if n == 0 or n == wp.static(MAX_CORNERS):
+                return n
+    return n
+
+
+@wp.func
 def clip_to_cell(shapes: Clippable, prim_id: int, cell_lo: wp.vec3, cell_hi: wp.vec3) -> Box:
     """The box of what of the primitive is in the cell, larger by its margin and within the cell; or an empty box."""
     if shapes.exact[prim_id] == wp.uint8(0):
@@ -90,32 +109,24 @@ def clip_to_cell(shapes: Clippable, prim_id: int, cell_lo: wp.vec3, cell_hi: wp.
     face = shapes.faces[prim_id]
     for i in range(3):
         polygon[i] = wp.vec3d(shapes.vertices[face[i]])
-    lo = wp.min(wp.min(polygon[0], polygon[1]), polygon[2])
-    hi = wp.max(wp.max(polygon[0], polygon[1]), polygon[2])
-    e = hi - lo
+    e = wp.max(wp.max(polygon[0], polygon[1]), polygon[2]) - wp.min(wp.min(polygon[0], polygon[1]), polygon[2])
     pad = CLIP_EXTENT * wp.max(wp.max(e[0], e[1]), e[2])
-    n = int(3)
-    planes = int(6)
-    for plane in range(planes):
-        axis = plane / 2
-        sign = wp.where(plane % 2 == 0, wp.float64(1.0), wp.float64(-1.0))
-        wall = wp.float64(wp.where(plane % 2 == 0, cell_lo[axis], cell_hi[axis]))
-        wall = wall - sign * (pad + CLIP_COORDINATE * wp.abs(wall))
-        outside = wp.where(plane % 2 == 0, lo[axis] < wall, hi[axis] > wall)
-        if outside:
-            n = cut_by_plane(polygon, n, clipped, axis, sign, wall)
-            if n == 0:
-                return empty_box()
-            if n == wp.static(MAX_CORNERS):  # there may have been more
-                return within_cell(shapes.lo[prim_id], shapes.hi[prim_id], cell_lo, cell_hi)
-            lo = polygon[0]
-            hi = polygon[0]
-            for i in range(n):
-                lo = wp.min(lo, polygon[i])
-                hi = wp.max(hi, polygon[i])
     margin = wp.vec3d(pad, pad, pad)
-    lo = lo - margin - CLIP_COORDINATE * wp.vec3d(wp.abs(lo[0]), wp.abs(lo[1]), wp.abs(lo[2]))
-    hi = hi + margin + CLIP_COORDINATE * wp.vec3d(wp.abs(hi[0]), wp.abs(hi[1]), wp.abs(hi[2]))
+    low = wp.vec3d(cell_lo)
+    high = wp.vec3d(cell_hi)
+    n = clip_triangle(polygon, clipped, low - (margin + CLIP_COORDINATE * wp.abs(low)),
+                      high + (margin + CLIP_COORDINATE * wp.abs(high)))
+    if n == 0:
+        return empty_box()
+    if n == wp.static(MAX_CORNERS):
+        return within_cell(shapes.lo[prim_id], shapes.hi[prim_id], cell_lo, cell_hi)
+    lo = polygon[0]
+    hi = polygon[0]
+    for i in range(n):
+        lo = wp.min(lo, polygon[i])
+        hi = wp.max(hi, polygon[i])
+    lo = lo - margin - CLIP_COORDINATE * wp.abs(lo)
+    hi = hi + margin + CLIP_COORDINATE * wp.abs(hi)
     return within_cell(wp.vec3(lo), wp.vec3(hi), cell_lo, cell_hi)
 
 

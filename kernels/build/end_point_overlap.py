@@ -7,7 +7,7 @@ boxes is found by clipping it to them, in float64.
 
 import warp as wp
 
-from wrt.kernels.build.clip import MAX_CORNERS, cut_by_plane
+from wrt.kernels.build.clip import MAX_CORNERS, clip_triangle
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import STACK_SIZE
 
@@ -45,16 +45,9 @@ def area_inside(triangle: Corners, lo: wp.vec3d, hi: wp.vec3d) -> wp.float64:
     polygon[0] = triangle.v0
     polygon[1] = triangle.v1
     polygon[2] = triangle.v2
-    n = int(3)
-    planes = int(6)
-    for plane in range(planes):
-        axis = plane / 2
-        sign = wp.where(plane % 2 == 0, wp.float64(1.0), wp.float64(-1.0))
-        wall = wp.where(plane % 2 == 0, lo[axis], hi[axis])
-        if wp.where(plane % 2 == 0, low[axis] < wall, high[axis] > wall):
-            n = cut_by_plane(polygon, n, clipped, axis, sign, wall)
-            if n == 0:
-                return wp.float64(-1.0)
+    n = clip_triangle(polygon, clipped, lo, hi)
+    if n == 0:
+        return wp.float64(-1.0)
     doubled = wp.vec3d()
     for i in range(1, n - 1):
         doubled = doubled + wp.cross(polygon[i] - polygon[0], polygon[i + 1] - polygon[0])

@@ -8,20 +8,7 @@ import warp as wp
 
 from wrt.kernels.build.triangle_cell import CellSource, TriangleCell, meets_cell, triangle_cell
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse.grid import GridCell, GridLayout, grid_plane
-
-
-@wp.func
-def slab_of(layout: GridLayout, axis: int, x: float) -> int:
-    """The lowest slab whose upper plane is not below x; closed slabs, so that a plane is in both."""
-    last = layout.n[axis] - 1
-    guess = (x - layout.lo[axis]) / layout.size[axis]
-    slab = int(wp.where(guess > 0.0, wp.min(guess, float(last)), 0.0))
-    while slab < last and grid_plane(layout, axis, slab + 1) < x:
-        slab += 1
-    while slab > 0 and grid_plane(layout, axis, slab) >= x:
-        slab -= 1
-    return slab
+from wrt.kernels.traverse.grid import GridCell, GridLayout, grid_plane, slab_of
 
 
 @wp.func

@@ -107,10 +107,9 @@ def add_events(events: wp.array(dtype=KdEvent), count: int, lo: wp.vec3, hi: wp.
 @wp.func
 def moved(corner: wp.vec3, split: KdSplit) -> wp.vec3:
     """A corner of the cell, moved into the splitting plane."""
-    x = wp.where(split.axis == 0, split.position, corner[0])
-    y = wp.where(split.axis == 1, split.position, corner[1])
-    z = wp.where(split.axis == 2, split.position, corner[2])
-    return wp.vec3(x, y, z)
+    out = corner
+    out[split.axis] = split.position
+    return out
 
 
 @wp.func

@@ -35,7 +35,7 @@ def middle_of(low: wp.vec3, high: wp.vec3) -> wp.vec3:
 
 @kernel
 def measure(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3)):
-    """The box of every PARTS-th middle, from that of the thread on: ends[2 i], ends[2 i + 1]."""
+    """The box of all middles: ends, which is empty before. A thread looks at every PARTS-th."""
     i = wp.tid()
     a = wp.vec3(wp.inf, wp.inf, wp.inf)
     b = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
@@ -43,20 +43,8 @@ def measure(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: w
         middle = middle_of(low[j], high[j])
         a = wp.min(a, middle)
         b = wp.max(b, middle)
-    ends[2 * i] = a
-    ends[2 * i + 1] = b
-
-
-@kernel
-def join(ends: wp.array(dtype=wp.vec3)):
-    """All of them into the first. One thread."""
-    a = ends[0]
-    b = ends[1]
-    for i in range(1, ends.shape[0] / 2):
-        a = wp.min(a, ends[2 * i])
-        b = wp.max(b, ends[2 * i + 1])
-    ends[0] = a
-    ends[1] = b
+    wp.atomic_min(ends, 0, a)
+    wp.atomic_max(ends, 1, b)
 
 
 @wp.func

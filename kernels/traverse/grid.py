@@ -45,6 +45,24 @@ def grid_plane(layout: GridLayout, axis: int, i: int) -> float:
 
 
 @wp.func
+def guessed_slab(layout: GridLayout, axis: int, x: float) -> int:
+    """About where x is: it only saves time."""
+    guess = (x - layout.lo[axis]) / layout.size[axis]
+    return int(wp.where(guess > 0.0, wp.min(guess, float(layout.n[axis] - 1)), 0.0))
+
+
+@wp.func
+def slab_of(layout: GridLayout, axis: int, x: float) -> int:
+    """The lowest slab whose upper plane is not below x; closed slabs, so that a plane is in both."""
+    slab = guessed_slab(layout, axis, x)
+    while slab < layout.n[axis] - 1 and grid_plane(layout, axis, slab + 1) < x:
+        slab += 1
+    while slab > 0 and grid_plane(layout, axis, slab) >= x:
+        slab -= 1
+    return slab
+
+
+@wp.func
 def exit_distance(layout: GridLayout, ray: BoxRay, axis: int, cell: int) -> float:
     """Where the ray leaves this slab of cells; inf where it is parallel to it."""
     plane = grid_plane(layout, axis, wp.where(ray.inv_dir[axis] < 0.0, cell, cell + 1))
@@ -53,20 +71,11 @@ def exit_distance(layout: GridLayout, ray: BoxRay, axis: int, cell: int) -> floa
 
 @wp.func
 def first_slab(layout: GridLayout, ray: BoxRay, direction: wp.vec3, axis: int, t: float) -> int:
-    """The first slab along the ray that it may not have left at t; where it is parallel, the lowest that holds the origin.
-
-    The guess by division only saves time: the slab is the one that the distances tell.
-    """
+    """The first slab along the ray that it may not have left at t; where it is parallel, the lowest that holds the origin."""
     last = layout.n[axis] - 1
-    origin = ray.origin[axis]
-    guess = (origin + wp.where(parallel(ray, axis), 0.0, t * direction[axis]) - layout.lo[axis]) / layout.size[axis]
-    slab = int(wp.where(guess > 0.0, wp.min(guess, float(last)), 0.0))
     if parallel(ray, axis):
-        while slab < last and grid_plane(layout, axis, slab + 1) < origin:
-            slab += 1
-        while slab > 0 and grid_plane(layout, axis, slab) >= origin:
-            slab -= 1
-        return slab
+        return slab_of(layout, axis, ray.origin[axis])
+    slab = guessed_slab(layout, axis, ray.origin[axis] + t * direction[axis])
     step = wp.where(ray.inv_dir[axis] < 0.0, -1, 1)
     begin = wp.where(step < 0, last, 0)
     while slab != last - begin and later(exit_distance(layout, ray, axis, slab)) < t:

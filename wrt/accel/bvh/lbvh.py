@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from wrt.accel.bvh.refit import Fitting, tree_of
 from wrt.accel.bvh.top_down import build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch_on, on_host, start
+from wrt.core.device import launch_on, on_host, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import lbvh as kernels
 from wrt.kernels.traverse.bvh2 import Bvh2Node
@@ -36,9 +37,8 @@ def build_on(device: Any, shape: Any, options: BvhOptions, threads: int = 1) -> 
     number_bits, bits = kernels.bits_of(n)
     fitting = Fitting(device, n, n - 1)
     fitting.find_bounds(shape, threads)
-    ends = wp.empty(2 * min(kernels.PARTS, n), dtype=wp.vec3, device=device)
-    launch_on(device, kernels.measure, len(ends) // 2, fitting.low, fitting.high, ends)
-    launch_on(device, kernels.join, 1, ends)
+    ends = upload(np.array([[np.inf] * 3, [-np.inf] * 3], np.float32), wp.vec3, device)
+    launch_on(device, kernels.measure, min(kernels.PARTS, n), fitting.low, fitting.high, ends)
     keys, order = wp.empty(2 * n, dtype=wp.uint64, device=device), wp.empty(2 * n, dtype=wp.int32, device=device)
     launch_on(device, kernels.write_keys, n, fitting.low, fitting.high, ends, number_bits, bits, keys, order, None)
     with device.context_guard:  # the sort takes the current one
