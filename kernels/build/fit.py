@@ -172,11 +172,9 @@ def fit(tree: Tree, options: BuildOptions):
 
 @kernel
 def find_parents(nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32)):
-    """A thread a node."""
+    """A thread a node. Of what is nobody's child, nothing is written."""
     i = wp.tid()
     node = nodes[i]
-    if i == 0:
-        parents[i] = NO_PARENT
     if node.count_0 == 0 and node.first_0 > 0:
         parents[node.first_0] = i
     if node.count_1 == 0 and node.first_1 > 0:

@@ -9,7 +9,6 @@ import warp as wp
 
 from wrt.kernels.build.records import BuildOptions, rows_of
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 QUEUE = 96
 QUEUE_SIZE = wp.constant(QUEUE)
@@ -176,11 +175,10 @@ def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), m
 @wp.struct
 class Walk:
     """Room for walks over the tree: order: the nodes, parents first; level: of each node, from 1; count: its records;
-    cost: of its subtree, by the surface area heuristic; index: where it is written."""
+    cost: of its subtree, by the surface area heuristic."""
 
     order: wp.array(dtype=wp.int32)
     level: wp.array(dtype=wp.int32)
-    index: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
     cost: wp.array(dtype=wp.float32)
     depth: wp.array(dtype=wp.int32)
@@ -228,42 +226,3 @@ def weigh(links: wp.array(dtype=Link), walk: Walk, options: BuildOptions, scale:
             if walk.count[i] <= options.max_leaf and not cost < whole and i > 0:
                 walk.cost[i] = whole
                 links[i].left = -2 - link.left
-
-
-@kernel
-def write_nodes(links: wp.array(dtype=Link), walk: Walk, n_inner: int, leaf_of: wp.array(dtype=wp.int32),
-                order: wp.array(dtype=wp.int32), nodes: wp.array(dtype=Bvh2Node), n_nodes: wp.array(dtype=wp.int32)):
-    """The tree as nodes in the order of `walk`, and the records (leaf_of: of the links from n_inner on) in that of the leaves."""
-    inner = int(0)
-    first = int(0)
-    inside = int(0)  # so many more links belong to the leaf that began last
-    for k in range(walk.order.shape[0]):
-        i = walk.order[k]
-        if inside > 0:
-            inside = inside - 1
-            walk.index[i] = -1
-        elif links[i].left >= 0:
-            walk.index[i] = inner
-            inner = inner + 1
-        else:
-            walk.index[i] = first
-            inside = 2 * walk.count[i] - 2
-        if i >= n_inner:
-            order[first] = leaf_of[i - n_inner]
-            first = first + 1
-    n_nodes[0] = inner
-    for i in range(n_inner):
-        link = links[i]
-        if link.left >= 0 and walk.index[i] >= 0:
-            left = links[link.left]
-            right = links[link.right]
-            node = Bvh2Node()
-            node.lo_0 = left.lo
-            node.hi_0 = left.hi
-            node.lo_1 = right.lo
-            node.hi_1 = right.hi
-            node.first_0 = walk.index[link.left]
-            node.first_1 = walk.index[link.right]
-            node.count_0 = wp.where(left.left >= 0, 0, walk.count[link.left])
-            node.count_1 = wp.where(right.left >= 0, 0, walk.count[link.right])
-            nodes[walk.index[i]] = node

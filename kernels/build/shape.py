@@ -1,6 +1,6 @@
 """Triangles and spheres on a device: the box of each, and the records that the watertight triangle test reads.
 
-Both have the bits of what the host makes (Geometry.write_bounds, the layout "corners"), so that a mesh that moves on a GPU need not
+Both have the bits of what the host makes (Geometry.bounds, the layout "corners"), so that a mesh that moves on a GPU need not
 travel to the host and back.
 """
 

@@ -11,32 +11,6 @@ ROUNDS = wp.constant(8)
 ROUND_UP = wp.constant(wp.float64(1.0 + 2.0**-22))
 
 
-@wp.struct
-class Spans:
-    """Of each child: the records order[begin] .. order[end - 1] in its subtree; nodes[i]'s are entries 2 i and 2 i + 1."""
-
-    begin: wp.array(dtype=wp.int32)
-    end: wp.array(dtype=wp.int32)
-
-
-@kernel
-def find_spans(nodes: wp.array(dtype=Bvh2Node), spans: Spans):
-    """Launched with dim = 1. Children stand behind their parents, and the records of a subtree next to each other."""
-    n = nodes.shape[0]
-    for k in range(n):
-        i = n - 1 - k
-        for side in range(2):
-            first = wp.where(side == 0, nodes[i].first_0, nodes[i].first_1)
-            count = wp.where(side == 0, nodes[i].count_0, nodes[i].count_1)
-            lo = wp.where(side == 0, nodes[i].lo_0, nodes[i].lo_1)
-            at = 2 * i + side
-            spans.begin[at] = first
-            spans.end[at] = first + count
-            if count == 0 and lo[0] < wp.inf:
-                spans.begin[at] = wp.min(spans.begin[2 * first], spans.begin[2 * first + 1])
-                spans.end[at] = wp.max(spans.end[2 * first], spans.end[2 * first + 1])
-
-
 @wp.func
 def farthest(lo: wp.vec3, hi: wp.vec3, center: wp.vec3d) -> wp.vec3d:
     """From the center to the corner of a box that is farthest from it."""
@@ -50,9 +24,11 @@ def farthest(lo: wp.vec3, hi: wp.vec3, center: wp.vec3d) -> wp.vec3d:
 
 
 @kernel
-def fit_spheres(nodes: wp.array(dtype=Bvh2Node), spans: Spans, order: wp.array(dtype=wp.int32), lo: wp.array(dtype=wp.vec3),
-                hi: wp.array(dtype=wp.vec3), out: wp.array(dtype=SphereNode), first: int):
-    """Spheres around the boxes lo, hi (by prim_id) below each child of out[first + tid].
+def fit_spheres(nodes: wp.array(dtype=Bvh2Node), begin: wp.array(dtype=wp.int32), end: wp.array(dtype=wp.int32),
+                order: wp.array(dtype=wp.int32), lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3),
+                out: wp.array(dtype=SphereNode), first: int):
+    """Spheres around the boxes lo, hi (by prim_id) below each child of out[first + tid]: of child 2 i + side, the records begin to
+    end - 1.
 
     Badoiu and Clarkson 2003, "Smaller core-sets for balls": from the middle of the box, the center goes a part 1 / (i + 1) of the
     way to the farthest corner, in round i; the best of the rounds counts. The radius is rounded up.
@@ -69,7 +45,7 @@ def fit_spheres(nodes: wp.array(dtype=Bvh2Node), spans: Spans, order: wp.array(d
             for r in range(ROUNDS + 1):
                 way = wp.vec3d()
                 square = wp.float64(-1.0)
-                for k in range(spans.begin[2 * i + side], spans.end[2 * i + side]):
+                for k in range(begin[2 * i + side], end[2 * i + side]):
                     d = farthest(lo[order[k]], hi[order[k]], wp.vec3d(center))
                     if wp.dot(d, d) > square:
                         square = wp.dot(d, d)
@@ -85,7 +61,7 @@ def fit_spheres(nodes: wp.array(dtype=Bvh2Node), spans: Spans, order: wp.array(d
 
 
 @kernel
-def fit_kdops(spans: Spans, order: wp.array(dtype=wp.int32), cut_lo: wp.array(dtype=wp.vec4), cut_hi: wp.array(dtype=wp.vec4),
+def fit_kdops(order: wp.array(dtype=wp.int32), cut_lo: wp.array(dtype=wp.vec4), cut_hi: wp.array(dtype=wp.vec4),
               out: wp.array(dtype=KdopNode)):
     """Launched with dim = 1. Planes askew around those of the primitives (cut_lo, cut_hi, by prim_id), from the leaves up.
 
@@ -99,7 +75,7 @@ def fit_kdops(spans: Spans, order: wp.array(dtype=wp.int32), cut_lo: wp.array(dt
             count = wp.where(side == 0, out[i].count_0, out[i].count_1)
             low = wp.vec4(wp.inf, wp.inf, wp.inf, wp.inf)
             high = wp.vec4(-wp.inf, -wp.inf, -wp.inf, -wp.inf)
-            if count == 0 and spans.end[2 * i + side] > spans.begin[2 * i + side]:
+            if count == 0 and wp.where(side == 0, out[i].lo_0, out[i].lo_1)[0] < wp.inf:
                 low = wp.min(out[first].cut_lo_0, out[first].cut_lo_1)
                 high = wp.max(out[first].cut_hi_0, out[first].cut_hi_1)
             for j in range(first, first + count):

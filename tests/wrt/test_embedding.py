@@ -15,7 +15,7 @@ import warp as wp
 
 import wrt
 from tests.data import ROOT
-from wrt.kernels.build.volumes import find_spans
+from wrt.kernels.build.volumes import fit_kdops
 from wrt.scene.shapes import icosphere
 
 SCENE = ROOT / "scenes" / "whitted.toml"
@@ -62,7 +62,7 @@ def test_debug_mode_is_for_kernels_of_the_user(decorator: Any, monkeypatch: pyte
 
     monkeypatch.setattr(wp.config, "mode", "debug")
     assert mine.module.resolve_options(wp.config)["mode"] == "debug"
-    assert find_spans.module.resolve_options(wp.config)["mode"] == "release"
+    assert fit_kdops.module.resolve_options(wp.config)["mode"] == "release"
 
 
 @pytest.mark.parametrize("kib", [64, 512])

@@ -69,18 +69,14 @@ class Geometry:
         """What a structure goes on using: with nothing that others write to."""
         return self
 
-    def bounds(self, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of every primitive's padded box, two (N, 3) float32."""
-        lo, hi = (np.empty((len(self), 3), np.float32) for _ in range(2))
-        self.write_bounds(lo, hi, threads)
-        return lo, hi
-
-    def write_bounds(self, lo: np.ndarray, hi: np.ndarray, threads: int = 1) -> None:
-        """The same into arrays that there are, (N, 3) float32.
+    def bounds(self, threads: int = 1, out: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of every primitive's padded box, two (N, 3) float32; out: arrays that take them.
 
         To the last bit what the units take (kernels.units.triangle.within_bounds): a hit is never outside its box. Around a
         triangle with a corner that is not finite, all of space, as kernels.build.shape has it.
         """
+        lo, hi = out or (np.empty((len(self), 3), np.float32) for _ in range(2))
+
         def fill(first: int) -> None:
             some, n = slice(first, first + RECORDS_PER_JOB), len(self.faces)
             corners = [self.vertices.take(self.faces[some, i], axis=0) for i in range(3)]
@@ -97,6 +93,7 @@ class Geometry:
                 lo[some][nowhere], hi[some][nowhere] = -np.inf, np.inf
 
         run_all([partial(fill, first) for first in range(0, len(self), RECORDS_PER_JOB)], threads)
+        return lo, hi
 
     def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
         """What the triangle test of `units` reads, in the given order of prim_id, or in their own."""

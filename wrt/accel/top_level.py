@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.base import Accelerator
-from wrt.accel.bvh.top_down import build_options, in_order
+from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
+from wrt.accel.bvh.top_down import build_data, build_options, in_order
 from wrt.accel.bvh.tree import BvhOptions, half_areas, squeeze
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.kernels.build import bvh2 as build_bvh2
-from wrt.kernels.build import fit
-from wrt.kernels.build.records import BuildData, BuildOptions, BuildTask
+from wrt.kernels.build.records import BuildTask
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.units.box import PAD_COORDINATE
@@ -69,10 +68,7 @@ def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) ->
     """low, high: of each instance's box."""
     first = geometry.first_instance
     nodes, order, roots, depth = split_worlds(low, high, first)
-    parents = np.full(len(nodes), fit.NO_PARENT, np.int32)
-    for side in "01":
-        inner = np.flatnonzero((nodes["count_" + side] == 0) & (nodes["first_" + side] > 0))
-        parents[nodes["first_" + side][inner]] = inner
+    parents = parents_of(upload(nodes, Bvh2Node, start("cpu"))).numpy()
     rows = np.arange(len(order))
     top = TopLevel(nodes, roots, parents, order, depth, low, high, np.empty(len(order)), records(Placement, len(order)))
     return write_placements(top, geometry, rows)
@@ -93,10 +89,7 @@ def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[
         nodes[name][slot[alone]] = value
     tasks = records(BuildTask, len(many))
     tasks["begin"], tasks["end"], tasks["slot"], tasks["parent"] = first[many], first[many + 1], slot[many], -1
-    data: Any = BuildData()
-    arrays = {"records": in_order(low, high), "nodes": nodes, "used": used}
-    for name, array in arrays.items():
-        setattr(data, name, upload(array, data._cls.vars[name].type.dtype, cpu))
+    data = build_data(records=in_order(low, high), nodes=nodes, used=used)
     depth, none = wp.zeros(1, dtype=wp.int32, device=cpu), wp.zeros(1, dtype=wp.int32, device=cpu)
     launch(build_bvh2.make_build_ranges(build_bvh2.SPLIT["binned"]), len(tasks), data, upload(tasks, BuildTask, cpu),
            build_options(BvhOptions(max_leaf=1)), 0, wp.empty(1, dtype=BuildTask, device=cpu), none, depth)
@@ -126,16 +119,13 @@ def spread_of(to_world: np.ndarray, to_local: np.ndarray) -> np.ndarray:
 
 def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> TopLevel:
     """The same trees where those instances, no row twice, have moved; low, high: their boxes."""
-    cpu, tree, options = start("cpu"), fit.Tree(), BuildOptions()
+    cpu, fitting = start("cpu"), Fitting(start("cpu"), len(top.order), len(top.nodes))
     all_low, all_high = top.low.copy(), top.high.copy()
     all_low[rows], all_high[rows] = low, high
-    options.row = 1
-    tree.nodes, tree.parents = upload(top.nodes.copy(), Bvh2Node, cpu), upload(top.parents, wp.int32, cpu)
-    tree.order = upload(top.order, wp.int32, cpu)
-    tree.low, tree.high = upload(all_low, wp.vec3, cpu), upload(all_high, wp.vec3, cpu)
-    tree.arrived = wp.zeros(len(top.nodes), dtype=wp.int32, device=cpu)
-    tree.below = wp.empty(len(top.nodes), dtype=fit.Below, device=cpu)
-    launch(fit.fit, len(top.nodes), tree, options)
+    fitting.low, fitting.high = upload(all_low, wp.vec3, cpu), upload(all_high, wp.vec3, cpu)
+    tree = tree_of(fitting, upload(top.nodes.copy(), Bvh2Node, cpu), upload(top.parents, wp.int32, cpu),
+                   upload(top.order, wp.int32, cpu))
+    fitting.fit(tree)
     return write_placements(replace(top, nodes=on_host(tree.nodes), low=all_low, high=all_high), geometry, rows)
 
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from wrt.accel.bvh.tree import half_areas
-from wrt.accel.geometry import Geometry
-from wrt.core.device import launch_on, on_host, start, upload
+from wrt.core.device import launch_on, on_host
 from wrt.kernels.build import fit as kernels
 from wrt.kernels.build.records import BuildOptions
 from wrt.kernels.build.shape import bounds
-from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 PRIMITIVES_PER_JOB = 32768
 
@@ -44,16 +41,18 @@ class Fitting:
         """Of each primitive of a kernels.build.shape.Shape."""
         launch_on(self.device, bounds, self.primitives, shape, self.low, self.high, None, threads=threads, step=PRIMITIVES_PER_JOB)
 
-    def fit(self, tree: Any, options: Any) -> None:
+    def fit(self, tree: Any, options: Any = None) -> None:
+        """options: None: no subtree becomes a leaf."""
+        if options is None:
+            options = BuildOptions()
+            options.row = 1
         launch_on(self.device, kernels.fit, self.nodes, tree, options)
 
     def refit(self, tree: Any, shape: Any, threads: int = 1) -> None:
         """Only the boxes change. Boxes of spatial splits become those of the whole triangles. On a GPU two launches and nothing
         else: a graph can capture them."""
         self.find_bounds(shape, threads)
-        options = BuildOptions()
-        options.row = 1
-        self.fit(tree, options)
+        self.fit(tree)
 
     def root(self) -> Root:
         """Of the tree that was fitted last."""
@@ -72,17 +71,7 @@ def tree_of(fitting: Fitting, nodes: Any, parents: Any, order: Any) -> Any:
 
 
 def parents_of(nodes: Any) -> Any:
-    """Of each of Bvh2Node records on a device, there."""
-    parents = wp.empty(len(nodes), dtype=wp.int32, device=nodes.device)
+    """Of each of Bvh2Node records on a device, there; kernels.build.fit.NO_PARENT of a root."""
+    parents = wp.full(len(nodes), kernels.NO_PARENT, dtype=wp.int32, device=nodes.device)
     launch_on(nodes.device, kernels.find_parents, len(nodes), nodes, parents)
     return parents
-
-
-def refit_nodes(nodes: np.ndarray, order: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Copies of Bvh2Node records whose boxes fit the geometry as it is now; order: (R,) int32, the prim_id of each primitive that
-    the leaves name."""
-    cpu = start("cpu")
-    there = upload(nodes.copy(), Bvh2Node, cpu)
-    fitting = Fitting(cpu, len(geometry), len(nodes))
-    fitting.refit(tree_of(fitting, there, parents_of(there), upload(order.copy(), wp.int32, cpu)), geometry.on(cpu))
-    return on_host(there).copy()

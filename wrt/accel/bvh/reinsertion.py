@@ -87,8 +87,7 @@ def links_of(tree: BinaryTree) -> np.ndarray:
 
 def half_areas(links: np.ndarray, scale: np.float32) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
-        e = (np.float32(0.5) * links["hi"] - np.float32(0.5) * links["lo"]) * scale
-        return e[:, 0] * e[:, 1] + e[:, 1] * e[:, 2] + e[:, 2] * e[:, 0]
+        return np.asarray(kernels.area_of.func(links["lo"].T, links["hi"].T, scale))
 
 
 def scale_of(links: np.ndarray) -> np.float32:
@@ -149,7 +148,7 @@ def largest(links: np.ndarray, areas: np.ndarray, share: float) -> np.ndarray:
 def walk_down(links: Any) -> Any:
     cpu = start("cpu")
     walk = kernels.Walk()
-    for name in ("order", "level", "index", "count"):
+    for name in ("order", "level", "count"):
         setattr(walk, name, wp.empty(len(links), dtype=wp.int32, device=cpu))
     walk.cost = wp.empty(len(links), dtype=wp.float32, device=cpu)
     walk.depth = wp.zeros(1, dtype=wp.int32, device=cpu)
@@ -160,29 +159,36 @@ def walk_down(links: Any) -> Any:
 def with_leaves(tree: BinaryTree, links: np.ndarray, walk: Any) -> BinaryTree:
     """The links as a tree, with the leaves of the one that they were made of."""
     n_inner, order = len(tree.nodes), walk.order.numpy()
-    inner = order[order < n_inner]
     begins, counts = np.zeros((2, len(links)), np.int32)
-    begins[inner] = np.arange(n_inner)
     begins[n_inner:] = np.flatnonzero(leaf_begins(tree))
     counts[n_inner:] = np.diff(begins[n_inner:], append=len(tree.order))
-    nodes, boxes = records(Bvh2Node, n_inner), np.concatenate([links["lo"], links["hi"]], axis=1)
+    return BinaryTree(nodes_of(links, order[order < n_inner], begins, counts), tree.order, int(walk.depth.numpy()[0]))
+
+
+def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Bvh2Node records of inner links, parents first; begins, counts: of each link that is a leaf, its first record and how many
+    there are."""
+    nodes, boxes = records(Bvh2Node, len(inner)), np.concatenate([links["lo"], links["hi"]], axis=1)
+    begins[inner], counts[inner] = np.arange(len(inner)), 0
     for side, name in (("0", "left"), ("1", "right")):
         child = links[name][inner]
         box = boxes.take(child, axis=0)
         nodes["lo_" + side], nodes["hi_" + side] = box[:, :3], box[:, 3:]
         nodes["first_" + side], nodes["count_" + side] = begins[child], counts[child]
-    return BinaryTree(nodes, tree.order, int(walk.depth.numpy()[0]))
+    return nodes
 
 
 def collapse(tree: BinaryTree, links: Any, walk: Any, options: BvhOptions) -> BinaryTree:
     """Subtrees become leaves wherever that costs no more; the depth is that of what is left. tree: with one record a leaf."""
-    cpu = start("cpu")
-    n_inner = len(tree.nodes)
     launch(kernels.weigh, 1, links, walk, build_options(options), scale_of(on_host(links)))
-    order = wp.empty(len(tree.order), dtype=wp.int32, device=cpu)
-    nodes = wp.empty(n_inner, dtype=Bvh2Node, device=cpu)
-    count = wp.zeros(1, dtype=wp.int32, device=cpu)
-    launch(kernels.write_nodes, 1, links, walk, n_inner, upload(tree.order, wp.int32, cpu), order, nodes, count)
-    inner = (walk.index.numpy()[:n_inner] >= 0) & (on_host(links)["left"][:n_inner] >= 0)
-    depth = int(walk.level.numpy()[:n_inner][inner].max())
-    return BinaryTree(on_host(nodes)[: int(count.numpy()[0])].copy(), order.numpy(), depth)
+    rows, order, counts = on_host(links), walk.order.numpy(), walk.count.numpy().copy()
+    # The links below one, 2 count - 2 of them, come next in the walk: of a leaf, they are inside it.
+    leaf, after = rows["left"][order] < 0, np.arange(1, len(order) + 1)
+    change = np.bincount(after[leaf], minlength=len(order) + 1)
+    inside = np.cumsum(change - np.bincount((after + 2 * counts[order] - 2)[leaf], minlength=len(order) + 1))[:-1] > 0
+    inner, leaves = order[~leaf & ~inside], order[leaf & ~inside]
+    begins = np.zeros(len(rows), np.int32)
+    begins[leaves] = np.cumsum(counts[leaves]) - counts[leaves]
+    n_inner = len(tree.nodes)
+    return BinaryTree(nodes_of(rows, inner, begins, counts), tree.order[order[order >= n_inner] - n_inner],
+                      int(walk.level.numpy()[inner].max()))

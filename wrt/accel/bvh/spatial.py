@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import warp as wp
 
-from wrt.accel.bvh.top_down import build_options, in_order, run_tasks
+from wrt.accel.bvh.top_down import build_data, build_options, in_order, run_tasks
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.accel.geometry import Geometry
-from wrt.core.device import on_host, records, start, upload
+from wrt.core.device import on_host, records
 from wrt.core.errors import InputError
 from wrt.kernels.build import records as build_records
 from wrt.kernels.build.bvh2 import make_build_ranges
@@ -25,7 +24,6 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
     """
     if options.split_budget > MAX_BUDGET:
         raise InputError(f"split_budget must be at most {MAX_BUDGET:g}, got {options.split_budget}")
-    cpu = start("cpu")
     lo, hi = geometry.bounds(threads)
     n = len(lo)
     if n <= 1:
@@ -33,12 +31,9 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
     room = n + int(options.split_budget * n)
     build = records(build_records.BuildRecord, room)
     build[:n] = in_order(lo, hi)
-    data = build_records.BuildData()
-    data.records = upload(build, build_records.BuildRecord, cpu)
-    data.boxes = wp.empty(room, dtype=build_records.BuildRecord, device=cpu)
-    data.nodes = upload(records(Bvh2Node, room - 1), Bvh2Node, cpu)
-    data.used = wp.zeros(room - 1, dtype=wp.uint8, device=cpu)
-    data.left = wp.zeros(room, dtype=wp.uint8, device=cpu)
+    data = build_data(records=build, boxes=records(build_records.BuildRecord, room), nodes=records(Bvh2Node, room - 1),
+                      used=np.zeros(room - 1, np.uint8), left=np.zeros(room, np.uint8),
+                      corners=geometry.vertices[geometry.faces].reshape(-1, 3))
     with np.errstate(over="ignore", invalid="ignore"):
         half = 0.5 * (hi.max(axis=0).astype(np.float64) - lo.min(axis=0))
         data.scale = 1.0 / max(half.max(), 2.0**-126)
@@ -46,7 +41,6 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
         area = options.split_alpha * (x * y + y * z + z * x)
     # Where a scene has no end there is no split that is worth it.
     data.min_overlap = min(area, 3e38) if np.isfinite(area) else 3e38
-    data.corners = upload(geometry.vertices[geometry.faces].reshape(-1, 3), wp.vec3, cpu)
     depth = run_tasks(make_build_ranges(split_references, take_room), data, build_options(options), n, threads, room)
     return compact(data, depth)
 

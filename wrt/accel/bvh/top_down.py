@@ -14,6 +14,7 @@ from wrt.core.device import load_kernel, on_host, records, start, upload
 from wrt.core.threads import run_growing
 from wrt.kernels.build import bvh2 as build_bvh2
 from wrt.kernels.build import records as build_records
+from wrt.kernels.structs import fields_of
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 
@@ -42,28 +43,31 @@ def primitive_records(geometry: Geometry, threads: int) -> np.ndarray:
     """BuildRecords of all primitives."""
     build = records(build_records.BuildRecord, len(geometry))
     build["prim_id"] = np.arange(len(geometry))
-    geometry.write_bounds(build["lo"], build["hi"], threads)
+    geometry.bounds(threads, out=(build["lo"], build["hi"]))
     return build
 
 
-def in_order(lo: np.ndarray, hi: np.ndarray, order: np.ndarray | None = None) -> np.ndarray:
-    """BuildRecords of the boxes lo, hi (N, 3) float32 in the given order of prim_id, or in their own."""
+def in_order(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """BuildRecords of the boxes lo, hi (N, 3) float32, in the order of prim_id."""
     build = records(build_records.BuildRecord, len(lo))
-    build["prim_id"] = np.arange(len(lo)) if order is None else order
-    build["lo"], build["hi"] = (lo, hi) if order is None else (lo[order], hi[order])
+    build["prim_id"], build["lo"], build["hi"] = np.arange(len(lo)), lo, hi
     return build
+
+
+def build_data(**arrays: np.ndarray) -> Any:
+    """kernels.build.records.BuildData with these of its arrays."""
+    data: Any = build_records.BuildData()
+    for name, array in arrays.items():
+        setattr(data, name, upload(array, fields_of(build_records.BuildData)[name].type.dtype, start("cpu")))
+    return data
 
 
 def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: int, **arrays: np.ndarray) -> BinaryTree:
     """Run a builder of kernels.build.bvh2 over BuildRecords; arrays: the other fields of BuildData that it reads."""
-    cpu = start("cpu")
     n = len(build)
     if n <= 1:
         return small_tree(build["lo"], build["hi"])
-    data: Any = build_records.BuildData()
-    arrays |= {"records": build, "nodes": records(Bvh2Node, n - 1), "used": np.zeros(n - 1, np.uint8)}
-    for name, array in arrays.items():
-        setattr(data, name, upload(array, data._cls.vars[name].type.dtype, cpu))
+    data = build_data(records=build, nodes=records(Bvh2Node, n - 1), used=np.zeros(n - 1, np.uint8), **arrays)
     depth = run_tasks(build_bvh2.make_build_ranges(build_bvh2.SPLIT[builder]), data, build_options(options), n, threads)
     return BinaryTree(squeeze(on_host(data.nodes), data.used.numpy() != 0), on_host(data.records)["prim_id"].copy(), depth)
 

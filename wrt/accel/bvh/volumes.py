@@ -10,7 +10,7 @@ import warp as wp
 from wrt.accel.built import Built
 from wrt.accel.bvh.binary import BinaryBvh
 from wrt.accel.bvh.kdop_area import kdop_areas
-from wrt.accel.bvh.refit import refit_nodes
+from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.bvh.tree import expected_cost, root_area
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import check_links
@@ -44,8 +44,7 @@ class Bvh2Sphere(BinaryBvh):
         check_links(nodes, empty, len(built.order), self.kernels.STACK_SIZE)
 
     def _refit(self, built: Built) -> Built:
-        there = [built.arrays["nodes"][f"sphere_{side}"][:, 3] >= 0.0 for side in "01"]
-        return self._around(boxes_around(built, there, self.geometry), built.order, built.leaves, built.depth)
+        return self._around(boxes_around(built, self.geometry), built.order, built.leaves, built.depth)
 
 
 class Bvh2Kdop(BinaryBvh):
@@ -65,19 +64,16 @@ class Bvh2Kdop(BinaryBvh):
                      cost_of(nodes, kdop_areas(kdops, middle)))
 
     def _refit(self, built: Built) -> Built:
-        there = [built.arrays["nodes"][f"lo_{side}"][:, 0] < np.inf for side in "01"]
-        return self._around(boxes_around(built, there, self.geometry), built.order, built.leaves, built.depth)
+        return self._around(boxes_around(built, self.geometry), built.order, built.leaves, built.depth)
 
 
-def boxes_around(built: Built, there: list[np.ndarray], geometry: Geometry) -> np.ndarray:
-    """Bvh2Node records with the links of other nodes, and boxes that fit the geometry; there: which children exist."""
-    nodes = records(Bvh2Node, len(built.arrays["nodes"]))
-    for name in LINKS:
-        nodes[name] = built.arrays["nodes"][name]
-    for side, exists in zip("01", there, strict=True):
-        nodes[f"lo_{side}"] = np.where(exists[:, None], 0.0, np.inf)
-        nodes[f"hi_{side}"] = np.where(exists[:, None], 0.0, -np.inf)
-    return refit_nodes(nodes, built.order, geometry)
+def boxes_around(built: Built, geometry: Geometry) -> np.ndarray:
+    """Bvh2Node records with the links of other nodes, and boxes that fit the geometry: empty where a child is none."""
+    cpu = start("cpu")
+    nodes = upload(with_links(Bvh2Node, built.arrays["nodes"], LINKS), Bvh2Node, cpu)
+    fitting = Fitting(cpu, len(geometry), len(nodes))
+    fitting.refit(tree_of(fitting, nodes, parents_of(nodes), upload(built.order.copy(), wp.int32, cpu)), geometry.on(cpu))
+    return on_host(nodes).copy()
 
 
 def cost_of(nodes: np.ndarray, areas: np.ndarray) -> float:
@@ -86,22 +82,24 @@ def cost_of(nodes: np.ndarray, areas: np.ndarray) -> float:
     return expected_cost(2.0 * root_area(nodes), areas, np.stack([nodes["count_0"], nodes["count_1"]]))
 
 
-def spans_of(nodes: np.ndarray) -> Any:
-    """fits.Spans of Bvh2Node records."""
-    cpu = start("cpu")
-    spans = fits.Spans()
-    spans.begin = wp.empty(2 * len(nodes), dtype=wp.int32, device=cpu)
-    spans.end = wp.empty(2 * len(nodes), dtype=wp.int32, device=cpu)
-    launch(fits.find_spans, 1, upload(nodes, Bvh2Node, cpu), spans)
-    return spans
+def spans_of(nodes: np.ndarray) -> list[np.ndarray]:
+    """begin, end: of each child of Bvh2Node records (of node i: 2 i and 2 i + 1), the records in its subtree, which stand next to
+    each other."""
+    first, count = (np.stack([nodes[f"{what}_0"], nodes[f"{what}_1"]], axis=1).reshape(-1) for what in ("first", "count"))
+    ends = []
+    for side in range(2):
+        at = np.arange(len(first))  # goes down to the first or the last leaf
+        while (inner := np.flatnonzero((count[at] == 0) & (first[at] > 0))).size:
+            at[inner] = 2 * first[at[inner]] + side
+        ends.append(first[at] + side * count[at])
+    return [ends[0], ends[1]]
 
 
-def with_links(struct: Any, nodes: np.ndarray) -> np.ndarray:
-    """Records of another kind of node with what they share with Bvh2Node records."""
+def with_links(struct: Any, nodes: np.ndarray, names: tuple[str, ...] | None = None) -> np.ndarray:
+    """Records of another kind of node with what they share with these, or with these of their fields."""
     out = records(struct, len(nodes))
-    for name in out.dtype.names or ():
-        if name in (nodes.dtype.names or ()):
-            out[name] = nodes[name]
+    for name in names or set(out.dtype.names or ()) & set(nodes.dtype.names or ()):
+        out[name] = nodes[name]
     return out
 
 
@@ -110,8 +108,9 @@ def fit_spheres(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, thread
     cpu = start("cpu")
     lo, hi = geometry.bounds()
     out = upload(with_links(traverse_bvh2_sphere.SphereNode, nodes), traverse_bvh2_sphere.SphereNode, cpu)
-    launch(fits.fit_spheres, len(nodes), upload(nodes, Bvh2Node, cpu), spans_of(nodes), upload(order.copy(), wp.int32, cpu),
-           upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu), out, None, threads=threads, step=NODES_PER_LAUNCH)
+    launch(fits.fit_spheres, len(nodes), upload(nodes, Bvh2Node, cpu), *(upload(each, wp.int32, cpu) for each in spans_of(nodes)),
+           upload(order.copy(), wp.int32, cpu), upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu), out, None, threads=threads,
+           step=NODES_PER_LAUNCH)
     return on_host(out)
 
 
@@ -152,6 +151,5 @@ def fit_kdops(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, middle: 
     cpu = start("cpu")
     cut_lo, cut_hi = cuts(geometry, middle)
     out = upload(with_links(traverse_bvh2_kdop.KdopNode, nodes), traverse_bvh2_kdop.KdopNode, cpu)
-    launch(fits.fit_kdops, 1, spans_of(nodes), upload(order.copy(), wp.int32, cpu), upload(cut_lo, wp.vec4, cpu),
-           upload(cut_hi, wp.vec4, cpu), out)
+    launch(fits.fit_kdops, 1, upload(order.copy(), wp.int32, cpu), upload(cut_lo, wp.vec4, cpu), upload(cut_hi, wp.vec4, cpu), out)
     return on_host(out)

@@ -7,7 +7,7 @@ import pytest
 
 from wrt.accel.build import build
 from wrt.accel.bvh.builders import BVH_BUILDERS
-from wrt.accel.bvh.refit import refit_nodes
+from wrt.accel.bvh.volumes import boxes_around
 from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere
@@ -100,5 +100,5 @@ def test_nodes_are_copies() -> None:
     accel = build(BALL, "bvh2")
     nodes = accel.built.arrays["nodes"]
     before = nodes.copy()
-    refit_nodes(nodes, accel.built.order, Geometry(2 * BALL.vertices, BALL.faces, np.zeros((0, 4), np.float32)))
+    boxes_around(accel.built, Geometry(2 * BALL.vertices, BALL.faces, np.zeros((0, 4), np.float32)))
     np.testing.assert_array_equal(nodes["lo_0"], before["lo_0"])
