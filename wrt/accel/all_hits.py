@@ -14,11 +14,11 @@ from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
 from wrt.accel.batches import RAYS_PER_LAUNCH
 from wrt.accel.hit_points import surroundings
-from wrt.accel.ray_query import require_one_mesh
+from wrt.accel.ray_query import structure_of
 from wrt.accel.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
 from wrt.core.arrays import returned, to_numpy, to_warp
-from wrt.core.checks import as_integer, as_one, shown
+from wrt.core.checks import as_integer, as_one
 from wrt.core.device import MOST_ROWS, launch_on, made_once, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -68,8 +68,7 @@ class Asked:
     give: Any = to_numpy  # what answers become, which are Warp's
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
-        self.structure = require_one_mesh(getattr(accel, "structure", None),
-                                          f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
+        self.structure = structure_of(accel)
         self.threads, self.device, self.state = thread_count(threads), accel.device, accel._state
         self.lists: Any = HitLists()
         self.lists.crossings = as_one(crossings, bool, "crossings")

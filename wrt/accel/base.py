@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -21,7 +22,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries import Queries
 from wrt.accel.ray_query import world_of
 from wrt.accel.rays import vectors
-from wrt.accel.store import check_order, pickled, save
+from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, check_options, check_units
 from wrt.core.arrays import check_no_gradients, taken
 from wrt.core.device import start, upload
@@ -49,7 +50,7 @@ class Accelerator(Queries, ABC):
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
                  box: str = "conservative", **options: Any) -> None:
-        self._begin(geometry, device, threads, triangle, box)
+        self._begin(type(self), geometry, device, threads, Units(triangle, box))
         check_options(self.name, self._build, options)
         self._options = options
         begin = build_clock()
@@ -61,7 +62,7 @@ class Accelerator(Queries, ABC):
                 triangle: str = "watertight", box: str = "conservative") -> Accelerator:
         """What was built before over the same geometry. Raises InputError where `built` is no such structure."""
         self = cls.__new__(cls)
-        self._begin(geometry, device, threads, triangle, box)
+        self._begin(cls, geometry, device, threads, Units(triangle, box))
         begin = build_clock()
         check_order(built.order, len(geometry), cls.name)
         self._check(built)
@@ -70,7 +71,11 @@ class Accelerator(Queries, ABC):
 
     def __reduce__(self) -> Any:
         """For pickle: what `save` writes, and what the structure is over. A refit there measures growth from the shape of now."""
-        return pickled(self, self._state)
+        units, state, of = self.structure.units, self._state, self._state.geometry
+        make = partial(type(self).restore, triangle=units.triangle, box=units.box)
+        given = state.built.on_host(), Geometry(of.vertices, of.faces, of.spheres), str(self.device), self.threads
+        options = {name: value for name, value in self._options.items() if name != "progress"}
+        return make, given, {"attributes": self.attributes, "_options": options}
 
     def __copy__(self) -> Accelerator:
         """The same structure, which a refit of this one leaves as it is."""
@@ -78,14 +83,14 @@ class Accelerator(Queries, ABC):
         other.__dict__.update(self.__dict__)
         return other
 
-    def _begin(self, geometry: Geometry, device: str, threads: int | None, triangle: str, box: str) -> None:
-        check_units(triangle, box)
+    def _begin(self, kind: type[Accelerator], geometry: Any, device: str, threads: int | None, units: Units) -> None:
+        check_units(units.triangle, units.box)
         self.device = start(device)
-        self._state = State(geometry.kept())
+        self._state = State(geometry.kept() if isinstance(geometry, Geometry) else geometry)
         self._refitting = threading.Lock()
         self._kept: dict[str, Any] = {}  # what refits go on using
         self.threads = thread_count(threads)
-        self.structure = Structure(type(self), Units(triangle, box, len(geometry.spheres) > 0))
+        self.structure = Structure(kind, units._replace(spheres=len(geometry.spheres) > 0))
         self._surfaces = Surfaces()
         self._surfaces.n_triangles = geometry.n_triangles
         self._surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # the caller may change his

@@ -12,9 +12,8 @@ import warp as wp
 from wrt.accel.base import Accelerator
 from wrt.accel.contains import contains
 from wrt.accel.hit_points import surroundings
-from wrt.accel.ray_query import require_one_mesh
+from wrt.accel.ray_query import structure_of
 from wrt.accel.rays import vectors
-from wrt.core.checks import shown
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -54,8 +53,7 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
     counts as the segment or the point that it is, though no ray hits it; one with a corner that is not finite is left out. Raises
     InputError that names the argument.
     """
-    structure = require_one_mesh(getattr(accel, "structure", None),
-                                 f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
+    structure = structure_of(accel)
     kernels: Any = structure.accel.kernels
     if not isinstance(kernels, WideTraversal) or structure.units.triangle != "watertight":
         raise InputError("closest points are asked of a bvh4, bvh8 or bvh8c with the watertight triangle test, not of a"

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.accel.ray_query import require_one_mesh
+from wrt.accel.ray_query import require_one_mesh, structure_of
 from wrt.core.arrays import check_no_gradients, float32, recording, to_numpy
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
@@ -112,7 +112,7 @@ def hits_of(accel: Any, vertices: Any, rays: tuple[Any, ...], rebuild_at: float)
 
     Raises InputError that names the argument.
     """
-    require_one_mesh(getattr(accel, "structure", None), f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
+    structure_of(accel)
     if vertices is not None:
         now, followed = to_numpy(vertices), accel.geometry.vertices
         if np.may_share_memory(now, followed) or not np.array_equal(float32(now), followed):  # shared: perhaps written to

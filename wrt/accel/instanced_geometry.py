@@ -68,11 +68,6 @@ class InstancedGeometry:
         """(I,) bool: False of what was joined in the world, and has no transform of its own."""
         return np.array([not isinstance(self.parts[part], NumberedGeometry) for part in self.part], bool)
 
-    @property
-    def to_local(self) -> np.ndarray:
-        """(I, 3, 4) float64: the inverse of to_world."""
-        return inverse_of(self.to_world)
-
 
 def inverse_of(matrices: np.ndarray) -> np.ndarray:
     """Of affine maps (I, 3, 4), in float64."""

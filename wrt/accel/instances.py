@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 from typing import Any
 
@@ -15,15 +14,12 @@ from wrt.accel.built import Built, State
 from wrt.accel.flatten import World
 from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of
 from wrt.accel.instancing import MAX_SPREAD
-from wrt.accel.structure import Structure, check_units
 from wrt.accel.top_level import BOXES, MOVED_BOXES, build_top, part_boxes, refit_top, spread_of, world_boxes
 from wrt.core.arrays import real_numbers
 from wrt.core.checks import shown
-from wrt.core.device import start, upload
+from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
-from wrt.core.threads import thread_count
-from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.scene.values import MAX_REACH
@@ -41,16 +37,8 @@ class Instances(Accelerator):
 
     def __init__(self, kind: type[Accelerator], geometry: InstancedGeometry, device: str = "cpu", threads: int | None = None, *,
                  triangle: str = "watertight", box: str = "conservative", **options: Any) -> None:
-        check_units(triangle, box)
         begin = build_clock()
-        self.device = start(device)
-        self._refitting, self._kept = threading.Lock(), {}
-        self._state = State(geometry)  # type: ignore[arg-type]  # it has what a Geometry is asked for here
-        self.threads = thread_count(threads)
-        self.structure = Structure(kind, Units(triangle, box, len(geometry.spheres) > 0, instances=True))
-        self._surfaces = Surfaces()
-        self._surfaces.n_triangles = geometry.n_triangles
-        self._surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)
+        self._begin(kind, geometry, device, threads, Units(triangle, box, instances=True))
         self.bottoms = [kind(part, device, threads, triangle=triangle, box=box, **options) for part in geometry.parts]
         self._place(begin)
 

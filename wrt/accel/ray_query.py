@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from wrt.accel.structure import Structure, check_units
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checks import as_one
+from wrt.core.checks import as_one, shown
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
 from wrt.kernels.ray_query import QueryHit, QueryRay, make_ray_query, query_ray
@@ -51,6 +51,12 @@ def ray_query(accel: Any, *, triangle: str | None = None, box: str | None = None
     structure = require_one_mesh(structure, "accel must be a structure over one mesh, or the name of one")
     world, closest_hit, any_hit, next_hit = query_of(structure)
     return RayQuery(world, QueryRay, QueryHit, query_ray, closest_hit, any_hit, next_hit)
+
+
+def structure_of(accel: Any) -> Structure:
+    """Of an accel that queries of points or of all hits take. Raises InputError for others."""
+    return require_one_mesh(getattr(accel, "structure", None),
+                            f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
 
 
 def require_one_mesh(structure: Any, what: str) -> Structure:

@@ -7,7 +7,6 @@ structure's class, and indices are checked before a ray follows them.
 from __future__ import annotations
 
 import os
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import warp as wp
 
 from wrt.accel.built import Built, State
 from wrt.accel.geometry import Geometry
-from wrt.accel.structure import Kind, Structure
+from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.device import record_dtype
@@ -29,7 +28,7 @@ MAGIC = b"wrt acceleration structure 1\n"
 STATS = ("nodes", "leaves", "depth", "sah_cost")
 
 
-def array_types(accel: type[Kind], triangle: str = "watertight") -> dict[str, np.dtype[Any]]:
+def array_types(accel: type[Any], triangle: str = "watertight") -> dict[str, np.dtype[Any]]:
     """What each array of Built.arrays holds, by the fields of the structure's struct."""
     struct = Structure(accel, Units(triangle)).struct()
     out = {}
@@ -70,15 +69,6 @@ def save(structure: Structure, state: State, path: str | os.PathLike[str]) -> No
         write_checked(file, MAGIC, header, body)
 
 
-def pickled(accel: Any, state: State) -> tuple[Any, ...]:
-    """What Accelerator.__reduce__ gives: how to restore it, from what, and what else it knows."""
-    units, of = accel.structure.units, state.geometry
-    make = partial(type(accel).restore, triangle=units.triangle, box=units.box)
-    given = state.built.on_host(), Geometry(of.vertices, of.faces, of.spheres), str(accel.device), accel.threads
-    options = {name: value for name, value in accel._options.items() if name != "progress"}
-    return make, given, {"attributes": accel.attributes, "_options": options}
-
-
 def read(path: str | os.PathLike[str], geometry: Geometry, device: str = "cpu", threads: int | None = None) -> Any:
     """An Accelerator from a file that `save` wrote, over the same geometry. Raises InputError for a file that is missing, foreign,
     damaged, of another version or over another mesh."""
@@ -98,7 +88,7 @@ def read(path: str | os.PathLike[str], geometry: Geometry, device: str = "cpu", 
         raise InputError(f"is no structure of this version ({type(error).__name__}: {error})", path) from error
 
 
-def read_arrays(cls: type[Kind], header: dict[str, Any], body: memoryview) -> Built:
+def read_arrays(cls: type[Any], header: dict[str, Any], body: memoryview) -> Built:
     types = array_types(cls, header["triangle"])
     arrays, at = {}, 0
     for name, dtype in types.items():
@@ -129,26 +119,29 @@ def check_binary(nodes: np.ndarray, n_primitives: int, max_depth: int) -> None:
 
 def check_links(nodes: np.ndarray, empties: list[np.ndarray], n_primitives: int, max_depth: int) -> None:
     """As check_binary, of any records with its links; empties: which of their two children do not exist, (N,) bool each."""
-    n = len(nodes)
-    parents, children = np.zeros(n, np.int64), []
+    inner_of = []
     for side, empty in zip(("0", "1"), empties, strict=True):
         first, count = nodes["first_" + side].astype(np.int64), nodes["count_" + side].astype(np.int64)
         leaf = count > 0
-        inner = ~leaf & ~empty
         if (empty & ((first != 0) | leaf)).any():  # nobody asks such a child's box: kernels look at `first` and `count`
             raise InputError("is damaged: a child that does not exist leads somewhere")
-        # A child stands behind its parent: no walk returns to where it was.
-        if (count < 0).any() or (leaf & ((first < 0) | (first + count > n_primitives))).any() or (
-                inner & ((first <= np.arange(n)) | (first >= n))).any():
+        if (count < 0).any() or (leaf & ((first < 0) | (first + count > n_primitives))).any():
             raise InputError("is damaged: a node leads out of the tree")
-        parents += np.bincount(first[inner], minlength=n)
-        children.append(np.where(inner, first, 0))
-    if n == 0 or parents[0] != 0 or (parents[1:] != 1).any():
-        raise InputError("is damaged: its nodes are no tree")
-    level, depth = np.zeros(1, np.int64), 0
-    while len(level):
-        depth += 1
-        if depth > max_depth:
-            raise InputError(f"is damaged: deeper than {max_depth}")
-        level = np.concatenate([child[level] for child in children])
-        level = level[level > 0]
+        inner_of.append(np.flatnonzero(~leaf & ~empty))
+    check_tree(len(nodes), np.concatenate(inner_of), np.concatenate([nodes[f"first_{i}"][of] for i, of in enumerate(inner_of)]),
+               max_depth - 1)
+
+
+def check_tree(n: int, parent: np.ndarray, child: np.ndarray, max_depth: int) -> None:
+    """Raise InputError unless n nodes are a tree from node 0 on, of at most max_depth levels below it, where each child stands
+    behind its parent: no walk returns to where it was."""
+    sound = n > 0 and bool((child > parent).all()) and np.array_equal(np.sort(child), np.arange(1, n))
+    if sound:
+        above, at = np.zeros(n, np.int64), np.arange(1, n)
+        above[child] = parent
+        for _ in range(max_depth):
+            at = above[at]
+            at = at[at > 0]
+        sound = not len(at)
+    if not sound:
+        raise InputError(f"is damaged: its nodes are no tree of at most {max_depth} levels below the root")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from inspect import signature
-from typing import Any, ClassVar, NamedTuple, Protocol, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 
-from wrt.core.checks import accepts, did_you_mean
+from wrt.core.checks import accepts, did_you_mean, require_known
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
 from wrt.kernels.query import make_any_hit_kernel, make_closest_hit_kernel, make_worlds_kernel
@@ -18,9 +18,8 @@ from wrt.kernels.units.triangle import RAY_TRIANGLE
 
 def check_units(triangle: str, box: str) -> None:
     """Raise InputError where there is no triangle test or box test of that name."""
-    for choice, table, what in ((triangle, RAY_TRIANGLE, "triangle test"), (box, RAY_AABB, "box test")):
-        if choice not in table:
-            raise InputError(f"no {what} {choice!r}; there is {', '.join(table)}")
+    require_known(triangle, RAY_TRIANGLE, "triangle test")
+    require_known(box, RAY_AABB, "box test")
 
 
 def check_options(name: str, build: Callable[..., Any], options: dict[str, Any]) -> None:
@@ -34,18 +33,11 @@ def check_options(name: str, build: Callable[..., Any], options: dict[str, Any])
             raise InputError(f"{option} must be {signature(build).parameters[option].annotation}, got {value!r}")
 
 
-class Kind(Protocol):
-    """What is asked of an Accelerator class: its traversal's module."""
-
-    name: ClassVar[str]
-    kernels: Any
-
-
 class Structure(NamedTuple):
-    """A kind of structure together with the units that walk it: what a kernel is made from. Hashable. Where the units walk
-    instances, it is a tree over structures of this kind (wrt.accel.instances)."""
+    """An Accelerator class together with the units that walk its structures: what a kernel is made from. Hashable. Where the units
+    walk instances, it is a tree over structures of this kind (wrt.accel.instances)."""
 
-    accel: type[Kind]
+    accel: type[Any]
     units: Units = Units()
 
     @property

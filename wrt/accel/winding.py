@@ -9,10 +9,9 @@ import warp as wp
 
 from wrt.accel.base import Accelerator
 from wrt.accel.hit_points import surroundings
-from wrt.accel.ray_query import require_one_mesh
+from wrt.accel.ray_query import structure_of
 from wrt.accel.rays import vectors
 from wrt.core.arrays import returned
-from wrt.core.checks import shown
 from wrt.core.device import launch_on, upload
 from wrt.core.threads import thread_count
 from wrt.kernels.query import FARTHEST
@@ -30,7 +29,7 @@ def winding_number(accel: Accelerator, points: Any, threads: int | None = None) 
     Winding Numbers"). On a triangle it is between its two sides. Every triangle is looked at: a point takes as long as the mesh is
     large, some 40 ns a triangle. Raises InputError as closest_points does.
     """
-    require_one_mesh(getattr(accel, "structure", None), f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
+    structure_of(accel)
     rows, give, device = vectors(points, "points", FARTHEST), returned(points), accel.device
     turns = wp.empty(len(rows), dtype=wp.vec3d, device=device)
     launch_on(device, wind, len(rows), surroundings(accel, accel._state).surfaces, upload(rows, wp.vec3, device), turns, None,

@@ -1,5 +1,7 @@
 """The k-d tree's builder: what every tree must satisfy, whatever it was built over, and that its splits are the cheapest."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,8 @@ from wrt.scene.shapes import icosphere, torus
 
 
 def make(geometry, threads=1, **options):
-    return build_tree(geometry, KdOptions(**options), threads)
+    built = build_tree(geometry, KdOptions(**options), threads)
+    return SimpleNamespace(**built.arrays, order=built.order, depth=built.depth, leaves=built.leaves, cost=built.sah_cost)
 
 
 def cells(tree):

@@ -11,7 +11,7 @@ from tests.placed import place
 from tests.structures import families_first
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
+from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry, inverse_of
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.scene.shapes import icosphere, torus
 
@@ -68,7 +68,7 @@ def expected(geometry, origins, directions, t_min, t_max):
     """t, prim_id, u, v: every instance asked by itself, by brute force; at equal t the lowest prim_id."""
     n = len(origins)
     best = {"t": np.full(n, np.inf, np.float32), "prim_id": np.full(n, -1)} | {k: np.zeros(n, np.float32) for k in "uv"}
-    for part, rows, first in zip(geometry.part, geometry.to_local, geometry.first_prim, strict=True):
+    for part, rows, first in zip(geometry.part, inverse_of(geometry.to_world), geometry.first_prim, strict=True):
         shape = geometry.parts[part]
         hits = build(Geometry(shape.vertices, shape.faces, shape.spheres), "brute_force").closest_hit(
             rows_times(rows, origins, 1.0), rows_times(rows, directions, 0.0), t_min, t_max)
@@ -204,7 +204,7 @@ def expected_of_one(geometry, which, origins, directions):
     """t in the one instance that each ray is aimed at."""
     out = np.full(len(which), np.inf, np.float32)
     alone = build(geometry.parts[0], "bvh2")
-    for i, rows in enumerate(geometry.to_local):
+    for i, rows in enumerate(inverse_of(geometry.to_world)):
         mine = which == i
         out[mine] = alone.closest_hit(rows_times(rows, origins[mine], 1.0), rows_times(rows, directions[mine], 0.0)).t
     return out

@@ -12,8 +12,9 @@ import warp as wp
 
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
-from wrt.accel.cells.common import check_tree, require_between
+from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
+from wrt.accel.store import check_tree
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
@@ -70,7 +71,21 @@ class Bsp(Accelerator):
         return builder.build()
 
     def _check(self, built: Built) -> None:
-        check_planes(built)
+        if any(built.arrays[name].size != size for name, size in (("lo", 3), ("hi", 3), ("extent", 1), ("first", 1), ("count", 1))):
+            raise InputError("is damaged: a tree has one root")
+        nodes, root_first, root_count = (built.arrays[name] for name in ("nodes", "first", "count"))
+        n = len(nodes)
+        parent = np.repeat(np.arange(-1, n), [1, *[2] * n])
+        first, count = (np.concatenate([root.reshape(1), np.stack([nodes[f"{what}_0"], nodes[f"{what}_1"]], axis=1).reshape(-1)])
+                        for what, root in (("first", root_first), ("count", root_count)))
+        first, inner = first.astype(np.int64), count == kernels.INNER
+        if ((count < 0) & ~inner).any() or (inner & ((first <= parent) | (first >= n))).any() or (
+                (count > 0) & ((first < 0) | (first + count > len(built.order)))).any():
+            raise InputError("is damaged: a node leads out of the tree")
+        if ((nodes["axis"] < 0) | (nodes["axis"] > kernels.PLANE)).any():
+            raise InputError("is damaged: its nodes are no tree")
+        # The link to the root is node 0, before the others.
+        check_tree(n + 1, parent[inner] + 1, first[inner] + 1, kernels.STACK_SIZE)
 
 
 class Launch:
@@ -214,22 +229,3 @@ def start_pieces(geometry: Geometry) -> tuple[Any, np.ndarray]:
         setattr(pieces, name, upload(values[name].reshape(n, *shape), dtype, cpu))
     pieces.points = upload(corners.reshape(-1, 3), wp.vec3d, cpu)
     return pieces, corners.reshape(-1, 3)
-
-
-def check_planes(built: Built) -> None:
-    """Raise InputError unless the nodes are a tree, no deeper than the stack, over the primitives in `order`."""
-    if any(built.arrays[name].size != size for name, size in (("lo", 3), ("hi", 3), ("extent", 1), ("first", 1), ("count", 1))):
-        raise InputError("is damaged: a tree has one root")
-    nodes, root_first, root_count = (built.arrays[name] for name in ("nodes", "first", "count"))
-    n = len(nodes)
-    parent = np.repeat(np.arange(-1, n), [1, *[2] * n])
-    first, count = (np.concatenate([root.reshape(1), np.stack([nodes[f"{what}_0"], nodes[f"{what}_1"]], axis=1).reshape(-1)])
-                    for what, root in (("first", root_first), ("count", root_count)))
-    first, inner = first.astype(np.int64), count == kernels.INNER
-    if ((count < 0) & ~inner).any() or (inner & ((first <= parent) | (first >= n))).any() or (
-            (count > 0) & ((first < 0) | (first + count > len(built.order)))).any():
-        raise InputError("is damaged: a node leads out of the tree")
-    if ((nodes["axis"] < 0) | (nodes["axis"] > kernels.PLANE)).any():
-        raise InputError("is damaged: its nodes are no tree")
-    # The link to the root is node 0, before the others.
-    check_tree(n + 1, parent[inner] + 1, first[inner] + 1, kernels.STACK_SIZE)

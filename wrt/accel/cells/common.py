@@ -36,8 +36,8 @@ def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
 
 
 def check_numbers(arrays: dict[str, np.ndarray]) -> None:
-    """Raise InputError unless pad and extent are what kernels.traverse.cell_ray.cell_slack may be given."""
-    if not (arrays["pad"] >= 0.0 and arrays["extent"] >= 0.0):
+    """Raise InputError unless pad and extent are what kernels.traverse.cell_ray.cell_slack may be given, and mailbox is a bool."""
+    if not (arrays["pad"] >= 0.0 and arrays["extent"] >= 0.0 and arrays["mailbox"] in (0, 1)):
         raise InputError("is damaged: its numbers are out of range")
 
 
@@ -48,20 +48,6 @@ def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: in
         raise InputError("is damaged: a cell leads out of the references")
     if ((references < 0) | (references >= n_primitives)).any():
         raise InputError("is damaged: a reference leads out of the primitives")
-
-
-def check_tree(n: int, parent: np.ndarray, child: np.ndarray, max_depth: int) -> None:
-    """Raise InputError unless n nodes are a tree from node 0 on, of at most max_depth levels below it, where each child stands
-    behind its parent: no walk returns to where it was."""
-    sound = n > 0 and bool((child > parent).all()) and np.array_equal(np.sort(child), np.arange(1, n))
-    if sound:
-        above, at = np.zeros(n, np.int64), np.arange(n)
-        above[child] = parent
-        for _ in range(max_depth):
-            at = above[at]
-        sound = not at.any()
-    if not sound:
-        raise InputError(f"is damaged: its nodes are no tree of at most {max_depth} levels below the root")
 
 
 def require_between(**options: tuple[float, float, float]) -> None:

@@ -51,21 +51,15 @@ class Grid(Accelerator):
     def _check(self, built: Built) -> None:
         arrays = one_row(self, built)
         check_numbers(arrays)
-        check_layout(*(arrays[name] for name in ("lo", "hi", "size", "n")))
-        if arrays["mailbox"] not in (0, 1):
-            raise InputError("is damaged: its numbers are out of range")
-        if len(arrays["cells"]) != np.prod(arrays["n"].astype(np.int64)):
+        lo, hi, size, n = (arrays[name] for name in ("lo", "hi", "size", "n"))
+        with np.errstate(over="ignore", invalid="ignore"):
+            last = lo + (n - 1).astype(np.float32) * size
+        empty = (lo == np.inf).all() and (hi == -np.inf).all()
+        if not ((n >= 1) & (n <= MAX_AXIS) & (size >= 0.0) & ((last <= hi) | empty)).all():
+            raise InputError("is damaged: its planes are not in order")
+        if len(arrays["cells"]) != np.prod(n.astype(np.int64)):
             raise InputError("is damaged: its cells are not those of its layout")
         check_references(arrays["cells"], arrays["references"], len(built.order))
-
-
-def check_layout(lo: np.ndarray, hi: np.ndarray, size: np.ndarray, n: np.ndarray) -> None:
-    """Raise InputError unless the planes of a layout from a file are in ascending order."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        last = lo + (n - 1).astype(np.float32) * size
-    empty = (lo == np.inf).all() and (hi == -np.inf).all()
-    if not ((n >= 1) & (n <= MAX_AXIS) & (size >= 0.0) & ((last <= hi) | empty)).all():
-        raise InputError("is damaged: its planes are not in order")
 
 
 def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> Any:

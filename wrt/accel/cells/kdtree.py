@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
-from wrt.accel.cells.common import check_tree
 from wrt.accel.cells.kdtree_build import KdOptions, build_tree
+from wrt.accel.store import check_tree
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import kdtree as kernels
 
@@ -29,9 +27,7 @@ class KdTree(Accelerator):
                max_growth: float = 16.0) -> Built:
         options = KdOptions(max_leaf, max_depth, by_cost, cost_traversal, cost_intersection, empty_bonus, perfect_below, clip,
                             max_growth)
-        tree = build_tree(self.geometry, options, self.threads)
-        arrays: dict[str, Any] = {"nodes": tree.nodes, "lo": tree.lo, "hi": tree.hi, "reach": np.float32(tree.reach)}
-        return Built(arrays, tree.order, len(tree.nodes) - tree.leaves, tree.leaves, tree.depth, tree.cost)
+        return build_tree(self.geometry, options, self.threads)
 
     def _check(self, built: Built) -> None:
         nodes = built.arrays["nodes"]

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from wrt.accel.built import Built
 from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, load_kernel, on_host, records, start, upload
@@ -56,20 +57,6 @@ class KdOptions:
         return min(round(8.0 + 1.3 * np.log2(max(n, 1))), STACK_SIZE)
 
 
-class KdTreeData(NamedTuple):
-    """nodes: records of KdNode, root first; order: prim_id in the order of the leaves; leaves counts empty ones too; cost: the
-    SAH cost, with both costs 1; reach: the largest extent of a triangle that was clipped."""
-
-    nodes: np.ndarray
-    order: np.ndarray
-    lo: np.ndarray
-    hi: np.ndarray
-    leaves: int
-    depth: int
-    cost: float
-    reach: float
-
-
 class Cell(NamedTuple):
     """A cell to build, and its references: prim_id (n,) and their boxes in it (n, 3)."""
 
@@ -83,15 +70,15 @@ class Cell(NamedTuple):
     slot: int
 
 
-def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> KdTreeData:
-    """The tree over a geometry; the same for every number of threads."""
+def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> Built:
+    """The tree over a geometry; the same for every number of threads. Its cost is that with both costs 1."""
     lo, hi = geometry.bounds()
     n = len(lo)
     if n == 0:
         nodes = records(KdNode, 1)
         nodes["word"] = LEAF
         nowhere = np.full(3, np.inf, np.float32)
-        return KdTreeData(nodes, np.zeros(0, np.int32), nowhere, -nowhere, 1, 1, 0.0, 0.0)
+        return Built({"nodes": nodes, "lo": nowhere, "hi": -nowhere, "reach": np.float32(0.0)}, np.zeros(0, np.int32), 0, 1, 1, 0.0)
     hi = np.where(lo < hi, hi, np.nextafter(hi, np.float32(np.inf)))  # a box has an inside
     shapes, reach = clippable(geometry, lo, hi, options.clip)
     budget = int(min(options.max_growth * n + 64, MAX_INDEX / 2))
@@ -239,7 +226,7 @@ def build_subtree(cell: Cell, shapes: Any, options: Any) -> tuple[np.ndarray, np
 
 
 def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[Part], root: Cell, area: float,
-           reach: float) -> KdTreeData:
+           reach: float) -> Built:
     """One tree of the top and the subtrees: each root goes to its slot, the other nodes and the references behind all before."""
     n_nodes = len(top) + sum(len(nodes) - 1 for nodes, _, _ in parts)
     n_references = sum(len(references) for _, references, _ in parts)
@@ -261,5 +248,6 @@ def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[Part], r
         next_reference += len(references)
     totals = [totals for _, _, totals in parts]
     cost = (area + sum(float(t["cost"]) for t in totals)) / float(half_area.func(root.cell_hi.astype(np.float64) - root.cell_lo))
-    return KdTreeData(nodes, order, root.cell_lo, root.cell_hi, sum(int(t["leaves"]) for t in totals),
-                      max(int(t["depth"]) for t in totals), cost, reach)
+    leaves, depth = sum(int(t["leaves"]) for t in totals), max(int(t["depth"]) for t in totals)
+    arrays: dict[str, Any] = {"nodes": nodes, "lo": root.cell_lo, "hi": root.cell_hi, "reach": np.float32(reach)}
+    return Built(arrays, order, n_nodes - leaves, leaves, depth, cost)

@@ -6,8 +6,9 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built
-from wrt.accel.cells.common import check_numbers, check_references, check_tree, one_row, triangle_reach
+from wrt.accel.cells.common import check_numbers, check_references, one_row
 from wrt.accel.cells.octree_build import OctreeOptions, build_tree
+from wrt.accel.store import check_tree
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import octree as kernels
 
@@ -25,14 +26,7 @@ class Octree(Accelerator):
 
     def _build(self, max_leaf: int = 8, max_depth: int = kernels.MAX_LEVELS, by_cost: bool = True, max_growth: float = 16.0,
                mailbox: bool = True) -> Built:
-        tree = build_tree(self.geometry, OctreeOptions(max_leaf, max_depth, by_cost, max_growth), self.threads)
-        layout, nodes = tree.layout, tree.nodes
-        pad, extent = triangle_reach(self.geometry, *self.geometry.bounds())
-        return Built({"lo": np.array(layout.lo), "hi": np.array(layout.hi), "size": np.array(layout.size, np.float32),
-                      "levels": np.array(layout.levels, np.int32), "pad": pad, "extent": extent,
-                      "mailbox": np.array(mailbox, np.int32), "nodes": nodes, "references": tree.references},
-                     np.arange(len(self.geometry), dtype=np.int32), len(nodes), int((nodes["count"] >= 0).sum()), tree.depth,
-                     tree.cost)
+        return build_tree(self.geometry, OctreeOptions(max_leaf, max_depth, by_cost, max_growth), mailbox, self.threads)
 
     def _check(self, built: Built) -> None:
         arrays = one_row(self, built)
@@ -40,7 +34,7 @@ class Octree(Accelerator):
         levels, lo, hi = int(arrays["levels"]), arrays["lo"], arrays["hi"]
         if not 0 <= levels <= kernels.MAX_LEVELS or (levels and not (lo + np.float32(1 << levels) * arrays["size"] >= hi).all()):
             raise InputError("is damaged: its cells are not in order")
-        if arrays["mailbox"] not in (0, 1) or (arrays["nodes"]["count"] < -0xFF).any():
+        if (arrays["nodes"]["count"] < -0xFF).any():
             raise InputError("is damaged: its numbers are out of range")
         nodes = arrays["nodes"]
         inner = np.flatnonzero(nodes["count"] < 0)

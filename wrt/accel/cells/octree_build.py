@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from wrt.accel.built import Built
 from wrt.accel.bvh.tree import half_areas
-from wrt.accel.cells.common import cell_source, require_between
+from wrt.accel.cells.common import cell_source, require_between, triangle_reach
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, records, start, upload
 from wrt.kernels.build import octree as build_octree
@@ -58,18 +59,6 @@ class Cells:
         return Cells(self.corner[chosen], begin, references, self.growth[chosen])
 
 
-@dataclass
-class Tree:
-    """nodes: records of OctreeNode, breadth first; references: of all leaves; depth: levels, the root's included; cost: expected
-    nodes and primitives of a random line through the root's cell."""
-
-    layout: Any
-    nodes: np.ndarray = field(default_factory=lambda: records(OctreeNode, 0))
-    references: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
-    depth: int = 0
-    cost: float = 0.0
-
-
 def root_cell(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> Any:
     """The layout around these boxes: a cube from the lowest corner, cut off at the highest one."""
     layout = OctreeLayout()
@@ -99,19 +88,21 @@ def areas(layout: Any, corner: np.ndarray, size: int) -> np.ndarray:
     return half_areas(planes(layout, corner), planes(layout, corner + size))
 
 
-def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Tree:
-    """Split the cells that have more than max_leaf primitives, where that pays, until none is left to split."""
+def build_tree(geometry: Geometry, options: OctreeOptions, mailbox: bool, threads: int) -> Built:
+    """Split the cells that have more than max_leaf primitives, where that pays, until none is left to split.
+
+    nodes: breadth first; depth: levels, the root's included; sah_cost: in nodes and primitives, of a random line through the root.
+    """
     bounds = geometry.bounds()
-    tree = Tree(root_cell(*bounds, options.max_depth))
-    n, levels = len(geometry), tree.layout.levels
-    split = _Splitter(geometry, bounds, tree.layout, threads)
+    layout, n = root_cell(*bounds, options.max_depth), len(geometry)
+    split = _Splitter(geometry, bounds, layout, threads)
     cells = Cells(np.zeros((1, 3), np.int32), np.array([0, n], np.int32), np.arange(n, dtype=np.int32),
                   np.array([min(options.max_growth, MAX_REFERENCES / max(n, 1))]))
-    whole = float(areas(tree.layout, cells.corner, 1 << levels)[0]) if levels else 0.0
-    nodes, references, n_nodes, n_references = [], [], 0, 0
+    whole = float(areas(layout, cells.corner, 1 << layout.levels)[0]) if layout.levels else 0.0
+    levels: list[np.ndarray] = []
+    references, n_nodes, n_references, cost = [], 0, 0, 0.0
     while len(cells.corner):
-        half = (1 << levels - tree.depth) >> 1
-        tree.depth += 1
+        half = (1 << layout.levels - len(levels)) >> 1
         chosen, count, children = choose(cells, split, half, options)
         level = records(OctreeNode, len(cells.corner))
         occupied = (count > 0).sum(axis=1)
@@ -121,14 +112,18 @@ def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Tree
         level["first"][~chosen] = n_references + leaves.begin[:-1]
         n_nodes += len(level)
         level["first"][chosen] = n_nodes + np.cumsum(occupied) - occupied
-        area = areas(tree.layout, cells.corner, 2 * half or 1) if whole > 0.0 else np.ones(len(level))
-        tree.cost += float((area * (1 + np.where(chosen, 0, cells.count))).sum() / (whole if whole > 0.0 else 1.0))
-        nodes.append(level)
+        area = areas(layout, cells.corner, 2 * half or 1) if whole > 0.0 else np.ones(len(level))
+        cost += float((area * (1 + np.where(chosen, 0, cells.count))).sum() / (whole if whole > 0.0 else 1.0))
+        levels.append(level)
         references.append(leaves.references)
         n_references += len(leaves.references)
         cells = children
-    tree.nodes, tree.references = np.concatenate(nodes), np.concatenate(references)
-    return tree
+    nodes = np.concatenate(levels)
+    pad, extent = triangle_reach(geometry, *bounds)
+    return Built({"lo": np.array(layout.lo), "hi": np.array(layout.hi), "size": np.array(layout.size, np.float32),
+                  "levels": np.array(layout.levels, np.int32), "pad": pad, "extent": extent, "mailbox": np.array(mailbox, np.int32),
+                  "nodes": nodes, "references": np.concatenate(references)},
+                 np.arange(n, dtype=np.int32), n_nodes, int((nodes["count"] >= 0).sum()), len(levels), cost)
 
 
 def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) -> tuple[np.ndarray, np.ndarray, Cells]:
