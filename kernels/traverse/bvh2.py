@@ -39,12 +39,12 @@ class Bvh2Node:
 
 
 @cache
-def make_struct(record: Any) -> Any:
-    """The structure over records of this kind: nodes[0] is the root; primitives are in the order of the leaves."""
+def make_struct(record: Any, node: Any = Bvh2Node) -> Any:
+    """The structure over records and nodes of these kinds: nodes[0] is the root; primitives are in the order of the leaves."""
 
     @wp.struct
     class Bvh2:
-        nodes: wp.array(dtype=Bvh2Node)
+        nodes: wp.array(dtype=node)
         primitives: wp.array(dtype=record)
         recorder: Recorder
 

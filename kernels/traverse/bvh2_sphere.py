@@ -5,9 +5,9 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.traverse import bvh2
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Volumes, make_binary_traversal  # noqa: F401 (STACK_SIZE: for the host)
 from wrt.kernels.traverse.common import Probe, Units
-from wrt.kernels.traverse.counters import Recorder
 from wrt.kernels.units.bounding_sphere import SphereRay, ray_bounding_sphere, sphere_ray
 
 
@@ -23,15 +23,8 @@ class SphereNode:
     count_1: int
 
 
-@cache
 def make_struct(record: Any) -> Any:
-    @wp.struct
-    class Bvh2Sphere:
-        nodes: wp.array(dtype=SphereNode)
-        primitives: wp.array(dtype=record)
-        recorder: Recorder
-
-    return Bvh2Sphere
+    return bvh2.make_struct(record, SphereNode)
 
 
 @cache

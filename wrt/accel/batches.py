@@ -175,29 +175,25 @@ def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out
     part = n if rays.as_warp else rays_on_gpu(n, device)
     for first in range(0, n, max(part, 1)):
         some = slice(first, min(first + part, n))
-        there = [array[some] if isinstance(array, wp.array)
-                 else wp.empty(some.stop - first, dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
-        hits = HitArrays()
-        for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
-            setattr(hits, name, array)
-        given = rays_on(device, rays if part == n else rays.part(some))
-        launch_on(device, kernel, some.stop - first, data, surfaces, given, hits if len(out) > 1 else there[0], None)
-        for array, found in zip(out, there, strict=True):
-            if not isinstance(array, wp.array):
-                array[some] = found.numpy()
+        given = rays_on(device, rays if part == n else Rays(*(array[some] for array in rays)))
+        launch_over(device, kernel, [data, surfaces, given], [array[some] for array in out])
 
 
 def trace_worlds(structure: Structure, data: Any, surfaces: Any, rays: Rays, worlds: Any, out: list[Any], device: Any,
                  threads: int) -> None:
     """Write the answers to arrays, each ray in its own world (wrt.accel.worlds.WorldIds); on a GPU in one launch."""
-    n = len(out[0])
+    inputs = [data, surfaces, rays_on(device, rays), worlds.arrays]
+    launch_over(device, worlds_kernel(structure, len(out) == 1), inputs, out, threads)
+
+
+def launch_over(device: Any, kernel: Any, inputs: list[Any], out: list[Any], threads: int = 1) -> None:
+    """Launch a kernel for one ray over as many as there is room for answers, which may be NumPy's."""
     there = [to_warp(array) if device.is_cpu or isinstance(array, wp.array)
-             else wp.empty(n, dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
+             else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
     hits: Any = HitArrays()
     for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
         setattr(hits, name, array)
-    launch_on(device, worlds_kernel(structure, len(out) == 1), n, data, surfaces, rays_on(device, rays), worlds.arrays,
-              hits if len(out) > 1 else there[0], None, threads=threads, step=RAYS_PER_LAUNCH)
+    launch_on(device, kernel, len(out[0]), *inputs, hits if len(out) > 1 else there[0], None, threads=threads, step=RAYS_PER_LAUNCH)
     for array, found in zip(out, there, strict=True):
         if not isinstance(array, wp.array) and device.is_cuda:
             array[:] = found.numpy()

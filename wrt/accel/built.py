@@ -60,8 +60,14 @@ class State:
     changes: bool = False
 
 
-def once(kept: WeakKeyDictionary[State, T], state: State, make: Callable[[], T]) -> T:
-    """What `make` gives for a state of a structure: made once, unless refits in place change it."""
-    if state in kept:
-        return kept[state]
-    return make() if state.changes else kept.setdefault(state, make())
+def once(make: Callable[..., T]) -> Callable[..., T]:
+    """A function whose last argument is a state of a structure: called once for each, unless refits in place change it."""
+    kept: WeakKeyDictionary[State, T] = WeakKeyDictionary()
+
+    def made(*given: Any) -> T:
+        state = given[-1]
+        if state in kept:
+            return kept[state]
+        return make(*given) if state.changes else kept.setdefault(state, make(*given))
+
+    return made

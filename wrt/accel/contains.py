@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
@@ -18,9 +16,6 @@ from wrt.core.arrays import returned
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.kernels.query import FARTHEST
-
-_bounds: WeakKeyDictionary[State, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
-_open_edges: WeakKeyDictionary[State, int] = WeakKeyDictionary()
 
 
 def finite_faces(geometry: Geometry) -> np.ndarray:
@@ -38,13 +33,16 @@ def open_edges(geometry: Geometry) -> int:
     return int((count % 2 == 1).sum())
 
 
+@once
 def open_edges_of(state: State) -> int:
-    """open_edges of a structure's mesh, counted once."""
-    return once(_open_edges, state, partial(open_edges, state.geometry))
+    """open_edges of a structure's mesh."""
+    return open_edges(state.geometry)
 
 
-def used_bounds(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+@once
+def used_bounds(state: State) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest corner of all finite faces, two (3,); inf and -inf where there are none."""
+    geometry = state.geometry
     used = geometry.vertices[finite_faces(geometry)].reshape(-1, 3)
     return used.min(axis=0, initial=np.inf), used.max(axis=0, initial=-np.inf)
 
@@ -68,7 +66,7 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any
 def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
     """As `contains`, of (N, 3) float32 and a mesh that may be open: then it depends on the rays' direction, that is on `seed`."""
     inside = np.zeros(len(rows), bool)
-    low, high = once(_bounds, asked.state, partial(used_bounds, asked.state.geometry))
+    low, high = used_bounds(asked.state)
     within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
     direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
     counts = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts()

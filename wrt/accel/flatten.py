@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -226,42 +225,36 @@ class _Joined:
 
 def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
     """All objects in world space; material: of each face, by `index` of its id()."""
-    vertices, faces, normals, uvs = [], [], [], []
-    material = [np.zeros(0, np.int32)]
-    first = 0
+    parts, material, first = [], [np.zeros(0, np.int32)], 0
     for thing in objects:
         v, f, n, t = _transformed(thing)
-        vertices.append(v)
-        faces.append(f + np.int32(first))
-        normals.append(n)
-        uvs.append(t)
+        parts.append((v, f + np.int32(first), n, t))
         table = np.array([index[id(m)] for m in thing.materials], np.int32)
         material.append(np.full(len(f), table[0]) if thing.face_material is None else table[thing.face_material])
         first += len(v)
         _require_room(first, 0)
-
-    def join(parts: list[np.ndarray], width: int, dtype: Any) -> np.ndarray:
-        return np.concatenate(parts) if parts else np.zeros((0, width), dtype)
-
+    none = [np.zeros((0, width), dtype) for width, dtype in ((3, np.float32), (3, np.int32), (3, np.float32), (2, np.float32))]
+    vertices, faces, normals, uvs = map(np.concatenate, zip(*parts, strict=True)) if parts else none
     # Far from 0, rounding puts corners on a line that were on none. All at once: a call for each of many boxes takes long.
-    corners = join(vertices, 3, np.float32)
-    triangles, source = flip_collinear(corners, join(faces, 3, np.int32))
-    return _Joined(corners, triangles, join(normals, 3, np.float32), join(uvs, 2, np.float32), source,
-                   np.concatenate(material)[source])
+    faces, source = flip_collinear(vertices, faces)
+    return _Joined(vertices, faces, normals, uvs, source, np.concatenate(material)[source])
 
 
 def _own_space(mesh: Mesh) -> _Joined:
     faces, source = flip_collinear(mesh.vertices, mesh.faces)
-    normals = np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals
-    uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
-    return _Joined(mesh.vertices, faces, normals, uvs, source, np.zeros(0, np.int32))
+    return _Joined(mesh.vertices, faces, *_attributes(mesh), source, np.zeros(0, np.int32))
+
+
+def _attributes(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """normals and uvs of the vertices, 0 where there are none."""
+    return (np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals,
+            np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs)
 
 
 def _transformed(thing: Object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     mesh, matrix = thing.mesh, thing.transform
     faces = mesh.faces
-    normals = np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals
-    uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
+    normals, uvs = _attributes(mesh)
     if np.array_equal(matrix, np.eye(4)):
         return mesh.vertices, faces, normals, uvs
     linear = matrix[:3, :3]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
@@ -34,9 +32,6 @@ class Surroundings(NamedTuple):
     world: World
     surfaces: Any
     numbering: Any
-
-
-_surroundings: WeakKeyDictionary[State, Surroundings] = WeakKeyDictionary()
 
 
 class HitPoints:
@@ -158,12 +153,9 @@ def _require(world: World, name: str) -> None:
         raise InputError(f"the structure is not over a scene: there is no {name}")
 
 
+@once
 def surroundings(accel: Any, state: State) -> Surroundings:
     """Of a structure in a state of it, on its device."""
-    return once(_surroundings, state, partial(_surroundings_of, accel, state))
-
-
-def _surroundings_of(accel: Any, state: State) -> Surroundings:
     geometry: Any = state.geometry
     world, device, surfaces = accel.attributes or world_over(geometry), accel.device, structs.Surfaces()
     placed = placed_now(world, geometry)

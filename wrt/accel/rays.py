@@ -30,9 +30,6 @@ class Rays(NamedTuple):
     def as_warp(self) -> bool:
         return isinstance(self.origins, wp.array)
 
-    def part(self, rows: slice) -> Rays:
-        return Rays(*(array[rows] for array in self))
-
     def on(self, device: Any) -> Rays:
         """The same, with Warp arrays of other devices copied to this one."""
         return Rays(*(array.to(device) if isinstance(array, wp.array) else array for array in self))

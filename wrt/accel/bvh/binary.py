@@ -14,7 +14,8 @@ import warp as wp
 
 from wrt.accel.base import Accelerator
 from wrt.accel.built import Built, State
-from wrt.accel.bvh.builders import DEVICE_BUILDERS, BvhOptions, build_binary, sah_cost
+from wrt.accel.bvh.builders import BvhOptions, build_binary, sah_cost
+from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry
@@ -65,9 +66,9 @@ class Bvh2(BinaryBvh):
     kernels = kernels
 
     def _by(self, options: BvhOptions) -> Built:
-        if options.builder not in DEVICE_BUILDERS or len(self.geometry) < 2:
+        if options.builder != "lbvh" or len(self.geometry) < 2:
             return super()._by(options)
-        nodes, parents, order, root = DEVICE_BUILDERS[options.builder](self.device, self._shape(), options, self.threads)
+        nodes, parents, order, root = build_on(self.device, self._shape(), options, self.threads)
         return Built({"nodes": nodes}, order, root.used, root.used + 1, root.height, root.sah_cost, parents)
 
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:

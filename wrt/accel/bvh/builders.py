@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, sah_cost
 from wrt.accel.geometry import Geometry
 from wrt.core.registry import Registry
 
-__all__ = ["BVH_BUILDERS", "DEVICE_BUILDERS", "BinaryTree", "BvhOptions", "build_binary", "sah_cost"]
+__all__ = ["BVH_BUILDERS", "BinaryTree", "BvhOptions", "build_binary", "sah_cost"]
 
 BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Registry("builder", {
     "binned": "wrt.accel.bvh.top_down:build_binned",
@@ -19,10 +18,6 @@ BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Regi
     "reinsertion": "wrt.accel.bvh.reinsertion:build_reinsertion",
     "median": "wrt.accel.bvh.top_down:build_median",
     "lbvh": "wrt.accel.bvh.lbvh:build_lbvh",
-})
-# Those that can do without the host: a Warp device, a Shape, options, threads -> what wrt.accel.bvh.lbvh.build_on gives.
-DEVICE_BUILDERS: Registry[Callable[[Any, Any, BvhOptions, int], Any]] = Registry("builder", {
-    "lbvh": "wrt.accel.bvh.lbvh:build_on",
 })
 
 

@@ -64,11 +64,6 @@ class WideBvh(Accelerator):
             raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}; take bvh8")
         return tree
 
-    @property
-    def _unit(self) -> int:
-        """Primitives, in which references to leaves count."""
-        return 1 if self.compressed else self.width
-
     def _nodes(self, built: Built) -> np.ndarray:
         return built.arrays["nodes"].reshape(-1, node_size(self.width, self.compressed))
 
@@ -126,7 +121,7 @@ class WideBvh(Accelerator):
         if len(built.arrays["nodes"]) % node_size(self.width, self.compressed):
             raise InputError("is damaged: its nodes are no whole ones")
         references = self._references(built)
-        check_wide(references, len(built.order), self._unit)
+        check_wide(references, len(built.order), 1 if self.compressed else self.width)
         if self.compressed and (existing_children(self._nodes(built), self.width) != (references != EMPTY)).any():
             raise InputError("is damaged: a node tells of children that it does not have")
         if not self.compressed:
