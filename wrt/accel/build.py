@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
-from hashlib import sha256
 from inspect import signature
 from pathlib import Path
 from typing import Any, overload
@@ -18,13 +15,12 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.instances import Instances
 from wrt.accel.instancing import instanced_meshes
-from wrt.accel.store import check_target, read
-from wrt.accel.structures import ACCELERATORS, meant
+from wrt.accel.store import read
+from wrt.accel.structures import ACCELERATORS
 from wrt.accel.worlds import worlds_over
 from wrt.core.arrays import is_tensor, taken, to_numpy
 from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError
-from wrt.core.version import VERSION
 from wrt.io.load import LOADERS, load_scene
 from wrt.io.mesh_file import load_mesh
 from wrt.scene.mesh import Mesh
@@ -77,31 +73,6 @@ def load_accel(path: str | os.PathLike[str], mesh: Any, device: str = "cpu", thr
     world = world_given(mesh)
     structure = read(path, one_geometry(world), as_one(device, str, "device"), threads)
     structure.attributes = world
-    return structure
-
-
-def build_cached(folder: str | os.PathLike[str], mesh: Mesh | Geometry, accel: str = "bvh", device: str = "cpu",
-                 threads: int | None = None, **options: Any) -> Accelerator:
-    """As `build`, but from `folder` where the same geometry was built with the same options before; else it is built, and left
-    there. A damaged file there is written anew. Raises InputError as `build` does, and where the folder cannot be written."""
-    world, accel = world_given(mesh), meant(accel)
-    geometry = one_geometry(world)
-    given = {name: value for name, value in options.items() if name != "progress"}
-    key = json.dumps([geometry.digest(), accel, given, VERSION], sort_keys=True)
-    path = Path(folder) / f"{sha256(key.encode()).hexdigest()[:32]}.accel"
-    if path.is_file():
-        with contextlib.suppress(InputError):  # a damaged one is replaced below
-            structure = read(path, geometry, device, threads)
-            structure.attributes = world
-            return structure
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made: {error.strerror}", folder) from error
-    check_target(path)
-    structure = build(geometry, accel, device, threads, **options)
-    structure.attributes = world
-    structure.save(path)
     return structure
 
 

@@ -18,10 +18,9 @@ import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.structures import STRUCTURES
-from wrt.accel.build import build, build_cached, load_accel
+from wrt.accel.build import build, load_accel
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import MAGIC, check_binary
-from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import DIGEST_BYTES
 from wrt.core.errors import InputError
 from wrt.scene.mesh import Mesh
@@ -202,22 +201,6 @@ def test_any_byte_may_be_changed(saved: Path, at: int, value: int) -> None:
         load_accel(path, BALL).closest_hit(*rays(50))
     except InputError as error:
         assert "changed.accel" in str(error)
-
-
-def test_the_cache_builds_once(tmp_path: Path, monkeypatch) -> None:
-    first = build_cached(tmp_path / "cache", BALL, "bvh2", max_leaf=2)
-    monkeypatch.setattr(ACCELERATORS["bvh2"], "_build", None)
-    same(build_cached(tmp_path / "cache", BALL, "bvh2", max_leaf=2), first)
-    with pytest.raises(TypeError):  # other options: another structure
-        build_cached(tmp_path / "cache", BALL, "bvh2", max_leaf=3)
-
-
-def test_a_damaged_entry_of_the_cache_is_made_anew(tmp_path: Path) -> None:
-    build_cached(tmp_path, BALL, "bvh2")
-    (entry,) = tmp_path.iterdir()
-    entry.write_bytes(b"half")
-    same(build_cached(tmp_path, BALL, "bvh2"), build(BALL))
-    assert entry.stat().st_size > 1000
 
 
 def test_the_command(tmp_path: Path, monkeypatch) -> None:
