@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -109,10 +110,10 @@ def test_headers_are_precompiled_once_for_all_threads_and_processes(tmp_path: Pa
             precompiled.append(extra_flags)
         Path(obj_path).write_text("object")
 
-    def a_process() -> None:
+    def a_process(processor: bytes = b"a") -> None:
         monkeypatch.setattr(compiler, "_whole", set())
         build = SimpleNamespace(build_cpu=build_cpu)
-        compiler._compile_well(build, SimpleNamespace(get_clang_pch_dir=lambda: "Warp's own"))
+        compiler._compile_well(build, a_runtime(processor))
         options = {"extra_flags": "-O2", "use_precompiled_headers": True, "pch_dir": None}
         with ThreadPoolExecutor(6) as pool:
             list(pool.map(lambda i: build.build_cpu(str(tmp_path / f"{i}.o"), str((without, with_it)[i % 2]), **options), range(6)))
@@ -131,10 +132,54 @@ def test_headers_are_precompiled_once_for_all_threads_and_processes(tmp_path: Pa
     (next(iter(kept)) / "made.pch").write_text("damaged")
     a_process()
     assert len(precompiled) == 3 and set(cache.iterdir()) == kept
+    for _ in range(2):
+        for processor in (b"a", b"b"):  # with one home; Clang refuses the headers of another processor
+            a_process(processor)
+    assert len(precompiled) == 5 and len(set(cache.iterdir()) - kept) == 2
     shutil.rmtree(cache)  # as for a kernel that is compiled elsewhere
     given.clear()
     a_process()
     assert {folder for _, _, folder in given} == {"Warp's own", None}
+
+
+def a_runtime(processor: bytes = b"a") -> SimpleNamespace:
+    llvm = SimpleNamespace(wp_get_host_cpu_name=lambda: processor, wp_get_host_cpu_features=lambda: b"+avx")
+    return SimpleNamespace(get_clang_pch_dir=lambda: "Warp's own", llvm=llvm)
+
+
+@pytest.mark.parametrize("there", ["nothing", "a file", "a damaged folder", "a link"])
+def test_headers_of_another_process_that_was_faster_are_not_moved(there: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It uses them: Clang tells when a file is gone that it is about to read."""
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
+    (tmp_path / "cache").mkdir()
+    given: list[Path] = []
+
+    def build_cpu(obj_path, cpp_path, *, pch_dir, others=0):
+        if others:  # as many processes begin and end while this one precompiles
+            headers(others - 1)
+        (Path(pch_dir) / "made.pch").write_text("headers")
+
+    def headers(others: int) -> None:
+        monkeypatch.setattr(compiler, "_whole", set())
+        monkeypatch.setattr(compiler, "_lock", threading.Lock())
+        given.append(compiler._headers(partial(build_cpu, others=others), {}, ()))
+        inodes.append(given[-1].stat().st_ino)
+
+    inodes: list[int] = []
+    headers(0)
+    folder = given[0]
+    shutil.rmtree(folder)
+    if there == "a file":
+        folder.touch()
+    elif there == "a link":
+        folder.symlink_to(tmp_path)
+    elif there == "a damaged folder":
+        folder.mkdir()
+        (folder / "seal").touch()
+    inodes.clear()
+    headers(2)
+    assert len(inodes) == 3 and len({*inodes}) == 1 and {*given} == {folder}
+    assert list((tmp_path / "cache").iterdir()) == [folder] and compiler._is_sealed(folder)
 
 
 @kernel
@@ -165,9 +210,10 @@ def test_an_overload_is_looked_for_once(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_warp_with_other_insides_is_left_as_it_is():
-    plain, runtime = SimpleNamespace(build_cpu=lambda source: source), SimpleNamespace(get_clang_pch_dir=lambda: "Warp's own")
+    plain = SimpleNamespace(build_cpu=lambda source: source)
     before = plain.build_cpu
-    compiler._compile_well(plain, runtime)
+    compiler._compile_well(plain, a_runtime())
+    compiler._compile_well(plain, SimpleNamespace(get_clang_pch_dir=lambda: "Warp's own"))
     compiler._compile_well(SimpleNamespace(), SimpleNamespace())
     for change in (compiler._compile_once, compiler._drop_unused_helpers, compiler._resolve_once):
         change(SimpleNamespace())
