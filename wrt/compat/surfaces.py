@@ -14,7 +14,7 @@ def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, t
     """ray, face, t, u, v of each hit, those of a ray together and in order, `limit` of them at most.
 
     A ray hits the faces that it crosses (all_hits, crossings). If it crosses none and only touches some, it hits the first of them,
-    or, if the mesh is closed, the first two: there it enters and leaves.
+    or, if the mesh is closed, the first two: there it enters and leaves. If it begins there, it may touch just one.
     """
     crossed = Asked(accel, threads, crossings=True).of(origins, directions).all(limit)
     found = [crossed.ray_id, crossed.prim_id, crossed.t, crossed.u, crossed.v]
@@ -23,7 +23,7 @@ def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, t
         rays = rays[accel.any_hit(origins[rays], directions[rays], threads=threads)]
     if len(rays):
         touched = first_hits(accel, 1 if open_edges_of(accel._state) else 2, origins[rays], directions[rays], threads=threads)
-        row, column = np.nonzero(np.broadcast_to(touched.prim_id[:, -1:] >= 0, touched.prim_id.shape))
+        row, column = np.nonzero(touched.prim_id >= 0)
         more = rays[row], *(array[row, column] for array in (touched.prim_id, touched.t, touched.u, touched.v))
         found = [np.concatenate(pair) for pair in zip(found, more, strict=True)]
         order = np.argsort(found[0], kind="stable")

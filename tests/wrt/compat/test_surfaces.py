@@ -193,3 +193,14 @@ def test_corners_that_differ_in_the_last_bit_are_one() -> None:
         assert np.bincount(ray.intersects_id(origins, target - origins)[1], minlength=200).tolist() == [1] * 200
         for counts, _ in adapters(vertices, faces, origins, target - origins):
             assert (counts == 1).all()
+
+
+@pytest.mark.parametrize("mesh", MESHES, ids=lambda mesh: mesh.name)
+def test_a_ray_from_on_the_surface_counts_what_it_hits(mesh: wrt.Mesh) -> None:
+    rng = np.random.default_rng(3)
+    ends = np.float32(mesh.vertices)[mesh.faces[rng.integers(len(mesh.faces), size=2000)]]
+    origins = np.select([rng.random((2000, 1)) < 0.5], [ends[:, 0]], 0.5 * (ends[:, 0] + ends[:, 1]))  # corners and edges
+    target = mesh.vertices[rng.integers(len(mesh.vertices), size=2000)]
+    moving = (target != origins).any(axis=1)
+    for counts, hit in adapters(mesh.vertices, mesh.faces, origins[moving], (target - origins)[moving]):
+        assert np.array_equal(counts > 0, hit) and 0.1 < hit.mean()
