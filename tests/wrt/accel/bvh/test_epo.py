@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from fractions import Fraction
 
@@ -53,8 +54,8 @@ def share_inside(triangle: np.ndarray, lo: np.ndarray, hi: np.ndarray) -> Fracti
     along = max(range(3), key=lambda i: normal[i])
     polygon = corners
     for axis in range(3):
-        for bound, sign in ((Fraction(float(lo[axis])), 1), (Fraction(float(hi[axis])), -1)):
-            inside = [sign * (p[axis] - bound) for p in polygon]
+        for end, sign in ((float(lo[axis]), 1), (float(hi[axis]), -1)):
+            inside = [sign * (p[axis] - Fraction(end)) if math.isfinite(end) else 1 for p in polygon]
             out = []
             for i, p in enumerate(polygon):
                 if inside[i - 1] * inside[i] < 0:
@@ -71,7 +72,7 @@ def share_inside(triangle: np.ndarray, lo: np.ndarray, hi: np.ndarray) -> Fracti
 def by_definition(accel: Accelerator) -> float:
     geometry = accel.geometry
     corners = geometry.vertices[geometry.faces]
-    edges = corners[:, 1:].astype(np.float64) - corners[:, :1]
+    edges = np.where(np.isfinite(corners).all(axis=(1, 2), keepdims=True), corners[:, 1:].astype(np.float64) - corners[:, :1], 0.0)
     areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     nodes = binary_nodes(accel) if accel.name == "bvh2" else wide_nodes(accel)
     total = 0.0
@@ -100,6 +101,14 @@ def test_as_defined(name: str, options: dict) -> None:
     assert epo > 0.5
     assert epo == pytest.approx(by_definition(accel), rel=1e-9)
     assert epo == pytest.approx(build(soup(60), name, threads=1, **options).epo(), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["bvh2", "bvh8"])
+def test_faces_that_are_not_finite_have_no_surface(name: str) -> None:
+    of = soup(60)
+    vertices = np.concatenate([of.vertices, np.float32([[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]])])
+    accel = build(Geometry(vertices, np.concatenate([of.faces, np.int32([[0, 1, 180], [181, 2, 3]])]), of.spheres), name)
+    assert accel.epo() == pytest.approx(by_definition(accel), rel=1e-9)
 
 
 def test_by_hand() -> None:
