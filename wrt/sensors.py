@@ -118,7 +118,7 @@ def with_range_noise(ranges: Any, seed: int, constant: float = 0.0, proportional
     with probability `dropout` it is lost (inf). What is a miss (inf) stays one. Each element has noise of its own, whatever the
     others are. constant: scene units. Raises InputError, also for ranges that are NaN or below 0.
     """
-    shape, ranges = np.shape(ranges), as_array(ranges, np.float64, "ranges")
+    ranges, shape = as_array(ranges, np.float64, "ranges"), np.shape(ranges)
     if not (ranges >= 0.0).all():
         raise InputError(f"ranges must be 0 or more, or inf for a miss, got {ranges[~(ranges >= 0.0)][0]:g}")
     constant, proportional = (as_number(value, name, low=0.0) for value, name in ((constant, "constant"),

@@ -125,6 +125,7 @@ def test_noise_repeats_and_is_each_elements_own() -> None:
     (lambda: with_range_noise([1.0, np.nan], 0), "ranges must be 0 or more, or inf for a miss, got nan"),
     (lambda: with_range_noise(np.float32([[np.inf, -3.0]]), 0), "ranges must be 0 or more, or inf for a miss, got -3"),
     (lambda: with_range_noise(-np.inf, 0), "ranges must be 0 or more, or inf for a miss, got -inf"),
+    (lambda: with_range_noise([[1.0, 2.0], [3.0]], 0), "ranges must be an array of numbers"),
     (lambda: pinhole(np.eye(2), (4, 4)), "intrinsics must be"),
     (lambda: pinhole([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]], (4, 4)), "focal lengths must be above 0, got 1 and -1"),
     (lambda: pinhole("K", (4, 4)), "intrinsics must be an array of numbers"),
