@@ -71,9 +71,9 @@ class Accelerator(Queries, ABC):
 
     def __reduce__(self) -> Any:
         """For pickle: what `save` writes, and what the structure is over. A refit there measures growth from the shape of now."""
-        units, state, of = self.structure.units, self._state, self._state.geometry
+        units, state = self.structure.units, self._state
         make = partial(type(self).restore, triangle=units.triangle, box=units.box)
-        given = state.built.on_host(), Geometry(of.vertices, of.faces, of.spheres), str(self.device), self.threads
+        given = state.built.on_host(), state.geometry, str(self.device), self.threads
         options = {name: value for name, value in self._options.items() if name != "progress"}
         return make, given, {"attributes": self.attributes, "_options": options}
 

@@ -63,6 +63,10 @@ class DeviceGeometry(Geometry):
         """With points that nobody else writes to."""
         return DeviceGeometry.moved(wp.clone(self.points), self.indices, self.spheres)
 
+    def __reduce__(self) -> Any:
+        """For pickle and deepcopy: a Geometry, on the host; Warp's arrays go through neither."""
+        return Geometry, (self.vertices, self.faces, self.spheres)
+
     def __len__(self) -> int:
         return len(self.indices) + len(self.spheres)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -19,6 +20,7 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.structures import STRUCTURES
 from wrt.accel.build import build, load_accel
+from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import MAGIC, check_binary
 from wrt.core.checked_file import DIGEST_BYTES
@@ -62,6 +64,17 @@ def test_a_structure_goes_through_pickle(name: str) -> None:
         before.refit(3.0 * BALL.vertices)
         after.refit(3.0 * BALL.vertices)
         same(before, after)
+
+
+def test_a_structure_over_arrays_of_a_device_goes_through_pickle(saved: Path) -> None:
+    """It is over a Geometry then, also where load_accel was given the arrays."""
+    over = DeviceGeometry(wp.array(BALL.vertices, dtype=wp.vec3, device="cpu"), wp.array(BALL.faces, dtype=wp.vec3i, device="cpu"))
+    for before in (build(over, "bvh2"), load_accel(saved, over)):
+        for after in (pickle.loads(pickle.dumps(before)), deepcopy(before)):
+            same(before, after)
+            assert type(after.geometry) is Geometry and after.geometry.digest() == before.geometry.digest()
+            after.refit(wp.array(2.0 * BALL.vertices, dtype=wp.vec3, device="cpu"), in_place=True)
+            same(after, build((2.0 * BALL.vertices, BALL.faces), "bvh2"))
 
 
 def test_a_scene_goes_through_pickle_and_instances_say_that_they_do_not() -> None:
