@@ -109,15 +109,17 @@ class Asked:
         return Hits(*(self.give(array.reshape((self.n, k))) for array in (hits.t, hits.u, hits.v, hits.prim_id)))
 
     def counts(self) -> np.ndarray:
-        """How many hits each ray has, (N,) int64."""
-        return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL))])
+        """How many hits each ray has, (N,) int64. Where no triangle is in several leaves, the first walk has counted them all."""
+        counting = self.state.stats.references == len(self.state.geometry)
+        return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL, counting))])
 
     def given(self, numbers: np.ndarray) -> Any:
         """int64 as an answer."""
         return numbers if self.give is to_numpy else self.give(upload(numbers, wp.int64, self.device))
 
-    def _listed(self, limit: int) -> Iterator[tuple[Any, list[Any], np.ndarray]]:
-        """Of so many rays at a time: the rays; lists, in one of which a ray has its hits, `limit` at most; and how many."""
+    def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[Any, list[Any], np.ndarray]]:
+        """Of so many rays at a time: the rays; lists, in one of which a ray has its hits, `limit` at most; and how many.
+        counting: lists may be too short."""
         limit = min(limit, ALL)
         for begin in range(0, self.n, RAYS_AT_ONCE):
             n, rays = min(RAYS_AT_ONCE, self.n - begin), self.rays
@@ -128,7 +130,7 @@ class Asked:
             lists = [self._filled(rays, np.full(n, FEW), limit)]
             counts = lists[0].count.numpy().astype(np.int64)
             many = counts > FEW
-            if many.any():
+            if many.any() and not counting:
                 lists[0].count = upload(np.where(many, 0, counts), wp.int32, self.device)
                 lists.append(self._filled(rays, np.where(many, np.minimum(counts, 2 * limit), 0), limit))
                 counts = np.where(many, lists[1].count.numpy(), counts)
@@ -197,7 +199,8 @@ def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0
 
 def count_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                threads: int | None = None, crossings: bool = False) -> Any:
-    """How many hits each ray has in its segment, (N,) int64; as all_hits."""
+    """How many hits each ray has in its segment, (N,) int64; as all_hits. Unless a triangle is in several leaves (cells), the hits
+    take no memory."""
     asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
     return asked.given(asked.counts())
 

@@ -111,6 +111,17 @@ def test_thousands_of_hits_in_one_place() -> None:
         assert np.array_equal(wrt.first_hits(accel, k, *asked).prim_id, np.tile(np.arange(k), (100, 1)))
 
 
+def test_counting_keeps_no_hits(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = wrt.Mesh(np.tile(np.float32([[-1, -1, 0], [2, -1, 0], [-1, 2, 0]]), (50, 1)), np.arange(150).reshape(-1, 3))
+    asked = np.tile(np.float32([0.1, 0.2, 3.0]), (10, 1)), np.tile(np.float32([0.0, 0.0, -1.0]), (10, 1))
+    accel = wrt.build(mesh)
+    monkeypatch.setattr("wrt.accel.all_hits.MOST_ROWS", 100)
+    for crossings in (False, True):
+        assert (wrt.count_hits(accel, *asked, crossings=crossings) == 50).all()
+    with pytest.raises(wrt.InputError, match="500 hits are more than an array can have"):
+        wrt.all_hits(accel, *asked)
+
+
 def test_more_rays_than_are_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(5)
     mesh = soup(rng)
