@@ -24,11 +24,6 @@ ACCELERATORS: Registry[type[Any]] = Registry("structure", {
 })
 
 
-def meant(accel: str) -> str:
-    """The name of what a name stands for: "bvh" is another name of the default."""
-    return "bvh8" if accel == "bvh" else accel
-
-
 def stack_on(device: str) -> str:
     """In kernels.traverse.stack.PLACES, where kernels for a device have their stacks."""
     return "local" if device == "cpu" else cuda.stack  # a CPU's threads have no other

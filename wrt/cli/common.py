@@ -13,7 +13,7 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -98,13 +98,9 @@ class OneOf(click.ParamType):
         return f"[{'|'.join(self.names())}]"
 
     def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[Any]:
-        return _completions(self.names(), incomplete)
+        from click.shell_completion import CompletionItem
 
-
-def _completions(words: Iterable[str], incomplete: str) -> list[Any]:
-    from click.shell_completion import CompletionItem
-
-    return [CompletionItem(word) for word in words if word.startswith(incomplete)]
+        return [CompletionItem(name) for name in self.names() if name.startswith(incomplete)]
 
 
 ACCEL = OneOf("wrt.accel.structures:ACCELERATORS")
@@ -127,19 +123,11 @@ class Setting(click.ParamType):
 
 
 class SceneSetting(Setting):
-    """A setting of a scene; completion in a shell knows them."""
+    """A setting of a scene."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, Any]:
         name, parsed = super().convert(value, param, ctx)
         return name, str(value).partition("=")[2] if name == "size" else parsed  # 0x360 is no number
-
-    def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[Any]:
-        from wrt.io.toml.report import setting_choices
-        from wrt.scene.settings import SETTINGS
-
-        name, sign, _ = incomplete.partition("=")
-        words = [f"{name}={value}" for value in setting_choices(name)] if sign else [f"{each}=" for each in SETTINGS]
-        return _completions(words, incomplete)
 
 
 SET = click.option(

@@ -9,7 +9,7 @@ from typing import Any
 
 from wrt.accel.instancing import instanced_meshes
 from wrt.accel.structure import Structure
-from wrt.accel.structures import ACCELERATORS, meant, stack_on
+from wrt.accel.structures import ACCELERATORS, stack_on
 from wrt.core.device import made_once, memory_of
 from wrt.core.errors import InputError
 from wrt.kernels import structs
@@ -124,7 +124,7 @@ class Plan:
 
 def plan_of(scene: Scene, options: Options) -> Plan:
     """Raises InputError for a camera or a crop that there is not."""
-    accel = meant(options.accel)
+    accel = "bvh8" if options.accel == "bvh" else options.accel
     camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
     meshes = instanced_meshes(scene, options.instancing)
     features = features_of(scene, camera, meshes)

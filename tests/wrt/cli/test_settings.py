@@ -23,14 +23,13 @@ from tests.data import ROOT
 from wrt.cli import common as cli_common
 from wrt.cli.common import ACCEL, SceneSetting, depth_hint
 from wrt.cli.main import cli
-from wrt.io.toml.report import setting_choices
 from wrt.picture.image import read_image
 from wrt.renderer.film_arrays import GROUPS, VISIBLE
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene
-from wrt.scene.settings import DEPTH, FILTERS, FRESNELS, GLASS_DEPTH, GLASS_SHADOWS, MAX_DEPTH, SETTINGS, Settings
+from wrt.scene.settings import DEPTH, FILTERS, FRESNELS, GLASS_DEPTH, MAX_DEPTH, SETTINGS, Settings
 from wrt.scene.shapes import quad
 
 SMALL = ("--size", "32x18", "--spp", 2)
@@ -192,18 +191,10 @@ def test_help_does_not_wait_for_warp(arguments: str) -> None:
 @pytest.mark.parametrize(("arguments", "incomplete", "expected"), [
     (["render", "--accel"], "bvh2", ["bvh2", "bvh2_sphere", "bvh2_kdop"]),
     (["render", "--tonemap"], "", ["none", "reinhard", "aces", "agx"]),
-    (["render", "--set"], "f", ["filter=", "fresnel="]),
-    (["animate", "--set"], "glass_shadows=", ["glass_shadows=opaque", "glass_shadows=tinted"]),
-    (["render", "--set"], "spp=", []), (["render", "--set"], "nothing=", []),
 ])
 def test_completion(arguments: list[str], incomplete: str, expected: list[str]) -> None:
     words = ShellComplete(cli, {}, "wrt", "_WRT_COMPLETE").get_completions(arguments, incomplete)
     assert [word.value for word in words] == expected
-
-
-def test_choices_come_from_the_schema() -> None:
-    assert setting_choices("glass_shadows") == GLASS_SHADOWS and setting_choices("fresnel") == FRESNELS
-    assert setting_choices("spp") == setting_choices("nothing") == ()
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

@@ -53,13 +53,6 @@ def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[str] 
     raise_all([*problems, *others], path)
 
 
-def setting_choices(name: str) -> tuple[str, ...]:
-    """The words that a setting may be; none where it is no choice between words."""
-    from wrt.io.toml.schema import SettingsTable
-
-    return tuple(SettingsTable.model_json_schema()["properties"].get(name, {}).get("enum", ()))
-
-
 def raise_all(problems: Sequence[str], path: Path) -> None:
     """Raise one InputError with all problems, each a line, but no more than MOST; nothing where there are none."""
     problems = list(dict.fromkeys(problems))
