@@ -20,6 +20,8 @@ from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 from wrt.scene.values import Color
 
+pytestmark = pytest.mark.filterwarnings("ignore:the picture is all black")  # some are meant to be
+
 ONE: Color = (1.0, 1.0, 1.0)
 WHITE = Material(albedo=ONE)
 FLOOR = Object(quad((-10, 0, 10), (20, 0, 0), (0, 0, -20)), (WHITE,))
