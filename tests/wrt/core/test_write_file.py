@@ -20,7 +20,7 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import ROOT
 from tests.wrt.renderer.test_checkpoint import SCENE
-from wrt.accel.build import build, build_cached
+from wrt.accel.build import build
 from wrt.cli.reporting import Reporting
 from wrt.core.errors import InputError
 from wrt.core.write_file import check_writable, replacing
@@ -185,17 +185,14 @@ def test_a_disk_that_becomes_read_only_in_the_middle_is_one_error(tmp_path: Path
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), file.name)
     with pytest.raises(InputError, match=r"^/proc/a\.exr: cannot be written: "):
         write_image("/proc/a.exr", PIXELS)
-    with pytest.raises(InputError, match=r"^/proc/nowhere: cannot be made: No such file or directory$"):
-        build_cached("/proc/nowhere", icosphere(0))
 
 
-def test_a_damaged_entry_of_a_cache_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    build_cached(tmp_path, icosphere(0), "bvh2")
-    (entry,) = tmp_path.iterdir()
-    entry.write_bytes(b"half")
+def test_a_structure_for_a_folder_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (entry := tmp_path / "a.accel").write_bytes(b"before")
     refuse(monkeypatch, tmp_path)
     with pytest.raises(InputError, match=rf"^{entry}: cannot be written: Read-only file system$"):
-        build_cached(tmp_path, icosphere(0), "bvh2")
+        build(icosphere(0), "bvh2").save(entry)
+    assert entry.read_bytes() == b"before"
 
 
 # --- links --------------------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ import warp as wp
 
 import wrt.accel.cells.bsp as module
 from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, soup, triangles
-from wrt.accel.build import build, build_cached
+from wrt.accel.build import build
 from wrt.accel.cells.bsp import Bsp
 from wrt.accel.counting import counted
 from wrt.accel.geometry import Geometry
@@ -44,14 +43,6 @@ def test_progress_rises_to_one() -> None:
     seen: list[float] = []
     build(icosphere(3), "bsp", progress=seen.append)
     assert len(seen) > 2 and seen == sorted(seen) and seen[-1] == 1.0
-
-
-def test_progress_is_no_part_of_what_is_cached(tmp_path: Path) -> None:
-    seen: list[float] = []
-    first = build_cached(tmp_path, icosphere(0), "bsp", progress=seen.append)
-    assert seen
-    again = build_cached(tmp_path, icosphere(0), "bsp")
-    assert len(list(tmp_path.iterdir())) == 1 and np.array_equal(first.built.order, again.built.order)
 
 
 def test_an_error_of_progress_ends_the_build() -> None:
