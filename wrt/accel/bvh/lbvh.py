@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from wrt.accel.bvh.refit import Fitting, tree_of
 from wrt.accel.bvh.top_down import build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch_on, on_host, start, upload
+from wrt.core.device import launch_on, on_host, start
 from wrt.core.errors import InputError
 from wrt.kernels.build import lbvh as kernels
 from wrt.kernels.traverse.bvh2 import Bvh2Node
@@ -37,7 +36,8 @@ def build_on(device: Any, shape: Any, options: BvhOptions, threads: int = 1) -> 
     number_bits, bits = kernels.bits_of(n)
     fitting = Fitting(device, n, n - 1)
     fitting.find_bounds(shape, threads)
-    ends = upload(np.array([[np.inf] * 3, [-np.inf] * 3], np.float32), wp.vec3, device)
+    ends = wp.full(2, wp.vec3(wp.inf), dtype=wp.vec3, device=device)
+    ends[1:].fill_(wp.vec3(-wp.inf))
     launch_on(device, kernels.measure, min(kernels.PARTS, n), fitting.low, fitting.high, ends)
     keys, order = wp.empty(2 * n, dtype=wp.uint64, device=device), wp.empty(2 * n, dtype=wp.int32, device=device)
     launch_on(device, kernels.write_keys, n, fitting.low, fitting.high, ends, number_bits, bits, keys, order, None)
