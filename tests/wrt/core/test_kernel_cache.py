@@ -55,6 +55,17 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A kernel cache with the kernel and the precompiled headers."""
+    start("cpu")
+    folder = tmp_path_factory.mktemp("filled") / "cache"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wp.config, "kernel_cache_dir", str(folder))
+        assert answer() == RIGHT
+    return folder
+
+
 def cut(to: Callable[[int], int]) -> Callable[[Path], None]:
     return lambda path: os.truncate(path, to(path.stat().st_size))
 
@@ -106,7 +117,9 @@ OF_FOLDERS = ("removed", "a link to nothing", "a link to itself", "a file", "a p
 @pytest.mark.skipif(os.name == "nt", reason="makes links and pipes as POSIX does")
 @pytest.mark.parametrize(("what", "damage"), [(what, damage) for what in ("*.o", "*.meta", "*.cpp") for damage in DAMAGE]
                          + [(".", damage) for damage in OF_FOLDERS])
-def test_whatever_is_damaged_is_compiled_anew_once(what: str, damage: str, cache: Path, capfd: pytest.CaptureFixture[str]):
+def test_whatever_is_damaged_is_compiled_anew_once(what: str, damage: str, filled: Path, cache: Path,
+                                                   capfd: pytest.CaptureFixture[str]):
+    shutil.copytree(filled, cache)
     assert answer() == RIGHT
     (folder,) = cache.glob("wp_*")
     (path,) = folder.glob(what) if what != "." else (folder,)
