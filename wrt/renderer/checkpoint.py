@@ -63,8 +63,8 @@ def read(path: str | os.PathLike[str]) -> Saved:
 class Checkpoint:
     """The file of one render. identity: what must be the same for going on, as JSON has it; groups: of samples.
 
-    With `resume` a file that is there is read, and refused where it is not of this render; without, any file that is there is
-    refused. Both, and whether the file can be written, are reported before the work.
+    With `resume` an existing file is read, and refused if it belongs to another render. Without it any existing file is refused.
+    Both, and whether the file can be written, are reported before the work.
     """
 
     def __init__(self, path: Path, every: float, identity: dict[str, Any], *, groups: int, resume: bool) -> None:

@@ -32,8 +32,8 @@ MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C has to wait for on a G
 # is up to 1.15 times as fast as 2, and 16 up to 1.1 times as fast as 4), but pictures that end early are the less even.
 GROWTH = 4
 STEP_SECONDS = 0.1
-OVERTIME = 5.0  # seconds after the time limit, all of them without an answer, after which a pass is given up
-SILENT = 20.0  # seconds without an answer that are told; and OVERTIME of the first pass, without which pixels are black
+OVERTIME = 5.0  # seconds: a pass that gives no answer for so long after the time limit is given up
+SILENT = 20.0  # seconds without an answer that are reported; also OVERTIME of the first pass, as without it pixels are black
 # Samples (summed over pixels) that are done, and whether no tile runs at the moment: then each pixel is done whole.
 Steps = Generator[tuple[int, bool], None, None]
 

@@ -106,7 +106,7 @@ class DistributedRenderer:
 
 
 def workers_for(plan: Plan) -> ExecutorWorkers:
-    """Those that the plan's options name."""
+    """Return the workers that the plan's options name."""
     scene, options = replace(plan.scene, cameras=(plan.camera,)), replace(plan.options, camera=None, accel=plan.accel)
     if options.devices is not None:
         return DeviceWorkers(scene, options)
