@@ -44,7 +44,8 @@ BELOW_KERNELS = {
     "ray_query": {"query", "structs"},
     "winding": {"structs"},
     "wide": {"native", "memory", "query", "traverse", "units", "structs"},
-    "shade": {"native", "launches", "memory", "query", "traverse", "units", "structs"},
+    "shade": {"native", "memory", "query", "traverse", "units", "structs"},
+    "loops": {"shade", "native", "launches", "memory", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
     "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }

@@ -4,7 +4,7 @@ Whitted 1980, "An Improved Illumination Model for Shaded Display", without recur
 a shadow ray asked for each light, and at most three new paths: straight on through what is partly transparent, reflected, and
 refracted. Each carries what it will be worth (throughput); a path is cut at max_depth bounces, after MAX_TRANSPARENT surfaces
 that it went straight through, or below min_throughput, and counted. So is what comes after MAX_RAYS: where nothing is cut by
-throughput, a tree of 64 levels has no end. loop.py traces.
+throughput, a tree of 64 levels has no end. kernels/loops traces.
 """
 
 from functools import cache

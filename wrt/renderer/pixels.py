@@ -1,4 +1,4 @@
-"""Pictures by one ray at a time (wrt.kernels.shade.render): on CUDA, and wherever rays are counted.
+"""Pictures by one ray at a time (wrt.kernels.loops.one_ray): on CUDA, and wherever rays are counted.
 
 A thread takes a pixel; or a sample, where the pixels alone would leave multiprocessors of a GPU without work.
 """
@@ -12,7 +12,7 @@ import warp as wp
 
 from wrt.core.device import launch_on
 from wrt.kernels import structs
-from wrt.kernels.shade.render import add_samples
+from wrt.kernels.loops.one_ray import add_samples
 from wrt.kernels.shade.step import Sample
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.tiles import Work

@@ -13,7 +13,7 @@ from wrt.accel.structures import ACCELERATORS, stack_on
 from wrt.core.device import made_once, memory_of
 from wrt.core.errors import InputError
 from wrt.kernels import structs
-from wrt.kernels.shade import render as kernels
+from wrt.kernels.loops import one_ray as kernels
 from wrt.kernels.traverse.common import Units
 from wrt.renderer.features import Features, features_of
 from wrt.renderer.film_arrays import BYTES_OF_AOVS, BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS

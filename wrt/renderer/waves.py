@@ -1,4 +1,4 @@
-"""Pictures on the CPU by waves of samples (wrt.kernels.shade.wave): which kernels, what they work in, and the waves of a tile."""
+"""Pictures on the CPU by waves of samples (wrt.kernels.loops.wave): which kernels, what they work in, and the waves of a tile."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import warp as wp
 from wrt.accel.batches import new_scratch
 from wrt.core.device import made_once, records, upload
 from wrt.kernels.launches import Launch
+from wrt.kernels.loops import wave, wave_begin, wave_shade, wave_surfaces, wave_textures
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
-from wrt.kernels.shade import wave, wave_begin, wave_shade, wave_surfaces, wave_textures
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_cutout

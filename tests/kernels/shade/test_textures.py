@@ -11,10 +11,10 @@ import warp as wp
 
 from wrt.core.device import upload
 from wrt.kernels import structs
+from wrt.kernels.loops.wave import BLOCK
+from wrt.kernels.loops.wave_surfaces import ROW, ROWS
+from wrt.kernels.loops.wave_textures import sample_lanes
 from wrt.kernels.shade.textures import make_sample_texture
-from wrt.kernels.shade.wave import BLOCK
-from wrt.kernels.shade.wave_surfaces import ROW, ROWS
-from wrt.kernels.shade.wave_textures import sample_lanes
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.renderer.upload import TextureTable, srgb_table
 from wrt.scene.materials import Checkerboard, Texture

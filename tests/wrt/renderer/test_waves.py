@@ -15,7 +15,7 @@ import warp as wp
 from tests.data import ROOT
 from wrt.core.device import load_kernel, start
 from wrt.io.load import load_scene
-from wrt.kernels.shade import wave
+from wrt.kernels.loops import wave
 from wrt.renderer import waves
 from wrt.renderer.film_arrays import OF_AOVS, AovFilm, DeviceFilm
 from wrt.renderer.options import Options

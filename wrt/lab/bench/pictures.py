@@ -28,7 +28,7 @@ COLUMNS: Columns = {
     "loop ns": lambda row: spread(row.loop), "waves ns": lambda row: spread(row.waves),
     "loop / waves": lambda row: spread(row.ratio), "differ": "{differ}"}
 LEGEND = """\
-loop: one ray at a time, as on CUDA; waves: many samples share queues, which packets trace (kernels/shade/wave.py). Nanoseconds of a
+loop: one ray at a time, as on CUDA; waves: many samples share queues, which packets trace (kernels/loops/wave.py). Nanoseconds of a
 thread's CPU time a sample: camera ray, tracing, shading and film; medians of runs by turns, in brackets their middle half; loop /
 waves run by run. rays a sample: with shadow rays. differ: pixels of another value (must be 0)."""
 

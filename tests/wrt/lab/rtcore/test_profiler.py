@@ -147,11 +147,11 @@ def test_what_a_profile_cannot_do_is_refused(scene: Scene, monkeypatch: pytest.M
 def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None:
     """The machine code for Turing is that of a source without a word on counting, to the last byte."""
     features, structure = features_of(scene, scene.camera(None)), Structure(ACCELERATORS["bvh"], Units())
-    folder = Path(wrt.__file__).parent.parent / "kernels" / "shade"
+    folder = Path(wrt.__file__).parent.parent / "kernels"
     modules = {}
-    for name in ("step", "loop", "render"):
-        text = without_counting((folder / f"{name}.py").read_text())
-        for other in ("step", "loop"):
+    for name, file in (("step", "shade/step.py"), ("film", "shade/film.py"), ("one_ray", "loops/one_ray.py")):
+        text = without_counting((folder / file).read_text())
+        for other in ("step", "film"):
             text = text.replace(f"wrt.kernels.shade.{other}", f"wrt.kernels.bare_{other}")
         (tmp_path / f"{name}.py").write_text(text)
         spec = importlib.util.spec_from_file_location(f"wrt.kernels.bare_{name}", tmp_path / f"{name}.py")
@@ -159,7 +159,7 @@ def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None
         modules[name] = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = modules[name]
         spec.loader.exec_module(modules[name])
-    codes, bare = [], modules["render"].make_render_kernel(features, structure, importlib.import_module(features.camera))
+    codes, bare = [], modules["one_ray"].make_render_kernel(features, structure, importlib.import_module(features.camera))
     for kernel in (render_kernel(features, structure), bare):
         (binary,) = wp.compile_aot_module(kernel.module, arch=75, module_dir=tmp_path / str(len(codes)))
         (code,) = read_cubin(Path(binary).read_bytes()).values()

@@ -5,17 +5,17 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.launches import Launch, run_range
+from wrt.kernels.loops.wave import BLOCK, Path, Wave, enqueue, put_sample
+from wrt.kernels.loops.wave_lights import make_wave_lights
+from wrt.kernels.loops.wave_normals import make_wave_normals
+from wrt.kernels.loops.wave_numbers import make_sample_facets, put_keys
+from wrt.kernels.loops.wave_surfaces import ROW, make_wave_surfaces, put_row_vec3, row_vec3
+from wrt.kernels.loops.wave_textures import in_lanes, make_wave_textures
 from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
 from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, make_step
-from wrt.kernels.shade.wave import BLOCK, Path, Wave, enqueue, put_sample
-from wrt.kernels.shade.wave_lights import make_wave_lights
-from wrt.kernels.shade.wave_normals import make_wave_normals
-from wrt.kernels.shade.wave_numbers import make_sample_facets, put_keys
-from wrt.kernels.shade.wave_surfaces import ROW, make_wave_surfaces, put_row_vec3, row_vec3
-from wrt.kernels.shade.wave_textures import in_lanes, make_wave_textures
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
 
 

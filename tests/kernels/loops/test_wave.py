@@ -11,10 +11,10 @@ from tests.kernel_tools import DEVICE, cpu_only, launch, vec3s, zeros  # isort: 
 import warp as wp
 
 from wrt.core.device import records, upload
-from wrt.kernels.shade.render import load_pixel, store_pixel, with_sample
+from wrt.kernels.loops.wave import LANES, add_to_pixels
+from wrt.kernels.shade.film import load_pixel, store_pixel, with_sample
 from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.step import Sample
-from wrt.kernels.shade.wave import LANES, add_to_pixels
 from wrt.kernels.structs import Film, kernel, unit
 
 OF_FILM = {"mean": wp.vec3, "m2": wp.vec3, "samples": wp.int32, "rays": wp.int64, "cut_depth": wp.int32, "cut_throughput": wp.int32,

@@ -4,12 +4,12 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.loops.wave import BLOCK, Wave, put_sample
 from wrt.kernels.memory import number_of_vec2, put_in_vec2, put_in_vec3, put_int, put_number
 from wrt.kernels.query import put_ray, queued_ray
-from wrt.kernels.shade.render import center_of
+from wrt.kernels.shade.film import center_of
 from wrt.kernels.shade.sampling import hash_pair, make_draw, quantiles
 from wrt.kernels.shade.step import Sample
-from wrt.kernels.shade.wave import BLOCK, Wave, put_sample
 from wrt.kernels.structs import AovFilm, Film, Limits, kernel
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.loops.wave import BLOCK, Wave
 from wrt.kernels.memory import call_in_int, call_in_vec2, call_in_vec3, call_in_vec3i, number_at, put_number
 from wrt.kernels.query import hit_at, queued_ray
 from wrt.kernels.shade.surface import (
@@ -15,7 +16,6 @@ from wrt.kernels.shade.surface import (
     make_place_of,
     make_triangle_at,
 )
-from wrt.kernels.shade.wave import BLOCK, Wave
 from wrt.kernels.structs import Surfaces
 
 # Rows of a block, with a number for each hit, and how many each thing has: what is gathered, and what is computed of it (bent: the

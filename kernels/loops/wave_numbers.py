@@ -4,9 +4,9 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.loops.wave import Job, Wave
+from wrt.kernels.loops.wave_surfaces import ROW, put_row_vec3
 from wrt.kernels.memory import bits_at
-from wrt.kernels.shade.wave import Job, Wave
-from wrt.kernels.shade.wave_surfaces import ROW, put_row_vec3
 
 
 @wp.func

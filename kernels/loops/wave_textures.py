@@ -4,14 +4,14 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.loops.wave import BLOCK, Wave
+from wrt.kernels.loops.wave_surfaces import ROW, put_row_number, row_number, row_vec3
 from wrt.kernels.memory import put_int
 from wrt.kernels.native import source
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import Texels
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.shade.textures import FARTHEST, WRAP_CLAMP, WRAP_MIRROR, WRAP_REPEAT
-from wrt.kernels.shade.wave import BLOCK, Wave
-from wrt.kernels.shade.wave_surfaces import ROW, put_row_number, row_number, row_vec3
 from wrt.kernels.structs import Surfaces, noinline
 
 # Textures of a material, and which of their channels are read.
@@ -19,7 +19,7 @@ ALBEDO, EMISSION, PARAMETERS, TRANSMISSION, NORMAL = range(5)
 SLOTS = 5
 
 
-@wp.func_native(source("shade/texture_lanes.h", LANES=LANES, BLOCK=BLOCK, U_ROW=ROW["tex_u"], V_ROW=ROW["tex_v"],
+@wp.func_native(source("loops/texture_lanes.h", LANES=LANES, BLOCK=BLOCK, U_ROW=ROW["tex_u"], V_ROW=ROW["tex_v"],
                        FARTHEST=FARTHEST, WRAP_REPEAT=WRAP_REPEAT, WRAP_CLAMP=WRAP_CLAMP, WRAP_MIRROR=WRAP_MIRROR))
 def sample_lanes(surfaces: Surfaces, wanted: wp.array(dtype=wp.int32), first: int, count: int, channels: int,
                  rows: wp.array(dtype=wp.float32), to: int) -> None:

@@ -4,13 +4,13 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.loops.wave import BLOCK, Wave
+from wrt.kernels.loops.wave_surfaces import ROW, put_row_vec3, row_number, row_vec3
+from wrt.kernels.loops.wave_textures import NORMAL, in_lanes
 from wrt.kernels.memory import int_at
 from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.shading import Texels, bump
 from wrt.kernels.shade.surface import Surface, bent
-from wrt.kernels.shade.wave import BLOCK, Wave
-from wrt.kernels.shade.wave_surfaces import ROW, put_row_vec3, row_number, row_vec3
-from wrt.kernels.shade.wave_textures import NORMAL, in_lanes
 from wrt.kernels.structs import Surfaces
 
 

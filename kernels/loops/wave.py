@@ -2,9 +2,9 @@
 
 A wavefront (Laine, Karras and Aila 2013, "Megakernels Considered Harmful"): the pending rays of a wave of samples wait in one
 queue; one launch traces all of them, and the next shades all hits. Camera rays are made, traced and shaded FRESH at a time, while
-they are in the cache; what comes of them waits until all have been. Each sample goes through its own paths in the order of loop.py
-and adds up its light in that order, so that pictures have the same bits. Traversal and shading are kernels of their own: another
-scene compiles no traversal.
+they are in the cache; what comes of them waits until all have been. Each sample goes through its own paths in the order of
+one_ray.py and adds up its light in that order, so that pictures have the same bits. Traversal and shading are kernels of their own:
+another scene compiles no traversal.
 
 Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once. trace_wave launches
 the others, so that a wave is a single launch to Python. What begins a wave is in wave_begin.py, the step in wave_shade.py; for many
@@ -20,8 +20,8 @@ import warp as wp
 from wrt.kernels.launches import Launch, run_range, run_with
 from wrt.kernels.native import source
 from wrt.kernels.query import HitArrays, Queue, hit_at, put_ray, queued_ray
+from wrt.kernels.shade.film import load_pixel, make_see, store_pixel, with_sample
 from wrt.kernels.shade.materials import Scatter
-from wrt.kernels.shade.render import load_pixel, make_see, store_pixel, with_sample
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, ShadowWalk, make_go_through
@@ -184,7 +184,7 @@ def make_gather(transparent_shadows: bool) -> Any:
     return gather
 
 
-@wp.func_native(source("shade/film_samples.h", LANES=LANES))
+@wp.func_native(source("loops/film_samples.h", LANES=LANES))
 def add_to_pixels(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(dtype=Sample), p: int, samples: int) -> None:
     """As with_sample, to the LANES entries of the film from pixels[p] on: done[p * samples] and what follows it."""
 

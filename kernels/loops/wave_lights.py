@@ -4,15 +4,15 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.loops.wave import Wave
+from wrt.kernels.loops.wave_normals import row_of_normals
+from wrt.kernels.loops.wave_surfaces import ROW, put_row_number, put_row_vec3, row_number, row_vec3
 from wrt.kernels.memory import bits_at, put_number
 from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point, make_sky_sample
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.lights import LIGHTS, LightSample, choose_emitter, from_emitter
 from wrt.kernels.shade.sampling import triangle_numbers
 from wrt.kernels.shade.surface import Surface, Triangle, triangle_point, triangle_point_error
-from wrt.kernels.shade.wave import Wave
-from wrt.kernels.shade.wave_normals import row_of_normals
-from wrt.kernels.shade.wave_surfaces import ROW, put_row_number, put_row_vec3, row_number, row_vec3
 from wrt.kernels.structs import Lighting, Surfaces
 
 MESH = list(LIGHTS).index("mesh")

@@ -1,0 +1,94 @@
+"""The film: how samples are added to a pixel, and what an AOV film shows of a hit."""
+
+from typing import Any
+
+import warp as wp
+
+from wrt.kernels.shade.shading import make_shading
+from wrt.kernels.shade.step import Sample
+from wrt.kernels.structs import AovFilm, Film, Hit, Ray, Surfaces
+
+
+@wp.struct
+class Pixel:
+    """An entry of the film (Film) while samples are added to it."""
+
+    mean: wp.vec3
+    m2: wp.vec3
+    samples: int
+    rays: wp.int64
+    cut_depth: int
+    cut_throughput: int
+    lost: float
+    not_finite: int
+
+
+@wp.func
+def load_pixel(film: Film, i: int) -> Pixel:
+    pixel = Pixel()
+    pixel.mean = film.mean[i]
+    pixel.m2 = film.m2[i]
+    pixel.samples = film.samples[i]
+    pixel.rays = film.rays[i]
+    pixel.cut_depth = film.cut_depth[i]
+    pixel.cut_throughput = film.cut_throughput[i]
+    pixel.lost = film.lost[i]
+    pixel.not_finite = film.not_finite[i]
+    return pixel
+
+
+@wp.func
+def store_pixel(film: Film, i: int, pixel: Pixel):
+    film.mean[i] = pixel.mean
+    film.m2[i] = pixel.m2
+    film.samples[i] = pixel.samples
+    film.rays[i] = pixel.rays
+    film.cut_depth[i] = pixel.cut_depth
+    film.cut_throughput[i] = pixel.cut_throughput
+    film.lost[i] = pixel.lost
+    film.not_finite[i] = pixel.not_finite
+
+
+@wp.func
+def with_sample(before: Pixel, sample: Sample) -> Pixel:
+    pixel = before
+    color = sample.radiance
+    if not wp.isfinite(color[0] + color[1] + color[2]):
+        pixel.not_finite += 1
+        color = wp.vec3(0.0, 0.0, 0.0)
+    pixel.samples += 1
+    delta = color - pixel.mean
+    pixel.mean = pixel.mean + delta / float(pixel.samples)
+    pixel.m2 = pixel.m2 + wp.cw_mul(delta, color - pixel.mean)
+    pixel.rays += wp.int64(sample.rays)
+    pixel.cut_depth += sample.cut_depth
+    pixel.cut_throughput += sample.cut_throughput
+    pixel.lost += sample.lost
+    return pixel
+
+
+@wp.func
+def center_of(x: int, y: int, width: int, height: int) -> wp.vec2:
+    """Where on the film a pixel has its center."""
+    return wp.vec2((float(x) + 0.5) / float(width), (float(y) + 0.5) / float(height))
+
+
+def make_see(features: Any) -> Any:
+    """What a pixel's center shows."""
+    surface_at, look_up, resolve, shading_normal, _, _ = make_shading(features)
+
+    @wp.func
+    def see(film: AovFilm, pixel: int, surfaces: Surfaces, ray: Ray, hit: Hit):
+        """hit: the closest one of `ray`, or a miss."""
+        film.depth[pixel] = hit.t
+        film.prim_id[pixel] = hit.prim_id
+        film.material_id[pixel] = -1
+        if hit.prim_id >= 0:
+            s = surface_at(surfaces, ray, hit)
+            texels = look_up(surfaces, s)
+            m = resolve(surfaces, s, texels)
+            film.normal[pixel] = shading_normal(surfaces, s, texels, -ray.direction)
+            film.albedo[pixel] = m.albedo
+            film.material_id[pixel] = s.material
+
+    return see
