@@ -32,19 +32,19 @@ if TYPE_CHECKING:
     from wrt import sensors as sensors
     from wrt import testing as testing
     from wrt import torch as torch
-    from wrt.accel.all_hits import all_hits as all_hits
-    from wrt.accel.all_hits import count_hits as count_hits
-    from wrt.accel.all_hits import first_hits as first_hits
     from wrt.accel.build import build as build
     from wrt.accel.build import load_accel as load_accel
-    from wrt.accel.closest_points import closest_points as closest_points
-    from wrt.accel.closest_points import signed_distance as signed_distance
-    from wrt.accel.contains import contains as contains
     from wrt.accel.device_geometry import DeviceGeometry as DeviceGeometry
-    from wrt.accel.ray_query import ray_query as ray_query
+    from wrt.accel.queries.all_hits import all_hits as all_hits
+    from wrt.accel.queries.all_hits import count_hits as count_hits
+    from wrt.accel.queries.all_hits import first_hits as first_hits
+    from wrt.accel.queries.closest_points import closest_points as closest_points
+    from wrt.accel.queries.closest_points import signed_distance as signed_distance
+    from wrt.accel.queries.contains import contains as contains
+    from wrt.accel.queries.ray_query import ray_query as ray_query
+    from wrt.accel.queries.visible import visible as visible
+    from wrt.accel.queries.winding import winding_number as winding_number
     from wrt.accel.structures import ACCELERATORS as ACCELERATORS
-    from wrt.accel.visible import visible as visible
-    from wrt.accel.winding import winding_number as winding_number
     from wrt.core.errors import InputError as InputError
     from wrt.core.errors import SceneWarning as SceneWarning
     from wrt.io.load import load_scene as load_scene

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.geometry import Geometry
-from wrt.accel.gradients import Cotangents, HitTensors, adjoint, hits_of, library
+from wrt.accel.queries.gradients import Cotangents, HitTensors, adjoint, hits_of, library
 from wrt.core.errors import InputError
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.gradients import Cotangents, HitTensors, adjoint, hits_of, library
+from wrt.accel.queries.gradients import Cotangents, HitTensors, adjoint, hits_of, library
 
 
 def closest_hit(accel: Any, vertices: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf, *,
@@ -16,8 +16,8 @@ def closest_hit(accel: Any, vertices: Any, origins: Any, directions: Any, t_min:
 
     accel: a structure over one mesh, which follows `vertices`, (V, 3), where they are not those it has (Accelerator.refit, as
     rebuild_at is); None: it stays. All else as in Accelerator.closest_hit: tensors of torch, on the CPU or a GPU, taken as float32.
-    Gradients (wrt.accel.gradients.adjoint) are computed in float64 on the CPU, and have the same bits each time; those of a miss
-    are 0. There are no second derivatives. Raises InputError that names the argument, and where torch is not installed.
+    Gradients (wrt.accel.queries.gradients.adjoint) are computed in float64 on the CPU, and have the same bits each time; those of a
+    miss are 0. There are no second derivatives. Raises InputError that names the argument, and where torch is not installed.
     """
     torch = library("torch")
     given = (each if each is None else torch.as_tensor(each) for each in (vertices, origins, directions))

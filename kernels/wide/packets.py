@@ -35,7 +35,7 @@ AXIS_BITS = 2
 # Then the beam: intervals that hold the origins and the reciprocals of all its rays. Each word is there for x, y and z: the origin
 # that is closest to the near planes, and to the far planes; the reciprocal of the largest magnitude, and of the smallest; the same
 # two for far planes; and which plane of a node is near (as a float). One word more: the lowest t_min. And two that are not the
-# beam's. REFUSED: the mask of rays whose numbers a query refuses (wrt.accel.rays); ACTIVE: what set_up says.
+# beam's. REFUSED: the mask of rays whose numbers a query refuses (wrt.accel.queries.rays); ACTIVE: what set_up says.
 BEAM_WORDS = ("near_origin", "far_origin", "largest", "smallest", "far_largest", "far_smallest", "near_row", "t_min")
 BEAM = {name: LANES * len(ROWS) + 3 * i for i, name in enumerate(BEAM_WORDS)}
 REFUSED = BEAM["t_min"] + 1

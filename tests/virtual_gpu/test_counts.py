@@ -14,7 +14,7 @@ import wrt
 from tests import device
 from tests.data import ROOT
 from tests.virtual_gpu import gpus
-from wrt.accel import batches
+from wrt.accel.queries import batches
 from wrt.renderer import pixels
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer

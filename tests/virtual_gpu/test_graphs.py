@@ -12,8 +12,8 @@ import wrt
 from tests import device
 from tests.data import ROOT
 from tests.virtual_gpu import VirtualGpuError, gpus
-from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
+from wrt.accel.queries.answers import Hits
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere
 

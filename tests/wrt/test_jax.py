@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import wrt
-from tests.wrt.accel.test_gradients import cotangents, rays
+from tests.wrt.accel.queries.test_gradients import cotangents, rays
 from wrt.core.errors import InputError
 from wrt.scene import shapes
 

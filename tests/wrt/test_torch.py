@@ -12,7 +12,7 @@ import pytest
 
 import wrt
 from tests.data import ROOT
-from tests.wrt.accel.test_gradients import N, cotangents, facing, rays, soup
+from tests.wrt.accel.queries.test_gradients import N, cotangents, facing, rays, soup
 from wrt.core.errors import InputError
 from wrt.scene import shapes
 

@@ -15,13 +15,13 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from wrt.accel.answers import AccelStats, Refit
 from wrt.accel.built import Built, State
 from wrt.accel.flatten import World
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries import Queries
-from wrt.accel.ray_query import world_of
-from wrt.accel.rays import vectors
+from wrt.accel.queries.accelerator import Queries
+from wrt.accel.queries.answers import AccelStats, Refit
+from wrt.accel.queries.ray_query import world_of
+from wrt.accel.queries.rays import vectors
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, check_options, check_units
 from wrt.core.arrays import check_no_gradients, taken
@@ -39,8 +39,8 @@ class Accelerator(Queries, ABC):
     Several threads may ask one structure at a time, and one of them may refit it: docs/acceleration.md, "Several threads".
 
     kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts); for the CPU it may have
-    make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.batches), with stream_block and stream_sizes;
-    the last of its slots tells whether it met a ray that a query refuses.
+    make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.queries.batches), with stream_block and
+    stream_sizes; the last of its slots tells whether it met a ray that a query refuses.
     """
 
     name: ClassVar[str]

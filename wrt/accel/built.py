@@ -48,8 +48,9 @@ class Built:
 class State:
     """All that a refit changes. It is replaced as a whole, and nothing but a refit in place writes to what is in it: whoever takes
     it once has parts that belong together, whatever other threads do. data: the Warp struct that kernels get; built_cost: the SAH
-    cost that growth is measured against; followed: the Warp array of a refit, where it requires gradients (wrt.accel.gradients);
-    changes: whether refits in place write to it. Until the structure is built, there is a geometry and nothing else."""
+    cost that growth is measured against; followed: the Warp array of a refit, where it requires gradients
+    (wrt.accel.queries.gradients); changes: whether refits in place write to it. Until the structure is built, there is a geometry
+    and nothing else."""
 
     geometry: Geometry
     built: Any = None

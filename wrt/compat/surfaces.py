@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.accel.all_hits import ALL, Asked, first_hits
 from wrt.accel.base import Accelerator
-from wrt.accel.contains import open_edges_of
+from wrt.accel.queries.all_hits import ALL, Asked, first_hits
+from wrt.accel.queries.contains import open_edges_of
 
 
 def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, threads: int | None,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.accel.counting import copied
+from wrt.accel.queries.counting import copied
 from wrt.accel.structure import Structure
 from wrt.core.device import on_host
 from wrt.core.threads import run_all

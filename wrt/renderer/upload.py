@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.flatten import World, world_of
-from wrt.accel.hit_points import instance_records
+from wrt.accel.queries.hit_points import instance_records
 from wrt.core.checks import listed
 from wrt.core.device import records, upload
 from wrt.core.errors import InputError, warn

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.batches import new_scratch
+from wrt.accel.queries.batches import new_scratch
 from wrt.core.device import made_once, records, upload
 from wrt.kernels.launches import Launch
 from wrt.kernels.loops import wave, wave_begin, wave_shade, wave_surfaces, wave_textures

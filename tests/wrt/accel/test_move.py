@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.placed import place
-from tests.wrt.accel.test_threads import at_a_time
+from tests.wrt.accel.queries.test_threads import at_a_time
 from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry

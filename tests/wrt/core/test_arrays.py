@@ -11,8 +11,8 @@ import warp as wp
 import wrt
 from tests.device import NAME as DEVICE
 from tests.kernel_tools import cpu_only
-from wrt.accel.answers import Hits
-from wrt.accel.rays import rays_of, rays_on
+from wrt.accel.queries.answers import Hits
+from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.core.arrays import to_numpy, to_warp
 from wrt.core.errors import InputError
 from wrt.picture.film import Film

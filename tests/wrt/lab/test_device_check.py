@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.command_line import wrt as run
-from wrt.accel.answers import Hits
+from wrt.accel.queries.answers import Hits
 from wrt.core.errors import InputError
 from wrt.lab import device_check
 from wrt.lab.device_check import Check, built_in, different, structures

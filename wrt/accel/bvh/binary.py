@@ -19,7 +19,7 @@ from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry
-from wrt.accel.rays import vectors
+from wrt.accel.queries.rays import vectors
 from wrt.accel.store import check_binary, save
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.answers import Hits
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.answers import Hits
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.threads import run_all, thread_count
 from wrt.io.mesh_file import as_mesh

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.geometry import Geometry
-from wrt.accel.rays import rays_of, rays_on
+from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.kernels.query import RayArrays
 
 HIT, ASK, MISS = 1, 0, -1  # what a ray's exact answer must be; ASK: the oracle knows

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.answers import Hits
+from wrt.accel.queries.answers import Hits
 from wrt.core.checks import as_integer, as_tuple
 from wrt.core.errors import InputError
 from wrt.core.html import html_table

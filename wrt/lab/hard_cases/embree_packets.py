@@ -10,8 +10,8 @@ from weakref import finalize
 
 import numpy as np
 
-from wrt.accel.answers import Hits
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.answers import Hits
 from wrt.core.packages import needed_by
 from wrt.lab.bench.rays import RaySet
 from wrt.lab.hard_cases.contestants import Peer, cut

@@ -127,7 +127,7 @@ CLAIM = np.dtype([("row", np.int64), ("t", np.float64), ("prim_id", np.int64), (
 
 
 def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool = True) -> Verdict:
-    """The verdict on closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.answers.Hits).
+    """The verdict on closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.queries.answers.Hits).
 
     lowest: of triangles that are the same, the one with the lowest prim_id must be told: wrt's own rule, not a peer's. Where u
     and v are None, errors of t are measured only: the bounds are those of wrt's test.

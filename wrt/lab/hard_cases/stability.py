@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.all_hits import all_hits
+from wrt.accel.queries.all_hits import all_hits
 from wrt.accel.structure import Structure
 from wrt.core.device import load_kernel, upload
 from wrt.core.errors import InputError

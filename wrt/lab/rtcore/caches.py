@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.answers import Counters
+from wrt.accel.queries.answers import Counters
 from wrt.core.device import load_kernel, start, upload
 from wrt.core.threads import run_all, thread_count
 from wrt.kernels.study.cache_lru import Caches, Missed, Trace, replay_lru, replay_warps

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.answers import Counters
 from wrt.accel.base import Accelerator
+from wrt.accel.queries.answers import Counters
 from wrt.lab.bench.report import Columns, Part, Row, tabled, tables_page
 from wrt.lab.rtcore.caches import LINE, Misses, first_level, second_level
 from wrt.lab.rtcore.parameters import BASE, PARAMETERS, SWEEPS, Core, Gpu

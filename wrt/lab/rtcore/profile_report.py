@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wrt.accel.answers import Counters
+from wrt.accel.queries.answers import Counters
 from wrt.core.errors import InputError
 from wrt.core.html import Rows
 from wrt.core.write_file import check_writable, write_bytes

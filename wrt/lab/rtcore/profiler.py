@@ -50,7 +50,7 @@ class Rays:
     rays: as kernels.study.ray_log.LoggedRay; counts: as kernels.traverse.counters.Counts; pixel: row * width + column; kind: index
     in KINDS ("straight": goes on unbent through a blended surface); depth: bounces behind it (a shadow ray's: of the ray whose hit
     it starts from); lines: distinct cache lines. trace_rows: the rays whose fetches were kept, trace_first: where each one's
-    begin; address, size: of each fetch, in bytes, as in wrt.accel.answers.Counters.
+    begin; address, size: of each fetch, in bytes, as in wrt.accel.queries.answers.Counters.
     """
 
     rays: np.ndarray

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.accel.ray_query import require_one_mesh, structure_of
+from wrt.accel.queries.ray_query import require_one_mesh, structure_of
 from wrt.core.arrays import check_no_gradients, float32, recording, to_numpy
 from wrt.core.checks import shown
 from wrt.core.errors import InputError

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.answers import Counters
+from wrt.accel.queries.answers import Counters
 from wrt.accel.structure import Structure
 from wrt.core.device import on_host, upload
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts

@@ -10,10 +10,10 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Accelerator
-from wrt.accel.contains import contains
-from wrt.accel.hit_points import surroundings
-from wrt.accel.ray_query import structure_of
-from wrt.accel.rays import vectors
+from wrt.accel.queries.contains import contains
+from wrt.accel.queries.hit_points import surroundings
+from wrt.accel.queries.ray_query import structure_of
+from wrt.accel.queries.rays import vectors
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count

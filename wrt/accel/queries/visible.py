@@ -9,13 +9,13 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import warp as wp
 
-from wrt.accel.all_hits import first_hits
-from wrt.accel.answers import ANY_HIT_TYPES, room_for
 from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
-from wrt.accel.hit_points import surroundings
 from wrt.accel.instanced_geometry import InstancedGeometry
-from wrt.accel.rays import vectors
+from wrt.accel.queries.all_hits import first_hits
+from wrt.accel.queries.answers import ANY_HIT_TYPES, room_for
+from wrt.accel.queries.hit_points import surroundings
+from wrt.accel.queries.rays import vectors
 from wrt.core.arrays import check_no_gradients, real_numbers, returned, taken, to_numpy
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, upload

@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 from warp._src.types import array_t  # what a kernel gets for an array; a Warp array takes ten times as long to make
 
-from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES
-from wrt.accel.rays import Rays, rays_on
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
+from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
 from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.answers import ANY_HIT_TYPES, HIT_TYPES, Counters, Hits, room_for
-from wrt.accel.batches import trace_on_gpu, trace_worlds, tracer
 from wrt.accel.built import State
-from wrt.accel.counting import counted
-from wrt.accel.gradients import record
-from wrt.accel.rays import Rays, rays_of
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Counters, Hits, room_for
+from wrt.accel.queries.batches import trace_on_gpu, trace_worlds, tracer
+from wrt.accel.queries.counting import counted
+from wrt.accel.queries.gradients import record
+from wrt.accel.queries.rays import Rays, rays_of
 from wrt.accel.structure import Structure
 from wrt.accel.worlds import WorldIds, worlds_asked
 from wrt.core.arrays import recording, returned
@@ -43,7 +43,7 @@ class Queries:
         which one each ray sees, a number or (N,) int (a Warp array is not looked at; a ray of a world that is none hits nothing).
 
         Several threads may ask at a time, with or without counters, while another refits. While a wp.Tape records, t, u, v and
-        hits.point have gradients at fixed prim_id (wrt.accel.gradients.adjoint) in Warp arrays that require them: origins,
+        hits.point have gradients at fixed prim_id (wrt.accel.queries.gradients.adjoint) in Warp arrays that require them: origins,
         directions, and the vertices of the last refit. What came in as tensors of torch or JAX goes out as such. Raises InputError
         that names the argument and what was expected; what `out` holds is lost then.
         """

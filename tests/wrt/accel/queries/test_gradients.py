@@ -13,7 +13,7 @@ import warp as wp
 import wrt
 from tests.device import NAME as DEVICE
 from wrt.accel.geometry import Geometry
-from wrt.accel.gradients import Cotangents, adjoint
+from wrt.accel.queries.gradients import Cotangents, adjoint
 from wrt.core.errors import InputError
 from wrt.scene import shapes
 

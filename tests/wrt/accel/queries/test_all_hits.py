@@ -115,7 +115,7 @@ def test_counting_keeps_no_hits(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = wrt.Mesh(np.tile(np.float32([[-1, -1, 0], [2, -1, 0], [-1, 2, 0]]), (50, 1)), np.arange(150).reshape(-1, 3))
     asked = np.tile(np.float32([0.1, 0.2, 3.0]), (10, 1)), np.tile(np.float32([0.0, 0.0, -1.0]), (10, 1))
     accel = wrt.build(mesh)
-    monkeypatch.setattr("wrt.accel.all_hits.MOST_ROWS", 100)
+    monkeypatch.setattr("wrt.accel.queries.all_hits.MOST_ROWS", 100)
     for crossings in (False, True):
         assert (wrt.count_hits(accel, *asked, crossings=crossings) == 50).all()
     with pytest.raises(wrt.InputError, match="500 hits are more than an array can have"):
@@ -127,7 +127,7 @@ def test_more_rays_than_are_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> No
     mesh = soup(rng)
     asked, accel = rays(rng, mesh, 1000), wrt.build(mesh)
     expected = wrt.all_hits(accel, *asked), wrt.first_hits(accel, 5, *asked), wrt.count_hits(accel, *asked)
-    monkeypatch.setattr("wrt.accel.all_hits.RAYS_AT_ONCE", 300)
+    monkeypatch.setattr("wrt.accel.queries.all_hits.RAYS_AT_ONCE", 300)
     found = wrt.all_hits(accel, *asked), wrt.first_hits(accel, 5, *asked), wrt.count_hits(accel, *asked)
     assert np.array_equal(found[2], expected[2]) and np.array_equal(found[0].first, expected[0].first)
     for field in ("t", "u", "v", "prim_id"):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.hit_points import HitPoints
+from wrt.accel.queries.hit_points import HitPoints
 from wrt.core.arrays import taken, to_numpy, to_warp
 from wrt.core.checks import shown
 from wrt.core.device import empty_aligned

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
-from wrt.accel.batches import RAYS_PER_LAUNCH
-from wrt.accel.hit_points import surroundings
-from wrt.accel.ray_query import structure_of
-from wrt.accel.rays import rays_of, rays_on
+from wrt.accel.queries.answers import Hits
+from wrt.accel.queries.batches import RAYS_PER_LAUNCH
+from wrt.accel.queries.hit_points import surroundings
+from wrt.accel.queries.ray_query import structure_of
+from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
 from wrt.core.arrays import returned, to_numpy, to_warp
 from wrt.core.checks import as_integer, as_one

@@ -8,7 +8,7 @@ import warp as wp
 
 import wrt
 from tests.kernel_tools import cpu_only, floats, launch, vec3s, zeros
-from tests.wrt.accel.test_all_hits import rays, soup
+from tests.wrt.accel.queries.test_all_hits import rays, soup
 from wrt.scene import shapes
 
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.all_hits import Asked
 from wrt.accel.base import Accelerator
 from wrt.accel.built import State, once
 from wrt.accel.geometry import Geometry
-from wrt.accel.rays import vectors
+from wrt.accel.queries.all_hits import Asked
+from wrt.accel.queries.rays import vectors
 from wrt.core.arrays import returned
 from wrt.core.device import upload
 from wrt.core.errors import InputError

@@ -9,10 +9,10 @@ import warp as wp
 
 from wrt.accel.built import State, once
 from wrt.accel.flatten import Placed, World, placed_now, run_of, world_over
-from wrt.accel.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
 from wrt.accel.instanced_geometry import InstancedGeometry
-from wrt.accel.ray_query import require_one_mesh
-from wrt.accel.rays import Rays, rays_on
+from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
+from wrt.accel.queries.ray_query import require_one_mesh
+from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.worlds import WorldIds
 from wrt.core.arrays import returned, to_warp
 from wrt.core.device import launch_on, records, upload
@@ -98,7 +98,7 @@ class HitPoints:
 
     def gradients(self, t: Any = None, u: Any = None, v: Any = None, point: Any = None) -> Gradients:
         """Derivatives of a number, such as a sum of squares to be made small, by vertices, origins and directions at fixed prim_id,
-        from its derivatives by these hits, (N,) and (N, 3); of misses they are not looked at (wrt.accel.gradients.adjoint).
+        from its derivatives by these hits, (N,) and (N, 3); of misses they are not looked at (wrt.accel.queries.gradients.adjoint).
 
         Raises InputError for other shapes, and where the structure is not over one mesh.
         """

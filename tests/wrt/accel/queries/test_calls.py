@@ -12,10 +12,10 @@ import pytest
 import warp as wp
 
 from tests.kernel_tools import DEVICE
-from wrt.accel.answers import Hits
 from wrt.accel.base import Accelerator
-from wrt.accel.batches import FEWEST
 from wrt.accel.build import build
+from wrt.accel.queries.answers import Hits
+from wrt.accel.queries.batches import FEWEST
 from wrt.core.arrays import to_numpy, to_warp
 from wrt.core.errors import InputError
 from wrt.scene.mesh import Mesh

@@ -1,0 +1,1 @@
+"""Queries: rays and points that a structure is asked, and its answers."""
