@@ -12,8 +12,8 @@ from typing import Any
 NAME = "cpu"
 IS_VIRTUAL = False
 # Where functions have "cpu" as their default device.
-MODULES = ("wrt.accel.base", "wrt.accel.build", "wrt.accel.instances", "wrt.accel.store", "wrt.compat.open3d", "wrt.compat.trimesh",
-           "wrt.renderer.compile", "wrt.renderer.options", "wrt.lab.bench.rasterizer", "wrt.lab.plans")
+MODULES = ("wrt.accel.base", "wrt.accel.scenes.build", "wrt.accel.instances", "wrt.accel.store", "wrt.compat.open3d",
+           "wrt.compat.trimesh", "wrt.renderer.compile", "wrt.renderer.options", "wrt.lab.bench.rasterizer", "wrt.lab.plans")
 
 
 def use(name: str, *, real: bool = False, seed: int = 0) -> None:

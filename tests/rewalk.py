@@ -96,7 +96,7 @@ def prim_ids(accel) -> np.ndarray:
 
 def rays(geometry, origins, directions, t_min=0.0, t_max=np.inf, capacity=256) -> list[WalkRay]:
     """The rays with all their hits, found by testing every primitive with the default unit."""
-    from wrt.accel.build import build
+    from wrt.accel.scenes.build import build
 
     yardstick = build(geometry, "brute_force")
     kernel = make_all_hits_kernel(yardstick.structure.units)

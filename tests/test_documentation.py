@@ -212,9 +212,10 @@ def functions_of(thing: Any) -> Iterator[tuple[str, Any]]:
             yield name, function
 
 
-@pytest.mark.parametrize("module", ["wrt", "wrt.accel.base", "wrt.accel.queries.answers", "wrt.accel.geometry", "wrt.accel.build",
-                                    "wrt.accel.queries.gradients", "wrt.accel.instances", "wrt.compat.open3d", "wrt.compat.trimesh",
-                                    "wrt.torch", "wrt.jax", "wrt.sensors", "wrt.testing"])
+@pytest.mark.parametrize("module", ["wrt", "wrt.accel.base", "wrt.accel.queries.answers", "wrt.accel.geometry",
+                                    "wrt.accel.scenes.build", "wrt.accel.queries.gradients", "wrt.accel.instances",
+                                    "wrt.compat.open3d", "wrt.compat.trimesh", "wrt.torch", "wrt.jax", "wrt.sensors",
+                                    "wrt.testing"])
 def test_everything_public_says_what_it_is(module: str) -> None:
     silent = []
     public = importlib.import_module(module)

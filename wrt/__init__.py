@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from wrt import sensors as sensors
     from wrt import testing as testing
     from wrt import torch as torch
-    from wrt.accel.build import build as build
-    from wrt.accel.build import load_accel as load_accel
     from wrt.accel.device_geometry import DeviceGeometry as DeviceGeometry
     from wrt.accel.queries.all_hits import all_hits as all_hits
     from wrt.accel.queries.all_hits import count_hits as count_hits
@@ -44,6 +42,8 @@ if TYPE_CHECKING:
     from wrt.accel.queries.ray_query import ray_query as ray_query
     from wrt.accel.queries.visible import visible as visible
     from wrt.accel.queries.winding import winding_number as winding_number
+    from wrt.accel.scenes.build import build as build
+    from wrt.accel.scenes.build import load_accel as load_accel
     from wrt.accel.structures import ACCELERATORS as ACCELERATORS
     from wrt.core.errors import InputError as InputError
     from wrt.core.errors import SceneWarning as SceneWarning

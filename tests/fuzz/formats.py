@@ -296,7 +296,7 @@ def rays() -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def accel_seeds() -> list[Seed]:
-    from wrt.accel.build import build
+    from wrt.accel.scenes.build import build
     from wrt.accel.structures import ACCELERATORS
 
     found = []
@@ -316,7 +316,7 @@ def read_accel(path: Path) -> object:
 
 
 def load_accel_only(path: Path) -> Any:
-    from wrt.accel.build import load_accel
+    from wrt.accel.scenes.build import load_accel
 
     return load_accel(path, ball(), threads=1)
 

@@ -9,7 +9,7 @@ from tests.kernel_tools import DEVICE, floats, vec3s, zeros  # isort: skip (star
 from tests.structures import STRUCTURES, families_first  # isort: skip
 import warp as wp
 
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel

@@ -21,7 +21,7 @@ from tests import bits, device
 from tests.data import ROOT
 from tests.structures import STRUCTURES as ALL
 from tests.virtual_gpu import gpus
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.core.arrays import to_numpy
 from wrt.core.errors import InputError
 from wrt.scene import shapes

@@ -16,12 +16,12 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.built import Built, State
-from wrt.accel.flatten import World
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Queries
 from wrt.accel.queries.answers import AccelStats, Refit
 from wrt.accel.queries.ray_query import world_of
 from wrt.accel.queries.rays import vectors
+from wrt.accel.scenes.flatten import World
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, check_options, check_units
 from wrt.core.arrays import check_no_gradients, taken

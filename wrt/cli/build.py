@@ -22,7 +22,7 @@ def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any],
     from dataclasses import asdict
 
     import wrt
-    from wrt.accel.build import reports_progress
+    from wrt.accel.scenes.build import reports_progress
     from wrt.accel.store import check_target
 
     check_target(output)

@@ -80,7 +80,7 @@ measured(cli, WhatIf)
 @click.option("--fresnel", type=OneOf("wrt.scene.settings:FRESNELS"), help="exact, or schlick (cheaper, approximate)")
 @click.option("--sampler", type=OneOf("wrt.scene.settings:SAMPLERS"), help="sobol (evenly spread), or independent (random)")
 @shared("given", "accel")
-@click.option("--instancing", type=OneOf("wrt.accel.instancing:INSTANCING"), default="auto", show_default=True,
+@click.option("--instancing", type=OneOf("wrt.accel.scenes.instancing:INSTANCING"), default="auto", show_default=True,
               help="Keep shared meshes once: auto (large ones), always or never")
 @click.option("--aov", type=Names(), default=(), help="Also depth, normal, albedo, prim_id, material_id")
 @click.option("--bits", type=int, help="PNG: 8 or 16; EXR: 16 or 32")

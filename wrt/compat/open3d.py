@@ -13,12 +13,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.all_hits import Asked
 from wrt.accel.queries.closest_points import closest_points
 from wrt.accel.queries.contains import odd_crossings
 from wrt.accel.queries.rays import vectors
+from wrt.accel.scenes.build import build
 from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown

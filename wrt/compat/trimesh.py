@@ -12,9 +12,9 @@ import numpy as np
 from trimesh.caching import Cache, cache_decorator
 from trimesh.ray.ray_util import contains_points
 
-from wrt.accel.build import build
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.contains import contains, open_edges_of
+from wrt.accel.scenes.build import build
 from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError

@@ -14,9 +14,9 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
+from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_integer
 from wrt.core.device import load_kernel, start

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core import cuda
 from wrt.core.checks import as_one
 from wrt.core.device import start

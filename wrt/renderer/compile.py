@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.core.device import load_kernel, start
 from wrt.core.threads import run_all
 from wrt.renderer.film_arrays import OF_AOVS

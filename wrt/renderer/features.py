@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.instancing import instanced_meshes
+from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.lights import EMISSIVE, LIGHTS

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.instancing import INSTANCING
+from wrt.accel.scenes.instancing import INSTANCING
 from wrt.accel.structure import check_units
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_choice, as_integer, as_names, as_one, as_path, as_tuple, did_you_mean, shown
@@ -58,7 +58,7 @@ class Progress:
 class Options:
     """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once (None: chosen); never
     change a pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always
-    taken. instancing: which meshes that several objects share are kept once (wrt.accel.instancing).
+    taken. instancing: which meshes that several objects share are kept once (wrt.accel.scenes.instancing).
 
     devices: several of this machine, of one kind ("cuda:0", "cuda:1"), that share the tiles, in place of `device`. executor: a
     concurrent.futures.Executor or a dask.distributed.Client whose workers trace the tiles on their `device` (docs/cluster.md);

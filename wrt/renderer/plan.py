@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
-from wrt.accel.instancing import instanced_meshes
+from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS, stack_on
 from wrt.core.device import made_once, memory_of
@@ -39,7 +39,7 @@ def aov_kernel(features: Features, structure: Any) -> Any:
 @dataclass(frozen=True, eq=False)
 class Plan:
     """accel: the structure's name, where the options may say "bvh"; meshes: the id()s of those that are kept once
-    (wrt.accel.instancing); structure: what the kernels are made for, a
+    (wrt.accel.scenes.instancing); structure: what the kernels are made for, a
     Structure or one with a log before it (wrt.renderer.costs); crop: x0, y0, x1, y1 in pixels; deepest: the bounces that the
     kernels have room for."""
 

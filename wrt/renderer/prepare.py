@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build, reports_progress
+from wrt.accel.scenes.build import build, reports_progress
 from wrt.core.device import load_kernel
 from wrt.core.threads import Pool, thread_count
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.bvh.small import SMALL
 from wrt.accel.geometry import Geometry
-from wrt.accel.instancing import stored_meshes
+from wrt.accel.scenes.build import build
+from wrt.accel.scenes.instancing import stored_meshes
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.flatten import World, world_of
 from wrt.accel.queries.hit_points import instance_records
+from wrt.accel.scenes.flatten import World, world_of
 from wrt.core.checks import listed
 from wrt.core.device import records, upload
 from wrt.core.errors import InputError, warn
@@ -222,7 +222,7 @@ def tell_left_out(scene: Scene) -> None:
 
 
 def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()) -> DeviceScene:
-    """Put a scene on a device (a Warp device); meshes: the id()s of those that are kept once (wrt.accel.instancing). Raises
+    """Put a scene on a device (a Warp device); meshes: the id()s of those that are kept once (wrt.accel.scenes.instancing). Raises
     InputError where the scene cannot be rendered."""
     tell_left_out(scene)
     world = world_of(scene, meshes)

@@ -10,9 +10,9 @@ from tests.kernel_tools import ints, launch, rounded, zeros  # isort: skip (star
 import warp as wp
 
 from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for
-from wrt.accel.build import build
 from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary, sah_cost
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.build.records import levels
 from wrt.kernels.structs import kernel

@@ -9,10 +9,10 @@ from tests.kernel_tools import rounded
 from tests.kernels.build.test_bvh2 import CASES, geometry_of
 from tests.kernels.build.test_clip import polygon_in
 from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, triangles
-from wrt.accel.build import build
 from wrt.accel.cells.kdtree_build import Cell as BuilderCell
 from wrt.accel.cells.kdtree_build import KdOptions, binned_split, build_tree
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE
 from wrt.scene.shapes import icosphere, torus

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.cell_cases import CASES, points_of, random_lines, segments, triangles
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere
 

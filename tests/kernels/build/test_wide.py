@@ -7,9 +7,9 @@ import pytest
 
 from tests.kernels.build.test_bvh2 import geometry_of
 from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for
-from wrt.accel.build import build
 from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
 from wrt.accel.bvh.wide_tree import collapse, stack_need
+from wrt.accel.scenes.build import build
 from wrt.kernels.wide.traverse import STACK_SIZE
 from wrt.scene.shapes import icosphere
 

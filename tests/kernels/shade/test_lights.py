@@ -9,7 +9,7 @@ import pytest
 from tests.kernel_tools import DEVICE, cpu_only, directions, floats, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
 import warp as wp
 
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.kernels.shade import backgrounds, lights
 from wrt.kernels.shade.backgrounds import (
     environment,

@@ -8,8 +8,8 @@ import pytest
 from tests.kernel_tools import DEVICE, directions, floats, ints, launch, rounded, unit, vec3s, zeros  # isort: skip
 import warp as wp
 
-from wrt.accel.build import build
-from wrt.accel.flatten import world_mesh
+from wrt.accel.scenes.build import build
+from wrt.accel.scenes.flatten import world_mesh
 from wrt.kernels.shade.surface import Surface, make_surface_at, next_away, spawn_point
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 from wrt.renderer.upload import upload_scene

@@ -6,7 +6,7 @@ import pytest
 from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 
 from tests.cell_cases import assert_same, grazing, soup
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 
 FINE = {"grid": {"density": 100.0}, "octree": {"max_leaf": 1, "by_cost": False, "max_growth": 100.0}}
 

@@ -10,8 +10,8 @@ from tests.kernel_tools import directions, floats, ints, launch, rounded, unit, 
 from tests.structures import FAMILIES, STRUCTURES, families_first  # isort: skip
 import warp as wp
 
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.query import HitArrays, RayArrays, load_ray

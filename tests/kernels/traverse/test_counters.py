@@ -12,8 +12,8 @@ from tests.data import data_path
 from tests.kernel_tools import rounded
 from tests.rewalk import PRIMITIVE_BYTES, REWALK, rays
 from tests.structures import STRUCTURES, families_first
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.io.mesh_file import load_mesh

@@ -8,7 +8,7 @@ import pytest
 from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 
 from tests.cell_cases import assert_same, soup
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 

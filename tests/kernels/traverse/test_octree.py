@@ -9,7 +9,7 @@ from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 
 from tests import rewalk
 from tests.cell_cases import assert_same, soup
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.scene.shapes import icosphere
 
 

@@ -11,7 +11,7 @@ import pytest
 from tests import device
 from tests.kernel_tools import DEVICE
 
-from wrt.accel.build import build  # isort: skip (starts Warp)
+from wrt.accel.scenes.build import build  # isort: skip (starts Warp)
 import warp as wp
 
 from tests.placed import place

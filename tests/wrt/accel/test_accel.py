@@ -15,9 +15,9 @@ import warp as wp
 
 import wrt
 from tests.kernels.units.test_box import pad_kernel
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.batches import RAYS_PER_LAUNCH
+from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import records
 from wrt.core.errors import InputError

@@ -12,8 +12,8 @@ import warp as wp
 
 import wrt
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build, load_accel
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build, load_accel
 from wrt.core.errors import InputError
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere

@@ -15,11 +15,11 @@ from tests.data import data_path
 from tests.gltf_files import GltfFile
 from tests.kernel_tools import DEVICE
 from tests.placed import place
-from wrt.accel.build import build
-from wrt.accel.flatten import world_mesh
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances
-from wrt.accel.instancing import instanced_meshes
+from wrt.accel.scenes.build import build
+from wrt.accel.scenes.flatten import world_mesh
+from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import upload

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from tests.placed import place
 from tests.wrt.accel.queries.test_threads import at_a_time
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
 from wrt.accel.instances import Instances
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene, Sphere

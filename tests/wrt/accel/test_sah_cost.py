@@ -20,10 +20,10 @@ import pytest
 import wrt
 from tests.data import data_path
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Counters
+from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere, torus

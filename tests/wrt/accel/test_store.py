@@ -19,9 +19,9 @@ import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.structures import STRUCTURES
-from wrt.accel.build import build, load_accel
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build, load_accel
 from wrt.accel.store import MAGIC, check_binary
 from wrt.core.checked_file import DIGEST_BYTES
 from wrt.core.errors import InputError

@@ -10,9 +10,9 @@ import pytest
 import wrt
 from tests.data import data_path
 from tests.structures import STRUCTURES as ALL
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.lab.hard_cases.cases import HARD_CASES, HardCase, generate
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.core.checks import shown
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.load import load_scene

@@ -9,7 +9,7 @@ import pytest
 
 from tests.fuzz.seeds import scenes, side_files
 from tests.gltf_files import one_triangle
-from wrt.accel.build import load_accel
+from wrt.accel.scenes.build import load_accel
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
 from wrt.io.load import load_scene

@@ -20,7 +20,7 @@ from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import ROOT
 from tests.wrt.renderer.test_checkpoint import SCENE
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.cli.reporting import Reporting
 from wrt.core.errors import InputError
 from wrt.core.write_file import check_writable, replacing

@@ -13,7 +13,7 @@ import pytest
 
 from tests.data import data_path
 from tests.gltf_files import one_triangle
-from wrt.accel.flatten import world_mesh
+from wrt.accel.scenes.flatten import world_mesh
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.load import load_scene, schema
 from wrt.scene.backgrounds import EnvironmentBackground, GradientBackground

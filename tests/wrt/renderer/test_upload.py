@@ -10,7 +10,7 @@ import pytest
 from tests.kernel_tools import DEVICE, launch, unit, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel.flatten import world_mesh
+from wrt.accel.scenes.flatten import world_mesh
 from wrt.core.errors import InputError, SceneWarning
 from wrt.kernels.shade import lights
 from wrt.kernels.shade.surface import Triangle, triangle_normal

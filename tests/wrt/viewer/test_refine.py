@@ -13,7 +13,7 @@ import pytest
 
 import wrt
 from tests.wrt.renderer.test_checkpoint import SCENE as PINHOLE
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.lab.rtcore.profiler import profile
 from wrt.picture.film import Film

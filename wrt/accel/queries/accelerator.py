@@ -12,8 +12,8 @@ from wrt.accel.queries.batches import trace_on_gpu, trace_worlds, tracer
 from wrt.accel.queries.counting import counted
 from wrt.accel.queries.gradients import record
 from wrt.accel.queries.rays import Rays, rays_of
+from wrt.accel.scenes.worlds import WorldIds, worlds_asked
 from wrt.accel.structure import Structure
-from wrt.accel.worlds import WorldIds, worlds_asked
 from wrt.core.arrays import recording, returned
 from wrt.core.checks import shown
 from wrt.core.errors import InputError

@@ -181,7 +181,7 @@ def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out
 
 def trace_worlds(structure: Structure, data: Any, surfaces: Any, rays: Rays, worlds: Any, out: list[Any], device: Any,
                  threads: int) -> None:
-    """Write the answers to arrays, each ray in its own world (wrt.accel.worlds.WorldIds); on a GPU in one launch."""
+    """Write the answers to arrays, each ray in its own world (wrt.accel.scenes.worlds.WorldIds); on a GPU in one launch."""
     inputs = [data, surfaces, rays_on(device, rays), worlds.arrays]
     launch_over(device, worlds_kernel(structure, len(out) == 1), inputs, out, threads)
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
+from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh

@@ -12,12 +12,12 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
 from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.rays import rays_of, rays_on
+from wrt.accel.scenes.build import build
 from wrt.core.device import launch_on, load_kernel, upload
 from wrt.core.threads import thread_count
 from wrt.io.mesh_file import as_mesh

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import load_kernel, start, upload
 from wrt.core.errors import InputError

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.io.mesh_file import as_mesh
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE

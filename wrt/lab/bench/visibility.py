@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core.threads import thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster

@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 from wrt.core.registry import Registry

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.lab.hard_cases.common import surface
 from wrt.lab.hard_cases.conformance import ClosestHit

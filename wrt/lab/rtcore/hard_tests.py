@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.core.device import load_kernel, upload
 from wrt.io.mesh_file import as_mesh
 from wrt.kernels.query import RayArrays

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.bvh.wide import WideBvh
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rays import RaySet, ray_sets

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.wide.references import leaf_count, leaf_first
 from wrt.scene.mesh import Mesh

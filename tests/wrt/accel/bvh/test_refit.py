@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wrt.accel.build import build
 from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.bvh.volumes import boxes_around
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wrt.accel.build import build
 from wrt.accel.bvh import reinsertion
 from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.bvh.reinsertion import EVERY_NODE, LARGEST_NODES, Effort, half_areas, links_of, optimized, scale_of
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 

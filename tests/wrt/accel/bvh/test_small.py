@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tests.kernel_tools import cpu_only  # isort: skip
-from wrt.accel.build import build
 from wrt.accel.bvh import wide
 from wrt.accel.bvh.small import SMALL, small_tree
 from wrt.accel.bvh.tree import BvhOptions
 from wrt.accel.bvh.wide_tree import WideTree, check_wide
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.scene.shapes import icosphere

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from tests.kernels.traverse.test_common import GEOMETRIES
-from wrt.accel.build import build
 from wrt.accel.bvh.kdop_area import kdop_area
 from wrt.accel.bvh.volumes import cuts, project
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wrt.accel.build import build
 from wrt.accel.bvh.compress import compress, decompress
 from wrt.accel.bvh.wide_tree import check_wide, lanes_of, packed
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere
 

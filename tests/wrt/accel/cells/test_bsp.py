@@ -13,11 +13,11 @@ import warp as wp
 
 import wrt.accel.cells.bsp as module
 from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, soup, triangles
-from wrt.accel.build import build
 from wrt.accel.cells.bsp import Bsp
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.counting import counted
 from wrt.accel.queries.rays import rays_of, rays_on
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.query import HitArrays, make_closest_hit_kernel
 from wrt.kernels.structs import Surfaces

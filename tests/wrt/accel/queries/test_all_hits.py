@@ -14,8 +14,8 @@ from tests.kernel_tools import floats, launch, vec3s, zeros
 from tests.kernels.every_hit import HitList, make_all_hits_kernel
 from tests.structures import families_first
 from tests.wrt.accel.test_structures_agree import mixed_rays
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.kernels.query import RayArrays
 from wrt.kernels.traverse.common import Units
 from wrt.lab.hard_cases.cases import ASK, HARD_CASES, HardCase, generate, judge_all_hits

@@ -13,9 +13,9 @@ import warp as wp
 
 from tests.kernel_tools import DEVICE
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import FEWEST
+from wrt.accel.scenes.build import build
 from wrt.core.arrays import to_numpy, to_warp
 from wrt.core.errors import InputError
 from wrt.scene.mesh import Mesh

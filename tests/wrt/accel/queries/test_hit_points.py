@@ -14,9 +14,9 @@ import warp as wp
 import wrt
 from tests.kernel_tools import DEVICE, unit, vec3s
 from tests.placed import place
-from wrt.accel.flatten import world_mesh, world_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.hit_points import HitPoints
+from wrt.accel.scenes.flatten import world_mesh, world_of
 from wrt.core.arrays import to_numpy
 from wrt.core.errors import InputError
 from wrt.scene import shapes

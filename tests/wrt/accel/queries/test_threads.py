@@ -15,11 +15,11 @@ import warp as wp
 import wrt
 from tests.placed import place
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build, load_accel
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import RAYS_PER_LAUNCH
+from wrt.accel.scenes.build import build, load_accel
 from wrt.accel.store import array_types
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import load_kernel, made_once, start

@@ -11,9 +11,9 @@ import pytest
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.data import data_path
-from wrt.accel.build import build
 from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import load_mesh
 from wrt.lab.bench import bvh as bench

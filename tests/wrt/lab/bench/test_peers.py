@@ -10,9 +10,9 @@ import pytest
 
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.lab.bench import peers

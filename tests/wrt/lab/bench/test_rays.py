@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.lab.bench.rays import RAY_KINDS, ray_sets
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere

@@ -14,9 +14,9 @@ from tests.kernel_tools import DEVICE, launch, vec3s, zeros  # isort: skip (star
 import warp as wp
 
 from wrt.accel.base import Accelerator
-from wrt.accel.build import build
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.shade.surface import make_surface_at, spawn_point
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from wrt.accel.build import build
 from wrt.accel.queries.answers import Counters
+from wrt.accel.scenes.build import build
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.rtcore.caches import LINE, Cache, Misses, distinct_lines, first_level, lines_of, replay, second_level
 from wrt.scene.shapes import icosphere

@@ -9,7 +9,7 @@ import numpy as np
 
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.kernels.study.hard_tests import HARD, REFUSED, SURE
 from wrt.lab.bench.rays import RaySet, endless
 from wrt.lab.rtcore.hard_tests import classified, counted

@@ -10,7 +10,7 @@ import pytest
 
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
-from wrt.accel.build import build
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.lab.bench.rays import ray_sets
 from wrt.lab.bench.report import text

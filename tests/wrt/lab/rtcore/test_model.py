@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wrt.accel.build import build
 from wrt.accel.queries.answers import Counters
+from wrt.accel.scenes.build import build
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE, Counts
 from wrt.lab.rtcore.caches import LINE, Cache
 from wrt.lab.rtcore.model import TERMS, Work, predict, sensitivity, simt, span, sweep, trace_rays

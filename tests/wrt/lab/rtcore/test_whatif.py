@@ -11,9 +11,9 @@ import pytest
 
 from tests.command_line import wrt as command
 from tests.kernel_tools import rounded
-from wrt.accel.build import build
 from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.study.bvh2_study import STACK_SIZE, Study
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.flatten import World, world_of
 from wrt.accel.instanced_geometry import InstancedGeometry
-from wrt.accel.instancing import is_invertible
+from wrt.accel.scenes.flatten import World, world_of
+from wrt.accel.scenes.instancing import is_invertible
 from wrt.core.arrays import real_numbers, to_numpy
 from wrt.core.checks import shown
 from wrt.core.device import upload

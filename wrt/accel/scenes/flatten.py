@@ -8,7 +8,7 @@ import numpy as np
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
-from wrt.accel.instancing import is_instance
+from wrt.accel.scenes.instancing import is_instance
 from wrt.core.errors import InputError
 from wrt.scene.clean import flip_collinear
 from wrt.scene.mesh import Mesh, unit_rows
@@ -81,7 +81,7 @@ class World:
 
 
 def world_of(scene: Scene, meshes: frozenset[int] = frozenset()) -> World:
-    """The world of a scene; meshes: the id()s of those that are kept once (wrt.accel.instancing)."""
+    """The world of a scene; meshes: the id()s of those that are kept once (wrt.accel.scenes.instancing)."""
     return instanced_world(scene, meshes) if meshes else world_mesh(scene)
 
 

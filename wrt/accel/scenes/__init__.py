@@ -1,0 +1,1 @@
+"""Scenes: how meshes, scenes and their files become structures."""
