@@ -21,9 +21,9 @@ from wrt.accel.queries.accelerator import Queries
 from wrt.accel.queries.answers import AccelStats, Refit
 from wrt.accel.queries.ray_query import world_of
 from wrt.accel.queries.rays import vectors
-from wrt.accel.scenes.flatten import World
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, check_options, check_units
+from wrt.accel.world import World
 from wrt.core.arrays import check_no_gradients, taken
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError

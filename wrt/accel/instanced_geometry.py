@@ -9,6 +9,9 @@ import numpy as np
 from wrt.accel.geometry import Geometry
 from wrt.kernels.traverse.common import Units
 
+# Sum of |A| |A^-1| over a row, 3 at most for turned and scaled meshes. Beyond, rounding in the mesh's space is much in the world.
+MAX_SPREAD = 1e4
+
 
 @dataclass(frozen=True, eq=False)
 class NumberedGeometry(Geometry):

@@ -10,11 +10,10 @@ import warp as wp
 
 from wrt.accel.base import Accelerator, array_bytes
 from wrt.accel.built import Built, State
-from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of
+from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, inverse_of
 from wrt.accel.queries.answers import AccelStats, Refit
-from wrt.accel.scenes.flatten import World
-from wrt.accel.scenes.instancing import MAX_SPREAD
 from wrt.accel.top_level import BOXES, MOVED_BOXES, build_top, part_boxes, refit_top, spread_of, world_boxes
+from wrt.accel.world import World
 from wrt.core.arrays import real_numbers
 from wrt.core.checks import shown
 from wrt.core.device import upload

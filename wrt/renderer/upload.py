@@ -11,7 +11,8 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.hit_points import instance_records
-from wrt.accel.scenes.flatten import World, world_of
+from wrt.accel.scenes.flatten import world_of
+from wrt.accel.world import World
 from wrt.core.checks import listed
 from wrt.core.device import records, upload
 from wrt.core.errors import InputError, warn

@@ -12,7 +12,7 @@ from wrt.accel.queries.batches import trace_on_gpu, trace_worlds, tracer
 from wrt.accel.queries.counting import counted
 from wrt.accel.queries.gradients import record
 from wrt.accel.queries.rays import Rays, rays_of
-from wrt.accel.scenes.worlds import WorldIds, worlds_asked
+from wrt.accel.queries.world_ids import WorldIds, worlds_asked
 from wrt.accel.structure import Structure
 from wrt.core.arrays import recording, returned
 from wrt.core.checks import shown

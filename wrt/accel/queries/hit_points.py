@@ -12,8 +12,8 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
 from wrt.accel.queries.ray_query import require_one_mesh
 from wrt.accel.queries.rays import Rays, rays_on
-from wrt.accel.scenes.flatten import Placed, World, placed_now, run_of, world_over
-from wrt.accel.scenes.worlds import WorldIds
+from wrt.accel.queries.world_ids import WorldIds
+from wrt.accel.world import Placed, World, placed_now, run_of, world_over
 from wrt.core.arrays import returned, to_warp
 from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError

@@ -13,11 +13,12 @@ from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.instances import Instances
-from wrt.accel.scenes.flatten import World, world_of, world_over
+from wrt.accel.scenes.flatten import world_of
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.scenes.worlds import worlds_over
 from wrt.accel.store import read
 from wrt.accel.structures import ACCELERATORS
+from wrt.accel.world import World, world_over
 from wrt.core.arrays import is_tensor, taken, to_numpy
 from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError

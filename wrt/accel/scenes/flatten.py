@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
 from wrt.accel.scenes.instancing import is_instance
+from wrt.accel.world import Placed, World
 from wrt.core.errors import InputError
 from wrt.scene.clean import flip_collinear
 from wrt.scene.mesh import Mesh, unit_rows
@@ -17,100 +18,9 @@ from wrt.scene.model import Object, Scene
 MOST = 2**31 - 2  # faces, and vertices
 
 
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """The scene's primitives in runs of one mesh in one place, in the order of prim_id; the last run may be all spheres.
-
-    (I,) int64 each: first_prim, first_face (into World.faces), first_material (into World.prim_material), material_step (1, or 0
-    where all are of one material); to_world: (I, 3, 4) float64.
-    """
-
-    first_prim: np.ndarray
-    first_face: np.ndarray
-    first_material: np.ndarray
-    material_step: np.ndarray
-    to_world: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class World:
-    """All shapes of a scene, or a mesh by itself. prim_id counts the faces of all objects in their order, then the spheres.
-
-    geometry: what is hit; vertices (V, 3), faces (F, 3), normals (V, 3) or None, uvs (V, 2), the last two zero where an object
-    has none, uvs (0, 2) where a mesh by itself has none; prim_material: index into the scene's materials. Without `placed`, all
-    is in world space and numbered as primitives are; with it, meshes with several places are there once, in their own space.
-    objects: the first prim_id of each object, and behind them of each sphere; None where there is no scene.
-    """
-
-    geometry: Geometry | InstancedGeometry
-    vertices: np.ndarray
-    faces: np.ndarray
-    normals: np.ndarray | None
-    uvs: np.ndarray
-    prim_material: np.ndarray
-    placed: Placed | None = None
-    objects: np.ndarray | None = None
-
-    def places(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The row in `faces` of each triangle, and its row in `placed` (0 where nothing is), (N,) each."""
-        if self.placed is None:
-            return prim_id, np.zeros(len(prim_id), np.int32)
-        run, local = self._run(prim_id)
-        return self.placed.first_face[run] + local, run
-
-    def materials(self, prim_id: np.ndarray) -> np.ndarray:
-        """The material of each primitive, (N,) int32."""
-        if self.placed is None:
-            return self.prim_material[prim_id]
-        run, local = self._run(prim_id)
-        return self.prim_material[self.placed.first_material[run] + self.placed.material_step[run] * local]
-
-    def corners(self, prim_id: np.ndarray) -> np.ndarray:
-        """The corners of triangles in world space, (N, 3, 3) float64."""
-        face, run = self.places(prim_id)
-        corners = self.vertices[self.faces[face]].astype(np.float64)
-        if self.placed is None:
-            return corners
-        to_world = self.placed.to_world[run]
-        return corners @ to_world[:, :, :3].transpose(0, 2, 1) + to_world[:, None, :, 3]
-
-    def _run(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        assert self.placed is not None
-        run = np.searchsorted(self.placed.first_prim, prim_id, side="right") - 1
-        return run, prim_id - self.placed.first_prim[run]
-
-
 def world_of(scene: Scene, meshes: frozenset[int] = frozenset()) -> World:
     """The world of a scene; meshes: the id()s of those that are kept once (wrt.accel.scenes.instancing)."""
     return instanced_world(scene, meshes) if meshes else world_mesh(scene)
-
-
-def world_over(geometry: Geometry | InstancedGeometry, normals: np.ndarray | None = None, uvs: np.ndarray | None = None) -> World:
-    """The world of what is no scene: a mesh by itself, whose normals and uvs are given, or instances of meshes without."""
-    material = np.zeros(0, np.int32)
-    uvs = np.zeros((0, 2), np.float32) if uvs is None else uvs
-    if isinstance(geometry, Geometry):
-        return World(geometry, geometry.vertices, geometry.faces, normals, uvs, material)
-    first_vertex = np.cumsum([0, *(len(part.vertices) for part in geometry.parts)])
-    first_face = np.cumsum([0, *(len(part.faces) for part in geometry.parts)])
-    nothing = np.zeros(len(geometry.part), np.int64)
-    return World(geometry, np.concatenate([part.vertices for part in geometry.parts]),
-                 np.concatenate([part.faces + np.int32(first) for part, first in zip(geometry.parts, first_vertex, strict=False)]),
-                 None, uvs, material, Placed(geometry.first_prim, first_face[geometry.part], nothing, nothing, geometry.to_world))
-
-
-def placed_now(world: World, geometry: Geometry | InstancedGeometry) -> Placed | None:
-    """world.placed, with the instances where they are now in a geometry that began as the world's."""
-    if world.placed is None or not isinstance(geometry, InstancedGeometry):
-        return None
-    to_world = world.placed.to_world.copy()
-    to_world[run_of(world.placed, geometry)] = geometry.to_world[geometry.is_placed]
-    return replace(world.placed, to_world=to_world)
-
-
-def run_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:
-    """The run of each instance that is placed (InstancedGeometry.is_placed); one without primitives has none of its own."""
-    return np.searchsorted(placed.first_prim, geometry.first_prim[geometry.is_placed], side="right") - 1
 
 
 def world_mesh(scene: Scene) -> World:

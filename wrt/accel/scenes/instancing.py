@@ -6,6 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 
+from wrt.accel.instanced_geometry import MAX_SPREAD
 from wrt.core.checks import as_choice
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
@@ -13,8 +14,6 @@ from wrt.scene.model import Object, Scene
 INSTANCING = ("auto", "always", "never")
 # Copies of one mesh with so many triangles together are worth a second level (docs/acceleration.md, "Instances").
 MIN_SAVED = 250_000
-# Sum of |A| |A^-1| over a row, 3 at most for turned and scaled meshes. Beyond, rounding in the mesh's space is much in the world.
-MAX_SPREAD = 1e4
 
 
 def instanced_meshes(scene: Scene, instancing: str = "auto") -> frozenset[int]:

@@ -1,4 +1,4 @@
-"""Several worlds in one structure: each ray sees the instances of one of them."""
+"""Several worlds in one structure: meshes and scenes as one geometry, all of whose objects are instances."""
 
 from __future__ import annotations
 
@@ -7,16 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import warp as wp
 
-from wrt.accel.instanced_geometry import InstancedGeometry
-from wrt.accel.scenes.flatten import World, world_of
+from wrt.accel.scenes.flatten import world_of
 from wrt.accel.scenes.instancing import is_invertible
-from wrt.core.arrays import real_numbers, to_numpy
-from wrt.core.checks import shown
-from wrt.core.device import upload
+from wrt.accel.world import World
 from wrt.core.errors import InputError
-from wrt.kernels.query import Worlds
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
@@ -39,41 +34,3 @@ def worlds_over(given: Sequence[Mesh | Scene]) -> World:
     world = world_of(Scene(together), frozenset(id(thing.mesh) for thing in together))
     geometry: Any = world.geometry
     return replace(world, geometry=replace(geometry, worlds=np.cumsum([0, *map(len, objects)])), objects=None)
-
-
-class WorldIds:
-    """The world of each of n rays: arrays for kernels, on the structure's device."""
-
-    def __init__(self, accel: Any, geometry: InstancedGeometry, world: Any, n: int) -> None:
-        self.first_prim = geometry.world_first_prim
-        self.arrays: Any = Worlds()
-        self.arrays.id, self.arrays.root = self._on(accel.device, world, n), accel.roots
-
-    def _on(self, device: Any, world: Any, n: int) -> Any:
-        if isinstance(world, wp.array):
-            if world.dtype != wp.int32 or world.shape != (n,):
-                raise InputError(f"world must be ({n},) int32, got {world.shape} {world.dtype.__name__}")
-            return (world if world.is_contiguous else world.contiguous()).to(device)
-        ids, count = real_numbers(world, "world", f"a number or ({n},)"), len(self.first_prim)
-        if ids.shape not in ((), (n,)) or (ids.dtype.kind not in "iu" and ids.size):
-            raise InputError(f"world must be a whole number or ({n},) of them, got {shown(world)}")
-        if ids.size and not (ids.min() >= 0 and ids.max() < count):
-            raise InputError(f"world must be 0 to {count - 1}, got {ids.min() if ids.min() < 0 else ids.max()}")
-        return upload(np.broadcast_to(ids, (n,)).astype(np.int32), wp.int32, device)
-
-    def numbered(self, prim_id: Any) -> np.ndarray:
-        """(N,) int32: prim_ids of hits as numbers among the primitives of all worlds."""
-        own, world = to_numpy(prim_id), self.arrays.id.numpy()
-        return np.where(own >= 0, own + self.first_prim[np.where(own >= 0, world, 0)], -1).astype(np.int32)
-
-
-def worlds_asked(accel: Any, geometry: Any, world: Any, n: int) -> WorldIds | None:
-    """The argument of a query; None where there is but one world, and none is named. Raises InputError that calls it `world`."""
-    several = isinstance(geometry, InstancedGeometry) and geometry.worlds is not None
-    if world is None:
-        if several and len(geometry.worlds) > 2:
-            raise InputError(f"world must be given: the structure is over {len(geometry.worlds) - 1} worlds")
-        return None
-    if not several:
-        raise InputError("world is for structures over worlds: wrt.build takes a list of them")
-    return WorldIds(accel, geometry, world, n)

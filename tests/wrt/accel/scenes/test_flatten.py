@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wrt.accel.scenes.flatten import World, instanced_world, world_mesh, world_of
+from wrt.accel.scenes.flatten import instanced_world, world_mesh, world_of
 from wrt.accel.scenes.instancing import INSTANCING, MIN_SAVED, instanced_meshes
+from wrt.accel.world import World
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
