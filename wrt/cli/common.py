@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import dataclasses
 import difflib
 import functools
 import importlib
@@ -13,7 +14,7 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,26 @@ SHARED = {
 def shared(*names: str) -> Callable[[Any], Any]:
     """A command with these of SHARED."""
     return lambda command: functools.reduce(lambda wrapped, name: SHARED[name](wrapped), reversed(names), command)
+
+
+def names_of(kind: type[Any]) -> list[str]:
+    """Return the names of a dataclass's fields."""
+    return [each.name for each in dataclasses.fields(kind)]
+
+
+def gathering(name: str, make: Callable[..., Any], names: Sequence[str], options: Sequence[Any]) -> Callable[[Any], Any]:
+    """Give a command these options, of which it gets one argument of that name: what `make` makes of them. names: those of the
+    options, and perhaps of others."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def gathered(**given: Any) -> None:
+            own = {each: given.pop(each) for each in names if each in given}
+            command(**given, **{name: make(**own)})
+
+        return functools.reduce(lambda wrapped, option: option(wrapped), options, gathered)
+
+    return decorate
 
 
 def settings_of(given: tuple[tuple[str, Any], ...], flags: dict[str, Any] | None = None, **taken: str) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass
@@ -13,7 +12,21 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from wrt.cli.common import ACCEL, CLUSTER, DURATION, SHARED, Names, OneOf, client_of, now_and_then, say, say_json, warnings_reported
+from wrt.cli.common import (
+    ACCEL,
+    CLUSTER,
+    DURATION,
+    SHARED,
+    Names,
+    OneOf,
+    client_of,
+    gathering,
+    names_of,
+    now_and_then,
+    say,
+    say_json,
+    warnings_reported,
+)
 from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
 from wrt.core.write_file import check_writable, write_bytes
@@ -90,25 +103,6 @@ def planned(plan: type[Plan]) -> Callable[[Any], Any]:
 
     flag = click.option("--quick", is_flag=True, help="Rough figures soon: less of all that is not given here, as it says")
     return gathering("plan", make, ["quick", *names_of(plan)], [*map(parameter, dataclasses.fields(plan)[::-1]), flag])
-
-
-def names_of(kind: type[Any]) -> list[str]:
-    return [each.name for each in dataclasses.fields(kind)]
-
-
-def gathering(name: str, make: Callable[..., Any], names: Sequence[str], options: Sequence[Any]) -> Callable[[Any], Any]:
-    """A command with these options, of which it gets what `make` makes as one argument of that name. names: those of the options,
-    and perhaps of others."""
-
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        @functools.wraps(command)
-        def gathered(**given: Any) -> None:
-            own = {each: given.pop(each) for each in names if each in given}
-            command(**given, **{name: make(**own)})
-
-        return functools.reduce(lambda wrapped, option: option(wrapped), options, gathered)
-
-    return decorate
 
 
 def parameter(each: dataclasses.Field[Any]) -> Any:

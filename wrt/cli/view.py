@@ -13,32 +13,44 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import load, naming, say, settings_of, shared
+from wrt.cli.common import gathering, load, naming, say, settings_of, shared
+
+
+def place_of(**given: Any) -> Any:
+    """Return the viewer's Place of the options below."""
+    from wrt.viewer.access import Place
+
+    return Place(**given)
+
+
+PLACE = (
+    click.option("--allow-origin", "allow_origins", multiple=True, metavar="ORIGIN",
+                 help="Another address under which browsers find it, such as https://example.org of a proxy; repeatable"),
+    click.option("--host", default="127.0.0.1", show_default=True,
+                 help="For which machines: 127.0.0.1 is this one only, 0.0.0.0 all that reach it and have the printed address"),
+    click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True,
+                 help="Where to listen; 0 is any free one"),
+)
 
 
 @click.command()
 @shared("scene")
-@click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="Where to listen; 0 is any free one")
-@click.option("--host", default="127.0.0.1", show_default=True,
-              help="For which machines: 127.0.0.1 is this one only, 0.0.0.0 all that reach it and have the printed address")
-@click.option("--allow-origin", multiple=True, metavar="ORIGIN",
-              help="Another address under which browsers find it, such as https://example.org of a proxy; repeatable")
+@gathering("place", place_of, ("host", "port", "allow_origins"), PLACE)
 @click.option("--open/--no-open", "open_browser", default=True, help="Open a browser  [default: where there is a desktop]")
 @click.option("--spp", type=click.IntRange(1, 1 << 24), default=1024, show_default=True, help="Samples a pixel to refine until")
 @shared("device", "threads", "camera", "accel", "given", "quiet")
-def view(scene: Path, port: int, host: str, allow_origin: tuple[str, ...], open_browser: bool, spp: int,
-         given: tuple[tuple[str, Any], ...], quiet: bool, **options: Any) -> None:
+def view(scene: Path, place: Any, open_browser: bool, spp: int, given: tuple[tuple[str, Any], ...], quiet: bool,
+         **options: Any) -> None:
     """Look around in SCENE: an orbit camera in the browser, whose picture gets finer while it stands still.
 
     The address that it prints holds a token: whoever has it may look and steer. Needs the extra `viewer`. Ctrl-C ends it.
     """
-    from wrt.viewer.access import as_origin
     from wrt.viewer.page import Page
     from wrt.viewer.server import import_viser, listen
 
     import_viser()
-    origins = [as_origin(text) for text in allow_origin]
-    listen(host, port).close()  # told before the scene is read
+    listen(place).close()  # told before the scene is read
+    from wrt.lab.costs import CostCounter
     from wrt.renderer.options import Options
 
     rendering = Options(**options)
@@ -46,7 +58,7 @@ def view(scene: Path, port: int, host: str, allow_origin: tuple[str, ...], open_
     loaded = load(scene, quiet).with_settings(**settings)
     with naming(scene):
         loaded.camera(rendering.camera)  # told with the file's name
-    page = Page(loaded, rendering, host, port, spp, allow_origins=origins, warn=(lambda text: None) if quiet else say)
+    page = Page(loaded, rendering, place, spp, counter_of=CostCounter.beside, warn=(lambda text: None) if quiet else say)
     say(page.url, err=False)
     if not quiet:
         say("Ctrl-C ends it")

@@ -95,7 +95,7 @@ def as_choice(value: str, choices: Collection[str], what: str) -> str:
 def require_known(name: str, known: Collection[str], what: str) -> None:
     """Raise InputError where there is no such thing of that name."""
     if name not in known:
-        raise InputError(f"no {what} {shown(name)}; {did_you_mean(name, known)}there is {', '.join(known)}")
+        raise InputError(f"no {what} {shown(name)}; {did_you_mean(name, known)}there is {', '.join(known) or 'none'}")
 
 
 def unknown(name: str, what: str, known: Iterable[str]) -> str:

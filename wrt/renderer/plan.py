@@ -39,9 +39,8 @@ def aov_kernel(features: Features, structure: Any) -> Any:
 @dataclass(frozen=True, eq=False)
 class Plan:
     """accel: the structure's name, where the options may say "bvh"; meshes: the id()s of those that are kept once
-    (wrt.accel.scenes.instancing); structure: what the kernels are made for, a
-    Structure or one with a log before it (wrt.renderer.costs); crop: x0, y0, x1, y1 in pixels; deepest: the bounces that the
-    kernels have room for."""
+    (wrt.accel.scenes.instancing); structure: what the kernels are made for, a Structure or what has its fields and methods; crop:
+    x0, y0, x1, y1 in pixels; deepest: the bounces that the kernels have room for."""
 
     scene: Scene
     options: Options

@@ -71,17 +71,33 @@ class Access:
         return hmac.compare_digest(text.encode("utf-8", "replace"), self.token.encode())
 
 
-def access_for(host: str, address: str, port: int, allowed: Iterable[str] = ()) -> tuple[Access, str]:
-    """The access to a server, and the address to print. host: as it was asked for; address, port: where the server listens;
-    allowed: further origins. Raises InputError for an origin that is none."""
+@dataclass(frozen=True)
+class Place:
+    """The address that the viewer listens on. host: 127.0.0.1 is for this machine only, 0.0.0.0 for all that reach it; port: 0 is
+    any free one; allow_origins: further addresses under which browsers find it, such as "https://example.org" of a proxy. Raises
+    InputError for an origin that is none."""
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    allow_origins: Iterable[str] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "allow_origins", tuple(as_origin(text) for text in self.allow_origins))
+
+
+HERE = Place()
+
+
+def access_for(place: Place, address: str, port: int) -> tuple[Access, str]:
+    """The access to a server, and the address to print. address, port: where the server listens."""
     where = ip_address(address.partition("%")[0])
-    names = {as_host(address), as_host(host.lower())}
+    names = {as_host(address), as_host(place.host.lower())}
     home = as_host(address)
     if where.is_unspecified:  # every address of this machine
         names, home = set(LOOPBACK), LOOPBACK[0] if where.version == 4 else LOOPBACK[2]
     elif where.is_loopback:
         names |= set(LOOPBACK)
-    origins = {origin_of("http", name, port) for name in names} | {as_origin(text) for text in allowed}
+    origins = {origin_of("http", name, port) for name in names} | set(place.allow_origins)
     access = Access(frozenset(origins), port)
     return access, f"{origin_of('http', home, port)}/?token={access.token}"
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import tempfile
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,10 @@ from wrt.renderer.options import Options
 from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import TONEMAPS
-from wrt.viewer.access import access_for
+from wrt.viewer.access import HERE, Place, access_for
 from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
-from wrt.viewer.refine import COSTS, Viewer
-from wrt.viewer.renderers import Shown
+from wrt.viewer.refine import Viewer
+from wrt.viewer.renderers import CounterOf, Shown
 from wrt.viewer.server import Door, import_viser, listen, to_stderr
 
 MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser one
@@ -59,23 +59,23 @@ def status(shown: Shown, viewer: Viewer, full: tuple[int, int], browsers: int) -
 
 
 class Page:
-    """A server with the panel and one Viewer. host, port (0: any free one): where it listens. Raises InputError where it cannot.
+    """A server with the panel and one Viewer. Raises InputError where it cannot listen at the place.
 
-    `url` is where it is found, with the token that a browser needs; allow_origins: other addresses of it, such as that of a proxy
-    ("https://example.org"); warn: hears of requests and messages that are refused, once of each kind. `close` ends it.
+    `url` is where it is found, with the token that a browser needs; spp, counter_of: as for Viewer; warn: called with requests and
+    messages that are refused, once of each kind. `close` ends it.
     """
 
-    def __init__(self, scene: Scene, options: Options, host: str = "127.0.0.1", port: int = 8080, spp: int = 1024, *,
-                 allow_origins: Iterable[str] = (), warn: Callable[[str], None] = to_stderr) -> None:
+    def __init__(self, scene: Scene, options: Options, place: Place = HERE, spp: int = 1024, *,
+                 counter_of: CounterOf | None = None, warn: Callable[[str], None] = to_stderr) -> None:
         import_viser()
-        self.viewer = Viewer(scene, options, self._show, self._report, spp)
+        self.viewer = Viewer(scene, options, self._show, self._report, spp, counter_of)
         start = self.viewer.view.camera
         self.unit, self.watching, self.name = unit_of(scene, start), -1, scene.name or "picture"
         self.full = (0, 0)
-        listening = listen(host, port)
+        listening = listen(place)
         try:
             address, port = listening.getsockname()[:2]
-            access, self.url = access_for(host, address, port, allow_origins)
+            access, self.url = access_for(place, address, port)
             self.door = Door(access, warn)
             self.server = self.door.open(listening, "wrt")
         except BaseException:
@@ -197,7 +197,7 @@ class Page:
     def _picture_folder(self) -> None:
         gui, viewer = self.server.gui, self.viewer
         with gui.add_folder("Picture"):
-            cost = gui.add_dropdown("show", (PICTURE, *COSTS), initial_value=PICTURE,
+            cost = gui.add_dropdown("show", (PICTURE, *viewer.costs), initial_value=PICTURE,
                                     hint="The picture, or a heat map of what each pixel costs: a counter summed over its rays")
             self.legend = gui.add_image(np.repeat(colors()[None], LEGEND_SIZE[0], axis=0), visible=False)
             self.marks = gui.add_markdown("", visible=False)

@@ -19,12 +19,11 @@ from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.picture.heatmap import colored, top_of
 from wrt.picture.tonemap import to_codes
-from wrt.renderer.costs import COUNTERS
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.progress import COMPILING
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
-from wrt.viewer.renderers import Renderers, Shown, View
+from wrt.viewer.renderers import CounterOf, Renderers, Shown, View
 
 COARSE = 0.08  # seconds that the first picture after a change should take
 PATIENCE = 0.5  # seconds after which it is given up, where the next change is waiting
@@ -65,19 +64,21 @@ class Viewer:
     any thread, and never waits for a picture.
 
     show: gets every picture; report: gets a word on what is going on, "" when nothing is to be said. Both are called by `run`.
-    scene, options: as for a Renderer; options.camera is the view to begin with. spp: where refining ends.
+    scene, options: as for a Renderer; options.camera is the view to begin with. spp: where refining ends. counter_of: what counts
+    for heat maps, as for Renderers.
     """
 
     def __init__(self, scene: Scene, options: Options, show: Callable[[Shown], None],
-                 report: Callable[[str], None] = lambda text: None, spp: int = 1024) -> None:
+                 report: Callable[[str], None] = lambda text: None, spp: int = 1024, counter_of: CounterOf | None = None) -> None:
         self.scene, self.show, self.report, self.spp = scene, show, report, spp
+        self.costs = () if counter_of is None else COSTS
         settings = scene.settings
         camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
         self.deepest = max(settings.max_depth, DEEPEST)
         self.view = View(camera, settings.size, settings.max_depth, options.accel)
         self.exposure, self.tonemap = settings.exposure, settings.tonemap
         self.shown: Shown | None = None  # last
-        self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._hear)
+        self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._hear, counter_of)
         self._pace = Pace()
         self._condition = threading.Condition()
         self._number = self._done = 0  # of changes, so far and rendered
@@ -96,7 +97,7 @@ class Viewer:
         if "accel" in changes:
             ACCELERATORS.check(changes["accel"])
         if changes.get("cost"):
-            require_known(changes["cost"], COUNTERS, "counter")
+            require_known(changes["cost"], self.costs, "counter")
         with self._condition:
             if callable(changes.get("camera")):
                 changes["camera"] = changes["camera"](self.view.camera)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from wrt.picture.film import Film
-from wrt.renderer.costs import CostCounter
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.pixel_rays import film_rays
+from wrt.renderer.prepare import Prepared
 from wrt.renderer.renderer import Renderer
 from wrt.scene.cameras import CameraKind
 from wrt.scene.digest import camera_digest
@@ -20,13 +20,27 @@ from wrt.scene.model import Scene
 TILE_SIZE = 16  # a tile that runs is waited for before the next view
 
 
-class Renderers:
-    """progress: hears of all of them. Every method that makes a renderer raises InputError where that cannot be."""
+class Counter(Protocol):
+    """Counts the work of every pixel, for heat maps."""
 
-    def __init__(self, scene: Scene, options: Options, progress: Callable[[Progress], None]) -> None:
-        self.scene, self.options, self.progress = scene, options, progress
+    def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
+        """Turn to another view, as Prepared.aimed does."""
+
+    def costs(self, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
+        """Return the counters by name, (H, W) int32 each; None where `go_on`, asked with the number of pixels done, said no."""
+
+
+CounterOf = Callable[[Prepared], Counter]
+
+
+class Renderers:
+    """progress: called by all of them. counter_of: makes the counter of a structure from what its renderer prepared; None: there
+    are no heat maps. Every method that makes a renderer raises InputError where that cannot be."""
+
+    def __init__(self, scene: Scene, options: Options, progress: Callable[[Progress], None], counter_of: CounterOf | None) -> None:
+        self.scene, self.options, self.progress, self.counter_of = scene, options, progress, counter_of
         self.by_accel: dict[str, Renderer] = {}
-        self.counters: dict[str, CostCounter] = {}
+        self.counters: dict[str, Counter] = {}
 
     def prepare(self, view: View) -> None:
         """Make what the view needs, if it is not there."""
@@ -34,9 +48,8 @@ class Renderers:
             options = replace(self.options, accel=view.accel, camera=view.camera.opened(), tile_size=TILE_SIZE,
                               progress=self.progress)
             self.by_accel[view.accel] = Renderer(self.scene, options)
-        if view.cost and view.accel not in self.counters:
-            prepared = self.by_accel[view.accel].prepared
-            self.counters[view.accel] = CostCounter(prepared.plan, prepared.device, prepared)
+        if view.cost and self.counter_of is not None and view.accel not in self.counters:
+            self.counters[view.accel] = self.counter_of(self.by_accel[view.accel].prepared)
 
     def picture(self, view: View, scale: int, spp: int) -> Film:
         """A picture of the view with so many of its pixels a side to one."""
@@ -45,7 +58,7 @@ class Renderers:
         return renderer.run()
 
     def costs(self, view: View, scale: int, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
-        """As CostCounter.costs."""
+        """Return the counters of the view's pixels, as Counter.costs."""
         counter = self.counters[view.accel]
         counter.aim(view.camera, view.size, **_settings(view, scale, 1))
         return counter.costs(go_on)
@@ -76,7 +89,7 @@ def _settings(view: View, scale: int, spp: int) -> dict[str, Any]:
 @dataclass(frozen=True, eq=False)
 class View:
     """What is asked for. size: (width, height) in pixels when it is fine; accel: a name in ACCELERATORS; cost: "" for the
-    picture, or a counter of wrt.renderer.costs.COUNTERS, of which a heat map is made."""
+    picture, or one of wrt.viewer.refine.COSTS, a counter of which a heat map is made."""
 
     camera: CameraKind
     size: tuple[int, int]

@@ -24,7 +24,7 @@ from typing import Any
 from weakref import WeakSet
 
 from wrt.core.errors import InputError
-from wrt.viewer.access import Access, Refused, shown
+from wrt.viewer.access import Access, Place, Refused, shown
 from wrt.viewer.messages import check_message
 
 VERSIONS = (1, 1, 1), (1, 2)  # from the first on, to before the second
@@ -52,8 +52,9 @@ def import_viser() -> Any:
     return viser
 
 
-def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens there (port 0: any free one). Raises InputError where that cannot be."""
+def listen(place: Place) -> socket.socket:
+    """A socket that listens there. Raises InputError where that cannot be."""
+    host, port = place.host, place.port
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address, family=family)

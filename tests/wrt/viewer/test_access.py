@@ -16,8 +16,9 @@ import pytest
 from tests.wrt.viewer.client import PATIENCE, Client, answer, client, raw_answer, upgrade, wait
 from tests.wrt.viewer.test_refine import SCENE
 from wrt.core.errors import InputError
+from wrt.lab.costs import CostCounter
 from wrt.renderer.options import Options
-from wrt.viewer.access import Access, Refused, access_for, as_origin
+from wrt.viewer.access import HERE, Access, Place, Refused, access_for, as_origin
 from wrt.viewer.messages import check_message
 
 CAMERA = {"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0.0, 0.0, -1.0], "fov": 0.8, "near": 0.01, "far": 1e3,
@@ -34,9 +35,9 @@ SENSE = {"click to focus": (True,), "exposure": (-1, 0.5e-300), "aperture": (0.5
 
 
 def test_the_printed_address_holds_a_new_token_each_time() -> None:
-    access, url = access_for("127.0.0.1", "127.0.0.1", 8080)
+    access, url = access_for(HERE, "127.0.0.1", 8080)
     assert url == f"http://127.0.0.1:8080/?token={access.token}" and len(access.token) >= 43
-    assert access.token not in repr(access) and access_for("127.0.0.1", "127.0.0.1", 8080)[0].token != access.token
+    assert access.token not in repr(access) and access_for(HERE, "127.0.0.1", 8080)[0].token != access.token
 
 
 @pytest.mark.parametrize(("host", "address", "printed", "names"), [
@@ -47,7 +48,7 @@ def test_the_printed_address_holds_a_new_token_each_time() -> None:
     ("Box.lan", "192.168.1.5", "192.168.1.5", ("192.168.1.5", "box.lan")),
 ])
 def test_the_names_of_an_address(host: str, address: str, printed: str, names: tuple[str, ...]) -> None:
-    access, url = access_for(host, address, 8080, ["https://Example.org", "http://proxy:9000/"])
+    access, url = access_for(Place(host, 8080, ["https://Example.org", "http://proxy:9000/"]), address, 8080)
     assert url.startswith(f"http://{printed}:8080/?token=")
     assert access.origins == {f"http://{name}:8080" for name in names} | {"https://example.org", "http://proxy:9000"}
     access.check(["192.168.1.7:8080"], ["http://192.168.1.7:8080"], "192.168.1.7")  # a number that the connection came to
@@ -55,7 +56,7 @@ def test_the_names_of_an_address(host: str, address: str, printed: str, names: t
     for name in ("evil.example:8080", "192.168.1.8:8080", "0.0.0.0:8080"):
         with pytest.raises(Refused):
             access.check([name], [], "192.168.1.7")
-    assert access_for("127.0.0.1", "127.0.0.1", 80)[1].startswith("http://127.0.0.1/?token=")
+    assert access_for(HERE, "127.0.0.1", 80)[1].startswith("http://127.0.0.1/?token=")
 
 
 @pytest.mark.parametrize("text", ["*", "null", "example.org", "https://", "ftp://example.org", "https://example.org/path", "",
@@ -82,11 +83,12 @@ def test_where_the_token_may_stand() -> None:
 class Served:
     """A page, what it warned of, and its port."""
 
-    def __init__(self, **settings: Any) -> None:
+    def __init__(self, **place: Any) -> None:
         from wrt.viewer.page import Page
 
         self.warnings: list[str] = []
-        self.page = Page(SCENE, Options(threads=1), port=0, spp=1, warn=self.warnings.append, **settings)
+        self.page = Page(SCENE, Options(threads=1), Place(port=0, **place), spp=1, counter_of=CostCounter.beside,
+                         warn=self.warnings.append)
         self.port, self.token = self.page.server.get_port(), self.page.door.access.token
 
 
@@ -240,7 +242,7 @@ def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) 
         with monkeypatch.context() as patch:
             patch.setattr(viser, "__version__", version)
             with pytest.raises(InputError, match=f"cannot guard viser {version}"):
-                Page(SCENE, Options(threads=1), port=0)
+                Page(SCENE, Options(threads=1), Place(port=0))
 
     class Other:
         def __init__(self, *arguments: Any, **settings: Any) -> None:
@@ -256,7 +258,7 @@ def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(viser, "ViserServer", Other)
     with pytest.raises(InputError, match="does not let itself be guarded"):
-        Page(SCENE, Options(threads=1), port=0)
+        Page(SCENE, Options(threads=1), Place(port=0))
     assert Other.stops == 1 and websockets.serve is serve
 
 

@@ -26,8 +26,10 @@ from tests.command_line import wrt as run
 from tests.data import ROOT
 from tests.wrt.viewer.client import answer
 from tests.wrt.viewer.test_refine import CAMERA, SCENE
+from wrt.lab.costs import CostCounter
 from wrt.renderer.options import Options
 from wrt.renderer.render import render
+from wrt.viewer.access import Place
 
 WHITTED = ROOT / "scenes" / "whitted.toml"
 SIZE = {"width": 640, "height": 480}
@@ -141,7 +143,7 @@ def page() -> Iterator[Any]:
     pytest.importorskip("viser")
     from wrt.viewer.page import Page
 
-    page = Page(SCENE, Options(threads=1), port=0, spp=4)
+    page = Page(SCENE, Options(threads=1), Place(port=0), spp=4, counter_of=CostCounter.beside)
     yield page
     page.close()
 

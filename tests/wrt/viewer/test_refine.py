@@ -15,6 +15,7 @@ import wrt
 from tests.wrt.renderer.test_checkpoint import SCENE as PINHOLE
 from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
+from wrt.lab.costs import CostCounter
 from wrt.lab.rtcore.profiler import profile
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
@@ -48,7 +49,7 @@ class Eye:
         self.pictures: list[Shown] = []
         self.words: list[str] = []
         self.react: Callable[[Shown], Any] = lambda shown: None
-        self.viewer = Viewer(scene, Options(**options), self._show, self.words.append, spp)
+        self.viewer = Viewer(scene, Options(**options), self._show, self.words.append, spp, CostCounter.beside)
 
     def _show(self, shown: Shown) -> None:
         self.pictures.append(shown)
@@ -244,6 +245,9 @@ def test_what_there_is_not_is_refused_and_what_cannot_be_built_is_told(monkeypat
     for changes, message in (({"accel": "bhv"}, "no structure 'bhv'"), ({"cost": "fees"}, "no counter 'fees'")):
         with pytest.raises(InputError, match=message):
             eye.viewer.change(**changes)
+    without = Viewer(SCENE, Options(), lambda shown: None)  # nothing that counts: no heat maps
+    with pytest.raises(InputError, match="no counter 'nodes'; there is none"):
+        without.change(cost="nodes")
     eye.see(size=(61, 34))
     pictures = len(eye.pictures)
 

@@ -19,8 +19,8 @@ from wrt.io.load import as_scene
 from wrt.kernels.shade.step import BRANCHES
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
+from wrt.lab.costs import COUNTERS, CostCounter
 from wrt.lab.rtcore.caches import distinct_lines
-from wrt.renderer.costs import COUNTERS, CostCounter
 from wrt.renderer.options import OPTIONS, Options, Progress
 from wrt.renderer.plan import plan_of
 from wrt.renderer.tiles import Rectangle

@@ -17,9 +17,9 @@ from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.kernels.traverse.common import Units
+from wrt.lab.costs import COUNTERS
 from wrt.lab.rtcore.cubin import read_cubin
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
-from wrt.renderer.costs import COUNTERS
 from wrt.renderer.features import features_of
 from wrt.renderer.options import Progress
 from wrt.renderer.plan import render_kernel

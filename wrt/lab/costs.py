@@ -1,4 +1,4 @@
-"""What a picture costs: the render kernel over a structure that counts, with a log of the rays before it."""
+"""Count the work of every pixel: the render kernel over a structure that counts, with a log of the rays before it."""
 
 from __future__ import annotations
 
@@ -44,11 +44,16 @@ class LoggedStructure(NamedTuple):
 
 
 class CostCounter:
-    """A render that counts. built: what is prepared already for the same scene, of which the structure is taken."""
+    """A render that counts. built: the same scene prepared for pictures; the counter shares its structure and its arrays."""
 
     def __init__(self, plan: Plan, device: Any, built: Prepared | None = None) -> None:
         counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
         self.prepared = prepare(replace(plan, structure=LoggedStructure(counting)), device, built)
+
+    @classmethod
+    def beside(cls, built: Prepared) -> CostCounter:
+        """Return the counter of a scene that is prepared for pictures."""
+        return cls(built.plan, built.device, built)
 
     def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
         """As Prepared.aimed."""
