@@ -110,7 +110,7 @@ def rays(geometry, origins, directions, t_min=0.0, t_max=np.inf, capacity=256) -
     out.prim_id = wp.zeros(n * capacity, dtype=wp.int32, device=device)
     out.t = wp.zeros(n * capacity, dtype=wp.float32, device=device)
     load_kernel(kernel, device)
-    wp.launch(kernel, dim=n, inputs=[yardstick.data.primitives, yardstick._surfaces, arrays, out, 0], device=device)
+    wp.launch(kernel, dim=n, inputs=[yardstick.data.primitives, yardstick.snapshot.surfaces, arrays, out, 0], device=device)
     count = out.count.numpy()
     assert count.max(initial=0) <= capacity, "more hits on a ray than there is room for"
     prim_id, t = out.prim_id.numpy().reshape(n, capacity), out.t.numpy().reshape(n, capacity)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.gradients import Cotangents, HitTensors, adjoint, hits_of, library
+from wrt.accel.queries.gradients import Cotangents, adjoint
+from wrt.accel.queries.tensors import HitTensors, hits_of, library
 from wrt.core.errors import InputError
 
 

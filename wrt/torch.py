@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.queries.gradients import Cotangents, HitTensors, adjoint, hits_of, library
+from wrt.accel.queries.gradients import Cotangents, adjoint
+from wrt.accel.queries.tensors import HitTensors, hits_of, library
 
 
 def closest_hit(accel: Any, vertices: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf, *,

@@ -12,7 +12,7 @@ import wrt
 from tests import device
 from tests.data import ROOT
 from tests.virtual_gpu import VirtualGpuError, gpus
-from wrt.accel.base import Accelerator
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Hits
 from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere

@@ -1,68 +1,66 @@
-"""The contract of an acceleration structure: what it is built from, what it answers, what it tells of itself."""
+"""A structure over one mesh: what it is built from, what becomes of it, what it tells of itself."""
 
 from __future__ import annotations
 
 import os
-import threading
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import Built, State
+from wrt.accel.built import AccelStats, Built, Refit
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.accelerator import Queries
-from wrt.accel.queries.answers import AccelStats, Refit
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.ray_query import world_of
 from wrt.accel.queries.rays import vectors
 from wrt.accel.store import check_order, save
-from wrt.accel.structure import Structure, check_options, check_units
+from wrt.accel.structure import Structure, check_options
 from wrt.accel.world import World
 from wrt.core.arrays import check_no_gradients, taken
-from wrt.core.device import start, upload
+from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
-from wrt.core.threads import thread_count
-from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 
 
-class Accelerator(Queries, ABC):
+class OneMesh(Accelerator, ABC):
     """A structure over a geometry, on a device. Subclasses set `name` and `kernels`, and implement `_build`.
 
-    Several threads may ask one structure at a time, and one of them may refit it: docs/acceleration.md, "Several threads".
-
-    kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts); for the CPU it may have
-    make_stream(units, any_hit), a kernel for many rays at a time, or None (wrt.accel.queries.batches), with stream_block and
-    stream_sizes; the last of its slots tells whether it met a ray that a query refuses.
+    kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts). stream: of structures
+    with a kernel for many rays at a time on the CPU, where that is made: make_stream(units, any_hit), a kernel, or None for units
+    that it has none for (wrt.accel.queries.batches); stream_block; stream_sizes. The last of its slots tells whether it met a ray
+    that a query refuses. can_refit: whether `_refit` follows vertices.
     """
 
     name: ClassVar[str]
     kernels: Any
-    _options: Mapping[str, Any] = MappingProxyType({})  # that it was built with
-    attributes: World | None = None  # what wrt.build knows of the primitives beyond the geometry: normals, uvs, materials, objects
+    stream: ClassVar[Any] = None
+    can_refit: ClassVar[bool] = False
 
-    def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None, *, triangle: str = "watertight",
-                 box: str = "conservative", **options: Any) -> None:
-        self._begin(type(self), geometry, device, threads, Units(triangle, box))
+    def __init__(self, geometry: Geometry, attributes: World | None = None, /, device: str = "cpu", threads: int | None = None, *,
+                 triangle: str = "watertight", box: str = "conservative", **options: Any) -> None:
+        super().__init__(Structure(type(self), Units(triangle, box)), geometry.kept(), attributes, device, threads)
         check_options(self.name, self._build, options)
-        self._options = options
+        self._options: Mapping[str, Any] = options  # that it was built with
         begin = build_clock()
         built = self._build(**options)
         self._take(built, begin, built.sah_cost)
 
     @classmethod
-    def restore(cls, built: Built, geometry: Geometry, device: str = "cpu", threads: int | None = None, *,
-                triangle: str = "watertight", box: str = "conservative") -> Accelerator:
-        """What was built before over the same geometry. Raises InputError where `built` is no such structure."""
+    def restore(cls, built: Built, geometry: Geometry, attributes: World | None = None, /, device: str = "cpu",
+                threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative",
+                options: Mapping[str, Any] = MappingProxyType({})) -> Self:
+        """What was built before over the same geometry, with these options. Raises InputError where `built` is no such
+        structure."""
         self = cls.__new__(cls)
-        self._begin(cls, geometry, device, threads, Units(triangle, box))
+        Accelerator.__init__(self, Structure(cls, Units(triangle, box)), geometry.kept(), attributes, device, threads)
+        self._options = options
         begin = build_clock()
         check_order(built.order, len(geometry), cls.name)
         self._check(built)
@@ -71,62 +69,41 @@ class Accelerator(Queries, ABC):
 
     def __reduce__(self) -> Any:
         """For pickle: what `save` writes, and what the structure is over. A refit there measures growth from the shape of now."""
-        units, state = self.structure.units, self._state
-        make = partial(type(self).restore, triangle=units.triangle, box=units.box)
-        given = state.built.on_host(), state.geometry, str(self.device), self.threads
+        units, snapshot = self.structure.units, self._snapshot
         options = {name: value for name, value in self._options.items() if name != "progress"}
-        return make, given, {"attributes": self.attributes, "_options": options}
-
-    def __copy__(self) -> Accelerator:
-        """The same structure, which a refit of this one leaves as it is."""
-        other = object.__new__(type(self))
-        other.__dict__.update(self.__dict__)
-        return other
-
-    def _begin(self, kind: type[Accelerator], geometry: Any, device: str, threads: int | None, units: Units) -> None:
-        check_units(units.triangle, units.box)
-        self.device = start(device)
-        self._state = State(geometry.kept() if isinstance(geometry, Geometry) else geometry)
-        self._refitting = threading.Lock()
-        self._kept: dict[str, Any] = {}  # what refits go on using
-        self.threads = thread_count(threads)
-        self.structure = Structure(kind, units._replace(spheres=len(geometry.spheres) > 0))
-        self._surfaces = Surfaces()
-        self._surfaces.n_triangles = geometry.n_triangles
-        self._surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # the caller may change his
+        make = partial(type(self).restore, device=str(self.device), threads=self.threads, triangle=units.triangle, box=units.box,
+                       options=options)
+        return make, (snapshot.built.on_host(), snapshot.geometry, snapshot.attributes)
 
     @property
     def geometry(self) -> Geometry:
-        """What the structure is over, as it is now."""
-        return self._state.geometry
+        """The geometry that the structure is over, as it is now."""
+        geometry: Geometry = self._snapshot.geometry
+        return geometry
 
     @property
     def built(self) -> Built:
         """What the builder gave, or the last refit."""
-        built: Built = self._state.built
+        built: Built = self._snapshot.built
         return built.on_host()
-
-    @property
-    def data(self) -> Any:
-        """The Warp struct that kernels get. A refit makes another, but in place it writes to this one's arrays."""
-        return self._state.data
 
     @property
     def world(self) -> Any:
         """The structure, as it is now, as an argument of a kernel of one's own (wrt.ray_query)."""
-        return world_of(self.structure, self.data, self._surfaces)
+        return world_of(self._snapshot)
 
-    @property
-    def stats(self) -> AccelStats:
-        """What was built, how large it is, and what it costs."""
-        return self._state.stats
+    def _over(self, geometry: Geometry) -> Self:
+        """A copy over another geometry, before anything is built over it: others still ask for the old shape."""
+        other = copy(self)
+        other._snapshot = self._snapshot.over(geometry)
+        return other
 
     def _take(self, built: Built, begin: float, built_cost: float) -> None:
-        """built_cost: as in State."""
+        """Have what was built. begin: when that began; built_cost: as in Snapshot."""
         data = self._upload(built)
         stats = AccelStats(build_clock() - begin, built.nodes, built.leaves, built.depth, built.references,
                            array_bytes(data), built.sah_cost)
-        self._state = State(self.geometry, built, data, stats, built_cost)
+        self._snapshot = replace(self._snapshot, built=built, data=data, stats=stats, built_cost=built_cost)
 
     @abstractmethod
     def _build(self, *args: Any, **options: Any) -> Built:
@@ -137,8 +114,8 @@ class Accelerator(Queries, ABC):
         raise InputError(f"a {self.name} cannot be read from a file")
 
     def _refit(self, built: Built) -> Built:
-        """The same tree around self.geometry, whose vertices have moved."""
-        raise InputError(f"a {self.name} cannot follow vertices that move; build it again, or take bvh2")
+        """The same tree around self.geometry, whose vertices have moved. Asked of structures that can_refit."""
+        raise NotImplementedError
 
     def _moved(self, vertices: Any) -> Geometry:
         """The geometry with other vertices. Raises InputError for what these cannot be."""
@@ -166,15 +143,16 @@ class Accelerator(Queries, ABC):
         may ask meanwhile. Raises InputError for another shape or values that are not finite (of a Warp array on a GPU they are
         not looked at), and from structures that cannot be refitted.
         """
+        if not self.can_refit:
+            raise InputError(f"a {self.name} cannot follow vertices that move; build it again, or take bvh2")
         vertices = taken(vertices, "vertices")
         with self._refitting:
-            begin, before = build_clock(), self._state
+            begin, before = build_clock(), self._snapshot
             if in_place:
                 check_no_gradients("a refit in place", vertices=vertices)
                 self._refit_in_place(vertices)
                 return Refit(build_clock() - begin, float("nan"), False)
-            beside = copy(self)  # has the new shape while others still ask for the old one
-            beside._state = State(self._moved(vertices))
+            beside = self._over(self._moved(vertices))
             built, built_cost = beside._refit(before.built), before.built_cost
             growth = float(built.sah_cost) / float(built_cost) if built_cost > 0.0 else 1.0
             if rebuilt := growth > rebuild_at:
@@ -182,7 +160,7 @@ class Accelerator(Queries, ABC):
                 built_cost = built.sah_cost
             beside._take(built, begin, built_cost)
             followed = vertices if isinstance(vertices, wp.array) and vertices.requires_grad else None
-            self._state = replace(beside._state, followed=followed)
+            self._snapshot = replace(beside._snapshot, followed=followed)
             return Refit(beside.stats.build_seconds, growth, rebuilt)
 
     def _children(self, built: Built) -> Any:
@@ -198,8 +176,8 @@ class Accelerator(Queries, ABC):
         """
         from wrt.accel.bvh.epo import end_point_overlap
 
-        state = self._state
-        return end_point_overlap(self._children(state.built.on_host()), state.geometry, self.threads)
+        snapshot = self._snapshot
+        return end_point_overlap(self._children(snapshot.built.on_host()), snapshot.geometry, self.threads)
 
     def _upload(self, built: Built) -> Any:
         data = self.structure.struct()
@@ -220,7 +198,7 @@ class Accelerator(Queries, ABC):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the structure to a file (.accel) that wrt.load_accel reads. Raises InputError where the system refuses."""
-        save(self.structure, self._state, path)
+        save(self._snapshot, path)
 
     def __repr__(self) -> str:
         s = self.stats

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import brute_force as kernels
 
 
-class BruteForce(Accelerator):
+class BruteForce(OneMesh):
     """No options."""
 
     name = "brute_force"
     kernels = kernels
+    can_refit = True
 
     def _build(self) -> Built:
         n = len(self.geometry)

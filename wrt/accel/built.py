@@ -1,18 +1,13 @@
-"""What a builder gives, and what a refit replaces."""
+"""What a builder gives, and what is told of it: sizes, costs, refits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
-from weakref import WeakKeyDictionary
+from typing import Any
 
 import warp as wp
 
-from wrt.accel.geometry import Geometry
 from wrt.core.device import on_host
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,31 +39,27 @@ class Built:
         return len(self.arrays.get("references", self.order))
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """All that a refit changes. It is replaced as a whole, and nothing but a refit in place writes to what is in it: whoever takes
-    it once has parts that belong together, whatever other threads do. data: the Warp struct that kernels get; built_cost: the SAH
-    cost that growth is measured against; followed: the Warp array of a refit, where it requires gradients
-    (wrt.accel.queries.gradients); changes: whether refits in place write to it. Until the structure is built, there is a geometry
-    and nothing else."""
+@dataclass(frozen=True)
+class AccelStats:
+    """build_seconds: wall clock, without those in which the builder's kernels were compiled; nodes, leaves, depth: 0 where there is
+    no tree; references: primitives in all leaves together, more than there are where a structure splits space; bytes: on the
+    device, triangles included; sah_cost: expected cost of a random line through the root box, one node visited and one
+    primitive tested costing 1 each (NaN where nobody knows)."""
 
-    geometry: Geometry
-    built: Any = None
-    data: Any = None
-    stats: Any = None
-    built_cost: float = float("nan")
-    followed: Any = None
-    changes: bool = False
+    build_seconds: float
+    nodes: int
+    leaves: int
+    depth: int
+    references: int
+    bytes: int
+    sah_cost: float
 
 
-def once(make: Callable[..., T]) -> Callable[..., T]:
-    """A function whose last argument is a state of a structure: called once for each, unless refits in place change it."""
-    kept: WeakKeyDictionary[State, T] = WeakKeyDictionary()
+@dataclass(frozen=True)
+class Refit:
+    """What OneMesh.refit or Instances.move did: seconds; growth: SAH cost of the refitted tree over that of the tree when it was
+    built; rebuilt: whether that was too much, and a new tree was built."""
 
-    def made(*given: Any) -> T:
-        state = given[-1]
-        if state in kept:
-            return kept[state]
-        return make(*given) if state.changes else kept.setdefault(state, make(*given))
-
-    return made
+    seconds: float
+    growth: float
+    rebuilt: bool

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator, array_bytes
-from wrt.accel.built import Built, State
+from wrt.accel.base import OneMesh, array_bytes
+from wrt.accel.built import AccelStats, Refit
 from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, inverse_of
-from wrt.accel.queries.answers import AccelStats, Refit
-from wrt.accel.top_level import BOXES, MOVED_BOXES, build_top, part_boxes, refit_top, spread_of, world_boxes
+from wrt.accel.queries.accelerator import Accelerator
+from wrt.accel.structure import Structure
+from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, spread_of, world_boxes
 from wrt.accel.world import World
 from wrt.core.arrays import real_numbers
 from wrt.core.checks import shown
@@ -34,38 +35,36 @@ class Instances(Accelerator):
 
     name = "instances"
 
-    def __init__(self, kind: type[Accelerator], geometry: InstancedGeometry, device: str = "cpu", threads: int | None = None, *,
-                 triangle: str = "watertight", box: str = "conservative", **options: Any) -> None:
+    def __init__(self, kind: type[OneMesh], geometry: InstancedGeometry, attributes: World | None = None, /, device: str = "cpu",
+                 threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative", **options: Any) -> None:
         begin = build_clock()
-        self._begin(kind, geometry, device, threads, Units(triangle, box, instances=True))
-        self.bottoms = [kind(part, device, threads, triangle=triangle, box=box, **options) for part in geometry.parts]
-        self._place(begin)
-
-    def _place(self, begin: float) -> None:
-        """The upper level around the structures as they are."""
-        geometry: Any = self.geometry
+        super().__init__(Structure(kind, Units(triangle, box, instances=True)), geometry, attributes, device, threads)
+        self.bottoms = [kind(part, device=device, threads=threads, triangle=triangle, box=box, **options)
+                        for part in geometry.parts]
         # As they are now: a Warp array of structs holds addresses, and does not keep what a refit would replace.
-        self._placed = [bottom._state for bottom in self.bottoms]
-        self._bottoms = wp.array([state.data for state in self._placed], dtype=self.structure.bottom, device=self.device)
-        boxes = part_boxes(geometry, self.bottoms, BOXES)
-        self._top = build_top(geometry, *world_boxes(geometry, np.arange(len(geometry.part)), boxes))
+        self._placed = [bottom.snapshot for bottom in self.bottoms]
+        self._bottoms = wp.array([each.data for each in self._placed], dtype=self.structure.bottom, device=self.device)
+        self._top = build_top(geometry, *world_boxes(geometry, np.arange(len(geometry.part)), self._boxes(geometry, BOXES)))
+        self._roots = upload(self._top.roots, wp.int32, self.device)
         self._take_top(geometry, begin, self._top.cost)
-        self.roots = upload(self._top.roots, wp.int32, self.device)
+
+    def _boxes(self, geometry: InstancedGeometry, most: int) -> list[Boxes]:
+        return part_boxes(geometry, [bottom.built.order for bottom in self.bottoms], most)
 
     def _take_top(self, geometry: Any, begin: float, built_cost: float) -> None:
         """Answer from now on as the upper level is now."""
         top, data = self._top, self.structure.struct()
-        sizes = np.array([top.nodes.nbytes, *(state.stats.bytes for state in self._placed)], np.int64)
+        sizes = np.array([top.nodes.nbytes, *(each.stats.bytes for each in self._placed)], np.int64)
         data.nodes = upload(top.nodes, data._cls.vars["nodes"].type.dtype, self.device)
         data.placements = upload(top.placements, Placement, self.device)
         data.bottoms, data.slack = self._bottoms, top.slack
         data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)
-        stats = [state.stats for state in self._placed]
+        stats = [each.stats for each in self._placed]
         told = AccelStats(
             build_clock() - begin, len(top.nodes) + sum(s.nodes for s in stats), top.leaves + sum(s.leaves for s in stats),
             top.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
             array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
-        self._state = State(geometry, None, data, told, built_cost)
+        self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=told, built_cost=built_cost, roots=self._roots)
 
     def move(self, instance: Any, matrix: Any, rebuild_at: float = np.inf) -> Refit:
         """Put an instance in another place, or several at once: boxes of the upper level are fitted anew, its trees stay as they
@@ -79,14 +78,14 @@ class Instances(Accelerator):
         flatten or shear more than wrt.build takes for instances.
         """
         with self._refitting:
-            begin, before = build_clock(), self._state
+            begin, before = build_clock(), self._snapshot
             geometry: Any = before.geometry
             rows, matrices = moves(rows_of(geometry, self.attributes), instance, matrix)
             to_world = geometry.to_world.copy()
             to_world[rows] = matrices
             geometry = replace(geometry, to_world=to_world)
             if "boxes" not in self._kept:
-                self._kept["boxes"] = part_boxes(geometry, self.bottoms, MOVED_BOXES)
+                self._kept["boxes"] = self._boxes(geometry, MOVED_BOXES)
             low, high = world_boxes(geometry, rows, self._kept["boxes"])
             if not (np.maximum(np.abs(low), np.abs(high))[low[:, 0] <= high[:, 0]] <= MAX_REACH).all():
                 raise InputError(f"matrix puts an instance farther than {MAX_REACH:g} from the origin")
@@ -99,23 +98,12 @@ class Instances(Accelerator):
             self._take_top(geometry, begin, cost)
             return Refit(self.stats.build_seconds, growth, rebuilt)
 
-    def _build(self, *args: Any, **options: Any) -> Built:
-        raise InputError("instances are built by wrt.build")
-
-    def refit(self, vertices: Any, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
-        """Raises InputError: one array of vertices cannot say where instances go."""
-        raise InputError("instances cannot follow vertices that move; move them, or build them again")
-
     def __reduce__(self) -> Any:
         raise TypeError("structures with instances cannot be pickled yet: pickle the scene, and build it again (wrt.build)")
 
-    def save(self, path: Any) -> None:
-        """Raises InputError: files hold one structure."""
-        raise InputError("instances cannot be written to a file", path)
-
     def __repr__(self) -> str:
         s, geometry = self.stats, self.geometry
-        return (f"Instances({len(geometry)} primitives in {len(geometry.part)} instances of "  # type: ignore[attr-defined]
+        return (f"Instances({len(geometry)} primitives in {len(geometry.part)} instances of "
                 f"{len(self.bottoms)} {self.structure.accel.name}, {s.bytes / 1e6:.1f} MB, built in {s.build_seconds:.3f} s)")
 
 

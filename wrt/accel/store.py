@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import Built, State
+from wrt.accel.built import Built
 from wrt.accel.geometry import Geometry
+from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
+from wrt.accel.world import World
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.device import record_dtype
 from wrt.core.errors import InputError
@@ -54,23 +56,25 @@ def check_target(path: str | os.PathLike[str]) -> None:
     check_writable(path)
 
 
-def save(structure: Structure, state: State, path: str | os.PathLike[str]) -> None:
+def save(snapshot: Snapshot, path: str | os.PathLike[str]) -> None:
     """Write it whole or not at all. Raises InputError where the system refuses."""
     check_target(path)
-    units, built = structure.units, state.built.on_host()
+    structure, built = snapshot.structure, snapshot.built.on_host()
+    units = structure.units
     rows = {name: np.ascontiguousarray(np.atleast_1d(array)) for name, array in built.arrays.items()}
     types = array_types(structure.accel, units.triangle)
     body = [rows[name].astype(types[name].base, copy=False).tobytes() for name in types]
     body.append(built.order.astype("<i4").tobytes())
     header = {"accel": structure.accel.name, "triangle": units.triangle, "box": units.box, "wrt": VERSION,
-              "geometry": state.geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
+              "geometry": snapshot.geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
               "order": len(built.order)} | {name: getattr(built, name) for name in STATS}
     with replacing(path) as file:
         write_checked(file, MAGIC, header, body)
 
 
-def read(path: str | os.PathLike[str], geometry: Geometry, device: str = "cpu", threads: int | None = None) -> Any:
-    """An Accelerator from a file that `save` wrote, over the same geometry. Raises InputError for a file that is missing, foreign,
+def read(path: str | os.PathLike[str], geometry: Geometry, attributes: World | None = None, device: str = "cpu",
+         threads: int | None = None) -> Any:
+    """A structure from a file that `save` wrote, over the same geometry. Raises InputError for a file that is missing, foreign,
     damaged, of another version or over another mesh."""
     header, body = read_checked(path, MAGIC, "acceleration structure")
     try:
@@ -81,7 +85,7 @@ def read(path: str | os.PathLike[str], geometry: Geometry, device: str = "cpu", 
             raise InputError("was built over another mesh")
         built = read_arrays(cls, header, body)
         with np.errstate(over="ignore", invalid="ignore"):  # numbers at the end of their range are looked at like all others
-            return cls.restore(built, geometry, device, threads, triangle=header["triangle"], box=header["box"])
+            return cls.restore(built, geometry, attributes, device, threads, triangle=header["triangle"], box=header["box"])
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise InputError(str(error), path) from error

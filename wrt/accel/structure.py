@@ -50,6 +50,11 @@ class Structure(NamedTuple):
         """The struct of one structure, also where there are instances of several."""
         return struct_of(self._replace(units=self.units._replace(instances=False)))
 
+    def require_one_mesh(self, message: str) -> None:
+        """Raise InputError with that message where there are instances or spheres."""
+        if self.units.instances or self.units.spheres:
+            raise InputError(message)
+
     def traversal(self, *, any_hit: bool, accepts: Any = None) -> Any:
         """The traversal unit as a Warp function (accel, surfaces, ray) -> Hit."""
         traverse = self.accel.kernels.make_traversal(self.units, any_hit, accepts)

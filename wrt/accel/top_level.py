@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.bvh.top_down import build_data, build_options, in_order
 from wrt.accel.bvh.tree import BvhOptions, half_areas, squeeze
@@ -146,10 +145,11 @@ def world_boxes(geometry: InstancedGeometry, rows: np.ndarray, boxes: list[Boxes
     return lo, hi
 
 
-def part_boxes(geometry: InstancedGeometry, bottoms: list[Accelerator], most: int) -> list[Boxes]:
-    """Boxes that hold those of each part's primitives, so that all instances together have about `most`, but 8 each."""
+def part_boxes(geometry: InstancedGeometry, orders: list[np.ndarray], most: int) -> list[Boxes]:
+    """Boxes that hold those of each part's primitives, so that all instances together have about `most`, but 8 each. orders: of
+    each part's primitives, so that neighbours are near."""
     groups = max(most // max(len(geometry.part), 1), 8)
-    corners = [grouped_boxes(part, bottom.built.order, groups) for part, bottom in zip(geometry.parts, bottoms, strict=True)]
+    corners = [grouped_boxes(part, order, groups) for part, order in zip(geometry.parts, orders, strict=True)]
     return [(0.5 * (low + high), 0.5 * (high - low)) for low, high in corners]
 
 

@@ -22,6 +22,7 @@ def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any],
     from dataclasses import asdict
 
     import wrt
+    from wrt.accel.instances import Instances
     from wrt.accel.scenes.build import reports_progress
     from wrt.accel.store import check_target
 
@@ -32,6 +33,8 @@ def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any],
         options["progress"] = lambda done: tell(f"{accel}: {100.0 * done:.0f} % built")
     with warnings_reported(quiet):
         structure = wrt.build(mesh, accel, threads=threads, **options)
+    if isinstance(structure, Instances):
+        raise InputError("a scene with instances has no structure in a file", mesh)
     structure.save(output)
     if as_json:
         say_json({"output": output, "accel": structure.name, **asdict(structure.stats)})

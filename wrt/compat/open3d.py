@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import Asked
 from wrt.accel.queries.closest_points import closest_points
 from wrt.accel.queries.contains import odd_crossings

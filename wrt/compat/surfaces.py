@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ALL, Asked, first_hits
 from wrt.accel.queries.contains import open_edges_of
 
@@ -22,7 +22,7 @@ def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, t
     if len(rays):
         rays = rays[accel.any_hit(origins[rays], directions[rays], threads=threads)]
     if len(rays):
-        touched = first_hits(accel, 1 if open_edges_of(accel._state) else 2, origins[rays], directions[rays], threads=threads)
+        touched = first_hits(accel, 1 if open_edges_of(accel.snapshot) else 2, origins[rays], directions[rays], threads=threads)
         row, column = np.nonzero(touched.prim_id >= 0)
         more = rays[row], *(array[row, column] for array in (touched.prim_id, touched.t, touched.u, touched.v))
         found = [np.concatenate(pair) for pair in zip(found, more, strict=True)]

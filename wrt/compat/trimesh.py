@@ -135,7 +135,7 @@ class _Placed:
 
     @property
     def closed(self) -> bool:
-        return open_edges_of(self.accel._state) == 0
+        return open_edges_of(self.accel.snapshot) == 0
 
     def moved(self, points: np.ndarray) -> np.ndarray:
         return np.ldexp(points - self.shift, self.exponent)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build, reports_progress
 from wrt.core.device import load_kernel
 from wrt.core.threads import Pool, thread_count

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.bvh.small import SMALL
 from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build
 from wrt.accel.scenes.instancing import stored_meshes
 from wrt.accel.structures import ACCELERATORS
@@ -66,7 +68,7 @@ class Renderer:
             arrays = upload_scene(scene, old.device, plan.meshes)
         geometry: Any = arrays.world.geometry
         self.prepared = replace(old, plan=plan, arrays=arrays)
-        if can_refit(old.accel, geometry):
+        if isinstance(old.accel, OneMesh) and old.accel.can_refit and same_faces(old.accel.geometry, geometry):
             refit = asdict(old.accel.refit(geometry.vertices, rebuild_at))
             return {"structure": "rebuilt" if refit["rebuilt"] else "refitted", "seconds": refit["seconds"],
                     "growth": refit["growth"]}
@@ -94,7 +96,7 @@ def builder_for(plan: Plan) -> dict[str, str]:
     return {"builder": "binned"} if few and default is not None and default.default == "refined" else {}
 
 
-def can_refit(accel: Accelerator, geometry: Geometry) -> bool:
-    """Whether it is a structure that follows vertices, over the same faces; rounding may have put a face's corners on a line."""
-    return (type(accel)._refit is not Accelerator._refit and np.array_equal(accel.geometry.faces, geometry.faces)
-            and accel.geometry.vertices.shape == geometry.vertices.shape)
+def same_faces(before: Geometry, now: Geometry | InstancedGeometry) -> bool:
+    """Whether the same faces lie between other vertices; rounding may have put a face's corners on a line."""
+    return (isinstance(now, Geometry) and np.array_equal(before.faces, now.faces)
+            and before.vertices.shape == now.vertices.shape)

@@ -54,8 +54,8 @@ def queue_kernel(structure: Any, features: Features, any_hit: bool) -> tuple[Any
     threads. Spheres are always provided for, so that scenes with and without them share it."""
     structure = structure._replace(units=structure.units._replace(spheres=True))
     accepts = make_cutout(features)
-    make = getattr(structure.accel.kernels, "make_stream", None)
-    kernel = make(structure.units, any_hit, Queue, accepts) if make else None
+    stream = structure.accel.stream
+    kernel = stream and stream.make_stream(structure.units, any_hit, Queue, accepts)
     if kernel is not None:
         return kernel, ALL
     return make_queue_kernel(structure.struct, structure.traversal(any_hit=any_hit, accepts=accepts), any_hit), 1

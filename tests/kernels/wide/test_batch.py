@@ -39,9 +39,9 @@ def one_by_one(accel, o, d, t_min, t_max):
     """Closest hits and any hits by the kernel for one ray."""
     rays, n = rays_on(accel.device, rays_of(o, d, t_min, t_max)), len(o)
     hits = new_hits(n)
-    launch(closest_hit_kernel(accel.structure), n, accel.data, accel._surfaces, rays, hits, 0)
+    launch(closest_hit_kernel(accel.structure), n, accel.data, accel.snapshot.surfaces, rays, hits, 0)
     dark = zeros(n, wp.bool)
-    launch(any_hit_kernel(accel.structure), n, accel.data, accel._surfaces, rays, dark, 0)
+    launch(any_hit_kernel(accel.structure), n, accel.data, accel.snapshot.surfaces, rays, dark, 0)
     return {name: getattr(hits, name).numpy() for name in ("t", "u", "v", "prim_id")}, dark.numpy()
 
 
@@ -221,7 +221,7 @@ def test_packets_are_given_up_where_they_fall_apart():
         o = np.concatenate([xy, np.full((n, 1), 3.0, np.float32)], axis=1)
         scratch = new_scratch(BatchTraversal.stream_sizes)
         rays = rays_on(accel.device, rays_of(o, np.tile([0.1, 0.1, -1.0], (n, 1)), 0.0, np.inf))
-        inputs = [accel.data, accel._surfaces, rays, new_hits(n), scratch, 0, n]
+        inputs = [accel.data, accel.snapshot.surfaces, rays, new_hits(n), scratch, 0, n]
         wp.launch(tracer(accel.structure, False).kernel, 1, inputs, device=DEVICE)
         assert scratch.slots.numpy()[FAILED] == failed and (scratch.slots.numpy()[PAUSED] > 0) == (failed > 0)
 
@@ -259,7 +259,7 @@ def assert_queue_as_one_ray(accel, o, d, t_max, exclude, accepts=None):
         for kernel, threads, more in ((many, 1, [scratch]), (one, len(o), [])):
             hits = new_hits(len(o))
             out = zeros(len(o), wp.bool) if any_hit else hits
-            wp.launch(kernel, threads, [accel.data, accel._surfaces, queue, out, *more, 0, len(o)], device=DEVICE)
+            wp.launch(kernel, threads, [accel.data, accel.snapshot.surfaces, queue, out, *more, 0, len(o)], device=DEVICE)
             arrays = [out] if any_hit else [hits.t, hits.u, hits.v, hits.prim_id]
             answers.append(np.concatenate([array.numpy().view(np.uint8) for array in arrays]))
         np.testing.assert_array_equal(*answers)

@@ -11,8 +11,8 @@ from tests.kernel_tools import DEVICE  # isort: skip (starts Warp)
 import warp as wp
 
 import wrt
-from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build, load_accel
 from wrt.core.errors import InputError
 from wrt.scene.mesh import Mesh

@@ -11,10 +11,12 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 import wrt
+from tests.command_line import wrt as command
 from tests.data import data_path
 from tests.gltf_files import GltfFile
 from tests.kernel_tools import DEVICE
 from tests.placed import place
+from wrt.accel.base import OneMesh
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances
 from wrt.accel.scenes.build import build
@@ -193,14 +195,18 @@ def test_nodes_and_instances_of_a_gltf_file_share_their_mesh(tmp_path) -> None:
     assert film.stats["triangles"] == 7 * 320 and film.stats["stored_triangles"] == 320
 
 
-def test_instances_have_neither_files_nor_refit(tmp_path) -> None:
-    ball = icosphere(1)
-    accel = build(place(*((Geometry.of(ball), np.eye(4)),) * 2), "bvh")
-    assert isinstance(accel, Instances) and "160 primitives in 1 instances" not in repr(accel)
-    with pytest.raises(InputError, match="cannot be written"):
-        accel.save(tmp_path / "x.accel")
-    with pytest.raises(InputError, match="cannot follow"):
-        accel.refit(ball.vertices)
+def test_instances_are_no_structure_over_one_mesh(tmp_path, monkeypatch) -> None:
+    accel = build(place(*((Geometry.of(icosphere(1)), np.eye(4)),) * 2), "bvh")
+    assert isinstance(accel, Instances) and not isinstance(accel, OneMesh)
+    assert "160 primitives in 2 instances" in repr(accel)
+    for options in ({"triangle": "none"}, {"box": "none"}):
+        with pytest.raises(InputError, match=r"no .* test 'none'"):
+            build(accel.geometry, **options)
+    monkeypatch.setattr("wrt.accel.scenes.instancing.MIN_SAVED", 1)
+    scene = wrt.Scene((Object(icosphere(1), (Material(),)),) * 2)
+    monkeypatch.setattr("wrt.accel.scenes.build.load_scene", lambda path: scene)
+    told = command("build", str(tmp_path / "x.glb"), "-o", str(tmp_path / "x.accel"))
+    assert told.code == 2 and "x.glb: a scene with instances has no structure in a file" in told.err
     with pytest.raises(InputError, match="no option"):
         build(accel.geometry, "bvh", nonsense=1)
 

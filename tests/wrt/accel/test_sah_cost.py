@@ -19,9 +19,9 @@ import pytest
 
 import wrt
 from tests.data import data_path
-from wrt.accel.base import Accelerator
 from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Counters
 from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS

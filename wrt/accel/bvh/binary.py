@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 import os
 from abc import abstractmethod
-from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
-from wrt.accel.built import Built, State
+from wrt.accel.base import OneMesh
+from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BvhOptions, build_binary, sah_cost
 from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
@@ -39,9 +38,11 @@ class InPlace(NamedTuple):
     shape: Any
 
 
-class BinaryBvh(Accelerator):
+class BinaryBvh(OneMesh):
     """Options: builder (a name in wrt.accel.bvh.builders.BVH_BUILDERS), max_leaf (1 to 64 primitives), cost_traversal and
     cost_intersection (of the SAH), split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
+
+    can_refit = True
 
     def _build(self, builder: str = "binned", max_leaf: int = 4, cost_traversal: float = 1.0,
                cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
@@ -124,22 +125,21 @@ class Bvh2(BinaryBvh):
         self._write_corners(kept.shape, kept.tree.order, self.data.primitives)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """As Accelerator.save. Of a tree that was refitted in place, what it costs is looked up first."""
-        state = self._state
-        if math.isnan(state.built.sah_cost):
-            cost = sah_cost(state.built.on_host().arrays["nodes"])
-            state = replace(state, built=replace(state.built, sah_cost=cost))
-        save(self.structure, state, path)
+        """As OneMesh.save. Of a tree that was refitted in place, what it costs is looked up first."""
+        snapshot = self._snapshot
+        if math.isnan(snapshot.built.sah_cost):
+            cost = sah_cost(snapshot.built.on_host().arrays["nodes"])
+            snapshot = replace(snapshot, built=replace(snapshot.built, sah_cost=cost))
+        save(snapshot, path)
 
     def _begin_in_place(self, points: Any) -> InPlace:
         """Arrays of its own for the structure, and what is kept beside them."""
-        built, spheres = self._on_device(self._state.built), self.geometry.spheres
+        built, spheres = self._on_device(self._snapshot.built), self.geometry.spheres
         built = replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])}, sah_cost=float("nan"))
-        beside = copy(self)
-        beside._state = State(DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres))
-        beside._take(built, build_clock(), self._state.built_cost)
+        beside = self._over(DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres))
+        beside._take(built, build_clock(), self._snapshot.built_cost)
         fitting, shape = Fitting(self.device, len(self.geometry), built.nodes), beside._shape()
-        self._state = replace(beside._state, changes=True)
+        self._snapshot = replace(beside.snapshot, changes=True)
         return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)
 
     def _primitives(self, built: Built) -> Any:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
@@ -32,13 +32,14 @@ def aligned(array: np.ndarray) -> np.ndarray:
     return out
 
 
-class WideBvh(Accelerator):
+class WideBvh(OneMesh):
     """Options: builder (of the binary tree, a name in wrt.accel.bvh.builders.BVH_BUILDERS), max_leaf (1 to 64 primitives; by
     default as many as a row has lanes), cost_traversal and cost_intersection (of one node visited and of one row of primitives
     tested), split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
 
     width: ClassVar[int]
     compressed: ClassVar[bool] = False
+    can_refit = True
 
     def _build(self, builder: str = "refined", max_leaf: int | None = None, cost_traversal: float = 1.0,
                cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
@@ -158,7 +159,7 @@ class Bvh8(WideBvh):
 
     name = "bvh8"
     width = 8
-    kernels = BatchTraversal()
+    kernels = stream = BatchTraversal()
 
 
 class Bvh8c(WideBvh):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
 from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
@@ -32,7 +32,7 @@ PIECE = {"prim_id": (wp.int32, ()), "first": (wp.int32, ()), "count": (wp.int32,
          "hi": (wp.vec3d, (3,)), "ball": (wp.vec4d, (4,)), "extent": (wp.float64, ())}
 
 
-class Bsp(Accelerator):
+class Bsp(OneMesh):
     """Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Slow to build: a subset of all triangles' planes is tried.
 
     Options: cost_intersection, cost_axis, cost_plane (of one primitive, of a node across an axis, of any other; the defaults

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.cells.common import cell_source, check_numbers, check_references, one_row, require_between, triangle_reach
@@ -25,7 +25,7 @@ MAX_AXIS = 2048
 PRIMITIVES_PER_LAUNCH = 16384
 
 
-class Grid(Accelerator):
+class Grid(OneMesh):
     """Options: density (cells for each primitive, on average over the grid's box; 1e-3 to 1e3), mailbox (whether a primitive that
     spans several cells is tested once where it can be).
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
 from wrt.accel.cells.kdtree_build import KdOptions, build_tree
 from wrt.accel.store import check_tree
@@ -12,7 +12,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.traverse import kdtree as kernels
 
 
-class KdTree(Accelerator):
+class KdTree(OneMesh):
     """Options: max_leaf (cells with so many primitives are not split), max_depth (None: 8 + 1.3 log2 n), by_cost (stop where no
     split costs less than a leaf); cost_traversal, cost_intersection (of the SAH), empty_bonus (0 to 1: what a split that cuts
     off empty space is let off); perfect_below (larger cells are split between 64 bins, smaller ones at the best of all planes);

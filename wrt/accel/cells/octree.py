@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
 from wrt.accel.cells.common import check_numbers, check_references, one_row
 from wrt.accel.cells.octree_build import OctreeOptions, build_tree
@@ -13,7 +13,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.traverse import octree as kernels
 
 
-class Octree(Accelerator):
+class Octree(OneMesh):
     """Options: max_leaf (cells with so many primitives are not split), max_depth (splits from the root down, 0 to MAX_LEVELS),
     by_cost (stop also where the octants cost a ray as much as the cell), max_growth (in every part of the tree, at most so many
     references for each primitive), mailbox (whether a primitive that spans several cells is tested once where it can be).

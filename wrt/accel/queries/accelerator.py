@@ -1,32 +1,85 @@
-"""What a structure is asked by the host: rays as arrays, hits as arrays."""
+"""A structure that is asked: rays as arrays in, hits as arrays out."""
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
+import warp as wp
 
-from wrt.accel.built import State
-from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Counters, Hits, room_for
-from wrt.accel.queries.batches import trace_on_gpu, trace_worlds, tracer
+from wrt.accel.built import AccelStats
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, room_for
+from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.counting import counted
 from wrt.accel.queries.gradients import record
-from wrt.accel.queries.rays import Rays, rays_of
-from wrt.accel.queries.world_ids import WorldIds, worlds_asked
-from wrt.accel.structure import Structure
+from wrt.accel.queries.rays import rays_of
+from wrt.accel.queries.world_ids import worlds_asked
+from wrt.accel.snapshot import Snapshot
+from wrt.accel.structure import Structure, check_units
+from wrt.accel.world import World
 from wrt.core.arrays import recording, returned
 from wrt.core.checks import shown
+from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
+from wrt.kernels.structs import Surfaces
 
 
-class Queries:
-    """The part of Accelerator that answers. device: a Warp device."""
+class Accelerator:
+    """A structure that answers: over one mesh (wrt.accel.base.OneMesh), or over instances (wrt.accel.instances.Instances).
 
-    device: Any
-    structure: Structure
-    _surfaces: Any
-    _state: State
+    Several threads may ask one structure at a time, and one of them may refit it: docs/acceleration.md, "Several threads".
+
+    structure: its kind and test units; device: a Warp device; threads: those that build and refit.
+    """
+
+    _snapshot: Snapshot  # replaced as a whole
+
+    def __init__(self, structure: Structure, geometry: Any, attributes: World | None, device: str, threads: int | None) -> None:
+        """geometry, attributes: as in Snapshot. Children build over it, and then take a snapshot with what they built."""
+        check_units(structure.units.triangle, structure.units.box)
+        self.device = start(device)
+        self.threads = thread_count(threads)
+        self.structure = structure._replace(units=structure.units._replace(spheres=len(geometry.spheres) > 0))
+        surfaces = Surfaces()
+        surfaces.n_triangles = geometry.n_triangles
+        surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # copied: the caller may write to its array later
+        self._snapshot = Snapshot(self.structure, self.device, surfaces, attributes, geometry)
+        self._refitting = threading.Lock()
+        self._kept: dict[str, Any] = {}  # what refits go on using
+
+    def __copy__(self) -> Accelerator:
+        """The same structure, which a refit of this one leaves as it is."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The structure as it is now: its parts belong together, whatever refits do meanwhile."""
+        return self._snapshot
+
+    @property
+    def geometry(self) -> Any:
+        """The Geometry or InstancedGeometry that the structure is over, as it is now."""
+        return self._snapshot.geometry
+
+    @property
+    def attributes(self) -> World | None:
+        """What wrt.build knows of the primitives beyond the geometry: normals, uvs, materials, objects."""
+        return self._snapshot.attributes
+
+    @property
+    def data(self) -> Any:
+        """The Warp struct that kernels get. A refit makes another, but in place it writes to this one's arrays."""
+        return self._snapshot.data
+
+    @property
+    def stats(self) -> AccelStats:
+        """What was built, how large it is, and what it costs."""
+        stats: AccelStats = self._snapshot.stats
+        return stats
 
     def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
                     threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits | None = None,
@@ -52,11 +105,15 @@ class Queries:
             raise InputError(f"out must be Hits, got {shown(out)}")
         given = None if out is None else [out.t, out.u, out.v, out.prim_id]
         t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None,
-                                                give is not None)
-        state = self._state  # once: a refit may replace it meanwhile
-        worlds = worlds_asked(self, state.geometry, world, len(t))
-        costs = _answer(self, state.data, rays, arrays, threads, worlds, trace if counters or trace else None)
-        hits = Hits(t, u, v, prim_id, costs, (self, state, rays, worlds))
+                                             give is not None)
+        snapshot = self._snapshot  # once: a refit may replace it meanwhile
+        worlds = worlds_asked(snapshot, world, len(t))
+        query, costs = Query(rays, arrays, threads, worlds), None
+        if counters or trace:
+            costs = counted(snapshot, query, fetches_too=trace)
+        else:
+            trace_query(snapshot, query)
+        hits = Hits(t, u, v, prim_id, costs, (snapshot, rays, worlds))
         if recording() is not None:
             record(hits, t=t, u=u, v=v)
         return hits if give is None else hits.each(give)
@@ -68,25 +125,15 @@ class Queries:
         threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max), returned(origins, directions)
         given = None if out is None else [out]
         arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None, give is not None)
-        state = self._state
-        _answer(self, state.data, rays, arrays, threads, worlds_asked(self, state.geometry, world, len(arrays[0])))
+        snapshot = self._snapshot
+        trace_query(snapshot, Query(rays, arrays, threads, worlds_asked(snapshot, world, len(arrays[0]))))
         return arrays[0] if give is None else give(arrays[0])
 
 
-def _answer(accel: Queries, data: Any, rays: Rays, out: list[Any], threads: int, worlds: WorldIds | None = None,
-            counting: bool | None = None) -> Counters | None:
-    """Write the answers of `data`, the structure as it was once, to arrays: of HIT_TYPES or ANY_HIT_TYPES. counting: with a trace
-    or without; None: not at all."""
-
-    def trace(structure: Structure, data: Any) -> None:
-        if worlds is not None:
-            trace_worlds(structure, data, accel._surfaces, rays, worlds, out, accel.device, threads)
-        elif accel.device.is_cuda:
-            trace_on_gpu(structure, data, accel._surfaces, rays, out, accel.device)
-        else:
-            tracer(structure, len(out) == 1).trace(data, accel._surfaces, rays, out, threads)
-
-    if counting is None:
-        trace(accel.structure, data)
-        return None
-    return counted(trace, accel.structure, data, len(out[0]), accel.device, counting)
+def snapshot_of(accel: Accelerator) -> Snapshot:
+    """The snapshot of a structure that is asked for points or for all hits. Raises InputError unless it is over one mesh."""
+    message = f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}"
+    if not isinstance(accel, Accelerator):
+        raise InputError(message)
+    accel.structure.require_one_mesh(message)
+    return accel.snapshot

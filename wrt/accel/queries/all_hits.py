@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
+from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import RAYS_PER_LAUNCH
 from wrt.accel.queries.hit_points import surroundings
-from wrt.accel.queries.ray_query import structure_of
 from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
 from wrt.core.arrays import returned, to_numpy, to_warp
@@ -68,12 +67,12 @@ class Asked:
     give: Any = to_numpy  # what answers become, which are Warp's
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
-        self.structure = structure_of(accel)
-        self.threads, self.device, self.state = thread_count(threads), accel.device, accel._state
+        self.snapshot = snapshot_of(accel)
+        self.threads, self.device = thread_count(threads), self.snapshot.device
         self.lists: Any = HitLists()
         self.lists.crossings = as_one(crossings, bool, "crossings")
         if crossings:
-            surfaces = surroundings(accel, self.state).surfaces
+            surfaces = surroundings(self.snapshot).surfaces
             self.lists.vertices, self.lists.faces = surfaces.vertices, surfaces.faces
 
     def of(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Asked:
@@ -110,7 +109,7 @@ class Asked:
 
     def counts(self) -> np.ndarray:
         """How many hits each ray has, (N,) int64. Where no triangle is in several leaves, the first walk has counted them all."""
-        counting = self.state.stats.references == len(self.state.geometry)
+        counting = self.snapshot.stats.references == len(self.snapshot.geometry)
         return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL, counting))])
 
     def given(self, numbers: np.ndarray) -> Any:
@@ -145,7 +144,7 @@ class Asked:
         lists.rows = wp.empty(rows_of(first[-1]), dtype=Hit, device=self.device)
         lists.first = upload(first, wp.int32, self.device)
         lists.count = wp.zeros(len(room), dtype=wp.int32, device=self.device)
-        self._launch(list_hits_kernel(self.structure), len(room), self.state.data, rays, lists)
+        self._launch(list_hits_kernel(self.snapshot.structure), len(room), self.snapshot.data, rays, lists)
         return lists
 
     def _copy(self, rays: RayArrays, lists: list[Any], begin: np.ndarray, hits: Any) -> None:

@@ -1,4 +1,4 @@
-"""What a structure answers, and what it says of itself: hits, counters, sizes, refits."""
+"""What a structure answers: hits, and what they cost; and the arrays that answers go to."""
 
 from __future__ import annotations
 
@@ -19,32 +19,6 @@ from wrt.core.html import html_table
 
 HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
 ANY_HIT_TYPES = {"out": np.bool_}
-
-
-@dataclass(frozen=True)
-class AccelStats:
-    """build_seconds: wall clock, without those in which the builder's kernels were compiled; nodes, leaves, depth: 0 where there is
-    no tree; references: primitives in all leaves together, more than there are where a structure splits space; bytes: on the
-    device, triangles included; sah_cost: expected cost of a random line through the root box, one node visited and one
-    primitive tested costing 1 each (NaN where nobody knows)."""
-
-    build_seconds: float
-    nodes: int
-    leaves: int
-    depth: int
-    references: int
-    bytes: int
-    sah_cost: float
-
-
-@dataclass(frozen=True)
-class Refit:
-    """What Accelerator.refit did: seconds; growth: SAH cost of the refitted tree over that of the tree when it was built; rebuilt:
-    whether that was too much, and a new tree was built."""
-
-    seconds: float
-    growth: float
-    rebuilt: bool
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,10 +1,9 @@
-"""A query's rays in launches, spread over threads: one ray at a time, or many, where a structure's traversal module has a form for
-them (make_stream)."""
+"""A query's rays in launches, spread over threads: many rays at a time where a structure has a kernel for them, else one."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -12,6 +11,8 @@ from warp._src.types import array_t  # what a kernel gets for an array; a Warp a
 
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
 from wrt.accel.queries.rays import Rays, rays_on
+from wrt.accel.queries.world_ids import WorldIds
+from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
 from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
@@ -32,6 +33,31 @@ MOST_PACKED = (1 << 31) - 64  # a kernel counts in int32, and by blocks up to th
 SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
 
 
+class Query(NamedTuple):
+    """A call of closest_hit or any_hit. out: the arrays that take the answers, of HIT_TYPES or of ANY_HIT_TYPES; worlds: which each
+    ray sees, in a structure over several."""
+
+    rays: Rays
+    out: list[Any]
+    threads: int
+    worlds: WorldIds | None = None
+
+    @property
+    def any_hit(self) -> bool:
+        return len(self.out) == 1
+
+
+def trace_query(snapshot: Snapshot, query: Query) -> None:
+    """Write the answers of a structure to the query's arrays. Raises InputError for rays that are refused; the answers are then
+    nothing to go by."""
+    if query.worlds is not None:
+        trace_worlds(snapshot, query, query.worlds)
+    elif snapshot.device.is_cuda:
+        trace_on_gpu(snapshot, query)
+    else:
+        tracer(snapshot.structure, query.any_hit).trace(snapshot, query)
+
+
 def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
     """Ranges first .. end - 1 of n rays, all but the last of multiples of `block`: large ones first, as each launch takes a while,
     and small ones in the end, as what a thread still traces then is waited for."""
@@ -48,24 +74,23 @@ class Tracer:
     """What answers queries on the CPU: the kernel for a structure, and workers that are kept from call to call."""
 
     def __init__(self, structure: Structure, any_hit: bool) -> None:
-        kernels = structure.accel.kernels
+        stream = structure.accel.stream
         # A kernel for many rays at a time, or None where there is but the one for one ray.
-        self.stream = kernels.make_stream(structure.units, any_hit) if hasattr(kernels, "make_stream") else None
+        self.stream = stream and stream.make_stream(structure.units, any_hit)
         self.kernel = self.stream or (any_hit_kernel if any_hit else closest_hit_kernel)(structure)
-        self.block = kernels.stream_block if self.stream else 1
-        self.sizes = kernels.stream_sizes if self.stream else ()
+        self.block = stream.stream_block if self.stream else 1
+        self.sizes = stream.stream_sizes if self.stream else ()
         self.types = ANY_HIT_TYPES if any_hit else HIT_TYPES
         self.inputs = structure.struct(), Surfaces(), RayArrays(), None if any_hit else HitArrays()
         self.free: list[Worker] = []
 
-    def trace(self, data: Any, surfaces: Any, rays: Rays, out: list[Any], threads: int) -> None:
-        """Write the answers to arrays without gaps. Raises InputError for rays that are refused; by then they have been traced, and
-        the answers are nothing to go by."""
+    def trace(self, snapshot: Snapshot, query: Query) -> None:
+        """As trace_query. Rays that are refused have been traced by then."""
         load_kernel(self.kernel, cpu := wp.get_device("cpu"))
-        rays = rays.on(cpu)
+        rays, threads = query.rays.on(cpu), query.threads
         if not self.stream:  # which says itself whether it met such
             rays = rays.checked()
-        given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in out]
+        given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
         n = len(given[0])
         packed = pack(given, answers) if SMALL < n <= MOST_PACKED and all(map(readable, given)) else None
         if packed and self.stream:
@@ -78,10 +103,10 @@ class Tracer:
         def job(first: int, end: int) -> None:
             worker = self.borrow()
             if packed:
-                worker.launch(data, surfaces, packed, first, end)
+                worker.launch(snapshot, packed, first, end)
             else:
                 copy(given, slice(first, end), worker.given, slice(end - first))
-                worker.launch(data, surfaces, worker.packed, 0, end - first)
+                worker.launch(snapshot, worker.packed, 0, end - first)
                 copy(worker.answers, slice(end - first), answers, slice(first, end))
             refused.append(bool(worker.slots[-1]))
             self.free.append(worker)  # not after an error: a thread may still be at work in it
@@ -124,9 +149,9 @@ class Worker:
         self.inputs: list[Any] = [None] * (len(own) + 5)  # as they were last
         self.own = [self.scratch.__ctype__()] if tracer.stream else []
 
-    def launch(self, data: Any, surfaces: Any, packed: tuple[Any, Any], first: int, end: int) -> None:
+    def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> None:
         """Trace rays first .. end - 1. The last of `slots` tells whether the kernel met one that is refused."""
-        inputs = [data.__ctype__(), surfaces.__ctype__(), *packed, *self.own, first, end]
+        inputs = [snapshot.data.__ctype__(), snapshot.surfaces.__ctype__(), *packed, *self.own, first, end]
         for i, last in enumerate(self.inputs):  # the kernel for one ray has no `end`
             if inputs[i] is not last:
                 self.command.set_param_at_index_from_ctype(i, inputs[i])
@@ -167,23 +192,24 @@ def rays_on_gpu(n: int, device: Any) -> int:
     return MOST_ON_GPU if n <= SURE else max(FEWEST, min(MOST_ON_GPU, int(memory_of(device) / 2.0 / BYTES_OF_RAY)))
 
 
-def trace_on_gpu(structure: Structure, data: Any, surfaces: Any, rays: Rays, out: list[Any], device: Any) -> None:
-    """As Tracer.trace. What is Warp's is traced in one launch; what comes from the host in parts of MOST_ON_GPU."""
+def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
+    """As trace_query. What is Warp's is traced in one launch; what comes from the host in parts of MOST_ON_GPU."""
+    device, structure, rays, out = snapshot.device, snapshot.structure, query.rays, query.out
     structure = structure._replace(units=structure.units._replace(stack=stack_on(device.alias)))
-    kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
+    kernel = (any_hit_kernel if query.any_hit else closest_hit_kernel)(structure)
     n = len(out[0])
     part = n if rays.as_warp else rays_on_gpu(n, device)
     for first in range(0, n, max(part, 1)):
         some = slice(first, min(first + part, n))
         given = rays_on(device, rays if part == n else Rays(*(array[some] for array in rays)))
-        launch_over(device, kernel, [data, surfaces, given], [array[some] for array in out])
+        launch_over(device, kernel, [snapshot.data, snapshot.surfaces, given], [array[some] for array in out])
 
 
-def trace_worlds(structure: Structure, data: Any, surfaces: Any, rays: Rays, worlds: Any, out: list[Any], device: Any,
-                 threads: int) -> None:
-    """Write the answers to arrays, each ray in its own world (wrt.accel.scenes.worlds.WorldIds); on a GPU in one launch."""
-    inputs = [data, surfaces, rays_on(device, rays), worlds.arrays]
-    launch_over(device, worlds_kernel(structure, len(out) == 1), inputs, out, threads)
+def trace_worlds(snapshot: Snapshot, query: Query, worlds: WorldIds) -> None:
+    """As trace_query, each ray in its own world; on a GPU in one launch."""
+    device = snapshot.device
+    inputs = [snapshot.data, snapshot.surfaces, rays_on(device, query.rays), worlds.arrays]
+    launch_over(device, worlds_kernel(snapshot.structure, query.any_hit), inputs, query.out, query.threads)
 
 
 def launch_over(device: Any, kernel: Any, inputs: list[Any], out: list[Any], threads: int = 1) -> None:

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
+from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.contains import contains
 from wrt.accel.queries.hit_points import surroundings
-from wrt.accel.queries.ray_query import structure_of
 from wrt.accel.queries.rays import vectors
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
@@ -53,19 +52,19 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
     counts as the segment or the point that it is, though no ray hits it; one with a corner that is not finite is left out. Raises
     InputError that names the argument.
     """
-    structure = structure_of(accel)
+    snapshot = snapshot_of(accel)
+    structure = snapshot.structure
     kernels: Any = structure.accel.kernels
     if not isinstance(kernels, WideTraversal) or structure.units.triangle != "watertight":
         raise InputError("closest points are asked of a bvh4, bvh8 or bvh8c with the watertight triangle test, not of a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
-    state, device = accel._state, accel.device
-    rows = vectors(points, "points", FARTHEST)
+    rows, device = vectors(points, "points", FARTHEST), snapshot.device
     n, out = len(rows), PointArrays()
     for name, field in fields_of(PointArrays).items():
         setattr(out, name, wp.empty(n, dtype=field.type.dtype, device=device))
     kernel, given = make_closest_point_kernel(kernels.width, kernels.compressed), upload(rows, wp.vec3, device)
-    surfaces = surroundings(accel, state).surfaces
-    launch_on(device, kernel, n, state.data, surfaces, given, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
+    surfaces = surroundings(snapshot).surfaces
+    launch_on(device, kernel, n, snapshot.data, surfaces, given, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
     return ClosestPoints(*(getattr(out, name).numpy() for name in fields_of(PointArrays)))
 
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
-from wrt.accel.built import State, once
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import Asked
 from wrt.accel.queries.rays import vectors
+from wrt.accel.snapshot import Snapshot, once
 from wrt.core.arrays import returned
 from wrt.core.device import upload
 from wrt.core.errors import InputError
@@ -34,15 +34,15 @@ def open_edges(geometry: Geometry) -> int:
 
 
 @once
-def open_edges_of(state: State) -> int:
+def open_edges_of(snapshot: Snapshot) -> int:
     """open_edges of a structure's mesh."""
-    return open_edges(state.geometry)
+    return open_edges(snapshot.geometry)
 
 
 @once
-def used_bounds(state: State) -> tuple[np.ndarray, np.ndarray]:
+def used_bounds(snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest corner of all finite faces, two (3,); inf and -inf where there are none."""
-    geometry = state.geometry
+    geometry = snapshot.geometry
     used = geometry.vertices[finite_faces(geometry)].reshape(-1, 3)
     return used.min(axis=0, initial=np.inf), used.max(axis=0, initial=-np.inf)
 
@@ -56,7 +56,7 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any
     """
     rows, give = vectors(points, "points", FARTHEST), returned(points)
     asked = Asked(accel, threads, crossings=True)
-    if count := open_edges_of(asked.state):
+    if count := open_edges_of(asked.snapshot):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces"
                          "; wrt.winding_number tells what is mostly inside")
     inside = odd_crossings(asked, rows)
@@ -66,7 +66,7 @@ def contains(accel: Accelerator, points: Any, threads: int | None = None) -> Any
 def odd_crossings(asked: Asked, rows: np.ndarray, seed: int = 0) -> np.ndarray:
     """As `contains`, of (N, 3) float32 and a mesh that may be open: then it depends on the rays' direction, that is on `seed`."""
     inside = np.zeros(len(rows), bool)
-    low, high = used_bounds(asked.state)
+    low, high = used_bounds(asked.snapshot)
     within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
     direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
     counts = asked.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts()

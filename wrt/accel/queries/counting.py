@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.queries.answers import Counters
-from wrt.accel.structure import Structure
+from wrt.accel.queries.batches import Query, trace_query
+from wrt.accel.snapshot import Snapshot
 from wrt.core.device import on_host, upload
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts
 
 
-def counted(trace: Callable[[Structure, Any], None], structure: Structure, data: Any, n: int, device: Any,
-            fetches_too: bool) -> Counters:
-    """Trace n rays and count. trace: does so with the kernel for a structure, and its data; it is called twice where fetches are
-    asked for: only then is it known how many each ray has."""
-    counting = structure._replace(units=structure.units._replace(counters=True))
+def counted(snapshot: Snapshot, query: Query, fetches_too: bool) -> Counters:
+    """Answer the query and count. Where fetches are asked for, it is traced twice: only then is it known how many each ray has."""
+    n, device = len(query.out[0]), snapshot.device
 
     def run(first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # The struct of the counting kernel is the same, but what it records is this call's alone.
-        own = copied(data)
+        own = copied(snapshot.data)
         own.recorder.counts = wp.zeros(n, dtype=Counts, device=device)
         own.recorder.first = upload(first, wp.int64, device)
         own.recorder.fetches = wp.zeros(int(first[-1]) if len(first) else 0, dtype=wp.int64, device=device)
-        trace(counting, own)
+        trace_query(snapshot.counting(own), query)
         return on_host(own.recorder.counts), on_host(own.recorder.fetches)
 
     counts, fetches = run(np.zeros(0, np.int64))

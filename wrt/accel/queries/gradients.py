@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,7 +9,6 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.ray_query import require_one_mesh, structure_of
 from wrt.core.arrays import check_no_gradients, float32, recording, to_numpy
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
@@ -26,17 +24,6 @@ class Gradients(NamedTuple):
     vertices: Any
     origins: Any
     directions: Any
-
-
-class HitTensors(NamedTuple):
-    """Of the closest hits: t, u, v (N,) float32 and prim_id (N,) int32 as Accelerator.closest_hit gives them, and point (N, 3)
-    float32, as Hits.point (NaN on a miss)."""
-
-    t: Any
-    u: Any
-    v: Any
-    point: Any
-    prim_id: Any
 
 
 class Cotangents(NamedTuple):
@@ -107,36 +94,15 @@ def adjoint(geometry: Geometry, origins: Any, directions: Any, prim_id: Any, cot
     return out
 
 
-def hits_of(accel: Any, vertices: Any, rays: tuple[Any, ...], rebuild_at: float) -> Any:
-    """Hits of closest_hit, once the structure has followed the vertices (None, or as they are: it stays). rays: its arguments.
-
-    Raises InputError that names the argument.
-    """
-    structure_of(accel)
-    if vertices is not None:
-        now, followed = to_numpy(vertices), accel.geometry.vertices
-        if np.may_share_memory(now, followed) or not np.array_equal(float32(now), followed):  # shared: perhaps written to
-            accel.refit(vertices, rebuild_at)
-    return accel.closest_hit(*rays)
-
-
-def library(name: str, module: str = "") -> Any:
-    """A library that wrt does not need. Raises InputError that says how to get it, where it is not there."""
-    try:
-        return importlib.import_module(module or name)
-    except ImportError as error:
-        raise InputError(f'wrt.{name} needs {name} ({error}): pip install "wrt[{name}]"') from error
-
-
 def record(hits: Any, **outputs: Any) -> None:
     """Let a wp.Tape that records have gradients of Warp arrays of `hits`, given by their names in Cotangents, in origins,
     directions and the array that the structure's last refit followed: those of them that require gradients."""
-    (accel, state, rays, _), tape = hits.source, recording()
-    leaves = Gradients(state.followed, rays.origins, rays.directions)
+    (snapshot, rays, _), tape = hits.source, recording()
+    leaves = Gradients(snapshot.followed, rays.origins, rays.directions)
     wanted = [array for array in leaves if isinstance(array, wp.array) and array.requires_grad and array.size]
     if tape is None or not wanted:
         return
-    require_one_mesh(accel.structure, ONE_MESH)
+    snapshot.structure.require_one_mesh(ONE_MESH)
     if not rays.as_warp:
         raise InputError("a wp.Tape is recording, with gradients in vertices: give rays as Warp arrays, or ask outside of it")
     for array in outputs.values():
@@ -153,8 +119,8 @@ def record(hits: Any, **outputs: Any) -> None:
 
 def check_recorded(hits: Any, name: str) -> None:
     """Raise InputError where a tape would wait for gradients of what has none."""
-    _, state, rays, _ = hits.source
-    given = {"vertices": state.followed, "origins": rays.origins, "directions": rays.directions}
+    snapshot, rays, _ = hits.source
+    given = {"vertices": snapshot.followed, "origins": rays.origins, "directions": rays.directions}
     check_no_gradients(f"hits.{name}", **given)
 
 

@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import State, once
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
-from wrt.accel.queries.ray_query import require_one_mesh
 from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.queries.world_ids import WorldIds
+from wrt.accel.snapshot import Snapshot, once
 from wrt.accel.world import Placed, World, placed_now, run_of, world_over
 from wrt.core.arrays import returned, to_warp
 from wrt.core.device import launch_on, records, upload
@@ -45,7 +44,7 @@ class HitPoints:
     u: Any
     v: Any
     prim_id: Any
-    source: tuple[Any, State, Rays, WorldIds | None] | None
+    source: tuple[Snapshot, Rays, WorldIds | None] | None
 
     @property
     def point(self) -> Any:
@@ -102,28 +101,28 @@ class HitPoints:
 
         Raises InputError for other shapes, and where the structure is not over one mesh.
         """
-        accel, state, rays, _ = self._source()
-        require_one_mesh(accel.structure, ONE_MESH)
-        found = adjoint(state.geometry, rays.origins, rays.directions, self.prim_id, Cotangents(t, u, v, point))
+        snapshot, rays, _ = self._source()
+        snapshot.structure.require_one_mesh(ONE_MESH)
+        found = adjoint(snapshot.geometry, rays.origins, rays.directions, self.prim_id, Cotangents(t, u, v, point))
         give = returned(self.t)
         return found if give is None else Gradients(*map(give, found))
 
-    def _source(self) -> tuple[Any, State, Rays, WorldIds | None]:
+    def _source(self) -> tuple[Snapshot, Rays, WorldIds | None]:
         if self.source is None:
             raise InputError("these hits do not know their rays: only those of closest_hit have points, normals and ids")
         return self.source
 
     def _filled(self, name: str) -> Any:
-        accel, state, rays, worlds = self._source()
+        snapshot, rays, worlds = self._source()
         if name in ("error", "normal", "shading", "uv"):
             check_recorded(self, name)
-        world, surfaces, numbering = surroundings(accel, state)
+        world, surfaces, numbering = surroundings(snapshot)
         if name == "shading" and world.normals is None:
             name = "normal"
         _require(world, name)
         if name == "instance" and world.objects is not None:
             name = "object"
-        n, device = len(self.t), accel.device
+        n, device = len(self.t), snapshot.device
         out: Any = HitPlaces()
         setattr(out, name, array := wp.empty(n, dtype=fields_of(HitPlaces)[name].type.dtype, device=device))
         hits: Any = HitArrays()
@@ -154,17 +153,17 @@ def _require(world: World, name: str) -> None:
 
 
 @once
-def surroundings(accel: Any, state: State) -> Surroundings:
-    """Of a structure in a state of it, on its device."""
-    geometry: Any = state.geometry
-    world, device, surfaces = accel.attributes or world_over(geometry), accel.device, structs.Surfaces()
+def surroundings(snapshot: Snapshot) -> Surroundings:
+    """Of a structure, on its device."""
+    geometry, device = snapshot.geometry, snapshot.device
+    world, surfaces = snapshot.attributes or world_over(geometry), structs.Surfaces()
     placed = placed_now(world, geometry)
     surfaces.n_triangles = geometry.n_triangles
     surfaces.vertices = upload(geometry.vertices if placed is None else world.vertices, wp.vec3, device)
     surfaces.faces = upload(world.faces, wp.vec3i, device)
     surfaces.normals = upload(np.zeros((1, 3)) if world.normals is None else world.normals, wp.vec3, device)
     surfaces.uvs = upload(world.uvs, wp.vec2, device)
-    surfaces.spheres = accel._surfaces.spheres
+    surfaces.spheres = snapshot.surfaces.spheres
     surfaces.prim_material = upload(world.prim_material, wp.int32, device)
     numbering = Numbering()
     if world.objects is not None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import zlib
 from typing import Any, NamedTuple
 
+from wrt.accel.queries.accelerator import Accelerator
+from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checks import as_one, shown
+from wrt.core.checks import as_one
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
 from wrt.kernels.ray_query import QueryHit, QueryRay, make_ray_query, query_ray
@@ -32,7 +34,7 @@ class RayQuery(NamedTuple):
     next_hit: Any
 
 
-def ray_query(accel: Any, *, triangle: str | None = None, box: str | None = None) -> RayQuery:
+def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str | None = None) -> RayQuery:
     """What a kernel needs to ask structures for hits, on the CPU and on CUDA.
 
     accel: a structure that the kernel is for, or for all of a kind its name in wrt.ACCELERATORS, with the intersection tests that
@@ -40,7 +42,7 @@ def ray_query(accel: Any, *, triangle: str | None = None, box: str | None = None
     multiply-add, or gets a structure of another kind, it prints so once, and its rays hit nothing.
     Raises InputError for unknown names, and for structures over several meshes.
     """
-    structure = getattr(accel, "structure", None)
+    message = "accel must be a structure over one mesh, or the name of one"
     if isinstance(accel, str):
         units = Units(as_one(triangle or Units().triangle, str, "triangle"), as_one(box or Units().box, str, "box"))
         ACCELERATORS.check(accel)
@@ -48,22 +50,13 @@ def ray_query(accel: Any, *, triangle: str | None = None, box: str | None = None
         structure = Structure(ACCELERATORS[accel], units)
     elif triangle is not None or box is not None:
         raise InputError("triangle and box belong to a structure's name; a structure has its own")
-    structure = require_one_mesh(structure, "accel must be a structure over one mesh, or the name of one")
+    elif isinstance(accel, Accelerator):
+        structure = accel.structure
+    else:
+        raise InputError(message)
+    structure.require_one_mesh(message)
     world, closest_hit, any_hit, next_hit = query_of(structure)
     return RayQuery(world, QueryRay, QueryHit, query_ray, closest_hit, any_hit, next_hit)
-
-
-def structure_of(accel: Any) -> Structure:
-    """Of an accel that queries of points or of all hits take. Raises InputError for others."""
-    return require_one_mesh(getattr(accel, "structure", None),
-                            f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}")
-
-
-def require_one_mesh(structure: Any, what: str) -> Structure:
-    """Raise InputError for what is no Structure, and where there are instances or spheres."""
-    if not isinstance(structure, Structure) or structure.units.instances or structure.units.spheres:
-        raise InputError(what)
-    return structure
 
 
 @made_once
@@ -79,9 +72,11 @@ def kind_of(structure: Structure) -> int:
     return zlib.crc32(f"{structure.accel.name} {structure.units.triangle}".encode()) & 0x7FFFFFFF
 
 
-def world_of(structure: Structure, data: Any, surfaces: Any) -> Any:
-    """A structure and what it is over as one record. Raises InputError for one over several meshes."""
-    world = query_of(require_one_mesh(structure, "kernels of one's own ask structures over one mesh"))[0]()
+def world_of(snapshot: Snapshot) -> Any:
+    """A structure and what it is over as one record. Raises InputError where it is not over one mesh."""
+    structure = snapshot.structure
+    structure.require_one_mesh("kernels of one's own ask structures over one mesh")
+    world = query_of(structure)[0]()
     world.kind = kind_of(structure)
-    world.accel, world.surfaces = data, surfaces
+    world.accel, world.surfaces = snapshot.data, snapshot.surfaces
     return world

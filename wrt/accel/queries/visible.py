@@ -9,9 +9,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import first_hits
 from wrt.accel.queries.answers import ANY_HIT_TYPES, room_for
 from wrt.accel.queries.hit_points import surroundings
@@ -53,14 +53,14 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
     if len(q) != n:
         raise InputError(f"b must have as many rows as a ({n}), got {len(q)}")
     array = room_for(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None, give is not None)[0]
-    state, known, surfaces = accel._state, on_a is not None or on_b is not None, Surfaces()
-    if len(getattr(state.geometry, "first_instance", ())) > 2:
+    snapshot, known, surfaces = accel.snapshot, on_a is not None or on_b is not None, Surfaces()
+    if len(getattr(snapshot.geometry, "first_instance", ())) > 2:
         raise InputError("visible does not take a structure over several worlds yet")
     if known:
         if accel.structure.units.instances:
             raise InputError("on_a and on_b are for structures without instances")
-        surfaces = surroundings(accel, state).surfaces
-    ids = [_prim_ids(value, name, n, len(state.geometry)) if known else np.zeros(0, np.int32)
+        surfaces = surroundings(snapshot).surfaces
+    ids = [_prim_ids(value, name, n, len(snapshot.geometry)) if known else np.zeros(0, np.int32)
            for value, name in ((on_a, "on_a"), (on_b, "on_b"))]
 
     def run(kernel: Any, *inputs: Any) -> None:
@@ -69,7 +69,7 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
     rays: Any = RayArrays()
     rays.origin, rays.direction = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(2))
     rays.t_min, rays.t_max = (wp.empty(n, dtype=wp.float32, device=device) for _ in range(2))
-    size = np.inf if state.changes else largest_size(state.geometry)
+    size = np.inf if snapshot.changes else largest_size(snapshot.geometry)
     run(segments, surfaces, p, q, *(upload(each, wp.int32, device) for each in ids), size, rays)
     given = rays.origin, rays.direction, rays.t_min, rays.t_max
     seen = accel.any_hit(*given, threads=threads)

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
+from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.hit_points import surroundings
-from wrt.accel.queries.ray_query import structure_of
 from wrt.accel.queries.rays import vectors
 from wrt.core.arrays import returned
 from wrt.core.device import launch_on, upload
@@ -29,10 +28,10 @@ def winding_number(accel: Accelerator, points: Any, threads: int | None = None) 
     Winding Numbers"). On a triangle it is between its two sides. Every triangle is looked at: a point takes as long as the mesh is
     large, some 40 ns a triangle. Raises InputError as closest_points does.
     """
-    structure_of(accel)
-    rows, give, device = vectors(points, "points", FARTHEST), returned(points), accel.device
+    snapshot = snapshot_of(accel)
+    rows, give, device = vectors(points, "points", FARTHEST), returned(points), snapshot.device
     turns = wp.empty(len(rows), dtype=wp.vec3d, device=device)
-    launch_on(device, wind, len(rows), surroundings(accel, accel._state).surfaces, upload(rows, wp.vec3, device), turns, None,
+    launch_on(device, wind, len(rows), surroundings(snapshot).surfaces, upload(rows, wp.vec3, device), turns, None,
               threads=thread_count(threads), step=POINTS_PER_LAUNCH)
     re, im, whole = turns.numpy().reshape(-1, 3).T
     out = whole + np.arctan2(im, re) / (2.0 * np.pi)

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.snapshot import Snapshot
 from wrt.core.arrays import real_numbers, to_numpy
 from wrt.core.checks import shown
 from wrt.core.device import upload
@@ -18,10 +19,10 @@ from wrt.kernels.query import Worlds
 class WorldIds:
     """The world of each of n rays: arrays for kernels, on the structure's device."""
 
-    def __init__(self, accel: Any, geometry: InstancedGeometry, world: Any, n: int) -> None:
-        self.first_prim = geometry.world_first_prim
+    def __init__(self, snapshot: Snapshot, world: Any, n: int) -> None:
+        self.first_prim = snapshot.geometry.world_first_prim
         self.arrays: Any = Worlds()
-        self.arrays.id, self.arrays.root = self._on(accel.device, world, n), accel.roots
+        self.arrays.id, self.arrays.root = self._on(snapshot.device, world, n), snapshot.roots
 
     def _on(self, device: Any, world: Any, n: int) -> Any:
         if isinstance(world, wp.array):
@@ -41,8 +42,9 @@ class WorldIds:
         return np.where(own >= 0, own + self.first_prim[np.where(own >= 0, world, 0)], -1).astype(np.int32)
 
 
-def worlds_asked(accel: Any, geometry: Any, world: Any, n: int) -> WorldIds | None:
+def worlds_asked(snapshot: Snapshot, world: Any, n: int) -> WorldIds | None:
     """The argument of a query; None where there is but one world, and none is named. Raises InputError that calls it `world`."""
+    geometry = snapshot.geometry
     several = isinstance(geometry, InstancedGeometry) and geometry.worlds is not None
     if world is None:
         if several and len(geometry.worlds) > 2:
@@ -50,4 +52,4 @@ def worlds_asked(accel: Any, geometry: Any, world: Any, n: int) -> WorldIds | No
         return None
     if not several:
         raise InputError("world is for structures over worlds: wrt.build takes a list of them")
-    return WorldIds(accel, geometry, world, n)
+    return WorldIds(snapshot, world, n)

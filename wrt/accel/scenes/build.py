@@ -9,7 +9,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.instances import Instances
@@ -36,8 +36,12 @@ def reports_progress(accel: str) -> bool:
 @overload
 def build(mesh: list[Any], accel: str = "bvh", device: str = "cpu", threads: int | None = None, **options: Any) -> Instances: ...
 @overload
-def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | None = None, **options: Any) -> Accelerator: ...
-def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | None = None, **options: Any) -> Accelerator:
+def build(mesh: Scene | InstancedGeometry | str | os.PathLike[str], accel: str = "bvh", device: str = "cpu",
+          threads: int | None = None, **options: Any) -> OneMesh | Instances: ...
+@overload
+def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | None = None, **options: Any) -> OneMesh: ...
+def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | None = None,
+          **options: Any) -> OneMesh | Instances:
     """An acceleration structure over a mesh or a scene, ready for `closest_hit` and `any_hit`.
 
     mesh: a Mesh, a Scene, the path of a mesh or scene file, a trimesh mesh or scene, or a pair (vertices, faces); or a Geometry.
@@ -57,24 +61,18 @@ def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | Non
     world = (worlds_over([shape_given(each) for each in mesh]) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else world_given(mesh))  # of a geometry no more is known
     geometry = mesh if world is None else world.geometry
-    structure: Accelerator
     if isinstance(geometry, InstancedGeometry):
-        structure = Instances(kind, geometry, device, threads, **options)
-    else:
-        structure = kind(geometry, device=device, threads=threads, **options)
-    structure.attributes = world
-    return structure
+        return Instances(kind, geometry, world, device=device, threads=threads, **options)
+    return kind(geometry, world, device=device, threads=threads, **options)
 
 
-def load_accel(path: str | os.PathLike[str], mesh: Any, device: str = "cpu", threads: int | None = None) -> Accelerator:
-    """The structure that Accelerator.save or `wrt build` wrote to `path`, over the same mesh: as in `build`.
+def load_accel(path: str | os.PathLike[str], mesh: Any, device: str = "cpu", threads: int | None = None) -> OneMesh:
+    """The structure that OneMesh.save or `wrt build` wrote to `path`, over the same mesh: as in `build`.
 
     Raises InputError for a file that is missing, foreign, damaged, of another version or over another mesh.
     """
     world = world_given(mesh)
-    structure = read(path, one_geometry(world), as_one(device, str, "device"), threads)
-    structure.attributes = world
-    return structure
+    return read(path, one_geometry(world), world, as_one(device, str, "device"), threads)
 
 
 def world_given(mesh: Any) -> World:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
 from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.tree import half_areas
@@ -100,7 +100,7 @@ def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[
                "peak_bytes": peak}
 
 
-def published_cost(accel: Accelerator, rays: RaySet) -> float:
+def published_cost(accel: OneMesh, rays: RaySet) -> float:
     """Nodes and leaves popped and triangles tested, a ray, as tinybvh counts."""
     hits = accel.closest_hit(rays.origins, rays.directions)
     counts = [wp.zeros(len(rays), dtype=wp.int32, device=accel.device) for _ in range(2)]
@@ -110,7 +110,7 @@ def published_cost(accel: Accelerator, rays: RaySet) -> float:
     return float(sum(count.numpy().mean() for count in counts))
 
 
-def surfaces(accel: Accelerator) -> np.ndarray:
+def surfaces(accel: OneMesh) -> np.ndarray:
     """Of both children of every node, (2, N)."""
     nodes = accel.built.arrays["nodes"]
     if accel.name == "bvh2_sphere":
@@ -144,7 +144,7 @@ def volume_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[s
                "differ": differing(hits, truth)}
 
 
-def tester_of(accel: Accelerator, rays: RaySet) -> Callable[[], int]:
+def tester_of(accel: OneMesh, rays: RaySet) -> Callable[[], int]:
     """Tests every one of some rays against some nodes, evenly from the whole tree; gives how many tests that were."""
     units = accel.structure.units
     record = units.triangle_test.record

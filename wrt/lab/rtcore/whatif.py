@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
 from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.geometry import Geometry
@@ -42,7 +42,7 @@ def studied(study: Study) -> type[Bvh2]:
     return type("Bvh2Study", (Bvh2,), {"kernels": study, "__doc__": Bvh2.__doc__})
 
 
-def with_traversal(accel: Accelerator, study: Study) -> Accelerator:
+def with_traversal(accel: OneMesh, study: Study) -> OneMesh:
     """The same tree, walked otherwise. Raises InputError where it is too deep for a trail."""
     if study.entries < STACK_SIZE and accel.stats.depth > LEVELS:
         raise InputError(f"the tree is {accel.stats.depth} deep: more than the {LEVELS} levels that a restart trail has bits for")
@@ -77,7 +77,7 @@ def quantised(lo: np.ndarray, hi: np.ndarray, bits: int) -> tuple[np.ndarray, np
     return out_lo.astype(np.float32), out_hi.astype(np.float32), size
 
 
-def with_planes(accel: Accelerator, bits: int) -> tuple[Accelerator, int]:
+def with_planes(accel: OneMesh, bits: int) -> tuple[OneMesh, int]:
     """The same tree with planes of so many bits, and the bytes of a node."""
     nodes = accel.built.arrays["nodes"].copy()
     lo, hi = (np.stack([nodes[f"{end}_{side}"] for side in (0, 1)], axis=1) for end in ("lo", "hi"))
@@ -133,7 +133,7 @@ class Variant:
     counters: Counters
 
 
-def traced(name: str, accel: Accelerator, rays: RaySet, node_bytes: tuple[int, int] | None = None) -> Variant:
+def traced(name: str, accel: OneMesh, rays: RaySet, node_bytes: tuple[int, int] | None = None) -> Variant:
     """node_bytes: of a node, as it is in memory and as it would be."""
     hits = accel.closest_hit(rays.origins, rays.directions, t_max=rays.t_max, trace=True)
     counters = hits.counters

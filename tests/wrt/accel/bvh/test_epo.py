@@ -9,8 +9,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.kernels.wide.references import leaf_count, leaf_first

@@ -239,7 +239,7 @@ def test_random_lines_cost_what_the_heuristic_says(kind: str, options: dict[str,
     n, refusing = len(rays.t_min), refusing_kernel()
 
     def trace(structure, data):
-        wp.launch(refusing, dim=n, inputs=[data, tree._surfaces, rays, hits, 0], device=tree.device)
+        wp.launch(refusing, dim=n, inputs=[data, tree.snapshot.surfaces, rays, hits, 0], device=tree.device)
 
     counts = counted(trace, tree.structure, tree.data, n, tree.device, False).counts
     steps = counts["nodes"] + counts["primitives"]

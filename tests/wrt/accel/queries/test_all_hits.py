@@ -53,7 +53,7 @@ def one_by_one(mesh: wrt.Mesh, asked: tuple[Any, ...]) -> list[list[tuple[float,
         vec3s(asked[0]), vec3s(asked[1]), floats(asked[2]), floats(asked[3]))
     found.capacity, found.count = CAPACITY, zeros(n, wp.int32)
     found.prim_id, found.t = zeros(n * CAPACITY, wp.int32), zeros(n * CAPACITY)
-    launch(make_all_hits_kernel(Units()), n, accel.data.primitives, accel._surfaces, arrays, found, 0)
+    launch(make_all_hits_kernel(Units()), n, accel.data.primitives, accel.snapshot.surfaces, arrays, found, 0)
     counts, prim_id, t = (array.numpy() for array in (found.count, found.prim_id, found.t))
     assert counts.max() <= CAPACITY
     rows = [slice(i * CAPACITY, i * CAPACITY + counts[i]) for i in range(n)]

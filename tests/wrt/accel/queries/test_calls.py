@@ -12,7 +12,7 @@ import pytest
 import warp as wp
 
 from tests.kernel_tools import DEVICE
-from wrt.accel.base import Accelerator
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import FEWEST
 from wrt.accel.scenes.build import build

@@ -15,8 +15,10 @@ import wrt
 from tests.kernel_tools import DEVICE, unit, vec3s
 from tests.placed import place
 from wrt.accel.geometry import Geometry
+from wrt.accel.instances import Instances
 from wrt.accel.queries.hit_points import HitPoints
 from wrt.accel.scenes.flatten import world_mesh, world_of
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.arrays import to_numpy
 from wrt.core.errors import InputError
 from wrt.scene import shapes
@@ -200,8 +202,7 @@ def test_what_a_scene_says_of_a_hit(instances: bool) -> None:
     accel = wrt.build(given)
     if instances:
         world = world_of(given, frozenset([id(given.objects[1].mesh)]))
-        accel = wrt.build(world.geometry)
-        accel.attributes = world
+        accel = Instances(ACCELERATORS["bvh"], world.geometry, world, device=DEVICE.alias)
     flat, hits = world_mesh(given), accel.closest_hit(*asked())
     hit = hits.prim_id >= 0
     prim_id, point = hits.prim_id[hit], hits.point[hit].astype(np.float64)

@@ -14,9 +14,9 @@ import warp as wp
 
 import wrt
 from tests.placed import place
-from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import RAYS_PER_LAUNCH
 from wrt.accel.scenes.build import build, load_accel
@@ -33,7 +33,7 @@ from wrt.scene.shapes import icosphere
 
 BALL = icosphere(3)
 SHAPES = BALL.vertices, (BALL.vertices * np.float32([1.0, 0.5, 0.8])).astype(np.float32)
-REFITTED = sorted({cls.name for cls in ACCELERATORS.values() if cls._refit is not Accelerator._refit})
+REFITTED = sorted({cls.name for cls in ACCELERATORS.values() if cls.can_refit})
 
 
 def some_rays(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -205,8 +205,8 @@ def test_refits_come_one_after_another_and_what_is_saved_is_whole(tmp_path: Any,
 
     at_a_time(lambda: flip(0), lambda: flip(1), save)
     assert len(growths) == 60 and all(growth == costs[which] for which, growth in growths)
-    state = accel._state
-    assert state.stats.sah_cost == state.built.sah_cost and state.geometry is accel.geometry
+    now = accel.snapshot
+    assert now.stats.sah_cost == now.built.sah_cost and now.geometry is accel.geometry
 
 
 def test_a_file_that_a_refit_comes_into_holds_one_shape(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -79,7 +79,7 @@ def test_each_world_answers_as_if_it_were_alone(kind: str) -> None:
 def test_meshes_are_kept_once() -> None:
     geometry: Any = structure().geometry
     assert len(structure().bottoms) == 3 and len(geometry.parts[0]) == 0  # the first is for what is no instance
-    assert geometry.first_instance.tolist() == [0, 7, 8, 8, 20, 22, 27, 28] and len(structure().roots) == 7
+    assert geometry.first_instance.tolist() == [0, 7, 8, 8, 20, 22, 27, 28] and len(structure().snapshot.roots) == 7
 
 
 def test_worlds_whose_instances_move() -> None:

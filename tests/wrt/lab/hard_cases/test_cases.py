@@ -13,8 +13,8 @@ import pytest
 from tests.kernel_tools import DEVICE, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Hits
 from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError

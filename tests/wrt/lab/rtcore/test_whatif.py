@@ -156,14 +156,14 @@ def test_the_command(ball: Path, tmp_path: Path) -> None:
     assert command("whatif", "order", str(tmp_path / "none.obj")).code == 2
 
 
-def test_what_there_is_not_is_refused(ball: Path) -> None:
+def test_what_there_is_not_is_refused(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for wrong, words in (({"study": "x"}, "no study"), ({"kinds": ("x",)}, "no kind"), ({"gpu": "x"}, "no GPU"),
                          ({"rays": 0}, "rays")):
         with pytest.raises(InputError, match=words):
             Plan(**{"study": "order", "mesh": ball, **wrong})  # type: ignore[arg-type]
     deep = Bvh2(Geometry.of(icosphere(1)))
-    deep._state = replace(deep._state, stats=replace(deep.stats, depth=63))
-    with pytest.raises(InputError, match="63 deep"):
+    with monkeypatch.context() as patch, pytest.raises(InputError, match="63 deep"):
+        patch.setattr(Bvh2, "stats", replace(deep.stats, depth=63))
         with_traversal(deep, Study(4))
     assert with_traversal(deep, Study(STACK_SIZE)).stats.nodes == deep.stats.nodes
     assert build(icosphere(1), "bvh2").stats.nodes == deep.stats.nodes
