@@ -15,7 +15,7 @@ def closest_hit(accel: Any, vertices: Any, origins: Any, directions: Any, t_min:
                 rebuild_at: float = 2.0) -> HitTensors:
     """The closest hit of each ray, with gradients of t, u, v and point at fixed prim_id in vertices, origins and directions.
 
-    accel: a structure over one mesh, which follows `vertices`, (V, 3), where they are not those it has (Accelerator.refit, as
+    accel: a structure over one mesh, which follows `vertices`, (V, 3), where they are not those it has (OneMesh.refit, as
     rebuild_at is); None: it stays. All else as in Accelerator.closest_hit: tensors of torch, on the CPU or a GPU, taken as float32.
     Gradients (wrt.accel.queries.gradients.adjoint) are computed in float64 on the CPU, and have the same bits each time; those of a
     miss are 0. There are no second derivatives. Raises InputError that names the argument, and where torch is not installed.

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -20,7 +18,7 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.ray_query import world_of
 from wrt.accel.queries.rays import vectors
 from wrt.accel.store import check_order, save
-from wrt.accel.structure import Structure, check_options
+from wrt.accel.structure import Structure, options_of
 from wrt.accel.world import World
 from wrt.core.arrays import check_no_gradients, taken
 from wrt.core.device import upload
@@ -30,37 +28,38 @@ from wrt.kernels.traverse.common import Units
 
 
 class OneMesh(Accelerator, ABC):
-    """A structure over a geometry, on a device. Subclasses set `name` and `kernels`, and implement `_build`.
+    """A structure over a geometry, on a device. Subclasses set `name`, `kernels` and `options`, and implement `_build`.
 
-    kernels: the traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts). stream: of structures
-    with a kernel for many rays at a time on the CPU, where that is made: make_stream(units, any_hit), a kernel, or None for units
-    that it has none for (wrt.accel.queries.batches); stream_block; stream_sizes. The last of its slots tells whether it met a ray
+    options: a frozen dataclass of what the builder can be told; it raises InputError for values out of range. kernels: the
+    traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts). stream: of structures with a kernel
+    for many rays at a time on the CPU (wrt.accel.queries.batches), where that is made: make_stream(units, any_hit), which gives
+    None for units that it has no kernel for; stream_block; stream_sizes. The last of the kernel's slots tells whether it met a ray
     that a query refuses. can_refit: whether `_refit` follows vertices.
     """
 
     name: ClassVar[str]
     kernels: Any
     stream: ClassVar[Any] = None
+    options: ClassVar[type[Any]]
     can_refit: ClassVar[bool] = False
 
     def __init__(self, geometry: Geometry, attributes: World | None = None, /, device: str = "cpu", threads: int | None = None, *,
                  triangle: str = "watertight", box: str = "conservative", **options: Any) -> None:
         super().__init__(Structure(type(self), Units(triangle, box)), geometry.kept(), attributes, device, threads)
-        check_options(self.name, self._build, options)
-        self._options: Mapping[str, Any] = options  # that it was built with
+        self.built_with = options_of(self.name, self.options, options)
         begin = build_clock()
-        built = self._build(**options)
+        built = self._build(self.built_with)
         self._take(built, begin, built.sah_cost)
 
     @classmethod
     def restore(cls, built: Built, geometry: Geometry, attributes: World | None = None, /, device: str = "cpu",
                 threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative",
-                options: Mapping[str, Any] = MappingProxyType({})) -> Self:
-        """What was built before over the same geometry, with these options. Raises InputError where `built` is no such
-        structure."""
+                built_with: Any = None) -> Self:
+        """What was built before over the same geometry. built_with: its options (None: not known, and those that there are by
+        default). Raises InputError where `built` is no such structure."""
         self = cls.__new__(cls)
         Accelerator.__init__(self, Structure(cls, Units(triangle, box)), geometry.kept(), attributes, device, threads)
-        self._options = options
+        self.built_with = cls.options() if built_with is None else built_with
         begin = build_clock()
         check_order(built.order, len(geometry), cls.name)
         self._check(built)
@@ -70,9 +69,9 @@ class OneMesh(Accelerator, ABC):
     def __reduce__(self) -> Any:
         """For pickle: what `save` writes, and what the structure is over. A refit there measures growth from the shape of now."""
         units, snapshot = self.structure.units, self._snapshot
-        options = {name: value for name, value in self._options.items() if name != "progress"}
+        options = replace(self.built_with, progress=None) if hasattr(self.built_with, "progress") else self.built_with
         make = partial(type(self).restore, device=str(self.device), threads=self.threads, triangle=units.triangle, box=units.box,
-                       options=options)
+                       built_with=options)
         return make, (snapshot.built.on_host(), snapshot.geometry, snapshot.attributes)
 
     @property
@@ -106,8 +105,8 @@ class OneMesh(Accelerator, ABC):
         self._snapshot = replace(self._snapshot, built=built, data=data, stats=stats, built_cost=built_cost)
 
     @abstractmethod
-    def _build(self, *args: Any, **options: Any) -> Built:
-        """The structure over self.geometry, on the host. Raises InputError for options out of range."""
+    def _build(self, options: Any) -> Built:
+        """The structure over self.geometry, on the host; options: an instance of the class's `options`."""
 
     def _check(self, built: Built) -> None:
         """Raise InputError where arrays that come from a file would lead a ray out of them or round in circles."""
@@ -156,7 +155,7 @@ class OneMesh(Accelerator, ABC):
             built, built_cost = beside._refit(before.built), before.built_cost
             growth = float(built.sah_cost) / float(built_cost) if built_cost > 0.0 else 1.0
             if rebuilt := growth > rebuild_at:
-                built = beside._build(**self._options)
+                built = beside._build(self.built_with)
                 built_cost = built.sah_cost
             beside._take(built, begin, built_cost)
             followed = vertices if isinstance(vertices, wp.array) and vertices.requires_grad else None

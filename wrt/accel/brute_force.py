@@ -6,18 +6,20 @@ import numpy as np
 
 from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
+from wrt.accel.structure import NoOptions
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import brute_force as kernels
 
 
 class BruteForce(OneMesh):
-    """No options."""
+    """All primitives, one after another."""
 
     name = "brute_force"
     kernels = kernels
+    options = NoOptions
     can_refit = True
 
-    def _build(self) -> Built:
+    def _build(self, options: NoOptions) -> Built:
         n = len(self.geometry)
         return Built({}, np.arange(n, dtype=np.int32), sah_cost=float(n))
 

@@ -19,7 +19,7 @@ class DeviceGeometry(Geometry):
     """What wrt.build takes in place of a mesh. points: a Warp array (V,) of vec3; indices: of int32, three a triangle one after
     another, as wp.Mesh has them, or (F,) of vec3i. Both are used where they are; `vertices` and `faces` copy them to the host.
 
-    A structure over it copies the points: they may be written to afterwards (Accelerator.refit follows them). Of their values
+    A structure over it copies the points: they may be written to afterwards (OneMesh.refit follows them). Of their values
     nothing is looked at; a triangle with a point that is not finite is hit by no ray. Raises InputError for other arrays, and for
     indices that lead to no point.
     """

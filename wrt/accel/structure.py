@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from inspect import signature
-from typing import Any, NamedTuple, get_type_hints
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import accepts, did_you_mean, require_known
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
@@ -15,6 +15,8 @@ from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 
+T = TypeVar("T")
+
 
 def check_units(triangle: str, box: str) -> None:
     """Raise InputError where there is no triangle test or box test of that name."""
@@ -22,15 +24,26 @@ def check_units(triangle: str, box: str) -> None:
     require_known(box, RAY_AABB, "box test")
 
 
-def check_options(name: str, build: Callable[..., Any], options: dict[str, Any]) -> None:
-    """Raise InputError for options that a builder does not have, or not of that type."""
-    known = {option: kind for option, kind in get_type_hints(build).items() if option not in ("options", "return")}
-    for option, value in options.items():
+@dataclass(frozen=True)
+class NoOptions:
+    """Options of a structure that has none."""
+
+
+def options_of(name: str, options: type[T], given: dict[str, Any]) -> T:
+    """The options of a structure, a dataclass. Raises InputError for what it has not, for other types and values out of range."""
+    known, types = {field.name: field for field in fields(options)}, get_type_hints(options)  # type: ignore[arg-type]
+    for option, value in given.items():
         if option not in known:
             names = [*known, "triangle", "box"]
             raise InputError(f"{name} has no option {option!r}; {did_you_mean(option, names)}there is {', '.join(names)}")
-        if not accepts(known[option], value):
-            raise InputError(f"{option} must be {signature(build).parameters[option].annotation}, got {value!r}")
+        if not accepts(types[option], value):
+            raise InputError(f"{option} must be {known[option].type}, got {value!r}")
+    return options(**given)
+
+
+def default_options(name: str) -> dict[str, Any]:
+    """The options of the structure of that name, with their defaults."""
+    return {field.name: field.default for field in fields(ACCELERATORS[name].options)}
 
 
 class Structure(NamedTuple):

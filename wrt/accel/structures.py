@@ -6,9 +6,24 @@ from __future__ import annotations
 from typing import Any
 
 from wrt.core import cuda
+from wrt.core.errors import InputError
 from wrt.core.registry import Registry
 
-ACCELERATORS: Registry[type[Any]] = Registry("structure", {
+FIELDS = ("name", "kernels", "options")  # class fields without a default in wrt.accel.base.OneMesh
+
+
+class Structures(Registry[type[Any]]):
+    """Name -> class of structures over one mesh. Raises InputError that names the class field that one lacks."""
+
+    def __getitem__(self, name: str) -> type[Any]:
+        kind = super().__getitem__(name)
+        for field in FIELDS:
+            if not hasattr(kind, field):
+                raise InputError(f"structure {name!r}: class {kind.__name__} has no field {field!r}")
+        return kind
+
+
+ACCELERATORS = Structures("structure", {
     "bvh": "wrt.accel.bvh.wide:Bvh8",  # the default
     "bvh2": "wrt.accel.bvh.binary:Bvh2",
     "bvh4": "wrt.accel.bvh.wide:Bvh4",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import asdict, replace
-from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build
 from wrt.accel.scenes.instancing import stored_meshes
-from wrt.accel.structures import ACCELERATORS
+from wrt.accel.structure import default_options
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
 from wrt.picture.film import Film
@@ -90,10 +89,9 @@ class Renderer:
 
 def builder_for(plan: Plan) -> dict[str, str]:
     """The structure's option `builder` for one picture, where its default takes too long for so few samples."""
-    default = signature(ACCELERATORS[plan.accel]._build).parameters.get("builder")
     triangles = sum(len(mesh.faces) for mesh in stored_meshes(plan.scene, plan.meshes))
     few = triangles > SMALL and plan.area * plan.scene.settings.spp < REFINED_FROM * triangles
-    return {"builder": "binned"} if few and default is not None and default.default == "refined" else {}
+    return {"builder": "binned"} if few and default_options(plan.accel).get("builder") == "refined" else {}
 
 
 def same_faces(before: Geometry, now: Geometry | InstancedGeometry) -> bool:

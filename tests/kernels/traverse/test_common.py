@@ -1,7 +1,6 @@
 """The traversal units: every structure in the registry finds, to the last bit, what testing all primitives finds."""
 
 from functools import cache
-from inspect import signature
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import warp as wp
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.accel.structure import Structure
+from wrt.accel.structure import Structure, default_options
 from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.query import HitArrays, RayArrays, load_ray
 from wrt.kernels.structs import Surfaces, kernel
@@ -22,7 +21,7 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 TREES = [name for name in STRUCTURES if name != "brute_force"]
-WITH_LEAVES = [name for name in TREES if "max_leaf" in signature(ACCELERATORS[name]._build).parameters]
+WITH_LEAVES = [name for name in TREES if "max_leaf" in default_options(name)]
 NO_SPHERES = np.zeros((0, 4), np.float32)
 
 

@@ -54,7 +54,7 @@ def test_a_structure_goes_through_pickle(name: str) -> None:
     before = build(ball, name, **({"triangle": "moeller_trumbore", "max_leaf": 2} if name == "bvh2" else {}))
     for after in (pickle.loads(pickle.dumps(before)), deepcopy(before)):
         same(before, after)
-        assert after.structure == before.structure and after._options == before._options
+        assert after.structure == before.structure and after.built_with == before.built_with
         hits, again = before.closest_hit(*rays()), after.closest_hit(*rays())
         assert np.array_equal(hits.shading_normal, again.shading_normal, equal_nan=True)
     if name == "bvh2":

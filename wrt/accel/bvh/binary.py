@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from abc import abstractmethod
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
-from wrt.accel.bvh.builders import BvhOptions, build_binary, sah_cost
+from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary, sah_cost
 from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.device_geometry import DeviceGeometry
@@ -39,14 +39,13 @@ class InPlace(NamedTuple):
 
 
 class BinaryBvh(OneMesh):
-    """Options: builder (a name in wrt.accel.bvh.builders.BVH_BUILDERS), max_leaf (1 to 64 primitives), cost_traversal and
-    cost_intersection (of the SAH), split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
+    """A binary tree of bounding volumes. Options: BinaryOptions."""
 
+    options = BinaryOptions
     can_refit = True
 
-    def _build(self, builder: str = "binned", max_leaf: int = 4, cost_traversal: float = 1.0,
-               cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
-        return self._by(BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget))
+    def _build(self, options: BinaryOptions) -> Built:
+        return self._by(BvhOptions(**asdict(options)))
 
     def _by(self, options: BvhOptions) -> Built:
         tree = build_binary(self.geometry, options, self.threads)

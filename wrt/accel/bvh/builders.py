@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from wrt.accel.bvh.tree import BinaryTree, BvhOptions, sah_cost
+from wrt.accel.bvh.tree import BinaryOptions, BinaryTree, BvhOptions, sah_cost
 from wrt.accel.geometry import Geometry
 from wrt.core.registry import Registry
 
-__all__ = ["BVH_BUILDERS", "BinaryTree", "BvhOptions", "build_binary", "sah_cost"]
+__all__ = ["BVH_BUILDERS", "BinaryOptions", "BinaryTree", "BvhOptions", "build_binary", "sah_cost"]
 
 BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Registry("builder", {
     "binned": "wrt.accel.bvh.top_down:build_binned",

@@ -14,12 +14,11 @@ MAX_LEAF = 64
 
 
 @dataclass(frozen=True)
-class BvhOptions:
+class BinaryOptions:
     """builder: a name in BVH_BUILDERS; max_leaf: 1 to 64 primitives; cost_traversal, cost_intersection: of the SAH, of one node
     visited and one primitive tested. Of spatial splits (builder "sbvh"): split_alpha: the overlap of an object split, as a share
     of the root's area, from which a plane is tried (Stich et al. 2009); split_budget: how many references there may be beyond
-    one a primitive, as a share of the primitives. row: primitives that are tested at once: a leaf costs as many tests as it has
-    rows. Raises InputError for values out of range."""
+    one a primitive, as a share of the primitives."""
 
     builder: str = "binned"
     max_leaf: int = 4
@@ -27,6 +26,13 @@ class BvhOptions:
     cost_intersection: float = 1.0
     split_alpha: float = 4e-5
     split_budget: float = 0.5
+
+
+@dataclass(frozen=True)
+class BvhOptions(BinaryOptions):
+    """What builders take: as told, and row: primitives that are tested at once, so that a leaf costs as many tests as it has rows.
+    Raises InputError for values out of range."""
+
     row: int = 1
 
     def __post_init__(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
-from wrt.accel.bvh.builders import BvhOptions, build_binary
+from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.small import SMALL, small_tree
 from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit
@@ -32,20 +32,31 @@ def aligned(array: np.ndarray) -> np.ndarray:
     return out
 
 
+@dataclass(frozen=True)
+class Bvh4Options(BinaryOptions):
+    """As BinaryOptions, for the binary tree that becomes a wide one. cost_traversal, cost_intersection: of one node visited and one
+    row of primitives tested; max_leaf is as many as a row has lanes by default."""
+
+    builder: str = "refined"
+
+
+@dataclass(frozen=True)
+class Bvh8Options(Bvh4Options):
+    __doc__ = Bvh4Options.__doc__
+
+    max_leaf: int = 8
+
+
 class WideBvh(OneMesh):
-    """Options: builder (of the binary tree, a name in wrt.accel.bvh.builders.BVH_BUILDERS), max_leaf (1 to 64 primitives; by
-    default as many as a row has lanes), cost_traversal and cost_intersection (of one node visited and of one row of primitives
-    tested), split_alpha and split_budget (of builder "sbvh"): see BvhOptions."""
+    """A binary tree collapsed into nodes of `width` children. Options: Bvh4Options and Bvh8Options."""
 
     width: ClassVar[int]
     compressed: ClassVar[bool] = False
     can_refit = True
 
-    def _build(self, builder: str = "refined", max_leaf: int | None = None, cost_traversal: float = 1.0,
-               cost_intersection: float = 1.0, split_alpha: float = 4e-5, split_budget: float = 0.5) -> Built:
-        max_leaf = self.width if max_leaf is None else max_leaf
-        options = BvhOptions(builder, max_leaf, cost_traversal, cost_intersection, split_alpha, split_budget, self.width)
-        few = builder == "refined" and len(self.geometry) <= SMALL
+    def _build(self, options: BinaryOptions) -> Built:
+        options = BvhOptions(**asdict(options), row=self.width)
+        few = options.builder == "refined" and len(self.geometry) <= SMALL
         tree = small_tree(*self.geometry.bounds(), options) if few else self._collapsed(options)
         if tree.stack > STACK_SIZE:
             tree = self._collapsed(options)
@@ -150,6 +161,7 @@ class Bvh4(WideBvh):
     __doc__ = WideBvh.__doc__
 
     name = "bvh4"
+    options = Bvh4Options
     width = 4
     kernels = WideTraversal(4)
 
@@ -158,6 +170,7 @@ class Bvh8(WideBvh):
     __doc__ = WideBvh.__doc__
 
     name = "bvh8"
+    options = Bvh8Options
     width = 8
     kernels = stream = BatchTraversal()
 
@@ -167,6 +180,7 @@ class Bvh8c(WideBvh):
     they hold what they held, and leaves without gaps."""
 
     name = "bvh8c"
+    options = Bvh8Options
     width = 8
     compressed = True
     kernels = WideTraversal(8, compressed=True)

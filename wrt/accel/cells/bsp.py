@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,8 +20,9 @@ from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.kernels.build import bsp as build_bsp
+from wrt.kernels.build import bsp_split
 from wrt.kernels.build.bsp_cell import MAX_FACES, MAX_POINTS, Cells
-from wrt.kernels.build.bsp_split import BspOptions, BspTools, Pieces
+from wrt.kernels.build.bsp_split import BspTools, Pieces
 from wrt.kernels.traverse import bsp as kernels
 
 MAX_DEPTH = 60  # below the traversal unit's stack
@@ -32,42 +34,62 @@ PIECE = {"prim_id": (wp.int32, ()), "first": (wp.int32, ()), "count": (wp.int32,
          "hi": (wp.vec3d, (3,)), "ball": (wp.vec4d, (4,)), "extent": (wp.float64, ())}
 
 
+@dataclass(frozen=True)
+class BspOptions:
+    """cost_intersection, cost_axis, cost_plane: of one primitive, of a node across an axis, of any other; the defaults are those of
+    the Manta renderer. samples: 0 or more; so many triangles of a cell, evenly spread over its list, give their four planes as
+    candidates; 0: a k-d tree. max_depth: 1 to 60; 0: 16 + 2 log2 of the number of primitives. max_growth: 1 to 1000, references in
+    all leaves for each primitive; a cell may use up its share of them, by how many it has. max_triangles: more primitives are
+    refused. progress: called with the fraction that is done, 0 to 1, from the threads that build. Raises InputError for values out
+    of range."""
+
+    cost_intersection: float = 75.0
+    cost_axis: float = 10.0
+    cost_plane: float = 20.0
+    samples: int = 128
+    max_depth: int = 0
+    max_growth: float = 16.0
+    max_triangles: int = 500_000
+    progress: Callable[[float], None] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("cost_intersection", "cost_axis", "cost_plane"):
+            if not 0.0 < (value := getattr(self, name)) < math.inf:
+                raise InputError(f"{name} must be above 0 and finite, got {value}")
+        require_between(samples=(self.samples, 0, 1 << 30), max_depth=(self.max_depth, 0, MAX_DEPTH),
+                        max_growth=(self.max_growth, 1.0, 1000.0))
+        if self.progress is not None and not callable(self.progress):
+            raise InputError(f"progress must be a function of one number, got {self.progress!r}")
+
+    def on_device(self, lo: np.ndarray, hi: np.ndarray, n: int) -> Any:
+        """As the kernels take them, for n primitives with these boxes."""
+        out = bsp_split.BspOptions()
+        out.cost_intersection, out.cost_axis, out.cost_plane = self.cost_intersection, self.cost_axis, self.cost_plane
+        out.samples, out.max_depth = self.samples, self.max_depth or min(MAX_DEPTH, 16 + 2 * math.ceil(math.log2(n)))
+        out.lo, out.hi = wp.vec3d(lo.min(axis=0)), wp.vec3d(hi.max(axis=0))
+        return out
+
+
 class Bsp(OneMesh):
     """Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Slow to build: a subset of all triangles' planes is tried.
-
-    Options: cost_intersection, cost_axis, cost_plane (of one primitive, of a node across an axis, of any other; the defaults
-    are those of the Manta renderer); samples (0 or more: so many triangles of a cell, evenly spread over its list, give their
-    four planes as candidates; 0: a k-d tree); max_depth (1 to 60; 0: 16 + 2 log2 of the number of primitives); max_growth (1 to
-    1000: references in all leaves for each primitive; a cell may use up its share of them, by how many it has); max_triangles
-    (more primitives are refused); progress: called with the fraction that is done, 0 to 1, from the threads that build.
-    """
+    Options: BspOptions."""
 
     name = "bsp"
     kernels = kernels
+    options = BspOptions
 
-    def _build(self, cost_intersection: float = 75.0, cost_axis: float = 10.0, cost_plane: float = 20.0, samples: int = 128,
-               max_depth: int = 0, max_growth: float = 16.0, max_triangles: int = 500_000,
-               progress: Callable[[float], None] | None = None) -> Built:
+    def _build(self, options: BspOptions) -> Built:
         n = len(self.geometry)
-        for name, value in (("cost_intersection", cost_intersection), ("cost_axis", cost_axis), ("cost_plane", cost_plane)):
-            if not 0.0 < value < math.inf:
-                raise InputError(f"{name} must be above 0 and finite, got {value}")
-        require_between(samples=(samples, 0, 1 << 30), max_depth=(max_depth, 0, MAX_DEPTH), max_growth=(max_growth, 1.0, 1000.0))
-        if progress is not None and not callable(progress):
-            raise InputError(f"progress must be a function of one number, got {progress!r}")
-        if n > max_triangles:
-            raise InputError(f"bsp is slow to build, and takes up to max_triangles={max_triangles} primitives; there are {n}: take "
-                             "another structure (kdtree, bvh), or raise max_triangles")
+        if n > options.max_triangles:
+            raise InputError(f"bsp is slow to build, and takes up to max_triangles={options.max_triangles} primitives; there are "
+                             f"{n}: take another structure (kdtree, bvh), or raise max_triangles")
         if n == 0:
             return Built({"nodes": records(kernels.BspNode, 0), "lo": np.full(3, np.inf), "hi": np.full(3, -np.inf),
                           "extent": np.zeros(1, np.float32), "first": np.zeros(1, np.int32), "count": np.zeros(1, np.int32)},
                          np.zeros(0, np.int32), sah_cost=0.0)
         lo, hi = (bound.astype(np.float64) for bound in self.geometry.bounds())
-        options = BspOptions()
-        options.cost_intersection, options.cost_axis, options.cost_plane = cost_intersection, cost_axis, cost_plane
-        options.samples, options.max_depth = samples, max_depth or min(MAX_DEPTH, 16 + 2 * math.ceil(math.log2(n)))
-        options.lo, options.hi = wp.vec3d(lo.min(axis=0)), wp.vec3d(hi.max(axis=0))
-        builder = Builder(self.geometry, options, self.threads, int(max_growth * n), progress or (lambda done: None))
+        builder = Builder(self.geometry, options.on_device(lo, hi, n), self.threads, int(options.max_growth * n),
+                          options.progress or (lambda done: None))
         return builder.build()
 
     def _check(self, built: Built) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,9 +26,20 @@ MAX_AXIS = 2048
 PRIMITIVES_PER_LAUNCH = 16384
 
 
+@dataclass(frozen=True)
+class GridOptions:
+    """density: cells for each primitive, on average over the grid's box, 1e-3 to 1e3; mailbox: whether a primitive that spans
+    several cells is tested once where it can be. Raises InputError for values out of range."""
+
+    density: float = 2.0
+    mailbox: bool = True
+
+    def __post_init__(self) -> None:
+        require_between(density=(self.density, 1e-3, 1e3))
+
+
 class Grid(OneMesh):
-    """Options: density (cells for each primitive, on average over the grid's box; 1e-3 to 1e3), mailbox (whether a primitive that
-    spans several cells is tested once where it can be).
+    """A uniform grid. Options: GridOptions.
 
     At most MAX_CELLS cells and, as estimated from the boxes, MAX_REFERENCES references: beyond, the cells are larger, and a
     RuntimeWarning says so. Spheres are listed wherever their box is. The `box` test is not used.
@@ -35,15 +47,15 @@ class Grid(OneMesh):
 
     name = "grid"
     kernels = kernels
+    options = GridOptions
 
-    def _build(self, density: float = 2.0, mailbox: bool = True) -> Built:
-        require_between(density=(density, 1e-3, 1e3))
+    def _build(self, options: GridOptions) -> Built:
         lo, hi = self.geometry.bounds()
-        layout = resolution(lo, hi, density)
+        layout = resolution(lo, hi, options.density)
         cells, references = list_references(self.geometry, (lo, hi), layout, self.threads)
         pad, extent = triangle_reach(self.geometry, lo, hi)
         return Built({"lo": np.array(layout.lo), "hi": np.array(layout.hi), "size": np.array(layout.size),
-                      "n": np.array(layout.n), "pad": pad, "extent": extent, "mailbox": np.array(mailbox, np.int32),
+                      "n": np.array(layout.n), "pad": pad, "extent": extent, "mailbox": np.array(options.mailbox, np.int32),
                       "cells": cells, "references": references},
                      np.arange(len(lo), dtype=np.int32), len(cells), int((cells["count"] > 0).sum()), 1,
                      sah_cost(layout, len(cells) + len(references)))

@@ -13,20 +13,13 @@ from wrt.kernels.traverse import kdtree as kernels
 
 
 class KdTree(OneMesh):
-    """Options: max_leaf (cells with so many primitives are not split), max_depth (None: 8 + 1.3 log2 n), by_cost (stop where no
-    split costs less than a leaf); cost_traversal, cost_intersection (of the SAH), empty_bonus (0 to 1: what a split that cuts
-    off empty space is let off); perfect_below (larger cells are split between 64 bins, smaller ones at the best of all planes);
-    clip (triangles are put into cells by what lies in them, not by their boxes); max_growth (how many references, and empty
-    leaves, there may be for each primitive)."""
+    """A k-d tree. Options: KdOptions."""
 
     name = "kdtree"
     kernels = kernels
+    options = KdOptions
 
-    def _build(self, max_leaf: int = 1, max_depth: int | None = None, by_cost: bool = True, cost_traversal: float = 2.0,
-               cost_intersection: float = 1.0, empty_bonus: float = 0.1, perfect_below: int = 65536, clip: bool = True,
-               max_growth: float = 16.0) -> Built:
-        options = KdOptions(max_leaf, max_depth, by_cost, cost_traversal, cost_intersection, empty_bonus, perfect_below, clip,
-                            max_growth)
+    def _build(self, options: KdOptions) -> Built:
         return build_tree(self.geometry, options, self.threads)
 
     def _check(self, built: Built) -> None:

@@ -30,7 +30,11 @@ Part = tuple[np.ndarray, np.ndarray, Any]  # nodes, order and totals of a subtre
 
 @dataclass(frozen=True)
 class KdOptions:
-    """Those of wrt.accel.cells.kdtree.KdTree. Raises InputError for values out of range."""
+    """max_leaf: cells with so many primitives are not split; max_depth (None: 8 + 1.3 log2 n); by_cost: stop where no split costs
+    less than a leaf; cost_traversal, cost_intersection: of the SAH; empty_bonus: 0 to 1, what a split that cuts off empty space is
+    let off; perfect_below: larger cells are split between 64 bins, smaller ones at the best of all planes; clip: triangles are put
+    into cells by what lies in them, not by their boxes; max_growth: how many references, and empty leaves, there may be for each
+    primitive. Raises InputError for values out of range."""
 
     max_leaf: int = 1
     max_depth: int | None = None

@@ -14,19 +14,17 @@ from wrt.kernels.traverse import octree as kernels
 
 
 class Octree(OneMesh):
-    """Options: max_leaf (cells with so many primitives are not split), max_depth (splits from the root down, 0 to MAX_LEVELS),
-    by_cost (stop also where the octants cost a ray as much as the cell), max_growth (in every part of the tree, at most so many
-    references for each primitive), mailbox (whether a primitive that spans several cells is tested once where it can be).
+    """An octree. Options: OctreeOptions.
 
     Spheres are listed wherever their box is. The `box` test is not used.
     """
 
     name = "octree"
     kernels = kernels
+    options = OctreeOptions
 
-    def _build(self, max_leaf: int = 8, max_depth: int = kernels.MAX_LEVELS, by_cost: bool = True, max_growth: float = 16.0,
-               mailbox: bool = True) -> Built:
-        return build_tree(self.geometry, OctreeOptions(max_leaf, max_depth, by_cost, max_growth), mailbox, self.threads)
+    def _build(self, options: OctreeOptions) -> Built:
+        return build_tree(self.geometry, options, self.threads)
 
     def _check(self, built: Built) -> None:
         arrays = one_row(self, built)

@@ -25,12 +25,16 @@ OCTANTS = np.arange(8)[:, None] >> np.arange(3) & 1  # (8, 3): which half, in x,
 
 @dataclass(frozen=True)
 class OctreeOptions:
-    """As in wrt.accel.cells.octree.Octree; with max_growth there are never more than MAX_REFERENCES either. Raises InputError."""
+    """max_leaf: cells with so many primitives are not split; max_depth: splits from the root down, 0 to MAX_LEVELS; by_cost: stop
+    also where the octants cost a ray as much as the cell; max_growth: in every part of the tree, at most so many references for
+    each primitive, and never more than MAX_REFERENCES; mailbox: whether a primitive that spans several cells is tested once where
+    it can be. Raises InputError for values out of range."""
 
-    max_leaf: int
-    max_depth: int
-    by_cost: bool
-    max_growth: float
+    max_leaf: int = 8
+    max_depth: int = MAX_LEVELS
+    by_cost: bool = True
+    max_growth: float = 16.0
+    mailbox: bool = True
 
     def __post_init__(self) -> None:
         require_between(max_leaf=(self.max_leaf, 1, 1 << 20), max_depth=(self.max_depth, 0, MAX_LEVELS),
@@ -88,7 +92,7 @@ def areas(layout: Any, corner: np.ndarray, size: int) -> np.ndarray:
     return half_areas(planes(layout, corner), planes(layout, corner + size))
 
 
-def build_tree(geometry: Geometry, options: OctreeOptions, mailbox: bool, threads: int) -> Built:
+def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Built:
     """Split the cells that have more than max_leaf primitives, where that pays, until none is left to split.
 
     nodes: breadth first; depth: levels, the root's included; sah_cost: in nodes and primitives, of a random line through the root.
@@ -121,8 +125,8 @@ def build_tree(geometry: Geometry, options: OctreeOptions, mailbox: bool, thread
     nodes = np.concatenate(levels)
     pad, extent = triangle_reach(geometry, *bounds)
     return Built({"lo": np.array(layout.lo), "hi": np.array(layout.hi), "size": np.array(layout.size, np.float32),
-                  "levels": np.array(layout.levels, np.int32), "pad": pad, "extent": extent, "mailbox": np.array(mailbox, np.int32),
-                  "nodes": nodes, "references": np.concatenate(references)},
+                  "levels": np.array(layout.levels, np.int32), "pad": pad, "extent": extent,
+                  "mailbox": np.array(options.mailbox, np.int32), "nodes": nodes, "references": np.concatenate(references)},
                  np.arange(n, dtype=np.int32), n_nodes, int((nodes["count"] >= 0).sum()), len(levels), cost)
 
 

@@ -20,7 +20,7 @@ class RayQuery(NamedTuple):
     """Warp functions and types for kernels over structures of one kind; they have the answers of Accelerator.closest_hit, to the
     last bit.
 
-    World: the type of the argument that Accelerator.world is. ray(origin, direction) -> Ray, from the origin to infinity; its
+    World: the type of the argument that OneMesh.world is. ray(origin, direction) -> Ray, from the origin to infinity; its
     t_min and t_max can be set. closest_hit(world, ray) -> Hit, with t, u, v and prim_id, which is -1 on a miss.
     any_hit(world, ray) -> bool. next_hit(world, ray, hit) -> Hit: the one after a hit of this ray, in the order of t and prim_id.
     """

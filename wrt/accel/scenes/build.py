@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from inspect import signature
 from pathlib import Path
 from typing import Any, overload
 
@@ -17,6 +16,7 @@ from wrt.accel.scenes.flatten import world_of
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.scenes.worlds import worlds_over
 from wrt.accel.store import read
+from wrt.accel.structure import default_options
 from wrt.accel.structures import ACCELERATORS
 from wrt.accel.world import World, world_over
 from wrt.core.arrays import is_tensor, taken, to_numpy
@@ -30,7 +30,7 @@ from wrt.scene.model import Scene
 
 def reports_progress(accel: str) -> bool:
     """Whether the structure is so slow to build that it has the option `progress`: called with the fraction done, 0 to 1."""
-    return accel in ACCELERATORS and "progress" in signature(ACCELERATORS[accel]._build).parameters
+    return accel in ACCELERATORS and "progress" in default_options(accel)
 
 
 @overload

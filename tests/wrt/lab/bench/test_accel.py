@@ -80,7 +80,7 @@ def test_a_structure_that_refuses_is_named_and_the_others_go_on(box, monkeypatch
     class Refusing(ACCELERATORS["bvh2"]):  # type: ignore[misc, name-defined]
         name = "refusing"
 
-        def _build(self):
+        def _build(self, options):
             raise InputError("more than 11 triangles")
 
     monkeypatch.setitem(bench.ACCELERATORS, "refusing", Refusing)
@@ -96,9 +96,9 @@ def test_the_build_that_is_timed_is_not_the_first(box, monkeypatch) -> None:
     class Slow(ACCELERATORS["bvh2"]):  # type: ignore[misc, name-defined]
         name = "slow"
 
-        def _build(self):
+        def _build(self, options):
             sizes.append(len(self.geometry))
-            return super()._build()
+            return super()._build(options)
 
     monkeypatch.setitem(bench.ACCELERATORS, "slow", Slow)
     run(plan(box, structures=("slow",), kinds=("random",), builds=2))
