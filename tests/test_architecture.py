@@ -31,6 +31,22 @@ BELOW_WRT = {
     "lab": {"renderer", "accel", "kernels", "io", "scene", "picture", "core"},
     "cli": {"lab", "viewer", "renderer", "accel", "io", "scene", "picture", "core"},
 }
+# The rooms of wrt/accel in their order: each imports from itself and from those before it. What is named nowhere is a structure. A
+# structure is asked by its methods, so queries stand below the structures.
+ROOMS_OF_ACCEL = (
+    {"triangle_data", "geometry", "device_geometry", "instanced_geometry", "world"},  # what is hit
+    {"structures", "structure", "built", "snapshot"},  # kinds of structures, and a structure at one time
+    {"queries"},
+    {"store", "base", "epo"},
+    {"bvh", "cells", "brute_force"},
+    {"top_level", "instances"},
+    {"scenes"},
+)
+MESHES = {"wrt.scene.mesh", "wrt.scene.clean", "wrt.scene.values"}  # no scenes: what the rooms before the last may use of wrt.scene
+# Private names of others that are used all the same, and why.
+PRIVATE = {"_replace": "public, of a NamedTuple", "_cls": "Warp's: the type of a struct",
+           "_ref": "Warp's: what an array without memory of its own keeps"}
+SET_FROM_OUTSIDE = {"requires_grad": "Warp's, of an array", "path": "of an InputError with another message"}
 # The folders of kernels/, and from which others each may import; `structs` is below all of them.
 BELOW_KERNELS = {
     "native": set(),
@@ -93,6 +109,54 @@ def test_host_folders_import_downward_only(path: Path) -> None:
     here = folder(module(path), "wrt")
     there = {folder(name, "wrt") for name in imports(path) if name == "wrt" or name.startswith("wrt.")}
     assert there - {here, ""} <= BELOW_WRT[here]
+
+
+def room(name: str) -> int:
+    """The place of a module of wrt.accel in ROOMS_OF_ACCEL."""
+    places = {each: i for i, names in enumerate(ROOMS_OF_ACCEL) for each in names}
+    return places.get(folder(name, "wrt.accel"), places["bvh"])
+
+
+@pytest.mark.parametrize("path", [path for path in HOST if path.is_relative_to(ROOT / "wrt" / "accel")], ids=ids)
+def test_rooms_of_accel_import_downward_only(path: Path) -> None:
+    here = room(module(path))
+    assert max((room(name) for name in imports(path) if name.startswith("wrt.accel.")), default=0) <= here
+    if here < room("wrt.accel.scenes"):
+        assert {name for name in imports(path) if name.startswith(("wrt.scene", "wrt.io"))} <= MESHES
+
+
+def test_a_query_imports_no_scene_and_no_reader() -> None:
+    code = ("import sys, wrt.accel.structures as s; import wrt.accel.instances, wrt.accel.queries.visible\n"
+            "all(s.ACCELERATORS.values()); print([m for m in sys.modules if m.startswith(('wrt.io', 'wrt.scene.model'))])")
+    assert run(code, ROOT, ROOT) == "[]"
+
+
+@pytest.mark.parametrize("path", [p for p in HOST if folder(module(p), "wrt") in ("accel", "renderer", "compat")], ids=ids)
+def test_private_names_are_used_where_they_are_made(path: Path) -> None:
+    """x._name, where x is another object, only in the module that makes the name."""
+    nodes = list(ast.walk(tree(path)))
+    made = {node.name for node in nodes if isinstance(node, ast.FunctionDef)} | {
+        node.attr for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+        and ast.unparse(node.value) == "self"}
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and re.match("_[^_]", node.attr) and node.attr not in made | PRIVATE.keys():
+            assert ast.unparse(node.value) in ("self", "cls", "super()"), f"line {node.lineno}: {ast.unparse(node)}"
+
+
+@cache
+def fields_of_records() -> frozenset[str]:
+    """The fields of all records of device code."""
+    classes = [node for path in KERNELS for node in ast.walk(tree(path)) if isinstance(node, ast.ClassDef)]
+    return frozenset(ast.unparse(each.target) for node in classes for each in node.body if isinstance(each, ast.AnnAssign))
+
+
+@pytest.mark.parametrize("path", [p for p in HOST if folder(module(p), "wrt") in ("accel", "renderer", "compat")], ids=ids)
+def test_objects_set_their_own_fields(path: Path) -> None:
+    """x.name = ..., where x is another object, only of device code's records, and of private names that this module makes."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and ast.unparse(node.value) not in ("self", "cls"):
+            allowed = node.attr in fields_of_records() or node.attr.startswith("_") or node.attr in SET_FROM_OUTSIDE
+            assert allowed, f"line {node.lineno}: {ast.unparse(node)}"
 
 
 @pytest.mark.parametrize("path", [path for path in KERNELS if path.name != "__init__.py"], ids=ids)

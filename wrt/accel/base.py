@@ -97,6 +97,12 @@ class OneMesh(Accelerator, ABC):
         other._snapshot = self._snapshot.over(geometry)
         return other
 
+    def _built_over(self, geometry: Geometry, built: Built, built_cost: float) -> Self:
+        """A copy with what was built over another geometry."""
+        other = self._over(geometry)
+        other._take(built, build_clock(), built_cost)
+        return other
+
     def _take(self, built: Built, begin: float, built_cost: float) -> None:
         """Have what was built. begin: when that began; built_cost: as in Snapshot."""
         data = self._upload(built)
@@ -168,12 +174,12 @@ class OneMesh(Accelerator, ABC):
 
     def epo(self) -> float:
         """End-point overlap of a BVH: nodes and primitives visited for nothing at a random point of the surface
-        (wrt.accel.bvh.epo).
+        (wrt.accel.epo).
 
         It tells of rays that end, as stats.sah_cost does of lines that nothing stops; it takes about as long as a build. Raises
         InputError for structures that are no BVH.
         """
-        from wrt.accel.bvh.epo import end_point_overlap
+        from wrt.accel.epo import end_point_overlap
 
         snapshot = self._snapshot
         return end_point_overlap(self._children(snapshot.built.on_host()), snapshot.geometry, self.threads)

@@ -193,7 +193,7 @@ class Run:
     def film(self) -> Film:
         """Take the samples, and give the film."""
         begin = self.begin = time.perf_counter()
-        interrupted = False
+        interrupted = out_of_time = False
         with held_interrupts() as self.interrupts:
             if self.checkpoint is not None:
                 self.checkpoint.begin()
@@ -207,7 +207,7 @@ class Run:
             except KeyboardInterrupt:  # from _follow, or from a progress callback that wants the end
                 interrupted = True
             except OutOfTime:
-                self.passes.timed_out = True
+                out_of_time = True
             except Exception as error:
                 self._keep(error)
                 raise
@@ -216,13 +216,13 @@ class Run:
                 self.checkpoint.save(self.arrays, self.seconds["trace"])
                 if self.checkpoint.problem:
                     warnings.warn(self.checkpoint.problem, RuntimeWarning, stacklevel=4)
-            facts = self._facts(interrupted or bool(self.interrupts))
+            facts = self._facts(interrupted or bool(self.interrupts), out_of_time)
             return film_of(self.plan, self.arrays, self.seed, self.aov, self.seconds, facts)
 
-    def _facts(self, interrupted: bool) -> dict[str, Any]:
+    def _facts(self, interrupted: bool, out_of_time: bool) -> dict[str, Any]:
         """Of the scene, and of how the run ended."""
         end = {"interrupted": interrupted, "signal": int(self.interrupts[0]) if self.interrupts else None,
-               "timed_out": self.passes.timed_out and not interrupted}
+               "timed_out": (out_of_time or self.passes.timed_out) and not interrupted}
         return self.tracer.facts() | end | ({} if self.checkpoint is None else self.checkpoint.facts())
 
     def _keep(self, error: Exception) -> None:

@@ -22,7 +22,6 @@ from wrt.accel.queries.rays import vectors
 from wrt.accel.store import check_binary, save
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
-from wrt.core.seconds import build_clock
 from wrt.kernels.build.shape import write_corners
 from wrt.kernels.structs import Primitive
 from wrt.kernels.traverse import bvh2 as kernels
@@ -135,8 +134,8 @@ class Bvh2(BinaryBvh):
         """Arrays of its own for the structure, and what is kept beside them."""
         built, spheres = self._on_device(self._snapshot.built), self.geometry.spheres
         built = replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])}, sah_cost=float("nan"))
-        beside = self._over(DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres))
-        beside._take(built, build_clock(), self._snapshot.built_cost)
+        moved = DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres)
+        beside = self._built_over(moved, built, self._snapshot.built_cost)
         fitting, shape = Fitting(self.device, len(self.geometry), built.nodes), beside._shape()
         self._snapshot = replace(beside.snapshot, changes=True)
         return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)
@@ -153,7 +152,7 @@ class Bvh2(BinaryBvh):
         launch_on(self.device, write_corners, len(order), shape, order, out, None, threads=self.threads, step=RECORDS_PER_JOB)
 
     def _children(self, built: Built) -> Any:
-        from wrt.accel.bvh.epo import children
+        from wrt.accel.epo import children
 
         nodes = built.arrays["nodes"]
         lo, hi, first, count = (np.stack([nodes[part + "_0"], nodes[part + "_1"]], axis=1)

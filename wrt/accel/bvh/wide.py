@@ -148,7 +148,7 @@ class WideBvh(OneMesh):
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
 
     def _children(self, built: Built) -> Any:
-        from wrt.accel.bvh.epo import children
+        from wrt.accel.epo import children
 
         tree = self._tree(built)
         leaf = tree.children < 0
