@@ -356,15 +356,3 @@ class AovFilm:
     albedo: wp.array(dtype=wp.vec3)
     prim_id: wp.array(dtype=wp.int32)
     material_id: wp.array(dtype=wp.int32)
-
-
-@wp.struct
-class Tile:
-    """A rectangle of pixels, and which samples of them to take; threads: that share the samples of a pixel, one or n_samples."""
-
-    x: int
-    y: int
-    width: int
-    first_sample: int
-    n_samples: int
-    threads: int

@@ -65,7 +65,7 @@ BELOW_KERNELS = {
     "build": {"wide", "traverse", "units", "structs"},
     "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }
-LIBRARIES_OF_KERNELS = {"warp", "functools", "re", "typing", "collections", "math", "pathlib"}
+LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "collections", "math", "pathlib"}
 
 
 def module(path: Path) -> str:

@@ -19,10 +19,11 @@ from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.cli.common import depth_hint
 from wrt.core.device import start
+from wrt.kernels.shade.features import Features
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
-from wrt.renderer.features import Features, features_of
+from wrt.renderer.features import features_of, switches
 from wrt.renderer.plan import aov_kernel, render_kernel
 from wrt.scene.cameras import CAMERAS
 from wrt.scene.model import Scene
@@ -42,9 +43,9 @@ def features(path: Path) -> set[Features]:
     return {features_of(scene, camera, instanced_meshes(scene)) for camera in scene.cameras}
 
 
-@pytest.mark.parametrize("name", Features().switches())
+@pytest.mark.parametrize("name", switches(Features()))
 def test_every_feature_has_a_scene_that_needs_it(name: str) -> None:
-    assert any(f.switches()[name] for path in SCENES for f in features(path)), f"no scene in scenes/ needs {name}"
+    assert any(switches(f)[name] for path in SCENES for f in features(path)), f"no scene in scenes/ needs {name}"
 
 
 def without(features: Features, name: str) -> Features:
@@ -61,10 +62,10 @@ def test_every_kind_of_camera_has_a_scene(kind: str) -> None:
     assert any(isinstance(camera, CAMERAS[kind]) for path in SCENES for camera in load(path).cameras)
 
 
-@pytest.mark.parametrize("name", Features().switches())
+@pytest.mark.parametrize("name", switches(Features()))
 def test_every_feature_changes_the_code_of_a_scene_that_needs_it(name: str) -> None:
     start("cpu")
-    needed = next(f for path in SCENES for f in features(path) if f.switches()[name])
+    needed = next(f for path in SCENES for f in features(path) if switches(f)[name])
     codes = [render_kernel(f, Structure(ACCELERATORS["bvh"], Units(spheres=f.spheres, instances=f.instances))).module.hash_module()
              for f in (needed, without(needed, name))]
     assert codes[0] != codes[1]

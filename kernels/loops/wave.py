@@ -22,14 +22,15 @@ from wrt.kernels.native import source
 from wrt.kernels.query import HitArrays, Queue, hit_at, put_ray, queued_ray
 from wrt.kernels.shade.film import load_pixel, make_see, store_pixel, with_sample
 from wrt.kernels.shade.materials import Scatter
+from wrt.kernels.shade.paths import make_path, make_paths
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, ShadowWalk, make_go_through
-from wrt.kernels.shade.step import Lit, Sample, add_up, lit_by, make_path, make_paths
+from wrt.kernels.shade.step import Lit, Sample, add_up, lit_by
 from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel
 
 Path = make_path(False)
-_, ray_of, _ = make_paths()
+ray_of = make_paths(False).ray_of
 BLOCK = 64  # rays for which something is computed in lanes at a time
 FRESH = 2048  # camera rays that are made, traced and shaded at a time, while they are in the cache
 

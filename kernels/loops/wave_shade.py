@@ -13,9 +13,11 @@ from wrt.kernels.loops.wave_surfaces import ROW, make_wave_surfaces, put_row_vec
 from wrt.kernels.loops.wave_textures import in_lanes, make_wave_textures
 from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
+from wrt.kernels.shade.follow_up import FOLLOWED, make_follow_up, with_cuts
+from wrt.kernels.shade.paths import make_paths
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
-from wrt.kernels.shade.step import Lit, Sample, ShadowRequest, add_up, counted, is_lit, make_step
+from wrt.kernels.shade.step import Sample, ShadowRequest, add_up, is_lit, make_step
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
 
 
@@ -27,18 +29,18 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
     step = make_step(features, shading)
     find, found = make_wave_surfaces(features, shading.surface_at)
     sample_textures, texels_at = make_wave_textures(features, shading.look_up)
-    _, first_path, _, choose_facet, shade, extra_lights, choose, shadow_request, keep, worth = step
+    follow_up, camera_path = make_follow_up(features), make_paths(False).camera_path
     bend, normal_at = make_wave_normals(features, shading.shading_normal)
-    sample_lights, light_at, by_keys = make_wave_lights(features, shading, found, choose)
+    sample_lights, light_at, by_keys = make_wave_lights(features, shading, found, step.choose)
     keyed = features.rough or by_keys
     apart = keyed or in_lanes(features)
-    sample_facets = make_sample_facets(choose_facet)
+    sample_facets = make_sample_facets(step.choose_facet)
     radiance, _, seen_at = BACKGROUNDS[features.background]
 
     @wp.func
-    def follow(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
+    def push(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
         """The number of paths that wait, with this one where it is followed."""
-        if verdict == 1:
+        if verdict == FOLLOWED:
             wave.paths[size * wave.capacity + number] = path
             return size + 1
         return size
@@ -148,7 +150,7 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
             path = Path()
             out = Sample()
             if job.fresh != 0:
-                path = first_path(queued_ray(wave.rays, k), wave.pixel_keys[number / job.samples])
+                path = camera_path(queued_ray(wave.rays, k), wave.pixel_keys[number / job.samples])
             else:
                 size = wave.size[number]
                 traced = wave.traced[number] + 1
@@ -163,30 +165,21 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
             met = found(wave, surfaces, j % BLOCK, k)
             texels = texels_at(wave, surfaces, met, j % BLOCK)
             met.shading = normal_at(wave, surfaces, met, texels, -path.direction, j % BLOCK)
-            shaded = shade(surfaces, lighting, path, met, texels, wave.hits.t[k], facet)
-            lit = Lit()
-            lit.light = shaded.light
-            lit.throughput = shaded.throughput
+            shaded = step.shade(surfaces, lighting, path, met, texels, wave.hits.t[k], facet)
+            next = follow_up(surfaces, shaded, limits, traced)
+            out = with_cuts(out, next)
+            lit = next.lit
             if wp.static(features.blend):
-                verdict = keep(shaded.onward, limits, traced)
-                size = follow(wave, number, size, shaded.onward, verdict)
-                out = counted(out, verdict)
-                out.lost += worth(surfaces, shaded.onward, verdict)
+                size = push(wave, number, size, shaded.onward, next.onward)
             if wp.static(features.reflection):
-                verdict = keep(shaded.reflected, limits, traced)
-                size = follow(wave, number, size, shaded.reflected, verdict)
-                out = counted(out, verdict)
-                lit.reflected = worth(surfaces, shaded.reflected, verdict)
+                size = push(wave, number, size, shaded.reflected, next.reflected)
             if wp.static(features.refraction):
-                verdict = keep(shaded.refracted, limits, traced)
-                size = follow(wave, number, size, shaded.refracted, verdict)
-                out = counted(out, verdict)
-                lit.refracted = worth(surfaces, shaded.refracted, verdict)
+                size = push(wave, number, size, shaded.refracted, next.refracted)
             if wp.static(features.lit):
                 if is_lit(shaded.scatter):
-                    for i in range(lighting.count + wp.static(extra_lights)):
+                    for i in range(lighting.count + wp.static(step.extra_lights)):
                         sample = light_at(wave, surfaces, lighting, shaded.surface, shaded.key, index, i, j % BLOCK)
-                        request = shadow_request(shaded, sample)
+                        request = step.shadow_request(shaded, sample)
                         slot = int(-1)
                         if any_positive(request.value):
                             slot = ask(wave, i, request)

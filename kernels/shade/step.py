@@ -2,9 +2,7 @@
 
 Whitted 1980, "An Improved Illumination Model for Shaded Display", without recursion. At a hit: emission and the ambient term,
 a shadow ray asked for each light, and at most three new paths: straight on through what is partly transparent, reflected, and
-refracted. Each carries what it will be worth (throughput); a path is cut at max_depth bounces, after MAX_TRANSPARENT surfaces
-that it went straight through, or below min_throughput, and counted. So is what comes after MAX_RAYS: where nothing is cut by
-throughput, a tree of 64 levels has no end. kernels/loops traces.
+refracted. Each carries its share of the picture (throughput). follow_up.py says which of them are followed; kernels/loops traces.
 """
 
 from functools import cache
@@ -13,53 +11,22 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.shade.direct import make_reflected_light, shadow_ray
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.materials import Scatter
-from wrt.kernels.shade.sampling import cap_point, hash_pair, make_sample_2d
-from wrt.kernels.shade.shading import BLEND, Texels
-from wrt.kernels.shade.shadows import MAX_TRANSPARENT, OUTSIDE, Shadow, attenuation
-from wrt.kernels.shade.surface import Surface, spawn_point
-from wrt.kernels.structs import Lighting, Limits, Material, Ray, Surfaces, any_positive, make_ray
+from wrt.kernels.shade.paths import ONWARD, REFLECTED, REFRACTED, UNKNOWN, make_path, make_paths
+from wrt.kernels.shade.sampling import cap_point, make_sample_2d
+from wrt.kernels.shade.shading import BLEND, Shading, Texels
+from wrt.kernels.shade.shadows import OUTSIDE, Shadow, attenuation
+from wrt.kernels.shade.surface import Surface
+from wrt.kernels.structs import Lighting, Material, Ray, Surfaces, any_positive
 
-MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
-UNKNOWN = wp.constant(-2)  # where a camera ray begins: within glass, or not
 FACET = wp.constant(2)  # the dimension of what chooses a microfacet
-BRANCHES = wp.constant(4)  # camera, reflection, refraction, straight on: the numbers that make_step gives its new paths
-
-
-@wp.func
-def label(branch: int, depth: int) -> int:
-    """What Ray.slot of a path's ray holds until it is logged. A shadow ray has 0: it belongs to the path's ray before it."""
-    return 1 + branch + BRANCHES * depth
-
-
-@cache
-def make_path(counting: bool) -> Any:
-    """A pending ray; `counting`: it also knows what kind of ray it is."""
-
-    @wp.struct
-    class Path:
-        """How much its light counts, how many bounces it has behind it and how many surfaces in a row it went straight
-        through, which solid glass it is in (a material, OUTSIDE or UNKNOWN), its samples' key, 1 + the triangle that it starts
-        on (0: none), and where rays are counted the branch that made it (0: the camera)."""
-
-        origin: wp.vec3
-        direction: wp.vec3
-        throughput: wp.vec3
-        depth: int
-        passed: int
-        medium: int
-        exclude_plus_one: int
-        key: wp.uint32
-        if counting:
-            branch: int
-
-    return Path
 
 
 @cache
 def make_shaded(counting: bool) -> Any:
-    """What `shade` makes of a path and a hit."""
+    """Return the struct Shaded, of which `shade` makes one of a path and a hit. counting: as of Features."""
     path_struct = make_path(counting)
 
     @wp.struct
@@ -126,13 +93,13 @@ def emitted(m: Material, s: Surface) -> wp.vec3:
 
 @wp.struct
 class Lit:
-    """A surface while its lights are asked: light and throughput as of Shaded; reflected, refracted: what is lost with those of its
-    new paths that are cut (Sample.lost)."""
+    """A surface while its lights are asked: light and throughput as of Shaded; lost_reflected, lost_refracted: what is lost with
+    those of its new paths that are cut (Sample.lost)."""
 
     light: wp.vec3
     throughput: wp.vec3
-    reflected: float
-    refracted: float
+    lost_reflected: float
+    lost_refracted: float
 
 
 @wp.func
@@ -163,92 +130,12 @@ def add_up(before: Sample, lit: Lit, direct: Shadow) -> Sample:
     out.cut_depth += direct.cut
     if direct.cut > 0:
         out.lost += mean3(wp.cw_mul(lit.throughput, direct.lost))
-    out.lost += lit.reflected
-    out.lost += lit.refracted
+    out.lost += lit.lost_reflected
+    out.lost += lit.lost_refracted
     return out
 
 
-@wp.func
-def counted(before: Sample, verdict: int) -> Sample:
-    """A sample with one more new path; verdict: of Step.keep."""
-    out = before
-    out.cut_depth += wp.where(verdict == 2, 1, 0)
-    out.cut_throughput += wp.where(verdict == 3, 1, 0)
-    return out
-
-
-class Step(NamedTuple):
-    """What a loop is made of.
-
-    Path: the struct; first_path(ray, key); ray_of(path). choose_facet(key, index) -> vec3: what chooses a microfacet at the end of
-    a path with that key, for the sample `index`. shade(surfaces, lighting, path, met, texels, t, facet) ->
-    Shaded.
-    extra_lights: how many there are beside those of `lighting` (the background is one); choose(lighting, surfaces, i, surface,
-    point) -> LightSample of light i (the background comes after the last one; point: of LightPoints), and shadow_request(shaded,
-    sample) -> ShadowRequest. keep(path, limits, traced): whether a new path is followed, and
-    worth(surfaces, path, verdict) what is lost where it is not.
-    """
-
-    Path: Any
-    first_path: Any
-    ray_of: Any
-    choose_facet: Any
-    shade: Any
-    extra_lights: int
-    choose: Any
-    shadow_request: Any
-    keep: Any
-    worth: Any
-
-
-def make_step(features: Any, shading: Any, counting: bool = False) -> Any:
-    """The step of a scene's kernel. `features`: wrt.renderer.features.Features; `shading`: of make_shading."""
-    Path = make_path(counting)
-    first_path, ray_of, child = make_paths(counting)
-    return Step(Path, first_path, ray_of, make_choose_facet(features), make_shade(features, shading, child, counting),
-                1 if features.sky_light else 0, *make_shadow_request(features, counting), *make_keep(features, counting))
-
-
-def make_paths(counting: bool = False) -> Any:
-    """Where paths begin: at the camera, or at a surface."""
-    Path = make_path(counting)
-
-    @wp.func
-    def first_path(camera_ray: Ray, key: wp.uint32) -> Path:
-        path = Path()
-        path.origin = camera_ray.origin
-        path.direction = camera_ray.direction
-        path.throughput = wp.vec3(1.0, 1.0, 1.0)
-        path.medium = UNKNOWN
-        path.key = key
-        return path
-
-    @wp.func
-    def ray_of(path: Path) -> Ray:
-        ray = make_ray(path.origin, path.direction)
-        ray.exclude_plus_one = path.exclude_plus_one
-        if wp.static(counting):
-            ray.slot = label(path.branch, path.depth)
-        return ray
-
-    @wp.func
-    def child(path: Path, s: Surface, direction: wp.vec3, throughput: wp.vec3, branch: int) -> Path:
-        out = Path()
-        out.origin = spawn_point(s.point, s.error, s.geometric, direction)
-        out.direction = direction
-        out.throughput = throughput
-        out.depth = path.depth + 1
-        out.medium = path.medium
-        out.exclude_plus_one = s.exclude_plus_one
-        out.key = hash_pair(path.key, wp.uint32(branch))
-        if wp.static(counting):
-            out.branch = branch
-        return out
-
-    return first_path, ray_of, child
-
-
-def make_missing(features: Any, is_solid: Any) -> Any:
+def make_missing(features: Features, is_solid: Any) -> Any:
     """How far a blended surface is not there."""
 
     @wp.func
@@ -268,8 +155,8 @@ def make_missing(features: Any, is_solid: Any) -> Any:
     return missing
 
 
-def make_choose_facet(features: Any) -> Any:
-    """Nothing is drawn where nothing is rough."""
+def make_choose_facet(features: Features) -> Any:
+    """Return the function that draws a microfacet, where anything is rough."""
     sample_2d = make_sample_2d(features)
 
     @wp.func
@@ -281,23 +168,15 @@ def make_choose_facet(features: Any) -> Any:
     return choose_facet
 
 
-def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) -> Any:
-    """One device function from a path and its hit to everything that follows from them."""
-    Path, Shaded = make_path(counting), make_shaded(counting)
-    _, _, resolve, _, scatter_at, is_solid = shading
-    missing = make_missing(features, is_solid)
-
-    @wp.func
-    def medium_at(m: Material, s: Surface, medium: int) -> int:
-        """The solid glass on the ray's side of a surface. A back is seen from within, whatever the path knows of."""
-        if not is_solid(m):
-            return medium
-        return wp.where(s.front == 0, s.material, wp.where(medium == UNKNOWN, OUTSIDE, medium))
+def make_straight_on(features: Features, is_solid: Any) -> Any:
+    """Return the function for what goes on straight through a blended surface."""
+    Path = make_path(features.counting)
+    child = make_paths(features.counting).child
 
     @wp.func
     def straight_on(surfaces: Surfaces, path: Path, m: Material, s: Surface, share: float, distance: float) -> Path:
-        """The part of a path that finds nothing at a blended surface. It takes no bounce."""
-        onward = child(path, s, path.direction, share * path.throughput, 3)
+        """Return the part of a path that finds nothing at the surface. It takes no bounce."""
+        onward = child(path, s, path.direction, share * path.throughput, ONWARD)
         onward.depth = path.depth
         onward.passed = path.passed + 1
         if wp.static(features.refraction):
@@ -307,15 +186,38 @@ def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) 
             onward.throughput = absorbed(surfaces, onward.throughput, path.medium, distance)
         return onward
 
+    return straight_on
+
+
+def make_medium_at(is_solid: Any) -> Any:
+    """Return the function for the medium of a ray at a surface."""
+
+    @wp.func
+    def medium_at(m: Material, s: Surface, medium: int) -> int:
+        """Return the solid glass on the ray's side of a surface. A back is seen from within, whatever the path knows of."""
+        if not is_solid(m):
+            return medium
+        return wp.where(s.front == 0, s.material, wp.where(medium == UNKNOWN, OUTSIDE, medium))
+
+    return medium_at
+
+
+def make_shade(features: Features, shading: Shading) -> Any:
+    """Return one device function from a path and its hit to everything that follows from them."""
+    Path, Shaded = make_path(features.counting), make_shaded(features.counting)
+    child = make_paths(features.counting).child
+    missing, medium_at = make_missing(features, shading.is_solid), make_medium_at(shading.is_solid)
+    straight_on = make_straight_on(features, shading.is_solid)
+
     @wp.func
     def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, met: Surface, texels: Texels, t: float,
               facet: wp.vec3) -> Shaded:
-        """met: the surface at the end of the path's ray (of ray_of), whose shading normal is as seen from there; its texels; t of
-        the hit; facet: of choose_facet."""
+        """met: the surface at the end of the path's ray, whose shading normal is as seen from there; its texels; t of the hit;
+        facet: of choose_facet."""
         out = Shaded()
         path = arriving
         s = met
-        m = resolve(surfaces, s, texels)
+        m = shading.resolve(surfaces, s, texels)
         out.wo = -path.direction
         if wp.static(features.blend):
             share = missing(m, s, path.medium)
@@ -328,7 +230,7 @@ def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) 
             path.medium = medium_at(m, s, path.medium)
         if wp.static(features.absorption):
             path.throughput = absorbed(surfaces, path.throughput, path.medium, t)
-        scatter = scatter_at(m, s, out.wo, facet)
+        scatter = shading.scatter(m, s, out.wo, facet)
         out.throughput = path.throughput
         out.surface = s
         out.scatter = scatter
@@ -338,9 +240,9 @@ def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) 
         if wp.static(features.emission):
             out.light += emitted(m, s)
         if wp.static(features.reflection):
-            out.reflected = child(path, s, scatter.reflection, wp.cw_mul(path.throughput, scatter.reflected), 1)
+            out.reflected = child(path, s, scatter.reflection, wp.cw_mul(path.throughput, scatter.reflected), REFLECTED)
         if wp.static(features.refraction):
-            out.refracted = child(path, s, scatter.refraction, wp.cw_mul(path.throughput, scatter.transmitted), 2)
+            out.refracted = child(path, s, scatter.refraction, wp.cw_mul(path.throughput, scatter.transmitted), REFRACTED)
             if scatter.bends != 0:
                 out.refracted.medium = wp.where(s.front != 0, s.material, OUTSIDE)
         return out
@@ -348,10 +250,9 @@ def make_shade(features: Any, shading: Any, child: Any, counting: bool = False) 
     return shade
 
 
-def make_shadow_request(features: Any, counting: bool = False) -> Any:
-    """What a surface asks of a light."""
-    Shaded = make_shaded(counting)
-    choose, reflected = make_reflected_light(features)
+def make_shadow_request(features: Features, reflected: Any) -> Any:
+    """Return the function for what a surface asks of a light. reflected: of make_reflected_light."""
+    Shaded = make_shaded(features.counting)
 
     @wp.func
     def shadow_request(shaded: Shaded, sample: LightSample) -> ShadowRequest:
@@ -363,32 +264,28 @@ def make_shadow_request(features: Any, counting: bool = False) -> Any:
             out.end = sample.end
         return out
 
-    return choose, shadow_request
+    return shadow_request
 
 
-def make_keep(features: Any, counting: bool = False) -> Any:
-    """Which paths are followed, and what is lost with those that are not."""
-    Path = make_path(counting)
+class Step(NamedTuple):
+    """The device functions that a loop is made of.
 
-    @wp.func
-    def keep(next: Path, limits: Limits, traced: int) -> int:
-        """0: carries nothing; 1: to be followed; 2: cut by depth, or by the number of rays so far; 3: cut by throughput."""
-        largest = wp.max(next.throughput)
-        if largest <= 0.0:
-            return 0
-        if next.depth > limits.max_depth or next.passed > MAX_TRANSPARENT or traced >= MAX_RAYS:
-            return 2
-        return wp.where(largest < limits.min_throughput, 3, 1)
+    choose_facet(key, index) -> vec3: the sample that chooses a microfacet at the end of a path with that key, for the sample
+    `index` of a pixel. shade(surfaces, lighting, path, met, texels, t, facet) -> Shaded.
+    extra_lights: how many there are beside those of `lighting` (the background is one); choose(lighting, surfaces, i, surface,
+    point) -> LightSample of light i (the background comes after the last one; point: of LightPoints), and shadow_request(shaded,
+    sample) -> ShadowRequest.
+    """
 
-    @wp.func
-    def worth(surfaces: Surfaces, next: Path, verdict: int) -> float:
-        """What is lost with a path that is cut; 0 for one that is not."""
-        if verdict < 2:
-            return 0.0
-        worth = mean3(next.throughput)
-        if wp.static(features.refraction):
-            if next.medium >= 0:  # within, light is denser, and the throughput was divided by as much
-                worth = worth * surfaces.materials[next.medium].ior * surfaces.materials[next.medium].ior
-        return worth
+    choose_facet: Any
+    shade: Any
+    extra_lights: int
+    choose: Any
+    shadow_request: Any
 
-    return keep, worth
+
+def make_step(features: Features, shading: Shading) -> Step:
+    """Return the step of a scene's kernel."""
+    choose, reflected = make_reflected_light(features)
+    return Step(make_choose_facet(features), make_shade(features, shading), 1 if features.sky_light else 0, choose,
+                make_shadow_request(features, reflected))

@@ -14,7 +14,7 @@ from wrt.kernels.structs import Hit, Ray, Surfaces
 
 @wp.struct
 class LoggedRay:
-    """As structs.Ray; label: of shade.step.label; any_hit: 1 where only whether was asked; hit: 1 where there was one."""
+    """As structs.Ray; label: of shade.paths.label; any_hit: 1 where only whether was asked; hit: 1 where there was one."""
 
     origin: wp.vec3
     direction: wp.vec3

@@ -377,15 +377,16 @@ def render_scene(path: Path) -> object:
     from dataclasses import fields
     from unittest import mock
 
+    from wrt.kernels.shade.features import Features
     from wrt.renderer import plan
-    from wrt.renderer.features import STACK_STEP, Features
+    from wrt.renderer.features import STACK_STEP
     from wrt.renderer.render import render
     from wrt.scene.lights import EMISSIVE, LIGHTS
     from wrt.scene.materials import MATERIALS
 
     scene = load_scene_with_normals(path)
-    switches = {each.name: True for each in fields(Features) if each.type == "bool"}
-    switches |= dict.fromkeys(("instances", "independent", "schlick"), False)
+    switches = {each.name: True for each in fields(Features) if each.type is bool}
+    switches |= dict.fromkeys(("instances", "independent", "schlick", "counting"), False)
     features = Features(**switches, materials=tuple(MATERIALS), lights=(*LIGHTS, *EMISSIVE), background=scene.background.kind,
                         stack_size=9 * STACK_STEP)
     with mock.patch.object(plan, "features_of", lambda *arguments: features):

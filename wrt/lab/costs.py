@@ -48,7 +48,8 @@ class CostCounter:
 
     def __init__(self, plan: Plan, device: Any, built: Prepared | None = None) -> None:
         counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
-        self.prepared = prepare(replace(plan, structure=LoggedStructure(counting)), device, built)
+        features = replace(plan.features, counting=True)
+        self.prepared = prepare(replace(plan, structure=LoggedStructure(counting), features=features), device, built)
 
     @classmethod
     def beside(cls, built: Prepared) -> CostCounter:

@@ -1,17 +1,17 @@
-"""What a scene needs: the switches that a render kernel is compiled from."""
+"""The switches that a scene needs of a render kernel."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any
 
 import numpy as np
 
 from wrt.accel.scenes.instancing import instanced_meshes
+from wrt.kernels.shade.features import Features
 from wrt.scene.backgrounds import BACKGROUNDS
-from wrt.scene.cameras import Camera, CameraKind
+from wrt.scene.cameras import CameraKind
 from wrt.scene.lights import EMISSIVE, LIGHTS
 from wrt.scene.materials import MATERIALS, Checkerboard, Texture
 from wrt.scene.model import Scene
@@ -19,60 +19,12 @@ from wrt.scene.model import Scene
 STACK_STEP = 16
 
 
-@dataclass(frozen=True)
-class Features:
-    """Everything that changes the code of a kernel; what is False leaves no trace in it.
-
-    camera: the module of its device function; lens, blades, filter: the camera's; independent: the samples are random numbers;
-    instances, spheres, smooth, textures, checkerboards, normal_maps, parameter_textures (of roughness and the like), cutout,
-    blend: the surfaces'; materials, lights, background: the kinds there are, by name; derived: reflection, refraction,
-    transmission, transparent_shadows, sky_light, highlight. stack_size: room for the rays that can be pending, in whole
-    STACK_STEPs, so that neighbouring depths share a kernel.
-    """
-
-    camera: str = Camera.device
-    lens: bool = False
-    blades: bool = False
-    filter: bool = False
-    independent: bool = False
-    instances: bool = False
-    spheres: bool = False
-    smooth: bool = False
-    textures: bool = False
-    checkerboards: bool = False
-    normal_maps: bool = False
-    parameter_textures: bool = False
-    cutout: bool = False
-    blend: bool = False
-    materials: tuple[str, ...] = ()
-    thin_glass: bool = False
-    absorption: bool = False
-    transmission: bool = False
-    rough: bool = False
-    highlight: bool = False
-    schlick: bool = False
-    emission: bool = False
-    lights: tuple[str, ...] = ()
-    background: str = "constant"
-    sky_light: bool = False
-    ambient: bool = False
-    tinted_shadows: bool = False
-    transparent_shadows: bool = False
-    reflection: bool = False
-    refraction: bool = False
-    stack_size: int = 1
-
-    @property
-    def lit(self) -> bool:
-        """Whether lights are asked for at a hit."""
-        return bool(self.lights) or self.sky_light
-
-    def switches(self) -> dict[str, bool]:
-        """Every on/off feature by name, each kind being one."""
-        on_off = {f.name: getattr(self, f.name) for f in fields(self) if f.type == "bool"}
-        return on_off | {f"{name}_lights": name in self.lights for name in (*LIGHTS, *EMISSIVE)} | {
-            name: name in self.materials for name in MATERIALS} | {
-            name: name == self.background for name in BACKGROUNDS if name != Features.background}
+def switches(features: Features) -> dict[str, bool]:
+    """Return every on/off feature that a scene can need, by name; each kind is one."""
+    on_off = {name: value for name, value in vars(features).items() if isinstance(value, bool) and name != "counting"}
+    return on_off | {f"{name}_lights": name in features.lights for name in (*LIGHTS, *EMISSIVE)} | {
+        name: name in features.materials for name in MATERIALS} | {
+        name: name == features.background for name in BACKGROUNDS if name != Features.background}
 
 
 def mesh_lights(scene: Scene) -> bool:
@@ -175,5 +127,5 @@ def describe(scene: Scene, camera: str | int | None = None) -> dict[str, Any]:
         "spp": scene.settings.spp,
         "bounds_low": low,
         "bounds_high": high,
-        "features": features_of(scene, scene.camera(camera), instanced_meshes(scene)).switches(),
+        "features": switches(features_of(scene, scene.camera(camera), instanced_meshes(scene))),
     }

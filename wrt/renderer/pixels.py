@@ -11,8 +11,7 @@ from typing import Any
 import warp as wp
 
 from wrt.core.device import launch_on
-from wrt.kernels import structs
-from wrt.kernels.loops.one_ray import add_samples
+from wrt.kernels.loops.one_ray import Tile, add_samples
 from wrt.kernels.shade.step import Sample
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.tiles import Work
@@ -38,10 +37,11 @@ def film_launch(device: Any, kernel: Any, world: World, limits: list[Any], film:
         for first in range(work.first, end, step):
             tile = tile_of(work._replace(first=first, n=min(step, end - first)))
             tile.threads = tile.n_samples if by_samples else 1
+            tile.samples = samples
             for limit, group in zip(limits, film.groups, strict=True):
-                launch_on(device, kernel, pixels * tile.threads, *world, limit, group, tile, samples)
+                launch_on(device, kernel, pixels * tile.threads, *world, limit, group, tile)
                 if tile.threads > 1:
-                    launch_on(device, add_samples, pixels, group, tile, samples)
+                    launch_on(device, add_samples, pixels, group, tile)
         return work.total
 
     return trace
@@ -59,7 +59,7 @@ def aov_launch(device: Any, kernel: Any, world: World, film: AovFilm) -> Callabl
 
 
 def tile_of(work: Work) -> Any:
-    tile = structs.Tile()
+    tile = Tile()
     tile.x, tile.y, tile.width, _ = work.rectangle
     tile.first_sample, tile.n_samples, tile.threads = work.first, work.n, 1
     return tile

@@ -14,8 +14,9 @@ from wrt.core.device import made_once, memory_of
 from wrt.core.errors import InputError
 from wrt.kernels import structs
 from wrt.kernels.loops import one_ray as kernels
+from wrt.kernels.shade.features import Features
 from wrt.kernels.traverse.common import Units
-from wrt.renderer.features import Features, features_of
+from wrt.renderer.features import features_of
 from wrt.renderer.film_arrays import BYTES_OF_AOVS, BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS
 from wrt.renderer.options import Options
 from wrt.renderer.waves import WaveKernels, wave_kernels

@@ -16,13 +16,13 @@ from wrt.core.device import made_once, records, upload
 from wrt.kernels.launches import Launch
 from wrt.kernels.loops import wave, wave_begin, wave_shade, wave_surfaces, wave_textures
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_cutout
 from wrt.kernels.shade.shadows import ShadowWalk
 from wrt.kernels.shade.step import Lit, Sample
 from wrt.kernels.wide.batch import BatchTraversal
-from wrt.renderer.features import Features
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.launches import Launches
 from wrt.renderer.tiles import Work

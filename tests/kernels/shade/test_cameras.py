@@ -10,8 +10,8 @@ import pytest
 from tests.kernel_tools import launch, unit, vec2s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
+from wrt.kernels.shade.features import Features
 from wrt.kernels.structs import Ray, kernel
-from wrt.renderer.features import Features
 from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera, FisheyeCamera, OrthographicCamera, PanoramaCamera
 

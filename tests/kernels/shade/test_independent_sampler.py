@@ -6,9 +6,9 @@ import pytest
 from tests.kernel_tools import launch, uints, zeros  # isort: skip (starts Warp)
 import warp as wp
 
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.sampling import independent_2d, make_sample_2d, sample_2d
 from wrt.kernels.structs import kernel
-from wrt.renderer.features import Features
 
 
 @kernel

@@ -18,11 +18,11 @@ from wrt.kernels.shade.backgrounds import (
     make_sky_sample,
 )
 from wrt.kernels.shade.direct import shadow_ray
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample, make_light_sample
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Background, Lighting, Ray, Surfaces, kernel
-from wrt.renderer.features import Features
 from wrt.renderer.upload import upload_scene
 from wrt.scene.backgrounds import BACKGROUNDS, ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.lights import EMISSIVE, LIGHTS, DirectionalLight, PointLight, SpotLight

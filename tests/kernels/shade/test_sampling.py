@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from tests.kernel_tools import cpu_only, floats, launch, sobol_like, uints, unit, vec2s, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.sampling import (
     LANES,
     cap_point,
@@ -30,7 +31,6 @@ from wrt.kernels.shade.sampling import (
     unit_float,
 )
 from wrt.kernels.structs import kernel
-from wrt.renderer.features import Features
 
 
 @kernel

@@ -6,8 +6,9 @@ Kernels are compiled from a scene's features: scenes that share a set of feature
 import numpy as np
 import pytest
 
+from wrt.kernels.shade.follow_up import MAX_RAYS
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT
-from wrt.kernels.shade.step import MAX_RAYS
+from wrt.renderer.features import switches
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
 from wrt.renderer.render import render
@@ -389,4 +390,4 @@ def test_variance_is_that_of_the_mean(reference):
 
 def test_the_kernel_holds_only_what_the_scene_needs():
     bare = plan_of(MIRROR_BOX, Options()).features
-    assert {name for name, on in bare.switches().items() if on} == {"mirror", "reflection", "emission"}
+    assert {name for name, on in switches(bare).items() if on} == {"mirror", "reflection", "emission"}

@@ -27,7 +27,7 @@ from wrt.io.load import load_scene, schema
 from wrt.picture import film as film_module
 from wrt.picture.image import read_channels, read_image, write_image
 from wrt.renderer import progress as progress_module
-from wrt.renderer.features import features_of
+from wrt.renderer.features import features_of, switches
 from wrt.renderer.options import Progress
 from wrt.renderer.result import film_of
 
@@ -405,13 +405,13 @@ def test_ctrl_c_before_the_first_sample_leaves_everything_as_it_was(where: str, 
 def test_info_tells_what_is_on_and_what_is_off() -> None:
     Path("scene.toml").write_text(TWO_CAMERAS)
     scene = load_scene("scene.toml")
-    switches = features_of(scene, scene.camera()).switches()
+    on_off = switches(features_of(scene, scene.camera()))
     facts = dict(line.split(": ", 1) for line in run("info", "scene.toml").out.splitlines())
     assert facts["triangles"] == "12" and facts["cameras"] == "front; side" and facts["background"] == "GradientBackground"
-    assert facts["features on"].split(", ") == [name for name, on in switches.items() if on]
-    assert facts["features off"].split(", ") == [name for name, on in switches.items() if not on]
+    assert facts["features on"].split(", ") == [name for name, on in on_off.items() if on]
+    assert facts["features off"].split(", ") == [name for name, on in on_off.items() if not on]
     told = strict_json(run("info", "scene.toml", "--json").out)
-    assert told["features"] == switches and told["bounds_low"] == [-1, -1, -1] and told["bounds_high"] == [1, 1, 1]
+    assert told["features"] == on_off and told["bounds_low"] == [-1, -1, -1] and told["bounds_high"] == [1, 1, 1]
 
 
 def test_info_of_a_scene_without_shapes() -> None:

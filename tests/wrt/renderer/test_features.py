@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wrt.renderer.features import STACK_STEP, Features, describe, features_of, filter_icdf
+from wrt.kernels.shade.features import Features
+from wrt.renderer.features import STACK_STEP, describe, features_of, filter_icdf, switches
 from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
@@ -34,8 +35,8 @@ def scene_of(*materials: Material, mesh: Any = None, spheres: tuple[Material, ..
 
 def on(scene: Scene, camera: Camera | None = None) -> set[str]:
     """But for "diffuse", which nearly every scene here has."""
-    switches = features_of(scene, camera or Camera()).switches()
-    return {name for name, value in switches.items() if value and name != "diffuse"}
+    on_off = switches(features_of(scene, camera or Camera()))
+    return {name for name, value in on_off.items() if value and name != "diffuse"}
 
 
 def test_a_black_opaque_scene_needs_nothing() -> None:
@@ -166,7 +167,7 @@ def test_describe_counts_and_names() -> None:
     assert (found["triangles"], found["unique_triangles"], found["objects"], found["spheres"]) == (160, 80, 2, 1)
     assert found["materials"] == ["bottle (glass)", "1 (diffuse)"] and found["cameras"] == ["front", "1"]
     assert np.allclose(found["bounds_high"], [2.0, 6.0, 2.0], atol=0.1)
-    assert found["features"] == features_of(scene, scene.camera()).switches()
+    assert found["features"] == switches(features_of(scene, scene.camera()))
 
 
 def test_emission_by_texture_or_alpha_is_seen_but_does_not_light() -> None:

@@ -20,6 +20,7 @@ import numpy as np
 import wrt
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.interrupts import Interrupted
+from wrt.kernels.shade.features import Features
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench import error_statistics as statistics
@@ -29,7 +30,6 @@ from wrt.lab.bench.report import Row, grouped
 from wrt.lab.plans import Error as Plan
 from wrt.picture import metrics
 from wrt.picture.film import Film
-from wrt.renderer.features import Features
 from wrt.renderer.options import Options
 from wrt.renderer.progress import TimeLeft
 from wrt.renderer.renderer import Renderer

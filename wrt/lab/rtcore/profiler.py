@@ -16,7 +16,7 @@ from wrt.core.device import memory_of, start, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.io.load import as_scene
-from wrt.kernels.shade.step import BRANCHES
+from wrt.kernels.shade.paths import BRANCHES
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
 from wrt.lab.costs import COUNTERS, CostCounter

@@ -148,11 +148,11 @@ def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None
     """The machine code for Turing is that of a source without a word on counting, to the last byte."""
     features, structure = features_of(scene, scene.camera(None)), Structure(ACCELERATORS["bvh"], Units())
     folder = Path(wrt.__file__).parent.parent / "kernels"
-    modules = {}
-    for name, file in (("step", "shade/step.py"), ("film", "shade/film.py"), ("one_ray", "loops/one_ray.py")):
-        text = without_counting((folder / file).read_text())
-        for other in ("step", "film"):
-            text = text.replace(f"wrt.kernels.shade.{other}", f"wrt.kernels.bare_{other}")
+    modules, names = {}, ("paths", "step", "follow_up", "film", "one_ray")
+    for name in names:
+        text = without_counting((folder / ("loops" if name == "one_ray" else "shade") / f"{name}.py").read_text())
+        for other in names:
+            text = text.replace(f"wrt.kernels.shade.{other} ", f"wrt.kernels.bare_{other} ")
         (tmp_path / f"{name}.py").write_text(text)
         spec = importlib.util.spec_from_file_location(f"wrt.kernels.bare_{name}", tmp_path / f"{name}.py")
         assert spec is not None and spec.loader is not None and "counting" not in text
@@ -174,11 +174,11 @@ def without_counting(text: str) -> str:
         indent = len(line) - len(line.lstrip())
         if depth is not None and indent > depth:
             continue
-        depth = indent if line.strip() in ("if counting:", "if wp.static(counting):") else None
+        depth = indent if line.strip() in ("if counting:", "if wp.static(counting):", "if wp.static(features.counting):") else None
         if depth is None:
             out.append(line)
     bare = "\n".join(out) + "\n"
-    for old, new in (("counting: bool = False", ""), ("counting: bool", "counting"), (", counting)", ")"), ("(counting)", "()"),
-                     (", )", ")"), ("    counting = structure.units.counters\n", "")):
+    for old, new in (("counting: bool", ""), ("(features.counting)", "()"), ("(counting)", "()"),
+                     (" counting: as of Features.", "")):
         bare = bare.replace(old, new)
     return "".join(line + "\n" for line in bare.splitlines() if "counting" not in line)

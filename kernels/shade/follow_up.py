@@ -1,0 +1,109 @@
+"""The follow-up of a hit, for both loops: which new paths are followed, which are cut, and what is lost with those.
+
+A path is cut behind max_depth bounces, behind MAX_TRANSPARENT surfaces in a row that it went straight through, or below
+min_throughput. So is every path of a sample that has traced MAX_RAYS: where throughput cuts nothing, a tree of 64 levels has no
+end.
+The loops (kernels/loops) push the paths that are FOLLOWED, in the order onward, reflected, refracted, and trace the last one first.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from wrt.kernels.shade.features import Features
+from wrt.kernels.shade.paths import make_path
+from wrt.kernels.shade.shadows import MAX_TRANSPARENT
+from wrt.kernels.shade.step import Lit, Sample, make_shaded, mean3
+from wrt.kernels.structs import Limits, Surfaces
+
+MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
+# Verdicts on a new path.
+NONE = wp.constant(0)  # it carries nothing
+FOLLOWED = wp.constant(1)
+CUT_BY_DEPTH = wp.constant(2)  # or by MAX_TRANSPARENT or MAX_RAYS
+CUT_BY_THROUGHPUT = wp.constant(3)
+
+
+@wp.struct
+class FollowUp:
+    """onward, reflected, refracted: the verdicts on the new paths of a Shaded; cut_depth, cut_throughput: how many are cut; lost:
+    with the path onward; lit: the surface while its lights are asked."""
+
+    onward: int
+    reflected: int
+    refracted: int
+    cut_depth: int
+    cut_throughput: int
+    lost: float
+    lit: Lit
+
+
+@wp.func
+def with_cuts(before: Sample, next: FollowUp) -> Sample:
+    """Add the cuts of a hit to its sample."""
+    out = before
+    out.cut_depth += next.cut_depth
+    out.cut_throughput += next.cut_throughput
+    out.lost += next.lost
+    return out
+
+
+def make_lost(features: Features) -> Any:
+    """Return the function for what is lost with a path, which depends on its medium."""
+    Path = make_path(features.counting)
+
+    @wp.func
+    def lost(surfaces: Surfaces, path: Path, verdict: int) -> float:
+        """Return the radiance that a cut path would have added in a room of radiance 1; 0 for one that is not cut."""
+        if verdict < CUT_BY_DEPTH:
+            return 0.0
+        lost = mean3(path.throughput)
+        if wp.static(features.refraction):
+            if path.medium >= 0:  # within, light is denser, and the throughput was divided by as much
+                lost = lost * surfaces.materials[path.medium].ior * surfaces.materials[path.medium].ior
+        return lost
+
+    return lost
+
+
+def make_follow_up(features: Features) -> Any:
+    """Return follow_up(surfaces, shaded, limits, traced) -> FollowUp. traced: the sample's rays so far, without those to lights."""
+    Path, Shaded = make_path(features.counting), make_shaded(features.counting)
+    lost = make_lost(features)
+
+    @wp.func
+    def verdict_on(path: Path, limits: Limits, traced: int) -> int:
+        largest = wp.max(path.throughput)
+        if largest <= 0.0:
+            return NONE
+        if path.depth > limits.max_depth or path.passed > MAX_TRANSPARENT or traced >= MAX_RAYS:
+            return CUT_BY_DEPTH
+        return wp.where(largest < limits.min_throughput, CUT_BY_THROUGHPUT, FOLLOWED)
+
+    @wp.func
+    def counted(before: FollowUp, verdict: int) -> FollowUp:
+        out = before
+        out.cut_depth += wp.where(verdict == CUT_BY_DEPTH, 1, 0)
+        out.cut_throughput += wp.where(verdict == CUT_BY_THROUGHPUT, 1, 0)
+        return out
+
+    @wp.func
+    def follow_up(surfaces: Surfaces, shaded: Shaded, limits: Limits, traced: int) -> FollowUp:
+        out = FollowUp()
+        out.lit.light = shaded.light
+        out.lit.throughput = shaded.throughput
+        if wp.static(features.blend):
+            out.onward = verdict_on(shaded.onward, limits, traced)
+            out.lost = lost(surfaces, shaded.onward, out.onward)
+            out = counted(out, out.onward)
+        if wp.static(features.reflection):
+            out.reflected = verdict_on(shaded.reflected, limits, traced)
+            out.lit.lost_reflected = lost(surfaces, shaded.reflected, out.reflected)
+            out = counted(out, out.reflected)
+        if wp.static(features.refraction):
+            out.refracted = verdict_on(shaded.refracted, limits, traced)
+            out.lit.lost_refracted = lost(surfaces, shaded.refracted, out.refracted)
+            out = counted(out, out.refracted)
+        return out
+
+    return follow_up
