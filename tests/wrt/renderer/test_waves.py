@@ -12,16 +12,18 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests import both_loops
+from tests.both_loops import aovs_of, one_ray_at_a_time
 from tests.data import ROOT
-from wrt.core.device import load_kernel, start
+from wrt.core.device import start
 from wrt.io.load import load_scene
 from wrt.kernels.loops import wave
 from wrt.renderer import waves
-from wrt.renderer.film_arrays import OF_AOVS, AovFilm, DeviceFilm
+from wrt.renderer.film_arrays import OF_AOVS
 from wrt.renderer.options import Options
-from wrt.renderer.plan import aov_kernel, plan_of, render_kernel
+from wrt.renderer.plan import plan_of
 from wrt.renderer.prepare import Prepared, prepare
-from wrt.renderer.tiles import Work, corners
+from wrt.renderer.tiles import corners
 from wrt.scene.backgrounds import GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, PointLight
@@ -69,22 +71,8 @@ def prepared(name: str, aov: tuple[str, ...] = (), **settings: Any) -> Prepared:
     return prepare(plan_of(scene, Options(device="cpu", threads=1, crop=corners(TILE), aov=aov)), start("cpu"))
 
 
-def one_ray_at_a_time(ready: Prepared) -> Prepared:
-    """With the loop that CUDA has."""
-    plan = ready.plan
-    makes = (render_kernel, aov_kernel) if plan.options.aov else (render_kernel,)
-    kernels = [make(plan.features, plan.structure) for make in makes]
-    for kernel in kernels:
-        load_kernel(kernel, ready.device)
-    return replace(ready, waves=None, kernels=kernels)
-
-
 def film_of(ready: Prepared, *parts: tuple[int, int], groups: int = 1) -> dict[str, np.ndarray]:
-    film = DeviceFilm(ready.plan.scene.settings, ready.plan.crop, ready.device, 5, groups)
-    trace = ready.launch(film)
-    for first, n in parts:
-        assert trace(Work(TILE, first, n)) == TILE[2] * TILE[3] * n
-    return {name: film.picture(array) for name, array in film.arrays()}
+    return both_loops.film_of(ready, TILE, *parts, groups=groups)
 
 
 def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
@@ -167,9 +155,7 @@ def test_aovs_are_those_of_one_ray_at_a_time(name: str) -> None:
     ready = prepared(name, aov=tuple(OF_AOVS))
     films = []
     for way in (ready, one_ray_at_a_time(ready)):
-        film = AovFilm(way.plan.scene.settings, way.plan.crop, way.device)
-        way.launch(film)(Work(TILE, 0, 1))
-        films.append({name: film.picture(name) for name in OF_AOVS})
+        films.append(aovs_of(way, TILE))
     assert_same(*films)
     assert (films[0]["prim_id"] >= 0).any() and ((films[0]["prim_id"] < 0).any() or name == "cutout")
 

@@ -1,0 +1,58 @@
+"""The command of the random tests: many cases on all processors, and one of them again."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+
+Check = Callable[[int, int], str]  # of a group and a seed: what differs
+GROUPS_EACH = 8  # that a process takes before another does: each leaves its kernels in memory
+
+
+def checked(check: Check, group: int, seed: int) -> str:
+    """As check; an error is told like a difference."""
+    try:
+        return check(group, seed)
+    except Exception:
+        return traceback.format_exc()
+
+
+def checked_group(check: Check, group: int, count: int) -> list[tuple[int, str]]:
+    """The seeds below `count` that differ, and in what."""
+    found = ((seed, checked(check, group, seed)) for seed in range(count))
+    return [(seed, what) for seed, what in found if what]
+
+
+def main(about: str, check: Check, per_group: int) -> None:
+    """Check `--count` cases from group `--seed` on, `per_group` a group, or the one of `--only`; exit with 1 where one differs."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=10_000, help="cases [default: 10000]")
+    parser.add_argument("--seed", type=int, default=0, help="number of the first group [default: 0]")
+    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="processes [default: one a processor]")
+    parser.add_argument("--only", type=int, nargs=2, metavar=("GROUP", "SEED"), help="one case")
+    options = parser.parse_args()
+    if options.only:
+        sys.exit(check(*options.only) or 0)
+    sys.exit(1 if run(check, per_group, options) else 0)
+
+
+def run(check: Check, per_group: int, options: argparse.Namespace) -> int:
+    """How many cases differ."""
+    begin, done, wrong = time.monotonic(), 0, 0
+    counts = [min(per_group, options.count - first) for first in range(0, options.count, per_group)]
+    with ProcessPoolExecutor(options.workers, get_context("spawn"), max_tasks_per_child=GROUPS_EACH) as pool:
+        jobs = {pool.submit(checked_group, check, options.seed + i, count): i for i, count in enumerate(counts)}
+        for job in as_completed(jobs):
+            i = jobs[job]
+            for seed, what in job.result():
+                wrong += 1
+                print(f"differs: --only {options.seed + i} {seed}: {what}", flush=True)
+            done += counts[i]
+            print(f"{done} of {options.count} cases, {wrong} differ, {time.monotonic() - begin:.0f} s", flush=True)
+    return wrong

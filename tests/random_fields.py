@@ -1,0 +1,126 @@
+"""Random values for the fields of scene descriptions: whatever `wrt.scene.kinds.given` describes can be drawn.
+
+A value is drawn in two steps. The first draws all that decides which kernels a scene needs (whether a field is used, flags,
+choices, kinds of textures). It is the same for all scenes of a group, and gives a function that draws the numbers of one scene.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING
+from typing import Any
+
+import numpy as np
+
+from wrt.core.errors import InputError
+from wrt.scene.kinds import Limits, forms
+from wrt.scene.materials import WRAPS, Texture
+
+Rng = np.random.Generator
+Draw = Callable[[Rng], Any]  # of one scene's generator
+LOW, HIGH = 0.02, 10.0  # of numbers without limits, which are drawn evenly on a logarithmic scale
+TRIES = 100
+
+
+def number(group: Rng, limits: Limits) -> Draw:
+    """Never the lower limit: 0 is often what turns a feature off. Sometimes the upper one."""
+    low = max(limits.get("ge", -math.inf), limits.get("gt", -math.inf))
+    high = min(limits.get("le", math.inf), limits.get("lt", math.inf))
+    if low < 0.0:
+        return lambda rng: rng.normal()
+    if high - low > 100.0:
+        return lambda rng: math.exp(rng.uniform(math.log(max(low, LOW)), math.log(min(high, HIGH))))
+    return lambda rng: high if rng.random() < 0.1 and "le" in limits else rng.uniform(low + 0.02 * (high - low), high)
+
+
+def angle(group: Rng, limits: Limits) -> Draw:
+    low, high = (math.radians(limits.get(names[0], limits.get(names[1], end)))
+                 for names, end in ((("ge", "gt"), -360.0), (("le", "lt"), 360.0)))
+    return lambda rng: rng.uniform(low + 0.02 * (high - low), high - 0.02 * (high - low))
+
+
+def color(group: Rng, limits: Limits) -> Draw:
+    """Not black; one channel is often 0."""
+    most = min(limits.get("le", 3.0), 3.0)
+
+    def draw(rng: Rng) -> np.ndarray:
+        out = most * rng.uniform(0.05, 1.0, 3)
+        if rng.random() < 0.3:
+            out[rng.integers(3)] = 0.0
+        return out
+
+    return draw
+
+
+def image(group: Rng, limits: Limits) -> Draw:
+    """A few bright pixels among dark and black ones."""
+
+    def draw(rng: Rng) -> np.ndarray:
+        out = 2.0 * rng.random((rng.integers(1, 8), rng.integers(1, 12), 3)) ** 4
+        out[rng.random(out.shape[:2]) < 0.2] = 0.0
+        out[rng.integers(len(out)), rng.integers(out.shape[1])] = 3.0
+        return out.astype(np.float32)
+
+    return draw
+
+
+def picture(rng: Rng, srgb: bool, wrap: tuple[str, str]) -> Texture:
+    """Of few pixels, whose alpha is mostly 0 or 255; mapped by any affine map."""
+    pixels = rng.integers(0, 256, (*rng.integers(1, 9, 2), 4), dtype=np.uint8)
+    ends = rng.random(pixels.shape[:2]) < 0.6
+    pixels[ends, 3] = rng.choice([0, 255], ends.sum())
+    return Texture(pixels, srgb, wrap, uv_transform=rng.normal(0.0, 2.0, (2, 3)))
+
+
+def texture(group: Rng, limits: Limits) -> Draw:
+    kind = limits["among"][group.integers(len(limits["among"]))]
+    if kind is not Texture:
+        return sketch(group, kind)
+    srgb, wrap = bool(group.random() < 0.5), tuple(group.choice(WRAPS, 2))
+    return lambda rng: picture(rng, srgb, wrap)
+
+
+def fixed(value: Any) -> Draw:
+    return lambda rng: value
+
+
+# A function for each of wrt.scene.kinds.FORMS: of the group's generator and the field's limits. None: scenes draw it otherwise.
+DRAWS: dict[str, Callable[[Rng, Limits], Draw] | None] = {
+    "point": lambda group, limits: lambda rng: rng.uniform(-4.0, 4.0, 3),
+    "direction": lambda group, limits: lambda rng: rng.normal(size=3),
+    "color": color,
+    "number": number,
+    "angle": angle,
+    "whole": lambda group, limits: fixed(int(group.integers(limits["ge"], limits["le"] + 1))),
+    "flag": lambda group, limits: fixed(bool(group.random() < 0.5)),
+    "choice": lambda group, limits: fixed(str(group.choice(limits["among"]))),
+    "size": None,
+    "image": image,
+    "texture": texture,
+}
+
+
+def sketch(group: Rng, kind: Any, odds: Mapping[str, float] = {}, /, **given: Any) -> Draw:
+    """A function that makes a `kind` with random fields. odds: of a field not to keep its default, 0.5 if it is not named."""
+    for _ in range(TRIES):
+        draws: dict[str, Draw] = {}
+        for name, each in forms(kind).items():
+            draw, needed = DRAWS[each.metadata["form"]], each.default is MISSING and each.default_factory is MISSING
+            if draw is not None and (needed or group.random() < odds.get(name, 0.5)) and name not in given:
+                draws[name] = draw(group, each.metadata["limits"])
+
+        def make(rng: Rng, draws: dict[str, Draw] = draws) -> Any:
+            for _ in range(TRIES):
+                try:
+                    return kind(**given, **{name: draw(rng) for name, draw in draws.items()})
+                except InputError as error:  # values that do not go together
+                    refused = error
+            raise refused
+
+        try:
+            make(np.random.default_rng(0))
+        except InputError:  # nor do the choices
+            continue
+        return make
+    raise AssertionError(f"no {kind.__name__} can be drawn")

@@ -1,0 +1,48 @@
+"""A hundred random scenes have the same bits by both loops of the renderer. Ten thousand: `python -m tests.random_scenes`."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests import random_fields
+from tests.random_scenes import Outcome, plan_of_scene, render
+from wrt.scene.backgrounds import BACKGROUNDS
+from wrt.scene.cameras import CAMERAS
+from wrt.scene.kinds import FORMS, forms
+from wrt.scene.settings import Settings
+
+# Together they have all that there is. Where a new row of a table or a new switch is in none of them, take other groups.
+GROUPS = 22, 52, 63, 77
+SCENES = 25  # of each
+
+
+def test_every_form_of_a_field_is_drawn() -> None:
+    assert random_fields.DRAWS.keys() == FORMS.keys()
+
+
+def test_the_groups_have_all_that_there_is() -> None:
+    plans = [plan_of_scene(group, 0) for group in GROUPS]
+    switches = [plan.features.switches() for plan in plans]
+    assert {name for name in switches[0] if not any(each[name] for each in switches)} == set()
+    assert {plan.camera.kind for plan in plans} == CAMERAS.keys()
+    assert {plan.scene.background.kind for plan in plans} == BACKGROUNDS.keys()
+    for name, field in forms(Settings).items():
+        if field.metadata["form"] == "choice" and name != "tonemap":
+            assert {getattr(plan.scene.settings, name) for plan in plans} == set(field.metadata["limits"]["among"]), name
+    assert {bool(plan.options.aov) for plan in plans} == {False, True}
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_both_loops_give_the_same_bits(group: int) -> None:
+    outcomes = [render(group, seed) for seed in range(SCENES)]
+    assert {seed: outcome.differ for seed, outcome in enumerate(outcomes) if outcome.differ} == {}
+    assert sum(map(is_lit, outcomes)) > SCENES / 2 and sum(map(goes_on, outcomes)) > SCENES / 4  # there is something to differ
+
+
+def is_lit(outcome: Outcome) -> bool:
+    return bool(outcome.film["mean of group 0"].any())
+
+
+def goes_on(outcome: Outcome) -> bool:
+    """Whether rays follow those of the camera, here two a sample at most."""
+    return bool(outcome.film["rays"].max() > 6)
