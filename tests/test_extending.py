@@ -7,11 +7,12 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 from tests.data import ROOT
 
-BLOCK = re.compile(r"^```(python|diff)\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```(python|diff|toml)\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 TRY_IT = """
 import numpy as np, stored_normal, wrt
@@ -182,7 +183,7 @@ def apply(copy: Path) -> None:
     assert 2 * len(blocks) == text.count("```"), "a block names no file"
     for kind, name, body in blocks:
         path = copy / name
-        if kind == "python":
+        if kind != "diff":
             assert not path.exists()
             path.write_text(body)
         else:
@@ -194,8 +195,8 @@ def apply(copy: Path) -> None:
             path.write_text(before.replace("\n" + old, "\n" + new))
 
 
-def python(folder: Path, *arguments: str, wrt: Path | None = None) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(wrt or folder)}
+def python(folder: Path, *arguments: str, path: Path | str = "") -> str:
+    environment = {**os.environ, "PYTHONPATH": str(path or folder)}
     done = subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
@@ -252,4 +253,30 @@ def test_a_camera_of_ones_own_needs_no_copy_of_the_project(tmp_path: Path) -> No
     blocks = {name: body for _, name, body in BLOCK.findall((ROOT / "docs" / "extending.md").read_text())}
     (tmp_path / "cylinder.py").write_text(blocks["cylinder.py"])
     (tmp_path / "cylinder.toml").write_text(CYLINDER)
-    assert python(tmp_path, "-c", A_CAMERA, wrt=ROOT).endswith("all of it works\n")
+    assert python(tmp_path, "-c", A_CAMERA, path=ROOT).endswith("all of it works\n")
+
+
+def test_a_package_adds_commands_measurements_and_structures(tmp_path: Path) -> None:
+    """The package is installed as pip would do it: its module, and its entry points beside it."""
+    blocks = {name: body for _, name, body in BLOCK.findall((ROOT / "docs" / "extending.md").read_text())}
+    (tmp_path / "my_lab.py").write_text(blocks["my_lab.py"])
+    project = tomllib.loads(blocks["pyproject.toml"])["project"]
+    installed = tmp_path / "my_lab-1.0.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    (installed / "entry_points.txt").write_text("".join(
+        f"[{group}]\n" + "".join(f"{name} = {place}\n" for name, place in rows.items())
+        for group, rows in project["entry-points"].items()))
+    (tmp_path / "pyramid.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
+
+    def command(*words: str) -> str:
+        return python(tmp_path, "-m", "wrt", *words, path=f"{tmp_path}{os.pathsep}{ROOT}")
+
+    assert "Print how many triangles SCENE has." in command("--help")
+    assert command("triangles", "pyramid.obj") == "4\n"
+    table = command("bench", "memory", "pyramid.obj")
+    assert "| pyramid.obj |         bvh4 |" in table and "| pyramid.obj | small_leaves |" in table
+    assert "small_leaves" not in command("bench", "memory", "pyramid.obj", "--quick").split("##")[0]
+    assert command("build", "pyramid.obj", "--accel", "small_leaves", "-o", "pyramid.accel") == "pyramid.accel\n"
+    loads = "import wrt; print(wrt.load_accel('pyramid.accel', 'pyramid.obj').name)"
+    assert python(tmp_path, "-c", loads, path=f"{tmp_path}{os.pathsep}{ROOT}") == "small_leaves\n"

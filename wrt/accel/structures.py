@@ -36,7 +36,7 @@ ACCELERATORS = Structures("structure", {
     "brute_force": "wrt.accel.brute_force:BruteForce",
     "grid": "wrt.accel.cells.grid:Grid",
     "octree": "wrt.accel.cells.octree:Octree",
-})
+}, "wrt.structures")
 
 
 def stack_on(device: str) -> str:

@@ -11,11 +11,14 @@ import click
 
 from wrt.cli.common import SIZE, Commands, Names, client_of, load, naming, say, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, measured, planned, reporting
+from wrt.core.registry import Registry
 from wrt.lab import plans
 from wrt.lab.plans import Error, Mitsuba, Stability
 
+BENCHES: Registry[click.Command] = Registry("bench", {}, "wrt.benches")
 
-@click.group(cls=Commands, invoke_without_command=True, no_args_is_help=True)
+
+@click.group(cls=Commands, commands=BENCHES, invoke_without_command=True, no_args_is_help=True)
 @click.option("--quick", is_flag=True, help="With a command: as its own --quick. Without one: of all that need no file, one after"
                                             " another, a minute on two cores")
 @click.pass_context
@@ -37,7 +40,8 @@ def bench(context: click.Context, quick: bool) -> None:
 
 for plan in (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, plans.Accel, plans.Bvh, plans.RtCore, plans.Float64,
              plans.Pictures, plans.Closed):
-    measured(bench, plan)
+    bench.add_command(measured(plan))
+whatif = measured(plans.WhatIf)
 
 
 @bench.command()

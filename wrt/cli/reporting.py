@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
@@ -122,18 +121,18 @@ def parameter(each: dataclasses.Field[Any]) -> Any:
                         help=known["text"])
 
 
-def measured(group: click.Group, plan: type[Plan]) -> None:
-    """The command that runs the study of a plan, each mesh on one worker where there is a cluster. The study is a module with rows,
-    parts, and what wrt.lab.bench.report asks of it."""
+def measured(plan: type[Plan]) -> click.Command:
+    """Return the command that runs the study of a plan, each mesh on one worker where there is a cluster. The study is a module as
+    wrt.lab.bench.report.study_of says."""
 
-    @group.command(plan.COMMAND.split()[-1], help=plan.__doc__)
+    @click.command(plan.COMMAND.split()[-1], help=plan.__doc__)
     @planned(plan)
     @reporting(cluster="meshes" in plan.__annotations__)
     def command(how: Reporting, plan: Any) -> None:
         from wrt.lab.bench import report
         from wrt.lab.bench.sweep import by_mesh
 
-        study = importlib.import_module(plan.STUDY)
+        study = report.study_of(plan)
         how.check_markdown()
         client = client_of(how.cluster)
         machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
@@ -146,3 +145,5 @@ def measured(group: click.Group, plan: type[Plan]) -> None:
         text = report.text(rows, plan, machine)
         how.write(text)
         how.end(text, {"machine": machine, **report.data(rows, plan), "output": how.output})
+
+    return command

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -34,6 +35,21 @@ def test_names_are_shown_whatever_was_imported() -> None:
     assert table["decimal"] and repr(table) == before
     table["own"] = int
     assert repr(table) == "Registry(number: fraction, decimal, own)"
+
+
+def test_installed_packages_add_rows_and_replace_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "more-1.0.dist-info").mkdir()
+    (tmp_path / "more-1.0.dist-info" / "entry_points.txt").write_text(
+        "[numbers]\nfraction = decimal:Decimal\nordinal = fractions:Fraction\n[letters]\na = fractions:Fraction\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    from fractions import Fraction
+
+    for ask in (lambda table: "ordinal" in table, len, lambda table: table["ordinal"], repr):
+        table: Registry[type] = Registry("number", {"fraction": "fractions:Fraction"}, "numbers")
+        assert ask(table) and list(table) == ["fraction", "ordinal"]
+        assert table["fraction"] is table["ordinal"] is Fraction
+    with pytest.raises(InputError, match="no number 'a'; there is fraction, ordinal"):
+        table.check("a")
 
 
 def test_a_render_imports_only_its_own_structure() -> None:

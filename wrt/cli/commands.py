@@ -1,0 +1,24 @@
+"""The table of commands: by name, where each one is. Each is imported when it is called, or listed by --help."""
+
+from __future__ import annotations
+
+import click
+
+from wrt.core.registry import Registry
+
+COMMANDS: Registry[click.Command] = Registry("command", {
+    "animate": "wrt.cli.animate:animate",
+    "bench": "wrt.cli.measure:bench",
+    "build": "wrt.cli.build:build",
+    "compare": "wrt.cli.compare:compare",
+    "compile": "wrt.cli.compile:compile_kernels",
+    "devices": "wrt.cli.devices:devices",
+    "info": "wrt.cli.scene_files:info",
+    "profile": "wrt.cli.measure:profile",
+    "render": "wrt.cli.render:render",
+    "schema": "wrt.cli.scene_files:schema",
+    "stability": "wrt.cli.measure:stability",
+    "validate": "wrt.cli.scene_files:validate",
+    "view": "wrt.cli.view:view",
+    "whatif": "wrt.cli.measure:whatif",
+}, "wrt.commands")

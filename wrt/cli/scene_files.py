@@ -1,0 +1,65 @@
+"""The commands that look at scene files without rendering: `info`, `schema`, `validate`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wrt.cli.common import load, naming, say, say_json, settings_of, shared
+from wrt.core.errors import InputError
+
+
+@click.command()
+@shared("scene", "camera", "given", "as_json")
+def info(scene: Path, camera: str | None, given: tuple[tuple[str, Any], ...], as_json: bool) -> None:
+    """Tell what SCENE holds, and which features its kernel is compiled with."""
+    from wrt.renderer.features import describe
+
+    settings = settings_of(given)
+    loaded = load(scene, quiet=False).with_settings(**settings)
+    with naming(scene):
+        facts = describe(loaded, camera)
+    if as_json:
+        say_json(facts)
+        return
+    features = facts.pop("features")
+    for name, value in facts.items():
+        between = "; " if isinstance(value, list) and value and isinstance(value[0], str) else ", "  # names may have commas
+        shown = "none" if value in (None, []) else between.join(map(str, value)) if isinstance(value, list) else value
+        say(f"{name}: {shown}", err=False)
+    for state in (True, False):
+        names = [name for name, on in features.items() if on is state]
+        say(f"features {'on' if state else 'off'}: {', '.join(names) or 'none'}", err=False)
+
+
+@click.command()
+@click.option("--markdown", is_flag=True, help="As a page to read, docs/scene_format.md")
+def schema(markdown: bool) -> None:
+    """Print the JSON Schema of scene files."""
+    if markdown:
+        from wrt.io.toml.reference_page import scene_format
+
+        click.echo(scene_format(), nl=False)
+        return
+    from wrt.io.load import schema as scene_schema
+
+    click.echo(json.dumps(scene_schema(), indent=2))
+
+
+@click.command()
+@click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path))
+def validate(scenes: tuple[Path, ...]) -> None:
+    """Check SCENES without rendering; exit code 2 where one cannot be used."""
+    bad = 0
+    for scene in scenes:
+        try:
+            load(scene, quiet=False)
+            say(f"{scene}: ok", err=False)
+        except InputError as error:
+            bad += 1
+            say(f"error: {error}")
+    if bad:
+        raise SystemExit(2)
