@@ -9,15 +9,11 @@ The compiler makes lanes of a plain Warp loop (sixteen where the CPU has them), 
 - places in one array differ by constants, or it would have to compare too many ranges. In C++, a place that is a multiple of a
   variable makes lanes for 1 times alone (film_samples.h).
 `-Rpass=loop-vectorize` among wp.config.cpu_compiler_flags says which loops are.
-
-call_in_...: prefetch the cache line of entry i. CPU only.
 """
 
+from typing import Any
+
 import warp as wp
-
-
-@wp.func_native("return array.data[(long long)i];")
-def bits_at(array: wp.array(dtype=wp.uint32), i: int) -> wp.uint32: ...
 
 
 @wp.func_native("return array.data[(long long)i][k];")
@@ -26,19 +22,15 @@ def number_of_vec2(array: wp.array(dtype=wp.vec2), i: int, k: int) -> float:
 
 
 @wp.func_native("array.data[(long long)i] = value;")
+def put(array: wp.array(dtype=Any), i: int, value: Any) -> None: ...
+
+
+@wp.func_native("array.data[(long long)i] = value;")
 def put_number(array: wp.array(dtype=wp.float32), i: int, value: float) -> None: ...
 
 
 @wp.func_native("array.data[(long long)i] = value;")
 def put_int(array: wp.array(dtype=wp.int32), i: int, value: int) -> None: ...
-
-
-@wp.func_native("return array.data[(long long)i];")
-def int_at(array: wp.array(dtype=wp.int32), i: int) -> int: ...
-
-
-@wp.func_native("return array.data[(long long)i];")
-def number_at(array: wp.array(dtype=wp.float32), i: int) -> float: ...
 
 
 @wp.func_native("array.data[(long long)i][k] = value;")
@@ -50,16 +42,5 @@ def put_in_vec3(array: wp.array(dtype=wp.vec3), i: int, k: int, value: float) ->
 
 
 @wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_int(array: wp.array(dtype=wp.int32), i: int) -> None: ...
-
-
-@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_vec2(array: wp.array(dtype=wp.vec2), i: int) -> None: ...
-
-
-@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_vec3(array: wp.array(dtype=wp.vec3), i: int) -> None: ...
-
-
-@wp.func_native("__builtin_prefetch(array.data + (long long)i);")
-def call_in_vec3i(array: wp.array(dtype=wp.vec3i), i: int) -> None: ...
+def prefetch(array: wp.array(dtype=Any), i: int) -> None:
+    """Prefetch the cache line of entry i (CPU)."""

@@ -53,6 +53,7 @@ BELOW_KERNELS = {
     "launches": set(),
     "memory": set(),
     "structs": set(),
+    "rows": {"structs"},
     "units": {"structs"},
     "traverse": {"native", "units", "structs"},
     "query": {"traverse", "units", "structs"},
@@ -60,8 +61,8 @@ BELOW_KERNELS = {
     "ray_query": {"query", "structs"},
     "winding": {"structs"},
     "wide": {"native", "memory", "query", "traverse", "units", "structs"},
-    "shade": {"native", "memory", "query", "traverse", "units", "structs"},
-    "loops": {"shade", "native", "launches", "memory", "query", "traverse", "units", "structs"},
+    "shade": {"native", "memory", "rows", "query", "traverse", "units", "structs"},
+    "loops": {"shade", "native", "launches", "memory", "rows", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
     "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }

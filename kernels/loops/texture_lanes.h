@@ -1,6 +1,6 @@
     // As textures.sample_texture, for the first `count` hits of a block, LANES at a time: loops that the compiler makes lanes of.
     // Where the texels are is found for all hits first, once for each different picture among LANES of them, and called in. Of the four
-    // channels, those in the mask `channels` are written.
+    // channels, those in the mask `channels` are written, one after another.
     const int* const all = wanted.data + first;
     const float *const us = rows.data + U_ROW * BLOCK, *const vs = rows.data + V_ROW * BLOCK;
     const auto wrapped = [](int at, int size, int wrap) {
@@ -94,10 +94,13 @@
             some |= kinds[i + lane];
             srgb |= kinds[i + lane] & SRGB;
         }
+        int row = to;
         if (some == NONE) {
             for (int c = 0; c < 4; ++c)
-                if (channels >> c & 1)
-                    for (int lane = 0; lane < LANES; ++lane) rows.data[(to + c) * BLOCK + i + lane] = 1.0f;
+                if (channels >> c & 1) {
+                    for (int lane = 0; lane < LANES; ++lane) rows.data[row * BLOCK + i + lane] = 1.0f;
+                    ++row;
+                }
             continue;
         }
         unsigned texel[4][LANES];
@@ -112,7 +115,7 @@
                     for (int lane = 0; lane < LANES; ++lane)
                         color[k][lane] = kinds[i + lane] == SRGB ? surfaces.srgb_to_linear.data[texel[k][lane] >> 8 * c & 255] : color[k][lane];
             }
-            float* const out = rows.data + (to + c) * BLOCK + i;
+            float* const out = rows.data + row++ * BLOCK + i;
             for (int lane = 0; lane < LANES; ++lane) {
                 const float s = x[i + lane], t = y[i + lane];
                 const float upper = (1.0f - s) * color[0][lane] + s * color[1][lane];

@@ -9,7 +9,7 @@ another scene compiles no traversal.
 Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its arguments once. trace_wave launches
 the others, so that a wave is a single launch to Python. What begins a wave is in wave_begin.py, the step in wave_shade.py; for many
 hits at a time, surfaces are in wave_surfaces.py, textures in wave_textures.py, normals in wave_normals.py, random numbers in
-wave_numbers.py, and lights in wave_lights.py.
+wave_numbers.py, and lights in wave_lights.py; wave_rows.py has what they hand to each other.
 """
 
 from functools import cache
@@ -66,8 +66,7 @@ class Wave:
     occluded, and waiting: which walks the shadow rays are of. asking: the number of shadow rays to each light.
 
     met, missed: places in the queue of the rays that hit something and of the others, each in their order. By place in a block of
-    BLOCK of the hits: rows (wave_surfaces.py), keys, indices, wanted (wave_textures.py), and sky_x, sky_y, sky_z, which before
-    are of a block of those that missed.
+    BLOCK of the hits, and of those that missed: rows (wave_rows.py), wanted (wave_textures.py).
     """
 
     capacity: int
@@ -98,12 +97,7 @@ class Wave:
     met: wp.array(dtype=wp.int32)
     missed: wp.array(dtype=wp.int32)
     rows: wp.array(dtype=wp.float32)
-    sky_x: wp.array(dtype=wp.float32)
-    sky_y: wp.array(dtype=wp.float32)
-    sky_z: wp.array(dtype=wp.float32)
     wanted: wp.array(dtype=wp.int32)
-    keys: wp.array(dtype=wp.uint32)
-    indices: wp.array(dtype=wp.uint32)
 
 
 @wp.func

@@ -4,48 +4,74 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.loops.wave import BLOCK, Wave
-from wrt.kernels.loops.wave_surfaces import ROW, put_row_vec3, row_number, row_vec3
-from wrt.kernels.loops.wave_textures import NORMAL, in_lanes
-from wrt.kernels.memory import int_at
+from wrt.kernels.loops.wave import Wave
+from wrt.kernels.loops.wave_rows import BENT, HITS, NORMAL_MAPS, SURFACES, TEXELS, NormalMap
+from wrt.kernels.loops.wave_textures import in_lanes
+from wrt.kernels.rows import Rows
 from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.shading import Texels, bump
 from wrt.kernels.shade.surface import Surface, bent
 from wrt.kernels.structs import Surfaces
 
 
-def row_of_normals(features: Any) -> int | None:
-    """The row where they are; None: they are computed one by one."""
+def rows_of_normals(features: Any) -> Rows | None:
+    """Return the rows where they are; None: they are computed one by one."""
     if features.instances or (features.normal_maps and not in_lanes(features)):
         return None
-    return ROW["bent"] if features.smooth or features.normal_maps else ROW["shading"]
+    return BENT if features.smooth or features.normal_maps else SURFACES.field("shading")
+
+
+def make_gather_maps() -> Any:
+    """gather_maps(wave, surfaces, first, end): the NormalMap of each of the hits first .. end - 1."""
+    store_map = NORMAL_MAPS.store()
+
+    @wp.func
+    def gather_maps(wave: Wave, surfaces: Surfaces, first: int, end: int):
+        for j in range(first, end):
+            out = NormalMap()
+            prim_id = wave.hits.prim_id[wave.met[j]]
+            if prim_id < surfaces.n_triangles:
+                material = surfaces.prim_material[prim_id]
+                out.scale = surfaces.materials[material].normal_scale
+                out.is_mapped = wp.where(surfaces.materials[material].normal_texture >= 0, 1, 0)
+            store_map(wave.rows, j - first, out)
+
+    return gather_maps
+
+
+def make_bend(features: Any) -> Any:
+    """bend(wave, surfaces, first, end): put the normals of the hits first .. end - 1, whose surfaces and textures are found, to the
+    rows BENT."""
+    gather_maps = make_gather_maps()
+    load_surface, load_direction = SURFACES.load("material", "exclude_plus_one"), HITS.field("direction").load()
+    load_map, load_color, store_bent = NORMAL_MAPS.load(), TEXELS.field("normal").load(), BENT.store()
+
+    @wp.func
+    def bend(wave: Wave, surfaces: Surfaces, first: int, end: int):
+        if wp.static(features.normal_maps):
+            gather_maps(wave, surfaces, first, end)
+        rows = wave.rows
+        i = int(0)
+        while i < end - first:
+            s = load_surface(rows, i)
+            n = s.shading
+            if wp.static(features.normal_maps):
+                map = load_map(rows, i)
+                n = where_vec3(map.is_mapped != 0, bump(s, map.scale, load_color(rows, i)), n)
+            store_bent(rows, i, bent(n, -load_direction(rows, i)))
+            i = i + 1
+
+    return bend
 
 
 def make_wave_normals(features: Any, shading_normal: Any) -> tuple[Any, Any]:
-    """bend(wave, count): for the hits of a block whose surfaces and textures are found; normal_at(wave, surfaces, surface, texels,
-    wo, i): for the i-th of them, what was computed before, or by `shading_normal` (of make_shading)."""
-    bends = row_of_normals(features) == ROW["bent"]
+    """Return bend (of make_bend), and normal_at(wave, surfaces, surface, texels, wo, i): for the i-th hit of a block, what was
+    computed before, or by `shading_normal` (of make_shading)."""
+    bends = rows_of_normals(features) == BENT
+    load_bent = BENT.load()
 
     @wp.func
-    def bend(wave: Wave, count: int):
-        rows = wave.rows
-        i = int(0)
-        while i < count:
-            n = row_vec3(rows, wp.static(ROW["shading"]), i)
-            if wp.static(features.normal_maps):
-                s = Surface()
-                s.shading = n
-                s.front = int(row_number(rows, wp.static(ROW["front"]), i))
-                s.tangent = row_vec3(rows, wp.static(ROW["tangent"]), i)
-                s.bitangent_sign = row_number(rows, wp.static(ROW["bitangent_sign"]), i)
-                mapped = bump(s, row_number(rows, wp.static(ROW["normal_scale"]), i), row_vec3(rows, wp.static(ROW["mapped"]), i))
-                is_mapped = int_at(wave.wanted, wp.static(NORMAL * BLOCK) + i) >= 0
-                n = where_vec3(is_mapped, mapped, n)
-            put_row_vec3(rows, wp.static(ROW["bent"]), i, bent(n, -row_vec3(rows, wp.static(ROW["direction"]), i)))
-            i = i + 1
-
-    @wp.func
-    def bend_nothing(wave: Wave, count: int):
+    def bend_nothing(wave: Wave, surfaces: Surfaces, first: int, end: int):
         pass
 
     @wp.func
@@ -55,6 +81,6 @@ def make_wave_normals(features: Any, shading_normal: Any) -> tuple[Any, Any]:
         if wp.static(features.spheres):
             if s.exclude_plus_one == 0:
                 return shading_normal(surfaces, s, texels, wo)
-        return row_vec3(wave.rows, wp.static(ROW["bent"]), i)
+        return load_bent(wave.rows, i)
 
-    return bend if bends else bend_nothing, normal_at
+    return make_bend(features) if bends else bend_nothing, normal_at

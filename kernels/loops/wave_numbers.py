@@ -5,8 +5,9 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.loops.wave import Job, Wave
-from wrt.kernels.loops.wave_surfaces import ROW, put_row_vec3
-from wrt.kernels.memory import bits_at
+from wrt.kernels.loops.wave_rows import FACETS, KEYS, Key
+
+store_key = KEYS.store()
 
 
 @wp.func
@@ -19,21 +20,27 @@ def key_at(wave: Wave, job: Job, number: int) -> wp.uint32:
 
 @wp.func
 def put_keys(wave: Wave, first: int, end: int):
-    """To wave.keys and wave.indices, what the numbers of the hits first .. end - 1, at most BLOCK, are made from."""
+    """Put the keys of the hits first .. end - 1, at most BLOCK, to the rows KEYS."""
     job = wave.job[0]
     for j in range(first, end):
         number = wave.number[wave.met[j]]
-        wave.keys[j - first] = key_at(wave, job, number)
-        wave.indices[j - first] = wp.uint32(job.first_sample + number % job.samples)
+        out = Key()
+        out.key = key_at(wave, job, number)
+        out.index = wp.uint32(job.first_sample + number % job.samples)
+        store_key(wave.rows, j - first, out)
 
 
 def make_sample_facets(choose_facet: Any) -> Any:
-    """sample_facets(wave, count): to the row facet, choose_facet (of make_step) for each hit of a block whose keys are put."""
+    """sample_facets(wave, count): put choose_facet (of make_step) of each hit of a block, whose keys are put, to FACETS."""
+    load_key, store_facet = KEYS.load(), FACETS.store()
+
     @wp.func
     def sample_facets(wave: Wave, count: int):
+        rows = wave.rows
         i = int(0)
         while i < count:
-            put_row_vec3(wave.rows, wp.static(ROW["facet"]), i, choose_facet(bits_at(wave.keys, i), bits_at(wave.indices, i)))
+            at = load_key(rows, i)
+            store_facet(rows, i, choose_facet(at.key, at.index))
             i = i + 1
 
     return sample_facets

@@ -6,10 +6,11 @@ import warp as wp
 
 from wrt.kernels.launches import Launch, run_range
 from wrt.kernels.loops.wave import BLOCK, Path, Wave, enqueue, put_sample
-from wrt.kernels.loops.wave_lights import make_wave_lights
+from wrt.kernels.loops.wave_lights import Vertex, make_wave_lights
 from wrt.kernels.loops.wave_normals import make_wave_normals
 from wrt.kernels.loops.wave_numbers import make_sample_facets, put_keys
-from wrt.kernels.loops.wave_surfaces import ROW, make_wave_surfaces, put_row_vec3, row_vec3
+from wrt.kernels.loops.wave_rows import FACETS, HITS, SEEN
+from wrt.kernels.loops.wave_surfaces import make_wave_surfaces
 from wrt.kernels.loops.wave_textures import in_lanes, make_wave_textures
 from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
@@ -31,11 +32,15 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
     sample_textures, texels_at = make_wave_textures(features, shading.look_up)
     follow_up, camera_path = make_follow_up(features), make_paths(False).camera_path
     bend, normal_at = make_wave_normals(features, shading.shading_normal)
-    sample_lights, light_at, by_keys = make_wave_lights(features, shading, found, step.choose)
-    keyed = features.rough or by_keys
+    wave_lights = make_wave_lights(features, shading, found, step.choose)
+    sample_lights, light_at = wave_lights.sample, wave_lights.at
+    keyed = features.rough or wave_lights.keyed
+    load_facet, store_direction = FACETS.load(), HITS.field("direction").store()
+    load_seen = SEEN.load()
     apart = keyed or in_lanes(features)
     sample_facets = make_sample_facets(step.choose_facet)
-    radiance, _, seen_at = BACKGROUNDS[features.background]
+    radiance, _, make_seen = BACKGROUNDS[features.background]
+    seen_at = make_seen(HITS.field("direction"), SEEN) if make_seen else None
 
     @wp.func
     def push(wave: Wave, number: int, size: int, path: Path, verdict: int) -> int:
@@ -86,10 +91,9 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
                 if i == 0:
                     count = wp.min(BLOCK, missed - j)
                     for n in range(count):
-                        put_row_vec3(wave.rows, wp.static(ROW["direction"]), n, wave.rays.direction[wave.missed[j + n]])
-                    seen_at(lighting.background, wave.rows, wp.static(ROW["direction"] * BLOCK), BLOCK, count,
-                            wave.sky_x, wave.sky_y, wave.sky_z)
-                seen = wp.vec3(wave.sky_x[i], wave.sky_y[i], wave.sky_z[i])
+                        store_direction(wave.rows, n, wave.rays.direction[wave.missed[j + n]])
+                    seen_at(lighting.background, wave.rows, count)
+                seen = load_seen(wave.rows, i)
             else:
                 seen = radiance(lighting.background, wave.rays.direction[k])
             if job.fresh != 0:
@@ -119,7 +123,7 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
         """What is computed in lanes, for the hits first .. end - 1, at most BLOCK."""
         find(wave, surfaces, first, end, wave.job[0].hits)
         sample_textures(wave, surfaces, first, end)
-        bend(wave, end - first)
+        bend(wave, surfaces, first, end)
         if wp.static(keyed):
             put_keys(wave, first, end)
         if wp.static(features.rough):
@@ -161,7 +165,7 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
             index = wp.uint32(job.first_sample + number % job.samples)
             facet = wp.vec3()
             if wp.static(features.rough):
-                facet = row_vec3(wave.rows, wp.static(ROW["facet"]), j % BLOCK)
+                facet = load_facet(wave.rows, j % BLOCK)
             met = found(wave, surfaces, j % BLOCK, k)
             texels = texels_at(wave, surfaces, met, j % BLOCK)
             met.shading = normal_at(wave, surfaces, met, texels, -path.direction, j % BLOCK)
@@ -177,8 +181,13 @@ def make_shade_kernels(features: Any) -> tuple[Any, Any]:
                 size = push(wave, number, size, shaded.refracted, next.refracted)
             if wp.static(features.lit):
                 if is_lit(shaded.scatter):
+                    vertex = Vertex()
+                    vertex.surface = shaded.surface
+                    vertex.key.key = shaded.key
+                    vertex.key.index = index
+                    vertex.i = j % BLOCK
                     for i in range(lighting.count + wp.static(step.extra_lights)):
-                        sample = light_at(wave, surfaces, lighting, shaded.surface, shaded.key, index, i, j % BLOCK)
+                        sample = light_at(wave, surfaces, lighting, vertex, i)
                         request = step.shadow_request(shaded, sample)
                         slot = int(-1)
                         if any_positive(request.value):

@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.memory import number_at, put_number
 from wrt.kernels.native import source
+from wrt.kernels.rows import Rows
 from wrt.kernels.shade.elementary import acos, atan2, sin_cos
 from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.sampling import LANES, PI, TWO_PI, cosine_point, search_cdf, share_of_row, turned_to
@@ -86,24 +86,27 @@ def environment(b: Background, direction: wp.vec3) -> wp.vec3:
 
 
 @wp.func_native(source("shade/environment_lanes.h", LANES=LANES))
-def environment_colors(background: Background, x: wp.array(dtype=wp.float32), y: wp.array(dtype=wp.float32),
-                       z: wp.array(dtype=wp.float32), count: int) -> None:
-    """environment_at of `count` columns x and rows y, to red in x, green in y and blue in z; each has room for LANES - 1 more."""
+def environment_colors(background: Background, rows: wp.array(dtype=wp.float32), at: int, length: int, count: int) -> None:
+    """environment_at of `count` columns in the row from rows[at] on and rows in the next; red, green and blue take the place of
+    these, and a third row. length: of a row, with room for LANES - 1 more."""
 
 
-@wp.func
-def environment_seen(b: Background, directions: wp.array(dtype=wp.float32), at: int, step: int, count: int,
-                     x: wp.array(dtype=wp.float32), y: wp.array(dtype=wp.float32), z: wp.array(dtype=wp.float32)):
-    """Many at a time (kernels.memory): of the directions whose components are in three rows from `at` on, each after `step`."""
-    sin, cos = turn_of(-b.rotation)
-    i = int(0)
-    while i < count:
-        d = wp.vec3(number_at(directions, at + i), number_at(directions, at + step + i), number_at(directions, at + 2 * step + i))
-        d = turned(d, sin, cos)
-        put_number(x, i, environment_column(b, d[0], d[2]))
-        put_number(y, i, environment_row(b, d[1]))
-        i = i + 1
-    environment_colors(b, x, y, z, count)
+def make_environment_seen(directions: Rows, colors: Rows) -> Any:
+    """seen(b, rows, count): `environment` of `count` directions, many at a time (kernels.memory). directions, colors: the rows of
+    vectors where they are, and go."""
+    load_direction, store_place = directions.load(), colors.store()
+
+    @wp.func
+    def seen(b: Background, rows: wp.array(dtype=wp.float32), count: int):
+        sin, cos = turn_of(-b.rotation)
+        i = int(0)
+        while i < count:
+            d = turned(load_direction(rows, i), sin, cos)
+            store_place(rows, i, wp.vec3(environment_column(b, d[0], d[2]), environment_row(b, d[1]), 0.0))
+            i = i + 1
+        environment_colors(b, rows, wp.static(colors.first * colors.length), wp.static(colors.length), count)
+
+    return seen
 
 
 @wp.func
@@ -130,19 +133,19 @@ def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
 
 
 class BackgroundKind(NamedTuple):
-    """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine. seen: as
-    environment_seen; None: it is not faster."""
+    """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine. make_seen: as
+    make_environment_seen; None: it is not faster."""
 
     radiance: Any
     sample: Any = None
-    seen: Any = None
+    make_seen: Any = None
 
 
 # By the name in wrt.scene.backgrounds.BACKGROUNDS.
 BACKGROUNDS = {
     "constant": BackgroundKind(constant),
     "gradient": BackgroundKind(gradient),
-    "environment": BackgroundKind(environment, environment_sample, environment_seen),
+    "environment": BackgroundKind(environment, environment_sample, make_environment_seen),
 }
 
 

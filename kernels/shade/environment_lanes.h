@@ -1,10 +1,11 @@
     // As backgrounds.environment_at, for LANES places at a time: loops that the compiler makes lanes of. Behind the last place there
     // may be anything, which is not read.
+    float *const x = rows.data + at, *const y = x + length, *const z = y + length;
     for (int i = 0; i < count; i += LANES) {
         float at_x[LANES] = {}, at_y[LANES] = {}, share_x[LANES], share_y[LANES];
         const int n = count - i < LANES ? count - i : LANES;
-        memcpy(at_x, x.data + i, sizeof(float) * n);
-        memcpy(at_y, y.data + i, sizeof(float) * n);
+        memcpy(at_x, x + i, sizeof(float) * n);
+        memcpy(at_y, y + i, sizeof(float) * n);
         long long corner[4][LANES];
         for (int lane = 0; lane < LANES; ++lane) {
             const float a = __builtin_floorf(at_x[lane]), b = __builtin_floorf(at_y[lane]);
@@ -30,7 +31,7 @@
                 const float low = (1.0f - share_x[lane]) * pixels[corner[2][lane] + c] + share_x[lane] * pixels[corner[3][lane] + c];
                 out[c][lane] = background.scale * ((1.0f - share_y[lane]) * top + share_y[lane] * low);
             }
-        memcpy(x.data + i, out[0], sizeof(float) * LANES);
-        memcpy(y.data + i, out[1], sizeof(float) * LANES);
-        memcpy(z.data + i, out[2], sizeof(float) * LANES);
+        memcpy(x + i, out[0], sizeof(float) * LANES);
+        memcpy(y + i, out[1], sizeof(float) * LANES);
+        memcpy(z + i, out[2], sizeof(float) * LANES);
     }

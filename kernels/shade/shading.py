@@ -1,14 +1,16 @@
 """What is known at a hit: the surface, its material with the textures in it, its normal, and how it scatters light."""
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import warp as wp
 
+from wrt.kernels.rows import numbers_of
 from wrt.kernels.shade.materials import make_scatter
 from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.surface import SEEN, Surface, bent, make_place_of, make_surface_at, triangle_uv
 from wrt.kernels.shade.textures import make_sample_texture
-from wrt.kernels.structs import Material, Surfaces, unit
+from wrt.kernels.structs import Material, Surfaces, fields_of, unit
 
 MASK = 1  # alpha modes; 0 is opaque
 BLEND = 2
@@ -27,29 +29,74 @@ class Texels:
     normal: wp.vec3
 
 
+class MaterialTexture(NamedTuple):
+    """channels: those of its picture that are read, in the order of "rgba"; fields: of Texels, which they go to, next to each other
+    there. feature: of the scenes for which it is compiled in; "": wherever there are textures."""
+
+    channels: str
+    fields: tuple[str, ...]
+    feature: str = "parameter_textures"
+
+    @property
+    def numbers(self) -> list[tuple[int, str]]:
+        """Each channel and the number of Texels that it goes to."""
+        names = [number for name in self.fields for number in numbers_of(fields_of(Texels)[name].type, f"texels.{name}")]
+        return list(zip(map("rgba".index, self.channels), names, strict=True))
+
+
+# A material's textures by the field of Material that has its index. Both loops read all of them from here.
+TEXTURES = {
+    "albedo_texture": MaterialTexture("rgba", ("albedo", "alpha"), ""),
+    "emission_texture": MaterialTexture("rgb", ("emission",), ""),
+    "metallic_roughness_texture": MaterialTexture("gb", ("roughness", "metallic")),
+    "transmission_texture": MaterialTexture("r", ("transmission",)),
+    "normal_texture": MaterialTexture("rgb", ("normal",), "normal_maps"),
+}
+
+
+def textures_of(features: Any) -> dict[str, MaterialTexture]:
+    """Return those that a scene has."""
+    if not features.textures and not features.checkerboards:
+        return {}
+    return {name: texture for name, texture in TEXTURES.items() if not texture.feature or getattr(features, texture.feature)}
+
+
+@cache
+def make_texture_index(name: str) -> Any:
+    """index(materials, material): which texture a material has in that field; -1: none."""
+
+    @wp.func_native(f"return materials.data[(long long)material].{name};")
+    def index(materials: wp.array(dtype=Material), material: int) -> int: ...
+
+    return index
+
+
 def make_look_up(features: Any) -> Any:
-    """All textures of a surface's material."""
+    """look_up(surfaces, surface) -> Texels: of all textures of a surface's material."""
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
+    look_up = no_texels
+    for name, texture in textures_of(features).items():
+        look_up = make_texture_link(name, texture, sample_texture, look_up)
+    return look_up
+
+
+@wp.func
+def no_texels(surfaces: Surfaces, s: Surface) -> Texels:
+    return Texels()
+
+
+def make_texture_link(name: str, texture: MaterialTexture, sample_texture: Any, others: Any) -> Any:
+    """look_up of one texture, and of the others."""
+    index = make_texture_index(name)
+
+    @wp.func_native("\n".join(f"{number} = color[{channel}];" for channel, number in texture.numbers))
+    def put(texels: wp.ref[Texels], color: wp.vec4) -> None: ...
 
     @wp.func
     def look_up(surfaces: Surfaces, s: Surface) -> Texels:
-        out = Texels()
-        uv = wp.vec2(s.u, s.v)
-        if wp.static(features.textures or features.checkerboards):
-            color = sample_texture(surfaces, surfaces.materials[s.material].albedo_texture, uv)
-            out.albedo = wp.vec3(color[0], color[1], color[2])
-            out.alpha = color[3]
-            light = sample_texture(surfaces, surfaces.materials[s.material].emission_texture, uv)
-            out.emission = wp.vec3(light[0], light[1], light[2])
-        if wp.static(features.parameter_textures):
-            mr = sample_texture(surfaces, surfaces.materials[s.material].metallic_roughness_texture, uv)
-            out.roughness = mr[1]
-            out.metallic = mr[2]
-            out.transmission = sample_texture(surfaces, surfaces.materials[s.material].transmission_texture, uv)[0]
-        if wp.static(features.normal_maps):
-            n = sample_texture(surfaces, surfaces.materials[s.material].normal_texture, uv)
-            out.normal = wp.vec3(n[0], n[1], n[2])
-        return out
+        texels = others(surfaces, s)
+        put(texels, sample_texture(surfaces, index(surfaces.materials, s.material), wp.vec2(s.u, s.v)))
+        return texels
 
     return look_up
 

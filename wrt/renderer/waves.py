@@ -14,12 +14,12 @@ import warp as wp
 from wrt.accel.queries.batches import new_scratch
 from wrt.core.device import made_once, records, upload
 from wrt.kernels.launches import Launch
-from wrt.kernels.loops import wave, wave_begin, wave_shade, wave_surfaces, wave_textures
+from wrt.kernels.loops import wave, wave_begin, wave_rows, wave_shade
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import LANES
-from wrt.kernels.shade.shading import make_cutout
+from wrt.kernels.shade.shading import TEXTURES, make_cutout
 from wrt.kernels.shade.shadows import ShadowWalk
 from wrt.kernels.shade.step import Lit, Sample
 from wrt.kernels.wide.batch import BatchTraversal
@@ -153,10 +153,8 @@ class Buffers:
         w.done, w.size, w.traced, w.number = room(n, Sample), room(n, wp.int32), room(n, wp.int32), room(n, wp.int32)
         w.paths = room(n * features.stack_size, wave.Path)
         w.met, w.missed = room(n, wp.int32), room(n, wp.int32)
-        w.rows = room(wave_surfaces.ROWS * wave.BLOCK, wp.float32)
-        w.sky_x, w.sky_y, w.sky_z = (room(wave.BLOCK, wp.float32) for _ in range(3))
-        w.wanted = room(wave_textures.SLOTS * wave.BLOCK, wp.int32)
-        w.keys, w.indices = room(wave.BLOCK, wp.uint32), room(wave.BLOCK, wp.uint32)
+        w.rows = room(wave_rows.ROWS * wave.BLOCK, wp.float32)
+        w.wanted = room(len(TEXTURES) * wave.BLOCK, wp.int32)
         w.pixels, w.pixel_keys = room(n + LANES, wp.int32), room(n, wp.uint32)
         w.rays, w.hits, w.lit, w.asked = queue(n), hit_arrays(n), room(n, Lit), room(n, wp.int32)
         w.request, w.value, w.shadow_rays = room(shadows, wp.int32), room(shadows, wp.vec3), queue(shadows)

@@ -10,10 +10,11 @@ from tests.kernel_tools import DEVICE, cpu_only, directions, floats, launch, rou
 import warp as wp
 
 from wrt.accel.scenes.build import build
+from wrt.kernels.rows import Rows
 from wrt.kernels.shade import backgrounds, lights
 from wrt.kernels.shade.backgrounds import (
     environment,
-    environment_seen,
+    make_environment_seen,
     make_sky_point,
     make_sky_sample,
 )
@@ -56,10 +57,14 @@ def light_kernel(features):
     return take
 
 
+DIRECTIONS = Rows(wp.vec3, 97)
+COLORS = Rows(wp.vec3, 97, DIRECTIONS.end)
+seen = make_environment_seen(DIRECTIONS, COLORS)
+
+
 @kernel
-def seen_kernel(b: Background, directions: wp.array(dtype=float), at: int, step: int, count: int, x: wp.array(dtype=float),
-                y: wp.array(dtype=float), z: wp.array(dtype=float)):
-    environment_seen(b, directions, at, step, count, x, y, z)
+def seen_kernel(b: Background, rows: wp.array(dtype=float), count: int):
+    seen(b, rows, count)
 
 
 @cpu_only
@@ -69,15 +74,16 @@ def test_a_picture_of_the_sky_in_lanes_is_that_of_one_direction_at_a_time(rotati
     rng = np.random.default_rng(1)
     axes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-0.0, 1, -0.0], [0.5**0.5, 0, 0.5**0.5]])
     direction = np.concatenate([unit(rng.normal(size=(71, 3))), axes, -axes])
-    n, step = len(direction), len(direction) + LANES
+    n = len(direction)
+    assert n + LANES == COLORS.length
     sky = EnvironmentBackground(rng.random((5, 8, 3)), rotation=rotation, scale=1.5)
     b = upload_scene(Scene(background=sky), DEVICE).lighting.background
-    rows = np.full((3, step), np.nan)
-    rows[:, :n] = direction.T
-    seen, expected = [floats(np.full(step, np.nan)) for _ in range(3)], zeros(n, wp.vec3)
-    launch(seen_kernel, 1, b, floats(rows.ravel()), 0, step, n, *seen)
+    rows = np.full((COLORS.end, COLORS.length), np.nan)
+    rows[:3, :n] = direction.T
+    rows, expected = floats(rows.ravel()), zeros(n, wp.vec3)
+    launch(seen_kernel, 1, b, rows, n)
     launch(environment_kernel, n, b, vec3s(direction), expected)
-    found = np.stack([color.numpy()[:n] for color in seen], axis=1)
+    found = rows.numpy().reshape(COLORS.end, -1)[3:, :n].T.copy()
     np.testing.assert_array_equal(found.view(np.int32), expected.numpy().view(np.int32))
 
 

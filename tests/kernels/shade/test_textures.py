@@ -12,7 +12,7 @@ import warp as wp
 from wrt.core.device import upload
 from wrt.kernels import structs
 from wrt.kernels.loops.wave import BLOCK
-from wrt.kernels.loops.wave_surfaces import ROW, ROWS
+from wrt.kernels.loops.wave_rows import ROWS, SURFACES
 from wrt.kernels.loops.wave_textures import sample_lanes
 from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Surfaces, kernel
@@ -185,9 +185,9 @@ def lanes_kernel(surfaces: Surfaces, wanted: wp.array(dtype=wp.int32), first: in
 
 
 def in_lanes(surfaces, index, uv, channels=15):
-    """(N, 4), NaN in other channels. Numbers behind the last are anything, as they are where the last block is not full."""
+    """(N, 4): the channels asked for, then NaN. Numbers behind the last are anything, as in a block that is not full."""
     wanted, rows = np.full(2 * BLOCK, -1), np.full((ROWS, BLOCK), np.nan, np.float32)
-    wanted[BLOCK : BLOCK + len(uv)], rows[[ROW["tex_u"], ROW["tex_v"]], : len(uv)] = index, uv.T
+    wanted[BLOCK : BLOCK + len(uv)], rows[[SURFACES.field(name).first for name in "uv"], : len(uv)] = index, uv.T
     out = floats(rows.ravel())
     launch(lanes_kernel, 1, surfaces, ints(wanted), BLOCK, len(uv), channels, out)
     return out.numpy().reshape(ROWS, BLOCK)[:4, : len(uv)].T
@@ -219,9 +219,9 @@ def test_only_the_channels_that_are_asked_for_are_written():
     surfaces, uv = surfaces_with([Texture(picture(rng))]), rng.random((20, 2)).astype(np.float32)
     expected = look_up([Texture(picture(np.random.default_rng(3)))], 0, uv)
     for mask in (1, 6, 7, 8, 15):
-        found, asked = in_lanes(surfaces, 0, uv, mask), [bool(mask >> channel & 1) for channel in range(4)]
-        np.testing.assert_array_equal(found[:, asked], expected[:, asked])
-        assert np.isnan(found[:, [not one for one in asked]]).all()
+        found, asked = in_lanes(surfaces, 0, uv, mask), [channel for channel in range(4) if mask >> channel & 1]
+        np.testing.assert_array_equal(found[:, : len(asked)], expected[:, asked])
+        assert np.isnan(found[:, len(asked) :]).all()
 
 
 def test_the_table_of_plain_numbers_is_a_division():

@@ -1,0 +1,84 @@
+"""Structs in rows, for loops that run in lanes (kernels.memory).
+
+A struct of 9 numbers takes 9 rows of a block: entry i of the block has its numbers in column i. A loop over i then reads and writes
+neighbours, which the compiler makes lanes of; in an array of structs they would be 9 numbers apart.
+
+`load` and `store` are C++ that is written from the struct's fields, a copy for each number; tests/kernels/test_rows.py shows it.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from wrt.kernels.structs import fields_of
+
+
+def numbers_of(dtype: Any, name: str) -> list[str]:
+    """Return the numbers of a struct, a vector or a number in C++, in their order: "name.point[0]", "name.point[1]" ..."""
+    if hasattr(dtype, "numpy_dtype"):
+        return [number for field, of in fields_of(dtype).items() for number in numbers_of(of.type, f"{name}.{field}")]
+    size = wp.types.type_size(dtype)
+    return [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
+
+
+class Rows(NamedTuple):
+    """The rows of a block that hold structs (or vectors) of one type. Each number takes 4 bytes, and keeps its bits.
+
+    length: entries of the block, and numbers of a row; first: the row of the struct's first number."""
+
+    dtype: Any
+    length: int
+    first: int = 0
+
+    @property
+    def end(self) -> int:
+        """The row behind the last."""
+        return self.first + len(numbers_of(self.dtype, "value"))
+
+    def field(self, name: str) -> "Rows":
+        """Return the rows of one field of the struct."""
+        fields = fields_of(self.dtype)
+        before = list(fields)[: list(fields).index(name)]
+        return Rows(fields[name].type, self.length, self.first + sum(len(numbers_of(fields[each].type, "")) for each in before))
+
+    def text(self, line: str, without: tuple[str, ...] = ()) -> str:
+        """Return that line of C++ for each {number} and its {place}, but for the numbers of the fields `without`."""
+        left_out = tuple(f"value.{name}{end}" for name in without for end in ("[", ".", ";"))
+        return "".join(f"    {line}\n".format(number=number, place=f"rows.data + {row * self.length}ll + i")
+                       for row, number in enumerate(numbers_of(self.dtype, "value"), self.first)
+                       if not f"{number};".startswith(left_out))
+
+    def load(self, *without: str) -> Any:
+        """load(rows, i) -> value: entry i. The fields `without` are 0."""
+        return make_load(self, without)
+
+    def store(self, *without: str) -> Any:
+        """store(rows, i, value): put entry i. The rows of the fields `without` stay as they are."""
+        return make_store(self, without)
+
+
+@cache
+def make_load(of: Rows, without: tuple[str, ...]) -> Any:
+    dtype = of.dtype
+
+    @wp.func_native(of.text("memcpy(&{number}, {place}, 4);", without))
+    def fill(rows: wp.array(dtype=wp.float32), i: int, value: wp.ref[dtype]) -> None: ...
+
+    @wp.func
+    def load(rows: wp.array(dtype=wp.float32), i: int) -> dtype:
+        value = dtype()
+        fill(rows, i, value)
+        return value
+
+    return load
+
+
+@cache
+def make_store(of: Rows, without: tuple[str, ...]) -> Any:
+    dtype = of.dtype
+
+    @wp.func_native(of.text("memcpy({place}, &{number}, 4);", without))
+    def store(rows: wp.array(dtype=wp.float32), i: int, value: dtype) -> None: ...
+
+    return store

@@ -1,0 +1,99 @@
+"""Structs in rows: what is stored is loaded again, number by number, and the text that does it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.kernel_tools import floats, launch, zeros  # isort: skip (starts Warp)
+import warp as wp
+
+from wrt.core.device import records
+from wrt.kernels.rows import Rows
+from wrt.kernels.structs import kernel
+
+
+@wp.struct
+class Corner:
+    point: wp.vec3
+    index: int
+
+
+@wp.struct
+class Thing:
+    corner: Corner
+    key: wp.uint32
+    size: float
+    at: wp.vec2
+
+
+THINGS = Rows(Thing, 5, 2)
+
+# What Rows writes: a plain copy for each number. Place of number k of entry i: (first + k) * length + i.
+STORED = """\
+    memcpy(rows.data + 10ll + i, &value.corner.point[0], 4);
+    memcpy(rows.data + 15ll + i, &value.corner.point[1], 4);
+    memcpy(rows.data + 20ll + i, &value.corner.point[2], 4);
+    memcpy(rows.data + 25ll + i, &value.corner.index, 4);
+    memcpy(rows.data + 30ll + i, &value.key, 4);
+    memcpy(rows.data + 35ll + i, &value.size, 4);
+    memcpy(rows.data + 40ll + i, &value.at[0], 4);
+    memcpy(rows.data + 45ll + i, &value.at[1], 4);
+"""
+
+
+def test_the_text_of_a_store_and_of_a_load() -> None:
+    assert THINGS.store().native_snippet == STORED
+    lines = [line for line in STORED.splitlines(keepends=True) if ".corner.point" not in line and ".at[" not in line]
+    assert THINGS.store("corner.point", "at").native_snippet == "".join(lines)
+    assert Rows(wp.vec3, 4).text("memcpy(&{number}, {place}, 4);") == (
+        "    memcpy(&value[0], rows.data + 0ll + i, 4);\n    memcpy(&value[1], rows.data + 4ll + i, 4);\n"
+        "    memcpy(&value[2], rows.data + 8ll + i, 4);\n")
+
+
+def test_rows_follow_one_another() -> None:
+    assert (THINGS.first, THINGS.end) == (2, 10)
+    assert (THINGS.field("key").first, THINGS.field("key").end) == (6, 7)
+    assert (THINGS.field("corner").field("index").first, THINGS.field("at").end) == (5, 10)
+    with pytest.raises(ValueError, match="nothing"):
+        THINGS.field("nothing")
+
+
+def copied(source: Rows, target: Rows, things: Any, without: tuple[str, ...] = ()) -> Any:
+    """Things that went to rows, from there to other rows, and back; and those rows."""
+    store, load, store_again, load_again = source.store(), source.load(*without), target.store(), target.load()
+
+    @kernel
+    def run(things: wp.array(dtype=Thing), rows: wp.array(dtype=wp.float32), out: wp.array(dtype=Thing)):
+        for i in range(things.shape[0]):
+            store(rows, i, things[i])
+        i = int(0)
+        while i < things.shape[0]:
+            store_again(rows, i, load(rows, i))
+            i = i + 1
+        for i in range(things.shape[0]):
+            out[i] = load_again(rows, i)
+
+    rows, out = floats(np.full(target.end * target.length, np.nan)), zeros(len(things), Thing)
+    launch(run, 1, wp.array(things, dtype=Thing, device=rows.device), rows, out)
+    return out.numpy(), rows.numpy().reshape(-1, target.length)
+
+
+def test_each_number_keeps_its_bits() -> None:
+    rng = np.random.default_rng(0)
+    things = records(Thing, 5)
+    things[:] = np.frombuffer(rng.bytes(things.nbytes), things.dtype)  # NaN and denormals too
+    out, rows = copied(THINGS, Rows(Thing, 5, THINGS.end), things)
+    assert out.tobytes() == things.tobytes()
+    numbers = np.frombuffer(things.tobytes(), np.uint32).reshape(5, -1).T
+    np.testing.assert_array_equal(rows[2:].view(np.uint32), np.concatenate([numbers, numbers]))
+    assert np.isnan(rows[:2]).all()  # nothing else is written
+
+
+def test_a_field_that_is_left_out_is_zero() -> None:
+    things = records(Thing, 5)
+    things["size"], things["key"], things["corner"]["index"] = 1.5, 2**32 - 1, np.arange(5)
+    out, _ = copied(THINGS, Rows(Thing, 5, THINGS.end), things, ("corner", "key"))
+    assert (out["size"] == 1.5).all() and not out["key"].any() and not out["corner"]["index"].any()
