@@ -13,10 +13,12 @@ from wrt.kernels.shade.features import Features
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CameraKind
 from wrt.scene.lights import EMISSIVE, LIGHTS
-from wrt.scene.materials import MATERIALS, Checkerboard, Texture
+from wrt.scene.materials import MATERIALS, SLOTS, Checkerboard, Texture
 from wrt.scene.model import Scene
 
 STACK_STEP = 16
+# Textures with a switch of their own; those of all other parameters share one (wrt.kernels.shade.shading.TEXTURES).
+COMMON = {"albedo_texture", "emission_texture", "normal_texture"}
 
 
 def switches(features: Features) -> dict[str, bool]:
@@ -63,8 +65,7 @@ def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = froze
         textures=any(isinstance(texture, Texture) for texture in textures),
         checkerboards=any(isinstance(texture, Checkerboard) for texture in textures),
         normal_maps=any(m.normal_texture is not None for m in materials),
-        parameter_textures=any(m.uses(name) and getattr(m, name) is not None for m in materials
-                               for name in ("metallic_roughness_texture", "transmission_texture")),
+        parameter_textures=any(m.reads(name) and getattr(m, name) is not None for m in materials for name in SLOTS.keys() - COMMON),
         cutout=any(m.alpha_mode == "mask" for m in materials),
         blend=blend,
         materials=tuple(name for name in MATERIALS if name in kinds),

@@ -164,6 +164,10 @@ class Material:
         """Whether its kind reads that field, of those that not every kind reads."""
         return field in MATERIALS[self.kind].uses
 
+    def reads(self, field: str) -> bool:
+        """Whether its kind reads that field."""
+        return self.uses(field) or field not in kinds_that_use()
+
     @property
     def is_clear(self) -> bool:
         """Whether light goes through it, alpha aside."""
