@@ -48,6 +48,9 @@ def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
 # 1 + 2^-12 squared is 1 + 2^-11 in float32, and 2^-24 more where the subtraction is fused with it. Volatile: or the compiler, which
 # never fuses, would reckon.
 @wp.func_native("""
+#if !defined(WRT_INLINE) && !defined(__CUDA_ARCH__)
+    return true;  // made by wp.kernel, without the headers of wide/
+#endif
     volatile float x = 1.000244140625f;
     const float y = x;
     return y * y - 1.00048828125f != 0.0f;

@@ -8,26 +8,30 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from wrt.kernels.headers import with_headers
+
 NO_HIT = wp.constant(0x7FFFFFFF)  # prim_id while nothing is hit: larger than any other, so that ties go to a real one
 INF = wp.constant(float("inf"))
 EPSILON = wp.constant(2.0**-24)  # the unit roundoff of float32
 
 # A fused multiply-add rounds once where its mirror image rounds twice: the edge tests of two neighbouring triangles would
 # no longer be exact negatives of each other, and a ray could slip between them.
-MODULE_OPTIONS = {"fuse_fp": False, "enable_backward": False}
+#
+# The headers have the box and edge tests in lanes, for the walks of wide trees; on the CPU alone.
+MODULE_OPTIONS = {"fuse_fp": False, "enable_backward": False, "extra_build_options": with_headers("wide/triangle.h")}
 
 
 if TYPE_CHECKING:  # device code is not for type checkers: its annotations are Warp's
     from typing import no_type_check as kernel
     from typing import no_type_check as noinline
 else:
-    def kernel(function):
+    def kernel(function, **options):
         """A Warp kernel in a module of its own, without fused multiply-add and without the code for gradients.
 
         wrt's own kernels are compiled in release mode, whatever wp.config.mode is: a kernel of Warp 1.19 in debug mode ends the
         process where several threads launch it. A kernel of the user follows wp.config.mode."""
         own = {"mode": "release"} if str(function.__module__).startswith("wrt.") else {}  # None where code was made by exec
-        return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS | own, enable_backward=False)
+        return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS | own | options, enable_backward=False)
 
     def noinline(function):
         """A Warp function that is called, and not copied to where it is called."""

@@ -50,9 +50,10 @@ SET_FROM_OUTSIDE = {"requires_grad": "Warp's, of an array", "path": "of an Input
 # The folders of kernels/, and from which others each may import; `structs` is below all of them.
 BELOW_KERNELS = {
     "native": set(),
+    "headers": {"native"},
     "launches": set(),
     "memory": set(),
-    "structs": set(),
+    "structs": {"headers"},
     "rows": {"structs"},
     "units": {"structs"},
     "traverse": {"native", "units", "structs"},
@@ -60,7 +61,7 @@ BELOW_KERNELS = {
     "hit_lists": {"query", "units", "structs"},
     "ray_query": {"query", "structs"},
     "winding": {"structs"},
-    "wide": {"native", "memory", "query", "traverse", "units", "structs"},
+    "wide": {"headers", "memory", "query", "traverse", "units", "structs"},
     "shade": {"native", "memory", "rows", "query", "traverse", "units", "structs"},
     "loops": {"shade", "native", "launches", "memory", "rows", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
@@ -256,7 +257,7 @@ def test_kernels_refuse_a_second_name() -> None:
 
 def copied(to: Path) -> None:
     """The package as a place without symbolic links holds it: device code beside it, and nothing in it."""
-    for path in (*HOST, *KERNELS):
+    for path in (*HOST, *KERNELS, *(ROOT / "kernels").rglob("*.h")):
         target = to / path.relative_to(ROOT)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(path.read_bytes())

@@ -13,13 +13,12 @@ import warp as wp
 
 from wrt.kernels.memory import put_number
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.structs import NO_HIT, Hit, Surfaces, kernel
+from wrt.kernels.structs import NO_HIT, Hit, Surfaces
 from wrt.kernels.traverse.common import Probe, Units, make_better, sphere_hit
 from wrt.kernels.traverse.stack import reference_of, t_of
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
-from wrt.kernels.wide.nodes import ROW_PADS, far_pad, node_size
-from wrt.kernels.wide.packets import (
+from wrt.kernels.wide.layout import (
     ACTIVE,
     COHERENT,
     LANES,
@@ -27,11 +26,16 @@ from wrt.kernels.wide.packets import (
     PRIM_ID_ROW,
     REFUSED,
     ROW,
+    ROW_SIZE,
     SLOT,
     SLOT_SIZE,
     STACK_WORDS,
     WIDTH,
+)
+from wrt.kernels.wide.nodes import ROW_PADS, far_pad
+from wrt.kernels.wide.packets import (
     Scratch,
+    WideBvh,
     count_of,
     key_at,
     lowest_of_all,
@@ -39,26 +43,26 @@ from wrt.kernels.wide.packets import (
     make_ray_triangles,
     make_set_up,
     make_steps,
+    make_triangles,
     meets,
+    packet_kernel,
+    prefetch_next,
     put_bits,
     put_slot,
     rays_at,
     reaching,
     slot_at,
     spheres_of,
-    triangles,
     write_hits,
     write_occluded,
 )
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
-from wrt.kernels.wide.traverse import WideTraversal, make_call_in, make_struct, row_size
+from wrt.kernels.wide.traverse import WideTraversal
 
-NODE = node_size(WIDTH, False)
 PRIM_ID = WIDTH * PRIM_ID_ROW  # where a row has its primitives' numbers
 PACKETS = 4  # set up at a time
 SLOTS = 24  # rays under way at a time
 FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
-LINES = 5  # cache lines that are called in of what is next: a row of triangles has 5, a node 4, and a branch would cost more
 WORTH = 6  # rays that come to a node together, on average, from which on a packet takes less time than its rays alone
 # Where packets fall apart, one after another, none is tried for a while: so many in a row, for so many that follow.
 IN_A_ROW, PAUSE = 4, 32
@@ -111,53 +115,50 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
     better = make_better(units, accepts)
 
     @wp.func
-    def test_spheres(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces,
-                     packet: wp.array(dtype=wp.float32), ray: int) -> bool:
-        probe = probe_at(packet, ray)
-        best = best_at(packet, ray)
+    def test_spheres(accel: WideBvh, first: int, mask: int, surfaces: Surfaces, scratch: Scratch, ray: int) -> bool:
+        probe = probe_at(scratch.packets, ray)
+        best = best_at(scratch.packets, ray)
         while mask != 0:
-            prim_id = bits(rows, first + PRIM_ID + lowest(mask))
+            prim_id = bits(accel.primitives, first + PRIM_ID + lowest(mask))
             mask = mask & (mask - 1)
             if prim_id + 1 != probe.ray.exclude_plus_one:
                 best = better(probe.ray, surfaces, sphere_hit(probe, surfaces, prim_id), prim_id, best)
         found = bool(best.prim_id != NO_HIT)
         if wp.static(any_hit):
             best.t = wp.where(found, -float(wp.inf), best.t)  # nothing else is reached
-        put_best(packet, ray, best)
+        put_best(scratch.packets, ray, best)
         return wp.static(any_hit) and found
 
     @wp.func
-    def nearest_accepted(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Surfaces,
-                         packet: wp.array(dtype=wp.float32), ray: int) -> bool:
+    def nearest_accepted(accel: WideBvh, first: int, mask: int, surfaces: Surfaces, scratch: Scratch, ray: int) -> bool:
         """The nearest triangle that is hit, until one is accepted."""
-        before = best_at(packet, ray)
+        before = best_at(scratch.packets, ray)
         while True:
-            lane = ray_triangles(rows, first, mask, packet, ray)
+            lane = ray_triangles(accel, first, mask, scratch, ray)
             if lane < 0:
                 return False
-            hit = best_at(packet, ray)
+            hit = best_at(scratch.packets, ray)
             if accepts(surfaces, hit.prim_id, hit.u, hit.v):
                 break
-            put_best(packet, ray, before)
+            put_best(scratch.packets, ray, before)
             mask = mask & ~(1 << lane)
         if wp.static(any_hit):
-            put_number(packet, ray + wp.static(ROW["t"]), -float(wp.inf))
+            put_number(scratch.packets, ray + wp.static(ROW["t"]), -float(wp.inf))
         return wp.static(any_hit)
 
     @wp.func
-    def test_row(rows: wp.array(dtype=wp.float32), first: int, count: int, surfaces: Surfaces, packet: wp.array(dtype=wp.float32),
-                 ray: int) -> bool:
+    def test_row(accel: WideBvh, first: int, count: int, surfaces: Surfaces, scratch: Scratch, ray: int) -> bool:
         mask = (2 << (count - 1)) - 1
         if wp.static(units.spheres):
-            spheres = spheres_of(rows, first, mask, surfaces.n_triangles)
+            spheres = spheres_of(accel, first, mask, surfaces.n_triangles)
             if spheres != 0:
-                if test_spheres(rows, first, spheres, surfaces, packet, ray):
+                if test_spheres(accel, first, spheres, surfaces, scratch, ray):
                     return True
                 mask = mask & ~spheres
         if wp.static(accepts is None):
-            return ray_triangles(rows, first, mask, packet, ray) >= 0 and wp.static(any_hit)
+            return ray_triangles(accel, first, mask, scratch, ray) >= 0 and wp.static(any_hit)
         else:
-            return nearest_accepted(rows, first, mask, surfaces, packet, ray)
+            return nearest_accepted(accel, first, mask, surfaces, scratch, ray)
 
     return test_row
 
@@ -165,21 +166,19 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
 def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
     """A packet with a beam, from the root."""
     test_row = make_row_test(units, any_hit, accepts, False)
-    struct = make_struct(units.triangle_test.record)
-    size_of_row = row_size(units.triangle_test.record, WIDTH)
-    children = make_children(any_hit, size_of_row, LINES)
+    children, triangles = make_children(any_hit), make_triangles(any_hit)
 
     @wp.func
-    def test_leaf(accel: struct, surfaces: Surfaces, reference: int, mask: int, packet: wp.array(dtype=wp.float32), base: int):
+    def test_leaf(accel: WideBvh, surfaces: Surfaces, reference: int, mask: int, scratch: Scratch, base: int):
         left = leaf_count(reference)
-        first = leaf_first(reference) * wp.static(size_of_row)
+        first = leaf_first(reference) * ROW_SIZE
         while left > 0 and mask != 0:
             n = wp.min(left, WIDTH)
             lanes = bool(wp.static(accepts is None) and count_of(mask) > FEW)
             if wp.static(units.spheres):
-                lanes = lanes and spheres_of(accel.primitives, first, (2 << (n - 1)) - 1, surfaces.n_triangles) == 0
+                lanes = lanes and spheres_of(accel, first, (2 << (n - 1)) - 1, surfaces.n_triangles) == 0
             if lanes:
-                found = triangles(accel.primitives, first, n, mask, any_hit, packet, base)
+                found = triangles(accel, first, n, mask, scratch, base)
                 if wp.static(any_hit):
                     mask = mask & ~found
             else:
@@ -187,14 +186,13 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 while rays != 0:
                     lane = lowest(rays)
                     rays = rays & (rays - 1)
-                    if test_row(accel.primitives, first, n, surfaces, packet, base + lane):
+                    if test_row(accel, first, n, surfaces, scratch, base + lane):
                         mask = mask & ~(1 << lane)
             left = left - WIDTH
-            first = first + wp.static(size_of_row)
+            first = first + ROW_SIZE
 
     @wp.func
-    def walk(accel: struct, surfaces: Surfaces, packet: wp.array(dtype=wp.float32), base: int, active: int,
-             stacks: wp.array(dtype=wp.uint32)) -> bool:
+    def walk(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, base: int, active: int) -> bool:
         """Whether it was worth it."""
         nodes = int(0)
         visits = int(0)
@@ -203,18 +201,18 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
         mask = int(active)
         while True:
             if reference < 0:
-                test_leaf(accel, surfaces, reference, mask, packet, base)
+                test_leaf(accel, surfaces, reference, mask, scratch, base)
             else:
                 nodes += 1
                 visits += count_of(mask)
-                size = children(accel.nodes, accel.primitives, reference * NODE, mask, packet, base, stacks, size)
+                size = children(accel, scratch, base, reference, mask, size)
             mask = int(0)
             while size > 0 and mask == 0:
                 size = size - 1
-                mask = rays_at(stacks, size) & reaching(t_of(key_at(stacks, size)), packet, base)
+                mask = rays_at(scratch.stacks, size) & reaching(t_of(key_at(scratch.stacks, size)), scratch, base)
             if mask == 0:
                 break
-            reference = reference_of(key_at(stacks, size))
+            reference = reference_of(key_at(scratch.stacks, size))
         return visits >= WORTH * nodes
 
     return walk
@@ -223,43 +221,38 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
     """Rays of several packets, each for itself, from the root. waiting: a bit for each; lane after lane, packet after packet."""
     test_row = make_row_test(units, any_hit, accepts, True)  # inlined: 1.02 times as fast, any hit 1.05
-    struct = make_struct(units.triangle_test.record)
-    size_of_row = row_size(units.triangle_test.record, WIDTH)
-    call_in = make_call_in(units.triangle_test.record, WIDTH, False, LINES)
     begin, step, pop = make_steps(any_hit)
 
     @wp.func
-    def start(accel: struct, scratch: Scratch, slot: int, ray: int):
+    def start(accel: WideBvh, scratch: Scratch, slot: int, ray: int):
         """`meets` has found that the ray meets a child of the root: there is a next one."""
         column = ray / LANES * PACKET_SIZE + ray % LANES
-        next = begin(accel.nodes, scratch.packets, column, scratch.stacks, slot * STACK_WORDS, scratch.slots, slot * SLOT_SIZE)
-        call_in(accel.nodes, accel.primitives, next)
+        prefetch_next(accel, begin(accel, scratch, slot, column))
 
     @wp.func
-    def turn(accel: struct, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
+    def turn(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
         """A node or a leaf, and on to what is next; False where the ray is done."""
         words = slot * SLOT_SIZE
         reference = slot_at(scratch.slots, words + wp.static(SLOT["next"]))
         if reference < 0:
             ray = slot_at(scratch.slots, words + wp.static(SLOT["ray"]))
             left = leaf_count(reference)
-            first = leaf_first(reference) * wp.static(size_of_row)
+            first = leaf_first(reference) * ROW_SIZE
             while left > 0:
-                if test_row(accel.primitives, first, wp.min(left, WIDTH), surfaces, scratch.packets, ray):
+                if test_row(accel, first, wp.min(left, WIDTH), surfaces, scratch, ray):
                     return False
                 left = left - WIDTH
-                first = first + wp.static(size_of_row)
-            next = pop(accel.nodes, number(scratch.packets, ray + wp.static(ROW["t"])), scratch.stacks, slot * STACK_WORDS,
-                       scratch.slots, words)
+                first = first + ROW_SIZE
+            next = pop(accel, scratch, slot, number(scratch.packets, ray + wp.static(ROW["t"])))
         else:
-            next = step(accel.nodes, scratch.packets, scratch.stacks, slot * STACK_WORDS, scratch.slots, words)
+            next = step(accel, scratch, slot)
         if next == EMPTY:
             return False
-        call_in(accel.nodes, accel.primitives, next)
+        prefetch_next(accel, next)
         return True
 
     @wp.func
-    def interleaved(accel: struct, surfaces: Surfaces, scratch: Scratch, waiting: wp.uint64):
+    def interleaved(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, waiting: wp.uint64):
         live = int(0)
         slot = int(0)
         while slot < SLOTS and waiting != wp.uint64(0):
@@ -286,15 +279,14 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
 def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
     """Rays first .. end - 1, PACKETS packets after another, in a single thread. out: HitArrays, or for any hit an array of bool.
     Arrays must have no gaps."""
-    struct = make_struct(units.triangle_test.record)
     walk_packet = make_packet_walk(units, any_hit, accepts)
     interleaved = make_interleaved(units, any_hit, accepts)
     set_up = make_set_up(rays_struct)
     write = write_occluded if any_hit else write_hits
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
-    @kernel
-    def trace(accel: struct, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
+    @packet_kernel
+    def trace(accel: WideBvh, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
         put_slot(scratch.slots, FAILED, 0)
         put_slot(scratch.slots, PAUSED, 0)
         put_slot(scratch.slots, ANY_REFUSED, 0)
@@ -304,7 +296,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
             for p in range(packets):
                 base = PACKET_SIZE * p
                 count = wp.min(end - block - LANES * p, LANES)
-                active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch.packets, base)
+                active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch, base)
                 put_bits(scratch.packets, base + ACTIVE, active)
                 if bits(scratch.packets, base + REFUSED) != 0:
                     put_slot(scratch.slots, ANY_REFUSED, 1)
@@ -313,7 +305,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 active = bits(scratch.packets, base + ACTIVE)
                 paused = slot_at(scratch.slots, PAUSED)
                 if active >= COHERENT and paused == 0:
-                    worth = walk_packet(accel, surfaces, scratch.packets, base, active - COHERENT, scratch.stacks)
+                    worth = walk_packet(accel, surfaces, scratch, base, active - COHERENT)
                     failed = wp.where(worth, 0, slot_at(scratch.slots, FAILED) + 1)
                     if failed == IN_A_ROW:  # after the pause one more that fails is enough for the next
                         failed = failed - 1
@@ -322,11 +314,11 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 else:
                     put_slot(scratch.slots, PAUSED, wp.max(paused - 1, 0))
                     active = active & wp.static(COHERENT - 1)
-                    active = meets(accel.nodes, 0, active, scratch.packets, base)
+                    active = meets(accel, scratch, base, active)
                     alone = alone | (wp.uint64(active) << wp.uint64(LANES * p))
             interleaved(accel, surfaces, scratch, alone)
             for p in range(packets):
-                write(out, block + LANES * p, wp.min(end - block - LANES * p, LANES), scratch.packets, PACKET_SIZE * p)
+                write(out, block + LANES * p, wp.min(end - block - LANES * p, LANES), scratch, PACKET_SIZE * p)
 
     return trace
 

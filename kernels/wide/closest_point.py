@@ -18,9 +18,10 @@ from wrt.kernels.traverse.stack import key_of, make_uninitialized, reference_of,
 from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
 from wrt.kernels.units.triangle import lower, upper
 from wrt.kernels.wide.lanes import bits
-from wrt.kernels.wide.nodes import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, first_reference, make_plane, node_size
+from wrt.kernels.wide.layout import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, STACK_SIZE, first_reference, node_size
+from wrt.kernels.wide.nodes import make_plane
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
-from wrt.kernels.wide.traverse import STACK_SIZE, make_gather, make_struct, row_size
+from wrt.kernels.wide.traverse import make_gather, make_struct, row_size
 
 empty_stack = make_uninitialized(STACK_SIZE, wp.uint64)
 NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # no entry of a stack: more than any

@@ -9,12 +9,10 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.native import source
 from wrt.kernels.structs import on_cuda
 from wrt.kernels.units.box import FAR_PAD, BoxRay
 from wrt.kernels.units.triangle import edge_areas, outside, sheared
-
-CACHE_LINE = 16  # float32
+from wrt.kernels.wide.layout import CACHE_LINE
 
 # The lanes' far distances are widened by way of the reciprocals, in one product instead of two: 8 u more than FAR_PAD outweigh
 # the four roundings by which the two ways may differ, so that no box is left out that the box unit enters.
@@ -40,6 +38,12 @@ class LaneRay:
     origin: wp.vec3
 
 
+def lanes_only(body: str, otherwise: str = "0") -> str:
+    """Return a native function's body for kernels of structs.kernel on the CPU, which have the headers of wide/. CUDA calls the
+    plain form. A kernel that a user made by wp.kernel is refused (ray_query.fused)."""
+    return f"\n#if defined(WRT_INLINE)\n{body}\n#else\n    return {otherwise};\n#endif\n"
+
+
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     return __ffs(mask) - 1;
@@ -61,7 +65,11 @@ def bits(rows: wp.array(dtype=wp.float32), i: int) -> int:
     """The int32 that stands in rows[i]."""
 
 
-@wp.func_native(source("wide/prefetch.h", CACHE_LINE=CACHE_LINE))
+@wp.func_native(f"""
+#if !defined(__CUDA_ARCH__)
+    for (int k = 0; k < lines; ++k) __builtin_prefetch(rows.data + (long long)first + {CACHE_LINE} * k);
+#endif
+""")
 def prefetch(rows: wp.array(dtype=wp.float32), first: int, lines: int) -> None:
     """So many cache lines from rows[first] are soon needed."""
 
@@ -104,7 +112,7 @@ def make_plain_cull(width: int) -> Any:
 def make_native_cull(width: int) -> Any:
     """make_cull in C++, for the CPU only."""
 
-    @wp.func_native(source("wide/row_cull.h", WIDTH=width))
+    @wp.func_native(lanes_only(f"return wrt::cull<{width}>(rows.data + (long long)first, ray);"))
     def cull(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int: ...
 
     return cull

@@ -12,33 +12,25 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.native import source
 from wrt.kernels.structs import on_cuda
 from wrt.kernels.units.box import RAY_AABB
-from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, row_type, value
-
-# The rows of planes. A low plane and the high plane of the same axis differ in the last bit of their numbers.
-PLANES = ("lo_x", "hi_x", "lo_y", "hi_y", "lo_z", "hi_z")
-LO_X, HI_X, LO_Y, HI_Y, LO_Z, HI_Z = range(len(PLANES))
-
-# A compressed node: where its word and its bytes begin; what is in the word; and the fraction's bits in a float32.
-WORD, FIRST_BYTES = 3, 4
-EXPONENT_BITS = 8
-EXIST_SHIFT = 3 * EXPONENT_BITS
-MANTISSA_BITS = 23
+from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, lanes_only, row_type, value
+from wrt.kernels.wide.layout import (
+    EXIST_SHIFT,
+    EXPONENT_BITS,
+    FIRST_BYTES,
+    HI_X,
+    HI_Y,
+    HI_Z,
+    LO_X,
+    LO_Y,
+    LO_Z,
+    MANTISSA_BITS,
+    WORD,
+)
 
 # By how much far distances are widened for the box tests that have a form in rows.
 ROW_PADS = {"conservative": LANE_PAD, "minmax": 1.0}
-
-
-def first_reference(width: int, compressed: bool) -> int:
-    """Where in a node the references of its children begin."""
-    return FIRST_BYTES + len(PLANES) * width // 4 if compressed else len(PLANES) * width
-
-
-def node_size(width: int, compressed: bool) -> int:
-    """Numbers a node."""
-    return first_reference(width, compressed) + (1 if compressed else 2) * width
 
 
 @cache
@@ -126,13 +118,19 @@ def make_plain(width: int, compressed: bool) -> Any:
 def make_native(width: int, compressed: bool) -> Any:
     """make_children of rows in C++, for the CPU only."""
     row = row_type(width)
-    layout = {"WIDTH": width, "COMPRESSED": compressed, "WORD": WORD, "FIRST_BYTES": FIRST_BYTES, "EXPONENT_BITS": EXPONENT_BITS,
-              "EXIST_SHIFT": EXIST_SHIFT, "MANTISSA_BITS": MANTISSA_BITS}
+    numbers = {"COMPRESSED": int(compressed), "WORD": WORD, "FIRST_BYTES": FIRST_BYTES, "EXPONENT_BITS": EXPONENT_BITS,
+               "EXIST_SHIFT": EXIST_SHIFT, "MANTISSA_BITS": MANTISSA_BITS}
+    layout = ", ".join(f"{name} = {value}" for name, value in numbers.items())
+    node = f"struct Layout {{ enum {{ {layout} }}; }}; const wrt::Node<{width}, Layout> node = {{nodes.data + (long long)first}};"
 
-    @wp.func_native(source("wide/row_entries.h", **layout))
+    @wp.func_native(lanes_only(f"""
+    {node}
+    const auto entries = node.entries(wrt::node_ray(ray));
+    return wrt::load<wp::vec_t<{width}, wp::float32>>(&entries);
+    """, "{}"))
     def row_entries(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> row: ...
 
-    @wp.func_native(source("wide/row_entered.h", **layout))
+    @wp.func_native(lanes_only(f"{node} return node.entered(wrt::node_ray(ray), t_max);"))
     def row_entered(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int: ...
 
     @wp.func

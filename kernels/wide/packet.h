@@ -1,10 +1,239 @@
-    // Sixteen rays side by side: `row(NAME)` is one number of each of them (packets.py: ROWS); q: where they begin.
-    static_assert(LANES == 16, "masks of rays are 16 bits");
-    typedef float Rays __attribute__((ext_vector_type(LANES), aligned(4)));
-    typedef int RayInts __attribute__((ext_vector_type(LANES), aligned(4)));
-    typedef bool RayBools __attribute__((ext_vector_type(LANES)));
-    #define RAY_MASK(x) (int)__builtin_bit_cast(unsigned short, __builtin_convertvector((x), RayBools))
-    const RayInts lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
-    #define IN(mask) ((((mask) >> lane) & 1) != 0)
-    auto row = [q](int k) -> Rays& { return *(Rays*)(q + k); };
-    auto int_row = [q](int k) -> RayInts& { return *(RayInts*)(q + k); };
+// Steps of a packet's walk: the nodes, triangles and stack entries that sixteen rays meet (layout.py).
+#pragma once
+#include "layout.h"
+#include "triangle.h"
+
+namespace wrt {
+
+// --- all rays of a packet, or one of them (layout.py: ROWS) ---------------------------------------------------------------------
+
+typedef Lanes<LANES>::Floats Rays;
+typedef Lanes<LANES>::Ints RayInts;
+
+struct AllRays {
+    float* rows;
+    WRT_MEMBER Rays operator[](int row) const { return load<Rays>(rows + row); }
+    WRT_MEMBER RayInts bits(int row) const { return load<RayInts>(rows + row); }
+    WRT_MEMBER void put(int row, Rays value) const { store(rows + row, value); }
+    WRT_MEMBER void put_bits(int row, RayInts value) const { store(rows + row, value); }
+};
+
+struct OneRay {
+    float* rows;
+    WRT_MEMBER float operator[](int row) const { return rows[row]; }
+    WRT_MEMBER int bits(int row) const { return load<int>(rows + row); }
+    WRT_MEMBER void put(int row, float value) const { rows[row] = value; }
+    WRT_MEMBER void put_bits(int row, int value) const { store(rows + row, value); }
+};
+
+template <class T, class Number> WRT_INLINE Vec3<T> in_lanes(const Vec3<Number>& v) {
+    return {{all<T>(v[0]), all<T>(v[1]), all<T>(v[2])}};
+}
+
+// Three rows, for x, y and z.
+template <class T, class Ray> WRT_INLINE Vec3<T> vector(const Ray& ray, int first) {
+    return {{all<T>(ray[first]), all<T>(ray[first + LANES]), all<T>(ray[first + 2 * LANES])}};
+}
+
+// --- triangles ----------------------------------------------------------------------------------------------------------------
+
+// The triangles of a leaf, for one ray.
+struct LeafRow : Row<WIDTH> {
+    WRT_MEMBER Ints prim_id() const { return load<Ints>(numbers + WIDTH * PRIM_ID_ROW); }
+};
+
+// Triangle j of a row, for all rays of a packet.
+struct Triangle {
+    Vec3<float> corners[3];
+    int id;
+
+    WRT_MEMBER Triangle(const float* row, int j) : id(load<int>(row + WIDTH * PRIM_ID_ROW + j)) {
+        for (int i = 0; i < 3; ++i)
+            for (int k = 0; k < 3; ++k) corners[i][k] = row[WIDTH * (3 * i + k) + j];
+    }
+    WRT_MEMBER Rays component(int corner, RayInts k) const {
+        const Vec3<float>& v = corners[corner];
+        return k == 0 ? all<Rays>(v[0]) : (k == 1 ? all<Rays>(v[1]) : all<Rays>(v[2]));
+    }
+    WRT_MEMBER const Vec3<float>& corner(int i) const { return corners[i]; }
+    WRT_MEMBER RayInts prim_id() const { return all<RayInts>(id); }
+};
+
+// Triangles that are hit in [t_min, t] or, at t itself, whose prim_id is not higher than that of the hit there: watertight,
+// within_bounds, and `better` (traverse/common.py). Only lanes of `mask` are tested, and never a ray's own triangle (EXCLUDE).
+template <int N, class Triangles, class Ray>
+WRT_INLINE Hits<N> ray_triangle(const Triangles& triangles, const Ray& ray, int mask) {
+    typedef typename Lanes<N>::Floats Floats;
+    typedef typename Lanes<N>::Ints Ints;
+    auto axes = ray.bits(AXES);
+    auto s_x = ray[SHEAR_X], s_y = ray[SHEAR_Y];
+    const TriangleRay<decltype(axes), decltype(s_x)> shear = {
+        axes & AXIS_MASK, axes >> AXIS_BITS & AXIS_MASK, axes >> 2 * AXIS_BITS, s_x, s_y, vector<decltype(s_x)>(ray, TURNED_X)};
+    const Vec3<Floats> a = seen(triangles, 0, shear), b = seen(triangles, 1, shear), c = seen(triangles, 2, shear);
+    const Ints id = triangles.prim_id(), exclude = all<Ints>(ray.bits(EXCLUDE));
+    Hits<N> hit;
+    hit.mask = mask & mask_of(~outside(edge_areas(a, b, c)) & (id + 1 != exclude));
+    if (hit.mask == 0) return hit;
+    hit = crossing<N>(a, b, c, all<Floats>(ray[SHEAR_Z]), hit.mask);
+    if (hit.mask == 0) return hit;
+    const BoxRay<Floats> box = {vector<Floats>(ray, ORIGIN_X), vector<Floats>(ray, INVERSE_X)};
+    const auto lo = lower(lower(triangles.corner(0), triangles.corner(1)), triangles.corner(2));
+    const auto hi = upper(upper(triangles.corner(0), triangles.corner(1)), triangles.corner(2));
+    within_bounds<Bounds>(box, hit, in_lanes<Floats>(lo), in_lanes<Floats>(hi));
+    const Floats t_min = all<Floats>(ray[T_MIN]), best = all<Floats>(ray[T]);
+    const Ints best_id = all<Ints>(ray.bits(PRIM_ID));
+    hit.mask &= mask_of((absolute(hit.t) < all<Floats>(__builtin_inff())) & (hit.t >= t_min) & (hit.t <= best));
+    hit.mask &= mask_of(~((hit.t == best) & (id > best_id)));
+    return hit;
+}
+
+// Those of a row's primitives that are no triangles.
+WRT_INLINE int spheres_of(const float* row, int n_triangles) {
+    return mask_of(LeafRow{{row}}.prim_id() >= n_triangles);
+}
+
+// --- nodes --------------------------------------------------------------------------------------------------------------------
+
+struct PacketRay {
+    Vec3<Rays> origin, inv_dir, far_inv_dir;
+    Rays t_min, t_max;
+};
+
+WRT_INLINE PacketRay packet_ray(const AllRays& packet) {
+    return {vector<Rays>(packet, ORIGIN_X), vector<Rays>(packet, INVERSE_X), vector<Rays>(packet, FAR_X), packet[T_MIN], packet[T]};
+}
+
+WRT_INLINE Interval<Rays> interval_in(const PacketRay& ray, const Vec3<Rays>& near, const Vec3<Rays>& far) {
+    Interval<Rays> t = {ray.t_min, ray.t_max};
+    narrow(t, near, far, ray.origin, ray.inv_dir, ray.far_inv_dir);
+    return t;
+}
+
+typedef Lanes<WIDTH>::Floats Children;
+
+// Where the beam enters the children of a node, and leaves them. Distances are products of two intervals: bounds are the extreme
+// origin times both reciprocals. The largest reciprocal comes first: it may be infinite, and 0 * inf = NaN then says nothing.
+WRT_INLINE Interval<Children> beam_interval(const float* packet, const float* node, const int near[3]) {
+    Interval<Children> t = {all<Children>(packet[BEAM_T_MIN]), all<Children>(LARGEST)};
+    for (int k = 0; k < 3; ++k) {
+        const Children n = load<Children>(node + WIDTH * near[k]) - packet[BEAM_NEAR_ORIGIN + k];
+        const Children a = n * packet[BEAM_LARGEST + k], b = n * packet[BEAM_SMALLEST + k], least = b < a ? b : a;
+        t.enter = least > t.enter ? least : t.enter;
+        const Children f = load<Children>(node + WIDTH * (near[k] ^ 1)) - packet[BEAM_FAR_ORIGIN + k];
+        const Children c = f * packet[BEAM_FAR_LARGEST + k], d = f * packet[BEAM_FAR_SMALLEST + k], most = d > c ? d : c;
+        t.leave = most < t.leave ? most : t.leave;
+    }
+    return t;
+}
+
+// The first cache lines of what a reference leads to: a row of triangles, or a node.
+WRT_INLINE void prefetch(const float* nodes, const float* primitives, int reference) {
+    const float* const first = reference < 0 ? primitives + (long long)(~reference >> LEAF_BITS) * ROW_SIZE
+                                             : nodes + (long long)reference * NODE_SIZE;
+    for (int k = 0; k < LINES; ++k) __builtin_prefetch(first + CACHE_LINE * k);
+}
+
+// Put an entry on a stack of `size` entries; of those from `begin` on the farthest is deepest, or for any hit the first.
+template <bool ANY_HIT> WRT_INLINE void put(unsigned* stack, int begin, int size, unsigned long long key, int rays) {
+    unsigned* at = stack + ENTRY * size;
+    if constexpr (!ANY_HIT)
+        for (; at > stack + ENTRY * begin && load<unsigned long long>(at - ENTRY) < key; at -= ENTRY)
+            __builtin_memcpy(at, at - ENTRY, ENTRY * sizeof(unsigned));
+    store(at, key);
+    at[ENTRY_RAYS] = rays;
+}
+
+// Put the children of a node that rays of the mask meet on a stack of `size` entries; the size it then has. Only with a beam.
+template <bool ANY_HIT>
+WRT_CALLED int children(const float* nodes, const float* primitives, float* packet, int node, int mask, unsigned* stack, int size) {
+    const float* const p = nodes + (long long)node * NODE_SIZE;
+    const int near[3] = {(int)packet[BEAM_NEAR_ROW], (int)packet[BEAM_NEAR_ROW + 1], (int)packet[BEAM_NEAR_ROW + 2]};
+    const Interval<Children> beam = beam_interval(packet, p, near);
+    const PacketRay ray = packet_ray({packet});
+    const float *near_x = p + WIDTH * near[0], *near_y = p + WIDTH * near[1], *near_z = p + WIDTH * near[2];
+    const float *far_x = p + WIDTH * (near[0] ^ 1), *far_y = p + WIDTH * (near[1] ^ 1), *far_z = p + WIDTH * (near[2] ^ 1);
+    int left = mask_of(beam.enter <= beam.leave), top = size;
+    for (; left; left &= left - 1) {
+        const int child = lowest(left);
+        const Interval<Rays> t = interval_in(ray, in_lanes<Rays>(Vec3<float>{{near_x[child], near_y[child], near_z[child]}}),
+                                             in_lanes<Rays>(Vec3<float>{{far_x[child], far_y[child], far_z[child]}}));
+        const int met = mask_of(t.enter <= t.leave) & mask;
+        if (!met) continue;
+        const int next = load<int>(p + REFERENCES + child);
+        prefetch(nodes, primitives, next);
+        const float entry = beam.enter[child];  // of `beam.enter[child]` itself clang 22 casts the bits of element 0
+        const auto key = (unsigned long long)__builtin_bit_cast(unsigned, entry) << 32 | (unsigned)next;
+        put<ANY_HIT>(stack, size, top++, key, met);
+    }
+    return top;
+}
+
+// The rays of the mask that meet a child of the root; and ROOT_ENTRIES.
+WRT_INLINE int meets(const float* root, int mask, float* packet) {
+    const PacketRay ray = packet_ray({packet});
+    const BoxRay<Rays> box = {ray.origin, ray.inv_dir};
+    const Rays never = all<Rays>(__builtin_inff());
+    int out = 0;
+    for (int child = 0; child < WIDTH; ++child) {
+        const float* const p = root + child;
+        const auto lo = in_lanes<Rays>(Vec3<float>{{p[WIDTH * LO_X], p[WIDTH * LO_Y], p[WIDTH * LO_Z]}});
+        const auto hi = in_lanes<Rays>(Vec3<float>{{p[WIDTH * HI_X], p[WIDTH * HI_Y], p[WIDTH * HI_Z]}});
+        const Interval<Rays> t = interval_in(ray, near_planes(box, lo, hi), near_planes(box, hi, lo));
+        store(packet + ROOT_ENTRIES + LANES * child, t.enter <= t.leave ? t.enter : never);
+        out |= mask_of(t.enter <= t.leave);
+    }
+    return out & mask;
+}
+
+// The rays that reach so far.
+WRT_INLINE int reaching(float t_entry, float* packet) { return mask_of(AllRays{packet}[T] >= t_entry); }
+
+// Test the first `count` triangles of a row, one after another, against the rays of the mask; return those that hit one. After any
+// hit t is -inf.
+template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, int mask, float* numbers) {
+    const AllRays packet = {numbers};
+    int found = 0;
+    for (int j = 0; j < count; ++j) {
+        const Triangle triangle(row, j);
+        const Hits<LANES> hit = ray_triangle<LANES>(triangle, packet, mask);
+        if (hit.mask == 0) continue;
+        found |= hit.mask;
+        const RayInts on = in_mask<RayInts>(hit.mask);
+        packet.put(T, on ? (ANY_HIT ? all<Rays>(-__builtin_inff()) : hit.t) : packet[T]);
+        packet.put_bits(PRIM_ID, on ? all<RayInts>(triangle.id) : packet.bits(PRIM_ID));
+        if constexpr (ANY_HIT) {
+            if ((mask &= ~hit.mask) == 0) break;
+        } else {
+            packet.put(U, on ? narrowed<LANES>(hit.areas[1] / hit.area) : packet[U]);
+            packet.put(V, on ? narrowed<LANES>(hit.areas[2] / hit.area) : packet[V]);
+        }
+    }
+    return found;
+}
+
+// HitArrays (query.py) from `first` on; a miss has t = inf and prim_id = -1.
+template <class HitArrays> WRT_INLINE void write_hits(const HitArrays& hits, int first, int count, float* numbers) {
+    const AllRays packet = {numbers};
+    const RayInts id = packet.bits(PRIM_ID), prim_id = id == NO_HIT ? all<RayInts>(-1) : id;
+    const Rays t = id == NO_HIT ? all<Rays>(__builtin_inff()) : packet[T] * packet[SCALE];
+    if (count == LANES) {
+        store(hits.t.data + first, t);
+        store(hits.u.data + first, packet[U]);
+        store(hits.v.data + first, packet[V]);
+        store(hits.prim_id.data + first, prim_id);
+        return;
+    }
+    for (int j = 0; j < count; ++j) {
+        hits.t.data[first + j] = t[j];
+        hits.u.data[first + j] = numbers[U + j];
+        hits.v.data[first + j] = numbers[V + j];
+        hits.prim_id.data[first + j] = prim_id[j];
+    }
+}
+
+WRT_INLINE void write_occluded(bool* occluded, int count, float* numbers) {
+    const int found = mask_of(AllRays{numbers}.bits(PRIM_ID) != NO_HIT);
+    for (int j = 0; j < count; ++j) occluded[j] = found >> j & 1;
+}
+
+}  // namespace wrt

@@ -13,7 +13,6 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.native import source
 from wrt.kernels.query import LARGEST
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
@@ -21,11 +20,9 @@ from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
 from wrt.kernels.units.triangle import component
 from wrt.kernels.wide.lanes import LaneRay, bits, lowest, make_cull, prefetch
-from wrt.kernels.wide.nodes import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, far_pad, first_reference, make_children, node_size
+from wrt.kernels.wide.layout import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, STACK_SIZE, first_reference, node_size
+from wrt.kernels.wide.nodes import far_pad, make_children
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
-
-# The builder lets no walk have more entries than this (kernels.build.wide.collapse).
-STACK_SIZE = 64
 
 
 @cache
@@ -72,7 +69,11 @@ def lane_ray(probe: Probe, pad: float) -> LaneRay:
 def make_gather(record: Any, width: int) -> Any:
     """gather(rows, i): the record that has its first number at rows[i], the next at rows[i + width] and so on."""
 
-    @wp.func_native(source("wide/gather.h", WIDTH=width))
+    @wp.func_native(f"""
+    float numbers[sizeof(out) / sizeof(float)];
+    for (unsigned k = 0; k < sizeof(out) / sizeof(float); ++k) numbers[k] = rows.data[(long long)i + {width} * k];
+    memcpy(&out, numbers, sizeof(out));
+    """)
     def copy_numbers(rows: wp.array(dtype=wp.float32), i: int, out: wp.ref[record]) -> None: ...
 
     @wp.func

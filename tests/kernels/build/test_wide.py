@@ -10,7 +10,7 @@ from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, ray
 from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary
 from wrt.accel.bvh.wide_tree import collapse, stack_need
 from wrt.accel.scenes.build import build
-from wrt.kernels.wide.traverse import STACK_SIZE
+from wrt.kernels.wide.layout import STACK_SIZE
 from wrt.scene.shapes import icosphere
 
 

@@ -21,9 +21,8 @@ from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.wide.batch import FAILED, IN_A_ROW, PACKETS, PAUSED, BatchTraversal
-from wrt.kernels.wide.packets import LANES
+from wrt.kernels.wide.layout import LANES, STACK_SIZE
 from wrt.kernels.wide.references import EMPTY, leaf_reference
-from wrt.kernels.wide.traverse import STACK_SIZE
 from wrt.lab.bench.rays import ray_sets
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere

@@ -14,7 +14,8 @@ from wrt.kernels.structs import Ray, kernel
 from wrt.kernels.traverse.common import Units, make_probe
 from wrt.kernels.units.box import FAR_PAD, box_ray, ray_aabb
 from wrt.kernels.wide.lanes import LANE_PAD, lowest, make_native_cull, make_plain_cull, row_type
-from wrt.kernels.wide.nodes import make_native, make_plain, node_size
+from wrt.kernels.wide.layout import node_size
+from wrt.kernels.wide.nodes import make_native, make_plain
 from wrt.kernels.wide.traverse import lane_ray
 
 WIDTHS = (4, 8)

@@ -14,8 +14,7 @@ from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hi
 from wrt.kernels.wide import packets
 from wrt.kernels.wide.batch import PACKETS, SLOTS
 from wrt.kernels.wide.lanes import LANE_PAD, row_type
-from wrt.kernels.wide.nodes import make_plain
-from wrt.kernels.wide.packets import (
+from wrt.kernels.wide.layout import (
     BEAM,
     COHERENT,
     ENTRY,
@@ -24,11 +23,14 @@ from wrt.kernels.wide.packets import (
     PACKET_SIZE,
     ROWS,
     SLOT_SIZE,
+    STACK_SIZE,
     STACK_WORDS,
     WIDTH,
 )
+from wrt.kernels.wide.nodes import make_plain
+from wrt.kernels.wide.packets import Scratch, WideBvh, packet_kernel
 from wrt.kernels.wide.references import EMPTY
-from wrt.kernels.wide.traverse import STACK_SIZE, lane_ray
+from wrt.kernels.wide.traverse import lane_ray
 
 EXCLUDE = LANES * ROWS.index("exclude")
 NOTHING = wp.constant(99)
@@ -55,37 +57,40 @@ class Lanes:
 
 
 set_up = packets.make_set_up(RayArrays)
-children, children_any = packets.make_children(False, 80, 5), packets.make_children(True, 80, 5)
+children, children_any = packets.make_children(False), packets.make_children(True)
+triangles, triangles_any = packets.make_triangles(False), packets.make_triangles(True)
 BELOW = wp.constant(2)  # entries that are on a stack before
+
+
+@wp.func
+def lead_to(scratch: Scratch, slot: int, node: int):
+    """With an empty stack."""
+    scratch.slots[slot * SLOT_SIZE + 1] = node
+    scratch.slots[slot * SLOT_SIZE + 2] = slot * STACK_WORDS
 
 
 def make_walk(any_hit):
     begin, step, pop = packets.make_steps(any_hit)
 
     @wp.func
-    def walk(nodes: wp.array(dtype=wp.float32), node: int, empty: int, packet: wp.array(dtype=wp.float32), column: int,
-             reach: float, stacks: wp.array(dtype=wp.uint32), slots: wp.array(dtype=wp.int32), ray: int,
+    def walk(accel: WideBvh, scratch: Scratch, node: int, empty: int, column: int, reach: float, ray: int,
              begun: wp.array(dtype=wp.int32), missed: wp.array(dtype=wp.int32), out: wp.array2d(dtype=wp.int32)):
         """What is next, or NOTHING: at the root; after a step into `node` and one into `empty`; and after a step into `node` and
         one pop after another."""
-        slot = ray * SLOT_SIZE
-        bottom = ray * STACK_WORDS
-        next = begin(nodes, packet, column, stacks, bottom, slots, slot)
+        next = begin(accel, scratch, ray, column)
         begun[ray] = wp.where(next == EMPTY, NOTHING, next)
-        slots[slot + 1] = node
-        slots[slot + 2] = bottom
-        next = step(nodes, packet, stacks, bottom, slots, slot)
+        lead_to(scratch, ray, node)
+        next = step(accel, scratch, ray)
         if next != EMPTY:
-            slots[slot + 1] = empty
-            next = step(nodes, packet, stacks, bottom, slots, slot)
+            scratch.slots[ray * SLOT_SIZE + 1] = empty
+            next = step(accel, scratch, ray)
         missed[ray] = wp.where(next == EMPTY, NOTHING, next)
-        slots[slot + 1] = node
-        slots[slot + 2] = bottom
-        next = step(nodes, packet, stacks, bottom, slots, slot)
+        lead_to(scratch, ray, node)
+        next = step(accel, scratch, ray)
         out[ray, 0] = wp.where(next == EMPTY, NOTHING, next)
         for k in range(WIDTH):
             if next != EMPTY:
-                next = pop(nodes, reach, stacks, bottom, slots, slot)
+                next = pop(accel, scratch, ray, reach)
             out[ray, k + 1] = wp.where(next == EMPTY, NOTHING, next)
 
     return walk
@@ -94,43 +99,56 @@ def make_walk(any_hit):
 walk, walk_any = make_walk(False), make_walk(True)
 
 
-@kernel
-def by_packets(rays: RayArrays, count: int, reach: float, empty: int, nodes: wp.array(dtype=wp.float32),
-               rows: wp.array(dtype=wp.float32), packet: wp.array(dtype=wp.float32), stacks: wp.array(dtype=wp.uint32),
-               slots: wp.array(dtype=wp.int32), out: Lanes):
-    """Packet i with node i and row i, and a slot for each ray; rays beyond `count` of each packet are left out."""
+@wp.func
+def with_stack(scratch: Scratch, stack: wp.array(dtype=wp.uint32)):
+    own = Scratch()
+    own.packets = scratch.packets
+    own.stacks = stack
+    own.slots = scratch.slots
+    return own
+
+
+@packet_kernel
+def by_packets(rays: RayArrays, count: int, reach: float, empty: int, accel: WideBvh, nodes: wp.array2d(dtype=wp.float32),
+               scratch: Scratch, out: Lanes):
+    """Packet i with node i, and a slot for each ray; rays beyond `count` of each packet are left out. nodes: those of accel."""
     i = wp.tid()
     base = PACKET_SIZE * i
-    active = set_up(rays, LANES * i, count, LANE_PAD, packet, base)
+    active = set_up(rays, LANES * i, count, LANE_PAD, scratch, base)
     out.state[i] = active
     mask = active & wp.static(COHERENT - 1)
-    out.meets[i] = packets.meets(nodes, 64 * i, mask, packet, base)
-    out.reaching[i] = packets.reaching(0.5, packet, base)
+    root = WideBvh()
+    root.nodes = nodes[i]
+    out.meets[i] = packets.meets(root, scratch, base, mask)
+    out.reaching[i] = packets.reaching(0.5, scratch, base)
     if active >= COHERENT:
-        size = children(nodes, rows, 64 * i, mask, packet, base, out.children[i], BELOW)
-        size_any = children_any(nodes, rows, 64 * i, mask, packet, base, out.children_any[i], BELOW)
+        size = children(accel, with_stack(scratch, out.children[i]), base, i, mask, BELOW)
+        size_any = children_any(accel, with_stack(scratch, out.children_any[i]), base, i, mask, BELOW)
         out.children[i, 3] = wp.uint32(size)
         out.children_any[i, 3] = wp.uint32(size_any)
     for j in range(LANES):
         ray = LANES * i + j
-        walk(nodes, i, empty, packet, base + j, reach, stacks, slots, ray, out.begun, out.missed, out.walk)
-        walk_any(nodes, i, empty, packet, base + j, reach, stacks, slots, ray, out.begun_any, out.missed_any, out.walk_any)
+        walk(root, scratch, 0, empty - i, base + j, reach, ray, out.begun, out.missed, out.walk)
+        walk_any(root, scratch, 0, empty - i, base + j, reach, ray, out.begun_any, out.missed_any, out.walk_any)
 
 
-@kernel
-def triangles_by_packets(rows: wp.array(dtype=wp.float32), state: wp.array(dtype=wp.int32), in_row: int, any_hit: bool,
-                         packet: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.int32)):
+@packet_kernel
+def triangles_by_packets(accel: WideBvh, state: wp.array(dtype=wp.int32), in_row: int, any_hit: bool, scratch: Scratch,
+                         found: wp.array(dtype=wp.int32)):
     i = wp.tid()
     mask = state[i] & wp.static(COHERENT - 1)
-    found[i] = packets.triangles(rows, 80 * i, in_row, mask, any_hit, packet, PACKET_SIZE * i)
+    if any_hit:
+        found[i] = triangles_any(accel, 80 * i, in_row, mask, scratch, PACKET_SIZE * i)
+    else:
+        found[i] = triangles(accel, 80 * i, in_row, mask, scratch, PACKET_SIZE * i)
 
 
 ray_triangles, ray_triangles_any = packets.make_ray_triangles(False, True), packets.make_ray_triangles(True, False)
 
 
-@kernel
-def triangles_ray_by_ray(rows: wp.array(dtype=wp.float32), state: wp.array(dtype=wp.int32), in_row: int, any_hit: bool,
-                         packet: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.int32)):
+@packet_kernel
+def triangles_ray_by_ray(accel: WideBvh, state: wp.array(dtype=wp.int32), in_row: int, any_hit: bool, scratch: Scratch,
+                         found: wp.array(dtype=wp.int32)):
     """found: a lane, or -1."""
     i = wp.tid()
     for j in range(LANES):
@@ -138,9 +156,9 @@ def triangles_ray_by_ray(rows: wp.array(dtype=wp.float32), state: wp.array(dtype
         lane = int(-1)
         if (state[i] >> j) & 1 != 0:
             if any_hit:
-                lane = ray_triangles_any(rows, 80 * i, (1 << in_row) - 1, packet, column)
+                lane = ray_triangles_any(accel, 80 * i, (1 << in_row) - 1, scratch, column)
             else:
-                lane = ray_triangles(rows, 80 * i, (1 << in_row) - 1, packet, column)
+                lane = ray_triangles(accel, 80 * i, (1 << in_row) - 1, scratch, column)
         found[LANES * i + j] = lane
 
 
@@ -222,9 +240,11 @@ class Both:
                              ("walk", (n * LANES, WIDTH + 1)), ("walk_any", (n * LANES, WIDTH + 1))):
             setattr(lanes, name, zeros(length, wp.int32))
         lanes.children, lanes.children_any = (zeros((n, ENTRY * (BELOW + WIDTH)), wp.uint32) for _ in range(2))
-        packet, stacks = zeros(n * PACKET_SIZE), zeros(n * LANES * STACK_WORDS, wp.uint32)
-        slots = zeros(n * LANES * SLOT_SIZE, wp.int32)
-        launch(by_packets, n, self.rays, count, reach, n, nodes, rows, packet, stacks, slots, lanes)
+        accel, scratch = WideBvh(), Scratch()
+        accel.nodes, accel.primitives = nodes, rows
+        scratch.packets = packet = zeros(n * PACKET_SIZE)
+        scratch.stacks, scratch.slots = zeros(n * LANES * STACK_WORDS, wp.uint32), zeros(n * LANES * SLOT_SIZE, wp.int32)
+        launch(by_packets, n, self.rays, count, reach, n, accel, nodes.reshape((n + 1, 8 * WIDTH)), scratch, lanes)
         self.state, self.meets, self.reaching = (getattr(lanes, name).numpy() for name in ("state", "meets", "reaching"))
         self.stacks = [array.numpy().reshape(n, BELOW + WIDTH, ENTRY) for array in (lanes.children, lanes.children_any)]
         self.begun, self.walk = lanes.begun.numpy(), lanes.walk.numpy()
@@ -234,10 +254,12 @@ class Both:
         exclude = np.zeros(n * LANES, np.int32) if exclude is None else exclude.astype(np.int32)
         packet.numpy().reshape(n, PACKET_SIZE)[:, EXCLUDE : EXCLUDE + LANES] = exclude.view(np.float32).reshape(n, LANES)
         one_by_one, self.lanes = wp.clone(packet), zeros(n * LANES, wp.int32)
-        launch(triangles_ray_by_ray, n, rows, lanes.state, in_row, any_hit, one_by_one, self.lanes)
+        scratch.packets = one_by_one
+        launch(triangles_ray_by_ray, n, accel, lanes.state, in_row, any_hit, scratch, self.lanes)
+        scratch.packets = packet
         self.one_by_one = one_by_one.numpy().reshape(n, PACKET_SIZE)
         found = zeros(n, wp.int32)
-        launch(triangles_by_packets, n, rows, lanes.state, in_row, any_hit, packet, found)
+        launch(triangles_by_packets, n, accel, lanes.state, in_row, any_hit, scratch, found)
         self.found, self.after = found.numpy(), packet.numpy().reshape(n, PACKET_SIZE)
 
         out_type, scalars = scalar_kernel()

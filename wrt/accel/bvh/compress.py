@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.kernels.wide.nodes import EXIST_SHIFT, EXPONENT_BITS, FIRST_BYTES, MANTISSA_BITS, PLANES, WORD, first_reference
+from wrt.kernels.wide.layout import EXIST_SHIFT, EXPONENT_BITS, FIRST_BYTES, MANTISSA_BITS, PLANES, WORD, first_reference
 
 EXPONENT_BIAS, LARGEST_EXPONENT = 127, 255  # of float32
 LARGEST_BYTE = 255

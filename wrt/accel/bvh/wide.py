@@ -18,9 +18,9 @@ from wrt.core.device import empty_aligned, preloading, record_dtype
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.kernels.wide.batch import BatchTraversal
-from wrt.kernels.wide.nodes import PLANES, first_reference, node_size
+from wrt.kernels.wide.layout import PLANES, STACK_SIZE, first_reference, node_size
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first
-from wrt.kernels.wide.traverse import STACK_SIZE, WideTraversal
+from wrt.kernels.wide.traverse import WideTraversal
 
 ROWS_PER_JOB = 4096
 

@@ -13,8 +13,8 @@ from wrt.core.device import launch, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build import wide as build_wide
 from wrt.kernels.traverse.bvh2 import Bvh2Node
+from wrt.kernels.wide.layout import STACK_SIZE
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first, leaf_reference
-from wrt.kernels.wide.traverse import STACK_SIZE
 
 COLLAPSE = build_wide.subtree_costs, build_wide.collapse  # kernels of `collapse`
 

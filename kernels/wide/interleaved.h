@@ -1,0 +1,121 @@
+// Steps of one ray among many that are under way at once (layout.py: LEVEL, SLOT_WORDS). All return the next reference, or EMPTY (0)
+// where the ray is done. nodes: of the tree; slot: the ray's; stacks: of all rays, where this one's begins at `bottom`.
+#pragma once
+#include "packet.h"
+
+namespace wrt {
+
+// Take the next child from a ray's stack, whose last level is at `at`: for any hit the last child there, else the nearest that
+// begins at or before `reach`.
+template <bool ANY_HIT> WRT_INLINE int take(const float* nodes, float reach, unsigned* stacks, int bottom, int at, int* slot) {
+    unsigned* level;
+    int child;
+    if constexpr (ANY_HIT) {
+        if (at == bottom) return 0;
+        level = stacks + at;
+        child = 31 - __builtin_clz(level[LEVEL_LEFT]);
+    } else {
+        // Keys are not sorted: the least is looked for when one is wanted, since most rays meet one child or two.
+        unsigned key;
+        for (;; at -= LEVEL) {
+            if (at == bottom) return 0;
+            level = stacks + at;
+            key = least_of(load<Lanes<WIDTH>::Keys>(level));
+            // Equal stays: a tie may have a lower prim_id.
+            if (__builtin_bit_cast(float, key & ~(unsigned)KEY_MASK) <= reach) break;
+        }
+        child = key & (WIDTH - 1);
+        level[child] = ~0u;
+    }
+    const unsigned left = level[LEVEL_LEFT] ^ 1u << child;
+    level[LEVEL_LEFT] = left;
+    const int next = load<int>(nodes + (long long)level[LEVEL_REFERENCES] + child);
+    slot[SLOT_NEXT] = next;
+    slot[SLOT_PLACE] = left != 0 ? at : at - LEVEL;
+    return next;
+}
+
+// Put the children of a node that a ray meets on its stack, if it meets any, as a new level; then take one. Both cases share one
+// path: about every third node has no child that is met, and a branch on that is mispredicted. Distances are not negative.
+template <bool ANY_HIT>
+WRT_INLINE int put_and_take(const float* nodes, int first, const Interval<Lanes<WIDTH>::Floats>& t, float reach, unsigned* stacks,
+                            int bottom, int* slot) {
+    typedef Lanes<WIDTH>::Keys Keys;
+    static_assert(WIDTH == 8, "the children have numbers");
+    const auto met = t.enter <= t.leave;
+    const unsigned left = mask_of(met);
+    const int place = slot[SLOT_PLACE];
+    unsigned* const level = stacks + place + LEVEL;
+    if constexpr (!ANY_HIT) {
+        const Keys child = {0, 1, 2, 3, 4, 5, 6, 7};
+        store(level, (__builtin_bit_cast(Keys, t.enter) & ~(unsigned)KEY_MASK) | (child + WIDTH) | ~__builtin_bit_cast(Keys, met));
+    }
+    level[LEVEL_LEFT] = left;
+    level[LEVEL_REFERENCES] = first + REFERENCES;
+    return take<ANY_HIT>(nodes, reach, stacks, bottom, WRT_UNPREDICTABLE(left != 0) ? place + LEVEL : place, slot);
+}
+
+// Put a ray into a slot, at the root's children, into which `meets` has found it to go.
+template <bool ANY_HIT> WRT_INLINE int begin(const float* nodes, float* packets, int ray, unsigned* stacks, int bottom, int* slot) {
+    typedef Lanes<WIDTH>::Floats Children;
+    Children enter;
+    for (int child = 0; child < WIDTH; ++child) enter[child] = packets[ray + ROOT_ENTRIES + LANES * child];
+    slot[SLOT_RAY] = ray;
+    slot[SLOT_PLACE] = bottom;
+    const float reach = __builtin_inff();
+    return put_and_take<ANY_HIT>(nodes, 0, {enter, all<Children>(LARGEST)}, reach, stacks, bottom, slot);
+}
+
+// From a node to the next child, its own or one on the stack.
+template <bool ANY_HIT> WRT_INLINE int step(const float* nodes, float* packets, unsigned* stacks, int bottom, int* slot) {
+    typedef Lanes<WIDTH>::Floats Children;
+    const int first = slot[SLOT_NEXT] * NODE_SIZE;
+    const OneRay ray = {packets + slot[SLOT_RAY]};
+    const float* const node = nodes + (long long)first;
+    const int near_x = ray.bits(NEAR_X), near_y = ray.bits(NEAR_Y), near_z = ray.bits(NEAR_Z);
+    const Vec3<Children> near = {{load<Children>(node + near_x), load<Children>(node + near_y), load<Children>(node + near_z)}};
+    const Vec3<Children> far = {{load<Children>(node + (near_x ^ WIDTH)), load<Children>(node + (near_y ^ WIDTH)),
+                                 load<Children>(node + (near_z ^ WIDTH))}};
+    const float reach = ray[T];
+    Interval<Children> t = {all<Children>(ray[T_MIN]), all<Children>(reach)};
+    narrow(t, near, far, vector<float>(ray, ORIGIN_X), vector<float>(ray, INVERSE_X), vector<float>(ray, FAR_X));
+    return put_and_take<ANY_HIT>(nodes, first, t, reach, stacks, bottom, slot);
+}
+
+// From a leaf to a child on the stack that begins at or before `reach`, the ray's t.
+template <bool ANY_HIT> WRT_INLINE int pop(const float* nodes, float reach, unsigned* stacks, int bottom, int* slot) {
+    return take<ANY_HIT>(nodes, reach, stacks, bottom, slot[SLOT_PLACE], slot);
+}
+
+// Test the triangles of a row in the mask; return the lane of the nearest that is hit, or -1. The hit goes to the ray's column of
+// its packet: of any hit only t = -inf and some prim_id, and its lane is 0.
+template <bool ANY_HIT> WRT_INLINE int ray_triangles_here(const float* row, int mask, float* column) {
+    const OneRay ray = {column};
+    const LeafRow triangles = {{row}};
+    const Hits<WIDTH> hit = ray_triangle<WIDTH>(triangles, ray, mask);
+    if (hit.mask == 0) return -1;
+    if constexpr (ANY_HIT) {
+        ray.put(T, -__builtin_inff());
+        ray.put_bits(PRIM_ID, 0);
+        return 0;
+    }
+    const auto id = triangles.prim_id();
+    int j = lowest(hit.mask);
+    for (int others = hit.mask & (hit.mask - 1); others; others &= others - 1) {
+        const int k = lowest(others);
+        if (hit.t[k] < hit.t[j] || (hit.t[k] == hit.t[j] && id[k] < id[j])) j = k;
+    }
+    const double area = hit.area[j], area_1 = hit.areas[1][j], area_2 = hit.areas[2][j];
+    ray.put(T, hit.t[j]);
+    ray.put(U, (float)(area_1 / area));
+    ray.put(V, (float)(area_2 / area));
+    ray.put_bits(PRIM_ID, id[j]);
+    return j;
+}
+
+// The same, as a function that is called.
+template <bool ANY_HIT> WRT_CALLED int ray_triangles(const float* row, int mask, float* column) {
+    return ray_triangles_here<ANY_HIT>(row, mask, column);
+}
+
+}  // namespace wrt

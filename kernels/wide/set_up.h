@@ -1,0 +1,197 @@
+// Set-up of a packet: query.py's scaled_ray, then what units and nodes ask of a ray, and the beam.
+#pragma once
+#include "packet.h"
+
+namespace wrt {
+
+// Arrays of rays, from the first one of a packet on. excludes: as Ray.exclude_plus_one, or null.
+struct RayPointers {
+    const float *origins, *directions, *t_mins, *t_maxs;
+    const int* excludes;
+    bool one_t_min, one_t_max;  // for all rays
+};
+
+// Of Warp's arrays without gaps, or with a stride of 0 for one t_min or t_max (query.py: RayArrays).
+template <class RayArrays> WRT_INLINE RayPointers pointers_to(const RayArrays& rays, int first, const int* excludes) {
+    const bool one_t_min = rays.t_min.strides[0] == 0, one_t_max = rays.t_max.strides[0] == 0;
+    return {(const float*)(rays.origin.data + first), (const float*)(rays.direction.data + first),
+            rays.t_min.data + (one_t_min ? 0 : first), rays.t_max.data + (one_t_max ? 0 : first),
+            excludes, one_t_min, one_t_max};
+}
+
+struct SixteenRays {
+    Vec3<Rays> origin, direction;
+    Rays t_min, t_max;
+    RayInts exclude;
+};
+
+// Component K of sixteen vectors of three. Three registers hold them: the first two give 11 or 10 numbers, the third the rest.
+template <int K> WRT_INLINE Rays component_of(const float* v) {
+    const Rays two = __builtin_shufflevector(load<Rays>(v), load<Rays>(v + LANES), K, K + 3, K + 6, K + 9, K + 12, K + 15, K + 18,
+                                             K + 21, K + 24, K + 27, K < 2 ? K + 30 : 0, 0, 0, 0, 0, 0);
+    return __builtin_shufflevector(two, load<Rays>(v + 2 * LANES), 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, K < 2 ? 10 : 16, K + 17, K + 20,
+                                   K + 23, K + 26, K + 29);
+}
+
+WRT_INLINE Vec3<Rays> vectors_of(const float* v) { return {{component_of<0>(v), component_of<1>(v), component_of<2>(v)}}; }
+
+// `count` rays, the last one of which is repeated to fill the lanes.
+WRT_INLINE SixteenRays load_rays(const RayPointers& from, int count) {
+    SixteenRays out;
+    if (count == LANES) {
+        out.origin = vectors_of(from.origins);
+        out.direction = vectors_of(from.directions);
+        out.t_min = from.one_t_min ? all<Rays>(*from.t_mins) : load<Rays>(from.t_mins);
+        out.t_max = from.one_t_max ? all<Rays>(*from.t_maxs) : load<Rays>(from.t_maxs);
+    } else {
+        float copy[8][LANES];
+        for (int j = 0; j < LANES; ++j) {
+            const int i = j < count ? j : count - 1;
+            for (int k = 0; k < 3; ++k) {
+                copy[k][j] = from.origins[3 * i + k];
+                copy[3 + k][j] = from.directions[3 * i + k];
+            }
+            copy[6][j] = from.t_mins[from.one_t_min ? 0 : i];
+            copy[7][j] = from.t_maxs[from.one_t_max ? 0 : i];
+        }
+        out.origin = {{load<Rays>(copy[0]), load<Rays>(copy[1]), load<Rays>(copy[2])}};
+        out.direction = {{load<Rays>(copy[3]), load<Rays>(copy[4]), load<Rays>(copy[5])}};
+        out.t_min = load<Rays>(copy[6]);
+        out.t_max = load<Rays>(copy[7]);
+    }
+    out.exclude = RayInts{};
+    if (from.excludes)
+        for (int j = 0; j < LANES; ++j) out.exclude[j] = from.excludes[j < count ? j : count - 1];
+    return out;
+}
+
+WRT_INLINE Rays longest(const Vec3<Rays>& v) {
+    const Rays x = absolute(v[0]), y = absolute(v[1]), z = absolute(v[2]), longer = y > x ? y : x;
+    return z > longer ? z : longer;
+}
+
+// The mask of rays whose numbers a query refuses (wrt.accel.queries.rays).
+WRT_INLINE int refused(const SixteenRays& rays) {
+    RayInts good = (longest(rays.direction) > 0.0f) & (rays.t_min >= 0.0f) & (rays.t_max == rays.t_max);
+    for (int k = 0; k < 3; ++k) good &= (absolute(rays.origin[k]) <= FARTHEST) & (absolute(rays.direction[k]) <= LARGEST);
+    return mask_of(~good);
+}
+
+// To units of a direction whose length no reciprocal loses; the factor by which directions were scaled. A t_min of -0 becomes 0.
+template <bool SCALED> WRT_INLINE Rays scale_rays(SixteenRays& rays) {
+    const Rays one = all<Rays>(1.0f), largest = all<Rays>(LARGEST), length = longest(rays.direction);
+    Rays scale = one, inverse = one;
+    if constexpr (SCALED) {
+        scale = length > LONGEST ? all<Rays>(SHORTEN) : (length < SHORTEST ? all<Rays>(LENGTHEN) : one);
+        inverse = length > LONGEST ? all<Rays>(1.0f / SHORTEN) : (length < SHORTEST ? all<Rays>(1.0f / LENGTHEN) : one);
+        for (int k = 0; k < 3; ++k) rays.direction[k] = scale * rays.direction[k];
+    }
+    rays.t_min = rays.t_min * inverse + 0.0f;
+    rays.t_max = (rays.t_max > largest ? largest : rays.t_max) * inverse;
+    return scale;
+}
+
+// t of the best hit before anything is found: traverse/common.py. A ray that is not finite has an empty segment.
+WRT_INLINE Rays no_hit(const SixteenRays& rays) {
+    const Rays zero_x = 0.0f * rays.origin[0] + 0.0f * rays.direction[0], zero_y = 0.0f * rays.origin[1] + 0.0f * rays.direction[1];
+    const Rays zero_z = 0.0f * rays.origin[2] + 0.0f * rays.direction[2], largest = all<Rays>(LARGEST);
+    const Rays t = zero_x + zero_y + zero_z == 0.0f ? rays.t_max : all<Rays>(-__builtin_inff());
+    return t < largest ? t : largest;
+}
+
+WRT_INLINE Rays component(const Vec3<Rays>& v, RayInts k) { return k == 0 ? v[0] : (k == 1 ? v[1] : v[2]); }
+
+template <class Ray> WRT_INLINE void put_vector(const Ray& ray, int first, const Vec3<Rays>& v) {
+    for (int k = 0; k < 3; ++k) ray.put(first + LANES * k, v[k]);
+}
+
+// The triangle unit's set-up.
+WRT_INLINE void put_triangle_ray(const AllRays& packet, const Vec3<Rays>& o, const Vec3<Rays>& d) {
+    const RayInts zero = {}, one = all<RayInts>(1), two = all<RayInts>(2);
+    const Rays size_x = absolute(d[0]), size_y = absolute(d[1]), size_z = absolute(d[2]);
+    RayInts kz = size_y > size_x ? one : zero;
+    kz = size_z > (kz == 0 ? size_x : size_y) ? two : kz;
+    const RayInts next = kz == 2 ? zero : kz + 1, after = next == 2 ? zero : next + 1;
+    const Rays d_z = component(d, kz);
+    const RayInts kx = d_z < 0.0f ? after : next, ky = d_z < 0.0f ? next : after;
+    packet.put_bits(AXES, kx | ky << AXIS_BITS | kz << 2 * AXIS_BITS);
+    put_vector(packet, TURNED_X, {{component(o, kx), component(o, ky), component(o, kz)}});
+    put_vector(packet, SHEAR_X, {{component(d, kx) / d_z, component(d, ky) / d_z, 1.0f / d_z}});
+}
+
+// Where the near planes of an axis begin in a node.
+WRT_INLINE RayInts near_row(Rays inv_dir, int lo, int hi) {
+    return inv_dir < 0.0f ? all<RayInts>(WIDTH * hi) : all<RayInts>(WIDTH * lo);
+}
+
+// The lesser of two neighbours, a's in the lower half and b's in the upper: four layers leave the least of each of sixteen rows.
+WRT_INLINE Rays lesser(Rays a, Rays b) {
+    const Rays even = __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    const Rays odd = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+    return even < odd ? even : odd;
+}
+
+WRT_INLINE Rays lesser(Rays a, Rays b, Rays c, Rays d) { return lesser(lesser(a, b), lesser(c, d)); }
+
+// Put the beam around all active rays, whose rows are in the packet (layout.py: BEAM_WORDS); return false if they do not run
+// the same way along each axis.
+WRT_INLINE bool put_beam(float* packet, const SixteenRays& rays, const Vec3<Rays>& inv_dir, int active, float far_pad) {
+    int down[3];
+    for (int k = 0; k < 3; ++k) {
+        down[k] = mask_of(inv_dir[k] < 0.0f) & active;
+        if (down[k] && down[k] != active) return false;
+    }
+    if (active == 0) return false;
+    // A lane without an active ray takes the numbers of one that has one.
+    const int some = lowest(active);
+    const RayInts on = in_mask<RayInts>(active);
+    Vec3<Rays> o, i;
+    for (int k = 0; k < 3; ++k) {
+        o[k] = on ? rays.origin[k] : all<Rays>(packet[ORIGIN_X + LANES * k + some]);
+        i[k] = on ? inv_dir[k] : all<Rays>(packet[INVERSE_X + LANES * k + some]);
+    }
+    const Rays begin = on ? rays.t_min : all<Rays>(packet[T_MIN + some]);
+    // A greatest number is the least of the negative ones.
+    const Rays least = lesser(lesser(lesser(o[0], o[1], o[2], -o[0]), lesser(-o[1], -o[2], i[0], i[1])),
+                              lesser(lesser(i[2], -i[0], -i[1], -i[2]), lesser(begin, begin, begin, begin)));
+    // The least origins, the greatest ones, the least reciprocals, the greatest; or of an axis where rays run down, the other way
+    // round: in order those to near planes, to far planes, the largest reciprocals in magnitude, the smallest.
+    const Rays ends = __builtin_shufflevector(least, -least, 0, 1, 2, 19, 20, 21, 6, 7, 8, 25, 26, 27, 12, 13, 14, 15);
+    const Rays other_ends = __builtin_shufflevector(ends, ends, 3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8, 12, 13, 14, 15);
+    const int x = down[0], y = down[1], z = down[2];
+    const RayInts runs_down = {x, y, z, x, y, z, x, y, z, x, y, z};
+    const Rays beam = runs_down != 0 ? ends : other_ends, far = far_pad * beam;
+    for (int k = 0; k < 12; ++k) packet[BEAM_NEAR_ORIGIN + k] = beam[k];
+    for (int k = 0; k < 6; ++k) packet[BEAM_FAR_LARGEST + k] = far[6 + k];
+    for (int k = 0; k < 3; ++k) packet[BEAM_NEAR_ROW + k] = 2 * k + (down[k] != 0);
+    packet[BEAM_T_MIN] = least[12];
+    return true;
+}
+
+// The set-up of `count` rays; the mask of those with a segment that is not empty, and COHERENT if they have a beam.
+template <bool SCALED> WRT_CALLED int set_up(const RayPointers& from, int count, float far_pad, float* numbers) {
+    SixteenRays rays = load_rays(from, count);
+    const AllRays packet = {numbers};
+    store(numbers + REFUSED, refused(rays));
+    packet.put(SCALE, scale_rays<SCALED>(rays));
+    rays.t_max = no_hit(rays);
+    const Vec3<Rays>&o = rays.origin, &d = rays.direction, i = {{1.0f / d[0], 1.0f / d[1], 1.0f / d[2]}};
+    put_vector(packet, ORIGIN_X, o);
+    put_vector(packet, DIRECTION_X, d);
+    put_vector(packet, INVERSE_X, i);
+    put_vector(packet, FAR_X, {{far_pad * i[0], far_pad * i[1], far_pad * i[2]}});
+    packet.put_bits(NEAR_X, near_row(i[0], LO_X, HI_X));
+    packet.put_bits(NEAR_Y, near_row(i[1], LO_Y, HI_Y));
+    packet.put_bits(NEAR_Z, near_row(i[2], LO_Z, HI_Z));
+    put_triangle_ray(packet, o, d);
+    packet.put(T_MIN, rays.t_min);
+    packet.put_bits(EXCLUDE, rays.exclude);
+    packet.put(T, rays.t_max);
+    packet.put(U, Rays{});
+    packet.put(V, Rays{});
+    packet.put_bits(PRIM_ID, all<RayInts>(NO_HIT));
+    const int active = mask_of(rays.t_max >= rays.t_min) & ((1 << count) - 1);
+    return put_beam(numbers, rays, i, active, far_pad) ? active | COHERENT : active;
+}
+
+}  // namespace wrt

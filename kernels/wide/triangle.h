@@ -1,0 +1,147 @@
+// Triangles: the watertight test of units/triangle.py in lanes, under the same names. One ray and a row of triangles, or rays of a
+// packet and one triangle.
+#pragma once
+#include "box.h"
+
+namespace wrt {
+
+// A row of N triangles: the first number of all their records, then the second, and so on.
+template <int N> struct Row {
+    const float* numbers;
+    typedef typename Lanes<N>::Floats Floats;
+    typedef typename Lanes<N>::Ints Ints;
+    WRT_MEMBER Floats component(int corner, int k) const { return load<Floats>(numbers + N * (3 * corner + k)); }
+    WRT_MEMBER Vec3<Floats> corner(int i) const { return {{component(i, 0), component(i, 1), component(i, 2)}}; }
+};
+
+// origin: in the order kx, ky, kz.
+template <class Int, class Number> struct TriangleRay {
+    Int kx, ky, kz;
+    Number shear_x, shear_y;
+    Vec3<Number> origin;
+};
+
+// A corner, relative to the origin, as the ray sees it.
+template <class Triangles, class Int, class Number>
+WRT_INLINE auto seen(const Triangles& triangles, int corner, const TriangleRay<Int, Number>& ray) {
+    auto x = triangles.component(corner, ray.kx) - ray.origin[0];
+    auto y = triangles.component(corner, ray.ky) - ray.origin[1];
+    auto z = triangles.component(corner, ray.kz) - ray.origin[2];
+    return Vec3<decltype(z)>{{x - ray.shear_x * z, y - ray.shear_y * z, z}};
+}
+
+template <class T> WRT_INLINE Vec3<T> edge_areas(const Vec3<T>& a, const Vec3<T>& b, const Vec3<T>& c) {
+    return {{c[0] * b[1] - c[1] * b[0], a[0] * c[1] - a[1] * c[0], b[0] * a[1] - b[1] * a[0]}};
+}
+
+template <class T> WRT_INLINE auto outside(const Vec3<T>& areas) {
+    const T zero = {};
+    return ((areas[0] < zero) | (areas[1] < zero) | (areas[2] < zero))
+           & ((areas[0] > zero) | (areas[1] > zero) | (areas[2] > zero));
+}
+
+// The mask of a row's triangles without those that the test refuses in float32.
+template <int N, class LaneRay> WRT_INLINE int cull(const float* numbers, const LaneRay& ray) {
+    const Row<N> row = {numbers};
+    const TriangleRay<int, float> shear = {ray.kx, ray.ky, ray.kz, ray.shear_x, ray.shear_y,
+                                           {{ray.origin[0], ray.origin[1], ray.origin[2]}}};
+    return mask_of(~outside(edge_areas(seen(row, 0, shear), seen(row, 1, shear), seen(row, 2, shear))));
+}
+
+template <int N> WRT_INLINE typename Lanes<N>::Doubles wide(typename Lanes<N>::Floats x) {
+    return __builtin_convertvector(x, typename Lanes<N>::Doubles);
+}
+
+template <int N> WRT_INLINE typename Lanes<N>::Floats narrowed(typename Lanes<N>::Doubles x) {
+    return __builtin_convertvector(x, typename Lanes<N>::Floats);
+}
+
+template <int N> WRT_INLINE Vec3<typename Lanes<N>::Doubles> wide(const Vec3<typename Lanes<N>::Floats>& v) {
+    return {{wide<N>(v[0]), wide<N>(v[1]), wide<N>(v[2])}};
+}
+
+// In the lanes of `mask`; u and v are areas[1] / area and areas[2] / area.
+template <int N> struct Hits {
+    typename Lanes<N>::Floats t;
+    Vec3<typename Lanes<N>::Doubles> areas;
+    typename Lanes<N>::Doubles area;
+    int mask;
+};
+
+// Where the z axis meets triangles of sheared corners, in float64: of the lanes of `mask`, those where it does.
+template <int N, class Floats>
+WRT_INLINE Hits<N> crossing(const Vec3<Floats>& a, const Vec3<Floats>& b, const Vec3<Floats>& c, Floats shear_z, int mask) {
+    typedef typename Lanes<N>::Doubles Doubles;
+    const Doubles zero = {};
+    Hits<N> hit;
+    hit.areas = edge_areas(wide<N>(a), wide<N>(b), wide<N>(c));
+    hit.area = hit.areas[0] + hit.areas[1] + hit.areas[2];
+    hit.mask = mask & mask_of(~outside(hit.areas) & ((hit.area < zero) | (hit.area > zero)));
+    if (hit.mask == 0) return hit;
+    const Doubles z = hit.areas[0] * wide<N>(a[2]) + hit.areas[1] * wide<N>(b[2]) + hit.areas[2] * wide<N>(c[2]);
+    hit.t = narrowed<N>(z / hit.area * wide<N>(shear_z));
+    return hit;
+}
+
+template <class T> WRT_INLINE Vec3<T> lower(const Vec3<T>& a, const Vec3<T>& b) {
+    return {{b[0] < a[0] ? b[0] : a[0], b[1] < a[1] ? b[1] : a[1], b[2] < a[2] ? b[2] : a[2]}};
+}
+
+template <class T> WRT_INLINE Vec3<T> upper(const Vec3<T>& a, const Vec3<T>& b) {
+    return {{b[0] > a[0] ? b[0] : a[0], b[1] > a[1] ? b[1] : a[1], b[2] > a[2] ? b[2] : a[2]}};
+}
+
+// Bounds: the constants of units/box.py and units/triangle.py, under their names.
+template <class Bounds, class T> WRT_INLINE T box_pad(const Vec3<T>& lo, const Vec3<T>& hi) {
+    const T e_x = hi[0] - lo[0], e_y = hi[1] - lo[1], e_z = hi[2] - lo[2];
+    const T longer = e_x > e_y ? e_x : e_y;
+    return Bounds::PAD_EXTENT * (e_z > longer ? e_z : longer) + Bounds::PAD_SMALLEST;
+}
+
+template <class Bounds, class Floats>
+WRT_INLINE Interval<Floats> padded_interval(const BoxRay<Floats>& ray, const Vec3<Floats>& lo, const Vec3<Floats>& hi) {
+    const Floats pad = box_pad<Bounds>(lo, hi);
+    Vec3<Floats> padded_lo, padded_hi;
+    for (int k = 0; k < 3; ++k) {
+        padded_lo[k] = lo[k] - (pad + Bounds::PAD_COORDINATE * absolute(lo[k]));
+        padded_hi[k] = hi[k] + (pad + Bounds::PAD_COORDINATE * absolute(hi[k]));
+    }
+    return slab_interval(ray, padded_lo, padded_hi);
+}
+
+template <class Floats> WRT_INLINE Floats clamped(Floats t, const Interval<Floats>& interval) {
+    const Floats inside = t > interval.leave ? interval.leave : t;
+    return inside < interval.enter ? interval.enter : inside;
+}
+
+// Of the lanes of `mask`: where clamping moved t farther than rounding explains, on a ray whose shear may have underflowed.
+template <class Bounds, class Floats>
+WRT_INLINE int underflowed(const BoxRay<Floats>& ray, Floats t, Floats moved, int mask) {
+    mask &= mask_of(absolute(moved - t) > Bounds::CLAMP_ROUNDING * absolute(t) + Bounds::CLAMP_STEP);
+    if (mask == 0) return 0;
+    const Floats inf = all<Floats>(__builtin_inff());
+    Floats steep = inf, grazing = {};
+    for (int axis = 0; axis < 3; ++axis) {
+        const Floats inverse = absolute(ray.inv_dir[axis]);
+        steep = inverse < steep ? inverse : steep;
+        grazing = ((inverse > grazing) & (inverse < inf)) ? inverse : grazing;
+    }
+    const Floats least = Bounds::SLOWEST * grazing;
+    return mask & mask_of((steep < least) | ((absolute(t) < least) & (absolute(moved) < least)));
+}
+
+// Move the t of hits into the intervals of their triangles' own boxes, or of the padded ones; leave out those that miss even that.
+template <class Bounds, int N, class Floats>
+WRT_INLINE void within_bounds(const BoxRay<Floats>& ray, Hits<N>& hit, const Vec3<Floats>& lo, const Vec3<Floats>& hi) {
+    Interval<Floats> interval = slab_interval(ray, lo, hi);
+    Floats moved = clamped(hit.t, interval);
+    const int again = (mask_of(~(interval.enter <= interval.leave)) & hit.mask) | underflowed<Bounds>(ray, hit.t, moved, hit.mask);
+    if (again) {
+        interval = padded_interval<Bounds>(ray, lo, hi);
+        hit.mask &= ~again | mask_of(interval.enter <= interval.leave * Bounds::FAR_PAD);
+        moved = in_mask<typename Lanes<N>::Ints>(again) ? clamped(hit.t, interval) : moved;
+    }
+    hit.t = moved;
+}
+
+}  // namespace wrt

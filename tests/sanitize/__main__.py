@@ -1,0 +1,84 @@
+"""The native code under the sanitizers of addresses and of undefined behaviour: `python -m tests.sanitize`.
+
+Each program of PROGRAMS is compiled by g++, and by clang++ where there is one, with headers of kernels/ and nothing of Warp. It
+reads cases that Python wrote, walks them in arrays that end where they must, and compares its answers with those of the scalar
+kernels. A further program is one more row: its source here, its own layout.h, and a function that writes its cases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from tests.data import ROOT
+from tests.sanitize.cases import write_cases
+from wrt.kernels.wide.layout import LAYOUT_H
+
+HERE = Path(__file__).parent
+COMPILERS = "g++", "clang++"
+PLAIN = "-std=c++17", "-ffp-contract=off", "-Wall", "-Wextra", "-Wno-psabi"  # psabi: vectors as arguments, within one file
+SANITIZED = "-O1", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
+
+LIMIT = 120  # seconds: a walk may be broken so that it never ends
+
+
+class Program(NamedTuple):
+    """headers: the folder of kernels/ that it includes from; layout: the text of layout.h there."""
+
+    source: str
+    headers: str
+    layout: str
+    write_cases: Callable[[Path], None]
+
+
+PROGRAMS = (Program("walks.cpp", "wide", LAYOUT_H, write_cases),)
+
+
+def compile_program(compiler: str, program: Program, folder: Path, *flags: str) -> Path:
+    """Compile into a folder, where layout.h is written too. Raises CalledProcessError."""
+    (folder / "layout.h").write_text("#pragma once\n" + program.layout)
+    out = folder / f"{program.source}-{compiler}"
+    where = "-I", str(ROOT / "kernels" / program.headers), "-I", str(folder)
+    subprocess.run([compiler, *PLAIN, *flags, *where, str(HERE / program.source), "-o", str(out)], check=True)
+    return out
+
+
+def usable() -> list[str]:
+    """The compilers that are there and can link the sanitizers' libraries."""
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "empty.cpp"
+        source.write_text("int main() { return 0; }\n")
+        command = [*SANITIZED, str(source), "-o", str(Path(folder) / "empty")]
+        return [name for name in COMPILERS if shutil.which(name)
+                and subprocess.run([name, *command], capture_output=True, check=False).returncode == 0]
+
+
+def main(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.sanitize", description=__doc__)
+    parser.add_argument("--if-possible", action="store_true", help="end with 0 where no compiler has the sanitizers")
+    options = parser.parse_args(arguments)
+    compilers = usable()
+    if not compilers:
+        print("not run: neither g++ nor clang++ is there with the libraries of -fsanitize=address,undefined")
+        return 0 if options.if_possible else 2
+    worst = 0
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for program in PROGRAMS:
+            program.write_cases(folder / "cases")
+            for compiler in compilers:
+                print(f"{program.source}, {compiler}: ", end="", flush=True)
+                runs = compile_program(compiler, program, folder, *SANITIZED)
+                result = subprocess.run([str(runs), str(folder / "cases")], check=False, timeout=LIMIT)
+                worst = max(worst, abs(result.returncode))
+    return 1 if worst else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,82 @@
+"""Trees and rays for walks.cpp, with the answers of the kernel for one ray: small trees of all counts, bad triangles, bad rays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.kernel_tools import floats, launch, vec3s, zeros  # isort: skip (starts Warp)
+import warp as wp
+
+from wrt.accel.scenes.build import build
+from wrt.accel.structure import any_hit_kernel, closest_hit_kernel
+from wrt.kernels.query import HitArrays, RayArrays
+from wrt.scene.mesh import Mesh
+
+FACES = (*range(1, 10), 15, 16, 17, 63, 64, 65, 300)
+RAYS = (0, 1, 7, 8, 9, 15, 16, 17, 63, 64, 65, 200)
+SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, 1e-30, -3e38, np.inf, -np.inf, np.nan], np.float32)
+
+
+def triangles(rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n, 3, 3) corners: every fifth triangle without area, every seventh in the place of the one before."""
+    corners = rng.normal(size=(n, 1, 3)) + rng.choice([1e-3, 0.3, 2.0], (n, 1, 1)) * rng.normal(size=(n, 3, 3))
+    corners[4::5, 2] = corners[4::5, rng.integers(0, 2)]
+    corners[6::7] = corners[5::7][: len(corners[6::7])]
+    return corners.astype(np.float32)
+
+
+def rays(rng: np.random.Generator, n: int, corners: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Origins, directions, t_min, t_max: towards triangles, side by side or not; every eighth ray has numbers that none should."""
+    together = rng.random((n, 1)) < 0.5
+    origin = np.where(together, 3.0 + 0.01 * rng.normal(size=(n, 3)), 3.0 * rng.normal(size=(n, 3)))
+    aim = corners.reshape(-1, 3)[rng.integers(0, corners.size // 3, n)] * rng.random((n, 1))
+    direction = np.where(rng.random((n, 1)) < 0.1, np.eye(3)[rng.integers(0, 3, n)], aim - origin)
+    direction *= 10.0 ** rng.integers(-30, 30, (n, 1))
+    origin, direction = origin.astype(np.float32), direction.astype(np.float32)
+    bad = np.arange(n) % 8 == 7
+    origin[bad], direction[bad] = (rng.choice(SPECIAL, (int(bad.sum()), 3)) for _ in range(2))
+    t_min = rng.choice(SPECIAL[[0, 0, 1, 4]], 1 if n % 2 else n)
+    return origin, direction, t_min, rng.choice(np.array([np.inf, np.inf, 3.4e38, 1.0, 0.0], np.float32), n)
+
+
+def answers(accel: Any, given: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+    """t, u, v, prim_id and whether there is any hit, one ray at a time."""
+    origin, direction, t_min, t_max = given
+    n = len(origin)
+    arrays, hits = RayArrays(), HitArrays()
+    arrays.origin, arrays.direction = vec3s(origin), vec3s(direction)
+    arrays.t_min, arrays.t_max = floats(np.broadcast_to(t_min, n)), floats(t_max)
+    hits.t, hits.u, hits.v, hits.prim_id = zeros(n), zeros(n), zeros(n), zeros(n, wp.int32)
+    any_hits = zeros(n, wp.bool)
+    if n > 0:
+        launch(closest_hit_kernel(accel.structure), n, accel.data, accel.snapshot.surfaces, arrays, hits, 0)
+        launch(any_hit_kernel(accel.structure), n, accel.data, accel.snapshot.surfaces, arrays, any_hits, 0)
+    found = [getattr(hits, name).numpy() for name in ("t", "u", "v", "prim_id")]
+    return [*found, any_hits.numpy().astype(np.int32)]
+
+
+def cases() -> Iterator[list[np.ndarray]]:
+    """The arrays of each case, in the order in which walks.cpp reads them."""
+    rng = np.random.default_rng(1)
+    for count in FACES:
+        corners = triangles(rng, count)
+        mesh = Mesh(corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int32).reshape(-1, 3))
+        for max_leaf in (1, 8, 20):
+            accel = build(mesh, "bvh8", max_leaf=max_leaf)
+            tree = [accel.data.nodes.numpy(), accel.data.primitives.numpy()]
+            for n in RAYS if count in (8, 300) else (17,):
+                given = rays(rng, n, corners)
+                yield [*tree, *given, np.zeros(n, np.int32), *answers(accel, given)]
+
+
+def write_cases(path: Path) -> None:
+    """Each array after its length."""
+    with path.open("wb") as file:
+        for arrays in cases():
+            for array in arrays:
+                flat = np.ascontiguousarray(array).reshape(-1)
+                file.write(np.int32(len(flat)).tobytes() + flat.tobytes())

@@ -1,0 +1,182 @@
+// Walks of wide trees by the headers of kernels/wide alone, with arrays that have no number more than they need: the walks of
+// kernels/wide/batch.py in C++. The file of cases comes from tests/sanitize/cases.py.
+#include "interleaved.h"
+#include "set_up.h"
+
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <vector>
+
+namespace {
+
+using namespace wrt;
+
+const int EMPTY = 0;
+
+template <class T> struct Array {  // as Warp's
+    T* data;
+    int strides[1];
+};
+
+struct Vector {
+    float x, y, z;
+};
+
+struct RayArrays {
+    Array<Vector> origin, direction;
+    Array<float> t_min, t_max;
+};
+
+struct HitArrays {
+    Array<float> t, u, v;
+    Array<int> prim_id;
+};
+
+struct Case {
+    std::vector<float> nodes, primitives;  // of a tree with nodes of 8 children
+    std::vector<float> origins, directions, t_mins, t_maxs;
+    std::vector<int> excludes;
+    std::vector<float> t, u, v;  // what the scalar walk finds
+    std::vector<int> prim_id, occluded;
+    int rays;
+};
+
+int leaf_first(int reference) { return (-1 - reference) >> LEAF_BITS; }
+int leaf_count(int reference) { return ((-1 - reference) & ((1 << LEAF_BITS) - 1)) + 1; }
+
+template <bool ANY_HIT> class Walk {
+public:
+    explicit Walk(Case& c) : given(c), packet(PACKET_SIZE), stack(STACK_WORDS), slot(SLOT_SIZE) {}
+
+    // Rays first .. first + count - 1, as one packet if they have a beam and `together`, else one by one.
+    void trace(int first, int count, bool together) {
+        RayArrays rays = {{(Vector*)given.origins.data(), {12}}, {(Vector*)given.directions.data(), {12}},
+                          {given.t_mins.data(), {given.t_mins.size() == 1 ? 0 : 4}}, {given.t_maxs.data(), {4}}};
+        const int state = set_up<true>(pointers_to(rays, first, given.excludes.data() + first), count, FAR, packet.data());
+        if (state >= COHERENT && together) {
+            walk_packet(state - COHERENT);
+        } else {
+            int alone = meets(given.nodes.data(), state & (COHERENT - 1), packet.data());
+            for (; alone; alone &= alone - 1) walk_alone(lowest(alone));
+        }
+    }
+
+    void write(HitArrays hits, int first, int count) { write_hits(hits, first, count, packet.data()); }
+    void write(bool* occluded, int count) { write_occluded(occluded, count, packet.data()); }
+
+private:
+    static constexpr float FAR = Bounds::FAR_PAD * (1.0f + 8.0f / (1 << 24));  // lanes.py: LANE_PAD
+
+    void walk_packet(int active) {
+        int size = 0, reference = 0, mask = active;
+        for (;;) {
+            if (reference < 0) {
+                leaf_of_packet(reference, mask);
+            } else {
+                size = children<ANY_HIT>(given.nodes.data(), given.primitives.data(), packet.data(), reference, mask, stack.data(), size);
+            }
+            unsigned long long key = 0;
+            for (mask = 0; size > 0 && mask == 0;) {
+                const unsigned* entry = stack.data() + ENTRY * --size;
+                key = load<unsigned long long>(entry);
+                mask = (int)entry[ENTRY_RAYS] & reaching(__builtin_bit_cast(float, (unsigned)(key >> 32)), packet.data());
+            }
+            if (mask == 0) return;
+            reference = (int)(unsigned)key;
+        }
+    }
+
+    void leaf_of_packet(int reference, int mask) {
+        const float* row = given.primitives.data() + leaf_first(reference) * ROW_SIZE;
+        for (int left = leaf_count(reference); left > 0; left -= WIDTH, row += ROW_SIZE) {
+            const int n = left < WIDTH ? left : WIDTH;
+            if (mask & 1) {  // by lanes of rays, or ray by ray: both occur
+                mask &= ~(triangles<ANY_HIT>(row, n, mask, packet.data()) & (ANY_HIT ? ~0 : 0));
+            } else {
+                for (int rays = mask; rays; rays &= rays - 1)
+                    ray_triangles<ANY_HIT>(row, (2 << (n - 1)) - 1, packet.data() + lowest(rays));
+            }
+        }
+    }
+
+    void walk_alone(int ray) {
+        int next = begin<ANY_HIT>(given.nodes.data(), packet.data(), ray, stack.data(), 0, slot.data());
+        while (next != EMPTY) {
+            prefetch(given.nodes.data(), given.primitives.data(), next);
+            if (next > 0) {
+                next = step<ANY_HIT>(given.nodes.data(), packet.data(), stack.data(), 0, slot.data());
+                continue;
+            }
+            const float* row = given.primitives.data() + leaf_first(next) * ROW_SIZE;
+            for (int left = leaf_count(next); left > 0; left -= WIDTH, row += ROW_SIZE) {
+                const int lane = ray_triangles_here<ANY_HIT>(row, (2 << ((left < WIDTH ? left : WIDTH) - 1)) - 1, packet.data() + ray);
+                if (ANY_HIT && lane >= 0) return;
+            }
+            next = pop<ANY_HIT>(given.nodes.data(), packet[ray + T], stack.data(), 0, slot.data());
+        }
+    }
+
+    Case& given;
+    std::vector<float> packet;
+    std::vector<unsigned> stack;
+    std::vector<int> slot;
+};
+
+// Whether all rays of a case are answered as expected, from `first` on in packets of at most `most`.
+bool agrees(Case& c, int most, bool together) {
+    std::vector<float> t(c.rays), u(c.rays), v(c.rays);
+    std::vector<int> prim_id(c.rays);
+    bool* const occluded = new bool[c.rays];
+    Walk<false> closest(c);
+    Walk<true> any(c);
+    for (int first = 0; first < c.rays; first += most) {
+        const int count = c.rays - first < most ? c.rays - first : most;
+        closest.trace(first, count, together);
+        closest.write({{t.data(), {4}}, {u.data(), {4}}, {v.data(), {4}}, {prim_id.data(), {4}}}, first, count);
+        any.trace(first, count, together);
+        any.write(occluded + first, count);
+    }
+    int wrong = 0;
+    for (int i = 0; i < c.rays; ++i) {
+        const bool same = !memcmp(&t[i], &c.t[i], 4) && !memcmp(&u[i], &c.u[i], 4) && !memcmp(&v[i], &c.v[i], 4)
+                          && prim_id[i] == c.prim_id[i] && occluded[i] == (c.occluded[i] != 0);
+        if (!same && wrong++ < 3)
+            printf("    ray %d: triangle %d at %.9g, any %d; one ray at a time: %d at %.9g, any %d\n", i, prim_id[i], t[i],
+                   occluded[i], c.prim_id[i], c.t[i], c.occluded[i]);
+    }
+    delete[] occluded;
+    return wrong == 0;
+}
+
+template <class T> bool read(FILE* file, std::vector<T>& out) {
+    int n;
+    if (fread(&n, sizeof(n), 1, file) != 1) return false;
+    out.resize(n);
+    return n == 0 || fread(out.data(), sizeof(T), n, file) == (size_t)n;
+}
+
+}  // namespace
+
+int main(int, char** arguments) {
+    FILE* const file = fopen(arguments[1], "rb");
+    if (!file) return 2;
+    Case c;
+    int cases = 0, wrong = 0;
+    for (; read(file, c.nodes); ++cases) {
+        if (!(read(file, c.primitives) && read(file, c.origins) && read(file, c.directions) && read(file, c.t_mins)
+              && read(file, c.t_maxs) && read(file, c.excludes) && read(file, c.t) && read(file, c.u) && read(file, c.v)
+              && read(file, c.prim_id) && read(file, c.occluded)))
+            return 2;
+        c.rays = (int)c.excludes.size();
+        for (int most : {LANES, 7, 1})
+            for (bool together : {true, false})
+                if (!agrees(c, most, together)) {
+                    printf("case %d, %d rays at a time: wrong\n", cases, most);
+                    ++wrong;
+                }
+    }
+    fclose(file);
+    printf("%d cases, %d wrong\n", cases, wrong);
+    return wrong != 0;
+}
