@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
-from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node, box_volumes, make_binary_traversal, make_struct
-from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node, Child, box_volumes, child_of, make_binary_traversal, make_struct
+from wrt.kernels.traverse.common import Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, make_counters
+from wrt.kernels.traverse.leaf import make_leaf
 
 LEVELS = 62  # of the tree, that a trail has bits for
 TOP = wp.constant(wp.uint64(1 << 63))
@@ -35,15 +36,33 @@ class Study(NamedTuple):
         if self.entries < STACK_SIZE:
             return make_short_stack(units, self.entries, any_hit, accepts)
         volumes = box_volumes(units.triangle_test.record, units.box_test)
-        return make_binary_traversal(units, volumes, any_hit, accepts, self.ordered, self.early)
+        return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit, self.ordered, self.early)
+
+
+@wp.struct
+class Trail:
+    """done: which levels are done but for their last child; level: one bit, lower for each step down; resumed: the level whose last
+    child is to be visited."""
+
+    done: wp.uint64
+    level: wp.uint64
+    resumed: wp.uint64
+
+
+@wp.func
+def carry(trail: Trail) -> Trail:
+    """On to the deepest level that has a child left, over those that have none; TOP or above: there is none."""
+    trail.done = (trail.done & ((~trail.level) + wp.uint64(1))) + trail.level
+    trail.resumed = trail.done & ((~trail.done) + wp.uint64(1))
+    return trail
 
 
 def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any, with so many entries (0: none, each pop starts again at the root). The tree has LEVELS at most."""
     probe_of = make_probe(units)
-    intersect = make_intersect(units, accepts)
+    visit_leaf = make_leaf(units, any_hit, accepts)
     ray_aabb = units.box_test
-    fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(Bvh2Node))
+    fetch_node, _, push, finish = make_counters(units, size_of(Bvh2Node))
     struct = make_struct(units.triangle_test.record)
     room = max(entries, 1)
 
@@ -52,76 +71,59 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
         probe = probe_of(ray)
         best = no_hit(ray)
         counts = Counts()
-        stack_first = wp.zeros(shape=wp.static(room), dtype=wp.int32)
-        stack_count = wp.zeros(shape=wp.static(room), dtype=wp.int32)
+        stack = wp.zeros(shape=wp.static(room), dtype=Child)
         stack_t = wp.zeros(shape=wp.static(room), dtype=wp.float32)
         top = int(0)  # entries ever pushed less those popped; the newest is at (top - 1) modulo room
         size = int(0)
-        first = int(0)
-        count = int(0)
-        trail = wp.uint64(0)
-        level = TOP  # one bit, lower for each step down
-        resumed = wp.uint64(0)  # the level whose last child is to be visited
-        while True:
-            if count > 0:
+        child = Child()
+        trail = Trail()
+        trail.level = TOP
+        while trail.done < TOP:
+            if child.count > 0:
                 counts.leaves += 1
-                for i in range(first, first + count):
-                    best = intersect(probe, surfaces, accel.primitives[i], best)
-                    counts = fetch_primitive(accel.recorder, ray, counts, i)
-                    if wp.static(any_hit):
-                        if best.prim_id != NO_HIT:
-                            return finish(accel.recorder, ray, counts, best)
+                best, counts = visit_leaf(accel, surfaces, probe, child.first, child.count, best, counts)
+                if wp.static(any_hit):
+                    if best.prim_id != NO_HIT:
+                        break
             else:
-                node = accel.nodes[first]
-                counts = fetch_node(accel.recorder, ray, counts, first, 2)
+                node = accel.nodes[child.first]
+                counts = fetch_node(accel.recorder, ray, counts, child.first, 2)
                 t_0 = ray_aabb(probe.box, node.lo_0, node.hi_0, best.t)
                 t_1 = ray_aabb(probe.box, node.lo_1, node.hi_1, best.t)
-                hit_0 = t_0 < wp.inf
-                hit_1 = t_1 < wp.inf
-                if hit_0 or hit_1:
-                    level = level >> wp.uint64(1)
+                if t_0 < wp.inf or t_1 < wp.inf:
+                    trail.level = trail.level >> wp.uint64(1)
                     second = t_1 < t_0  # which is nearer; a miss is at infinity
                     go = bool(True)
-                    if hit_0 and hit_1:
-                        if (trail & level) != NONE:
+                    if t_0 < wp.inf and t_1 < wp.inf:
+                        if (trail.done & trail.level) != NONE:
                             second = not second
                         elif wp.static(entries > 0):
-                            at = top % wp.static(room)
-                            stack_first[at] = wp.where(second, node.first_0, node.first_1)
-                            stack_count[at] = wp.where(second, node.count_0, node.count_1)
-                            stack_t[at] = wp.where(second, t_0, t_1)
+                            stack[top % wp.static(room)] = child_of(node, not second)
+                            stack_t[top % wp.static(room)] = wp.where(second, t_0, t_1)
                             top = top + 1
                             size = wp.min(size + 1, wp.static(room))
                             counts = push(counts, size)
-                    elif level != resumed:
-                        trail = trail | level
+                    elif trail.level != trail.resumed:
+                        trail.done = trail.done | trail.level
                     else:
                         go = bool(False)  # only the first child is left in reach, and that is done
                     if go:
-                        first = wp.where(second, node.first_1, node.first_0)
-                        count = wp.where(second, node.count_1, node.count_0)
+                        child = child_of(node, second)
                         continue
-            # On to the deepest level that has a child left: carry over those that have none.
+            # The newest entry of the deepest level that has a child left, or from the root again.
             found = bool(False)
             while not found:
-                trail = (trail & ((~level) + wp.uint64(1))) + level
-                if trail >= TOP:
-                    return finish(accel.recorder, ray, counts, best)
-                resumed = trail & ((~trail) + wp.uint64(1))
-                if size > 0:
+                trail = carry(trail)
+                child = Child()
+                if size > 0 and trail.done < TOP:
                     size = size - 1
                     top = top - 1
-                    at = top % wp.static(room)
                     counts.pops += 1
-                    level = resumed
-                    if stack_t[at] <= best.t:
-                        first = stack_first[at]
-                        count = stack_count[at]
-                        found = True
+                    trail.level = trail.resumed
+                    found = stack_t[top % wp.static(room)] <= best.t
+                    child = stack[top % wp.static(room)]
                 else:
-                    first = int(0)
-                    count = int(0)
-                    level = TOP
+                    trail.level = TOP
                     found = True
         return finish(accel.recorder, ray, counts, best)
 

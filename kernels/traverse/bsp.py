@@ -31,8 +31,10 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
-from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.bvh2 import Child, child_of
+from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.leaf import make_leaf
 from wrt.kernels.units.box import BoxRay, slab_interval
 
 # The builder keeps the depth at or below this; a path from the root pushes at most one child a level.
@@ -111,19 +113,56 @@ def make_struct(record: Any) -> Any:
     return Bsp
 
 
-def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any (the first that is found). The box test has no say: only the root has a box."""
-    probe_of = make_probe(units)
-    intersect = make_intersect(units, accepts)
-    fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(BspNode))
-    struct = make_struct(units.triangle_test.record)
+@wp.struct
+class Sides:
+    """The children of a node in the order of a ray, whether the ray meets them, and where, at most, it leaves the nearer one and
+    enters the farther one."""
+
+    near: Child
+    far: Child
+    meets_near: bool
+    meets_far: bool
+    near_t_1: float
+    far_t_0: float
+
+
+@wp.func
+def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1: float, drift: float) -> Sides:
+    """The sides for the part of a ray from t_0 to t_1. drift: of Reach."""
+    # The distance of the origin from the plane, against the normal, and one over the speed along the normal.
+    height = float(0.0)
+    inv = float(0.0)
+    if node.axis < wp.static(PLANE):
+        height = -node.offset - box.origin[node.axis]
+        inv = box.inv_dir[node.axis]
+    else:
+        height = -(wp.dot(node.normal, box.origin) + node.offset)
+        inv = 1.0 / wp.dot(node.normal, direction)
+    thick = node.tolerance + drift * wp.max(-t_0, t_1)
+    up = not inv < 0.0
+    slab = wp.where(up, thick, -thick)
+    near_end = (height + slab) * inv
+    far_begin = (height - slab) * inv
+    out = Sides()
+    out.near = child_of(node, not up)
+    out.far = child_of(node, up)
+    # Comparisons with NaN are false: it says nothing, and the child is visited.
+    out.meets_near = out.near.count != 0 and not (t_0 > near_end)
+    out.meets_far = out.far.count != 0 and not (far_begin > t_1)
+    out.near_t_1 = wp.where(near_end < t_1, near_end, t_1)
+    out.far_t_0 = wp.where(far_begin > t_0, far_begin, t_0)
+    return out
+
+
+def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
+    """walk(accel, surfaces, probe, reach) -> the best hit and counts."""
+    visit_leaf = make_leaf(units, any_hit, accepts)
+    fetch_node, _, push, _ = make_counters(units, size_of(BspNode))
 
     @wp.func
-    def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
-        probe = probe_of(ray)
-        best = no_hit(ray)
+    def walk(accel: Any, surfaces: Any, probe: Probe, reach: Reach):
+        best = no_hit(probe.ray)
         counts = Counts()
-        reach = reach_of(probe.box, ray, best.t, accel.lo, accel.hi, accel.extent)
         stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_t_0 = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
@@ -133,70 +172,62 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         count = int(accel.count)
         t_0 = float(reach.t_0)
         t_1 = float(reach.t_1)
-        while t_0 <= t_1:
+        found = t_0 <= t_1
+        while found:
             if count >= 0:
-                if count > 0:
-                    counts.leaves += 1
-                for i in range(first, first + count):
-                    best = intersect(probe, surfaces, accel.primitives[i], best)
-                    counts = fetch_primitive(accel.recorder, ray, counts, i)
-                    if wp.static(any_hit):
-                        if best.prim_id != NO_HIT:
-                            return finish(accel.recorder, ray, counts, best)
+                counts.leaves += wp.where(count > 0, 1, 0)
+                best, counts = visit_leaf(accel, surfaces, probe, first, count, best, counts)
+                if wp.static(any_hit):
+                    if best.prim_id != NO_HIT:
+                        break
             else:
-                node = accel.nodes[first]
-                counts = fetch_node(accel.recorder, ray, counts, first, 0)
-                # The distance of the origin from the plane, against the normal, and one over the speed along the normal.
-                height = float(0.0)
-                inv = float(0.0)
-                if node.axis < wp.static(PLANE):
-                    height = -node.offset - ray.origin[node.axis]
-                    inv = probe.box.inv_dir[node.axis]
-                else:
-                    height = -(wp.dot(node.normal, ray.origin) + node.offset)
-                    inv = 1.0 / wp.dot(node.normal, ray.direction)
-                thick = node.tolerance + reach.drift * wp.max(-t_0, t_1)
-                up = not inv < 0.0
-                slab = wp.where(up, thick, -thick)
-                near_end = (height + slab) * inv
-                far_begin = (height - slab) * inv
-                # Comparisons with NaN are false: it says nothing, and the child is visited.
-                near = (wp.where(up, node.count_0, node.count_1) != 0) and not (t_0 > near_end)
-                far = (wp.where(up, node.count_1, node.count_0) != 0) and not (far_begin > t_1)
-                far_first = wp.where(up, node.first_1, node.first_0)
-                far_count = wp.where(up, node.count_1, node.count_0)
-                far_t_0 = wp.where(far_begin > t_0, far_begin, t_0)
-                if near:
-                    if far:
-                        stack_first[size] = far_first
-                        stack_count[size] = far_count
-                        stack_t_0[size] = far_t_0
+                counts = fetch_node(accel.recorder, probe.ray, counts, first, 0)
+                sides = cut_by_plane(accel.nodes[first], probe.box, probe.ray.direction, t_0, t_1, reach.drift)
+                if sides.meets_near:
+                    if sides.meets_far:
+                        stack_first[size] = sides.far.first
+                        stack_count[size] = sides.far.count
+                        stack_t_0[size] = sides.far_t_0
                         stack_t_1[size] = t_1
                         size = size + 1
                         counts = push(counts, size)
-                    first = wp.where(up, node.first_0, node.first_1)
-                    count = wp.where(up, node.count_0, node.count_1)
-                    t_1 = wp.where(near_end < t_1, near_end, t_1)
+                    first = sides.near.first
+                    count = sides.near.count
+                    t_1 = sides.near_t_1
                     continue
-                if far:
-                    first = far_first
-                    count = far_count
-                    t_0 = far_t_0
+                if sides.meets_far:
+                    first = sides.far.first
+                    count = sides.far.count
+                    t_0 = sides.far_t_0
                     continue
             # Pop; what begins beyond the closest hit, and farther than a hit is moved, is dropped.
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
                 counts.pops += 1
-                end = best.t + reach.beyond
-                if stack_t_0[size] <= end:
+                if stack_t_0[size] <= best.t + reach.beyond:
                     first = stack_first[size]
                     count = stack_count[size]
                     t_0 = stack_t_0[size]
-                    t_1 = wp.min(stack_t_1[size], end)
-                    found = True
-            if not found:
-                break
+                    t_1 = wp.min(stack_t_1[size], best.t + reach.beyond)
+                    found = bool(True)
+        return best, counts
+
+    return walk
+
+
+def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
+    """The closest hit, or any (the first that is found). The box test has no say: only the root has a box."""
+    probe_of = make_probe(units)
+    walk = make_walk(units, any_hit, accepts)
+    _, _, _, finish = make_counters(units, 0)
+    struct = make_struct(units.triangle_test.record)
+
+    @wp.func
+    def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
+        probe = probe_of(ray)
+        reach = reach_of(probe.box, ray, no_hit(ray).t, accel.lo, accel.hi, accel.extent)
+        best, counts = walk(accel, surfaces, probe, reach)
         return finish(accel.recorder, ray, counts, best)
 
     return traverse

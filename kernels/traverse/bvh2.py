@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
-from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, add_counts, make_counters
+from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.leaf import make_leaf
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
 from wrt.kernels.units.box import BoxRay
 
@@ -79,20 +80,35 @@ def box_volumes(record: Any, box_test: Any) -> Volumes:
     return Volumes(struct, Bvh2Node, set_up, enter)
 
 
+@wp.struct
+class Child:
+    """A leaf's primitives first .. first + count - 1, or (count = 0) the inner node `first`."""
+
+    first: int
+    count: int
+
+
+@wp.func
+def child_of(node: Any, second: bool) -> Child:
+    child = Child()
+    child.first = wp.where(second, node.first_1, node.first_0)
+    child.count = wp.where(second, node.count_1, node.count_0)
+    return child
+
+
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found)."""
-    return make_binary_traversal(units, box_volumes(units.triangle_test.record, units.box_test), any_hit, accepts)
+    volumes = box_volumes(units.triangle_test.record, units.box_test)
+    return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)
 
 
-def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts: Any = None, ordered: bool = True,
-                          early: bool = True, visit: Any = None) -> Any:
-    """As make_traversal, over a tree with volumes of another kind. ordered: the nearer child first; early: nodes beyond the best
-    hit are dropped (what either is worth is for studies to tell). visit(accel, surfaces, ray, index, best) -> Hit: in place of
-    the triangle test, where a leaf holds structures, which count for themselves."""
+def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_hit: bool, ordered: bool = True,
+                          early: bool = True) -> Any:
+    """As make_traversal, over a tree with these volumes and leaves (kernels.traverse.leaf). ordered: the nearer child first; early:
+    nodes beyond the best hit are dropped (what either is worth is for studies to tell)."""
     probe_of = make_probe(units)
-    intersect = make_intersect(units, accepts)
     struct, set_up, enter, root = volumes.struct, volumes.set_up, volumes.enter, volumes.root
-    fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(volumes.node))
+    fetch_node, _, push, finish = make_counters(units, size_of(volumes.node))
     # Where a child begins and its t, and how many primitives it has.
     new_keys, shared_keys, put_key, key_at = make_stack(units.stack, STACK_SIZE, wp.uint64, ENTRY)
     new_counts, shared_counts, put_count, count_at = make_stack(units.stack, STACK_SIZE, wp.int32, ENTRY)
@@ -116,47 +132,31 @@ def make_binary_traversal(units: Units, volumes: Volumes, any_hit: bool, accepts
         while True:
             if count > 0:
                 counts.leaves += 1
-                if wp.static(visit is not None and units.counters):
-                    add_counts(accel.recorder, ray.slot, counts)
-                    counts = Counts()
-                for i in range(first, first + count):
-                    if wp.static(visit is not None):
-                        best = visit(accel, surfaces, ray, i, best)
-                    else:
-                        best = intersect(probe, surfaces, accel.primitives[i], best)
-                        counts = fetch_primitive(accel.recorder, ray, counts, i)
-                    if wp.static(any_hit):
-                        if best.prim_id != NO_HIT:
-                            return finish(accel.recorder, ray, counts, best)
+                best, counts = visit_leaf(accel, surfaces, probe, first, count, best, counts)
+                if wp.static(any_hit):
+                    if best.prim_id != NO_HIT:
+                        break
                 if wp.static(early):
                     end = best.t
             else:
                 node = accel.nodes[first]
                 counts = fetch_node(accel.recorder, ray, counts, first, 2)
                 entry = enter(prepared, node, end)
-                t_0 = entry[0]
-                t_1 = entry[1]
-                hit_0 = t_0 < wp.inf
-                hit_1 = t_1 < wp.inf
-                if hit_0 and hit_1:
-                    swap = bool(False)
+                hit_0 = entry[0] < wp.inf
+                hit_1 = entry[1] < wp.inf
+                if hit_0 or hit_1:
+                    second = not hit_0  # which child is visited first
                     if wp.static(ordered):
-                        swap = t_1 < t_0
-                    key = key_of(wp.where(swap, t_0, t_1), wp.where(swap, node.first_0, node.first_1))
-                    put_key(keys, first_keys, size, key)
-                    put_count(sizes, first_sizes, size, wp.where(swap, node.count_0, node.count_1))
-                    size = size + 1
-                    counts = push(counts, size)
-                    first = wp.where(swap, node.first_1, node.first_0)
-                    count = wp.where(swap, node.count_1, node.count_0)
-                    continue
-                if hit_0:
-                    first = node.first_0
-                    count = node.count_0
-                    continue
-                if hit_1:
-                    first = node.first_1
-                    count = node.count_1
+                        second = entry[1] < entry[0]
+                    if hit_0 and hit_1:
+                        far = child_of(node, not second)
+                        put_key(keys, first_keys, size, key_of(wp.where(second, entry[0], entry[1]), far.first))
+                        put_count(sizes, first_sizes, size, far.count)
+                        size = size + 1
+                        counts = push(counts, size)
+                    near = child_of(node, second)
+                    first = near.first
+                    count = near.count
                     continue
             # Pop; what begins beyond the closest hit is dropped. Equal stays: a tie may have a lower prim_id there.
             found = bool(False)

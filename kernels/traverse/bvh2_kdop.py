@@ -8,6 +8,7 @@ import warp as wp
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Volumes, make_binary_traversal  # noqa: F401 (STACK_SIZE: for the host)
 from wrt.kernels.traverse.common import Probe, Units
 from wrt.kernels.traverse.counters import Recorder
+from wrt.kernels.traverse.leaf import make_leaf
 from wrt.kernels.units.kdop import KdopRay, kdop_ray, ray_kdop
 
 
@@ -61,4 +62,5 @@ def kdop_volumes(record: Any) -> Volumes:
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found). The box test of `units` is for primitives only."""
-    return make_binary_traversal(units, kdop_volumes(units.triangle_test.record), any_hit, accepts)
+    volumes = kdop_volumes(units.triangle_test.record)
+    return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)

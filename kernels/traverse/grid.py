@@ -3,7 +3,7 @@
 Amanatides and Woo 1987, "A Fast Voxel Traversal Algorithm for Ray Tracing", made to lose no ray: the distance to every plane
 is taken afresh, so that no error adds up, and where the ray leaves a cell within rounding of an edge or a corner, all the cells
 around that it may have passed through are visited too. Exactly those cells are visited that the conservative box test would
-enter, each once. Mailboxing: Amanatides and Woo, section 3, with a few slots by the primitive's number.
+enter, each once.
 """
 
 from functools import cache
@@ -13,11 +13,10 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.cell_ray import cell_slack, earlier, later, parallel
-from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.common import Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.leaf import Mailbox, make_mailbox_leaf
 from wrt.kernels.units.box import BoxRay, slab_interval
-
-MAILBOX_SIZE = 8
 
 
 @wp.struct
@@ -86,13 +85,14 @@ def first_slab(layout: GridLayout, ray: BoxRay, direction: wp.vec3, axis: int, t
 
 
 @wp.func
-def slabs_left(layout: GridLayout, ray: BoxRay, axis: int, slab: int, limit: float) -> int:
-    """How many slabs, from this one on, the ray leaves for the next up to `limit`."""
+def slabs_left(layout: GridLayout, ray: BoxRay, axis: int, slab: int, t_exit: float, limit: float) -> int:
+    """How many slabs, from this one on, which it leaves at t_exit, the ray leaves for the next up to `limit`."""
     n = int(0)
     step = wp.where(ray.inv_dir[axis] < 0.0, -1, 1)
-    while slab + step >= 0 and slab + step < layout.n[axis] and exit_distance(layout, ray, axis, slab) <= limit:
+    while t_exit <= limit and slab + step >= 0 and slab + step < layout.n[axis]:
         slab += step
         n += 1
+        t_exit = exit_distance(layout, ray, axis, slab)
     return n
 
 
@@ -119,11 +119,21 @@ def make_struct(record: Any) -> Any:
     return Grid
 
 
+@wp.func
+def layout_of(accel: Any) -> GridLayout:
+    layout = GridLayout()
+    layout.lo = accel.lo
+    layout.hi = accel.hi
+    layout.size = accel.size
+    layout.n = accel.n
+    return layout
+
+
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found). The box test is the walk's own, whatever `units` says."""
     probe_of = make_probe(units)
-    intersect = make_intersect(units, accepts)
-    fetch_node, fetch_primitive, _, finish = make_counters(units, size_of(GridCell))
+    visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
+    fetch_node, _, _, finish = make_counters(units, size_of(GridCell))
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
@@ -131,11 +141,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         probe = probe_of(ray)
         best = no_hit(ray)
         counts = Counts()
-        layout = GridLayout()
-        layout.lo = accel.lo
-        layout.hi = accel.hi
-        layout.size = accel.size
-        layout.n = accel.n
+        layout = layout_of(accel)
         slack = cell_slack(probe.box, accel.pad, accel.extent)
         interval = slab_interval(probe.box, layout.lo, layout.hi)
         t_in = wp.max(interval[0], earlier(ray.t_min) - slack)
@@ -149,7 +155,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
             step[axis] = wp.where(probe.box.inv_dir[axis] < 0.0, -1, 1)
             t_next[axis] = exit_distance(layout, probe.box, axis, slab[axis])
         stride = wp.vec3i(1, layout.n[0], layout.n[0] * layout.n[1])
-        mailbox = wp.zeros(shape=wp.static(MAILBOX_SIZE), dtype=wp.int32)  # primitive + 1, or 0
+        mailbox = Mailbox()
 
         while t_in <= later(best.t) + slack:
             axis = wp.where(t_next[0] <= t_next[1], wp.where(t_next[0] <= t_next[2], 0, 2), wp.where(t_next[1] <= t_next[2], 1, 2))
@@ -158,12 +164,8 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
             t_out = t_next[axis]
             # Slabs across the two other axes that it leaves as good as at the same place: this cell and those are visited.
             limit = wp.where(t_out < wp.inf, later(t_out), float(-wp.inf))
-            side_slabs = int(0)
-            other_slabs = int(0)
-            if t_next[side] <= limit:
-                side_slabs = slabs_left(layout, probe.box, side, slab[side], limit)
-            if t_next[other] <= limit:
-                other_slabs = slabs_left(layout, probe.box, other, slab[other], limit)
+            side_slabs = slabs_left(layout, probe.box, side, slab[side], t_next[side], limit)
+            other_slabs = slabs_left(layout, probe.box, other, slab[other], t_next[other], limit)
             corner = slab[0] + slab[1] * stride[1] + slab[2] * stride[2]
             for k in range((side_slabs + 1) * (other_slabs + 1)):
                 index = (corner + (k % (side_slabs + 1)) * step[side] * stride[side]
@@ -172,17 +174,10 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
                 counts = fetch_node(accel.recorder, ray, counts, index, 0)
                 if cell.count > 0:
                     counts.leaves += 1
-                for i in range(cell.first, cell.first + cell.count):
-                    primitive = accel.references[i]
-                    slot = primitive % wp.static(MAILBOX_SIZE)
-                    if accel.mailbox > 0 and mailbox[slot] == primitive + 1:
-                        continue
-                    mailbox[slot] = primitive + 1
-                    best = intersect(probe, surfaces, accel.primitives[primitive], best)
-                    counts = fetch_primitive(accel.recorder, ray, counts, primitive)
-                    if wp.static(any_hit):
-                        if best.prim_id != NO_HIT:
-                            return finish(accel.recorder, ray, counts, best)
+                mailbox, best, counts = visit_leaf(accel, surfaces, probe, cell, mailbox, best, counts)
+                if wp.static(any_hit):
+                    if best.prim_id != NO_HIT:
+                        return finish(accel.recorder, ray, counts, best)
             slab[axis] = slab[axis] + step[axis]
             if slab[axis] < 0 or slab[axis] >= layout.n[axis]:
                 break

@@ -10,10 +10,10 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
 from wrt.kernels.traverse.bvh2 import Bvh2Node, Volumes, make_binary_traversal
 from wrt.kernels.traverse.common import Probe, Units
-from wrt.kernels.traverse.counters import Recorder
+from wrt.kernels.traverse.counters import Counts, Recorder, add_counts
 from wrt.kernels.units.box import FAR_PAD, BoxRay, slab_interval
 
 
@@ -121,10 +121,8 @@ def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
     return out
 
 
-def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any) -> Any:
-    """The closest hit, or any, among all structures placed in the world whose root is ray.first_prim. bottom: the lower level's
-    traversal, made with these units."""
-    struct = make_struct(bottom_struct)
+def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> Any:
+    """The leaf of the upper level (kernels.traverse.leaf). bottom: the traversal of what is placed in it."""
 
     @wp.func
     def visit(accel: struct, surfaces: Surfaces, ray: Ray, index: int, best: Hit) -> Hit:
@@ -144,6 +142,26 @@ def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any)
         return hit
 
     @wp.func
+    def visit_leaf(accel: struct, surfaces: Surfaces, probe: Probe, first: int, count: int, best: Hit, counts: Counts):
+        if wp.static(units.counters):  # what is placed counts for itself
+            add_counts(accel.recorder, probe.ray.slot, counts)
+            counts = Counts()
+        for i in range(first, first + count):
+            best = visit(accel, surfaces, probe.ray, i, best)
+            if wp.static(any_hit):
+                if best.prim_id != NO_HIT:
+                    break
+        return best, counts
+
+    return visit_leaf
+
+
+def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any) -> Any:
+    """The closest hit, or any, among all structures placed in the world whose root is ray.first_prim. bottom: the lower level's
+    traversal, made with these units."""
+    struct = make_struct(bottom_struct)
+
+    @wp.func
     def set_up(accel: struct, probe: Probe) -> WidenedRay:
         out = WidenedRay()
         out.box = probe.box
@@ -161,4 +179,5 @@ def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any)
 
     volumes = Volumes(struct, Bvh2Node, set_up, enter_both, root)
     # The lower walk may have its stack in shared memory, and this one goes on behind it.
-    return make_binary_traversal(units._replace(instances=False, stack="local"), volumes, any_hit, visit=visit)
+    visit_leaf = make_placed_leaf(units, any_hit, bottom, struct)
+    return make_binary_traversal(units._replace(instances=False, stack="local"), volumes, visit_leaf, any_hit)

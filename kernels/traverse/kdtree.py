@@ -17,8 +17,9 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.cell_ray import earlier, later
-from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.leaf import make_leaf
 from wrt.kernels.units.box import slab_interval
 
 # Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
@@ -74,12 +75,80 @@ def held_distance(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
     return reach * wp.min(HELD_GRAZING * steepest, 1.01 / longest)
 
 
+@wp.func
+def limit_of(t: float, held: float) -> float:
+    """Cells that begin beyond hold no hit that is nearer than t."""
+    return t * HELD_RELATIVE + held
+
+
+def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
+    """walk(accel, surfaces, probe, part, held, counts) -> the best hit and counts. part: of the ray, (t_enter, t_exit)."""
+    visit_leaf = make_leaf(units, any_hit, accepts)
+    fetch_node, _, push, _ = make_counters(units, size_of(KdNode))
+
+    @wp.func
+    def walk(accel: Any, surfaces: Any, probe: Probe, part: wp.vec2, held: float, counts: Counts):
+        best = no_hit(probe.ray)
+        t_enter = part[0]
+        t_exit = part[1]
+        stack_index = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
+        stack_enter = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
+        stack_exit = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
+        size = int(0)
+        index = int(0)
+        found = bool(True)
+        while found:
+            node = accel.nodes[index]
+            counts = fetch_node(accel.recorder, probe.ray, counts, index, 0)
+            axis = node.word & 3
+            first = node.word >> 2
+            if axis != LEAF:
+                inverse = probe.box.inv_dir[axis]
+                t_split = (node.split - probe.box.origin[axis]) * inverse
+                far = wp.where(inverse < 0.0, first, first + 1)
+                near_exit = later(t_split)
+                far_enter = wp.where(earlier(t_split) > t_enter, earlier(t_split), t_enter)
+                if t_enter > near_exit:
+                    index = far
+                    t_enter = far_enter
+                else:
+                    if not t_exit < earlier(t_split):
+                        stack_index[size] = far
+                        stack_enter[size] = far_enter
+                        stack_exit[size] = t_exit
+                        size = size + 1
+                        counts = push(counts, size)
+                    index = wp.where(inverse < 0.0, first + 1, first)
+                    t_exit = wp.where(near_exit < t_exit, near_exit, t_exit)
+                continue
+
+            counts.leaves += 1
+            counts.box_operations -= 1  # a leaf's record has no plane to test
+            best, counts = visit_leaf(accel, surfaces, probe, first, int(node.split), best, counts)
+            if wp.static(any_hit):
+                if best.prim_id != NO_HIT:
+                    break
+            # Pop; what begins beyond the closest hit is dropped. Equal stays: a tie may have a lower prim_id there.
+            limit = limit_of(best.t, held)
+            found = bool(False)
+            while size > 0 and not found:
+                size = size - 1
+                counts.pops += 1
+                index = stack_index[size]
+                t_enter = stack_enter[size]
+                t_exit = wp.where(limit < stack_exit[size], limit, stack_exit[size])
+                found = t_enter <= t_exit
+        return best, counts
+
+    return walk
+
+
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found)."""
     probe_of = make_probe(units)
-    intersect = make_intersect(units, accepts)
     ray_aabb = units.box_test
-    fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(KdNode))
+    walk = make_walk(units, any_hit, accepts)
+    _, _, _, finish = make_counters(units, 0)
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
@@ -89,68 +158,15 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         counts = Counts()
         counts.boxes += 1  # the root's cell, which comes with the structure
         counts.box_operations += 1
-        if not ray_aabb(probe.box, accel.lo, accel.hi, best.t) < wp.inf:
-            return finish(accel.recorder, ray, counts, best)
-        held = held_distance(ray.direction, probe.box.inv_dir, accel.reach)
-        limit = best.t * HELD_RELATIVE + held  # cells that begin beyond can hold nothing better
-        span = slab_interval(probe.box, accel.lo, accel.hi)
-        t_enter = earlier(span[0]) - held
-        t_exit = later(span[1]) + held
-        begin = ray.t_min * (2.0 - HELD_RELATIVE) - held
-        t_enter = wp.where(begin > t_enter, begin, t_enter)
-        t_exit = wp.where(limit < t_exit, limit, t_exit)
-        stack_index = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
-        stack_enter = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
-        stack_exit = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
-        size = int(0)
-        index = int(0)
-        while True:
-            node = accel.nodes[index]
-            counts = fetch_node(accel.recorder, ray, counts, index, 0)
-            axis = node.word & 3
-            first = node.word >> 2
-            if axis != LEAF:
-                inverse = probe.box.inv_dir[axis]
-                t_split = (node.split - probe.box.origin[axis]) * inverse
-                swap = inverse < 0.0
-                near = wp.where(swap, first + 1, first)
-                far = wp.where(swap, first, first + 1)
-                near_exit = later(t_split)
-                far_enter = earlier(t_split)
-                if t_enter > near_exit:
-                    index = far
-                    t_enter = wp.where(far_enter > t_enter, far_enter, t_enter)
-                else:
-                    if not t_exit < far_enter:
-                        stack_index[size] = far
-                        stack_enter[size] = wp.where(far_enter > t_enter, far_enter, t_enter)
-                        stack_exit[size] = t_exit
-                        size = size + 1
-                        counts = push(counts, size)
-                    index = near
-                    t_exit = wp.where(near_exit < t_exit, near_exit, t_exit)
-                continue
-
-            counts.leaves += 1
-            counts.box_operations -= 1  # a leaf's record has no plane to test
-            for i in range(first, first + int(node.split)):
-                best = intersect(probe, surfaces, accel.primitives[i], best)
-                counts = fetch_primitive(accel.recorder, ray, counts, i)
-                if wp.static(any_hit):
-                    if best.prim_id != NO_HIT:
-                        return finish(accel.recorder, ray, counts, best)
-            limit = best.t * HELD_RELATIVE + held
-            # Pop; what begins beyond the closest hit is dropped. Equal stays: a tie may have a lower prim_id there.
-            found = bool(False)
-            while size > 0 and not found:
-                size = size - 1
-                counts.pops += 1
-                index = stack_index[size]
-                t_enter = stack_enter[size]
-                t_exit = wp.where(limit < stack_exit[size], limit, stack_exit[size])
-                found = t_enter <= t_exit
-            if not found:
-                break
+        if ray_aabb(probe.box, accel.lo, accel.hi, best.t) < wp.inf:
+            held = held_distance(ray.direction, probe.box.inv_dir, accel.reach)
+            limit = limit_of(best.t, held)
+            span = slab_interval(probe.box, accel.lo, accel.hi)
+            t_enter = earlier(span[0]) - held
+            t_exit = later(span[1]) + held
+            begin = ray.t_min * (2.0 - HELD_RELATIVE) - held
+            part = wp.vec2(wp.where(begin > t_enter, begin, t_enter), wp.where(limit < t_exit, limit, t_exit))
+            best, counts = walk(accel, surfaces, probe, part, held, counts)
         return finish(accel.recorder, ray, counts, best)
 
     return traverse

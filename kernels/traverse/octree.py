@@ -13,11 +13,10 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.cell_ray import cell_slack, earlier, later
-from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.leaf import Mailbox, make_mailbox_leaf
 from wrt.kernels.units.box import BoxRay, slab_interval
-
-MAILBOX_SIZE = 8
 
 # Corners of cells are whole numbers of the finest cell, exact in float32; the stack has one entry a level.
 MAX_LEVELS = 20
@@ -134,55 +133,76 @@ def make_struct(record: Any) -> Any:
     return Octree
 
 
-def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any (the first that is found). The box test is the walk's own, whatever `units` says."""
-    probe_of = make_probe(units)
-    intersect = make_intersect(units, accepts)
-    fetch_node, fetch_primitive, push, finish = make_counters(units, size_of(OctreeNode))
-    struct = make_struct(units.triangle_test.record)
+@wp.struct
+class OctreeRay:
+    """Set-up of the walk, once a ray. backwards: 1 on each axis that the ray runs down, else 0; flip: the same as a mask; begin:
+    where the walk begins; slack: how far it goes on behind the best hit."""
+
+    layout: OctreeLayout
+    box: BoxRay
+    backwards: wp.vec3i
+    flip: int
+    begin: float
+    slack: float
+
+
+@wp.func
+def octree_ray(accel: Any, box: BoxRay, t_min: float) -> OctreeRay:
+    out = OctreeRay()
+    out.layout.lo = accel.lo
+    out.layout.hi = accel.hi
+    out.layout.size = accel.size
+    out.layout.levels = accel.levels
+    out.box = box
+    out.backwards = wp.vec3i(wp.where(box.inv_dir[0] < 0.0, 1, 0), wp.where(box.inv_dir[1] < 0.0, 1, 0),
+                             wp.where(box.inv_dir[2] < 0.0, 1, 0))
+    out.flip = out.backwards[0] + 2 * out.backwards[1] + 4 * out.backwards[2]
+    out.slack = cell_slack(box, accel.pad, accel.extent)
+    out.begin = earlier(t_min) - out.slack
+    return out
+
+
+@wp.func
+def distance_to_cell(ray: OctreeRay, corner: wp.vec3i, size: int) -> float:
+    """Where the ray enters the cell of `size` finest cells with this lowest corner, but not before the walk begins."""
+    return latest(distances(ray.layout, ray.box, corner + size * ray.backwards), ray.begin)
+
+
+@wp.func
+def enter_octants(ray: OctreeRay, occupied: int, corner: wp.vec3i, size: int, enter: float, limit: float) -> int:
+    """Mask, in the order of the ray, of the occupied octants that it meets up to `limit` in the cell that it meets at `enter`."""
+    forwards = wp.vec3i(1, 1, 1) - ray.backwards
+    leave = later(earliest(distances(ray.layout, ray.box, corner + size * forwards), float(wp.inf)))
+    half = size >> 1
+    middle = distances(ray.layout, ray.box, corner + wp.vec3i(half, half, half))
+    return octants_met(in_order(occupied, ray.flip), enter, middle, wp.where(limit < leave, limit, leave))
+
+
+def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
+    """walk(accel, surfaces, probe, set_up, enter, counts) -> the best hit and counts. enter: where the root's cell begins."""
+    visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
+    fetch_node, _, push, _ = make_counters(units, size_of(OctreeNode))
 
     @wp.func
-    def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
-        probe = probe_of(ray)
-        best = no_hit(ray)
-        counts = Counts()
-        counts.boxes += 1  # the root's cell, which comes with the structure
-        counts.box_operations += 1
-        layout = OctreeLayout()
-        layout.lo = accel.lo
-        layout.hi = accel.hi
-        layout.size = accel.size
-        layout.levels = accel.levels
-        slack = cell_slack(probe.box, accel.pad, accel.extent)
-        interval = slab_interval(probe.box, layout.lo, layout.hi)
-        begin = earlier(ray.t_min) - slack
-        enter = wp.max(interval[0], begin)
-        if not (enter <= later(interval[1]) and enter <= later(best.t) + slack and enter < wp.inf):
-            return finish(accel.recorder, ray, counts, best)
-        backwards = wp.vec3i(wp.where(probe.box.inv_dir[0] < 0.0, 1, 0), wp.where(probe.box.inv_dir[1] < 0.0, 1, 0),
-                             wp.where(probe.box.inv_dir[2] < 0.0, 1, 0))
-        flip = backwards[0] + 2 * backwards[1] + 4 * backwards[2]
-        forwards = wp.vec3i(1, 1, 1) - backwards
-        mailbox = wp.zeros(shape=wp.static(MAILBOX_SIZE), dtype=wp.int32)  # primitive + 1, or 0
+    def walk(accel: Any, surfaces: Any, probe: Probe, set_up: OctreeRay, enter: float, counts: Counts):
+        best = no_hit(probe.ray)
+        mailbox = Mailbox()
         stack_first = wp.zeros(shape=wp.static(MAX_LEVELS), dtype=wp.int32)
         stack_occupied = wp.zeros(shape=wp.static(MAX_LEVELS), dtype=wp.int32)
         stack_left = wp.zeros(shape=wp.static(MAX_LEVELS), dtype=wp.int32)
         level = int(0)
         entries = int(0)
         index = int(0)
-        size = 1 << layout.levels
+        size = 1 << accel.levels
         corner = wp.vec3i()
-        while True:
+        found = bool(True)
+        while found:
             node = accel.nodes[index]
-            counts = fetch_node(accel.recorder, ray, counts, index, 0)
+            counts = fetch_node(accel.recorder, probe.ray, counts, index, 0)
             left = int(0)
             if node.count < 0:
                 counts.boxes += wp.bit_count(-node.count)
-                leave = later(earliest(distances(layout, probe.box, corner + size * forwards), float(wp.inf)))
-                limit = later(best.t) + slack
-                size = size >> 1
-                middle = distances(layout, probe.box, corner + wp.vec3i(size, size, size))
-                left = octants_met(in_order(-node.count, flip), enter, middle, wp.where(limit < leave, limit, leave))
+                left = enter_octants(set_up, -node.count, corner, size, enter, later(best.t) + set_up.slack)
                 if left != 0:
                     stack_first[level] = node.first
                     stack_occupied[level] = -node.count
@@ -194,17 +214,10 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
             else:
                 counts.leaves += 1
                 counts.box_operations -= 1  # a leaf has no planes
-                for i in range(node.first, node.first + node.count):
-                    primitive = accel.references[i]
-                    slot = primitive % wp.static(MAILBOX_SIZE)
-                    if accel.mailbox > 0 and mailbox[slot] == primitive + 1:
-                        continue
-                    mailbox[slot] = primitive + 1
-                    best = intersect(probe, surfaces, accel.primitives[primitive], best)
-                    counts = fetch_primitive(accel.recorder, ray, counts, primitive)
-                    if wp.static(any_hit):
-                        if best.prim_id != NO_HIT:
-                            return finish(accel.recorder, ray, counts, best)
+                mailbox, best, counts = visit_leaf(accel, surfaces, probe, node, mailbox, best, counts)
+                if wp.static(any_hit):
+                    if best.prim_id != NO_HIT:
+                        break
             # The first octant that was just met, or the next that is left, unless it begins where no better hit can be.
             fresh = left != 0
             found = bool(False)
@@ -213,22 +226,44 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
                 if left == 0:
                     level -= 1
                 else:
-                    octant = wp.bit_count((left & -left) - 1) ^ flip
+                    octant = wp.bit_count((left & -left) - 1) ^ set_up.flip
                     left = left & (left - 1)
                     stack_left[level - 1] = left
-                    size = (1 << layout.levels) >> level
+                    size = (1 << accel.levels) >> level
                     mask = -2 * size
                     corner = wp.vec3i(corner[0] & mask, corner[1] & mask, corner[2] & mask) + octant_corner(octant, size)
                     if not fresh:
                         counts.pops += 1
                         if left == 0:
                             entries -= 1
-                    enter = latest(distances(layout, probe.box, corner + size * backwards), begin)
-                    found = fresh or enter <= later(best.t) + slack
+                    enter = distance_to_cell(set_up, corner, size)
+                    found = fresh or enter <= later(best.t) + set_up.slack
                     index = stack_first[level - 1] + wp.bit_count(stack_occupied[level - 1] & ((1 << octant) - 1))
                     fresh = False
-            if not found:
-                break
+        return best, counts
+
+    return walk
+
+
+def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
+    """The closest hit, or any (the first that is found). The box test is the walk's own, whatever `units` says."""
+    probe_of = make_probe(units)
+    walk = make_walk(units, any_hit, accepts)
+    _, _, _, finish = make_counters(units, 0)
+    struct = make_struct(units.triangle_test.record)
+
+    @wp.func
+    def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
+        probe = probe_of(ray)
+        best = no_hit(ray)
+        counts = Counts()
+        counts.boxes += 1  # the root's cell, which comes with the structure
+        counts.box_operations += 1
+        set_up = octree_ray(accel, probe.box, ray.t_min)
+        interval = slab_interval(probe.box, accel.lo, accel.hi)
+        enter = wp.max(interval[0], set_up.begin)
+        if enter <= later(interval[1]) and enter <= later(best.t) + set_up.slack and enter < wp.inf:
+            best, counts = walk(accel, surfaces, probe, set_up, enter, counts)
         return finish(accel.recorder, ray, counts, best)
 
     return traverse
