@@ -11,13 +11,13 @@ from wrt.kernels.build.records import (
     area_scale,
     center_of,
     empty_row,
-    half_area,
     halves_at,
     high_of,
     levels,
     low_of,
     lower,
     parted_at,
+    row_area,
     row_of,
 )
 
@@ -104,13 +104,13 @@ def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
                 k = bins.count - 1 - j
                 side = lower(side, box[axis * BINS + k])
                 n = n + count[axis * BINS + k]
-                right_cost[k] = wp.where(n == 0, float(wp.inf), half_area(side, scale) * float(n))
+                right_cost[k] = wp.where(n == 0, float(wp.inf), row_area(side, scale) * float(n))
             side = empty_row()
             n = int(0)
             for k in range(1, bins.count):
                 side = lower(side, box[axis * BINS + k - 1])
                 n = n + count[axis * BINS + k - 1]
-                cost = half_area(side, scale) * float(n) + right_cost[k]
+                cost = row_area(side, scale) * float(n) + right_cost[k]
                 if n > 0 and cost < best.cost:
                     best.axis = axis
                     best.bin = k

@@ -245,38 +245,70 @@ def start_pieces(source: Pieces, begin: int, end: int, target: Pieces) -> int:
     return size
 
 
+@wp.func
+def start_root(task: BspTask, n_points: int) -> BspTask:
+    """The launch's own task, over the pieces that start_pieces has written."""
+    task.end = task.end - task.begin
+    task.begin = 0
+    task.points_end = n_points
+    task.parent = -1
+    return task
+
+
+@wp.func
+def leave_over(tools: BspTools, output: BspOutput, task: BspTask, slot: int):
+    """A later launch builds this cell."""
+    left = output.results[N_LEFT_OVER]
+    output.left_over[left] = task
+    copy_cell(tools.cells, slot, output.left_cells, left)
+    link(output, task, left, LEFT_OVER)
+    output.results[N_LEFT_OVER] = left + 1
+
+
+@wp.func
+def child_of(task: BspTask, index: int, side: int, pieces: wp.vec3i, points_end: int) -> BspTask:
+    """A side of the node `index`. pieces: where those below the plane begin, those above it, and where these end."""
+    child = BspTask()
+    child.begin = pieces[side]
+    child.end = pieces[side + 1]
+    child.points_end = points_end
+    child.parent = index
+    child.side = side
+    child.depth = task.depth + 1
+    child.budget = int(wp.int64(task.budget) * wp.int64(child.end - child.begin) / wp.int64(pieces[2] - pieces[0]))
+    return child
+
+
+@wp.func
+def clip_to_side(cells: Cells, split: BspSplit, side: int, to: int):
+    """The part of the cell at HAND on one side of the plane."""
+    sign = wp.where(side == 0, wp.float64(-1.0), wp.float64(1.0))
+    clip_cell(cells, HAND, to, sign * split.normal, sign * split.offset, split.pad)
+
+
 @kernel
 def build_cells(source: Pieces, tasks: wp.array(dtype=BspTask), cells: Cells, which: int, tools: BspTools,
                 stack: wp.array(dtype=BspTask), output: BspOutput):
     """Build the subtree of tasks[which], which is in slot `which` of `cells`; at depth 0 the cell is the root box."""
     keep = tools.options.keep
-    root = tasks[which]
-    size = start_pieces(source, root.begin, root.end, tools.pieces)
+    size = start_pieces(source, tasks[which].begin, tasks[which].end, tools.pieces)
     if size < 0:
         output.results[FULL] = 1
         return
     box_cell(tools.cells, 0, tools.options.lo, tools.options.hi)
     root_area = cell_area(tools.cells, 0)
-    if root.depth > 0:
+    if tasks[which].depth > 0:
         copy_cell(cells, which, tools.cells, 0)
-    root.end = root.end - root.begin
-    root.begin = 0
-    root.points_end = size
-    root.parent = -1
-    stack[0] = root
+    stack[0] = start_root(tasks[which], size)
     waiting = int(1)
-    used = int(root.end)
+    used = int(stack[0].end)
     while waiting > 0:
         waiting = waiting - 1
         task = stack[waiting]
         output.results[DEPTH] = wp.max(output.results[DEPTH], task.depth)
         n = task.end - task.begin
-        left = output.results[N_LEFT_OVER]
-        if n <= keep and left < output.left_over.shape[0]:
-            output.left_over[left] = task
-            copy_cell(tools.cells, waiting, output.left_cells, left)
-            link(output, task, left, LEFT_OVER)
-            output.results[N_LEFT_OVER] = left + 1
+        if n <= keep and output.results[N_LEFT_OVER] < output.left_over.shape[0]:
+            leave_over(tools, output, task, waiting)
             continue
         copy_cell(tools.cells, waiting, tools.cells, HAND)
         scope = scope_of(tools, task, HAND)
@@ -307,16 +339,8 @@ def build_cells(source: Pieces, tasks: wp.array(dtype=BspTask), cells: Cells, wh
         output.cost[0] += share
         index = write_node(output, task, split, plane_tolerance(split, scope))
         for side in range(2):
-            child = BspTask()
-            child.begin = wp.where(side == 0, base, middle)
-            child.end = wp.where(side == 0, middle, used)
-            child.points_end = size
-            child.parent = index
-            child.side = side
-            child.depth = task.depth + 1
-            child.budget = int(wp.int64(task.budget) * wp.int64(child.end - child.begin) / wp.int64(used - base))
+            child = child_of(task, index, side, wp.vec3i(base, middle, used), size)
             if child.end > child.begin:
-                sign = wp.where(side == 0, wp.float64(-1.0), wp.float64(1.0))
-                clip_cell(tools.cells, HAND, waiting, sign * split.normal, sign * split.offset, split.pad)
+                clip_to_side(tools.cells, split, side, waiting)
                 stack[waiting] = child
                 waiting = waiting + 1

@@ -70,14 +70,20 @@ def box_cell(cells: Cells, slot: int, lo: wp.vec3d, hi: wp.vec3d):
 
 
 @wp.func
+def points_of(cells: Cells, slot: int, face: int) -> wp.vec2i:
+    """The points of a face: the first, and the end."""
+    first = slot * (MAX_FACES + 1) + face
+    return wp.vec2i(slot * MAX_POINTS + cells.first[first], slot * MAX_POINTS + cells.first[first + 1])
+
+
+@wp.func
 def measure_cell(cells: Cells, slot: int):
     """Fill in the areas of the faces."""
     for face in range(cells.n_faces[slot]):
-        begin = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face]
-        end = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face + 1]
-        origin = cells.points[begin]
+        points = points_of(cells, slot, face)
+        origin = cells.points[points[0]]
         total = wp.vec3d()
-        for i in range(begin + 1, end - 1):
+        for i in range(points[0] + 1, points[1] - 1):
             total += wp.cross(cells.points[i] - origin, cells.points[i + 1] - origin)
         cells.area[slot * MAX_FACES + face] = wp.float64(0.5) * wp.length(total)
 
@@ -102,6 +108,50 @@ def copy_cell(source: Cells, slot: int, target: Cells, to: int):
     target.n_faces[to] = source.n_faces[slot]
 
 
+@wp.struct
+class CutFace:
+    """A face and a plane. above: twice the area vector of its part above the plane; down, up: where its edges cross the plane, if
+    `crossed`; highest (0 or above), lowest (0 or below): distances of its corners, times the normal's length."""
+
+    above: wp.vec3d
+    down: wp.vec3d
+    up: wp.vec3d
+    crossed: bool
+    highest: wp.float64
+    lowest: wp.float64
+
+
+@wp.func
+def cut_face(cells: Cells, points: wp.vec2i, n: wp.vec3d, d: wp.float64, eps: wp.float64) -> CutFace:
+    zero = wp.float64(0.0)
+    out = CutFace()
+    p = cells.points[points[1] - 1]
+    s_p = snapped_side(n, d, eps, p)
+    first = p
+    out.down = p
+    out.up = p
+    for i in range(points[0], points[1]):
+        q = cells.points[i]
+        s_q = snapped_side(n, d, eps, q)
+        out.highest = wp.max(out.highest, s_q)
+        out.lowest = wp.min(out.lowest, s_q)
+        if s_p >= zero and s_q >= zero:
+            out.above += wp.cross(p - first, q - first)
+        elif s_p >= zero:
+            out.down = crossing(p, q, s_p, s_q)
+            out.above += wp.cross(p - first, out.down - first)
+            out.crossed = True
+        elif s_q >= zero:
+            out.up = crossing(p, q, s_p, s_q)
+            out.above += wp.cross(out.up - first, q - first)
+            out.crossed = True
+        p = q
+        s_p = s_q
+    if out.crossed:
+        out.above += wp.cross(out.down - first, out.up - first)
+    return out
+
+
 @wp.func
 def split_areas(cells: Cells, slot: int, n: wp.vec3d, d: wp.float64, eps: wp.float64) -> wp.vec2d:
     """The surfaces of the parts of a cell below and above a plane, each with the cut itself.
@@ -120,47 +170,19 @@ def split_areas(cells: Cells, slot: int, n: wp.vec3d, d: wp.float64, eps: wp.flo
     on_cut = wp.vec3d()
     met = bool(False)
     for face in range(cells.n_faces[slot]):
-        begin = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face]
-        end = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face + 1]
-        p = cells.points[end - 1]
-        s_p = snapped_side(n, d, eps, p)
-        first = p
-        part = wp.vec3d()  # twice the area vector of what is above
-        down = p
-        up = p
-        crossed = bool(False)
-        highest = zero
-        lowest = zero
-        for i in range(begin, end):
-            q = cells.points[i]
-            s_q = snapped_side(n, d, eps, q)
-            highest = wp.max(highest, s_q)
-            lowest = wp.min(lowest, s_q)
-            if s_p >= zero and s_q >= zero:
-                part += wp.cross(p - first, q - first)
-            elif s_p >= zero:
-                down = crossing(p, q, s_p, s_q)
-                part += wp.cross(p - first, down - first)
-                crossed = True
-            elif s_q >= zero:
-                up = crossing(p, q, s_p, s_q)
-                part += wp.cross(up - first, q - first)
-                crossed = True
-            p = q
-            s_p = s_q
+        part = cut_face(cells, points_of(cells, slot, face), n, d, eps)
         area = cells.area[slot * MAX_FACES + face]
-        if crossed:
-            part += wp.cross(down - first, up - first)
-            high = wp.min(half * wp.length(part), area)
+        if part.crossed:
+            high = wp.min(half * wp.length(part.above), area)
             above += high
             below += area - high
             if not met:
-                on_cut = down
+                on_cut = part.down
                 met = True
-            cut += wp.cross(down - on_cut, up - on_cut)
-        elif highest > zero:
+            cut += wp.cross(part.down - on_cut, part.up - on_cut)
+        elif part.highest > zero:
             above += area
-        elif lowest < zero:
+        elif part.lowest < zero:
             below += area
         else:
             closing = wp.max(closing, area)
@@ -168,6 +190,24 @@ def split_areas(cells: Cells, slot: int, n: wp.vec3d, d: wp.float64, eps: wp.flo
     closing = wp.max(closing, half * wp.length(cut))
     within = wp.max(within, closing)
     return wp.vec2d(wp.max(below + within, closing + closing), wp.max(above + within, closing + closing))
+
+
+@wp.func
+def order_by_angle(rim: wp.array(dtype=wp.vec3d), count: int, center: wp.vec3d, n: wp.vec3d):
+    """Sort the corners of the cut by their angle, counterclockwise about -n."""
+    x_axis = wp.normalize(rim[0] - center)
+    y_axis = wp.cross(x_axis, n)
+    angle = wp.zeros(shape=48, dtype=wp.float64)
+    for i in range(count):
+        c = rim[i]
+        a = turn(wp.dot(c - center, x_axis), wp.dot(c - center, y_axis))
+        k = int(i)
+        while k > 0 and angle[wp.max(k - 1, 0)] > a:
+            angle[k] = angle[k - 1]
+            rim[k] = rim[k - 1]
+            k = k - 1
+        angle[k] = a
+        rim[k] = c
 
 
 @wp.func
@@ -182,16 +222,15 @@ def clip_cell(cells: Cells, slot: int, to: int, n: wp.vec3d, d: wp.float64, eps:
     full = bool(False)
     center = wp.vec3d()
     for face in range(cells.n_faces[slot]):
-        begin = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face]
-        end = slot * MAX_POINTS + cells.first[slot * (MAX_FACES + 1) + face + 1]
+        points = points_of(cells, slot, face)
         start = int(size)
-        if size + (end - begin) + 2 > MAX_POINTS:
+        if size + (points[1] - points[0]) + 2 > MAX_POINTS:
             full = True
             break
-        p = cells.points[end - 1]
+        p = cells.points[points[1] - 1]
         s_p = snapped_side(n, d, eps, p)
         leaves = int(0)
-        for i in range(begin, end):
+        for i in range(points[0], points[1]):
             q = cells.points[i]
             s_q = snapped_side(n, d, eps, q)
             if (s_p >= zero) != (s_q >= zero):
@@ -218,22 +257,8 @@ def clip_cell(cells: Cells, slot: int, to: int, n: wp.vec3d, d: wp.float64, eps:
         copy_cell(cells, slot, cells, to)
         return
 
-    if n_rim >= 3:
-        # The cut closes the cell: its corners by their angle, counterclockwise about -n.
-        center = center / wp.float64(n_rim)
-        x_axis = wp.normalize(rim[0] - center)
-        y_axis = wp.cross(x_axis, n)
-        angle = wp.zeros(shape=48, dtype=wp.float64)
-        for i in range(n_rim):
-            c = rim[i]
-            a = turn(wp.dot(c - center, x_axis), wp.dot(c - center, y_axis))
-            k = int(i)
-            while k > 0 and angle[wp.max(k - 1, 0)] > a:
-                angle[k] = angle[k - 1]
-                rim[k] = rim[k - 1]
-                k = k - 1
-            angle[k] = a
-            rim[k] = c
+    if n_rim >= 3:  # the cut closes the cell
+        order_by_angle(rim, n_rim, center / wp.float64(n_rim), n)
         cells.first[to * (MAX_FACES + 1) + faces] = size
         for i in range(n_rim):
             cells.points[base + size + i] = rim[i]

@@ -19,13 +19,13 @@ from wrt.kernels.build.records import (
     area_scale,
     center_of,
     empty_row,
-    half_area,
     halves_at,
     high_of,
     levels,
     low_of,
     lower,
     measured,
+    row_area,
     row_of,
     rows_of,
     tell_parent,
@@ -90,12 +90,12 @@ def choose_sweep(data: BuildData, task: BuildTask) -> int:
                 i = task.begin + task.end - k
                 box = data.boxes[data.order[axis * n + i]]
                 side = lower(side, row_of(box.lo, box.hi))
-                data.area[i] = half_area(side, scale) * float(task.end - i)
+                data.area[i] = row_area(side, scale) * float(task.end - i)
             side = empty_row()
             for i in range(task.begin + 1, task.end):
                 box = data.boxes[data.order[axis * n + i - 1]]
                 side = lower(side, row_of(box.lo, box.hi))
-                cost = half_area(side, scale) * float(i - task.begin) + data.area[i]
+                cost = row_area(side, scale) * float(i - task.begin) + data.area[i]
                 if cost < best_cost:
                     best_cost = cost
                     best_axis = axis
@@ -158,11 +158,27 @@ def child_of(task: BuildTask, halves: Halves, side: int) -> BuildTask:
 def worth_it(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
     """Whether two leaves cost less than one."""
     scale = area_scale(task.measures.box)
-    area = half_area(task.measures.box, scale)
-    parts = (half_area(halves.left.box, scale) * rows_of(options, halves.count_0)
-             + half_area(halves.right.box, scale) * rows_of(options, halves.count_1))
+    area = row_area(task.measures.box, scale)
+    parts = (row_area(halves.left.box, scale) * rows_of(options, halves.count_0)
+             + row_area(halves.right.box, scale) * rows_of(options, halves.count_1))
     split_cost = options.cost_traversal * area + options.cost_intersection * parts
     return split_cost < options.cost_intersection * rows_of(options, task.end - task.begin) * area
+
+
+@wp.func
+def write_node(data: BuildData, task: BuildTask, halves: Halves):
+    """The inner node of a split range, its sides as leaves until they tell it what became of them."""
+    data.used[task.slot] = wp.uint8(1)
+    node = Bvh2Node()
+    node.lo_0 = low_of(halves.left.box)
+    node.hi_0 = high_of(halves.left.box)
+    node.lo_1 = low_of(halves.right.box)
+    node.hi_1 = high_of(halves.right.box)
+    node.first_0 = task.begin
+    node.count_0 = halves.count_0
+    node.first_1 = halves.middle
+    node.count_1 = halves.count_1
+    data.nodes[task.slot] = node
 
 
 @wp.func
@@ -215,24 +231,14 @@ def make_build_ranges(split: Any, place: Any = None) -> Any:
                 slot = slot + 1
             max_depth[0] = wp.max(max_depth[0], task.depth)
             tell_parent(data.nodes, task, task.slot, 0)
-            data.used[task.slot] = wp.uint8(1)
-            node = Bvh2Node()
-            node.lo_0 = low_of(halves.left.box)
-            node.hi_0 = high_of(halves.left.box)
-            node.lo_1 = low_of(halves.right.box)
-            node.hi_1 = high_of(halves.right.box)
-            node.first_0 = task.begin
-            node.count_0 = halves.count_0
-            node.first_1 = halves.middle
-            node.count_1 = halves.count_1
-            data.nodes[task.slot] = node
+            write_node(data, task, halves)
             # A single record is a leaf; others find out for themselves.
-            if node.count_1 > 1:
+            if halves.count_1 > 1:
                 stack[size] = child_of(task, halves, 1)
                 size = size + 1
             elif wp.static(place is not None):
                 mark(data.left, halves.middle, halves.middle + 1)
-            if node.count_0 > 1:
+            if halves.count_0 > 1:
                 stack[size] = child_of(task, halves, 0)
                 size = size + 1
             elif wp.static(place is not None):

@@ -7,6 +7,7 @@ what the others have left (Karras 2012, "Maximizing Parallelism in the Construct
 import warp as wp
 
 from wrt.kernels.build.records import BuildOptions, rows_of
+from wrt.kernels.build.shape import half_area
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.kernels.units.triangle import lower, upper
@@ -95,12 +96,9 @@ def inner_children(node: Bvh2Node) -> int:
 
 
 @wp.func
-def half_area(lo: wp.vec3, hi: wp.vec3) -> wp.float64:
+def area_of(lo: wp.vec3, hi: wp.vec3) -> wp.float64:
     """Half the surface; 0 for an empty box. float64: no float32 is too large."""
-    x = wp.max(wp.float64(hi[0]) - wp.float64(lo[0]), wp.float64(0.0))
-    y = wp.max(wp.float64(hi[1]) - wp.float64(lo[1]), wp.float64(0.0))
-    z = wp.max(wp.float64(hi[2]) - wp.float64(lo[2]), wp.float64(0.0))
-    return x * y + y * z + z * x
+    return half_area(wp.max(wp.vec3d(hi) - wp.vec3d(lo), wp.vec3d()))
 
 
 @wp.func
@@ -115,7 +113,7 @@ def child_of(tree: Tree, options: BuildOptions, first: int, count: int) -> Below
         out.lo = lower(out.lo, tree.low[tree.order[j]])
         out.hi = upper(out.hi, tree.high[tree.order[j]])
     out.size = count
-    area = half_area(out.lo, out.hi)
+    area = area_of(out.lo, out.hi)
     out.cost = wp.float64(options.cost_intersection * rows_of(options, count)) * area
     out.plain = wp.float64(count) * area
     return out
@@ -128,7 +126,7 @@ def joined(options: BuildOptions, a: Below, b: Below, root: bool) -> Below:
     out.lo = lower(a.lo, b.lo)
     out.hi = upper(a.hi, b.hi)
     out.size = a.size + b.size
-    area = half_area(out.lo, out.hi)
+    area = area_of(out.lo, out.hi)
     out.cost = wp.float64(options.cost_traversal) * area + a.cost + b.cost
     out.plain = area + a.plain + b.plain
     out.used = 1 + a.used + b.used

@@ -8,7 +8,8 @@ the plane are clipped to both cells, sorted by themselves and merged in. The hos
 import warp as wp
 
 from wrt.kernels.build.clip import Clippable, clip_to_cell
-from wrt.kernels.build.kdtree_split import KdEvent, KdOptions, KdSplit, KdTask, KdWork, cheapest_split, half_area
+from wrt.kernels.build.kdtree_split import KdEvent, KdOptions, KdSplit, KdTask, KdWork, cheapest_split
+from wrt.kernels.build.shape import half_area
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 
@@ -45,15 +46,15 @@ def before(a: KdEvent, b: KdEvent) -> bool:
 
 
 @wp.func
-def merge(a: wp.array(dtype=KdEvent), first_a: int, end_a: int, b: wp.array(dtype=KdEvent), first_b: int, end_b: int,
+def merge(a: wp.array(dtype=KdEvent), range_a: wp.vec2i, b: wp.array(dtype=KdEvent), range_b: wp.vec2i,
           out: wp.array(dtype=KdEvent), first: int):
-    """Two sorted lists into one, at out[first]."""
-    i = int(first_a)
-    j = int(first_b)
+    """Two sorted lists into one, at out[first]. A range is the first place, and the one behind the last."""
+    i = int(range_a[0])
+    j = int(range_b[0])
     k = int(first)
-    while i < end_a or j < end_b:
-        take_b = i >= end_a
-        if not take_b and j < end_b:
+    while i < range_a[1] or j < range_b[1]:
+        take_b = i >= range_a[1]
+        if not take_b and j < range_b[1]:
             take_b = before(b[j], a[i])
         if take_b:
             out[k] = b[j]
@@ -86,7 +87,7 @@ def sort(events: wp.array(dtype=KdEvent), first: int, count: int, scratch: wp.ar
                 # Only the left run is moved away: what is merged never overtakes the right one.
                 for i in range(begin, middle):
                     scratch[i - begin] = events[i]
-                merge(scratch, 0, middle - begin, events, middle, end, events, begin)
+                merge(scratch, wp.vec2i(0, middle - begin), events, wp.vec2i(middle, end), events, begin)
         width = 2 * width
 
 
@@ -155,8 +156,8 @@ def divide(shapes: Clippable, work: KdWork, task: KdTask, split: KdSplit) -> wp.
     sort(work.fresh_left, 0, fresh_left, work.scratch)
     sort(work.fresh_right, 0, fresh_right, work.scratch)
     n_right = kept_right + fresh_right
-    merge(work.kept_right, 0, kept_right, work.fresh_right, 0, fresh_right, work.events, task.first)
-    merge(work.kept_left, 0, kept_left, work.fresh_left, 0, fresh_left, work.events, task.first + n_right)
+    merge(work.kept_right, wp.vec2i(0, kept_right), work.fresh_right, wp.vec2i(0, fresh_right), work.events, task.first)
+    merge(work.kept_left, wp.vec2i(0, kept_left), work.fresh_left, wp.vec2i(0, fresh_left), work.events, task.first + n_right)
     return wp.vec2i(n_right, kept_left + fresh_left)
 
 

@@ -7,6 +7,8 @@ are split between bins before, at the same costs: wrt.accel.cells.kdtree_build.b
 
 import warp as wp
 
+from wrt.kernels.build.shape import half_area
+
 
 @wp.struct
 class KdEvent:
@@ -72,18 +74,15 @@ class KdSplit:
 
 
 @wp.func
-def half_area(e: wp.vec3d) -> wp.float64:
-    return e[0] * e[1] + e[1] * e[2] + e[2] * e[0]
-
-
-@wp.func
-def split_cost(options: KdOptions, scale: wp.float64, caps: wp.float64, rim: wp.float64, below: wp.float64, above: wp.float64,
-               left: wp.float64, right: wp.float64) -> wp.float64:
-    """Of a plane across an axis with so many references on each side, `below` and `above` it so far to the cell's ends; caps: area
-    of the cell across the axis; rim: half of the length around that; scale: the cost of a reference over the cell's half area.
+def split_cost(options: KdOptions, scale: wp.float64, face: wp.vec2d, below: wp.float64, above: wp.float64, left: wp.float64,
+               right: wp.float64) -> wp.float64:
+    """Of a plane across an axis with so many references on each side, `below` and `above` it so far to the cell's ends. face: the
+    cell's extent along the two other axes; scale: the cost of a reference over the cell's half area.
 
     The host takes it too, of arrays: `split_cost.func`.
     """
+    caps = face[0] * face[1]
+    rim = face[0] + face[1]
     return options.cost_traversal + scale * ((below * rim + caps) * left + (above * rim + caps) * right)
 
 
@@ -120,11 +119,10 @@ def cheapest_split(work: KdWork, task: KdTask, options: KdOptions) -> KdSplit:
         left = n_left[axis]
         n_left[axis] = left + starts
         if position > task.lo[axis] and position < task.hi[axis] and wp.max(left, 1) + wp.max(right, 1) <= task.budget:
-            e_1 = e[(axis + 1) % 3]
-            e_2 = e[(axis + 2) % 3]
+            face = wp.vec2d(e[(axis + 1) % 3], e[(axis + 2) % 3])
             below = wp.float64(position) - wp.float64(task.lo[axis])
             above = wp.float64(task.hi[axis]) - wp.float64(position)
-            cost = split_cost(options, scale, e_1 * e_2, e_1 + e_2, below, above, wp.float64(left), wp.float64(right))
+            cost = split_cost(options, scale, face, below, above, wp.float64(left), wp.float64(right))
             if left == 0 or right == 0:
                 cost = cost * (wp.float64(1.0) - options.empty_bonus)
             if cost < best.cost:

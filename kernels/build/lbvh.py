@@ -67,16 +67,16 @@ def cell_of(x: float, begin: float, end: float, bits: int) -> wp.uint64:
 
 
 @kernel
-def write_keys(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3), number_bits: int,
-               bits: int, keys: wp.array(dtype=wp.uint64), order: wp.array(dtype=wp.int32), first: int):
-    """Of primitives first .. first + dim - 1: the Morton code of its middle, then its number."""
+def write_keys(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3), bits: wp.vec2i,
+               keys: wp.array(dtype=wp.uint64), order: wp.array(dtype=wp.int32), first: int):
+    """Of primitives first .. first + dim - 1: the Morton code of its middle, then its number. bits: bits_of."""
     i = first + wp.tid()
     middle = middle_of(low[i], high[i])
     a = ends[0]
     b = ends[1]
-    code = (spread(cell_of(middle[0], a[0], b[0], bits)) << wp.uint64(2)) | (
-        spread(cell_of(middle[1], a[1], b[1], bits)) << wp.uint64(1)) | spread(cell_of(middle[2], a[2], b[2], bits))
-    keys[i] = (code << wp.uint64(number_bits)) | wp.uint64(i)
+    code = (spread(cell_of(middle[0], a[0], b[0], bits[1])) << wp.uint64(2)) | (
+        spread(cell_of(middle[1], a[1], b[1], bits[1])) << wp.uint64(1)) | spread(cell_of(middle[2], a[2], b[2], bits[1]))
+    keys[i] = (code << wp.uint64(bits[0])) | wp.uint64(i)
     order[i] = i
 
 

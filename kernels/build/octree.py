@@ -25,21 +25,23 @@ def octants_of_box(lo: wp.vec3, hi: wp.vec3, middle: wp.vec3, end: wp.vec3) -> i
     return mask
 
 
+@wp.struct
+class SplitCells:
+    """The cells to be split. half: of their size, in finest cells; corners: the lowest of each cell; cell_of: of each reference."""
+
+    half: int
+    corners: wp.array(dtype=wp.vec3i)
+    cell_of: wp.array(dtype=wp.int32)
+
+
 @kernel
-def find_octants(
-    source: CellSource,
-    layout: OctreeLayout,
-    first: int,
-    half: int,
-    corners: wp.array(dtype=wp.vec3i),
-    cell_of: wp.array(dtype=wp.int32),
-    references: wp.array(dtype=wp.int32),
-    masks: wp.array(dtype=wp.int32),
-):
-    """Reference first + tid, of a primitive in a cell that is to be split: the octants that it meets."""
+def find_octants(source: CellSource, layout: OctreeLayout, first: int, cells: SplitCells, references: wp.array(dtype=wp.int32),
+                 masks: wp.array(dtype=wp.int32)):
+    """Reference first + tid, of a primitive in one of the cells: the octants that it meets."""
+    half = cells.half
     r = first + wp.tid()
     i = references[r]
-    corner = corners[cell_of[r]]
+    corner = cells.corners[cells.cell_of[r]]
     lo = source.lo[i]
     hi = source.hi[i]
     mask = octants_of_box(lo, hi, octree_planes(layout, corner + wp.vec3i(half, half, half)), layout.hi)

@@ -127,13 +127,13 @@ def lower(a: Row, b: Row) -> Row:
 
 @wp.func
 def area_scale(box: Row) -> float:
-    """The factor that makes a range's longest side 1, so that no area under- or overflows: what `half_area` wants."""
+    """The factor that makes a range's longest side 1, so that no area under- or overflows: what `row_area` wants."""
     e = 0.5 * high_of(box) - 0.5 * low_of(box)
     return 1.0 / wp.max(wp.max(wp.max(e[0], e[1]), e[2]), 2.0**-126.0)
 
 
 @wp.func
-def half_area(box: Row, scale: float) -> float:
+def row_area(box: Row, scale: float) -> float:
     """Half the surface of a box, in units of a range's own size; 0 for an empty one."""
     half = 0.5 * scale * box
     x = -(half[0] + half[3])

@@ -8,6 +8,7 @@ same tree, on all cores; then the moves are made one after the other, the best f
 import warp as wp
 
 from wrt.kernels.build.records import BuildOptions, rows_of
+from wrt.kernels.build.shape import half_area
 from wrt.kernels.structs import kernel
 
 QUEUE = 96
@@ -36,8 +37,7 @@ class Move:
 
 @wp.func
 def area_of(lo: wp.vec3, hi: wp.vec3, scale: float) -> float:
-    e = (0.5 * hi - 0.5 * lo) * scale
-    return e[0] * e[1] + e[1] * e[2] + e[2] * e[0]
+    return half_area((0.5 * hi - 0.5 * lo) * scale)
 
 
 @wp.func

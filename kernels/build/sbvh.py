@@ -18,12 +18,12 @@ from wrt.kernels.build.records import (
     area_scale,
     center_of,
     empty_row,
-    half_area,
     high_of,
     levels,
     low_of,
     lower,
     measured,
+    row_area,
     row_of,
 )
 from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
@@ -142,14 +142,14 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
                 b = BINS - 1 - k
                 side = lower(side, box[b])
                 count = count + leave[b]
-                right_cost[b] = half_area(side, scale) * float(count)
+                right_cost[b] = row_area(side, scale) * float(count)
                 right_count[b] = count
             side = empty_row()
             count = int(0)
             for b in range(1, BINS):
                 side = lower(side, box[b - 1])
                 count = count + enter[b - 1]
-                cost = half_area(side, scale) * float(count) + right_cost[b]
+                cost = row_area(side, scale) * float(count) + right_cost[b]
                 fits = count > 0 and count < n and right_count[b] > 0 and right_count[b] < n
                 if fits and count + right_count[b] <= task.limit - task.begin and cost < best.cost:
                     best.axis = axis
@@ -158,77 +158,97 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
     return best
 
 
-@wp.func
-def part_by_plane(data_records: wp.array(dtype=BuildRecord), room: wp.array(dtype=BuildRecord), task: BuildTask, split: Split,
-                  corners: wp.array(dtype=wp.vec3)) -> wp.vec2i:
-    """References left of the plane to room[begin ..], those right of it to room[.. limit - 1] backwards; how many each.
+@wp.struct
+class Parts:
+    """The boxes of both sides of a plane, and how many references they have; one that the plane cuts is in both."""
 
-    One on both sides is not split where leaving it whole on one side costs less ("reference unsplitting", section 4.4).
-    """
+    left: Row
+    right: Row
+    n_left: int
+    n_right: int
+
+
+@wp.func
+def parts_of(data: BuildData, task: BuildTask, axis: int, plane: float) -> Parts:
+    parts = Parts()
+    parts.left = empty_row()
+    parts.right = empty_row()
+    for i in range(task.begin, task.end):
+        record = data.records[i]
+        if record.hi[axis] < plane:
+            parts.left = lower(parts.left, row_of(record.lo, record.hi))
+            parts.n_left += 1
+        elif record.lo[axis] >= plane:
+            parts.right = lower(parts.right, row_of(record.lo, record.hi))
+            parts.n_right += 1
+        else:
+            part = cut(record, axis, -wp.inf, plane, data.corners)
+            if not is_empty(part):
+                parts.left = lower(parts.left, row_of(part.lo, part.hi))
+                parts.n_left += 1
+            part = cut(record, axis, plane, wp.inf, data.corners)
+            if not is_empty(part):
+                parts.right = lower(parts.right, row_of(part.lo, part.hi))
+                parts.n_right += 1
+    return parts
+
+
+@wp.func
+def cheaper_side(parts: Parts, box: Row, scale: float) -> int:
+    """The side that it pays to leave a reference with this box on as a whole, -1 left or 1 right; 0: it is split ("reference
+    unsplitting", section 4.4)."""
+    area_0 = row_area(parts.left, scale)
+    area_1 = row_area(parts.right, scale)
+    both = area_0 * float(parts.n_left) + area_1 * float(parts.n_right)
+    only_0 = row_area(lower(parts.left, box), scale) * float(parts.n_left) + area_1 * float(parts.n_right - 1)
+    only_1 = area_0 * float(parts.n_left - 1) + row_area(lower(parts.right, box), scale) * float(parts.n_right)
+    if only_0 < both and only_0 <= only_1:
+        return -1
+    return wp.where(only_1 < both, 1, 0)
+
+
+@wp.func
+def part_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec2i:
+    """References left of the plane to data.boxes[begin ..], those right of it to data.boxes[.. limit - 1] backwards; how many each.
+    One on both sides is split, unless it costs less to leave it whole or there is no room."""
     scale = area_scale(task.measures.box)
     plane = plane_of(task.measures.box[split.axis], -task.measures.box[3 + split.axis], split.bin)
-    left = empty_row()
-    right = empty_row()
-    n_left = int(0)
-    n_right = int(0)
-    for i in range(task.begin, task.end):  # what is surely on one side, and the parts of what is not
-        record = data_records[i]
-        if record.hi[split.axis] < plane:
-            left = lower(left, row_of(record.lo, record.hi))
-            n_left = n_left + 1
-        elif record.lo[split.axis] >= plane:
-            right = lower(right, row_of(record.lo, record.hi))
-            n_right = n_right + 1
-        else:
-            part = cut(record, split.axis, -wp.inf, plane, corners)
-            if not is_empty(part):
-                left = lower(left, row_of(part.lo, part.hi))
-                n_left = n_left + 1
-            part = cut(record, split.axis, plane, wp.inf, corners)
-            if not is_empty(part):
-                right = lower(right, row_of(part.lo, part.hi))
-                n_right = n_right + 1
-
+    parts = parts_of(data, task, split.axis, plane)
     done_0 = int(0)
     done_1 = int(0)
     for i in range(task.begin, task.end):
-        record = data_records[i]
+        record = data.records[i]
         to_left = bool(record.hi[split.axis] < plane)
         to_right = bool(record.lo[split.axis] >= plane)
         if not to_left and not to_right:
-            part_0 = cut(record, split.axis, -wp.inf, plane, corners)
-            part_1 = cut(record, split.axis, plane, wp.inf, corners)
+            part_0 = cut(record, split.axis, -wp.inf, plane, data.corners)
+            part_1 = cut(record, split.axis, plane, wp.inf, data.corners)
             to_left = is_empty(part_1)
             to_right = is_empty(part_0) and not to_left
             if not to_left and not to_right:
-                area_0 = half_area(left, scale)
-                area_1 = half_area(right, scale)
-                wide_0 = lower(left, row_of(record.lo, record.hi))
-                wide_1 = lower(right, row_of(record.lo, record.hi))
-                both = area_0 * float(n_left) + area_1 * float(n_right)
-                only_0 = half_area(wide_0, scale) * float(n_left) + area_1 * float(n_right - 1)
-                only_1 = area_0 * float(n_left - 1) + half_area(wide_1, scale) * float(n_right)
-                if only_0 < both and only_0 <= only_1:
+                box = row_of(record.lo, record.hi)
+                side = cheaper_side(parts, box, scale)
+                if side < 0:
                     to_left = bool(True)
-                    left = wide_0
-                    n_right = n_right - 1
-                elif only_1 < both:
+                    parts.left = lower(parts.left, box)
+                    parts.n_right -= 1
+                elif side > 0:
                     to_right = bool(True)
-                    right = wide_1
-                    n_left = n_left - 1
+                    parts.right = lower(parts.right, box)
+                    parts.n_left -= 1
                 elif done_0 + done_1 + 1 + task.end - i <= task.limit - task.begin:
-                    room[task.begin + done_0] = part_0
+                    data.boxes[task.begin + done_0] = part_0
                     done_0 = done_0 + 1
                     done_1 = done_1 + 1
-                    room[task.limit - done_1] = part_1
+                    data.boxes[task.limit - done_1] = part_1
                 else:
                     to_left = bool(True)
         if to_left:
-            room[task.begin + done_0] = record
+            data.boxes[task.begin + done_0] = record
             done_0 = done_0 + 1
         elif to_right:
             done_1 = done_1 + 1
-            room[task.limit - done_1] = record
+            data.boxes[task.limit - done_1] = record
     return wp.vec2i(done_0, done_1)
 
 
@@ -285,17 +305,17 @@ def split_references(data: BuildData, task: BuildTask) -> Halves:
     halves = sides(data, object_split(data, task), task)
     n = task.end - task.begin
     lo = wp.max(low_of(halves.left.box), low_of(halves.right.box))
-    overlap = half_area(row_of(lo, wp.min(high_of(halves.left.box), high_of(halves.right.box))), data.scale)
+    overlap = row_area(row_of(lo, wp.min(high_of(halves.left.box), high_of(halves.right.box))), data.scale)
     if task.depth + levels(n) >= MAX_DEPTH or not overlap > data.min_overlap:
         return halves
     best = Split()
     best.axis = -1
-    best.cost = (half_area(halves.left.box, scale) * float(halves.count_0)
-                 + half_area(halves.right.box, scale) * float(halves.count_1))
+    best.cost = (row_area(halves.left.box, scale) * float(halves.count_0)
+                 + row_area(halves.right.box, scale) * float(halves.count_1))
     best = spatial_split(data.records, task, data.corners, best)
     if best.axis < 0:
         return halves
-    counts = part_by_plane(data.records, data.boxes, task, best, data.corners)
+    counts = part_by_plane(data, task, best)
     if counts[0] == 0 or counts[1] == 0:
         counts = object_split(data, task)
     return sides(data, counts, task)

@@ -4,6 +4,8 @@ Both have the bits of what the host makes (Geometry.bounds, the layout "corners"
 travel to the host and back.
 """
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.structs import Primitive, kernel
@@ -49,6 +51,12 @@ def bounds(shape: Shape, low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.v
     pad = box_pad(lo, hi)
     low[i] = padded_lo(lo, pad)
     high[i] = padded_hi(hi, pad)
+
+
+@wp.func
+def half_area(extent: Any) -> Any:
+    """Half the surface of a box of this extent, in either precision. The host takes it too, of (3, ...) arrays: half_area.func."""
+    return extent[0] * extent[1] + extent[1] * extent[2] + extent[2] * extent[0]
 
 
 @wp.func

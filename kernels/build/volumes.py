@@ -24,11 +24,10 @@ def farthest(lo: wp.vec3, hi: wp.vec3, center: wp.vec3d) -> wp.vec3d:
 
 
 @kernel
-def fit_spheres(nodes: wp.array(dtype=Bvh2Node), begin: wp.array(dtype=wp.int32), end: wp.array(dtype=wp.int32),
-                order: wp.array(dtype=wp.int32), lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3),
-                out: wp.array(dtype=SphereNode), first: int):
-    """Spheres around the boxes lo, hi (by prim_id) below each child of out[first + tid]: of child 2 i + side, the records begin to
-    end - 1.
+def fit_spheres(nodes: wp.array(dtype=Bvh2Node), spans: wp.array(dtype=wp.vec2i), order: wp.array(dtype=wp.int32),
+                lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3), out: wp.array(dtype=SphereNode), first: int):
+    """Spheres around the boxes lo, hi (by prim_id) below each child of out[first + tid]: of child 2 i + side, the records
+    spans[.][0] to spans[.][1] - 1.
 
     Badoiu and Clarkson 2003, "Smaller core-sets for balls": from the middle of the box, the center goes a part 1 / (i + 1) of the
     way to the farthest corner, in round i; the best of the rounds counts. The radius is rounded up.
@@ -45,7 +44,7 @@ def fit_spheres(nodes: wp.array(dtype=Bvh2Node), begin: wp.array(dtype=wp.int32)
             for r in range(ROUNDS + 1):
                 way = wp.vec3d()
                 square = wp.float64(-1.0)
-                for k in range(begin[2 * i + side], end[2 * i + side]):
+                for k in range(spans[2 * i + side][0], spans[2 * i + side][1]):
                     d = farthest(lo[order[k]], hi[order[k]], wp.vec3d(center))
                     if wp.dot(d, d) > square:
                         square = wp.dot(d, d)

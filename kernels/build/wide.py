@@ -7,6 +7,7 @@ down, the nodes that this calls for. A leaf costs as much as the full rows of pr
 
 import warp as wp
 
+from wrt.kernels.build.shape import half_area
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first, leaf_reference
@@ -75,10 +76,9 @@ def high_of(node: Bvh2Node, side: int) -> wp.vec3:
 
 
 @wp.func
-def half_area(node: Bvh2Node, side: int) -> float:
-    """Half the surface of a child's box, scaled so that only boxes near the end of float32 have one that overflows."""
-    e = wp.max(high_of(node, side) - low_of(node, side), wp.vec3(0.0, 0.0, 0.0))
-    return wp.min(e[0] * e[1] + e[1] * e[2] + e[2] * e[0], 1.0e30)
+def area_of(node: Bvh2Node, side: int) -> float:
+    """Half the surface of a child's box; 0 for an empty one, and finite for one too large for float32."""
+    return wp.min(half_area(wp.max(high_of(node, side) - low_of(node, side), wp.vec3())), 1.0e30)
 
 
 @wp.func
@@ -110,7 +110,7 @@ def child_cost(trees: Subtrees, options: CollapseOptions, node: Bvh2Node, side: 
     """The least cost of a child as at most k roots."""
     n = count_of(node, side)
     if n > 0:
-        return leaf_cost(options, half_area(node, side), n)
+        return leaf_cost(options, area_of(node, side), n)
     return trees.cost[first_of(node, side) * MAX_WIDTH + k - 1]
 
 
@@ -129,7 +129,7 @@ def subtree_costs(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, tre
         for side in range(2):
             if count_of(node, side) == 0:
                 c = first_of(node, side)
-                area = half_area(node, side)
+                area = area_of(node, side)
                 height = wp.max(height, trees.height[c])
                 inner = options.cost_traversal * area + trees.cost[c * MAX_WIDTH + options.width - 1]
                 whole = leaf_cost(options, area, trees.size[c])
@@ -230,7 +230,7 @@ def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, ou
     for i in range(n):
         code = out.source[i]
         child = out.children[base + i]
-        child_area = half_area(nodes[code / 2], code % 2)
+        child_area = area_of(nodes[code / 2], code % 2)
         j = int(i)
         while j > 0 and ((child > 0 and reference[j - 1] < 0)
                          or ((child > 0) == (reference[j - 1] > 0) and area[j - 1] > child_area)):
@@ -252,14 +252,44 @@ def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, ou
         out.hi[first + i] = high_of(nodes[source[i] / 2], source[i] % 2)
 
 
-@kernel
-def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), options: CollapseOptions, trees: Subtrees,
-             out: WideTree):
-    """Write the wide tree, depth first. One thread.
+@wp.func
+def take_roots(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees: Subtrees, task: WideTask, out: WideTree) -> int:
+    """Write the sources of the children of a wide node; return how many they are.
 
     A node of k children leaves k - 1 on the stack while the last is walked. Where its plan would leave too little room for the
     binary tree below, which needs one entry a level, it takes fewer children.
     """
+    k = int(options.width)
+    n = int(0)
+    while True:
+        n = roots_of(nodes, trees, task.node, k, out.source)
+        tallest = int(0)
+        for j in range(n):
+            code = out.source[j]
+            if count_of(nodes[code / 2], code % 2) == 0:
+                tallest = wp.max(tallest, trees.height[first_of(nodes[code / 2], code % 2)])
+        if k == 2 or task.room - (n - 1) >= tallest:
+            break
+        k = k - 1
+    return n
+
+
+@wp.func
+def write_rows(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), code: int, count: int, width: int,
+               out: WideTree) -> int:
+    """Write the leaf of a source with so many primitives behind the rows that there are; return how many rows it takes."""
+    rows = (count + width - 1) / width
+    first = out.count[1] * width
+    gather(nodes, order, code / 2, code % 2, out, first)
+    for i in range(count, rows * width):
+        out.order[first + i] = -1
+    return rows
+
+
+@kernel
+def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), options: CollapseOptions, trees: Subtrees,
+             out: WideTree):
+    """Write the wide tree, depth first, and what it counts to out.count. One thread."""
     stack = wp.zeros(shape=wp.static(8 * STACK_SIZE), dtype=WideTask)
     root = WideTask()
     root.room = options.stack
@@ -267,7 +297,7 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
     stack[0] = root
     size = int(1)
     n_nodes = int(1)
-    n_rows = int(0)
+    out.count[1] = 0
     n_leaves = int(0)
     depth = int(0)
     least_room = int(options.stack)
@@ -276,20 +306,8 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
         task = stack[size]
         depth = wp.max(depth, task.depth)
         base = task.slot * options.width
-        k = int(options.width)
-        n = int(0)
-        room = int(0)
-        while True:
-            n = roots_of(nodes, trees, task.node, k, out.source)
-            room = task.room - (n - 1)
-            tallest = int(0)
-            for j in range(n):
-                code = out.source[j]
-                if count_of(nodes[code / 2], code % 2) == 0:
-                    tallest = wp.max(tallest, trees.height[first_of(nodes[code / 2], code % 2)])
-            if k == 2 or room >= tallest:
-                break
-            k = k - 1
+        n = take_roots(nodes, options, trees, task, out)
+        room = task.room - (n - 1)
         least_room = wp.min(least_room, room)
         for j in range(n):
             # The last child is taken from the stack first: it gets the next slots.
@@ -299,12 +317,8 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
             c = first_of(node, side)
             count = child_size(trees, node, side)
             if count_of(node, side) > 0 or trees.choice[c * MAX_WIDTH] == wp.uint8(1):
-                rows = (count + options.width - 1) / options.width
-                gather(nodes, order, code / 2, side, out, n_rows * options.width)
-                for i in range(count, rows * options.width):
-                    out.order[n_rows * options.width + i] = -1
-                out.children[base + j] = leaf_reference(n_rows, count)
-                n_rows = n_rows + rows
+                out.children[base + j] = leaf_reference(out.count[1], count)
+                out.count[1] += write_rows(nodes, order, code, count, options.width, out)
                 n_leaves = n_leaves + 1
             else:
                 child = WideTask()
@@ -318,7 +332,6 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
                 n_nodes = n_nodes + 1
         write_in_order(nodes, options, out, base, n)
     out.count[0] = n_nodes
-    out.count[1] = n_rows
     out.count[2] = n_leaves
     out.count[3] = depth
     out.count[4] = options.stack - least_room

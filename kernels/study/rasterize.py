@@ -220,46 +220,50 @@ def key_of(depth: wp.float32, prim_id: int) -> wp.uint64:
     return (wp.uint64(wp.cast(depth, wp.uint32)) << wp.uint64(32)) | wp.uint64(prim_id)
 
 
+@wp.struct
+class Corners:
+    """A triangle in homogeneous pixels."""
+
+    a: wp.vec3d
+    b: wp.vec3d
+    c: wp.vec3d
+    prim_id: int
+
+
 @wp.func
-def draw_row(
-    view: View, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, columns: wp.vec2i, row: int, prim_id: int, keys: wp.array(dtype=wp.uint64)
-):
+def draw_row(view: View, corners: Corners, columns: wp.vec2i, row: int, keys: wp.array(dtype=wp.uint64)):
     """Put a triangle's key into the pixels of part of a row where it is covered and nearest."""
     y = wp.float64(row) + HALF
     for column in range(columns[0], columns[1] + 1):
         x = wp.float64(column) + HALF
-        w = depth_at(a, b, c, x, y)
+        w = depth_at(corners.a, corners.b, corners.c, x, y)
         if w >= ZERO:
             # abs: the bits of -0 would sort behind everything
             depth = wp.float32(wp.abs(w) * wp.length(view.from_pixels @ wp.vec3d(x, y, wp.float64(1.0))))
             if wp.isfinite(depth):
-                wp.atomic_min(keys, row * view.width + column, key_of(depth, prim_id))
+                wp.atomic_min(keys, row * view.width + column, key_of(depth, corners.prim_id))
 
 
 @kernel
-def rasterize(
-    view: View,
-    projected: wp.array(dtype=wp.vec3d),
-    faces: wp.array(dtype=wp.vec3i),
-    boxes: wp.array(dtype=wp.vec4i),
-    prim_ids: wp.array(dtype=wp.int32),
-    first_row: int,
-    rows: int,
-    keys: wp.array(dtype=wp.uint64),
-):
-    """Launch over (bands, triangles): band i is `rows` rows from first_row + i rows. Two threads may share a pixel on CUDA,
-    where the minimum is atomic, but not on the CPU: there a band is one launch, in one thread."""
+def rasterize(view: View, projected: wp.array(dtype=wp.vec3d), faces: wp.array(dtype=wp.vec3i), boxes: wp.array(dtype=wp.vec4i),
+              prim_ids: wp.array(dtype=wp.int32), bands: wp.vec2i, keys: wp.array(dtype=wp.uint64)):
+    """Launch over (bands, triangles). bands: the first row of the first, and the rows of each. Two threads may share a pixel on
+    CUDA, where the minimum is atomic, but not on the CPU: there a band is one launch, in one thread."""
     band, i = wp.tid()
-    prim_id = prim_ids[i]
-    box = boxes[prim_id]
-    top = wp.max(box[1], first_row + band * rows)
-    bottom = wp.min(box[3], first_row + band * rows + rows - 1)
+    corners = Corners()
+    corners.prim_id = prim_ids[i]
+    box = boxes[corners.prim_id]
+    top = wp.max(box[1], bands[0] + band * bands[1])
+    bottom = wp.min(box[3], bands[0] + band * bands[1] + bands[1] - 1)
     if box[0] > box[2] or top > bottom:
         return
-    f = faces[prim_id]
+    f = faces[corners.prim_id]
     a = projected[f[0]]
     b = projected[f[1]]
     c = projected[f[2]]
+    corners.a = a
+    corners.b = b
+    corners.c = c
     size = wp.vec2d(wp.float64(view.width), wp.float64(view.height))
     edge_a = edge_between(b, c, size)
     edge_b = edge_between(c, a, size)
@@ -281,4 +285,4 @@ def rasterize(
                 span = cut(span, edge_c, side, y)
                 if span[0] <= span[1]:
                     columns = wp.vec2i(int(wp.ceil(span[0] - HALF)), int(wp.floor(span[1] - HALF)))
-                    draw_row(view, a, b, c, columns, row, prim_id, keys)
+                    draw_row(view, corners, columns, row, keys)

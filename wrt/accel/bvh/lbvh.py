@@ -40,7 +40,7 @@ def build_on(device: Any, shape: Any, options: BvhOptions, threads: int = 1) -> 
     ends[1:].fill_(wp.vec3(-wp.inf))
     launch_on(device, kernels.measure, min(kernels.PARTS, n), fitting.low, fitting.high, ends)
     keys, order = wp.empty(2 * n, dtype=wp.uint64, device=device), wp.empty(2 * n, dtype=wp.int32, device=device)
-    launch_on(device, kernels.write_keys, n, fitting.low, fitting.high, ends, number_bits, bits, keys, order, None)
+    launch_on(device, kernels.write_keys, n, fitting.low, fitting.high, ends, wp.vec2i(number_bits, bits), keys, order, None)
     with device.context_guard:  # the sort takes the current one
         wp.utils.radix_sort_pairs(keys, order, n, number_bits, number_bits + 3 * bits)
     nodes, parents = (wp.empty(n - 1, dtype=kind, device=device) for kind in (Bvh2Node, wp.int32))

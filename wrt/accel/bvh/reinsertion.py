@@ -13,6 +13,7 @@ from wrt.accel.bvh.tree import BinaryTree, BvhOptions
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, on_host, preloading, records, start, upload
 from wrt.kernels.build import reinsertion as kernels
+from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
 NODES_PER_LAUNCH = 256
@@ -87,7 +88,7 @@ def links_of(tree: BinaryTree) -> np.ndarray:
 
 def half_areas(links: np.ndarray, scale: np.float32) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.asarray(kernels.area_of.func(links["lo"].T, links["hi"].T, scale))
+        return np.asarray(half_area.func(((np.float32(0.5) * links["hi"] - np.float32(0.5) * links["lo"]) * scale).T))
 
 
 def scale_of(links: np.ndarray) -> np.float32:

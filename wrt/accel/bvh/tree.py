@@ -8,6 +8,7 @@ import numpy as np
 
 from wrt.core.device import records
 from wrt.core.errors import InputError
+from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 MAX_LEAF = 64
@@ -80,7 +81,7 @@ def squeeze(nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
 def half_areas(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     """Half the surfaces of boxes lo, hi (..., 3), (...) float64; 0 for empty ones."""
     e = np.clip(hi.astype(np.float64) - lo.astype(np.float64), 0.0, 1e39)
-    return np.asarray(e[..., 0] * e[..., 1] + e[..., 1] * e[..., 2] + e[..., 2] * e[..., 0])
+    return np.asarray(half_area.func(np.moveaxis(e, -1, 0)))
 
 
 def root_area(nodes: np.ndarray) -> float:

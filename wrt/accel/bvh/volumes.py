@@ -108,9 +108,9 @@ def fit_spheres(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, thread
     cpu = start("cpu")
     lo, hi = geometry.bounds()
     out = upload(with_links(traverse_bvh2_sphere.SphereNode, nodes), traverse_bvh2_sphere.SphereNode, cpu)
-    launch(fits.fit_spheres, len(nodes), upload(nodes, Bvh2Node, cpu), *(upload(each, wp.int32, cpu) for each in spans_of(nodes)),
-           upload(order.copy(), wp.int32, cpu), upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu), out, None, threads=threads,
-           step=NODES_PER_LAUNCH)
+    spans = upload(np.stack(spans_of(nodes), axis=1), wp.vec2i, cpu)
+    launch(fits.fit_spheres, len(nodes), upload(nodes, Bvh2Node, cpu), spans, upload(order.copy(), wp.int32, cpu),
+           upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu), out, None, threads=threads, step=NODES_PER_LAUNCH)
     return on_host(out)
 
 

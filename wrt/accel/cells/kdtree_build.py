@@ -17,7 +17,8 @@ from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.kernels.build import kdtree as kernels
 from wrt.kernels.build.clip import Clippable, clip_references
-from wrt.kernels.build.kdtree_split import half_area, split_cost
+from wrt.kernels.build.kdtree_split import split_cost
+from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 
 BINS = 64
@@ -147,8 +148,8 @@ def binned_split(cell: Cell, options: KdOptions) -> tuple[int, np.float32] | Non
         right = n - np.cumsum(np.bincount(np.searchsorted(planes, cell.hi[:, axis], side="left"), minlength=BINS))[:-1]
         share = planes.astype(np.float64) - low
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            cost = split_cost.func(options, options.cost_intersection / half_area.func(e), e[axis - 2] * e[axis - 1],
-                                   e[axis - 2] + e[axis - 1], share, width - share, left, right)
+            cost = split_cost.func(options, options.cost_intersection / half_area.func(e), (e[axis - 2], e[axis - 1]), share,
+                                   width - share, left, right)
         cost = np.where((left == 0) | (right == 0), (1.0 - options.empty_bonus) * cost, cost)
         inside = (planes > cell.cell_lo[axis]) & (planes < cell.cell_hi[axis])
         inside &= np.maximum(left, 1) + np.maximum(right, 1) <= cell.budget

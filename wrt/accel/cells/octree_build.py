@@ -163,9 +163,11 @@ class _Splitter:
         self.begin, self.references = self._int32(cells.begin), self._int32(cells.references)
         self.masks = wp.zeros(n, dtype=wp.int32, device=self.cpu)
         count = wp.zeros((m, 8), dtype=wp.int32, device=self.cpu)
-        cell_of = self._int32(np.repeat(np.arange(m), cells.count))
-        corner = upload(np.ascontiguousarray(cells.corner, np.int32), wp.vec3i, self.cpu)
-        launch(build_octree.find_octants, n, self.source, self.layout, None, half, corner, cell_of, self.references, self.masks,
+        split = build_octree.SplitCells()
+        split.half = half
+        split.corners = upload(np.ascontiguousarray(cells.corner, np.int32), wp.vec3i, self.cpu)
+        split.cell_of = self._int32(np.repeat(np.arange(m), cells.count))
+        launch(build_octree.find_octants, n, self.source, self.layout, None, split, self.references, self.masks,
                threads=self.threads, step=REFERENCES_PER_LAUNCH)
         launch(build_octree.count_octants, m, None, self.begin, self.masks, count, threads=self.threads, step=CELLS_PER_LAUNCH)
         return count.numpy()

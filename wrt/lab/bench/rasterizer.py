@@ -128,7 +128,7 @@ class Rasterizer:
 
     def _launch(self, view: Any, dim: tuple[int, int], prim_ids: Any, first: int, rows: int) -> None:
         wp.launch(kernels.rasterize, dim=dim, device=self.device, inputs=[
-            view, self.projected, self.faces, self.boxes, prim_ids, first, rows, self.keys])
+            view, self.projected, self.faces, self.boxes, prim_ids, wp.vec2i(first, rows), self.keys])
 
     def depth(self) -> np.ndarray:
         return self._half(1, np.float32)
