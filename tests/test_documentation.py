@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import re
@@ -249,6 +250,18 @@ def test_links_lead_somewhere(page: Path) -> None:
         file = (page.parent / path).resolve() if path else page
         assert file.exists() and file.is_relative_to(ROOT), f"{page.name}: {target}"
         assert not anchor or anchor in anchors(file), f"{page.name}: {target}"
+
+
+@pytest.mark.parametrize("file", ["README.md", "units/triangle.py", "units/box.py", "loops/one_ray.py", "loops/wave.py"])
+def test_the_device_code_names_files_that_exist(file: str) -> None:
+    """What runs, where what is, and which test holds two forms to each other: nothing else tells a reader."""
+    text = (ROOT / "kernels" / file).read_text(encoding="utf-8")
+    if file.endswith(".py"):
+        text = ast.get_docstring(ast.parse(text)) or ""
+    named = set(re.findall(r"(?<![\w./*])[\w*][\w/*]*\.(?:py|h|md)\b", text))
+    assert any(name.startswith("tests/") for name in named)
+    for name in named:
+        assert any(any(folder.glob(name)) for folder in (ROOT, ROOT / "kernels", *(ROOT / "kernels").iterdir())), name
 
 
 def test_every_page_is_reached_from_the_readme() -> None:

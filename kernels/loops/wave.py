@@ -1,4 +1,5 @@
-"""Many camera samples at a time, for one CPU thread: the integrator's step in a loop over queues.
+"""Many camera samples at a time, for one CPU thread: pictures on a CPU. one_ray.py says why there are two loops;
+tests/wrt/renderer/test_waves.py and tests/test_random_scenes.py hold them to the same bits.
 
 A wavefront (Laine, Karras and Aila 2013, "Megakernels Considered Harmful"): the pending rays of a wave of samples wait in one
 queue; one launch traces all of them, and the next shades all hits. Camera rays are made, traced and shaded FRESH at a time, while
