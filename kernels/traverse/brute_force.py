@@ -5,9 +5,10 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray
-from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
+from wrt.kernels.structs import Hit, Ray
+from wrt.kernels.traverse.common import Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.leaf import make_leaf
 
 
 @cache
@@ -25,21 +26,14 @@ def make_struct(record: Any) -> Any:
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """The closest hit, or any (the first that is found), among all primitives."""
     probe_of = make_probe(units)
-    intersect = make_intersect(units, accepts)
-    _, fetch_primitive, _, finish = make_counters(units, 0)
+    visit_leaf = make_leaf(units, any_hit, accepts)
+    _, _, _, finish = make_counters(units, 0)
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
-        best = no_hit(ray)
-        counts = Counts()
-        for i in range(accel.primitives.shape[0]):
-            best = intersect(probe, surfaces, accel.primitives[i], best)
-            counts = fetch_primitive(accel.recorder, ray, counts, i)
-            if wp.static(any_hit):
-                if best.prim_id != NO_HIT:
-                    break
+        best, counts = visit_leaf(accel, surfaces, probe, 0, accel.primitives.shape[0], no_hit(ray), Counts())
         return finish(accel.recorder, ray, counts, best)
 
     return traverse
