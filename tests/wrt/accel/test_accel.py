@@ -15,9 +15,11 @@ import warp as wp
 
 import wrt
 from tests.kernels.units.test_box import pad_kernel
+from wrt.accel.base import OneMesh
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.batches import RAYS_PER_LAUNCH
 from wrt.accel.scenes.build import build
+from wrt.accel.structure import NoOptions
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import records
 from wrt.core.errors import InputError
@@ -71,6 +73,25 @@ def test_unknown_names_and_devices_are_refused() -> None:
         build(BALL, bulder="sah")
     with pytest.raises(InputError, match="threads"):
         build(BALL, threads=0)
+
+
+@pytest.mark.parametrize("field", ["name", "kernels", "options"])
+def test_a_row_from_outside_without_a_field_is_refused_by_name(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    has: dict[str, Any] = {"name": "half", "kernels": ACCELERATORS["bvh2"].kernels, "options": NoOptions}
+    monkeypatch.setitem(ACCELERATORS, "half", type("Half", (OneMesh,), {key: has[key] for key in has if key != field}))
+    with pytest.raises(InputError, match=f"structure 'half': class Half has no field '{field}'"):
+        build(BALL, "half")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_class_says_whether_it_follows_vertices(name: str) -> None:
+    accel, moved = build(BALL, name), 2.0 * BALL.vertices
+    if accel.can_refit:
+        accel.refit(moved)
+        assert np.array_equal(accel.geometry.vertices, moved)
+    else:
+        with pytest.raises(InputError, match=f"a {accel.name} cannot follow vertices that move"):
+            accel.refit(moved)
 
 
 @pytest.mark.parametrize("name", NAMES)

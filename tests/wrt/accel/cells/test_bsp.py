@@ -15,13 +15,15 @@ import wrt.accel.cells.bsp as module
 from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, soup, triangles
 from wrt.accel.cells.bsp import Bsp
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.counting import counted
+from wrt.accel.queries.counting import copied
 from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.accel.scenes.build import build
+from wrt.core.device import on_host
 from wrt.core.errors import InputError
 from wrt.kernels.query import HitArrays, make_closest_hit_kernel
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.bsp import PLANE, STACK_SIZE
+from wrt.kernels.traverse.counters import Counts
 from wrt.scene.shapes import icosphere
 
 
@@ -236,12 +238,11 @@ def test_random_lines_cost_what_the_heuristic_says(kind: str, options: dict[str,
     hits = HitArrays()
     hits.t, hits.u, hits.v = (wp.zeros(len(rays.t_min), dtype=wp.float32, device=tree.device) for _ in range(3))
     hits.prim_id = wp.zeros(len(rays.t_min), dtype=wp.int32, device=tree.device)
-    n, refusing = len(rays.t_min), refusing_kernel()
-
-    def trace(structure, data):
-        wp.launch(refusing, dim=n, inputs=[data, tree.snapshot.surfaces, rays, hits, 0], device=tree.device)
-
-    counts = counted(trace, tree.structure, tree.data, n, tree.device, False).counts
+    data = copied(tree.data)
+    data.recorder.counts = wp.zeros(len(rays.t_min), dtype=Counts, device=tree.device)
+    data.recorder.first, data.recorder.fetches = (wp.zeros(0, dtype=wp.int64, device=tree.device) for _ in range(2))
+    wp.launch(refusing_kernel(), dim=len(rays.t_min), inputs=[data, tree.snapshot.surfaces, rays, hits, 0], device=tree.device)
+    counts = on_host(data.recorder.counts)
     steps = counts["nodes"] + counts["primitives"]
     assert abs(steps.mean() - tree.stats.sah_cost) < 3.0 * steps.std() / np.sqrt(len(steps))
 
