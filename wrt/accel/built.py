@@ -1,4 +1,4 @@
-"""What a builder gives, and what is told of it: sizes, costs, refits."""
+"""The arrays that a builder gives, and figures of a structure: sizes, costs, refits."""
 
 from __future__ import annotations
 

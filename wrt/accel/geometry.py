@@ -1,4 +1,4 @@
-"""What is hit: the triangles and spheres that a structure is built over."""
+"""The triangles and spheres that a structure is built over."""
 
 from __future__ import annotations
 

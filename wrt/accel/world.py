@@ -1,4 +1,4 @@
-"""What is known of primitives beyond the geometry: where they stand, and their normals, texture coordinates, materials, objects."""
+"""Attributes of primitives beyond the geometry: their places, normals, texture coordinates, materials and objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a structure answers: hits, and what they cost; and the arrays that answers go to."""
+"""Answers of a structure: hits, what they cost, and the arrays that take them."""
 
 from __future__ import annotations
 

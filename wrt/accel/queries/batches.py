@@ -42,10 +42,6 @@ class Query(NamedTuple):
     threads: int
     worlds: WorldIds | None = None
 
-    @property
-    def any_hit(self) -> bool:
-        return len(self.out) == 1
-
 
 def trace_query(snapshot: Snapshot, query: Query) -> None:
     """Write the answers of a structure to the query's arrays. Raises InputError for rays that are refused; the answers are then
@@ -55,7 +51,7 @@ def trace_query(snapshot: Snapshot, query: Query) -> None:
     elif snapshot.device.is_cuda:
         trace_on_gpu(snapshot, query)
     else:
-        tracer(snapshot.structure, query.any_hit).trace(snapshot, query)
+        tracer(snapshot.structure, len(query.out) == 1).trace(snapshot, query)
 
 
 def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
@@ -196,7 +192,7 @@ def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
     """As trace_query. What is Warp's is traced in one launch; what comes from the host in parts of MOST_ON_GPU."""
     device, structure, rays, out = snapshot.device, snapshot.structure, query.rays, query.out
     structure = structure._replace(units=structure.units._replace(stack=stack_on(device.alias)))
-    kernel = (any_hit_kernel if query.any_hit else closest_hit_kernel)(structure)
+    kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
     n = len(out[0])
     part = n if rays.as_warp else rays_on_gpu(n, device)
     for first in range(0, n, max(part, 1)):
@@ -209,7 +205,7 @@ def trace_worlds(snapshot: Snapshot, query: Query, worlds: WorldIds) -> None:
     """As trace_query, each ray in its own world; on a GPU in one launch."""
     device = snapshot.device
     inputs = [snapshot.data, snapshot.surfaces, rays_on(device, query.rays), worlds.arrays]
-    launch_over(device, worlds_kernel(snapshot.structure, query.any_hit), inputs, query.out, query.threads)
+    launch_over(device, worlds_kernel(snapshot.structure, len(query.out) == 1), inputs, query.out, query.threads)
 
 
 def launch_over(device: Any, kernel: Any, inputs: list[Any], out: list[Any], threads: int = 1) -> None:

@@ -1,4 +1,4 @@
-"""What hits know beyond t, u, v and prim_id: points with error bounds, normals, texture coordinates, ids. Computed when asked."""
+"""Points of hits with error bounds, normals, texture coordinates and ids: computed when asked for."""
 
 from __future__ import annotations
 

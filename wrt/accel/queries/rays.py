@@ -1,4 +1,4 @@
-"""Rays of a query: what somebody gives, and what of it is refused."""
+"""Rays of a query: the arrays that a caller gives, checked, and as kernels take them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Rays(NamedTuple):
 
     def on(self, device: Any) -> Rays:
         """The same, with Warp arrays of other devices copied to this one."""
-        return Rays(*(array.to(device) if isinstance(array, wp.array) else array for array in self))
+        return Rays(*[array.to(device) if isinstance(array, wp.array) else array for array in self])
 
     def checked(self) -> Rays:
         """The same as float32 without gaps. Raises InputError that names the first that kernels must not get; of Warp arrays, only

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 import threading
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +13,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.kernel_tools import DEVICE
+from tests.kernel_tools import DEVICE, cpu_only
+from wrt.accel import queries
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import FEWEST
@@ -51,6 +54,25 @@ def frozen(a: np.ndarray) -> np.ndarray:
     a = a.copy()
     a.flags.writeable = False
     return a
+
+
+@cpu_only
+@pytest.mark.parametrize("n", [1, MANY])
+def test_the_way_of_a_query_is_short(n: int) -> None:
+    """The Python files between the call and the launch: those that wrt.accel.queries names, and what they use of wrt.core."""
+    accel, rays, files = build(icosphere(3)), some_rays(n), set()
+    accel.closest_hit(*rays, threads=1)
+
+    def note(frame: Any, event: str, _: Any) -> None:
+        if event == "call" and frame.f_globals["__name__"].startswith("wrt."):
+            files.add(frame.f_globals["__name__"].removeprefix("wrt."))
+
+    sys.setprofile(note)
+    accel.closest_hit(*rays, threads=1)
+    sys.setprofile(None)
+    named = {f"accel.queries.{name}" for name in re.findall(r"(\w+)\.py\s\(", queries.__doc__ or "")}
+    assert len(named) == 5
+    assert files - {"kernels.structs"} == {*named, "core.arrays", "core.device", "core.threads"}  # structs: names of fields
 
 
 FORMS = {
