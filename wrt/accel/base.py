@@ -53,12 +53,11 @@ class OneMesh(Accelerator, ABC):
 
     @classmethod
     def restore(cls, built: Built, geometry: Geometry, attributes: World | None = None, /, device: str = "cpu",
-                threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative",
-                built_with: Any = None) -> Self:
+                threads: int | None = None, *, units: Units | None = None, built_with: Any = None) -> Self:
         """What was built before over the same geometry. built_with: its options (None: not known, and those that there are by
         default). Raises InputError where `built` is no such structure."""
         self = cls.__new__(cls)
-        Accelerator.__init__(self, Structure(cls, Units(triangle, box)), geometry.kept(), attributes, device, threads)
+        Accelerator.__init__(self, Structure(cls, units or Units()), geometry.kept(), attributes, device, threads)
         self.built_with = cls.options() if built_with is None else built_with
         begin = build_clock()
         check_order(built.order, len(geometry), cls.name)
@@ -70,8 +69,7 @@ class OneMesh(Accelerator, ABC):
         """For pickle: what `save` writes, and what the structure is over. A refit there measures growth from the shape of now."""
         units, snapshot = self.structure.units, self._snapshot
         options = replace(self.built_with, progress=None) if hasattr(self.built_with, "progress") else self.built_with
-        make = partial(type(self).restore, device=str(self.device), threads=self.threads, triangle=units.triangle, box=units.box,
-                       built_with=options)
+        make = partial(type(self).restore, device=str(self.device), threads=self.threads, units=units, built_with=options)
         return make, (snapshot.built.on_host(), snapshot.geometry, snapshot.attributes)
 
     @property

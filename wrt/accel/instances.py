@@ -80,7 +80,7 @@ class Instances(Accelerator):
         with self._refitting:
             begin, before = build_clock(), self._snapshot
             geometry: Any = before.geometry
-            rows, matrices = moves(rows_of(geometry, self.attributes), instance, matrix)
+            rows, matrices = moves(rows_of(geometry, before.attributes), instance, matrix)
             to_world = geometry.to_world.copy()
             to_world[rows] = matrices
             geometry = replace(geometry, to_world=to_world)

@@ -85,7 +85,7 @@ def read(path: str | os.PathLike[str], geometry: Geometry, attributes: World | N
             raise InputError("was built over another mesh")
         built = read_arrays(cls, header, body)
         with np.errstate(over="ignore", invalid="ignore"):  # numbers at the end of their range are looked at like all others
-            return cls.restore(built, geometry, attributes, device, threads, triangle=header["triangle"], box=header["box"])
+            return cls.restore(built, geometry, attributes, device, threads, units=Units(header["triangle"], header["box"]))
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise InputError(str(error), path) from error

@@ -66,11 +66,6 @@ class Accelerator:
         return self._snapshot.geometry
 
     @property
-    def attributes(self) -> World | None:
-        """What wrt.build knows of the primitives beyond the geometry: normals, uvs, materials, objects."""
-        return self._snapshot.attributes
-
-    @property
     def data(self) -> Any:
         """The Warp struct that kernels get. A refit makes another, but in place it writes to this one's arrays."""
         return self._snapshot.data
