@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.loops.wave import Wave
+from wrt.kernels.loops.state import Wave
 from wrt.kernels.loops.wave_normals import rows_of_normals
 from wrt.kernels.loops.wave_rows import EMITTERS, KEYS, LIGHTS, NUMBERS, SKY, SKY_POINTS, SURFACES, EmitterPoint, Key, Numbers
 from wrt.kernels.rows import Rows
@@ -48,12 +48,13 @@ def make_put_spheres(features: Any, sampled: Sampled, shading: Any, found: Any) 
     @wp.func
     def put_spheres(wave: Wave, surfaces: Surfaces, first: int, end: int):
         for j in range(first, end):
-            k = wave.met[j]
-            if wave.hits.prim_id[k] >= surfaces.n_triangles:
+            k = wave.outcomes.hit[j]
+            if wave.queue.hits.prim_id[k] >= surfaces.n_triangles:
                 s = found(wave, surfaces, j - first, k)
-                store_point(wave.rows, j - first, s.point)
+                store_point(wave.block.rows, j - first, s.point)
                 if wp.static(sampled.sky):
-                    store_normal(wave.rows, j - first, shading_normal(surfaces, s, look_up(surfaces, s), -wave.rays.direction[k]))
+                    wo = -wave.queue.rays.direction[k]
+                    store_normal(wave.block.rows, j - first, shading_normal(surfaces, s, look_up(surfaces, s), wo))
 
     return put_spheres
 
@@ -67,7 +68,7 @@ def make_sample_sky(features: Any, sampled: Sampled) -> Any:
     @wp.func
     def sample_sky(wave: Wave, lighting: Lighting, count: int):
         background = lighting.background
-        rows = wave.rows
+        rows = wave.block.rows
         light = lighting.count
         i = int(0)
         while i < count:
@@ -117,7 +118,7 @@ def make_sample_mesh(features: Any) -> Any:
 
     @wp.func
     def sample_mesh(wave: Wave, surfaces: Surfaces, lighting: Lighting, count: int):
-        rows = wave.rows
+        rows = wave.block.rows
         draw(rows, count)
         choose(rows, surfaces, lighting, count)
         i = int(0)
@@ -152,18 +153,18 @@ def make_light_at(features: Any, sampled: Sampled, choose_light: Any) -> Any:
     def light_at(wave: Wave, surfaces: Surfaces, lighting: Lighting, vertex: Vertex, light: int) -> LightSample:
         if wp.static(sampled.mesh):
             if light == 0 and first_is_mesh(lighting):
-                mesh = load_light(wave.rows, vertex.i)
+                mesh = load_light(wave.block.rows, vertex.i)
                 mesh.area = 1
                 return mesh
         if wp.static(sampled.sky):
             if light == lighting.count:
-                sky = load_sky(wave.rows, vertex.i)
+                sky = load_sky(wave.block.rows, vertex.i)
                 sky.distant = 1
                 sky.area = 1
                 return sky
         if wp.static(sampled.points):
             if light == lighting.count:
-                return choose_light(lighting, surfaces, light, vertex.surface, load_point(wave.rows, vertex.i))
+                return choose_light(lighting, surfaces, light, vertex.surface, load_point(wave.block.rows, vertex.i))
         point = light_point(lighting, vertex.key.key, vertex.key.index, light)
         return choose_light(lighting, surfaces, light, vertex.surface, point)
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.loops.wave import Wave
+from wrt.kernels.loops.state import Wave
 from wrt.kernels.loops.wave_rows import BENT, HITS, NORMAL_MAPS, SURFACES, TEXELS, NormalMap
 from wrt.kernels.loops.wave_textures import in_lanes
 from wrt.kernels.rows import Rows
@@ -29,12 +29,12 @@ def make_gather_maps() -> Any:
     def gather_maps(wave: Wave, surfaces: Surfaces, first: int, end: int):
         for j in range(first, end):
             out = NormalMap()
-            prim_id = wave.hits.prim_id[wave.met[j]]
+            prim_id = wave.queue.hits.prim_id[wave.outcomes.hit[j]]
             if prim_id < surfaces.n_triangles:
                 material = surfaces.prim_material[prim_id]
                 out.scale = surfaces.materials[material].normal_scale
                 out.is_mapped = wp.where(surfaces.materials[material].normal_texture >= 0, 1, 0)
-            store_map(wave.rows, j - first, out)
+            store_map(wave.block.rows, j - first, out)
 
     return gather_maps
 
@@ -50,7 +50,7 @@ def make_bend(features: Any) -> Any:
     def bend(wave: Wave, surfaces: Surfaces, first: int, end: int):
         if wp.static(features.normal_maps):
             gather_maps(wave, surfaces, first, end)
-        rows = wave.rows
+        rows = wave.block.rows
         i = int(0)
         while i < end - first:
             s = load_surface(rows, i)
@@ -81,6 +81,6 @@ def make_wave_normals(features: Any, shading_normal: Any) -> tuple[Any, Any]:
         if wp.static(features.spheres):
             if s.exclude_plus_one == 0:
                 return shading_normal(surfaces, s, texels, wo)
-        return load_bent(wave.rows, i)
+        return load_bent(wave.block.rows, i)
 
     return make_bend(features) if bends else bend_nothing, normal_at

@@ -4,30 +4,30 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.loops.wave import Job, Wave
+from wrt.kernels.loops.state import Wave
 from wrt.kernels.loops.wave_rows import FACETS, KEYS, Key
 
 store_key = KEYS.store()
 
 
 @wp.func
-def key_at(wave: Wave, job: Job, number: int) -> wp.uint32:
-    """Of the samples of a path that has just been traced."""
-    if job.fresh != 0:
-        return wave.pixel_keys[number / job.samples]
-    return wave.paths[wave.size[number] * wave.capacity + number].key
+def key_at(wave: Wave, s: int) -> wp.uint32:
+    """Return the key of the path of sample s that has just been traced."""
+    if wave.progress[0].fresh != 0:
+        return wave.pixels.key[s / wave.task[0].samples]
+    return wave.samples.paths[wave.samples.pending[s] * wave.capacity + s].key
 
 
 @wp.func
 def put_keys(wave: Wave, first: int, end: int):
     """Put the keys of the hits first .. end - 1, at most BLOCK, to the rows KEYS."""
-    job = wave.job[0]
+    task = wave.task[0]
     for j in range(first, end):
-        number = wave.number[wave.met[j]]
+        s = wave.queue.sample[wave.outcomes.hit[j]]
         out = Key()
-        out.key = key_at(wave, job, number)
-        out.index = wp.uint32(job.first_sample + number % job.samples)
-        store_key(wave.rows, j - first, out)
+        out.key = key_at(wave, s)
+        out.index = wp.uint32(task.first_sample + s % task.samples)
+        store_key(wave.block.rows, j - first, out)
 
 
 def make_sample_facets(choose_facet: Any) -> Any:
@@ -36,7 +36,7 @@ def make_sample_facets(choose_facet: Any) -> Any:
 
     @wp.func
     def sample_facets(wave: Wave, count: int):
-        rows = wave.rows
+        rows = wave.block.rows
         i = int(0)
         while i < count:
             at = load_key(rows, i)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from wrt.kernels.loops.wave import BLOCK
+from wrt.kernels.loops.state import BLOCK
 from wrt.kernels.rows import Rows
 from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.shading import Texels
@@ -66,5 +66,6 @@ EMITTERS = Rows(EmitterPoint, BLOCK, NUMBERS.end)
 LIGHTS = Rows(LightSample, BLOCK, EMITTERS.end)  # of the first light
 SKY = Rows(LightSample, BLOCK, LIGHTS.end)
 SKY_POINTS = Rows(wp.vec3, BLOCK, SKY.end)  # what places a sample on the sky (sky_point)
-SEEN = Rows(wp.vec3, BLOCK, SKY_POINTS.end)  # the background's colours, of a block of the rays that missed
+MISSED = Rows(wp.vec3, BLOCK, SKY_POINTS.end)  # directions of a block of the rays that missed
+SEEN = Rows(wp.vec3, BLOCK, MISSED.end)  # and the background's colours there
 ROWS = SEEN.end

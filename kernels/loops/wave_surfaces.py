@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.loops.wave import Wave
+from wrt.kernels.loops.state import Wave
 from wrt.kernels.loops.wave_rows import HITS, SURFACES, Met
 from wrt.kernels.memory import prefetch
 from wrt.kernels.query import hit_at, queued_ray
@@ -17,7 +17,7 @@ FAR = 16  # hits whose triangle is prefetched before it is gathered
 @wp.func
 def hit_triangle(wave: Wave, surfaces: Surfaces, j: int) -> int:
     """The triangle of hit j; for a sphere any valid one, whose result is ignored."""
-    return wp.min(wave.hits.prim_id[wave.met[j]], surfaces.n_triangles - 1)
+    return wp.min(wave.queue.hits.prim_id[wave.outcomes.hit[j]], surfaces.n_triangles - 1)
 
 
 class Attributes:
@@ -55,13 +55,13 @@ def make_gather(has: Attributes) -> Any:
     def gather(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
         for j in range(first, end):
             prefetch_triangles(wave, surfaces, j, hits)
-            k = wave.met[j]
+            k = wave.outcomes.hit[j]
             met = Met()
             met.triangle = triangle_at(surfaces, place_of(surfaces, hit_triangle(wave, surfaces, j)))
-            met.u = wave.hits.u[k]
-            met.v = wave.hits.v[k]
-            met.direction = wave.rays.direction[k]
-            store_met(wave.rows, j - first, met)
+            met.u = wave.queue.hits.u[k]
+            met.v = wave.queue.hits.v[k]
+            met.direction = wave.queue.rays.direction[k]
+            store_met(wave.block.rows, j - first, met)
 
     return gather
 
@@ -77,7 +77,7 @@ def make_find(has: Attributes) -> Any:
         if surfaces.n_triangles == 0:
             return
         gather(wave, surfaces, first, end, hits)
-        rows = wave.rows
+        rows = wave.block.rows
         i = int(0)
         while i < end - first:
             met = load_met(rows, i)
@@ -95,13 +95,13 @@ def make_found(has: Attributes, spheres: bool) -> Any:
 
     @wp.func
     def found(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
-        hit = hit_at(wave.hits, k)
+        hit = hit_at(wave.queue.hits, k)
         if wp.static(spheres):
             if hit.prim_id >= surfaces.n_triangles:
-                sphere = facing(on_sphere(surfaces, queued_ray(wave.rays, k), hit), wave.rays.direction[k])
+                sphere = facing(on_sphere(surfaces, queued_ray(wave.queue.rays, k), hit), wave.queue.rays.direction[k])
                 sphere.material = surfaces.prim_material[hit.prim_id]
                 return sphere
-        s = load_surface(wave.rows, i)
+        s = load_surface(wave.block.rows, i)
         s.material = surfaces.prim_material[hit.prim_id]
         s.exclude_plus_one = hit.prim_id + 1
         return s
@@ -119,7 +119,7 @@ def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
 
     @wp.func
     def found_alone(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
-        return surface_at(surfaces, queued_ray(wave.rays, k), hit_at(wave.hits, k))
+        return surface_at(surfaces, queued_ray(wave.queue.rays, k), hit_at(wave.queue.hits, k))
 
     if features.instances:
         return find_nothing, found_alone

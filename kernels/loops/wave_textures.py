@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.loops.wave import BLOCK, Wave
+from wrt.kernels.loops.state import BLOCK, Wave
 from wrt.kernels.loops.wave_rows import SURFACES, TEXELS
 from wrt.kernels.memory import put
 from wrt.kernels.native import source
@@ -27,7 +27,7 @@ def sample_lanes(surfaces: Surfaces, wanted: wp.array(dtype=wp.int32), first: in
 @noinline
 def sample_slot(wave: Wave, surfaces: Surfaces, slot: int, count: int, channels: int, to: int):
     """One texture of each of a block's hits."""
-    sample_lanes(surfaces, wave.wanted, slot * BLOCK, count, channels, wave.rows, to)
+    sample_lanes(surfaces, wave.block.wanted, slot * BLOCK, count, channels, wave.block.rows, to)
 
 
 def in_lanes(features: Any) -> bool:
@@ -46,7 +46,7 @@ def sample_nothing(wave: Wave, surfaces: Surfaces, count: int):
 
 
 def make_texture_link(slot: int, name: str, texture: MaterialTexture, want_others: Any, sample_others: Any) -> tuple[Any, Any]:
-    """want(wave, surfaces, i, material): put the textures of hit i of a block to wave.wanted, -1 where `material` is; and
+    """want(wave, surfaces, i, material): put the textures of hit i of a block to wave.block.wanted, -1 where `material` is; and
     sample(wave, surfaces, count): sample them for the first hits of a block. This one, in its slot, and the others."""
     index = make_texture_index(name)
     channels = sum(1 << channel for channel, _ in texture.numbers)
@@ -58,7 +58,7 @@ def make_texture_link(slot: int, name: str, texture: MaterialTexture, want_other
         texture = int(-1)
         if material >= 0:
             texture = index(surfaces.materials, material)
-        put(wave.wanted, wp.static(slot * BLOCK) + i, texture)
+        put(wave.block.wanted, wp.static(slot * BLOCK) + i, texture)
 
     @wp.func
     def sample(wave: Wave, surfaces: Surfaces, count: int):
@@ -95,7 +95,7 @@ def make_wave_textures(features: Any, look_up: Any) -> tuple[Any, Any]:
         for i in range((count + LANES - 1) / LANES * LANES):
             material = int(-1)
             if i < count:
-                prim_id = wave.hits.prim_id[wave.met[first + i]]
+                prim_id = wave.queue.hits.prim_id[wave.outcomes.hit[first + i]]
                 if prim_id < surfaces.n_triangles:
                     material = surfaces.prim_material[prim_id]
             want(wave, surfaces, i, material)
@@ -106,6 +106,6 @@ def make_wave_textures(features: Any, look_up: Any) -> tuple[Any, Any]:
         if wp.static(features.spheres):
             if s.exclude_plus_one == 0:
                 return look_up(surfaces, s)
-        return load(wave.rows, i)
+        return load(wave.block.rows, i)
 
     return sample_textures, texels_at

@@ -14,7 +14,8 @@ import warp as wp
 from wrt.accel.queries.batches import new_scratch
 from wrt.core.device import made_once, records, upload
 from wrt.kernels.launches import Launch
-from wrt.kernels.loops import wave, wave_begin, wave_rows, wave_shade
+from wrt.kernels.loops import state, wave, wave_begin, wave_rows, wave_shade
+from wrt.kernels.loops.state import BLOCK
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.materials import Scatter
@@ -139,44 +140,49 @@ def capacity(features: Features, lights: int) -> int:
 
 
 class Buffers:
-    """What one thread works in. job, order: views of the wave's."""
+    """What one thread works in. task, order: views of the wave's."""
 
     def __init__(self, features: Features, lights: int) -> None:
         self.capacity = n = capacity(features, lights)
-        shadows = n * lights
-        self.job, self.order = records(wave.Job, 1), np.zeros(n, np.int32)
-        w = self.wave = wave.Wave()
+        self.task, self.order = records(state.Task, 1), np.zeros(n, np.int32)
+        w = self.wave = state.Wave()
         w.capacity = n
-        w.job, w.order = upload(self.job, wave.Job, "cpu"), upload(self.order, wp.int32, "cpu")
-        w.asking = wp.zeros(max(lights, 1), dtype=wp.int32, device="cpu")
-        w.xi, w.lens_xi = room(n + LANES, wp.vec2), room(n + LANES, wp.vec2)
-        w.done, w.size, w.traced, w.number = room(n, Sample), room(n, wp.int32), room(n, wp.int32), room(n, wp.int32)
-        w.paths = room(n * features.stack_size, wave.Path)
-        w.met, w.missed = room(n, wp.int32), room(n, wp.int32)
-        w.rows = room(wave_rows.ROWS * wave.BLOCK, wp.float32)
-        w.wanted = room(len(TEXTURES) * wave.BLOCK, wp.int32)
-        w.pixels, w.pixel_keys = room(n + LANES, wp.int32), room(n, wp.uint32)
-        w.rays, w.hits, w.lit, w.asked = queue(n), hit_arrays(n), room(n, Lit), room(n, wp.int32)
-        w.request, w.value, w.shadow_rays = room(shadows, wp.int32), room(shadows, wp.vec3), queue(shadows)
-        if features.transparent_shadows:
-            w.scatter, w.walks, w.waiting = room(n, Scatter), room(shadows, ShadowWalk), room(shadows, wp.int32)
-            w.shadow_hits = hit_arrays(shadows)
-        else:
-            w.occluded = room(shadows, wp.bool)
+        w.task, w.progress = upload(self.task, state.Task, "cpu"), wp.zeros(1, dtype=state.Progress, device="cpu")
+        w.pixels.order = upload(self.order, wp.int32, "cpu")
+        w.pixels.key, w.pixels.film_index = room(n, wp.uint32), room(n + LANES, wp.int32)
+        w.samples.film_point, w.samples.lens_point = room(n + LANES, wp.vec2), room(n + LANES, wp.vec2)
+        w.samples.sum, w.samples.pending, w.samples.traced = room(n, Sample), room(n, wp.int32), room(n, wp.int32)
+        w.samples.paths = room(n * features.stack_size, state.Path)
+        w.queue.sample, w.queue.rays, w.queue.hits = room(n, wp.int32), queue(n), hit_arrays(n)
+        w.outcomes.hit, w.outcomes.missed, w.outcomes.resumed = (room(n, wp.int32) for _ in range(3))
+        self.allocate_shadows(features.transparent_shadows, lights)
+        w.block.rows, w.block.wanted = room(wave_rows.ROWS * BLOCK, wp.float32), room(len(TEXTURES) * BLOCK, wp.int32)
         self.scratch = new_scratch(BatchTraversal.stream_sizes)
 
+    def allocate_shadows(self, transparent: bool, lights: int) -> None:
+        """Allocate what asking lights takes."""
+        w, n, slots = self.wave, self.capacity, self.capacity * lights
+        w.receivers.sample, w.receivers.lit, w.receivers.shadow = room(n, wp.int32), room(n, Lit), room(slots, wp.int32)
+        w.shadows.value, w.shadow_queue.rays = room(slots, wp.vec3), queue(slots)
+        w.shadow_queue.count = wp.zeros(max(lights, 1), dtype=wp.int32, device="cpu")
+        if transparent:
+            w.receivers.scatter, w.shadows.walk = room(n, Scatter), room(slots, ShadowWalk)
+            w.shadow_queue.slot, w.shadow_queue.hits = room(slots, wp.int32), hit_arrays(slots)
+        else:
+            w.shadow_queue.occluded = room(slots, wp.bool)
+
     def take(self, work: Work, each: Callable[[], None]) -> None:
-        """Call `each` for every wave of some work, with its job and its pixels in place."""
-        job, (x, y, width, height) = self.job[0], work.rectangle
-        job["x"], job["y"], job["width"] = x, y, width
+        """Call `each` for every wave of some work, with its task in place."""
+        task, (x, y, width, height) = self.task[0], work.rectangle
+        task["x"], task["y"], task["width"] = x, y, width
         order, most = block_order(width, height), min(work.n, self.capacity)
         for first in range(work.first, work.first + work.n, most):
             samples = min(most, work.first + work.n - first)
             count = self.capacity // samples
-            job["first_sample"], job["samples"] = first, samples
+            task["first_sample"], task["samples"] = first, samples
             for begin in range(0, len(order), count):
                 pixels = order[begin : begin + count]
-                self.order[: len(pixels)], job["pixels"] = pixels, len(pixels)
+                self.order[: len(pixels)], task["pixels"] = pixels, len(pixels)
                 each()
 
 
@@ -193,14 +199,14 @@ class Picture:
 
         block = recorded(command(kernels.prepare, w, surfaces, lighting, 0, 0), ALL) if kernels.prepare else Launch()
         launches = {
-            "closest_hit": trace(kernels.closest_hit, w.rays, w.hits),
+            "closest_hit": trace(kernels.closest_hit, w.queue.rays, w.queue.hits),
             "shade": recorded(command(kernels.shade, w, surfaces, lighting, limits[0], block, 0, 0), ALL),
         }
         if kernels.shadow:
-            launches["walk_hit"] = trace(kernels.closest_hit, w.shadow_rays, w.shadow_hits)
+            launches["walk_hit"] = trace(kernels.closest_hit, w.shadow_queue.rays, w.shadow_queue.hits)
             launches["go_through"] = recorded(command(kernels.shadow, w, surfaces, 0))
         if kernels.any_hit:
-            launches["shadow_hit"] = trace(kernels.any_hit, w.shadow_rays, w.occluded)
+            launches["shadow_hit"] = trace(kernels.any_hit, w.shadow_queue.rays, w.shadow_queue.occluded)
         for group_limits, group in zip(limits, film.groups, strict=True):
             launches["begin"] = recorded(command(kernels.begin, w, camera, group_limits, group, 0, 0), ALL)
             of_group = wave.WaveLaunches()
@@ -221,13 +227,13 @@ class Aovs:
         kernels, w, (accel, surfaces, _, camera) = waves.kernels, buffers.wave, world
         self.buffers, self.block = buffers, kernels.block
         self.begin, self.see = command(kernels.begin_aov, w, camera, film.struct), command(kernels.see, w, surfaces, film.struct)
-        self.closest_hit = traversal(kernels, kernels.closest_hit, buffers, accel, surfaces, w.rays, w.hits)
+        self.closest_hit = traversal(kernels, kernels.closest_hit, buffers, accel, surfaces, w.queue.rays, w.queue.hits)
 
     def take(self, work: Work) -> None:
         self.buffers.take(work, self.trace)
 
     def trace(self) -> None:
-        pixels = int(self.buffers.job[0]["pixels"])
+        pixels = int(self.buffers.task[0]["pixels"])
         self.begin.launch()
         self.closest_hit.set_dim(-(-pixels // self.block))
         self.closest_hit.set_param_by_name("end", pixels)

@@ -11,7 +11,7 @@ import warp as wp
 
 from wrt.core.device import upload
 from wrt.kernels import structs
-from wrt.kernels.loops.wave import BLOCK
+from wrt.kernels.loops.state import BLOCK
 from wrt.kernels.loops.wave_rows import ROWS, SURFACES
 from wrt.kernels.loops.wave_textures import sample_lanes
 from wrt.kernels.shade.textures import make_sample_texture

@@ -176,7 +176,7 @@ def test_waves_are_smaller_where_each_sample_takes_more_room() -> None:
     features = plan_of(load_scene(SCENES / "whitted.toml"), Options()).features
     assert waves.Buffers(features, 2).capacity == waves.CAPACITY
     many = waves.Buffers(features, 1000)
-    assert 64 <= many.capacity < waves.CAPACITY and len(many.wave.value) == 1000 * many.capacity <= waves.ROOM
+    assert 64 <= many.capacity < waves.CAPACITY and len(many.wave.shadows.value) == 1000 * many.capacity <= waves.ROOM
     assert waves.Buffers(replace(features, stack_size=1 << 20), 1).capacity == 64
 
 
