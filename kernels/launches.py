@@ -1,12 +1,15 @@
-"""Launches that a kernel of the CPU makes: a loop over kernels without Python between them, and without its lock."""
+"""Launches that a kernel of the CPU makes: a loop over kernels without Python between them, and without its lock.
+
+How Warp compiles a kernel for the CPU is no part of its documents: a C function of two addresses, of the launch's size
+(launch_bounds_t) and of its arguments. The self-test of wrt.accel.queries.raw_launches holds it."""
 
 import warp as wp
 
 
 @wp.struct
 class Launch:
-    """A kernel that is compiled for the CPU, with its arguments: addresses, which wrt.renderer.launches has. For one thread at a
-    time: launches write into it.
+    """A kernel that is compiled for the CPU, with its arguments: addresses that wrt.accel.queries.raw_launches keeps. For one
+    thread at a time: launches write into it.
 
     entry: of the machine code, bounds: of the launch's size, args: of all arguments, tail: of the last of them; block: how many
     rays each of its threads takes, where it has a range of them.

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.structs import fields_of
+from wrt.kernels.warp_private import fields_of
 
 
 def numbers_of(dtype: Any, name: str) -> list[str]:
     """Return the numbers of a struct, a vector or a number in C++, in their order: "name.point[0]", "name.point[1]" ..."""
     if hasattr(dtype, "numpy_dtype"):
-        return [number for field, of in fields_of(dtype).items() for number in numbers_of(of.type, f"{name}.{field}")]
+        return [number for field, kind in fields_of(dtype).items() for number in numbers_of(kind, f"{name}.{field}")]
     size = wp.types.type_size(dtype)
     return [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
 
@@ -40,7 +40,7 @@ class Rows(NamedTuple):
         """Return the rows of one field of the struct."""
         fields = fields_of(self.dtype)
         before = list(fields)[: list(fields).index(name)]
-        return Rows(fields[name].type, self.length, self.first + sum(len(numbers_of(fields[each].type, "")) for each in before))
+        return Rows(fields[name], self.length, self.first + sum(len(numbers_of(fields[each], "")) for each in before))
 
     def text(self, line: str, without: tuple[str, ...] = ()) -> str:
         """Return that line of C++ for each {number} and its {place}, but for the numbers of the fields `without`."""

@@ -54,11 +54,6 @@ def size_of(struct: Any) -> int:
     return int(struct.numpy_dtype()["itemsize"])
 
 
-def fields_of(struct: Any) -> dict[str, Any]:
-    """The fields of a record by name, in their order."""
-    return dict(struct.vars)
-
-
 @wp.func
 def gamma(n: float) -> float:
     """n rounding errors in a row, relative: n u / (1 - n u) (Higham 2002, lemma 3.1)."""

@@ -44,17 +44,18 @@ ROOMS_OF_ACCEL = (
 )
 MESHES = {"wrt.scene.mesh", "wrt.scene.clean", "wrt.scene.values"}  # no scenes: what the rooms before the last may use of wrt.scene
 # Private names of others that are used all the same, and why.
-PRIVATE = {"_replace": "public, of a NamedTuple", "_cls": "Warp's: the type of a struct",
-           "_ref": "Warp's: what an array without memory of its own keeps"}
+PRIVATE = {"_replace": "public, of a NamedTuple"}
 SET_FROM_OUTSIDE = {"requires_grad": "Warp's, of an array", "path": "of an InputError with another message"}
 # The folders of kernels/, and from which others each may import; `structs` is below all of them.
 BELOW_KERNELS = {
     "native": set(),
     "headers": {"native"},
     "launches": set(),
+    "launch_probe": {"launches", "structs"},
     "memory": set(),
     "structs": {"headers"},
-    "rows": {"structs"},
+    "warp_private": set(),
+    "rows": {"warp_private", "structs"},
     "units": {"structs"},
     "traverse": {"native", "units", "structs"},
     "query": {"traverse", "units", "structs"},
@@ -62,7 +63,7 @@ BELOW_KERNELS = {
     "ray_query": {"query", "structs"},
     "winding": {"structs"},
     "wide": {"headers", "memory", "query", "traverse", "units", "structs"},
-    "shade": {"native", "memory", "rows", "query", "traverse", "units", "structs"},
+    "shade": {"warp_private", "native", "memory", "rows", "query", "traverse", "units", "structs"},
     "loops": {"shade", "native", "launches", "memory", "rows", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
     "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},

@@ -10,7 +10,8 @@ from wrt.kernels.shade.materials import make_scatter
 from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.surface import SEEN, Surface, bent, make_place_of, make_surface_at, triangle_uv
 from wrt.kernels.shade.textures import make_sample_texture
-from wrt.kernels.structs import Material, Surfaces, fields_of, unit
+from wrt.kernels.structs import Material, Surfaces, unit
+from wrt.kernels.warp_private import fields_of
 
 MASK = 1  # alpha modes; 0 is opaque
 BLEND = 2
@@ -40,7 +41,7 @@ class MaterialTexture(NamedTuple):
     @property
     def numbers(self) -> list[tuple[int, str]]:
         """Each channel and the number of Texels that it goes to."""
-        names = [number for name in self.fields for number in numbers_of(fields_of(Texels)[name].type, f"texels.{name}")]
+        names = [number for name in self.fields for number in numbers_of(fields_of(Texels)[name], f"texels.{name}")]
         return list(zip(map("rgba".index, self.channels), names, strict=True))
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from wrt.accel.queries.raw_launches import Launches
 from wrt.kernels.launches import Launch, run, run_range, run_with
 from wrt.kernels.structs import kernel
-from wrt.renderer.launches import Launches
 
 
 @wp.struct

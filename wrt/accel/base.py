@@ -25,6 +25,7 @@ from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
 from wrt.kernels.traverse.common import Units
+from wrt.kernels.warp_private import fields_of
 
 
 class OneMesh(Accelerator, ABC):
@@ -184,7 +185,7 @@ class OneMesh(Accelerator, ABC):
 
     def _upload(self, built: Built) -> Any:
         data = self.structure.struct()
-        types = {name: field.type for name, field in data._cls.vars.items()}
+        types = fields_of(data)
         for name, array in built.arrays.items():
             kind = types[name]
             is_array = isinstance(kind, wp.array)
@@ -211,5 +212,5 @@ class OneMesh(Accelerator, ABC):
 
 def array_bytes(data: Any) -> int:
     """Bytes of all arrays of a Warp struct."""
-    arrays = (getattr(data, name) for name in data._cls.vars)
+    arrays = (getattr(data, name) for name in fields_of(data))
     return sum(array.capacity for array in arrays if isinstance(array, wp.array))

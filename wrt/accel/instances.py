@@ -22,6 +22,7 @@ from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
+from wrt.kernels.warp_private import fields_of
 from wrt.scene.values import MAX_REACH
 
 ALIGNMENT = 64  # bytes, between the addresses of structures
@@ -55,7 +56,7 @@ class Instances(Accelerator):
         """Answer from now on as the upper level is now."""
         top, data = self._top, self.structure.struct()
         sizes = np.array([top.nodes.nbytes, *(each.stats.bytes for each in self._placed)], np.int64)
-        data.nodes = upload(top.nodes, data._cls.vars["nodes"].type.dtype, self.device)
+        data.nodes = upload(top.nodes, fields_of(data)["nodes"].dtype, self.device)
         data.placements = upload(top.placements, Placement, self.device)
         data.bottoms, data.slack = self._bottoms, top.slack
         data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)

@@ -19,12 +19,14 @@ from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.accel.world import World
+from wrt.core import warp_private
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.device import record_dtype
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
 from wrt.core.write_file import check_writable, replacing
 from wrt.kernels.traverse.common import Units
+from wrt.kernels.warp_private import fields_of
 
 MAGIC = b"wrt acceleration structure 1\n"
 STATS = ("nodes", "leaves", "depth", "sah_cost")
@@ -32,21 +34,14 @@ STATS = ("nodes", "leaves", "depth", "sah_cost")
 
 def array_types(accel: type[Any], triangle: str = "watertight") -> dict[str, np.dtype[Any]]:
     """What each array of Built.arrays holds, by the fields of the structure's struct."""
-    struct = Structure(accel, Units(triangle)).struct()
-    out = {}
-    for name, field in struct._cls.vars.items():
-        if name not in ("primitives", "recorder"):
-            kind = field.type.dtype if isinstance(field.type, wp.array) else field.type
-            out[name] = row_type(kind)
-    return out
+    kinds = fields_of(Structure(accel, Units(triangle)).struct())
+    return {name: row_type(kind.dtype if isinstance(kind, wp.array) else kind) for name, kind in kinds.items()
+            if name not in ("primitives", "recorder")}
 
 
 def row_type(kind: Any) -> np.dtype[Any]:
     """The NumPy type of one row of a Warp type: a struct, a vector or a number."""
-    if hasattr(kind, "numpy_dtype"):
-        return record_dtype(kind)
-    scalar = wp.dtype_to_numpy(getattr(kind, "_wp_scalar_type_", kind))
-    return np.dtype((scalar, getattr(kind, "_shape_", ())))
+    return record_dtype(kind) if hasattr(kind, "numpy_dtype") else warp_private.row_type(kind)
 
 
 def check_target(path: str | os.PathLike[str]) -> None:

@@ -65,7 +65,7 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
     output, bits = output or Path(f"{scene.stem or 'picture'}.png"), options.pop("bits")
     check_picture(output, bits)
     if scene.exists():
-        from wrt.core.device import preload_headers
+        from wrt.accel.queries.raw_launches import preload_headers
 
         preload_headers()  # while the rest is imported
     settings = check_options(output, given, options)

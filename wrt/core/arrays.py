@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from warp._src import context  # there is no public way to ask whether a tape records
 
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
+from wrt.core.warp_private import recording_tape
 
 DLPACK_CPU = 1
 REAL = "iufO"  # NumPy's kinds of real numbers, and objects such as fractions: no bool, complex, text or date
@@ -59,14 +59,9 @@ def float32(array: np.ndarray) -> np.ndarray:
         return np.require(array, np.float32, ["C", "A"])
 
 
-def recording() -> Any:
-    """The wp.Tape that records, or None."""
-    return context.runtime.tape
-
-
 def check_no_gradients(what: str = "this", **arrays: Any) -> None:
     """Raise InputError that names the Warp array in which a tape would wait for gradients of `what`, which has none."""
-    for name, array in arrays.items() if recording() is not None else ():
+    for name, array in arrays.items() if recording_tape() is not None else ():
         if isinstance(array, wp.array) and array.requires_grad:
             raise InputError(f"{name} requires gradients and a wp.Tape is recording, but {what} has none (t, u, v and point of"
                              f" closest_hit have, in origins, directions and vertices): ask outside of the tape, or give"

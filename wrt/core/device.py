@@ -21,9 +21,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import warp as wp
 
-from wrt.core import cuda
-from wrt.core.compiler import empty_kernel, is_whole, prepare_compiler, remove
+from wrt.core import cuda, warp_private
 from wrt.core.errors import InputError
+from wrt.core.kernel_cache import is_whole, remove
 from wrt.core.seconds import loading
 from wrt.core.threads import run_all, submit, thread_count, with_stack
 
@@ -88,11 +88,11 @@ def _stderr_without(text: bytes) -> Iterator[None]:
 
 @made_once
 def _start_warp() -> None:
-    with _stderr_without(b"NVIDIA CUDA driver"), _cache_told():  # where there is no GPU, it says so each time
+    with _stderr_without(warp_private.NO_DRIVER), _cache_told():  # where there is no GPU, it says so each time
         if not os.environ.get("WARP_CACHE_PATH"):
             os.environ.pop("WARP_CACHE_PATH", None)  # empty: Warp would keep its kernels in the current folder
         wp.init()
-        prepare_compiler()
+        warp_private.prepare()
 
 
 @made_once
@@ -101,7 +101,7 @@ def start(device: str) -> Any:
     kernel cache cannot be made."""
     _start_warp()
     try:
-        with _stderr_without(b"Warp CUDA error"):  # told by the InputError below
+        with _stderr_without(warp_private.CUDA_ERROR):  # told by the InputError below
             return wp.get_device(device)
     except Exception as error:  # Warp raises ValueError or RuntimeError, depending on what is wrong with the name
         known = ", ".join(str(d) for d in wp.get_devices())
@@ -171,30 +171,30 @@ def preloading(*kernels: Any) -> Iterator[None]:
         wait(loads)
 
 
-def preload_headers() -> None:
-    """Begin to precompile Warp's headers, where the cache is empty: beside what comes before the first kernel. For a process of
-    wrt's own: one that was forked meanwhile would wait for ever. Errors are told where a kernel cannot be compiled."""
+def preload_headers(kernel: Any) -> None:
+    """Begin to precompile Warp's headers with this small kernel, where the cache is empty: beside what comes before the first
+    other kernel. For a process of wrt's own: one that was forked meanwhile would wait for ever. Errors are told where a kernel
+    cannot be compiled."""
     cpu = start("cpu")
-    if not any(Path(wp.config.kernel_cache_dir).glob("wp_*")):
-        submit(partial(load_kernel, empty_kernel, cpu))
+    if not any(Path(wp.config.kernel_cache_dir).glob(warp_private.IN_CACHE)):
+        submit(partial(load_kernel, kernel, cpu))
 
 
 def _load(kernel: Any, device: Any, block_dim: int) -> None:
     """Load a kernel; what of it is damaged in the cache is compiled anew."""
-    module = kernel.module
     with _cache_told():
-        folder = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim)
-        files = [folder / module._get_compile_output_name(device, block_dim=block_dim), folder / module._get_meta_name(block_dim)]
+        files = warp_private.cache_files(kernel, device, block_dim)
+        folder, sealed = files[0].parent, warp_private.is_own(kernel)
         before = [path for path in (files if folder.is_dir() else [folder]) if os.path.lexists(path)]
         with contextlib.suppress(Exception):  # told below, if it happens again
-            if all(map(is_whole, files)):
-                module.load(device, block_dim=block_dim)
+            if all(is_whole(path, sealed) for path in files):
+                warp_private.load(kernel, device, block_dim)
                 return
         for path in before:  # not what another process has compiled since
             remove(path)
         folder.parent.mkdir(parents=True, exist_ok=True)
         _require_room_to_compile(folder.parent)
-        module.load(device, block_dim=block_dim)
+        warp_private.load(kernel, device, block_dim)
 
 
 @contextmanager
@@ -203,7 +203,7 @@ def _cache_told() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if not isinstance(error, OSError | UnicodeError) and type(error) is not Exception:  # Warp's own are plain ones
+        if not isinstance(error, OSError | UnicodeError) and not warp_private.is_warps_error(error):
             raise
         reason = "its name is not UTF-8" if isinstance(error, UnicodeError) else getattr(error, "strerror", None) or error
         raise InputError(f"kernels cannot be compiled: {reason} (WARP_CACHE_PATH names another folder)",
@@ -234,7 +234,7 @@ def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:
         assert array.dtype == record_dtype(dtype)
         rows = np.ascontiguousarray(array).view(np.uint8)
         return _seen_as(wp.array(rows, dtype=wp.uint8, device=device, copy=not rows.flags.writeable), dtype, array.shape)
-    array = np.ascontiguousarray(array, dtype=wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype)))
+    array = np.ascontiguousarray(array, dtype=wp.dtype_to_numpy(warp_private.scalar_type(dtype)))
     # A frozen NumPy array (a scene's) cannot be aliased: Warp wants to be able to write.
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
 
@@ -251,7 +251,7 @@ def on_host(array: Any) -> np.ndarray:
 def _seen_as(array: Any, dtype: Any, shape: tuple[int, ...]) -> Any:
     """A Warp array of the same memory, which it keeps."""
     out = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device)
-    out.memory = array
+    warp_private.keep(out, array)
     return out
 
 

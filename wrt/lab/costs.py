@@ -14,9 +14,9 @@ from wrt.accel.queries.counting import copied
 from wrt.accel.structure import Structure
 from wrt.core.device import on_host
 from wrt.core.threads import run_all
-from wrt.kernels.structs import fields_of
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import Counts, Recorder
+from wrt.kernels.warp_private import fields_of
 from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.plan import Plan
 from wrt.renderer.prepare import Prepared, prepare

@@ -9,6 +9,7 @@ import numpy as np
 from wrt.accel.scenes.build import build
 from wrt.core.device import load_kernel, start
 from wrt.core.threads import run_all
+from wrt.core.warp_private import short_name
 from wrt.renderer.film_arrays import OF_AOVS
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
@@ -30,4 +31,4 @@ def compile_picture(scene: Scene, accel: str, device: str = "cpu", threads: int 
     target = start(device)
     kernels = plan_of(scene, Options(accel=accel, device=device, aov=tuple(OF_AOVS))).kernels
     run_all([partial(load_kernel, kernel, target) for kernel in kernels], threads)
-    return [kernel.key.rsplit("__", 1)[-1] for kernel in kernels]
+    return [short_name(kernel) for kernel in kernels]

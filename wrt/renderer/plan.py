@@ -12,6 +12,7 @@ from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS, stack_on
 from wrt.core.device import made_once, memory_of
 from wrt.core.errors import InputError
+from wrt.core.warp_private import module_hash
 from wrt.kernels import structs
 from wrt.kernels.loops import one_ray as kernels
 from wrt.kernels.shade.features import Features
@@ -94,7 +95,7 @@ class Plan:
         """Of the whole code that makes pixels, the same in every process."""
         block_dim = 1 if self.options.device == "cpu" else None
         kernels = replace(self, options=replace(self.options, aov=())).kernels
-        hashes = [kernel.module.get_module_hash(block_dim) for kernel in kernels]
+        hashes = [module_hash(kernel, block_dim) for kernel in kernels]
         return hashlib.sha256(b"".join(hashes)).hexdigest()
 
     def limits(self, seed: int) -> Any:

@@ -18,6 +18,7 @@ from wrt.core.device import records, upload
 from wrt.core.errors import InputError, warn
 from wrt.kernels import structs
 from wrt.kernels.shade import backgrounds, lights, materials, textures
+from wrt.kernels.warp_private import fields_of
 from wrt.picture.tonemap import decode_srgb
 from wrt.scene.backgrounds import Background
 from wrt.scene.cameras import CameraKind
@@ -188,7 +189,7 @@ def background_struct(background: Background, device: Any) -> Any:
     b: Any = structs.Background()
     number(background.kind, backgrounds.BACKGROUNDS, "background kind")
     for name, value in background.record().items():
-        kind = b._cls.vars[name].type
+        kind = fields_of(b)[name]
         if isinstance(value, np.ndarray):
             setattr(b, name, upload(value, kind.dtype, device))
         else:

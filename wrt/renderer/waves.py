@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.batches import new_scratch
+from wrt.accel.queries.raw_launches import Launches
 from wrt.core.device import made_once, records, upload
 from wrt.kernels.launches import Launch
 from wrt.kernels.loops import state, wave, wave_begin, wave_rows, wave_shade
@@ -25,7 +26,6 @@ from wrt.kernels.shade.shadows import ShadowWalk
 from wrt.kernels.shade.step import Lit, Sample
 from wrt.kernels.wide.batch import BatchTraversal
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
-from wrt.renderer.launches import Launches
 from wrt.renderer.tiles import Work
 
 # Samples of a wave: 4,096 to 32,768 are 0.92 to 1.06 times as fast, by the scene. Fewer where each has room for many paths or asks

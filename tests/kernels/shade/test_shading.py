@@ -14,7 +14,8 @@ from wrt.kernels.rows import Rows
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.shading import TEXTURES, Texels, make_resolve, textures_of
 from wrt.kernels.shade.surface import Surface
-from wrt.kernels.structs import Surfaces, fields_of, kernel
+from wrt.kernels.structs import Surfaces, kernel
+from wrt.kernels.warp_private import fields_of
 from wrt.renderer.features import features_of
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import MATERIALS, SLOTS, Material, Texture

@@ -13,6 +13,7 @@ from wrt.kernels.query import RayArrays, load_ray
 from wrt.kernels.structs import Ray, kernel
 from wrt.kernels.traverse.common import Units, make_probe
 from wrt.kernels.units.box import FAR_PAD, box_ray, ray_aabb
+from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.lanes import LANE_PAD, lowest, make_native_cull, make_plain_cull, row_type
 from wrt.kernels.wide.layout import node_size
 from wrt.kernels.wide.nodes import make_native, make_plain
@@ -65,7 +66,7 @@ def results(width, compressed, nodes, rows, rays):
         out.entries = zeros(n, row_type(width))
         out.entered, out.candidates = zeros(n, wp.int32), zeros(n, wp.int32)
         launch(run, n, floats(nodes.reshape(-1)), floats(rows.reshape(-1)), arrays, out)
-        answers.append({name: getattr(out, name).numpy() for name in out._cls.vars})
+        answers.append({name: getattr(out, name).numpy() for name in fields_of(out)})
     return answers
 
 

@@ -14,8 +14,8 @@ from wrt.core.device import load_kernel, on_host, records, start, upload
 from wrt.core.threads import run_growing
 from wrt.kernels.build import bvh2 as build_bvh2
 from wrt.kernels.build import records as build_records
-from wrt.kernels.structs import fields_of
 from wrt.kernels.traverse.bvh2 import Bvh2Node
+from wrt.kernels.warp_private import fields_of
 
 
 def build_binned(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
@@ -58,7 +58,7 @@ def build_data(**arrays: np.ndarray) -> Any:
     """kernels.build.records.BuildData with these of its arrays."""
     data: Any = build_records.BuildData()
     for name, array in arrays.items():
-        setattr(data, name, upload(array, fields_of(build_records.BuildData)[name].type.dtype, start("cpu")))
+        setattr(data, name, upload(array, fields_of(build_records.BuildData)[name].dtype, start("cpu")))
     return data
 
 

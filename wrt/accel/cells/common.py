@@ -15,6 +15,7 @@ from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.build.triangle_cell import CellSource
 from wrt.kernels.units.box import PAD_EXTENT
+from wrt.kernels.warp_private import fields_of
 
 
 def cell_source(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray]) -> Any:
@@ -29,9 +30,9 @@ def cell_source(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray]) -> An
 def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
     """The arrays of `built`, where what is a single vector or number is one, and no longer the one row that it is in a file."""
     arrays = dict(built.arrays)
-    for name, field in accel.structure.struct()._cls.vars.items():
-        if name in arrays and not isinstance(field.type, wp.array):
-            arrays[name] = np.reshape(arrays[name], row_type(field.type).shape)
+    for name, kind in fields_of(accel.structure.struct()).items():
+        if name in arrays and not isinstance(kind, wp.array):
+            arrays[name] = np.reshape(arrays[name], row_type(kind).shape)
     return arrays
 
 

@@ -18,11 +18,12 @@ from wrt.accel.queries.world_ids import worlds_asked
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
 from wrt.accel.world import World
-from wrt.core.arrays import recording, returned
+from wrt.core.arrays import returned
 from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
+from wrt.core.warp_private import recording_tape
 from wrt.kernels.structs import Surfaces
 
 
@@ -109,7 +110,7 @@ class Accelerator:
         else:
             trace_query(snapshot, query)
         hits = Hits(t, u, v, prim_id, costs, (snapshot, rays, worlds))
-        if recording() is not None:
+        if recording_tape() is not None:
             record(hits, t=t, u=u, v=v)
         return hits if give is None else hits.each(give)
 

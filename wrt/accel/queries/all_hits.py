@@ -23,7 +23,8 @@ from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, list_hit, make_list_hits_kernel
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.structs import Hit, fields_of
+from wrt.kernels.structs import Hit
+from wrt.kernels.warp_private import fields_of
 
 ALL = (1 << 30) - 1
 RAYS_AT_ONCE = 1 << 18  # for whose first walk there are 32 MiB

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
-from warp._src.types import array_t  # what a kernel gets for an array; a Warp array takes ten times as long to make
 
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
+from wrt.accel.queries.raw_launches import check_raw_launches
 from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.queries.world_ids import WorldIds
 from wrt.accel.snapshot import Snapshot
@@ -18,8 +18,10 @@ from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, launch_on, load_kernel, made_once, memory_of
 from wrt.core.threads import run_all
+from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.structs import Surfaces, fields_of
+from wrt.kernels.structs import Surfaces
+from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.packets import Scratch
 
 # Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Up to FEWEST
@@ -125,8 +127,8 @@ tracer = made_once(Tracer)
 def new_scratch(sizes: tuple[int, ...]) -> Any:
     """sizes: as stream_sizes of a traversal's module; aligned, as rows of lanes would else lie in two cache lines each."""
     out: Any = Scratch()
-    for (name, field), size in zip(fields_of(Scratch).items(), sizes, strict=False):
-        setattr(out, name, to_warp(empty_aligned((size,), wp.dtype_to_numpy(field.type.dtype))))
+    for (name, kind), size in zip(fields_of(Scratch).items(), sizes, strict=False):
+        setattr(out, name, to_warp(empty_aligned((size,), wp.dtype_to_numpy(kind.dtype))))
     return out
 
 
@@ -141,20 +143,23 @@ class Worker:
         self.block, self.scratch = tracer.block, new_scratch(tracer.sizes)
         self.slots = self.scratch.slots.numpy() if tracer.stream else np.zeros(1, np.int32)
         own = [self.scratch, 0] if tracer.stream else []
+        check_raw_launches()
+        self.threads = 1
         self.command = wp.launch(tracer.kernel, dim=1, inputs=[*tracer.inputs, *own, 0], device="cpu", record_cmd=True)
         self.inputs: list[Any] = [None] * (len(own) + 5)  # as they were last
-        self.own = [self.scratch.__ctype__()] if tracer.stream else []
+        self.own = [record_of(self.scratch)] if tracer.stream else []
 
     def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> None:
         """Trace rays first .. end - 1. The last of `slots` tells whether the kernel met one that is refused."""
-        inputs = [snapshot.data.__ctype__(), snapshot.surfaces.__ctype__(), *packed, *self.own, first, end]
+        inputs = [record_of(snapshot.data), record_of(snapshot.surfaces), *packed, *self.own, first, end]
         for i, last in enumerate(self.inputs):  # the kernel for one ray has no `end`
             if inputs[i] is not last:
                 self.command.set_param_at_index_from_ctype(i, inputs[i])
                 self.inputs[i] = inputs[i]
         threads = end - first if self.block == 1 else 1
-        if threads != self.command.bounds.size:
+        if threads != self.threads:
             self.command.set_dim(threads)
+            self.threads = threads
         self.command.launch()
 
 
@@ -165,12 +170,7 @@ def readable(array: np.ndarray) -> bool:
 
 def pack(given: list[np.ndarray], answers: list[np.ndarray]) -> tuple[Any, Any]:
     """Rays and answers as kernels get them: RayArrays, and HitArrays or an array of bool. Nothing keeps the memory."""
-    records: list[Any] = [RayArrays(), HitArrays()]
-    rays, hits = (record.__ctype__() for record in records)
-    for struct, names, arrays in ((rays, fields_of(RayArrays), given), (hits, fields_of(HitArrays), answers)):
-        for name, array in zip(names, arrays, strict=False):
-            setattr(struct, name, array_t(array.ctypes.data, ndim=1, shape=array.shape, strides=array.strides))
-    return rays, hits if len(answers) > 1 else hits.t
+    return struct_record(RayArrays, given), struct_record(HitArrays, answers) if len(answers) > 1 else array_record(answers[0])
 
 
 def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: slice) -> None:

@@ -17,7 +17,7 @@ from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.kernels.query import FARTHEST
-from wrt.kernels.structs import fields_of
+from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.closest_point import PointArrays, make_closest_point_kernel
 from wrt.kernels.wide.traverse import WideTraversal
 
@@ -61,7 +61,7 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
     rows, device = vectors(points, "points", FARTHEST), snapshot.device
     n, out = len(rows), PointArrays()
     for name, field in fields_of(PointArrays).items():
-        setattr(out, name, wp.empty(n, dtype=field.type.dtype, device=device))
+        setattr(out, name, wp.empty(n, dtype=field.dtype, device=device))
     kernel, given = make_closest_point_kernel(kernels.width, kernels.compressed), upload(rows, wp.vec3, device)
     surfaces = surroundings(snapshot).surfaces
     launch_on(device, kernel, n, snapshot.data, surfaces, given, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)

@@ -37,6 +37,6 @@ def counted(snapshot: Snapshot, query: Query, fetches_too: bool) -> Counters:
 
 def copied(data: Any) -> Any:
     """A Warp struct with the same arrays and numbers, of which fields may be set."""
-    out = data._cls()
+    out = type(data)()
     out.assign(data)
     return out

@@ -9,10 +9,11 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.core.arrays import check_no_gradients, float32, recording, to_numpy
+from wrt.core.arrays import check_no_gradients, float32, to_numpy
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all, thread_count
+from wrt.core.warp_private import recording_tape
 
 ONE_MESH = "only hits of a structure over one mesh, without spheres, have gradients"
 HITS_PER_JOB = 8192  # so that what is between stays in the cache
@@ -97,7 +98,7 @@ def adjoint(geometry: Geometry, origins: Any, directions: Any, prim_id: Any, cot
 def record(hits: Any, **outputs: Any) -> None:
     """Let a wp.Tape that records have gradients of Warp arrays of `hits`, given by their names in Cotangents, in origins,
     directions and the array that the structure's last refit followed: those of them that require gradients."""
-    (snapshot, rays, _), tape = hits.source, recording()
+    (snapshot, rays, _), tape = hits.source, recording_tape()
     leaves = Gradients(snapshot.followed, rays.origins, rays.directions)
     wanted = [array for array in leaves if isinstance(array, wp.array) and array.requires_grad and array.size]
     if tape is None or not wanted:

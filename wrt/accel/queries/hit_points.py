@@ -20,7 +20,7 @@ from wrt.core.threads import thread_count
 from wrt.kernels import structs
 from wrt.kernels.query import HitArrays
 from wrt.kernels.shade.hit_points import HitPlaces, Numbering, hit_places
-from wrt.kernels.structs import fields_of
+from wrt.kernels.warp_private import fields_of
 
 HITS_PER_LAUNCH = 65536
 
@@ -124,7 +124,7 @@ class HitPoints:
             name = "object"
         n, device = len(self.t), snapshot.device
         out: Any = HitPlaces()
-        setattr(out, name, array := wp.empty(n, dtype=fields_of(HitPlaces)[name].type.dtype, device=device))
+        setattr(out, name, array := wp.empty(n, dtype=fields_of(HitPlaces)[name].dtype, device=device))
         hits: Any = HitArrays()
         for each in fields_of(HitArrays):
             setattr(hits, each, to_warp(getattr(self, each)).to(device))

@@ -11,8 +11,9 @@ import warp as wp
 from wrt.core.arrays import check_no_gradients, float32, real_numbers, taken
 from wrt.core.device import upload
 from wrt.core.errors import InputError
+from wrt.core.warp_private import keep
 from wrt.kernels.query import FARTHEST, RayArrays
-from wrt.kernels.structs import fields_of
+from wrt.kernels.warp_private import fields_of
 
 LOWEST = {"t_min": 0.0, "t_max": -np.inf}
 
@@ -77,7 +78,7 @@ def one_for_all(value: float, n: int, device: Any) -> Any:
     """An array of n times the same number, which is there once: written by the device, so that a graph can capture it."""
     one = wp.full(1, value, dtype=wp.float32, device=device)
     out = wp.array(ptr=one.ptr, shape=(n,), strides=(0,), dtype=wp.float32, device=device)
-    out._ref = one  # it has no memory of its own
+    keep(out, one)
     return out
 
 

@@ -55,15 +55,14 @@ class UnitCode:
 def compiled(kernel: Any, arch: int = ARCH, block_dim: int | None = None) -> KernelCode:
     """The kernel's machine code, by default for Turing and Warp's own blocks."""
     start("cpu")
-    options = kernel.module.options
-    before = options["block_dim"]
-    options["block_dim"] = block_dim or before
+    before = wp.get_module_options(kernel.module)["block_dim"]
+    wp.set_module_options({"block_dim": block_dim or before}, kernel.module)
     try:
         with tempfile.TemporaryDirectory() as folder:
             (binary,) = wp.compile_aot_module(kernel.module, arch=arch, module_dir=folder)
             (code,) = read_cubin(Path(binary).read_bytes()).values()
     finally:
-        options["block_dim"] = before
+        wp.set_module_options({"block_dim": before}, kernel.module)
     return code
 
 

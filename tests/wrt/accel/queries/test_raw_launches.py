@@ -1,0 +1,191 @@
+"""The self-test before the first launch whose arguments wrt makes by hand: it sees each assumption that no longer holds."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wrt
+from tests.data import ROOT
+
+from tests.kernel_tools import cpu_only  # isort: skip
+import warp as wp
+
+from wrt.accel.queries import raw_launches
+from wrt.core import warp_private
+from wrt.core.device import made_once, start
+from wrt.core.errors import InputError
+
+pytestmark = cpu_only
+
+
+Code = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+
+
+class Longer(ctypes.Structure):
+    """A record with a new field."""
+
+    _fields_ = [("new", ctypes.c_int), ("record", warp_private.array_t)]
+
+
+def transposed(data: int, ndim: int, shape: Any, strides: Any, array_t: Any = warp_private.array_t) -> Any:
+    return array_t(data, ndim=ndim, shape=strides, strides=shape)
+
+
+def elsewhere(data: int, ndim: int, shape: Any, strides: Any, array_t: Any = warp_private.array_t) -> Any:
+    return array_t(grad=data, ndim=ndim, shape=shape, strides=strides)
+
+
+def without_size(data: int, ndim: int, shape: Any, strides: Any, array_t: Any = warp_private.array_t) -> Any:
+    return array_t(data, ndim=0)
+
+
+def longer(data: int, ndim: int, shape: Any, strides: Any, array_t: Any = warp_private.array_t) -> Any:
+    return Longer(0, array_t(data, ndim=ndim, shape=shape, strides=strides))
+
+
+def other_size(launch: warp_private.Recorded) -> warp_private.Recorded:
+    """As if a kernel did not read its size where it is told."""
+    bounds, code = type(launch.keeps[1])(1), Code(launch.entry)
+    called = Code(lambda _, args: code(ctypes.addressof(bounds), args))
+    return launch._replace(entry=ctypes.cast(called, ctypes.c_void_p).value, keeps=(launch.keeps, bounds, code, called))
+
+
+def other_last(launch: warp_private.Recorded) -> warp_private.Recorded:
+    """As if there were another argument behind the last one."""
+    return launch._replace(last=launch.last - 4)
+
+
+def other_code(launch: warp_private.Recorded) -> warp_private.Recorded:
+    called = Code(lambda bounds, args: None)
+    return launch._replace(entry=ctypes.cast(called, ctypes.c_void_p).value, keeps=(launch.keeps, called))
+
+
+@pytest.fixture
+def not_tested(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a process that has launched nothing."""
+    start("cpu")
+    raw_launches.check_raw_launches()
+    monkeypatch.setattr(raw_launches, "_test_once", made_once(raw_launches._test_once.__wrapped__))
+
+
+def query() -> Any:
+    return wrt.build(wrt.Mesh(np.eye(3), np.array([[0, 1, 2]])), "bvh2").closest_hit(np.zeros((1, 3)), np.ones((1, 3))).t
+
+
+def refused(differ: str) -> None:
+    with pytest.raises(InputError) as error:
+        raw_launches.check_raw_launches()
+    assert str(error.value) == (f"Warp {wp.config.version} is not supported, its insides differ ({differ}):"
+                                f" install 'warp-lang>=1.19,<1.20'")
+
+
+@pytest.mark.usefixtures("not_tested")
+def test_this_warp_passes_and_is_tested_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw_launches.check_raw_launches()
+    monkeypatch.setattr(raw_launches, "_has_records", lambda *arrays: False)
+    raw_launches.check_raw_launches()
+
+
+@pytest.mark.usefixtures("not_tested")
+@pytest.mark.parametrize("record", [transposed, elsewhere, without_size, longer])
+def test_other_records_of_arrays_are_refused_before_anything_is_launched(record: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warp_private, "array_t", record)
+    monkeypatch.setattr(wp, "launch", None)
+    refused("records of arrays")
+
+
+@pytest.mark.usefixtures("not_tested")
+def test_a_struct_of_another_layout_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warp_private, "struct_record", lambda struct, arrays: Longer(1, warp_private.array_record(*arrays)))
+    refused("records of arrays")
+
+
+@pytest.mark.usefixtures("not_tested")
+@pytest.mark.parametrize("method", ["set_param_at_index_from_ctype", "set_dim"])
+def test_launches_that_do_not_take_what_is_set_are_refused(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = getattr(wp.Launch, method)
+
+    def ignored(self: Any, *args: Any) -> None:
+        if not isinstance(args[-1], int):
+            plain(self, *args)
+
+    monkeypatch.setattr(wp.Launch, method, ignored)
+    refused("arguments of launches")
+
+
+@pytest.mark.usefixtures("not_tested")
+@pytest.mark.parametrize("change", [other_size, other_last, other_code])
+def test_other_launches_by_kernels_are_refused(change: Callable[[Any], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = warp_private.recorded
+    monkeypatch.setattr(warp_private, "recorded", lambda command: change(recorded(command)))
+    refused("launches by kernels")
+
+
+@pytest.mark.usefixtures("not_tested")
+@pytest.mark.parametrize("name", ["params", "hooks"])
+def test_a_command_without_its_parts_is_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = warp_private.recorded
+
+    class Without:
+        def __init__(self, command: Any) -> None:
+            self.command = command
+
+        def __getattr__(self, asked: str) -> Any:
+            if asked == name:
+                raise AttributeError(f"'Launch' object has no attribute {name!r}")
+            return getattr(self.command, asked)
+
+    monkeypatch.setattr(warp_private, "recorded", lambda command: recorded(Without(command)))
+    refused(f"'Launch' object has no attribute {name!r}")
+
+
+@pytest.mark.usefixtures("not_tested")
+def test_a_write_beside_the_array_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One word before the array."""
+    struct = warp_private.struct_record
+
+    def longer(kind: Any, arrays: list[np.ndarray]) -> Any:
+        return struct(kind, [np.ndarray(arrays[0].shape, np.int32, memory, offset=4 * raw_launches.GUARDS - 4)
+                             if (memory := arrays[0].base) is not None else arrays[0]])
+
+    monkeypatch.setattr(warp_private, "struct_record", longer)
+    refused("arguments of launches")
+
+
+@pytest.mark.usefixtures("not_tested")
+def test_a_query_and_a_picture_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(raw_launches, "_launches_itself", lambda *arrays: False)
+    scene = wrt.load_scene(ROOT / "scenes" / "whitted.toml")
+    for ask in (query, lambda: wrt.render(scene, size=(8, 8), spp=1)):
+        with pytest.raises(InputError, match="launches by kernels"):
+            ask()
+
+
+BROKEN = """
+import sys
+import wrt.accel.queries.raw_launches as raw_launches
+raw_launches._has_arguments = lambda *arrays: False
+sys.argv = ["wrt", *sys.argv[1:]]
+from wrt.cli.main import main
+main()
+"""
+
+
+def test_the_command_line_ends_with_one_message(tmp_path: Path) -> None:
+    picture = tmp_path / "out.png"
+    done = subprocess.run([sys.executable, "-c", BROKEN, "render", ROOT / "scenes" / "whitted.toml", "--size", "8x8", "--spp", "1",
+                           "--quiet", "-o", picture], capture_output=True, text=True,
+                          env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert (done.returncode, done.stdout) == (2, "") and not picture.exists()
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert done.stderr.endswith(f"Warp {wp.config.version} is not supported, its insides differ (arguments of launches):"
+                                f" install 'warp-lang>=1.19,<1.20'\n")

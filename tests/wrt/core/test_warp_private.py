@@ -1,0 +1,373 @@
+"""What wrt knows of Warp's insides: another Warp is refused, the changes of its compiler hold for wrt's modules alone and change no
+kernel, and headers are precompiled once."""
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.data import ROOT
+
+from tests.kernel_tools import cpu_only, launch, zeros  # isort: skip
+import warp as wp
+
+from wrt.core import kernel_cache, warp_private
+from wrt.core.device import preloading, start
+from wrt.core.errors import InputError
+from wrt.core.warp_private import WORKS_WITH
+from wrt.kernels.structs import kernel
+from wrt.kernels.warp_private import fields_of
+
+pytestmark = cpu_only
+DIFFER = f"Warp {wp.config.version} is not supported, its insides differ"
+
+
+def ours(function: Callable, monkeypatch: pytest.MonkeyPatch) -> wp.Kernel:
+    """The function as a kernel of wrt."""
+    return kernel_of("wrt.kernels.pretended", function, monkeypatch)
+
+
+def kernel_of(module: str, function: Callable, monkeypatch: pytest.MonkeyPatch) -> wp.Kernel:
+    monkeypatch.setattr(function, "__module__", module)
+    monkeypatch.setattr(function, "__qualname__", f"{function.__name__}_{module[:3]}")
+    return kernel(function)
+
+
+def compiled(name: str) -> Path:
+    """The folder of a kernel's module in the cache."""
+    return next(Path(wp.config.kernel_cache_dir).glob(f"wp_{name}_*"))
+
+
+# --- another Warp -----------------------------------------------------------------------------------------------------
+
+
+def test_the_versions_that_work_are_those_that_pip_installs() -> None:
+    assert f'"{WORKS_WITH}",' in (ROOT / "pyproject.toml").read_text()
+
+
+@pytest.mark.parametrize(("owner", "name", "change"), [
+    *((*replaced, change) for replaced in warp_private._REPLACED for change in ("gone", "other parameters")),
+    ("runtime", "tape", "gone")])
+def test_a_warp_with_other_insides_is_refused(owner: str, name: str, change: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before anything of it is replaced."""
+    parts = {"Adjoint": SimpleNamespace(), "Module": SimpleNamespace(), "codegen": SimpleNamespace(), "build": SimpleNamespace(),
+             "runtime": SimpleNamespace(tape=None)}
+    for (each, function), parameters in warp_private._REPLACED.items():
+        made = {}
+        exec(f"def {function}({', '.join(parameters)}): ...", made)
+        setattr(parts[each], function, made[function])
+    before = {each: dict(vars(part)) for each, part in parts.items()}
+    parts["codegen"].Adjoint = parts["Adjoint"]
+    context = SimpleNamespace(Module=parts["Module"], runtime=parts["runtime"])
+    for attribute, part in (("codegen", parts["codegen"]), ("build", parts["build"]), ("context", context)):
+        monkeypatch.setattr(warp_private, attribute, part)
+    if change == "gone":
+        delattr(parts[owner], name)
+    else:
+        setattr(parts[owner], name, lambda self, other: None)
+    with pytest.raises(InputError) as refused:
+        warp_private.prepare()
+    assert str(refused.value) == f"{DIFFER} ({owner}.{name}): install '{WORKS_WITH}'"
+    for each, part in parts.items():
+        left = {key: value for key, value in vars(part).items() if key not in ("Adjoint", name)}
+        assert left == {key: value for key, value in before[each].items() if key != name}
+
+
+def test_a_warp_without_a_name_is_one_message_of_the_command_line(tmp_path: Path) -> None:
+    scene, picture = ROOT / "scenes" / "whitted.toml", tmp_path / "out.png"
+    code = ("import sys\nfrom warp._src import types\ndel types.array_t\n"
+            f"sys.argv = ['wrt', 'render', {str(scene)!r}, '--spp', '1', '--size', '8x8', '-o', {str(picture)!r}]\n"
+            "from wrt.cli.main import main\nmain()\n")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1) and not picture.exists()
+    assert done.stderr.startswith(f"error: {DIFFER} (cannot import name 'array_t'")
+    assert done.stderr.endswith(f"): install '{WORKS_WITH}'\n")
+
+
+# --- structs ----------------------------------------------------------------------------------------------------------
+
+
+@wp.struct
+class Pair:
+    a: wp.vec3
+    b: float
+
+
+def test_fields_are_those_of_a_struct_in_their_order() -> None:
+    for pair in (Pair, Pair()):
+        assert list(fields_of(pair).items()) == [("a", wp.vec3), ("b", wp.float32)]
+
+
+@pytest.mark.parametrize(("kind", "scalar", "shape"), [(wp.vec3, "f4", (3,)), (wp.mat44, "f4", (4, 4)), (wp.int64, "i8", ()),
+                                                       (wp.float32, "f4", ()), (wp.bool, "?", ()), (wp.uint8, "u1", ())])
+def test_a_row_has_numpys_type(kind: object, scalar: str, shape: tuple[int, ...]) -> None:
+    assert warp_private.row_type(kind) == np.dtype((scalar, shape))
+
+
+# --- the compiler -----------------------------------------------------------------------------------------------------
+
+
+def add_pairs(pairs: wp.array(dtype=Pair), sums: wp.array(dtype=float)):
+    i = wp.tid()
+    sums[i] = wp.dot(pairs[i].a, pairs[i].a) + pairs[i].b
+
+
+def test_a_kernel_of_ours_holds_what_is_called_alone(monkeypatch: pytest.MonkeyPatch):
+    pairs = np.zeros(3, Pair.numpy_dtype())
+    pairs["a"], pairs["b"] = [[1.0, 2.0, 3.0]], [1.0, 2.0, 3.0]
+    for module in ("wrt.kernels.pretended", "elsewhere"):
+        made, sums = kernel_of(module, add_pairs, monkeypatch), zeros(3)
+        launch(made, 3, wp.array(pairs, dtype=Pair, device="cpu"), sums)
+        assert sums.numpy().tolist() == [15.0, 16.0, 17.0]
+        (compiled_object,) = compiled(add_pairs.__qualname__).glob("*.o")
+        assert (b"adj_atomic_add" in compiled_object.read_bytes()) == (module == "elsewhere")
+
+
+def double_each(numbers: wp.array(dtype=float)):
+    i = wp.tid()
+    numbers[i] = 2.0 * numbers[i]
+
+
+def double_all(numbers: wp.array(dtype=float)):
+    for i in range(numbers.shape[0]):
+        numbers[i] = 2.0 * numbers[i]
+
+
+def test_a_kernel_of_ours_is_written_once(monkeypatch: pytest.MonkeyPatch):
+    twice, called = "_cpu_forward_tasks<true>", "static WP_NOINLINE void"
+    for function, threads in ((double_each, 5), (double_all, 1)):
+        sources = []
+        for module in ("wrt.kernels.pretended", "elsewhere"):
+            made, numbers = kernel_of(module, function, monkeypatch), wp.array(np.arange(5.0), dtype=float, device="cpu")
+            launch(made, threads, numbers)
+            assert numbers.numpy().tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
+            sources.append(next(compiled(function.__qualname__).glob("*.cpp")).read_text())
+        ours, anybodys = sources
+        assert (called in ours) == (threads == 1) and twice not in ours
+        assert called not in anybodys and (twice in anybodys) == (threads > 1)
+
+
+def add_halves(numbers: wp.array(dtype=wp.bfloat16), sums: wp.array(dtype=float)):
+    i = wp.tid()
+    sums[i] = float(numbers[i]) + 0.5
+
+
+def test_a_kernel_of_bfloat16_has_headers_with_it(monkeypatch: pytest.MonkeyPatch):
+    start("cpu")
+    numbers, sums = wp.array([1.0, 2.0, -4.0], dtype=wp.bfloat16, device="cpu"), zeros(3)
+    launch(ours(add_halves, monkeypatch), 3, numbers, sums)
+    assert sums.numpy().tolist() == [1.5, 2.5, -3.5]
+
+
+def mixes(sums: wp.array(dtype=float), v: wp.vec3):
+    i = wp.tid()
+    a = wp.dot(v * 0.5, v + v) * float(i * i) + wp.max(v[0], v[0] * v[1])
+    sums[i] = wp.dot(v * 2.0, v + v) + a + float(wp.max(i, 2 * i))
+
+
+@pytest.mark.parametrize("module", ["wrt.kernels.pretended", "elsewhere"])
+def test_an_overload_is_looked_for_once_in_kernels_of_ours(module: str, monkeypatch: pytest.MonkeyPatch):
+    from warp._src.codegen import Adjoint
+
+    asked, plain = [], Adjoint.resolve_func.__wrapped__
+    made = kernel_of(module, mixes, monkeypatch)
+
+    def resolve_func(adj, func, arg_types, kwarg_types, min_outputs):
+        asked.append((func.key, arg_types))
+        return plain(adj, func, arg_types, kwarg_types, min_outputs)
+
+    written = []
+    monkeypatch.setattr(Adjoint, "resolve_func", resolve_func)
+    for _ in range(2):
+        asked.clear()
+        made.adj.build(None)
+        written.append((list(asked), list(made.adj.blocks[0].body_forward)))
+        warp_private._resolve_once()
+    (each, forward), (once, same) = written
+    assert forward == same and set(each) == set(once)
+    if module == "elsewhere":
+        assert once == each
+    else:
+        assert len(set(once)) == len(once) < len(each) - 5
+
+
+MINE = """
+import sys
+import warp as wp
+
+@wp.struct
+class Pair:
+    a: wp.vec3
+    b: float
+
+@wp.kernel
+def add_pairs(pairs: wp.array(dtype=Pair), sums: wp.array(dtype=float)):
+    i = wp.tid()
+    sums[i] = wp.dot(pairs[i].a, pairs[i].a) + wp.sin(pairs[i].b)
+
+@wp.kernel
+def count(n: wp.array(dtype=int)):
+    n[0] = n[0] + 1
+
+wp.config.log_level = wp.LOG_WARNING
+if "with wrt" in sys.argv:
+    import numpy, wrt
+    wrt.build(wrt.Mesh(numpy.eye(3), numpy.array([[0, 1, 2]])), "brute_force").closest_hit(numpy.zeros((1, 3)), numpy.ones((1, 3)))
+n = wp.zeros(1, dtype=int, device="cpu")
+wp.launch(count, dim=1, inputs=[n], device="cpu")
+"""
+
+
+def test_kernels_of_a_user_are_those_that_warp_makes_without_wrt(tmp_path: Path):
+    files = []
+    for argument in ("with wrt", "without"):
+        (tmp_path / "mine.py").write_text(MINE)
+        environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / argument), "PYTHONPATH": str(ROOT)}
+        subprocess.run([sys.executable, tmp_path / "mine.py", argument], check=True, env=environment)
+        (folder,) = (tmp_path / argument).glob("*/wp___main__*")
+        files.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    assert files[0] == files[1] and {name.rsplit(".", 1)[1] for name in files[0]} == {"cpp", "o", "meta"}
+
+
+def test_headers_are_precompiled_once_for_all_threads_and_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Warp's compiler precompiles what it does not find in its folder."""
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(cache))
+    monkeypatch.setattr(warp_private, "_own", lambda: True)
+    without, with_it = tmp_path / "without.cpp", tmp_path / "with.cpp"
+    without.write_text("#define WP_NO_BFLOAT16\n")
+    with_it.write_text("\n")
+    given, precompiled, lock = [], [], threading.Lock()
+
+    def build_cpu(obj_path, cpp_path, extra_flags="", use_precompiled_headers=False, pch_dir=None):
+        with lock:
+            given.append((Path(cpp_path).name, extra_flags, pch_dir))
+        if use_precompiled_headers and pch_dir != "Warp's own" and not any(Path(pch_dir).glob("*.pch")):
+            threading.Event().wait(0.02)
+            (Path(pch_dir) / "made.pch").write_text("headers")
+            precompiled.append(extra_flags)
+        Path(obj_path).write_text("object")
+
+    def a_process(processor: bytes = b"a") -> None:
+        monkeypatch.setattr(kernel_cache, "_whole", set())
+        build = a_compiler(build_cpu, processor, monkeypatch)
+        options = {"extra_flags": "-O2", "use_precompiled_headers": True, "pch_dir": None}
+        with ThreadPoolExecutor(6) as pool:
+            list(pool.map(lambda i: build.build_cpu(str(tmp_path / f"{i}.o"), str((without, with_it)[i % 2]), **options), range(6)))
+        assert all(kernel_cache.is_whole(tmp_path / f"{i}.o", True) for i in range(6))
+        build.build_cpu(str(tmp_path / "out.o"), str(with_it))  # without headers
+
+    a_process()
+    always = "-fpch-instantiate-templates -discard-value-names"
+    flags = {"without.cpp": f"{always} -DWP_NO_BFLOAT16= -O2", "with.cpp": f"{always} -O2"}
+    assert sorted(precompiled) == sorted(flags.values()) and (*("with.cpp", always + " "), None) in given
+    folders = {name: {folder for each, flag, folder in given if each == name and flag == flags[name]} for name in flags}
+    kept = {path for path in cache.iterdir()}
+    assert [len(each) for each in folders.values()] == [1, 1] and {Path(*each) for each in folders.values()} == kept
+    a_process()
+    assert len(precompiled) == 2
+    (next(iter(kept)) / "made.pch").write_text("damaged")
+    a_process()
+    assert len(precompiled) == 3 and set(cache.iterdir()) == kept
+    for _ in range(2):
+        for processor in (b"a", b"b"):  # with one home; Clang refuses the headers of another processor
+            a_process(processor)
+    assert len(precompiled) == 5 and len(set(cache.iterdir()) - kept) == 2
+    shutil.rmtree(cache)  # as for a kernel that is compiled elsewhere
+    given.clear()
+    a_process()
+    assert {folder for _, _, folder in given} == {"Warp's own", None}
+
+
+def a_compiler(build_cpu: Callable, processor: bytes, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A Warp's `build` whose function is this one, with wrt's changes."""
+    llvm = SimpleNamespace(wp_get_host_cpu_name=lambda: processor, wp_get_host_cpu_features=lambda: b"+avx")
+    runtime = SimpleNamespace(get_clang_pch_dir=lambda: "Warp's own", llvm=llvm)
+    build = SimpleNamespace(build_cpu=build_cpu)
+    monkeypatch.setattr(warp_private, "context", SimpleNamespace(runtime=runtime))
+    monkeypatch.setattr(warp_private, "build", build)
+    warp_private._compile_well()
+    return build
+
+
+@pytest.mark.parametrize("there", ["nothing", "a file", "a damaged folder", "a link"])
+def test_headers_of_another_process_that_was_faster_are_not_moved(there: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It uses them: Clang tells when a file is gone that it is about to read."""
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
+    (tmp_path / "cache").mkdir()
+    given: list[Path] = []
+
+    def headers(others: int) -> None:
+        def precompile(folder: Path) -> None:
+            if others:  # as many processes begin and end while this one precompiles
+                headers(others - 1)
+            (folder / "made.pch").write_text("headers")
+
+        monkeypatch.setattr(kernel_cache, "_whole", set())
+        monkeypatch.setattr(kernel_cache, "_lock", threading.Lock())
+        given.append(kernel_cache.shared_headers("key", precompile, warp_private.LEFTOVER))
+        inodes.append(given[-1].stat().st_ino)
+
+    inodes: list[int] = []
+    headers(0)
+    folder = given[0]
+    shutil.rmtree(folder)
+    if there == "a file":
+        folder.touch()
+    elif there == "a link":
+        folder.symlink_to(tmp_path)
+    elif there == "a damaged folder":
+        folder.mkdir()
+        (folder / "seal").touch()
+    inodes.clear()
+    headers(2)
+    assert len(inodes) == 3 and len({*inodes}) == 1 and {*given} == {folder}
+    assert list((tmp_path / "cache").iterdir()) == [folder] and kernel_cache._is_sealed(folder)
+
+
+@kernel
+def add_one(numbers: wp.array(dtype=float)):
+    numbers[0] += 1.0
+
+
+@kernel
+def add_two(numbers: wp.array(dtype=float)):
+    numbers[0] += 2.0
+
+
+def test_what_is_preloaded_is_loaded_at_the_end_of_the_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A process that is forked after it has no lock that a thread of its parent holds."""
+    start("cpu")
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    numbers = zeros(1)
+    with pytest.raises(KeyError), preloading(add_one, add_two):
+        launch(add_one, 1, numbers)
+        raise KeyError
+    assert list(compiled("add_two").glob("*.o"))
+    shutil.rmtree(tmp_path)  # what is loaded is not looked for
+    with preloading(add_one, add_two):
+        launch(add_two, 1, numbers)
+    assert numbers.numpy().tolist() == [3.0] and not tmp_path.exists()
+
+
+PRELOADED = """
+from wrt.accel.queries.raw_launches import preload_headers
+preload_headers()
+"""
+
+
+def test_headers_are_made_beforehand_where_the_cache_is_empty(tmp_path: Path):
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", PRELOADED], cwd=ROOT, capture_output=True, text=True, env=environment)
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+        assert len(list(tmp_path.glob("*/precompiled-*/*.pch"))) == 1
