@@ -1,0 +1,419 @@
+"""Random meshes and rays, through every structure in every way there is: `python -m tests.random_meshes --count 10000`.
+
+All structures have the bits of brute force, whichever way the rays come: alone or many at a time, in an order that makes packets
+or one that makes none, from NumPy or Warp. The number of a case's group decides what it is over; `--only GROUP SEED` does one
+again.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import wrt
+from tests import random_cases
+from tests.random_rays import RAYS, Rays, at_their_hits, rays_of
+from tests.structures import STRUCTURES
+from wrt.accel.bvh.builders import BVH_BUILDERS
+from wrt.accel.flatten import world_of
+from wrt.accel.geometry import Geometry
+from wrt.accel.instancing import instanced_meshes
+from wrt.core.errors import InputError
+from wrt.kernels.query import HitArrays, RayArrays, put_hit
+from wrt.kernels.structs import fields_of
+from wrt.scene import shapes
+from wrt.scene.materials import Material
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Object, Scene, Sphere
+
+Rng = np.random.Generator
+Triangles = np.ndarray  # (N, 3, 3) float64: corners
+PACKET, PACKETS = 16, 4  # rays of a packet, and packets of a call after which none is tried for a while
+MANY = 1100, 1400  # rays of a call that are traced where they are, as a few are not
+
+# --- meshes: around the origin, of size 1 -----------------------------------------------------------------------------
+
+
+def soup(rng: Rng, n: int) -> Triangles:
+    return rng.uniform(-1.0, 1.0, (n, 1, 3)) + rng.uniform(-1.0, 1.0, (n, 3, 3)) * 10.0 ** rng.uniform(-3.0, 0.0, (n, 1, 1))
+
+
+def shared_corners(rng: Rng, n: int) -> Triangles:
+    """Neighbours at edges and corners; some triangles are there twice, some are points or lines."""
+    corners = rng.uniform(-1.0, 1.0, (3 + n // 3, 3))
+    return corners[rng.integers(0, len(corners), (n, 3))]
+
+
+def grid(rng: Rng, n: int) -> Triangles:
+    """A height field over whole numbers, often flat: boxes without thickness, edges along the axes."""
+    side = max(1, round((n / 2) ** 0.5))
+    heights = rng.integers(0, rng.integers(1, 4), (side + 1, side + 1))
+    x, y = np.mgrid[:side, :side].reshape(2, -1)
+    a, b, c, d = (np.stack([x + i, y + j, heights[x + i, y + j]], axis=1) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]) * (2.0 / side) - (1.0, 1.0, 0.0)
+
+
+def stack(rng: Rng, n: int) -> Triangles:
+    """Sheets over each other, some at the same place."""
+    sheets = [grid(rng, max(2, n // 5)) * (1.0, 1.0, 0.0) + (0.0, 0.0, z) for z in rng.integers(-2, 3, 5) / 4.0]
+    return np.concatenate(sheets)
+
+
+def slivers(rng: Rng, n: int) -> Triangles:
+    """Needles around a few lines."""
+    begin, along = rng.uniform(-1.0, 1.0, (2, n, 1, 3))
+    return begin + along * rng.uniform(-1.0, 1.0, (n, 3, 1)) + rng.normal(0.0, 10.0 ** rng.uniform(-8.0, -2.0), (n, 3, 3))
+
+
+def fan(rng: Rng, n: int) -> Triangles:
+    """All at one corner, often in one plane."""
+    angle = np.linspace(0.0, 2.0 * np.pi, n + 3)
+    rim = np.stack([np.cos(angle), np.sin(angle), rng.integers(0, 2) * rng.uniform(-0.5, 0.5, len(angle))], axis=1)
+    return np.stack([np.zeros((n + 2, 3)), rim[:-1], rim[1:]], axis=1)
+
+
+def of_shape(make: Callable[[], Mesh]) -> Callable[[Rng, int], Triangles]:
+    return lambda rng, n: make().vertices.astype(np.float64)[make().faces]
+
+
+MESHES: dict[str, Callable[[Rng, int], Triangles]] = {
+    "soup": soup, "shared corners": shared_corners, "grid": grid, "stack": stack, "slivers": slivers, "fan": fan,
+    "one": lambda rng, n: soup(rng, 1), "nothing": lambda rng, n: np.zeros((0, 3, 3)),
+    "box": of_shape(shapes.box), "ball": of_shape(lambda: shapes.icosphere(2)),
+    "torus": of_shape(lambda: shapes.torus(0.7, 0.3, 12, 8)),
+}
+
+
+def triangles(rng: Rng) -> Triangles:
+    """One kind or two together, in any order of faces and corners."""
+    size = [4, 30, 80, 600][rng.choice(4, p=[0.2, 0.4, 0.37, 0.03])]
+    kinds = rng.choice([*MESHES], rng.integers(1, 3))
+    out = np.concatenate([MESHES[kind](rng, int(rng.integers(1, size + 1))) for kind in kinds])
+    if rng.random() < 0.3 and len(out):  # some twice
+        out = np.concatenate([out, out[rng.integers(0, len(out), rng.integers(1, 9))]])
+    out = rng.permutation(out)
+    turned = rng.random(len(out)) < 0.2
+    out[turned] = out[turned][:, ::-1]
+    if rng.random() < 0.3:
+        out = out @ np.linalg.qr(rng.normal(size=(3, 3)))[0].T
+    return out
+
+
+def mesh_of(rng: Rng) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces: of any size, and anywhere."""
+    corners = triangles(rng)
+    if rng.random() < 0.3:
+        corners = corners + rng.normal(size=3) * 10.0 ** rng.uniform(0.0, 4.0)
+    if rng.random() < 0.3:
+        corners = corners * 10.0 ** rng.uniform(-12.0, 12.0)
+    if len(corners) and rng.random() < 0.5:
+        vertices, faces = np.unique(corners.reshape(-1, 3).astype(np.float32), axis=0, return_inverse=True)
+        return vertices, faces.reshape(-1, 3).astype(np.int32)
+    return corners.reshape(-1, 3).astype(np.float32), np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
+
+
+def balls(rng: Rng, vertices: np.ndarray) -> np.ndarray:
+    """(S, 4) float32, of the mesh's size, some at its corners."""
+    low, high = extent(vertices)
+    centers = rng.uniform(low, high, (rng.integers(1, 9), 3))
+    radii = np.max(high - low) * 10.0 ** rng.uniform(-2.0, 0.0, (len(centers), 1))
+    return np.concatenate([centers, radii], axis=1).astype(np.float32)
+
+
+def extent(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    good = vertices[np.isfinite(vertices).all(axis=1)].astype(np.float64)
+    return (good.min(axis=0), good.max(axis=0)) if len(good) else (-np.ones(3), np.ones(3))
+
+
+# --- what a case is over ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """given: for wrt.build; world: of each ray, where there are several; before: vertices to build over, and to refit from."""
+
+    given: Any
+    rays: Rays
+    world: np.ndarray | None = None
+    before: np.ndarray | None = None
+
+
+def plain(rng: Rng) -> Case:
+    vertices, faces = mesh_of(rng)
+    before = None
+    if rng.random() < 0.2 and len(faces):
+        low, high = extent(vertices)
+        before = (vertices + 0.3 * np.max(high - low) * rng.normal(size=vertices.shape)).astype(np.float32)
+    elif rng.random() < 0.15 and len(faces):
+        vertices = vertices.copy()
+        broken = rng.integers(0, len(vertices), 1 + len(vertices) // 20)
+        vertices[broken, rng.integers(0, 3, len(broken))] = rng.choice([np.nan, np.inf, -np.inf], len(broken))
+    geometry = Geometry(vertices, faces, np.zeros((0, 4), np.float32))
+    return Case(geometry, rays_of(rng, vertices[faces]), None, before)
+
+
+def with_spheres(rng: Rng) -> Case:
+    vertices, faces = mesh_of(rng)
+    return Case(Geometry(vertices, faces, balls(rng, vertices)), rays_of(rng, vertices[faces]))
+
+
+def placement(rng: Rng, size: float) -> np.ndarray:
+    matrix = np.eye(4)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0] if rng.random() < 0.7 else np.eye(3)
+    matrix[:3, :3] = turn * np.exp(rng.normal(0.0, 0.5, 3))
+    matrix[:3, 3] = size * rng.normal(size=3)
+    return matrix
+
+
+def placed(rng: Rng, spheres: bool) -> Scene:
+    """Up to three meshes, each shown up to four times."""
+    grey, objects = (Material(),), []
+    for _ in range(rng.integers(1, 4)):
+        vertices, faces = mesh_of(rng)
+        mesh = Mesh(vertices, faces)
+        size = float(np.max(np.subtract(*extent(vertices)[::-1])))
+        objects += [Object(mesh, grey, placement(rng, size)) for _ in range(rng.integers(1, 5))]
+    balls = [Sphere(rng.normal(size=3), rng.uniform(0.1, 1.0), grey[0]) for _ in range(rng.integers(0, 3))] if spheres else []
+    return Scene(tuple(objects), tuple(balls))
+
+
+def corners_of(scene: Scene) -> np.ndarray:
+    return np.concatenate([(thing.mesh.vertices @ thing.transform[:3, :3].T + thing.transform[:3, 3])[thing.mesh.faces]
+                           for thing in scene.objects])
+
+
+def instances(rng: Rng) -> Case:
+    scene = placed(rng, spheres=True)
+    return Case(world_of(scene, instanced_meshes(scene, "always")).geometry, rays_of(rng, corners_of(scene)))
+
+
+def worlds(rng: Rng) -> Case:
+    scenes = [placed(rng, spheres=False) for _ in range(rng.integers(1, 4))]
+    rays = rays_of(rng, np.concatenate([corners_of(scene) for scene in scenes]))
+    return Case(scenes, rays, rng.integers(0, len(scenes), RAYS).astype(np.int32))
+
+
+OVER: dict[str, Callable[[Rng], Case]] = {
+    "plain": plain, "with spheres": with_spheres, "instances": instances, "worlds": worlds}
+
+# --- ways -------------------------------------------------------------------------------------------------------------
+
+
+def in_packets(rays: Rays) -> Iterator[np.ndarray]:
+    """Calls of a few packets, each of rays that run the same way along every axis."""
+    octants = np.signbit(rays.directions) @ (1, 2, 4)
+    blocks = [np.resize(of, -(-len(of) // PACKET) * PACKET).reshape(-1, PACKET)
+              for of in (np.flatnonzero(octants == octant) for octant in range(8)) if len(of)]
+    together = np.concatenate(blocks)
+    for first in range(0, len(together), PACKETS):
+        yield together[first : first + PACKETS].ravel()
+
+
+def without_packets(rays: Rays) -> Iterator[np.ndarray]:
+    """With two rays that run against each other in each packet's worth of rays."""
+    index = np.resize(np.arange(len(rays)), -(-len(rays) // (PACKET - 2)) * (PACKET - 2)).reshape(-1, PACKET - 2)
+    against = np.tile([AGAINST, AGAINST - 1], (len(index), 1))
+    yield np.concatenate([index, against], axis=1).ravel()
+
+
+def many(rays: Rays) -> Iterator[np.ndarray]:
+    yield np.resize(np.arange(len(rays)), np.random.default_rng(len(rays)).integers(*MANY))
+
+
+def as_they_are(rays: Rays) -> Iterator[np.ndarray]:
+    yield np.arange(len(rays))
+
+
+AGAINST = -1  # and -2: no rays of the case, and in Warp arrays no rays at all
+
+
+def filled(rays: Rays, index: np.ndarray, nothing: bool) -> Rays:
+    """The rays of an index; those that are none run against each other, or are not finite."""
+    out = Rays(*(array[np.maximum(index, 0)] for array in (rays.origins, rays.directions, rays.t_min, rays.t_max)))
+    for extra, sign in ((AGAINST, 1.0), (AGAINST - 1, -1.0)):
+        rows = index == extra
+        out.origins[rows], out.directions[rows], out.t_min[rows], out.t_max[rows] = 0.0, sign, 0.0, np.inf
+        if nothing:
+            out.directions[rows] = np.nan
+    return out
+
+
+@dataclass(frozen=True)
+class Way:
+    """order: calls, each of the rays of an index; of: "numpy", "float64" (with gaps) or "warp"; counters: the walk that counts, of
+    one ray after another."""
+
+    order: Callable[[Rays], Iterator[np.ndarray]] = as_they_are
+    of: str = "numpy"
+    counters: bool = False
+
+
+WAYS = {
+    "as they are": Way(), "packets": Way(in_packets), "no packets": Way(without_packets), "many": Way(many),
+    "float64": Way(of="float64"), "warp": Way(without_packets, "warp"), "many of warp": Way(many, "warp"),
+    "counting": Way(counters=True),
+}
+
+
+def asked(accel: Any, rays: Rays, way: Way, world: np.ndarray | None) -> tuple[Any, np.ndarray]:
+    """closest_hit and any_hit, as NumPy's. Where all rays have the same ends, they are given once."""
+    arrays = [rays.origins, rays.directions, rays.t_min, rays.t_max]
+    if way.of == "float64":
+        arrays = [np.repeat(array.astype(np.float64), 2, axis=0)[::2] for array in arrays]
+    if way.of == "warp":
+        arrays = [wp.array(array, dtype=dtype, device=accel.device)
+                  for array, dtype in zip(arrays, (wp.vec3, wp.vec3, wp.float32, wp.float32), strict=True)]
+    elif len(rays):
+        arrays[2:] = [float(end[0]) if (end == end[0]).all() else end for end in arrays[2:]]
+    more = {} if world is None else {"world": world}
+    hits = accel.closest_hit(*arrays, **more, **({"counters": True} if way.counters else {})).numpy()
+    occluded = accel.any_hit(*arrays, **more)
+    return hits, occluded.numpy() if isinstance(occluded, wp.array) else occluded
+
+
+# Where there is a kernel for many rays at a time, each case tries all; elsewhere this share of them.
+ALL_WAYS, SOME_WAYS = ("bvh8",), 0.4
+FIELDS = "t", "u", "v", "prim_id"
+
+
+def differences(accel: Any, rays: Rays, world: np.ndarray | None, expected: Any, way: Way) -> Iterator[str]:
+    """What a way gives that is not expected."""
+    for index in way.order(rays):
+        of_each = None if world is None else world[np.maximum(index, 0)]
+        hits, occluded = asked(accel, filled(rays, index, way.of == "warp"), way, of_each)
+        if way.of == "warp" and ((hits.prim_id >= 0) | occluded)[index < 0].any():
+            yield "a ray that is not finite hits something"
+        real, rows = index >= 0, index[index >= 0]
+        for name in FIELDS:
+            got, wanted = getattr(hits, name)[real], getattr(expected, name)[rows]
+            if bad := np.flatnonzero(got.view(np.int32) != wanted.view(np.int32)).tolist():
+                yield f"{name} of ray {rows[bad[0]]} ({len(bad)}): {got[bad[0]]} for {wanted[bad[0]]}"
+        if bad := np.flatnonzero(occluded[real] != (expected.prim_id[rows] >= 0)).tolist():
+            yield f"any_hit of ray {rows[bad[0]]} ({len(bad)})"
+
+
+def all_hits(accel: Any, rays: Rays, crossings: bool) -> list[np.ndarray]:
+    """Lists of all hits, their numbers, and the first three."""
+    arguments = rays.origins, rays.directions, rays.t_min, rays.t_max
+    every = wrt.all_hits(accel, *arguments, crossings=crossings)
+    first = wrt.first_hits(accel, 3, *arguments, crossings=crossings)
+    out = [every.first, every.t, every.u, every.v, every.prim_id, *(getattr(first, name) for name in FIELDS)]
+    return [*out, wrt.count_hits(accel, *arguments, crossings=crossings)]
+
+
+@cache
+def own_kernel(name: str) -> Any:
+    """A kernel of a user's own: the closest hit, the one after it, and whether there is any."""
+    query = wrt.ray_query(name)
+
+    @wrt.kernel
+    def ask(world: query.World, rays: RayArrays, hits: HitArrays, later: HitArrays, occluded: wp.array(dtype=wp.bool)):
+        i = wp.tid()
+        ray = query.ray(rays.origin[i], rays.direction[i])
+        ray.t_min = rays.t_min[i]
+        ray.t_max = rays.t_max[i]
+        hit = query.closest_hit(world, ray)
+        put_hit(hits, i, hit, 1.0)
+        occluded[i] = query.any_hit(world, ray)
+        if hit.prim_id >= 0:
+            hit = query.next_hit(world, ray, hit)
+        put_hit(later, i, hit, 1.0)
+
+    return ask
+
+
+def by_own_kernel(accel: Any, name: str, rays: Rays) -> list[np.ndarray]:
+    """The first two hits of each ray, (N, 2) of each of FIELDS, and any_hit."""
+    given, hits, later = RayArrays(), HitArrays(), HitArrays()
+    for field, array in zip(fields_of(RayArrays), (rays.origins, rays.directions, rays.t_min, rays.t_max), strict=True):
+        setattr(given, field, wp.array(array, dtype=wp.vec3 if array.ndim == 2 else wp.float32, device=accel.device))
+    for out in (hits, later):
+        for field, dtype in zip(FIELDS, (wp.float32, wp.float32, wp.float32, wp.int32), strict=True):
+            setattr(out, field, wp.empty(len(rays), dtype=dtype, device=accel.device))
+    occluded = wp.empty(len(rays), dtype=wp.bool, device=accel.device)
+    wp.launch(own_kernel(name), dim=len(rays), inputs=[accel.world, given, hits, later, occluded], device=accel.device)
+    return [*(np.stack([getattr(out, name).numpy() for out in (hits, later)], axis=1) for name in FIELDS), occluded.numpy()]
+
+
+def same_bits(one: list[np.ndarray], other: list[np.ndarray]) -> bool:
+    return all(a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(one, other, strict=True))
+
+
+# --- one case ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scope:
+    """The structures that are asked, those whose rays are counted, those that list all hits, and those that a kernel of a user's
+    own asks. Each of them compiles kernels."""
+
+    structures: Collection[str] = tuple(STRUCTURES)
+    counting: Collection[str] = tuple(STRUCTURES)
+    listing: Collection[str] = tuple(STRUCTURES)
+    own: Collection[str] = tuple(STRUCTURES)
+
+
+def built(rng: Rng, name: str, case: Case) -> Any:
+    """With a builder and a size of leaves that its kind has; sometimes by a refit."""
+    has, options = inspect.signature(wrt.ACCELERATORS[name]._build).parameters, dict[str, Any]()
+    if "builder" in has and rng.random() < 0.7:
+        options["builder"] = str(rng.choice([*BVH_BUILDERS]))
+    if "max_leaf" in has and rng.random() < 0.5:
+        options["max_leaf"] = int(rng.integers(1, 20))
+    if case.before is not None:
+        accel = wrt.build(replace(case.given, vertices=case.before), name, threads=1, **options)
+        try:
+            accel.refit(case.given.vertices)
+        except InputError:  # not of its kind
+            pass
+        else:
+            return accel
+    return wrt.build(case.given, name, threads=1, **options)
+
+
+def problems(number: int, seed: int, scope: Scope) -> Iterator[str]:
+    """What of a case is not as it must be."""
+    rng = np.random.default_rng((number, seed))
+    over = [*OVER][number % len(OVER)]
+    case = OVER[over](rng)
+    with_world = {} if case.world is None else {"world": case.world}
+    brute = wrt.build(case.given, "brute_force", threads=1)
+
+    def truth(rays: Rays) -> Any:
+        return brute.closest_hit(rays.origins, rays.directions, rays.t_min, rays.t_max, **with_world)
+
+    segments = at_their_hits(rng, case.rays, truth(case.rays))
+    sets = [(rays, truth(rays)) for rays in (case.rays, segments)]
+    crossings = bool(rng.random() < 0.3 and np.isfinite(getattr(case.given, "vertices", np.nan)).all())
+    lists = [all_hits(brute, rays, crossings) for rays, _ in sets] if over == "plain" and scope.listing else []
+    for name in scope.structures:
+        with np.errstate(invalid="ignore"):  # of faces that are not finite
+            accel = built(rng, name, case)
+        for which, (rays, expected) in enumerate(sets):
+            for way, how in WAYS.items():
+                if (name in scope.counting if how.counters else name in ALL_WAYS or rng.random() < SOME_WAYS):
+                    for what in differences(accel, rays, case.world, expected, how):
+                        yield f"{name} over {over}, rays {which}, {way}: {what}"
+            if over == "plain" and name in scope.listing and not same_bits(all_hits(accel, rays, crossings), lists[which]):
+                yield f"{name}, rays {which}: all hits, crossings {crossings}"
+            if over == "plain" and name in scope.own:
+                two = wrt.first_hits(accel, 2, rays.origins, rays.directions, rays.t_min, rays.t_max)
+                wanted = [*(getattr(two, field) for field in FIELDS), expected.prim_id >= 0]
+                if not same_bits(by_own_kernel(accel, name, rays), wanted):
+                    yield f"{name}, rays {which}: a kernel of one's own"
+
+
+def check(number: int, seed: int, scope: Scope = Scope()) -> str:
+    """The first that differs, and how many do; "" where nothing does."""
+    found = [*problems(number, seed, scope)]
+    return f"{found[0]} and {len(found) - 1} more" if found else ""
+
+
+if __name__ == "__main__":
+    random_cases.main(__doc__, check, 100)
