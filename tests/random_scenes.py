@@ -36,7 +36,7 @@ from wrt.scene.motion import Motion
 from wrt.scene.settings import Settings
 
 ODDS_OF_MATERIAL = {**dict.fromkeys(SLOTS, 0.25), "emission": 0.4, "emits_light": 0.3, "alpha_mode": 0.5, "transmission": 0.4}
-DEPTHS = 0, 1, 2, 3, 4, 24  # bounces
+DEPTHS = 1, 2, 3, 4, 5, 24  # bounces
 MOST_RAYS = 5  # bounces up to which every ray is followed: beyond, a sample could have millions
 SHAPES: tuple[Callable[[], Mesh], ...] = (
     shapes.quad, shapes.box, shapes.prism, lambda: shapes.icosphere(0), lambda: shapes.icosphere(1),
@@ -93,7 +93,7 @@ def group_of(number: int) -> Group:
     for i in range(max(len(materials), len(owners))):  # each material is somewhere, and each object has one
         owners[i % len(owners)].append(i % len(materials))
     ways = ["", "", "keys", "keys" if instances else "target"]
-    around = 1 if rng.random() < 0.5 else -1
+    around = 1 if rng.random() < 0.7 else -1
     objects = [Placed(mesh, tuple(own), str(rng.choice(ways)), i == around)
                for i, (mesh, own) in enumerate(zip(placed_meshes, owners, strict=True))]
     kinds = some_of(rng, LIGHTS, number) if rng.random() < 0.8 else []
@@ -178,7 +178,7 @@ def plan_of_scene(number: int, seed: int) -> Plan:
                   rng.uniform(0.1, 1.0, 3) if group.ambient else (0.0, 0.0, 0.0), group.settings)
     scene = scene_at(scene.with_settings(size=(int(rng.integers(1, 20)), int(rng.integers(1, 12)))), rng.random())
     plan = plan_of(scene, Options(device="cpu", threads=1, **group.options))
-    depth = int(rng.integers(0, group.settings.max_depth + 1))
+    depth = int(rng.integers(0, group.settings.max_depth + 1, 2).max())
     least = 0.0 if depth <= MOST_RAYS and rng.random() < 0.5 else 10.0 ** rng.uniform(-1.5, -0.3)
     return plan.aimed(plan.camera, max_depth=depth, min_throughput=least)
 
