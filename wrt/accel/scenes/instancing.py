@@ -6,7 +6,6 @@ from collections import defaultdict
 
 import numpy as np
 
-from wrt.accel.instanced_geometry import MAX_SPREAD
 from wrt.core.checks import as_choice
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
@@ -46,6 +45,8 @@ def is_instance(thing: Object, meshes: frozenset[int]) -> bool:
 
 def is_invertible(thing: Object) -> bool:
     """Whether rays can be taken to the object's own space without much loss."""
+    from wrt.accel.instanced_geometry import MAX_SPREAD  # imports Warp: the help of `render`, which lists INSTANCING, does not wait
+
     linear = thing.transform[:3, :3]
     with np.errstate(all="ignore"):
         try:

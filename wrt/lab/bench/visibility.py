@@ -54,14 +54,13 @@ rays' answer is the exact one within a rounding error, some 1e-4 pixels, of the 
 the largest relative one where prim_id agrees, and its share of the bound derived for it (must not be above 1)."""
 
 
-def row_of(sweep: str, surface: str, triangles: int, pixels: int, raster: Sequence[float], cast: Sequence[float],
-           build: Sequence[float], agreement: Row) -> Row:
-    """One mesh in one picture. raster, cast: seconds of each run, run i of the one next to run i of the other; build:
-    seconds of each build of the structure, which casting needs first."""
+def row_of(raster: Sequence[float], cast: Sequence[float], build: Sequence[float], agreement: Row, **subject: Any) -> Row:
+    """Return the row of one mesh in one picture. raster, cast: seconds of each run, run i of the one next to run i of the other;
+    build: seconds of each build of the structure, which casting needs first; subject: sweep, surface, triangles, pixels."""
     ratio = [np.median((np.array(cast) + extra) / np.array(raster)) for extra in (0.0, np.median(build))]
-    return Row(sweep=sweep, surface=surface, triangles=triangles, pixels=pixels, raster=list(raster), cast=list(cast),
-               build=list(build), agreement=agreement, raster_median=float(np.median(raster)), cast_median=float(np.median(cast)),
-               build_median=float(np.median(build)), cast_over_raster=float(ratio[0]), cast_and_build_over_raster=float(ratio[1]))
+    return Row(**subject, raster=list(raster), cast=list(cast), build=list(build), agreement=agreement,
+               raster_median=float(np.median(raster)), cast_median=float(np.median(cast)), build_median=float(np.median(build)),
+               cast_over_raster=float(ratio[0]), cast_and_build_over_raster=float(ratio[1]))
 
 
 def terrain(cells: int) -> Mesh:
@@ -134,8 +133,8 @@ def ready(plan: Plan, surface: Surface, geometry: Geometry) -> Callable[[str, in
         size = (side, side)
         seconds = alternate({drawer: partial(drawer.draw, surface.camera, size) for drawer in (rasterizer, caster)}, plan.runs)
         checked = agreement(rasterizer, caster, geometry, surface.camera, size)
-        return row_of(sweep, surface.name, len(geometry.faces), side * side, seconds[rasterizer].tolist(), seconds[caster].tolist(),
-                      builds, checked)
+        return row_of(seconds[rasterizer].tolist(), seconds[caster].tolist(), builds, checked, sweep=sweep, surface=surface.name,
+                      triangles=len(geometry.faces), pixels=side * side)
 
     return measure
 

@@ -130,11 +130,11 @@ def _check_light_transport(scene: Scene, integrator: str) -> None:
 def _integrator(mi: Any, name: str, scene: Scene, lit: bool, parts: dict[str, Part]) -> Any:
     max_depth = scene.settings.max_depth
     if name == "whitted":
-        from wrt.lab.mitsuba.whitted import whitted_integrator
+        from wrt.lab.mitsuba.whitted import Walk, whitted_integrator
 
         inside = {key: part.material.absorption for key, part in parts.items() if max(part.material.absorption) > 0.0}
         blended = {key for key, part in parts.items() if part.material.alpha_mode == "blend"}
-        return whitted_integrator(mi, max_depth, scene.ambient, lit, inside, blended)
+        return whitted_integrator(mi, Walk(mi, max_depth, scene.ambient, lit, inside, blended))
     if name == "direct":
         return {"type": "direct"}
     # Mitsuba counts a path's edges: 1 is emission seen by the camera, 2 direct light. No Russian roulette: less noise.

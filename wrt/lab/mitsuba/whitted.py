@@ -10,46 +10,96 @@ from wrt.scene.values import Color
 MAX_TRANSPARENT = 256  # surfaces in a row that a ray may go straight through
 
 
-def whitted_integrator(mi: Any, max_depth: int, ambient: Color, lights: bool, absorption: dict[str, Color],
-                       blended: set[str]) -> Any:
-    """An integrator whose expectation is wrt's picture: direct light and ambient at diffuse surfaces, where paths end.
+class Walk:
+    """Paths whose expectation is wrt's picture: direct light and ambient at diffuse surfaces, where paths end.
 
-    Reflection, refraction and transparency are followed, one of them by chance where wrt follows all. max_depth:
-    bounces after the first hit. lights: whether there is an emitter to sample. absorption: shape id -> coefficient
-    inside it; blended: ids of shapes that rays pass by their alpha, which is no bounce.
-    It is Python code in a scalar variant, some 10 microseconds a bounce: for small pictures.
+    Reflection, refraction and transparency are followed, one of them by chance where wrt follows all. max_depth: bounces after the
+    first hit. lights: whether there is an emitter to sample. absorption: shape id -> coefficient inside it; blended: ids of shapes
+    that rays pass by their alpha, which is no bounce.
     """
-    flags = mi.BSDFFlags
-    diffuse, smooth = int(flags.Diffuse), int(flags.Smooth)
-    followed = int(flags.All) & ~diffuse
-    anywhere, onward = mi.BSDFContext(), mi.BSDFContext()
-    onward.type_mask = followed
-    exp = importlib.import_module("drjit").exp
-    radiance_around = mi.Color3f(ambient)
-    inside = {shape: mi.Color3f(value) for shape, value in absorption.items()}
 
-    def transmittance(scene: Any, si: Any, light: Any) -> Any:
-        """What is left of the light on a shadow ray: solid surfaces take all, cut-outs and thin panes a part."""
-        share = mi.Color3f(1.0)
+    def __init__(self, mi: Any, max_depth: int, ambient: Color, lights: bool, absorption: dict[str, Color],
+                 blended: set[str]) -> None:
+        flags = mi.BSDFFlags
+        self.mi, self.max_depth, self.lights, self.blended = mi, max_depth, lights, blended
+        self.diffuse, self.smooth, self.null = int(flags.Diffuse), int(flags.Smooth), int(flags.Null)
+        self.followed = int(flags.All) & ~self.diffuse
+        self.anywhere, self.onward = mi.BSDFContext(), mi.BSDFContext()
+        self.onward.type_mask = self.followed
+        self.exp = importlib.import_module("drjit").exp
+        self.ambient = mi.Color3f(ambient)
+        self.inside = {shape: mi.Color3f(value) for shape, value in absorption.items()}
+
+    def transmittance(self, scene: Any, si: Any, light: Any) -> Any:
+        """Return the share of the light that a shadow ray keeps: solid surfaces take all, cut-outs and thin panes a part."""
+        share = self.mi.Color3f(1.0)
         ray = si.spawn_ray_to(light.p)
         for _ in range(MAX_TRANSPARENT):
             hit = scene.ray_intersect(ray)
             if not hit.is_valid():
                 return share
             bsdf = hit.bsdf()
-            if not bsdf.flags() & int(flags.Null):
+            if not bsdf.flags() & self.null:
                 break
             share *= bsdf.eval_null_transmission(hit)
             ray = hit.spawn_ray_to(light.p)
-        return mi.Color3f(0.0)
+        return self.mi.Color3f(0.0)
 
-    def direct_light(scene: Any, sampler: Any, si: Any, bsdf: Any) -> Any:
-        """One sample of one light; a traced reflection finds those with an area by itself."""
+    def direct_light(self, scene: Any, sampler: Any, si: Any, bsdf: Any) -> Any:
+        """Sample one light once; a traced reflection finds those with an area by itself."""
         light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False)
-        if light.pdf == 0.0 or not (light.delta or bsdf.flags() & diffuse):
-            return mi.Color3f(0.0)
-        value = weight * bsdf.eval(anywhere, si, si.to_local(light.d))
-        return value * transmittance(scene, si, light) if max(value) > 0.0 else value
+        if light.pdf == 0.0 or not (light.delta or bsdf.flags() & self.diffuse):
+            return self.mi.Color3f(0.0)
+        value = weight * bsdf.eval(self.anywhere, si, si.to_local(light.d))
+        return value * self.transmittance(scene, si, light) if max(value) > 0.0 else value
+
+    def reflected(self, scene: Any, sampler: Any, si: Any, bsdf: Any) -> Any:
+        """Return the light of emitters and of the ambient that a surface reflects to where the path came from."""
+        radiance = self.mi.Color3f(0.0)
+        if self.lights and bsdf.flags() & self.smooth:
+            radiance += self.direct_light(scene, sampler, si, bsdf)
+        if bsdf.flags() & self.diffuse and max(self.ambient) > 0.0:
+            there = 1.0 - bsdf.eval_null_transmission(si)
+            radiance += self.ambient * bsdf.eval_diffuse_reflectance(si) * there
+        return radiance
+
+    def sample(self, scene: Any, sampler: Any, ray: Any) -> tuple[Any, bool, list[Any]]:
+        """As Mitsuba's SamplingIntegrator.sample: radiance along a ray, whether it hit anything, no AOVs."""
+        radiance, throughput, within = self.mi.Color3f(0.0), self.mi.Color3f(1.0), None
+        depth = passed = 0
+        while depth <= self.max_depth and passed <= MAX_TRANSPARENT:
+            si = scene.ray_intersect(ray)
+            if within is not None and si.is_valid():
+                throughput *= self.exp(-within * si.t)
+            emitter = si.emitter(scene)
+            if emitter is not None:
+                radiance += throughput * emitter.eval(si)
+            if not si.is_valid():
+                return radiance, depth + passed > 0, []
+            bsdf = si.bsdf()
+            radiance += throughput * self.reflected(scene, sampler, si, bsdf)
+            if not bsdf.flags() & self.followed:
+                break
+            bounce, weight = bsdf.sample(self.onward, si, sampler.next_1d(), sampler.next_2d())
+            throughput *= weight
+            if not max(throughput) > 0.0:
+                break
+            direction = si.to_world(bounce.wo)
+            if bounce.eta != 1.0:  # refracted, and now on the side where it goes
+                within = self.inside.get(si.shape.id()) if direction @ si.n < 0.0 else None
+            ray = si.spawn_ray(direction)
+            if si.shape.id() in self.blended and bounce.sampled_component == bsdf.component_count() - 1:
+                passed += 1  # straight on past a blended surface (the last component of Mitsuba's mask): no bounce
+            else:
+                depth, passed = depth + 1, 0
+        return radiance, True, []
+
+
+def whitted_integrator(mi: Any, walk: Walk) -> Any:
+    """Return an integrator that takes its samples from a Walk.
+
+    It is Python code in a scalar variant, some 10 microseconds a bounce: for small pictures.
+    """
 
     class Whitted(mi.SamplingIntegrator):  # its base exists only once Mitsuba's variant is set
         def __init__(self) -> None:
@@ -59,37 +109,6 @@ def whitted_integrator(mi: Any, max_depth: int, ambient: Color, lights: bool, ab
             return []
 
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: bool = True) -> Any:
-            radiance, throughput, within = mi.Color3f(0.0), mi.Color3f(1.0), None
-            depth = passed = 0
-            while depth <= max_depth and passed <= MAX_TRANSPARENT:
-                si = scene.ray_intersect(ray)
-                if within is not None and si.is_valid():
-                    throughput *= exp(-within * si.t)
-                emitter = si.emitter(scene)
-                if emitter is not None:
-                    radiance += throughput * emitter.eval(si)
-                if not si.is_valid():
-                    return radiance, depth + passed > 0, []
-                bsdf = si.bsdf()
-                if lights and bsdf.flags() & smooth:
-                    radiance += throughput * direct_light(scene, sampler, si, bsdf)
-                if bsdf.flags() & diffuse and max(ambient) > 0.0:
-                    there = 1.0 - bsdf.eval_null_transmission(si)
-                    radiance += throughput * radiance_around * bsdf.eval_diffuse_reflectance(si) * there
-                if not bsdf.flags() & followed:
-                    break
-                bounce, weight = bsdf.sample(onward, si, sampler.next_1d(), sampler.next_2d())
-                throughput *= weight
-                if not max(throughput) > 0.0:
-                    break
-                direction = si.to_world(bounce.wo)
-                if bounce.eta != 1.0:  # refracted, and now on the side where it goes
-                    within = inside.get(si.shape.id()) if direction @ si.n < 0.0 else None
-                ray = si.spawn_ray(direction)
-                if si.shape.id() in blended and bounce.sampled_component == bsdf.component_count() - 1:
-                    passed += 1  # straight on past a blended surface (the last component of Mitsuba's mask): no bounce
-                else:
-                    depth, passed = depth + 1, 0
-            return radiance, True, []
+            return walk.sample(scene, sampler, ray)
 
     return Whitted()

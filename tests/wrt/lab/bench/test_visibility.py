@@ -236,7 +236,7 @@ def test_surfaces_grow_to_the_limit_and_cover_the_same(tmp_path: Path) -> None:
 def row(sweep: str, triangles: int, pixels: int, raster: float, cast: float, build: float = 1.0, surface: str = "s") -> Row:
     same = Row(pixels=pixels, covered=pixels // 2, differ=3, ties=2, silhouettes=1, unexplained=0, depth_error=1e-6,
                depth_share=0.3)
-    return row_of(sweep, surface, triangles, pixels, (raster,) * 3, (cast,) * 3, (build,) * 2, same)
+    return row_of((raster,) * 3, (cast,) * 3, (build,) * 2, same, sweep=sweep, surface=surface, triangles=triangles, pixels=pixels)
 
 
 def test_fit_finds_the_exponent_of_a_power_and_its_uncertainty() -> None:
