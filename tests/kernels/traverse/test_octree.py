@@ -7,8 +7,8 @@ import pytest
 
 from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 
-from tests import rewalk
 from tests.cell_cases import assert_same, soup
+from tests.rewalk import PRIMITIVES
 from wrt.accel.scenes.build import build
 from wrt.scene.shapes import icosphere
 
@@ -39,11 +39,30 @@ def test_rays_in_planes_visit_the_cells_that_the_box_test_enters():
     direction = rng.choice([-1.0, -0.0, 0.0, 1.0], (80, 3))
     direction[~direction.any(axis=1), 0] = 1.0
     origin = rounded(corner - 0.5 * direction)
-    counters = octree.closest_hit(origin, direction, counters=True).counters
-    for i, ray in enumerate(rewalk.rays(geometry, origin, direction)):
-        walk = rewalk.octree(octree, ray)
-        assert [counters.nodes[i], counters.primitives[i], counters.pops[i]] == [walk.nodes, walk.primitives, walk.pops]
+    counters = octree.closest_hit(origin, direction, trace=True).counters
+    low, high = cells(octree)
     assert counters.nodes.mean() > 10
+    for i in range(len(origin)):
+        fetched = slice(counters.first[i], counters.first[i + 1])
+        node = counters.address[fetched][counters.address[fetched] < PRIMITIVES] // octree.data.nodes.numpy().itemsize
+        assert len(set(node)) == len(node)  # none twice
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = [(plane[node] - origin[i]) / direction[i] for plane in (low - 1e-5, high + 1e-5)]
+        enter, leave = np.fmax.reduce(np.minimum(*ends), axis=1), np.fmin.reduce(np.maximum(*ends), axis=1)
+        assert (np.maximum(enter, -1e-5) <= leave).all()
+
+
+def cells(octree):
+    """The corners of every node's cell, (N, 3) float64 each."""
+    nodes, n = octree.data.nodes.numpy(), 1 << int(octree.data.levels)
+    low, size = np.zeros((len(nodes), 3)), np.full(len(nodes), float(n))
+    for i, (first, count) in enumerate(zip(nodes["first"], nodes["count"], strict=True)):  # a node stands before its children
+        octants = [k for k in range(8) if count < 0 and -count >> k & 1]
+        for child, k in enumerate(octants, first):
+            size[child] = size[i] / 2
+            low[child] = low[i] + size[child] * (k >> np.arange(3) & 1)
+    begin, step = np.array(octree.data.lo, np.float64), float(octree.data.size)
+    return begin + step * low, begin + step * (low + size[:, None])
 
 
 def test_mailboxing_saves_tests_and_no_cells():
