@@ -58,10 +58,10 @@ IN_WRT = {
 }
 # Of kernels/, the parts that each folder of wrt/ may import. The others import none.
 KERNELS_OF_HOST = {
-    "accel": {"hit_lists", "query", "ray_query", "winding", "build", "shade", "traverse", "wide", "units", "structs"},
+    "accel": {"launch_probe", "hit_lists", "query", "ray_query", "winding", "build", "shade", "traverse", "wide", "units", "warp_private", "structs"},
     "compat": {"query"},
-    "renderer": {"launches", "query", "loops", "shade", "traverse", "wide", "structs"},
-    "lab": {"query", "study", "shade", "traverse", "units", "structs"},
+    "renderer": {"launches", "query", "loops", "shade", "traverse", "wide", "warp_private", "structs"},
+    "lab": {"query", "study", "shade", "traverse", "units", "warp_private", "structs"},
 }
 # The laboratory: only these of the product may name it, and only the laboratory its device code.
 LABORATORY = re.compile(r"\bwrt[./]lab\b|\bkernels[./]study\b")
