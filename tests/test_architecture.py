@@ -58,7 +58,8 @@ IN_WRT = {
 }
 # Of kernels/, the parts that each folder of wrt/ may import. The others import none.
 KERNELS_OF_HOST = {
-    "accel": {"launch_probe", "hit_lists", "query", "ray_query", "winding", "build", "shade", "traverse", "wide", "units", "warp_private", "structs"},
+    "accel": {"launch_probe", "launches", "hit_lists", "query", "ray_query", "winding", "build", "shade", "traverse", "wide",
+              "units", "warp_private", "structs"},
     "compat": {"query"},
     "renderer": {"launches", "query", "loops", "shade", "traverse", "wide", "warp_private", "structs"},
     "lab": {"query", "study", "shade", "traverse", "units", "warp_private", "structs"},
