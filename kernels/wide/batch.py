@@ -109,9 +109,8 @@ def put_best(packet: wp.array(dtype=wp.float32), ray: int, best: Hit):
     put_bits(packet, ray + wp.static(ROW["prim_id"]), best.prim_id)
 
 
-def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> Any:
-    """The first `count` primitives of a row against one ray of a packet; whether the ray has found what it asks for."""
-    ray_triangles = make_ray_triangles(any_hit and accepts is None, inlined)
+def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
+    """The spheres of a row in the mask against one ray of a packet; whether the ray has found what it asks for."""
     better = make_better(units, accepts)
 
     @wp.func
@@ -128,6 +127,12 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
             best.t = wp.where(found, -float(wp.inf), best.t)  # nothing else is reached
         put_best(scratch.packets, ray, best)
         return wp.static(any_hit) and found
+
+    return test_spheres
+
+
+def make_accepted(any_hit: bool, accepts: Any, ray_triangles: Any) -> Any:
+    """The triangles of a row in the mask, of which `accepts` may refuse some, as in make_row_test."""
 
     @wp.func
     def nearest_accepted(accel: WideBvh, first: int, mask: int, surfaces: Surfaces, scratch: Scratch, ray: int) -> bool:
@@ -146,6 +151,14 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
             put_number(scratch.packets, ray + wp.static(ROW["t"]), -float(wp.inf))
         return wp.static(any_hit)
 
+    return nearest_accepted
+
+
+def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> Any:
+    """The first `count` primitives of a row against one ray of a packet; whether the ray has found what it asks for."""
+    ray_triangles = make_ray_triangles(any_hit and accepts is None, inlined)
+    test_spheres, nearest_accepted = make_sphere_test(units, any_hit, accepts), make_accepted(any_hit, accepts, ray_triangles)
+
     @wp.func
     def test_row(accel: WideBvh, first: int, count: int, surfaces: Surfaces, scratch: Scratch, ray: int) -> bool:
         mask = (2 << (count - 1)) - 1
@@ -163,10 +176,10 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
     return test_row
 
 
-def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """A packet with a beam, from the root."""
+def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
+    """The rays of a packet in the mask against the primitives of a leaf: many by lanes of rays, few one by one."""
     test_row = make_row_test(units, any_hit, accepts, False)
-    children, triangles = make_children(any_hit), make_triangles(any_hit)
+    triangles = make_triangles(any_hit)
 
     @wp.func
     def test_leaf(accel: WideBvh, surfaces: Surfaces, reference: int, mask: int, scratch: Scratch, base: int):
@@ -190,6 +203,13 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                         mask = mask & ~(1 << lane)
             left = left - WIDTH
             first = first + ROW_SIZE
+
+    return test_leaf
+
+
+def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
+    """A packet with a beam, from the root."""
+    children, test_leaf = make_children(any_hit), make_packet_leaf(units, any_hit, accepts)
 
     @wp.func
     def walk(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, base: int, active: int) -> bool:

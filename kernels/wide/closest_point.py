@@ -18,7 +18,7 @@ from wrt.kernels.traverse.stack import key_of, make_uninitialized, reference_of,
 from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
 from wrt.kernels.units.triangle import lower, upper
 from wrt.kernels.wide.lanes import bits
-from wrt.kernels.wide.layout import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, STACK_SIZE, first_reference, node_size
+from wrt.kernels.wide.layout import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, STACK_SIZE, NodeLayout
 from wrt.kernels.wide.nodes import make_plane
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.kernels.wide.traverse import make_gather, make_struct, row_size
@@ -170,26 +170,37 @@ def nearer_flat(p: wp.vec3, surfaces: Surfaces, prim_id: int, best: Nearest) -> 
     return nearer_of(p, triangle, on, best)
 
 
-@cache
-def make_closest_point_kernel(width: int, compressed: bool) -> Any:
-    """Points first .. first + dim - 1 against a tree whose primitives are corners."""
-    struct, gather = make_struct(Primitive), make_gather(Primitive, width)
-    plane, exists = make_plane(width, compressed)
-    size_of_node, references = node_size(width, compressed), first_reference(width, compressed)
-    unit = 1 if compressed else width  # of primitives, in which references count
+def make_leaf_search(layout: NodeLayout) -> Any:
+    """nearest_in_leaf(accel, surfaces, reference, p, best) -> Nearest."""
+    struct, gather = make_struct(Primitive), make_gather(Primitive, layout.width)
+    width, size_of_row = layout.width, row_size(Primitive, layout.width)
 
     @wp.func
     def nearest_in_leaf(accel: struct, surfaces: Surfaces, reference: int, p: wp.vec3, best: Nearest) -> Nearest:
-        begin = leaf_first(reference) * unit
+        begin = leaf_first(reference) * wp.static(layout.unit)
         for i in range(begin, begin + leaf_count(reference)):
             row = i / width
-            record = gather(accel.primitives, row * wp.static(row_size(Primitive, width)) + i - row * width)
+            record = gather(accel.primitives, row * size_of_row + i - row * width)
             found = on_triangle(p, record)
             if found.d2 < wp.float64(wp.inf):
                 best = nearer_of(p, record, found, best)
             else:
                 best = nearer_flat(p, surfaces, record.prim_id, best)
         return best
+
+    return nearest_in_leaf
+
+
+def make_closest_point(layout: NodeLayout) -> Any:
+    """closest_point(accel, surfaces, p) -> Nearest: the walk of the tree."""
+    struct, nearest_in_leaf = make_struct(Primitive), make_leaf_search(layout)
+    plane, exists = make_plane(layout.width, layout.compressed)
+
+    @wp.func
+    def distance_to_child(accel: struct, first: int, j: int, p: wp.vec3) -> wp.float64:
+        lo = wp.vec3(plane(accel.nodes, first, LO_X, j), plane(accel.nodes, first, LO_Y, j), plane(accel.nodes, first, LO_Z, j))
+        hi = wp.vec3(plane(accel.nodes, first, HI_X, j), plane(accel.nodes, first, HI_Y, j), plane(accel.nodes, first, HI_Z, j))
+        return squared_distance(p, lo, hi)
 
     @wp.func
     def closest_point(accel: struct, surfaces: Surfaces, p: wp.vec3) -> Nearest:
@@ -204,15 +215,11 @@ def make_closest_point_kernel(width: int, compressed: bool) -> Any:
             if reference < 0:
                 best = nearest_in_leaf(accel, surfaces, reference, p, best)
             else:
-                first = reference * wp.static(size_of_node)
-                for j in range(width):
-                    child = bits(accel.nodes, first + references + j)
+                first = reference * wp.static(layout.size)
+                for j in range(wp.static(layout.width)):
+                    child = bits(accel.nodes, first + wp.static(layout.references) + j)
                     if child != EMPTY and exists(accel.nodes, first, j):
-                        lo = wp.vec3(plane(accel.nodes, first, LO_X, j), plane(accel.nodes, first, LO_Y, j),
-                                     plane(accel.nodes, first, LO_Z, j))
-                        hi = wp.vec3(plane(accel.nodes, first, HI_X, j), plane(accel.nodes, first, HI_Y, j),
-                                     plane(accel.nodes, first, HI_Z, j))
-                        d2 = squared_distance(p, lo, hi)
+                        d2 = distance_to_child(accel, first, j, p)
                         if d2 <= best.d2:
                             key = key_of(float(d2), child)
                             far = wp.max(near, key)
@@ -229,6 +236,14 @@ def make_closest_point_kernel(width: int, compressed: bool) -> Any:
                 break
             reference = reference_of(near)
         return best
+
+    return closest_point
+
+
+@cache
+def make_closest_point_kernel(layout: NodeLayout) -> Any:
+    """Points first .. first + dim - 1 against a tree whose primitives are corners."""
+    struct, closest_point = make_struct(Primitive), make_closest_point(layout)
 
     @kernel
     def closest_points(accel: struct, surfaces: Surfaces, points: wp.array(dtype=wp.vec3), out: PointArrays, first: int):

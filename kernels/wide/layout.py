@@ -1,5 +1,7 @@
 """Numbers of nodes, packets, stacks and slots, for Python and for C++ (`LAYOUT_H` is the text of layout.h)."""
 
+from typing import NamedTuple
+
 from wrt.kernels.headers import constants
 from wrt.kernels.query import FARTHEST, LARGEST, LENGTHEN, LONGEST, SHORTEN, SHORTEST
 from wrt.kernels.structs import NO_HIT, Primitive, size_of
@@ -33,6 +35,26 @@ def first_reference(width: int, compressed: bool) -> int:
 def node_size(width: int, compressed: bool) -> int:
     """Return the number of floats in a node."""
     return first_reference(width, compressed) + (1 if compressed else 2) * width
+
+
+class NodeLayout(NamedTuple):
+    """Nodes of `width` children, plain or compressed."""
+
+    width: int
+    compressed: bool
+
+    @property
+    def references(self) -> int:
+        return first_reference(self.width, self.compressed)
+
+    @property
+    def size(self) -> int:
+        return node_size(self.width, self.compressed)
+
+    @property
+    def unit(self) -> int:
+        """Number of primitives in which references to leaves count: a row, or one where leaves follow each other without a gap."""
+        return 1 if self.compressed else self.width
 
 
 # --- many rays at a time ----------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ boxes last.
 """
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -20,7 +20,7 @@ from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
 from wrt.kernels.units.triangle import component
 from wrt.kernels.wide.lanes import LaneRay, bits, lowest, make_cull, prefetch
-from wrt.kernels.wide.layout import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, STACK_SIZE, first_reference, node_size
+from wrt.kernels.wide.layout import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, STACK_SIZE, NodeLayout
 from wrt.kernels.wide.nodes import far_pad, make_children
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 
@@ -109,73 +109,78 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, width: int) -> Any:
 
 
 @cache
-def make_call_in(record: Any, width: int, compressed: bool, lines: int) -> Any:
-    """call_in(nodes, primitives, reference): the first cache lines of what a reference leads to, as it is needed soon."""
-    unit = 1 if compressed else width  # of primitives, in which references count
+def make_prefetch(record: Any, layout: NodeLayout) -> Any:
+    """prefetch_next(accel, reference): prefetch the first cache lines of the node or the leaf that a reference points to."""
+    struct, lines = make_struct(record), 2
 
     @wp.func
-    def call_in(nodes: wp.array(dtype=wp.float32), primitives: wp.array(dtype=wp.float32), reference: int):
+    def prefetch_next(accel: struct, reference: int):
         if reference >= 0:
-            prefetch(nodes, reference * wp.static(node_size(width, compressed)), lines)
+            prefetch(accel.nodes, reference * wp.static(layout.size), lines)
         else:
-            prefetch(primitives, leaf_first(reference) * unit / width * wp.static(row_size(record, width)), lines)
+            row = leaf_first(reference) * wp.static(layout.unit) / wp.static(layout.width)
+            prefetch(accel.primitives, row * wp.static(row_size(record, layout.width)), lines)
 
-    return call_in
+    return prefetch_next
 
 
-def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compressed: bool) -> Any:
-    """The closest hit, or any (the first that is found), in a tree of nodes of `width` children."""
-    children = make_children(width, compressed, units.box)
-    probe_of = make_probe(units)
-    test_row = make_row_test(units, any_hit, accepts, width)
-    size_of_node = node_size(width, compressed)
-    fetch_node, fetch_primitive, push, finish = make_counters(units, 4 * size_of_node)
+def make_leaf_test(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout) -> Any:
+    """test_leaf(accel, surfaces, reference, probe, rows, best) -> the best hit; for any hit, the first that is found."""
     record = units.triangle_test.record
     struct = make_struct(record)
-    call_in = make_call_in(record, width, compressed, 2)
-    references = first_reference(width, compressed)
-    unit = 1 if compressed else width  # of primitives, in which references count
-    new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
-
-    @wp.func
-    def child(accel: struct, at: int) -> int:
-        """The reference at `at`."""
-        reference = bits(accel.nodes, at)
-        call_in(accel.nodes, accel.primitives, reference)
-        return reference
-
-    @wp.func
-    def count_node(accel: struct, ray: Ray, counts: Counts, index: int) -> Counts:
-        if wp.static(units.counters):
-            boxes = int(0)
-            for j in range(width):
-                if bits(accel.nodes, index * wp.static(size_of_node) + references + j) != EMPTY:
-                    boxes += 1
-            return fetch_node(accel.recorder, ray, counts, index, boxes)
-        return counts
+    test_row = make_row_test(units, any_hit, accepts, layout.width)
+    width, size_of_row = layout.width, row_size(record, layout.width)
 
     @wp.func
     def test_leaf(accel: struct, surfaces: Any, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
-        begin = leaf_first(reference) * unit
+        begin = leaf_first(reference) * wp.static(layout.unit)
         end = begin + leaf_count(reference)
         while begin < end:
             row = begin / width
             lane = int(0)
-            if wp.static(compressed):
+            if wp.static(layout.compressed):
                 lane = begin - row * width
             n = wp.min(width - lane, end - begin)
             mask = ((2 << (n - 1)) - 1) << lane
-            best = test_row(accel.primitives, row * wp.static(row_size(record, width)), mask, surfaces, probe, rows, best)
+            best = test_row(accel.primitives, row * size_of_row, mask, surfaces, probe, rows, best)
             if wp.static(any_hit):
                 if best.prim_id != NO_HIT:
                     return best
             begin = begin + n
         return best
 
+    return test_leaf
+
+
+class Counting(NamedTuple):
+    """What a walk counts, where units.counters: node(accel, ray, counts, index), leaf(accel, ray, counts, reference) and
+    pop(counts) -> counts; push and finish as in traverse.counters.make_counters."""
+
+    node: Any
+    leaf: Any
+    pop: Any
+    push: Any
+    finish: Any
+
+
+def make_counting(units: Units, layout: NodeLayout) -> Counting:
+    struct = make_struct(units.triangle_test.record)
+    fetch_node, fetch_primitive, push, finish = make_counters(units, 4 * layout.size)
+
+    @wp.func
+    def count_node(accel: struct, ray: Ray, counts: Counts, index: int) -> Counts:
+        if wp.static(units.counters):
+            boxes = int(0)
+            for j in range(wp.static(layout.width)):
+                if bits(accel.nodes, index * wp.static(layout.size) + wp.static(layout.references) + j) != EMPTY:
+                    boxes += 1
+            return fetch_node(accel.recorder, ray, counts, index, boxes)
+        return counts
+
     @wp.func
     def count_leaf(accel: struct, ray: Ray, counts: Counts, reference: int) -> Counts:
         if wp.static(units.counters):
-            first = leaf_first(reference) * unit
+            first = leaf_first(reference) * wp.static(layout.unit)
             counts.leaves += 1
             for j in range(leaf_count(reference)):
                 counts = fetch_primitive(accel.recorder, ray, counts, first + j)
@@ -186,6 +191,26 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compre
         if wp.static(units.counters):
             counts.pops += 1
         return counts
+
+    return Counting(count_node, count_leaf, count_pop, push, finish)
+
+
+def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout) -> Any:
+    """The closest hit, or any (the first that is found), in a tree of such nodes."""
+    struct = make_struct(units.triangle_test.record)
+    children = make_children(layout.width, layout.compressed, units.box)
+    probe_of = make_probe(units)
+    test_leaf = make_leaf_test(units, any_hit, accepts, layout)
+    prefetch_next = make_prefetch(units.triangle_test.record, layout)
+    count_node, count_leaf, count_pop, count_push, finish = make_counting(units, layout)
+    new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
+
+    @wp.func
+    def child(accel: struct, at: int) -> int:
+        """The reference at `at`."""
+        reference = bits(accel.nodes, at)
+        prefetch_next(accel, reference)
+        return reference
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
@@ -206,11 +231,11 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compre
                     if best.prim_id != NO_HIT:
                         return finish(accel.recorder, ray, counts, best)
             else:
-                first = reference * wp.static(size_of_node)
+                first = reference * wp.static(layout.size)
                 counts = count_node(accel, ray, counts, reference)
                 t, mask = children(accel.nodes, first, rows, best.t)
                 if mask != 0:
-                    first = first + references
+                    first = first + wp.static(layout.references)
                     lane = lowest(mask)
                     mask = mask & (mask - 1)
                     near = key_of(t[lane], child(accel, first + lane))
@@ -233,7 +258,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, width: int, compre
                             else:
                                 put(stack, shared, size, far)
                         size = size + 1
-                        counts = push(counts, size)
+                        counts = count_push(counts, size)
                     reference = reference_of(near)
                     continue
             # Pop; what begins beyond the closest hit is dropped. Equal stays: a tie may have a lower prim_id there.
@@ -256,11 +281,10 @@ class WideTraversal:
     """What wrt.accel takes for the traversal's module, for one layout of nodes."""
 
     def __init__(self, width: int, compressed: bool = False) -> None:
-        self.width = width
-        self.compressed = compressed
+        self.layout = NodeLayout(width, compressed)
 
     def make_struct(self, record: Any) -> Any:
         return make_struct(record)
 
     def make_traversal(self, units: Units, any_hit: bool, accepts: Any = None) -> Any:
-        return make_traversal(units, any_hit, accepts, self.width, self.compressed)
+        return make_traversal(units, any_hit, accepts, self.layout)

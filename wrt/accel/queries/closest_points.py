@@ -62,7 +62,7 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
     n, out = len(rows), PointArrays()
     for name, field in fields_of(PointArrays).items():
         setattr(out, name, wp.empty(n, dtype=field.dtype, device=device))
-    kernel, given = make_closest_point_kernel(kernels.width, kernels.compressed), upload(rows, wp.vec3, device)
+    kernel, given = make_closest_point_kernel(kernels.layout), upload(rows, wp.vec3, device)
     surfaces = surroundings(snapshot).surfaces
     launch_on(device, kernel, n, snapshot.data, surfaces, given, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
     return ClosestPoints(*(getattr(out, name).numpy() for name in fields_of(PointArrays)))
