@@ -91,9 +91,9 @@ BELOW_KERNELS = {
 }
 LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "collections", "math", "pathlib"}
 # Ceilings, to be lowered where less is reached, and never raised: the aim is 100, 10 and 5.
-LONGEST_FUNCTION = 201  # lines
-LONG_FUNCTIONS = 29  # that have more than 60 lines
-LONG_SIGNATURES = 17  # with more than 7 parameters
+LONGEST_FUNCTION = 127  # lines
+LONG_FUNCTIONS = 10  # that have more than 60 lines
+LONG_SIGNATURES = 5  # with more than 7 parameters
 
 
 def module(path: Path) -> str:

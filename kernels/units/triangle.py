@@ -6,8 +6,8 @@ edge compute the same area with opposite sign, so that no ray passes between the
 it: RAY_TRIANGLE is the table of all. A test takes the ray's set-up and one record, and gives a `Hit` on the whole line.
 
 **What runs.** This file takes one triangle and one ray: on CUDA, where rays are counted, in kernels of users, and in all structures
-but bvh4, bvh8 and bvh8c. Rays in arrays through those, on a CPU, run its steps in lanes, kernels/wide/*.h, in half of the time.
-tests/kernels/wide/test_packets.py holds the two to the same bits (kernels/README.md has it all).
+but bvh4, bvh8 and bvh8c. Rays in arrays through those, on a CPU, run its steps in lanes, kernels/wide/triangle.h, in half of the
+time. tests/kernels/wide/test_packets.py holds the two to the same bits (kernels/README.md has it all).
 """
 
 from typing import Any, NamedTuple
