@@ -20,13 +20,12 @@ differ; wrt's kernels have their own.
 
 from __future__ import annotations
 
-import ctypes
 from pathlib import Path
 from typing import Any
 
 import warp as wp
-from warp._src import context as warp_context
 
+from tests.virtual_gpu import warp_private
 from tests.virtual_gpu.compiler import SUFFIX
 from tests.virtual_gpu.driver import NAME, Core, Gpus
 from tests.virtual_gpu.graphs import VirtualGpuError
@@ -36,45 +35,25 @@ __all__ = ["NAME", "VirtualGpuError", "gpus", "install"]
 
 def install(devices: int = 2, arch: int = 75, seed: int | None = 0, memory: int = 8 << 30) -> None:
     """Let Warp find virtual GPUs; before wp.init(). The arguments are those of Gpus."""
-    if warp_context.runtime is not None:
+    if warp_private.has_started():
         raise RuntimeError("virtual GPUs are installed before Warp starts")
-    if not wp.config.version.startswith("1.19."):
+    if not wp.config.version.startswith(warp_private.VERSION):
         raise NotImplementedError(f"virtual GPUs know the insides of Warp 1.19, not of {wp.config.version}")
-    load_dll = warp_context.Runtime.load_dll
-    output_name = warp_context.Module._get_compile_output_name
-    get_hooks, invoke = warp_context.ModuleExec.get_kernel_hooks, warp_context.invoke
 
-    def load(self: Any, path: str) -> Any:
-        library = load_dll(self, path)
+    def library_of(library: Any, path: str) -> Any:
         return library if "clang" in Path(path).name else Core(library, Gpus(library, devices, arch, seed, memory))
 
-    def named(self: Any, device: Any, *args: Any, **kwargs: Any) -> str:
+    def name_of(name: str, device: Any) -> str:
         """Nothing takes a file of ours for NVIDIA's; without a device it is NVIDIA's that is asked for."""
-        name: str = output_name(self, device, *args, **kwargs)
         return str(Path(name).with_suffix(SUFFIX)) if device and device.is_cuda else name
 
-    def described(self: Any, kernel: Any) -> Any:
-        """Here the names and the types of a kernel's arguments are known."""
-        hooks = get_hooks(self, kernel)
-        if self.device.is_cuda:
-            function = gpus().objects[hooks.forward]
-            function.arguments = [(each.label, each.type) for each in kernel.adj.args]
-            function.dimensions = kernel.adj.kernel_dim
-        return hooks
+    def loaded(handle: int, arguments: list[tuple[str, Any]], dimensions: int) -> None:
+        function = gpus().objects[handle]
+        function.arguments, function.dimensions = arguments, dimensions
 
-    def invoked(kernel: Any, hooks: Any, params: Any, adjoint: bool) -> Any:
-        """A launch on the CPU."""
-        given = zip(kernel.adj.args, params[1:], strict=False)
-        gpus().check_arguments(kernel.key, [(each.label, each.type, ctypes.addressof(value)) for each, value in given
-                                            if isinstance(value, ctypes.Structure)], None)
-        return invoke(kernel, hooks, params, adjoint)
-
-    warp_context.Runtime.load_dll = load
-    warp_context.invoke = invoked
-    warp_context.Module._get_compile_output_name = named
-    warp_context.ModuleExec.get_kernel_hooks = described
+    warp_private.replace(library_of, name_of, loaded, lambda kernel, given: gpus().check_arguments(kernel, given, None))
 
 
 def gpus() -> Gpus:
     """Those of this process, after wp.init()."""
-    return warp_context.runtime.core.gpus  # type: ignore[no-any-return]
+    return warp_private.library().gpus  # type: ignore[no-any-return]

@@ -4,7 +4,7 @@ import argparse
 import faulthandler
 import sys
 
-from tests.virtual_gpu import gpus, install
+from tests.virtual_gpu import gpus, install, warp_private
 
 
 def main() -> None:
@@ -16,15 +16,13 @@ def main() -> None:
     given = parser.parse_args()
     faulthandler.enable()  # tells who touched the device's memory
     install(given.devices, given.arch, given.seed)
-    from warp._src import context
-
     from wrt.cli import main as wrt
 
     sys.argv[1:] = given.arguments
     try:
         wrt.main()
     finally:
-        if context.runtime is not None:
+        if warp_private.has_started():
             print(f"virtual GPU: {gpus().counts}", file=sys.stderr)
 
 

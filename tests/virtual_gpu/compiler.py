@@ -6,21 +6,14 @@ CPU's flags); the module's text after them as CUDA code, with `__CUDA_ARCH__` de
 
 from __future__ import annotations
 
-import ctypes
-import os
-import re
 import tempfile
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
-import warp as wp
-from warp._src import build, context
+from tests.virtual_gpu.warp_private import BLOCK_DIM, KERNEL, LAST_HEADER, compile_for_host
 
 DEVICE_H = Path(__file__).with_name("device.h").read_text()
-LAST_HEADER = '#include "deterministic.h"\n'
-BLOCK_DIM = re.compile(r"^#define WP_TILE_BLOCK_DIM (\d+)$", re.MULTILINE)
-KERNEL = re.compile(r"\b__global__ void (?:\w+\(\d+\) )?(\w+)\(")
 LEVEL = 2  # of optimisation, as for the CPU
 SUFFIX = f".virtual{sha256(DEVICE_H.encode()).hexdigest()[:8]}.cubin"
 
@@ -51,10 +44,5 @@ def precompiled_headers() -> tempfile.TemporaryDirectory[str]:
 
 def compile_module(source: str, arch: int, path: str, *, fuse_fp: bool) -> int:
     """Write the object file. Zero, or an error, which Clang has told on stderr."""
-    runtime = context.runtime
-    flags = context._resolve_cpu_compiler_flags(None, wp.config.cpu_compiler_flags).split()
-    return int(runtime.llvm.wp_compile_cpp(
-        for_host(source, arch).encode(), os.fsencode(Path(path).with_suffix(".cpp").name),
-        os.fsencode(os.path.join(build.warp_home, "native")), os.fsencode(path), False, False, fuse_fp, True,
-        (ctypes.c_char_p * (len(flags) + 1))(*map(str.encode, flags), None), LEVEL, False,
-        True, os.fsencode(precompiled_headers().name), 1))
+    return compile_for_host(for_host(source, arch), Path(path).with_suffix(".cpp").name, path, precompiled_headers().name,
+                            fuse_fp=fuse_fp, level=LEVEL)

@@ -13,14 +13,12 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-import warp as wp
-from warp._src import context as warp_context
-from warp._src.codegen import Struct
-from warp._src.types import array_t, matches_array_class, type_size_in_bytes
 
+from tests.virtual_gpu import warp_private
 from tests.virtual_gpu.compiler import SUFFIX, compile_module, entry
 from tests.virtual_gpu.graphs import Counts, Graph, Graphs, VirtualGpuError, address, copied
 from tests.virtual_gpu.memory import Memory
+from tests.virtual_gpu.warp_private import array_t, element_size, fields_of, is_array
 
 CONTEXT = 1 << 8  # the handle of cuda:0's; cuda:1's is the next
 NAME = "virtual GPU"
@@ -69,20 +67,19 @@ def arrays_of(name: str, kind: Any, at: int) -> Iterator[tuple[str, array_t, int
     """The arrays of a kernel's argument, and those of their records that hold arrays: name, record and bytes of an element.
 
     An array is given before what is in it, so that who asks can look first whether it may be read."""
-    if matches_array_class(kind, wp.array):
+    if is_array(kind):
         array = array_t.from_address(at)
-        yield name, array, type_size_in_bytes(kind.dtype)
-        if isinstance(kind.dtype, Struct) and has_arrays(kind.dtype):
+        yield name, array, element_size(kind)
+        if has_arrays(kind.dtype):
             for i in range(array.shape[0]):
                 yield from arrays_of(f"{name}[{i}]", kind.dtype, array.data + i * array.strides[0])
-    elif isinstance(kind, Struct):
-        for label, variable in kind.vars.items():
-            yield from arrays_of(f"{name}.{label}", variable.type, at + getattr(kind.ctype, label).offset)
+    for label, each, offset in fields_of(kind):
+        yield from arrays_of(f"{name}.{label}", each, at + offset)
 
 
-def has_arrays(struct: Struct) -> bool:
-    return any(matches_array_class(each.type, wp.array) or (isinstance(each.type, Struct) and has_arrays(each.type))
-               for each in struct.vars.values())
+def has_arrays(kind: Any) -> bool:
+    """Whether it is a struct with arrays."""
+    return any(is_array(each) or has_arrays(each) for _, each, _ in fields_of(kind))
 
 
 class Gpus(Graphs):
@@ -261,30 +258,30 @@ class Gpus(Graphs):
         """For the host where it is for a virtual GPU; all else is NVIDIA's, which needs no GPU."""
         arch, fuse_fp, path = args[1], args[11], os.fsdecode(args[15])
         if not path.endswith(SUFFIX):
-            nvidias, declared = self.real.wp_cuda_compile_program, warp_context.runtime.core.wp_cuda_compile_program
+            nvidias, declared = self.real.wp_cuda_compile_program, warp_private.library().wp_cuda_compile_program
             nvidias.argtypes, nvidias.restype = declared.argtypes, declared.restype
             return int(nvidias(source, *args))
         return compile_module(source.decode(), arch, path, fuse_fp=fuse_fp)
 
     def cuda_load_module(self, context: int, path: bytes) -> int:
         handle = next(self.handles)
-        if warp_context.runtime.llvm.wp_load_obj(path, self.module(handle), False):
+        if warp_private.compiler().wp_load_obj(path, self.module(handle), False):
             raise VirtualGpuError(f"{os.fsdecode(path)} cannot be loaded")
         return handle
 
     def cuda_unload_module(self, context: int, handle: int) -> None:
-        warp_context.runtime.llvm.wp_unload_obj(self.module(handle))
+        warp_private.compiler().wp_unload_obj(self.module(handle))
 
     @staticmethod
     def module(handle: int) -> bytes:
         return f"virtual_gpu_{handle}".encode()
 
     def cuda_get_kernel(self, context: int, handle: int, name: bytes) -> int | None:
-        at = warp_context.runtime.llvm.wp_lookup(self.module(handle), entry(name.decode()).encode())
+        at = warp_private.compiler().wp_lookup(self.module(handle), entry(name.decode()).encode())
         if not at:
             return None
         function = next(self.handles)
-        self.objects[function] = Function(name.decode().removesuffix("_cuda_kernel_forward"), RUN(at))
+        self.objects[function] = Function(name.decode().removesuffix(warp_private.FORWARD), RUN(at))
         return function
 
     def cuda_configure_kernel_shared_memory(self, function: int, size: int) -> bool:

@@ -8,11 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-import warp as wp
-from warp._src.codegen import Struct
-from warp._src.types import array_t, launch_bounds_t, matches_array_class, type_size_in_bytes
-
 from tests.virtual_gpu.memory import Memory
+from tests.virtual_gpu.warp_private import argument_size, bounds_size
 
 Call = Callable[[], Any]
 
@@ -123,15 +120,6 @@ class Graphs:
 def copied(values: Any, dimensions: int, kinds: Iterable[Any]) -> tuple[Any, list[Any]]:
     """The arguments of a launch as they are now: CUDA copies them when it captures. The first is the launch's bounds, of so many
     dimensions; kinds: the types of the others. Also what holds the copies."""
-    sizes = [ctypes.sizeof(launch_bounds_t((1,) * dimensions)), *map(size_of, kinds)]
+    sizes = [bounds_size(dimensions), *map(argument_size, kinds)]
     held = [ctypes.create_string_buffer(ctypes.string_at(values[i], size), size) for i, size in enumerate(sizes)]
     return (ctypes.c_void_p * len(held))(*map(ctypes.addressof, held)), held
-
-
-def size_of(kind: Any) -> int:
-    """Bytes of an argument of a kernel."""
-    if matches_array_class(kind, wp.array):
-        return ctypes.sizeof(array_t)
-    if isinstance(kind, Struct):
-        return ctypes.sizeof(kind.ctype)
-    return int(type_size_in_bytes(kind))

@@ -1,0 +1,101 @@
+"""What is no part of Warp's documents is named in few places, so that the next version of Warp is a known amount of work: one file
+of the host, one of device code, one of the virtual GPU, and a few words of native code. docs/warp.md lists them."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.data import ROOT
+
+SOURCES = sorted(path for folder in ("wrt", "kernels") for path in (ROOT / folder).rglob("*.py")
+                 if not path.is_relative_to(ROOT / "wrt" / "kernels"))
+FOR_INSIDES = {"wrt/core/warp_private.py", "kernels/warp_private.py"}
+VIRTUAL_GPU = sorted((ROOT / "tests" / "virtual_gpu").rglob("*.py"))
+# Attributes of Warp's objects that look public, and are not documented.
+UNDOCUMENTED = {"adj", "codegen", "ctype", "execs", "get_kernel_hooks", "get_module_hash", "get_module_identifier", "hash_module",
+                "hashers", "hooks", "launch_bounds_t", "native_func", "params", "params_addr", "runtime", "array_t", "vars"}
+# Names that begin with an underscore and that no file of the project makes, but another library or Python, by what they are of.
+OF_OTHERS = {"_replace": "NamedTuple", "_asdict": "NamedTuple", "_fields": "NamedTuple", "_exit": "os", "_getframe": "sys",
+             "_run_exitfuncs": "atexit", "_gui_input_handle_from_uuid": "viser", "_connected": "viser", "_obj": "ctypes.byref"}
+CLICK = {"wrt/cli/common.py", "wrt/cli/reporting.py", "wrt/cli/measure.py"}  # its commands have `params`, too
+TEXTS = re.compile(r"\b_?wp_|WP_[A-Z]|Warp CUDA|NVIDIA CUDA")
+# Words of Warp's C++ that native code of kernels may use.
+NATIVE = {"wp::vec_t", "wp::float32", "wp::float64", "wp::uint64", "wp::launch_bounds_t", "WP_TILE_BLOCK_DIM"}
+
+
+def made_here() -> frozenset[str]:
+    """Every name that a file of the project defines or sets."""
+    names = set()
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                names.add(node.name)
+            elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
+                names.add(node.id if isinstance(node, ast.Name) else node.attr)
+    return frozenset(names)
+
+
+OURS = made_here()
+
+
+def insides(source: str, file: str = "") -> Iterator[str]:
+    """The names and texts of Warp's insides in a source of Python."""
+    tree = ast.parse(source)
+    prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom | ast.Import):
+            modules = [node.module or ""] if isinstance(node, ast.ImportFrom) else [each.name for each in node.names]
+            names = [each.name for each in node.names]
+            yield from (name for name in (*modules, *names) if name.startswith("warp._") or name in UNDOCUMENTED)
+        elif isinstance(node, ast.Attribute):
+            private = (re.match("_[^_]|__ctype__", node.attr) and node.attr not in OURS | OF_OTHERS.keys()
+                       and ast.unparse(node.value) not in ("self", "cls", "super()"))
+            if private or (node.attr in UNDOCUMENTED and not (node.attr == "params" and file in CLICK)):
+                yield ast.unparse(node)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str | bytes) and id(node) not in prose:
+            text = node.value if isinstance(node.value, str) else node.value.decode(errors="replace")
+            if "\n" not in text and not file.startswith("kernels/"):  # native code is looked at below
+                yield from TEXTS.findall(text)
+
+
+@pytest.mark.parametrize("source", [
+    "from warp._src import context", "import warp._src.types", "from warp.types import array_t", "x = wp._src",
+    "command.hooks.forward", "size, *rest = command.params", "struct._cls", "f(data).vars.items()", "record.__ctype__()",
+    "kernel.module.get_module_hash(1)", "kernel.adj", "getattr(kind, '_wp_scalar_type_', kind)", "folder.glob('wp_*')",
+    "text in b'Warp CUDA error'",
+    "module._get_meta_name()", "struct.ctype", "wp.context.runtime.tape"])
+def test_the_search_finds(source: str) -> None:
+    assert list(insides(source))
+
+
+@pytest.mark.parametrize("path", [path for path in SOURCES if path.relative_to(ROOT).as_posix() not in FOR_INSIDES],
+                         ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_insides_of_warp_are_named_in_their_files_only(path: Path) -> None:
+    assert list(insides(path.read_text(), path.relative_to(ROOT).as_posix())) == []
+
+
+@pytest.mark.parametrize("path", [path for path in VIRTUAL_GPU if path.name != "warp_private.py" and "test_" not in path.name],
+                         ids=lambda path: path.name)
+def test_the_virtual_gpu_imports_no_private_module_elsewhere(path: Path) -> None:
+    """(Warp's C functions, which it replaces, are its driver's methods.)"""
+    assert [each for each in insides(path.read_text()) if each.startswith("warp.") or "." in each] == []
+
+
+def native_words() -> set[str]:
+    texts = [path.read_text() for path in (ROOT / "kernels").rglob("*") if path.suffix in (".py", ".h")]
+    return {word for text in texts for word in re.findall(r"\bwp::\w+|\bWP_\w+", text)}
+
+
+def test_native_code_uses_few_words_of_warps() -> None:
+    assert native_words() <= NATIVE
+
+
+def test_the_page_for_the_next_version_lists_every_word_and_file() -> None:
+    page = (ROOT / "docs" / "warp.md").read_text()
+    for each in (*native_words(), *FOR_INSIDES, "tests/virtual_gpu/warp_private.py", "kernels/launches.py"):
+        assert f"`{each}`" in page or f"(../{each})" in page, each
