@@ -38,7 +38,7 @@ ROOMS_OF_ACCEL = (
     {"triangle_data", "geometry", "device_geometry", "instanced_geometry", "world"},  # what is hit
     {"structures", "structure", "built", "snapshot"},  # kinds of structures, and a structure at one time
     {"queries"},
-    {"store", "base", "epo"},
+    {"store", "base", "epo", "tensors"},
     {"bvh", "cells", "brute_force"},
     {"top_level", "instances"},
     {"scenes"},
@@ -93,7 +93,7 @@ LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "col
 # Ceilings, to be lowered where less is reached, and never raised: the aim is 100, 10 and 5.
 LONGEST_FUNCTION = 127  # lines
 LONG_FUNCTIONS = 10  # that have more than 60 lines
-LONG_SIGNATURES = 5  # with more than 7 parameters
+LONG_SIGNATURES = 3  # with more than 7 parameters
 
 
 def module(path: Path) -> str:

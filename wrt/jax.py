@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from wrt.accel.base import OneMesh
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.gradients import Cotangents, adjoint
-from wrt.accel.queries.tensors import HitTensors, hits_of, library
+from wrt.accel.tensors import HitTensors, hits_of, library
 from wrt.core.errors import InputError
 
 
-def closest_hit(accel: Any, vertices: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf, *,
+def closest_hit(accel: OneMesh, vertices: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf, *,
                 rebuild_at: float = 2.0) -> HitTensors:
     """As wrt.torch.closest_hit, for arrays of JAX, also in jax.jit, jax.grad and jax.vmap: a callback on the host asks the
     structure, which is a constant there. (JAX wraps an error that the callback raises.)"""
@@ -34,7 +35,7 @@ def _function() -> Any:
     def on_host(function: Any, shapes: Any, *arrays: Any) -> Any:
         return jax.pure_callback(lambda *each: function(*jax.tree.map(np.asarray, each)), shapes, *arrays, vmap_method="sequential")
 
-    def closest_hit(accel: Any, rebuild_at: float, vertices: Any, *rays: Any) -> HitTensors:
+    def closest_hit(accel: OneMesh, rebuild_at: float, vertices: Any, *rays: Any) -> HitTensors:
         def ask(vertices: Any, *rays: Any) -> HitTensors:
             hits = hits_of(accel, vertices, rays, rebuild_at)
             return HitTensors(hits.t, hits.u, hits.v, hits.point, hits.prim_id)
@@ -43,11 +44,11 @@ def _function() -> Any:
         one, three, index = (jax.ShapeDtypeStruct(*each) for each in (((n,), np.float32), ((n, 3), np.float32), ((n,), np.int32)))
         return on_host(ask, HitTensors(one, one, one, three, index), vertices, *rays)
 
-    def forward(accel: Any, rebuild_at: float, *given: Any) -> tuple[HitTensors, Any]:
+    def forward(accel: OneMesh, rebuild_at: float, *given: Any) -> tuple[HitTensors, Any]:
         hits = closest_hit(accel, rebuild_at, *given)
         return hits, (*given, hits.prim_id)
 
-    def backward(accel: Any, rebuild_at: float, kept: Any, cotangents: HitTensors) -> Any:
+    def backward(accel: OneMesh, rebuild_at: float, kept: Any, cotangents: HitTensors) -> Any:
         vertices, origins, directions, *ends, prim_id = kept
         leaves = vertices, origins, directions
 

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from wrt.accel.base import OneMesh
 from wrt.accel.queries.gradients import Cotangents, adjoint
-from wrt.accel.queries.tensors import HitTensors, hits_of, library
+from wrt.accel.tensors import HitTensors, hits_of, library
 
 
-def closest_hit(accel: Any, vertices: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf, *,
+def closest_hit(accel: OneMesh, vertices: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf, *,
                 rebuild_at: float = 2.0) -> HitTensors:
     """The closest hit of each ray, with gradients of t, u, v and point at fixed prim_id in vertices, origins and directions.
 
@@ -29,7 +30,7 @@ def closest_hit(accel: Any, vertices: Any, origins: Any, directions: Any, t_min:
 def _function() -> Any:
     torch = library("torch")
 
-    def forward(ctx: Any, accel: Any, rebuild_at: float, t_min: Any, t_max: Any, *given: Any) -> tuple[Any, ...]:
+    def forward(ctx: Any, accel: OneMesh, rebuild_at: float, t_min: Any, t_max: Any, *given: Any) -> tuple[Any, ...]:
         vertices, *rays = (each if each is None else each.detach().float().contiguous() for each in given)
         hits = hits_of(accel, vertices, (*rays, t_min, t_max), rebuild_at)
         ctx.geometry = hits.source[1].geometry

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from wrt.accel.base import OneMesh
 from wrt.accel.queries.accelerator import snapshot_of
 from wrt.core.arrays import float32, to_numpy
 from wrt.core.errors import InputError
@@ -23,7 +24,7 @@ class HitTensors(NamedTuple):
     prim_id: Any
 
 
-def hits_of(accel: Any, vertices: Any, rays: tuple[Any, ...], rebuild_at: float) -> Any:
+def hits_of(accel: OneMesh, vertices: Any, rays: tuple[Any, ...], rebuild_at: float) -> Any:
     """Hits of closest_hit, once the structure has followed the vertices (None, or as they are: it stays). rays: its arguments.
 
     Raises InputError that names the argument.
