@@ -69,8 +69,7 @@ class OneMesh(Accelerator, ABC):
     def __reduce__(self) -> Any:
         """For pickle: what `save` writes, and what the structure is over. A refit there measures growth from the shape of now."""
         units, snapshot = self.structure.units, self._snapshot
-        options = replace(self.built_with, progress=None) if hasattr(self.built_with, "progress") else self.built_with
-        make = partial(type(self).restore, device=str(self.device), threads=self.threads, units=units, built_with=options)
+        make = partial(type(self).restore, device=str(self.device), threads=self.threads, units=units, built_with=self.built_with)
         return make, (snapshot.built.on_host(), snapshot.geometry, snapshot.attributes)
 
     @property

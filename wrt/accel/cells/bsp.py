@@ -61,6 +61,10 @@ class BspOptions:
         if self.progress is not None and not callable(self.progress):
             raise InputError(f"progress must be a function of one number, got {self.progress!r}")
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickle: `progress` stays in this process."""
+        return {**self.__dict__, "progress": None}
+
     def on_device(self, lo: np.ndarray, hi: np.ndarray, n: int) -> Any:
         """As the kernels take them, for n primitives with these boxes."""
         out = bsp_split.BspOptions()

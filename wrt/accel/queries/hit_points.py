@@ -147,7 +147,7 @@ def _require(world: World, name: str) -> None:
     if name == "instance" and not isinstance(world.geometry, InstancedGeometry):
         raise InputError("the structure has no instances")
     if name in ("object", "material") and world.objects is None:
-        if getattr(world.geometry, "worlds", None) is not None:
+        if isinstance(world.geometry, InstancedGeometry) and world.geometry.worlds is not None:
             raise InputError(f"hits over worlds do not know their {name} yet; hits.instance is known")
         raise InputError(f"the structure is not over a scene: there is no {name}")
 

@@ -54,7 +54,7 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
         raise InputError(f"b must have as many rows as a ({n}), got {len(q)}")
     array = room_for(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None, give is not None)[0]
     snapshot, known, surfaces = accel.snapshot, on_a is not None or on_b is not None, Surfaces()
-    if len(getattr(snapshot.geometry, "first_instance", ())) > 2:
+    if isinstance(snapshot.geometry, InstancedGeometry) and len(snapshot.geometry.first_instance) > 2:
         raise InputError("visible does not take a structure over several worlds yet")
     if known:
         if accel.structure.units.instances:
