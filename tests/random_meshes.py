@@ -21,12 +21,12 @@ from tests import random_cases
 from tests.random_rays import RAYS, Rays, at_their_hits, rays_of
 from tests.structures import STRUCTURES
 from wrt.accel.bvh.builders import BVH_BUILDERS
-from wrt.accel.flatten import world_of
 from wrt.accel.geometry import Geometry
-from wrt.accel.instancing import instanced_meshes
+from wrt.accel.scenes.flatten import world_of
+from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.core.errors import InputError
 from wrt.kernels.query import HitArrays, RayArrays, put_hit
-from wrt.kernels.structs import fields_of
+from wrt.kernels.warp_private import fields_of
 from wrt.scene import shapes
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
