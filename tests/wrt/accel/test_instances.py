@@ -17,10 +17,11 @@ from tests.gltf_files import GltfFile
 from tests.kernel_tools import DEVICE
 from tests.placed import place
 from wrt.accel.base import OneMesh
+from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances
 from wrt.accel.scenes.build import build
-from wrt.accel.scenes.flatten import world_mesh
+from wrt.accel.scenes.flatten import world_mesh, world_of
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
@@ -209,6 +210,21 @@ def test_instances_are_no_structure_over_one_mesh(tmp_path, monkeypatch) -> None
     assert told.code == 2 and "x.glb: a scene with instances has no structure in a file" in told.err
     with pytest.raises(InputError, match="no option"):
         build(accel.geometry, "bvh", nonsense=1)
+
+
+@pytest.mark.parametrize("builder", BVH_BUILDERS)
+def test_what_is_joined_keeps_its_numbers(builder: str) -> None:
+    """A floor and a sphere are behind the instances in the order of the scene, and before them in the structure."""
+    ball, grey = icosphere(2), Material()
+    floor = Object(quad((-5.0, -5.0, 0.0), (10.0, 0.0, 0.0), (0.0, 10.0, 0.0)), (grey,))
+    objects = Object(ball, (grey,), turned(1, 1.0, 2.0, 0.0, 2.0)), Object(ball, (grey,), turned(2, 1.0, -2.0, 0.0, 2.0)), floor
+    scene = Scene(objects, (Sphere((0.0, 2.0, 2.0), 1.0, grey),))
+    origins = np.random.default_rng(1).uniform((-4.0, -4.0, 5.0), (4.0, 4.0, 5.0), (500, 3))
+    rays = origins, np.broadcast_to([0.1, 0.2, -1.0], origins.shape)
+    expected = build(world_of(scene, frozenset()).geometry, "brute_force").closest_hit(*rays)
+    assert (expected.prim_id == 642).any() and ((640 <= expected.prim_id) & (expected.prim_id < 642)).any()
+    hits = build(world_of(scene, instanced_meshes(scene, "always")).geometry, "bvh2", builder=builder).closest_hit(*rays)
+    assert np.array_equal(hits.prim_id, expected.prim_id)
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import NumberedGeometry
 from wrt.accel.queries.rays import vectors
 from wrt.accel.store import check_binary, save
 from wrt.core.device import launch_on, upload
@@ -141,8 +142,9 @@ class Bvh2(BinaryBvh):
         return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)
 
     def _primitives(self, built: Built) -> Any:
-        """On the device where the order is there, and the triangle test reads corners."""
-        if not isinstance(built.order, wp.array) or self.structure.units.triangle_test.layout != "corners":
+        """On the device where the order is there, the triangle test reads corners, and primitives have no numbers of their own."""
+        if (not isinstance(built.order, wp.array) or self.structure.units.triangle_test.layout != "corners"
+                or isinstance(self.geometry, NumberedGeometry)):
             return super()._primitives(built.on_host())
         out = wp.empty(len(built.order), dtype=Primitive, device=self.device)
         self._write_corners(self._shape(), built.order, out)
