@@ -111,7 +111,7 @@ def mesh_of(rng: Rng) -> tuple[np.ndarray, np.ndarray]:
     if rng.random() < 0.3:
         corners = corners + rng.normal(size=3) * 10.0 ** rng.uniform(0.0, 4.0)
     if rng.random() < 0.3:
-        corners = corners * 10.0 ** rng.uniform(-12.0, 12.0)
+        corners = corners * 10.0 ** (rng.uniform(-12.0, 12.0) if rng.random() < 0.8 else rng.uniform(-44.0, -36.0))
     if len(corners) and rng.random() < 0.5:
         vertices, faces = np.unique(corners.reshape(-1, 3).astype(np.float32), axis=0, return_inverse=True)
         return vertices, faces.reshape(-1, 3).astype(np.int32)

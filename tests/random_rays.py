@@ -103,6 +103,13 @@ def in_a_plane(rng: Rng, target: Target, n: int) -> Bundle:
     return origins, directions
 
 
+def nearly_along_axes(rng: Rng, target: Target, n: int) -> Bundle:
+    """Through surfaces, with components so small that products of them underflow."""
+    origins, axes = along_axes(rng, target, n)
+    origins = np.where(axes == 0.0, target.on_surface(rng, n), origins)
+    return origins, np.where(axes == 0.0, rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(-46.0, -20.0, (n, 3)), axes)
+
+
 def from_surfaces(rng: Rng, target: Target, n: int) -> Bundle:
     origins = np.where(rng.random((n, 1)) < 0.3, target.corner(rng, n), target.on_surface(rng, n))
     return origins, np.where(rng.random((n, 1)) < 0.5, rng.normal(size=(n, 3)), target.inside(rng, n) - origins)
@@ -129,8 +136,8 @@ def parallel(rng: Rng, target: Target, n: int) -> Bundle:
 
 
 BUNDLES: dict[str, Callable[[Rng, Target, int], Bundle]] = {
-    each.__name__: each for each in (inwards, from_within, at_corners, at_edges, along_axes, in_a_plane, from_surfaces, edge_on,
-                                     camera, parallel)}
+    each.__name__: each for each in (inwards, from_within, at_corners, at_edges, along_axes, nearly_along_axes, in_a_plane,
+                                     from_surfaces, edge_on, camera, parallel)}
 
 
 def rays_of(rng: Rng, corners: np.ndarray) -> Rays:
