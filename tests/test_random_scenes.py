@@ -6,6 +6,7 @@ import pytest
 
 from tests import random_fields
 from tests.random_scenes import Outcome, plan_of_scene, render
+from wrt.renderer.features import switches
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CAMERAS
 from wrt.scene.kinds import FORMS, forms
@@ -22,8 +23,8 @@ def test_every_form_of_a_field_is_drawn() -> None:
 
 def test_the_groups_have_all_that_there_is() -> None:
     plans = [plan_of_scene(group, 0) for group in GROUPS]
-    switches = [plan.features.switches() for plan in plans]
-    assert {name for name in switches[0] if not any(each[name] for each in switches)} == set()
+    on_off = [switches(plan.features) for plan in plans]
+    assert {name for name in on_off[0] if not any(each[name] for each in on_off)} == set()
     assert {plan.camera.kind for plan in plans} == CAMERAS.keys()
     assert {plan.scene.background.kind for plan in plans} == BACKGROUNDS.keys()
     for name, field in forms(Settings).items():

@@ -4,7 +4,7 @@ A wavefront (Laine, Karras and Aila 2013, "Megakernels Considered Harmful"). The
 (state.py); one launch traces all of them, and the next shades all hits. So packets of rays share their way through a structure,
 and what has no branches is computed in lanes. one_ray.py does the same for one sample at a time, for CUDA and where rays are
 counted; it says why there are two. Each sample goes through its own paths in the order of one_ray.py and adds up its light in that
-order. So pictures have the same bits: tests/wrt/renderer/test_waves.py, and of random scenes tests/both_loops.py.
+order. So pictures have the same bits: tests/wrt/renderer/test_waves.py, and of random scenes tests/test_random_scenes.py.
 
 trace_wave is a single launch to Python. In a wave it launches, in this order:
 1. for FRESH camera rays at a time, while they are in the cache: begin_wave (wave_begin.py), closest_hit (wrt.kernels.wide), and

@@ -11,8 +11,10 @@ from wrt.kernels.rows import Rows
 from wrt.kernels.shade import lights as kinds
 from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point, make_sky_sample
 from wrt.kernels.shade.direct import make_light_points
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample, choose_emitter, emitter_corners, from_emitter
 from wrt.kernels.shade.sampling import triangle_numbers
+from wrt.kernels.shade.shading import Shading
 from wrt.kernels.shade.surface import Surface, triangle_point, triangle_point_error
 from wrt.kernels.structs import Lighting, Surfaces
 
@@ -31,7 +33,7 @@ class Sampled:
     sampled by the cosine; points: of that, where normals are computed one by one (wave_normals.py), only what places them. normals:
     the rows of those that are not."""
 
-    def __init__(self, features: Any) -> None:
+    def __init__(self, features: Features) -> None:
         kind = BACKGROUNDS[features.background]
         by_cosine = features.sky_light and kind.sample is None and kind.make_seen is None
         self.normals: Rows | None = rows_of_normals(features)
@@ -40,7 +42,7 @@ class Sampled:
         self.points = by_cosine and self.normals is None
 
 
-def make_put_spheres(features: Any, sampled: Sampled, shading: Any, found: Any) -> Any:
+def make_put_spheres(features: Features, sampled: Sampled, shading: Shading, found: Any) -> Any:
     """put_spheres(wave, surfaces, first, end): what of the rows is needed here, for hits on spheres."""
     store_point, store_normal = SURFACES.field("point").store(), (sampled.normals or SURFACES.field("shading")).store()
     look_up, shading_normal = shading.look_up, shading.shading_normal
@@ -59,7 +61,7 @@ def make_put_spheres(features: Any, sampled: Sampled, shading: Any, found: Any) 
     return put_spheres
 
 
-def make_sample_sky(features: Any, sampled: Sampled) -> Any:
+def make_sample_sky(features: Features, sampled: Sampled) -> Any:
     """sample_sky(wave, lighting, count): put samples of the sky to the rows SKY, or what places them to SKY_POINTS."""
     sky_point, sky_sample, light_numbers = make_sky_point(features), make_sky_sample(features), make_light_points(features).numbers
     load_key, load_normal = KEYS.load(), (sampled.normals or SURFACES.field("shading")).load()
@@ -83,7 +85,7 @@ def make_sample_sky(features: Any, sampled: Sampled) -> Any:
     return sample_sky
 
 
-def make_sample_mesh(features: Any) -> Any:
+def make_sample_mesh(features: Features) -> Any:
     """sample_mesh(wave, surfaces, lighting, count): put mesh_light with the first light to the rows LIGHTS. Emitters are chosen and
     gathered in between, one by one."""
     light_numbers = make_light_points(features).numbers
@@ -143,7 +145,7 @@ class Vertex:
     i: int
 
 
-def make_light_at(features: Any, sampled: Sampled, choose_light: Any) -> Any:
+def make_light_at(features: Features, sampled: Sampled, choose_light: Any) -> Any:
     """light_at(wave, surfaces, lighting, vertex, light) -> LightSample: what was computed before, or by choose_light (of
     make_step)."""
     light_point = make_light_points(features).point
@@ -180,7 +182,7 @@ class WaveLights(NamedTuple):
     keyed: bool
 
 
-def make_wave_lights(features: Any, shading: Any, found: Any, choose_light: Any) -> WaveLights:
+def make_wave_lights(features: Features, shading: Shading, found: Any, choose_light: Any) -> WaveLights:
     """found: of make_wave_surfaces; choose_light: `choose` of make_step."""
     sampled = Sampled(features)
     put_spheres = make_put_spheres(features, sampled, shading, found)

@@ -8,13 +8,14 @@ from wrt.kernels.loops.state import Wave
 from wrt.kernels.loops.wave_rows import BENT, HITS, NORMAL_MAPS, SURFACES, TEXELS, NormalMap
 from wrt.kernels.loops.wave_textures import in_lanes
 from wrt.kernels.rows import Rows
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.shading import Texels, bump
 from wrt.kernels.shade.surface import Surface, bent
 from wrt.kernels.structs import Surfaces
 
 
-def rows_of_normals(features: Any) -> Rows | None:
+def rows_of_normals(features: Features) -> Rows | None:
     """Return the rows where they are; None: they are computed one by one."""
     if features.instances or (features.normal_maps and not in_lanes(features)):
         return None
@@ -39,7 +40,7 @@ def make_gather_maps() -> Any:
     return gather_maps
 
 
-def make_bend(features: Any) -> Any:
+def make_bend(features: Features) -> Any:
     """bend(wave, surfaces, first, end): put the normals of the hits first .. end - 1, whose surfaces and textures are found, to the
     rows BENT."""
     gather_maps = make_gather_maps()
@@ -64,7 +65,7 @@ def make_bend(features: Any) -> Any:
     return bend
 
 
-def make_wave_normals(features: Any, shading_normal: Any) -> tuple[Any, Any]:
+def make_wave_normals(features: Features, shading_normal: Any) -> tuple[Any, Any]:
     """Return bend (of make_bend), and normal_at(wave, surfaces, surface, texels, wo, i): for the i-th hit of a block, what was
     computed before, or by `shading_normal` (of make_shading)."""
     bends = rows_of_normals(features) == BENT

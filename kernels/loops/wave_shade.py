@@ -15,9 +15,9 @@ from wrt.kernels.loops.wave_textures import in_lanes, make_wave_textures
 from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.follow_up import FOLLOWED, make_follow_up, with_cuts
+from wrt.kernels.shade.follow_up import FOLLOWED, FollowUp, make_follow_up, with_cuts
 from wrt.kernels.shade.paths import make_paths
-from wrt.kernels.shade.shading import make_shading
+from wrt.kernels.shade.shading import Shading, make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
 from wrt.kernels.shade.step import Sample, ShadowRequest, Step, add_up, is_lit, make_shaded, make_step
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
@@ -132,7 +132,7 @@ class Lanes(NamedTuple):
     light_at: Any
 
 
-def make_lanes(features: Features, shading: Any, step: Step) -> Lanes:
+def make_lanes(features: Features, shading: Shading, step: Step) -> Lanes:
     """Where textures, or numbers that choose a facet or a place in the sky, are computed in lanes, two cores compile two kernels in
     0.6 of the time; without, both together would take longer than one."""
     find, found = make_wave_surfaces(features, shading.surface_at)
@@ -206,12 +206,36 @@ def make_ask_lights(features: Features, step: Step, light_at: Any) -> Any:
     return ask_lights
 
 
+def make_push_paths(features: Features) -> Any:
+    """Return push_paths(wave, at, shaded, next) -> int: let the new paths that are followed wait; return how many of the sample's
+    paths wait then."""
+
+    @wp.func
+    def push_paths(wave: Wave, at: Arrival, shaded: Shaded, next: FollowUp) -> int:
+        pending = int(at.pending)
+        if wp.static(features.blend):
+            if next.onward == FOLLOWED:
+                push_path(wave.samples, wave.capacity, at.sample, pending, shaded.onward)
+                pending += 1
+        if wp.static(features.reflection):
+            if next.reflected == FOLLOWED:
+                push_path(wave.samples, wave.capacity, at.sample, pending, shaded.reflected)
+                pending += 1
+        if wp.static(features.refraction):
+            if next.refracted == FOLLOWED:
+                push_path(wave.samples, wave.capacity, at.sample, pending, shaded.refracted)
+                pending += 1
+        return pending
+
+    return push_paths
+
+
 def make_shade_kernels(features: Features) -> tuple[Any, Any]:
     """Return the kernel for the step at every hit of the queue, and the kernel for a block of hits that it launches, or None."""
     shading = make_shading(features)
     step, follow_up, add_background = make_step(features, shading), make_follow_up(features), make_add_background(features)
     lanes = make_lanes(features, shading, step)
-    ask_lights = make_ask_lights(features, step, lanes.light_at)
+    ask_lights, push_paths = make_ask_lights(features, step, lanes.light_at), make_push_paths(features)
 
     @kernel
     def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits, block: Launch, first: int, end: int):
@@ -231,19 +255,7 @@ def make_shade_kernels(features: Features) -> tuple[Any, Any]:
             at = arrive(wave, j)
             shaded = lanes.shade(wave, surfaces, lighting, at)
             next = follow_up(surfaces, shaded, limits, at.traced)
-            pending = int(at.pending)
-            if wp.static(features.blend):
-                if next.onward == FOLLOWED:
-                    push_path(wave.samples, wave.capacity, at.sample, pending, shaded.onward)
-                    pending += 1
-            if wp.static(features.reflection):
-                if next.reflected == FOLLOWED:
-                    push_path(wave.samples, wave.capacity, at.sample, pending, shaded.reflected)
-                    pending += 1
-            if wp.static(features.refraction):
-                if next.refracted == FOLLOWED:
-                    push_path(wave.samples, wave.capacity, at.sample, pending, shaded.refracted)
-                    pending += 1
+            pending = push_paths(wave, at, shaded, next)
             sum = with_cuts(at.sum, next)
             asks = bool(False)
             if wp.static(features.lit):

@@ -8,6 +8,7 @@ from wrt.kernels.loops.state import Wave
 from wrt.kernels.loops.wave_rows import HITS, SURFACES, Met
 from wrt.kernels.memory import prefetch
 from wrt.kernels.query import hit_at, queued_ray
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.surface import Surface, facing, make_on_sphere, make_on_triangle, make_place_of, make_triangle_at
 from wrt.kernels.structs import Surfaces
 
@@ -23,7 +24,7 @@ def hit_triangle(wave: Wave, surfaces: Surfaces, j: int) -> int:
 class Attributes:
     """Which attributes of surfaces a scene has, and which fields of the rows it leaves alone."""
 
-    def __init__(self, features: Any) -> None:
+    def __init__(self, features: Features) -> None:
         self.smooth, self.tangents = features.smooth, features.normal_maps
         self.uvs = features.textures or features.checkerboards
         normals, uvs = () if self.smooth else ("n0", "n1", "n2"), () if self.uvs else ("u", "v")
@@ -109,7 +110,7 @@ def make_found(has: Attributes, spheres: bool) -> Any:
     return found
 
 
-def make_wave_surfaces(features: Any, surface_at: Any) -> tuple[Any, Any]:
+def make_wave_surfaces(features: Features, surface_at: Any) -> tuple[Any, Any]:
     """Return find (of make_find) and found (of make_found). With instances, surfaces are computed one by one, when they are asked
     for; surface_at: of make_shading."""
 

@@ -8,6 +8,7 @@ from wrt.kernels.loops.state import BLOCK, Wave
 from wrt.kernels.loops.wave_rows import SURFACES, TEXELS
 from wrt.kernels.memory import put
 from wrt.kernels.native import source
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import TEXTURES, MaterialTexture, Texels, make_texture_index, textures_of
 from wrt.kernels.shade.surface import Surface
@@ -30,7 +31,7 @@ def sample_slot(wave: Wave, surfaces: Surfaces, slot: int, count: int, channels:
     sample_lanes(surfaces, wave.block.wanted, slot * BLOCK, count, channels, wave.block.rows, to)
 
 
-def in_lanes(features: Any) -> bool:
+def in_lanes(features: Features) -> bool:
     """Whether a wave's textures are sampled many at a time."""
     return features.textures and not features.checkerboards and not features.instances
 
@@ -68,7 +69,7 @@ def make_texture_link(slot: int, name: str, texture: MaterialTexture, want_other
     return want, sample
 
 
-def make_wave_textures(features: Any, look_up: Any) -> tuple[Any, Any]:
+def make_wave_textures(features: Features, look_up: Any) -> tuple[Any, Any]:
     """sample_textures(wave, surfaces, first, end): for the hits first .. end - 1, at most BLOCK, whose surfaces are found;
     texels_at(wave, surfaces, surface, i) -> Texels for the i-th of them: what was computed before, or by `look_up` (of
     make_shading)."""

@@ -7,6 +7,7 @@ import warp as wp
 from wrt.kernels.native import source
 from wrt.kernels.rows import Rows
 from wrt.kernels.shade.elementary import acos, atan2, sin_cos
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.sampling import LANES, PI, TWO_PI, cosine_point, search_cdf, share_of_row, turned_to
 from wrt.kernels.structs import Background
@@ -152,12 +153,12 @@ BACKGROUNDS = {
 # --- the scene's ------------------------------------------------------------------------------------------------------
 
 
-def make_background(features: Any) -> Any:
+def make_background(features: Features) -> Any:
     """Radiance from beyond all surfaces: (background, unit direction) -> radiance."""
     return BACKGROUNDS[features.background].radiance
 
 
-def make_sky_point(features: Any) -> Any:
+def make_sky_point(features: Features) -> Any:
     """sky_point(xi): the point that sky_sample takes. It has no branches, so that loops can run in lanes."""
     of_cosine = BACKGROUNDS[features.background].sample is None
 
@@ -170,7 +171,7 @@ def make_sky_point(features: Any) -> Any:
     return sky_point
 
 
-def make_sky_sample(features: Any) -> Any:
+def make_sky_sample(features: Features) -> Any:
     """One direction to the background. point: of sky_point."""
     kind = BACKGROUNDS[features.background]
     radiance, by_kind = kind.radiance, kind.sample

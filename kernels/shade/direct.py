@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.shade.backgrounds import make_sky_point, make_sky_sample
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LIGHTS, WITHOUT_AREA, LightSample, make_light_sample
 from wrt.kernels.shade.materials import Scatter, blinn_phong
 from wrt.kernels.shade.sampling import PI, hash_pair, make_sample_2d
@@ -27,7 +28,7 @@ def shadow_ray(s: Surface, sample: LightSample) -> Ray:
     return ray
 
 
-def make_reflected_light(features: Any) -> Any:
+def make_reflected_light(features: Features) -> Any:
     """The light that one sample sends to the eye, before shadows, and which sample that is."""
     light_sample = make_light_sample(features)
     sky_sample = make_sky_sample(features)
@@ -69,7 +70,7 @@ class LightPoints(NamedTuple):
     point: Any
 
 
-def make_light_points(features: Any) -> LightPoints:
+def make_light_points(features: Features) -> LightPoints:
     """What places a sample on a light."""
     sample_2d = make_sample_2d(features)
     sky_point = make_sky_point(features)

@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.step import Sample
 from wrt.kernels.structs import AovFilm, Film, Hit, Ray, Surfaces
@@ -73,7 +74,7 @@ def center_of(x: int, y: int, width: int, height: int) -> wp.vec2:
     return wp.vec2((float(x) + 0.5) / float(width), (float(y) + 0.5) / float(height))
 
 
-def make_see(features: Any) -> Any:
+def make_see(features: Features) -> Any:
     """What a pixel's center shows."""
     surface_at, look_up, resolve, shading_normal, _, _ = make_shading(features)
 

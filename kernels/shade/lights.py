@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_hemisphere, frame_x, point_at, search_cdf, share_of_row, triangle
 from wrt.kernels.shade.surface import (
     Surface,
@@ -117,7 +118,7 @@ def from_emitter(point: wp.vec3, error: wp.vec3, n: wp.vec3, emission: wp.vec3, 
     return sample
 
 
-def make_mesh_light(features: Any) -> Any:
+def make_mesh_light(features: Features) -> Any:
     """A point on the emitters of one light, by power and then uniformly by area."""
 
     @wp.func
@@ -218,7 +219,7 @@ WITHOUT_AREA = ("point", "directional", "spot")
 # --- any of them ------------------------------------------------------------------------------------------------------
 
 
-def make_light_sample(features: Any) -> Any:
+def make_light_sample(features: Features) -> Any:
     """The scene's kinds, one `if` after another, as in materials.py."""
     light_sample = no_light
     for number, name in reversed(list(enumerate(LIGHTS))):

@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.elementary import LOG_2, exp, power
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.fresnel import fresnel_conductor, fresnel_dielectric, fresnel_schlick, fresnel_tint
 from wrt.kernels.shade.sampling import PI, ggx_normal, ggx_visible_share
 from wrt.kernels.shade.surface import Surface
@@ -94,7 +95,7 @@ def conductor(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) ->
     return with_highlight(m, result)
 
 
-def make_glass(features: Any) -> Any:
+def make_glass(features: Features) -> Any:
     """Reflection and refraction at a boundary to index m.ior, or at a thin pane of it."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
 
@@ -125,7 +126,7 @@ def make_glass(features: Any) -> Any:
     return glass
 
 
-def make_metallic_roughness(features: Any) -> Any:
+def make_metallic_roughness(features: Features) -> Any:
     """glTF 2.0, appendix B: a metal and a coated diffuse (or clear) body, mixed by `metallic`."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
     glass = make_glass(features)
@@ -164,7 +165,7 @@ MATERIALS = {
 # --- any of them ------------------------------------------------------------------------------------------------------
 
 
-def make_of_kind(features: Any) -> Any:
+def make_of_kind(features: Features) -> Any:
     """The scene's kinds, one `if` after another: a table that is looked up in a device function keeps the code of before an
     edit."""
     of_kind = no_kind
@@ -191,7 +192,7 @@ def make_link(number: int, function: Any, others: Any) -> Any:
     return of_kind
 
 
-def make_scatter(features: Any) -> Any:
+def make_scatter(features: Features) -> Any:
     """How a surface splits what arrives."""
     of_kind = make_of_kind(features)
 

@@ -12,6 +12,7 @@ import warp as wp
 
 from wrt.kernels.native import source
 from wrt.kernels.shade.elementary import near_sin_cos, sin_cos
+from wrt.kernels.shade.features import Features
 from wrt.kernels.structs import unit
 
 # The constants of the hash, of the scramble, and what makes the seeds of a point's two numbers differ.
@@ -121,7 +122,7 @@ def quantile(icdf: wp.array(dtype=wp.float32), x: float) -> float:
     return wp.lerp(icdf[i], icdf[i + 1], position - float(i))
 
 
-def make_draw(features: Any) -> Any:
+def make_draw(features: Features) -> Any:
     """Many numbers of a pixel at a time, for the CPU."""
     sample = make_sample_2d(features)
 
@@ -137,7 +138,7 @@ def make_draw(features: Any) -> Any:
     return draw
 
 
-def make_sample_2d(features: Any) -> Any:
+def make_sample_2d(features: Features) -> Any:
     """The sampler that the scene's settings ask for."""
     return independent_2d if features.independent else sample_2d
 

@@ -42,11 +42,20 @@ def is_before(p: wp.vec3, q: wp.vec3) -> bool:
     return p[2] < q[2]
 
 
+@wp.struct
+class Pairs:
+    """Pairs of points a and b, world space; on_a, on_b: the primitives that they are on, -1 for none, or nothing (length 0)."""
+
+    a: wp.array(dtype=wp.vec3)
+    b: wp.array(dtype=wp.vec3)
+    on_a: wp.array(dtype=wp.int32)
+    on_b: wp.array(dtype=wp.int32)
+
+
 @kernel
-def segments(surfaces: Surfaces, a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), on_a: wp.array(dtype=wp.int32),
-             on_b: wp.array(dtype=wp.int32), size: float, rays: RayArrays, first: int):
-    """Rays between a and b, without their ends: the same ray whichever of the two is called a. on_a, on_b: as of `lifted`, or
-    nothing (length 0). size: of the largest primitive. A segment that is all ends, or not finite, has a ray that hits nothing.
+def segments(surfaces: Surfaces, pairs: Pairs, size: float, rays: RayArrays, first: int):
+    """Rays between a and b, without their ends: the same ray whichever of the two is called a. size: of the largest primitive. A
+    segment that is all ends, or not finite, has a ray that hits nothing.
 
     What is left out at an end p is what rounding may do to a surface through p. Let u = 2^-24, |p| the largest coordinate of p,
     and S the size of the primitive there. Then p is off the surface by a few u |p|. The ray begins at the end with the smaller
@@ -57,12 +66,12 @@ def segments(surfaces: Surfaces, a: wp.array(dtype=wp.vec3), b: wp.array(dtype=w
     for cosines above 0.15.
     """
     i = first + wp.tid()
-    p = a[i]
-    q = b[i]
-    if on_a.shape[0] > 0:
-        p = lifted(surfaces, on_a[i], a[i], b[i])
-    if on_b.shape[0] > 0:
-        q = lifted(surfaces, on_b[i], b[i], a[i])
+    p = pairs.a[i]
+    q = pairs.b[i]
+    if pairs.on_a.shape[0] > 0:
+        p = lifted(surfaces, pairs.on_a[i], pairs.a[i], pairs.b[i])
+    if pairs.on_b.shape[0] > 0:
+        q = lifted(surfaces, pairs.on_b[i], pairs.b[i], pairs.a[i])
     turned = largest(q) < largest(p) or (largest(q) == largest(p) and is_before(q, p))
     origin = wp.where(turned, q, p)
     target = wp.where(turned, p, q)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.rows import numbers_of
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.materials import make_scatter
 from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.surface import SEEN, Surface, bent, make_place_of, make_surface_at, triangle_uv
@@ -55,7 +56,7 @@ TEXTURES = {
 }
 
 
-def textures_of(features: Any) -> dict[str, MaterialTexture]:
+def textures_of(features: Features) -> dict[str, MaterialTexture]:
     """Return those that a scene has."""
     if not features.textures and not features.checkerboards:
         return {}
@@ -72,7 +73,7 @@ def make_texture_index(name: str) -> Any:
     return index
 
 
-def make_look_up(features: Any) -> Any:
+def make_look_up(features: Features) -> Any:
     """look_up(surfaces, surface) -> Texels: of all textures of a surface's material."""
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
     look_up = no_texels
@@ -102,7 +103,7 @@ def make_texture_link(name: str, texture: MaterialTexture, sample_texture: Any, 
     return look_up
 
 
-def make_resolve(features: Any) -> Any:
+def make_resolve(features: Features) -> Any:
     """The material at a point: parameters times textures."""
 
     @wp.func
@@ -121,7 +122,7 @@ def make_resolve(features: Any) -> Any:
     return resolve
 
 
-def make_cutout(features: Any) -> Any:
+def make_cutout(features: Features) -> Any:
     """Cut-outs: a hit on a masked texture's clear part is none. For the traversal units, which call it at every hit; None where a
     scene has no cut-outs."""
     if not features.cutout:
@@ -160,7 +161,7 @@ def bump(s: Surface, scale: float, color: wp.vec3) -> wp.vec3:
     return where_vec3(length == 0.0, s.shading, side * n)
 
 
-def make_is_solid(features: Any) -> Any:
+def make_is_solid(features: Features) -> Any:
     """Glass with an inside: what a ray enters at the front of a surface and leaves at its back."""
 
     @wp.func
@@ -186,7 +187,7 @@ class Shading(NamedTuple):
     is_solid: Any
 
 
-def make_shading(features: Any) -> Any:
+def make_shading(features: Features) -> Any:
     """Once for a kernel: the integrator's step, shadow rays and AOVs share it."""
     uvs = features.textures or features.checkerboards
     surface_at = make_surface_at(features.spheres, features.smooth, uvs, features.normal_maps, features.instances)

@@ -5,7 +5,8 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.elementary import exp
-from wrt.kernels.shade.shading import BLEND
+from wrt.kernels.shade.features import Features
+from wrt.kernels.shade.shading import BLEND, Shading
 from wrt.kernels.shade.surface import Surface, make_place_of, spawn_point
 from wrt.kernels.structs import Hit, Material, Ray, Surfaces
 
@@ -70,7 +71,7 @@ def is_opaque(m: Material) -> bool:
     return m.transmission <= 0.0 and m.alpha_mode != wp.static(BLEND)
 
 
-def make_pass_surface(features: Any, scatter: Any, is_solid: Any) -> Any:
+def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
     """One more surface on light's way."""
 
     @wp.func
@@ -146,11 +147,10 @@ def begin_shadow(ray: Ray, end: wp.vec3) -> ShadowWalk:
     return walk
 
 
-def make_go_through(features: Any, shading: Any) -> Any:
-    """What a shadow ray does with the closest hit on its way. Nothing here traces a ray."""
-    surface_at, look_up, resolve, shading_normal, scatter, is_solid = shading
+def make_through_hit(features: Features, shading: Shading) -> Any:
+    """Return through_hit(surfaces, walk, hit) -> ShadowWalk: through the closest surface on the way, or no farther."""
     place_of = make_place_of(features.instances)
-    pass_surface = make_pass_surface(features, scatter, is_solid)
+    pass_surface = make_pass_surface(features, shading.scatter, shading.is_solid)
 
     @wp.func
     def through_hit(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
@@ -159,12 +159,12 @@ def make_go_through(features: Any, shading: Any) -> Any:
             walk.done = 1
             return walk
         ray = walk.ray
-        s = surface_at(surfaces, ray, hit)
-        texels = look_up(surfaces, s)
-        m = resolve(surfaces, s, texels)
+        s = shading.surface_at(surfaces, ray, hit)
+        texels = shading.look_up(surfaces, s)
+        m = shading.resolve(surfaces, s, texels)
         m.roughness = 0.0
         d = wp.normalize(ray.direction)
-        s.shading = shading_normal(surfaces, s, texels, -d)
+        s.shading = shading.shading_normal(surfaces, s, texels, -d)
         walk.passage = pass_surface(surfaces, walk.passage, m, s, -d, hit.t * wp.length(ray.direction))
         now = left(walk.passage)
         if wp.max(now.transmittance) <= 0.0:
@@ -178,6 +178,13 @@ def make_go_through(features: Any, shading: Any) -> Any:
                 walk.shadow.transmittance = now.transmittance
                 walk.done = 1
         return walk
+
+    return through_hit
+
+
+def make_go_through(features: Features, shading: Shading) -> Any:
+    """Return go_through(surfaces, walk, hit) -> ShadowWalk. Nothing here traces a ray."""
+    through_hit = make_through_hit(features, shading)
 
     @wp.func
     def at_end(surfaces: Surfaces, before: ShadowWalk) -> ShadowWalk:
@@ -210,7 +217,7 @@ def make_go_through(features: Any, shading: Any) -> Any:
     return go_through
 
 
-def make_transmittance(features: Any, shading: Any, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
+def make_transmittance(features: Features, shading: Shading, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
     """Shadow rays: one any-hit query, or where a scene lets light through surfaces, one closest hit after another."""
     go_through = make_go_through(features, shading)
 

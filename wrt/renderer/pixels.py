@@ -15,13 +15,14 @@ from wrt.kernels.loops.one_ray import Tile, add_samples
 from wrt.kernels.shade.step import Sample
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.tiles import Work
-from wrt.renderer.waves import World
+from wrt.renderer.waves import SceneRecords
 
 THREADS_OF_SM = 2048  # that a multiprocessor keeps at a time, of NVIDIA's largest
 ROUNDS = 4  # times as many samples in a launch
 
 
-def film_launch(device: Any, kernel: Any, world: World, limits: list[Any], film: DeviceFilm, alone: bool) -> Callable[[Work], int]:
+def film_launch(device: Any, kernel: Any, scene: SceneRecords, limits: list[Any], film: DeviceFilm,
+                alone: bool) -> Callable[[Work], int]:
     """A function that adds some work's samples to the film, and gives their number. limits: those of each group of the film; alone:
     a pixel is always one thread's."""
     room = 0 if alone else device.sm_count * THREADS_OF_SM * ROUNDS
@@ -39,7 +40,7 @@ def film_launch(device: Any, kernel: Any, world: World, limits: list[Any], film:
             tile.threads = tile.n_samples if by_samples else 1
             tile.samples = samples
             for limit, group in zip(limits, film.groups, strict=True):
-                launch_on(device, kernel, pixels * tile.threads, *world, limit, group, tile)
+                launch_on(device, kernel, pixels * tile.threads, *scene, limit, group, tile)
                 if tile.threads > 1:
                     launch_on(device, add_samples, pixels, group, tile)
         return work.total
@@ -47,12 +48,12 @@ def film_launch(device: Any, kernel: Any, world: World, limits: list[Any], film:
     return trace
 
 
-def aov_launch(device: Any, kernel: Any, world: World, film: AovFilm) -> Callable[[Work], int]:
+def aov_launch(device: Any, kernel: Any, scene: SceneRecords, film: AovFilm) -> Callable[[Work], int]:
     """As film_launch, of AOVs."""
-    accel, surfaces, _, camera = world
 
     def trace(work: Work) -> int:
-        launch_on(device, kernel, work.rectangle[2] * work.rectangle[3], accel, surfaces, camera, film.struct, tile_of(work))
+        launch_on(device, kernel, work.rectangle[2] * work.rectangle[3], scene.accel, scene.surfaces, scene.camera, film.struct,
+                  tile_of(work))
         return work.total
 
     return trace

@@ -22,7 +22,7 @@ from wrt.renderer.pixels import aov_launch, film_launch
 from wrt.renderer.plan import Plan
 from wrt.renderer.tiles import Rectangle, Work, corners, tiles
 from wrt.renderer.upload import DeviceScene, camera_struct, upload_scene
-from wrt.renderer.waves import CAPACITY, Waves
+from wrt.renderer.waves import CAPACITY, SceneRecords, Waves
 from wrt.scene.cameras import CameraKind
 
 TILE_SIZE = 32  # the least on the CPU
@@ -75,14 +75,14 @@ class Prepared:
     def launch(self, film: DeviceFilm | AovFilm, accel: Any = None) -> Callable[[Work], int]:
         """A function that traces some work into the film, and gives its samples. accel: a record in place of the structure's."""
         accel = self.accel.data if accel is None else accel
-        world = (accel, self.arrays.surfaces, self.arrays.lighting, self.camera)
+        scene = SceneRecords(accel, self.arrays.surfaces, self.arrays.lighting, self.camera)
         limits = [] if isinstance(film, AovFilm) else [self.plan.limits(seed) for seed in film.seeds]
         if self.waves is not None:
-            return self.waves.launch(world, limits, film)
+            return self.waves.launch(scene, limits, film)
         if isinstance(film, AovFilm):
-            return aov_launch(self.device, self.kernels[1], world, film)
+            return aov_launch(self.device, self.kernels[1], scene, film)
         alone = self.device.is_cpu or self.plan.structure.units.counters
-        return film_launch(self.device, self.kernels[0], world, limits, film, alone)
+        return film_launch(self.device, self.kernels[0], scene, limits, film, alone)
 
     # --- what a worker is asked for (wrt.renderer.distributed) ---
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -32,9 +32,17 @@ from wrt.renderer.tiles import Work
 # many lights: ROOM is for all of them together.
 CAPACITY, ROOM = 16384, 1 << 18
 ALL = 1 << 30  # rays of a kernel whose only thread takes them all
-World = tuple[Any, Any, Any, Any]  # the records of structure, surfaces, lighting and camera
 OF_CAMERA = ("camera", "lens", "blades", "filter", "independent")
 OF_CUTOUT = ("instances", "textures", "checkerboards", "cutout")
+
+
+class SceneRecords(NamedTuple):
+    """The device's records of a scene: of its structure, surfaces and lighting, and of the camera."""
+
+    accel: Any
+    surfaces: Any
+    lighting: Any
+    camera: Any
 
 
 def some(features: Features, names: tuple[str, ...]) -> Features:
@@ -114,7 +122,7 @@ class Waves:
     lights: int
     free: list[Buffers] = field(default_factory=list)
 
-    def launch(self, world: World, limits: list[Any], film: DeviceFilm | AovFilm) -> Callable[[Work], int]:
+    def launch(self, scene: SceneRecords, limits: list[Any], film: DeviceFilm | AovFilm) -> Callable[[Work], int]:
         """A function that takes some work's samples into the film, and gives their number; several threads may call it. limits:
         those of each group of the film."""
         recorded: dict[int, Picture | Aovs] = {}
@@ -125,8 +133,8 @@ class Waves:
             except IndexError:
                 buffers = Buffers(self.features, self.lights)
             if id(buffers) not in recorded:
-                recorded[id(buffers)] = (Aovs(self, buffers, world, film) if isinstance(film, AovFilm)
-                                         else Picture(self, buffers, world, limits, film))
+                recorded[id(buffers)] = (Aovs(self, buffers, scene, film) if isinstance(film, AovFilm)
+                                         else Picture(self, buffers, scene, limits, film))
             recorded[id(buffers)].take(work)
             self.free.append(buffers)  # not after an error
             return work.total
@@ -189,26 +197,26 @@ class Buffers:
 class Picture:
     """The launches of a picture in some buffers, packed once: all that changes from wave to wave is in the buffers."""
 
-    def __init__(self, waves: Waves, buffers: Buffers, world: World, limits: list[Any], film: DeviceFilm) -> None:
-        kernels, w, (accel, surfaces, lighting, camera) = waves.kernels, buffers.wave, world
+    def __init__(self, waves: Waves, buffers: Buffers, scene: SceneRecords, limits: list[Any], film: DeviceFilm) -> None:
+        kernels, w = waves.kernels, buffers.wave
         self.buffers, self.kept, self.groups = buffers, Launches(), []
         recorded = self.kept.recorded
 
         def trace(kernel: Any, rays: Any, out: Any) -> Any:
-            return recorded(traversal(kernels, kernel, buffers, accel, surfaces, rays, out), kernels.block)
+            return recorded(traversal(kernels, kernel, buffers, scene.accel, scene.surfaces, rays, out), kernels.block)
 
-        block = recorded(command(kernels.prepare, w, surfaces, lighting, 0, 0), ALL) if kernels.prepare else Launch()
+        block = recorded(command(kernels.prepare, w, scene.surfaces, scene.lighting, 0, 0), ALL) if kernels.prepare else Launch()
         launches = {
             "closest_hit": trace(kernels.closest_hit, w.queue.rays, w.queue.hits),
-            "shade": recorded(command(kernels.shade, w, surfaces, lighting, limits[0], block, 0, 0), ALL),
+            "shade": recorded(command(kernels.shade, w, scene.surfaces, scene.lighting, limits[0], block, 0, 0), ALL),
         }
         if kernels.shadow:
             launches["walk_hit"] = trace(kernels.closest_hit, w.shadow_queue.rays, w.shadow_queue.hits)
-            launches["go_through"] = recorded(command(kernels.shadow, w, surfaces, 0))
+            launches["go_through"] = recorded(command(kernels.shadow, w, scene.surfaces, 0))
         if kernels.any_hit:
             launches["shadow_hit"] = trace(kernels.any_hit, w.shadow_queue.rays, w.shadow_queue.occluded)
         for group_limits, group in zip(limits, film.groups, strict=True):
-            launches["begin"] = recorded(command(kernels.begin, w, camera, group_limits, group, 0, 0), ALL)
+            launches["begin"] = recorded(command(kernels.begin, w, scene.camera, group_limits, group, 0, 0), ALL)
             of_group = wave.WaveLaunches()
             for name, launch in launches.items():
                 setattr(of_group, name, launch)
@@ -223,11 +231,12 @@ class Picture:
 class Aovs:
     """As Picture, of AOVs."""
 
-    def __init__(self, waves: Waves, buffers: Buffers, world: World, film: AovFilm) -> None:
-        kernels, w, (accel, surfaces, _, camera) = waves.kernels, buffers.wave, world
+    def __init__(self, waves: Waves, buffers: Buffers, scene: SceneRecords, film: AovFilm) -> None:
+        kernels, w = waves.kernels, buffers.wave
         self.buffers, self.block = buffers, kernels.block
-        self.begin, self.see = command(kernels.begin_aov, w, camera, film.struct), command(kernels.see, w, surfaces, film.struct)
-        self.closest_hit = traversal(kernels, kernels.closest_hit, buffers, accel, surfaces, w.queue.rays, w.queue.hits)
+        self.begin = command(kernels.begin_aov, w, scene.camera, film.struct)
+        self.see = command(kernels.see, w, scene.surfaces, film.struct)
+        self.closest_hit = traversal(kernels, kernels.closest_hit, buffers, scene.accel, scene.surfaces, w.queue.rays, w.queue.hits)
 
     def take(self, work: Work) -> None:
         self.buffers.take(work, self.trace)

@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.elementary import sin_cos
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.pixel_rays import no_ray
 from wrt.kernels.structs import Ray, make_ray
 
@@ -39,5 +40,5 @@ def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
     return make_ray(camera.origin, wp.normalize(direction))
 
 
-def make_camera_ray(features: Any = None) -> Any:
+def make_camera_ray(features: Features | None = None) -> Any:
     return camera_ray

@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.shade.features import Features
 from wrt.kernels.structs import Ray, make_ray
 
 
@@ -27,5 +28,5 @@ def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
     return make_ray(camera.origin + x * camera.right + y * camera.up, camera.forward)
 
 
-def make_camera_ray(features: Any = None) -> Any:
+def make_camera_ray(features: Features | None = None) -> Any:
     return camera_ray

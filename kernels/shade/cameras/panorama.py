@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.elementary import sin_cos
+from wrt.kernels.shade.features import Features
 from wrt.kernels.structs import Ray, make_ray
 
 
@@ -28,5 +29,5 @@ def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
     return make_ray(camera.origin, wp.normalize(sin_down * level + cos_down * camera.up))
 
 
-def make_camera_ray(features: Any = None) -> Any:
+def make_camera_ray(features: Features | None = None) -> Any:
     return camera_ray

@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.sampling import disk, polygon
 from wrt.kernels.structs import Ray, lift, make_ray, unit
 
@@ -32,9 +33,9 @@ def chief_ray(camera: Camera, film: wp.vec2) -> wp.vec3:
     return camera.forward + x * camera.right + y * camera.up
 
 
-def make_camera_ray(features: Any = None) -> Any:
+def make_camera_ray(features: Features | None = None) -> Any:
     lens = features is not None and features.lens
-    blades = lens and features.blades
+    blades = features is not None and features.lens and features.blades
 
     @wp.func
     def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:

@@ -22,7 +22,7 @@ from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.kernels.query import FARTHEST, RayArrays
-from wrt.kernels.shade.segments import see, segments
+from wrt.kernels.shade.segments import Pairs, see, segments
 from wrt.kernels.structs import Surfaces
 
 PAIRS_PER_LAUNCH = 65536
@@ -70,7 +70,9 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
     rays.origin, rays.direction = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(2))
     rays.t_min, rays.t_max = (wp.empty(n, dtype=wp.float32, device=device) for _ in range(2))
     size = np.inf if snapshot.changes else largest_size(snapshot.geometry)
-    run(segments, surfaces, p, q, *(upload(each, wp.int32, device) for each in ids), size, rays)
+    pairs: Any = Pairs()
+    pairs.a, pairs.b, pairs.on_a, pairs.on_b = p, q, *(upload(each, wp.int32, device) for each in ids)
+    run(segments, surfaces, pairs, size, rays)
     given = rays.origin, rays.direction, rays.t_min, rays.t_max
     seen = accel.any_hit(*given, threads=threads)
     run(see, p, q, seen)
