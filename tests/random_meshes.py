@@ -215,6 +215,12 @@ def in_packets(rays: Rays) -> Iterator[np.ndarray]:
         yield together[first : first + PACKETS].ravel()
 
 
+def alike(rays: Rays) -> Iterator[np.ndarray]:
+    """Packets of one ray, many times: around it there is no room for what rounding may leave out."""
+    together = np.repeat(np.arange(len(rays)), PACKET)
+    yield from np.split(together, range(PACKET * PACKETS, len(together), PACKET * PACKETS))
+
+
 def without_packets(rays: Rays) -> Iterator[np.ndarray]:
     """With two rays that run against each other in each packet's worth of rays."""
     index = np.resize(np.arange(len(rays)), -(-len(rays) // (PACKET - 2)) * (PACKET - 2)).reshape(-1, PACKET - 2)
@@ -255,7 +261,7 @@ class Way:
 
 
 WAYS = {
-    "as they are": Way(), "packets": Way(in_packets), "no packets": Way(without_packets), "many": Way(many),
+    "as they are": Way(), "packets": Way(in_packets), "alike": Way(alike), "no packets": Way(without_packets), "many": Way(many),
     "float64": Way(of="float64"), "warp": Way(without_packets, "warp"), "many of warp": Way(many, "warp"),
     "counting": Way(counters=True),
 }
