@@ -7,9 +7,8 @@ again.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
@@ -216,8 +215,9 @@ def in_packets(rays: Rays) -> Iterator[np.ndarray]:
 
 
 def alike(rays: Rays) -> Iterator[np.ndarray]:
-    """Packets of one ray, many times: around it there is no room for what rounding may leave out."""
+    """Packets of one ray, many times: around it there is no room for what rounding may leave out. Two others are of no length."""
     together = np.repeat(np.arange(len(rays)), PACKET)
+    together[::PACKET], together[5::PACKET] = EMPTY, EMPTY - 1
     yield from np.split(together, range(PACKET * PACKETS, len(together), PACKET * PACKETS))
 
 
@@ -236,15 +236,16 @@ def as_they_are(rays: Rays) -> Iterator[np.ndarray]:
     yield np.arange(len(rays))
 
 
-AGAINST = -1  # and -2: no rays of the case, and in Warp arrays no rays at all
+AGAINST = -1  # and -2: no rays of the case, but two that run against each other; in Warp arrays they are not finite
+EMPTY = -3  # and -4: the same two, of no length
 
 
 def filled(rays: Rays, index: np.ndarray, nothing: bool) -> Rays:
-    """The rays of an index; those that are none run against each other, or are not finite."""
+    """The rays of an index."""
     out = Rays(*(array[np.maximum(index, 0)] for array in (rays.origins, rays.directions, rays.t_min, rays.t_max)))
-    for extra, sign in ((AGAINST, 1.0), (AGAINST - 1, -1.0)):
+    for extra, sign, end in ((AGAINST, 1.0, np.inf), (AGAINST - 1, -1.0, np.inf), (EMPTY, 1.0, -1.0), (EMPTY - 1, -1.0, -1.0)):
         rows = index == extra
-        out.origins[rows], out.directions[rows], out.t_min[rows], out.t_max[rows] = 0.0, sign, 0.0, np.inf
+        out.origins[rows], out.directions[rows], out.t_min[rows], out.t_max[rows] = 0.0, sign, 0.0, end
         if nothing:
             out.directions[rows] = np.nan
     return out
@@ -293,8 +294,8 @@ def differences(accel: Any, rays: Rays, world: np.ndarray | None, expected: Any,
     for index in way.order(rays):
         of_each = None if world is None else world[np.maximum(index, 0)]
         hits, occluded = asked(accel, filled(rays, index, way.of == "warp"), way, of_each)
-        if way.of == "warp" and ((hits.prim_id >= 0) | occluded)[index < 0].any():
-            yield "a ray that is not finite hits something"
+        if ((hits.prim_id >= 0) | occluded)[(index <= EMPTY) | ((index < 0) & (way.of == "warp"))].any():
+            yield "a ray that is not finite, or of no length, hits something"
         real, rows = index >= 0, index[index >= 0]
         for name in FIELDS:
             got, wanted = getattr(hits, name)[real], getattr(expected, name)[rows]
@@ -365,13 +366,19 @@ class Scope:
     own: Collection[str] = tuple(STRUCTURES)
 
 
-def built(rng: Rng, name: str, case: Case) -> Any:
-    """With a builder and a size of leaves that its kind has; sometimes by a refit."""
-    has, options = inspect.signature(wrt.ACCELERATORS[name]._build).parameters, dict[str, Any]()
+def options_of(rng: Rng, name: str) -> dict[str, Any]:
+    """A builder and a size of leaves, where structures of that name have them."""
+    has, options = {each.name for each in fields(wrt.ACCELERATORS[name].options)}, dict[str, Any]()
     if "builder" in has and rng.random() < 0.7:
         options["builder"] = str(rng.choice([*BVH_BUILDERS]))
     if "max_leaf" in has and rng.random() < 0.5:
         options["max_leaf"] = int(rng.integers(1, 20))
+    return options
+
+
+def built(rng: Rng, name: str, case: Case) -> Any:
+    """A structure over what the case gives, sometimes by a refit."""
+    options = options_of(rng, name)
     if case.before is not None:
         accel = wrt.build(replace(case.given, vertices=case.before), name, threads=1, **options)
         try:

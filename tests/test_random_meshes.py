@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from tests.random_meshes import OVER, Scope, check
+from tests.random_meshes import OVER, Scope, check, options_of
 from tests.structures import FAMILIES
+from wrt.accel.bvh.builders import BVH_BUILDERS
 
 CASES = {"plain": 55, "with spheres": 15, "instances": 15, "worlds": 15}
 # What is not asked here is asked by the command, and by tests of its own.
@@ -16,6 +18,14 @@ OTHERS = Scope(("brute_force", "bvh8"), ("bvh8",), (), ())
 
 def test_all_that_a_case_can_be_over_is_tried() -> None:
     assert CASES.keys() == OVER.keys()
+
+
+@pytest.mark.parametrize("name", ["bvh2", "bvh8", "bvh2_kdop"])
+def test_every_builder_is_drawn(name: str) -> None:
+    rng = np.random.default_rng(0)
+    options = [options_of(rng, name) for _ in range(200)]
+    assert {each["builder"] for each in options if "builder" in each} == BVH_BUILDERS.keys()
+    assert len({each["max_leaf"] for each in options if "max_leaf" in each}) > 10
 
 
 @pytest.mark.parametrize("over", CASES)
