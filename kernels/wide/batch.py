@@ -34,6 +34,10 @@ from wrt.kernels.wide.layout import (
 )
 from wrt.kernels.wide.nodes import ROW_PADS, far_pad
 from wrt.kernels.wide.packets import (
+    ANY_REFUSED,
+    FAILED,
+    PAUSED,
+    REPORT_SIZE,
     Scratch,
     WideBvh,
     count_of,
@@ -66,9 +70,6 @@ FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
 WORTH = 6  # rays that come to a node together, on average, from which on a packet takes less time than its rays alone
 # Where packets fall apart, one after another, none is tried for a while: so many in a row, for so many that follow.
 IN_A_ROW, PAUSE = 4, 32
-FAILED = SLOT_SIZE * SLOTS  # where Scratch.slots counts the packets in a row that fell apart
-PAUSED = FAILED + 1  # and those that are left until one is tried again
-ANY_REFUSED = PAUSED + 1  # where it says whether a query refuses one of the rays: the last number of `slots`
 
 
 @wp.func
@@ -297,8 +298,8 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 @cache
 def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
-    """Rays first .. end - 1, PACKETS packets after another, in a single thread. out: HitArrays, or for any hit an array of bool.
-    Arrays must have no gaps."""
+    """Rays first .. end - 1, PACKETS packets after another, in a single thread. out: HitArrays, or for any hit an array of bool;
+    and scratch.report (of Scratch). Arrays must have no gaps."""
     walk_packet = make_packet_walk(units, any_hit, accepts)
     interleaved = make_interleaved(units, any_hit, accepts)
     set_up = make_set_up(rays_struct)
@@ -307,9 +308,9 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
 
     @packet_kernel
     def trace(accel: WideBvh, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
-        put_slot(scratch.slots, FAILED, 0)
-        put_slot(scratch.slots, PAUSED, 0)
-        put_slot(scratch.slots, ANY_REFUSED, 0)
+        put_slot(scratch.report, FAILED, 0)
+        put_slot(scratch.report, PAUSED, 0)
+        put_slot(scratch.report, ANY_REFUSED, 0)
         for block in range(first, end, wp.static(PACKETS * LANES)):
             alone = wp.uint64(0)
             packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # not a constant: the walk would be there once for each
@@ -319,20 +320,20 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch, base)
                 put_bits(scratch.packets, base + ACTIVE, active)
                 if bits(scratch.packets, base + REFUSED) != 0:
-                    put_slot(scratch.slots, ANY_REFUSED, 1)
+                    put_slot(scratch.report, ANY_REFUSED, 1)
             for p in range(packets):
                 base = PACKET_SIZE * p
                 active = bits(scratch.packets, base + ACTIVE)
-                paused = slot_at(scratch.slots, PAUSED)
+                paused = slot_at(scratch.report, PAUSED)
                 if active >= COHERENT and paused == 0:
                     worth = walk_packet(accel, surfaces, scratch, base, active - COHERENT)
-                    failed = wp.where(worth, 0, slot_at(scratch.slots, FAILED) + 1)
+                    failed = wp.where(worth, 0, slot_at(scratch.report, FAILED) + 1)
                     if failed == IN_A_ROW:  # after the pause one more that fails is enough for the next
                         failed = failed - 1
-                        put_slot(scratch.slots, PAUSED, PAUSE)
-                    put_slot(scratch.slots, FAILED, failed)
+                        put_slot(scratch.report, PAUSED, PAUSE)
+                    put_slot(scratch.report, FAILED, failed)
                 else:
-                    put_slot(scratch.slots, PAUSED, wp.max(paused - 1, 0))
+                    put_slot(scratch.report, PAUSED, wp.max(paused - 1, 0))
                     active = active & wp.static(COHERENT - 1)
                     active = meets(accel, scratch, base, active)
                     alone = alone | (wp.uint64(active) << wp.uint64(LANES * p))
@@ -347,7 +348,7 @@ class BatchTraversal(WideTraversal):
     """Plain nodes of 8, for which there is a kernel for many rays at a time."""
 
     stream_block = PACKETS * LANES
-    stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, ANY_REFUSED + 1  # lengths of a Scratch's arrays
+    stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, SLOT_SIZE * SLOTS, REPORT_SIZE  # lengths of a Scratch's arrays
 
     def __init__(self) -> None:
         super().__init__(WIDTH)

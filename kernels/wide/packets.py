@@ -27,14 +27,23 @@ else:
         return kernel(function, extra_build_options=HEADERS)
 
 
+FAILED, PAUSED, ANY_REFUSED = (wp.constant(place) for place in range(3))
+REPORT_SIZE = 3
+
+
 @wp.struct
 class Scratch:
     """What one thread works in. packets: PACKET_SIZE each; stacks: STACK_WORDS a slot, or before these one packet's; slots:
-    SLOT_SIZE each, then three numbers of batch.make_kernel."""
+    SLOT_SIZE each.
+
+    report: what batch.make_kernel counts in a launch and leaves behind it. At FAILED: packets in a row that fell apart; PAUSED:
+    packets until one is tried again; ANY_REFUSED: 1 where a query refuses one of the rays, which the host reads.
+    """
 
     packets: wp.array(dtype=wp.float32)
     stacks: wp.array(dtype=wp.uint32)
     slots: wp.array(dtype=wp.int32)
+    report: wp.array(dtype=wp.int32)
 
 
 def flag(value: bool) -> str:

@@ -20,8 +20,9 @@ from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
-from wrt.kernels.wide.batch import FAILED, IN_A_ROW, PACKETS, PAUSED, BatchTraversal
+from wrt.kernels.wide.batch import IN_A_ROW, PACKETS, BatchTraversal
 from wrt.kernels.wide.layout import LANES, STACK_SIZE
+from wrt.kernels.wide.packets import FAILED, PAUSED
 from wrt.kernels.wide.references import EMPTY, leaf_reference
 from wrt.lab.bench.rays import ray_sets
 from wrt.scene.mesh import Mesh
@@ -222,7 +223,7 @@ def test_packets_are_given_up_where_they_fall_apart():
         rays = rays_on(accel.device, rays_of(o, np.tile([0.1, 0.1, -1.0], (n, 1)), 0.0, np.inf))
         inputs = [accel.data, accel.snapshot.surfaces, rays, new_hits(n), scratch, 0, n]
         wp.launch(tracer(accel.structure, False).kernel, 1, inputs, device=DEVICE)
-        assert scratch.slots.numpy()[FAILED] == failed and (scratch.slots.numpy()[PAUSED] > 0) == (failed > 0)
+        assert scratch.report.numpy()[FAILED] == failed and (scratch.report.numpy()[PAUSED] > 0) == (failed > 0)
 
 
 def test_units_without_lanes_have_no_stream():

@@ -22,7 +22,7 @@ from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.warp_private import fields_of
-from wrt.kernels.wide.packets import Scratch
+from wrt.kernels.wide.packets import ANY_REFUSED, REPORT_SIZE, Scratch
 
 # Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Up to FEWEST
 # are not divided. A thread takes a SHARES-th of its part of what is left, LEAST or more, so that all end at about the same time.
@@ -106,7 +106,7 @@ class Tracer:
                 copy(given, slice(first, end), worker.given, slice(end - first))
                 worker.launch(snapshot, worker.packed, 0, end - first)
                 copy(worker.answers, slice(end - first), answers, slice(first, end))
-            refused.append(bool(worker.slots[-1]))
+            refused.append(bool(worker.report[ANY_REFUSED]))
             self.free.append(worker)  # not after an error: a thread may still be at work in it
 
         run_all([partial(job, *each) for each in ranges], threads)
@@ -141,7 +141,7 @@ class Worker:
         self.answers = [np.empty(FEWEST, dtype) for dtype in tracer.types.values()]
         self.packed = pack(self.given, self.answers)
         self.block, self.scratch = tracer.block, new_scratch(tracer.sizes)
-        self.slots = self.scratch.slots.numpy() if tracer.stream else np.zeros(1, np.int32)
+        self.report = self.scratch.report.numpy() if tracer.stream else np.zeros(REPORT_SIZE, np.int32)
         own = [self.scratch, 0] if tracer.stream else []
         check_raw_launches()
         self.threads = 1
@@ -150,7 +150,7 @@ class Worker:
         self.own = [record_of(self.scratch)] if tracer.stream else []
 
     def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> None:
-        """Trace rays first .. end - 1. The last of `slots` tells whether the kernel met one that is refused."""
+        """Trace rays first .. end - 1. report[ANY_REFUSED] tells whether the kernel met one that is refused."""
         inputs = [record_of(snapshot.data), record_of(snapshot.surfaces), *packed, *self.own, first, end]
         for i, last in enumerate(self.inputs):  # the kernel for one ray has no `end`
             if inputs[i] is not last:
