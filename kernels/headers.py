@@ -19,7 +19,8 @@ LINE = re.compile(r'#include "(\w+\.h)"|#pragma once')
 
 def constants(numbers: Mapping[str, float], struct: str = "") -> str:
     """Write numbers as C++ in namespace wrt, or as members of a struct of that name, which is given to templates."""
-    kinds = {name: "float" if isinstance(value, float) else "int" for name, value in numbers.items()}
+    kinds = {name: "float" if isinstance(value, float) else "unsigned" if value >= 2**31 else "int"
+             for name, value in numbers.items()}
     lines = [f"constexpr {kinds[name]} {name} = {literal(value)};" for name, value in numbers.items()]
     body = "struct " + struct + " {\n" + "".join(f"static {line}\n" for line in lines) + "};" if struct else "\n".join(lines)
     return f"namespace wrt {{\n{body}\n}}\n"

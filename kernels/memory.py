@@ -7,7 +7,7 @@ The compiler makes lanes of a plain Warp loop (sixteen where the CPU has them), 
 - vectors of three are made, chosen from and normalised number by number (where_vec3, structs.unit), and there are none of two: LLVM
   keeps two numbers together, in what it calls an instruction's vector type;
 - places in one array differ by constants, or it would have to compare too many ranges. In C++, a place that is a multiple of a
-  variable makes lanes for 1 times alone (film_samples.h).
+  variable makes lanes for 1 times alone (shade/film.h).
 `-Rpass=loop-vectorize` among wp.config.cpu_compiler_flags says which loops are.
 """
 

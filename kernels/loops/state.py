@@ -124,11 +124,9 @@ class ShadowQueue:
 
 @wp.struct
 class Block:
-    """By place i in a block of BLOCK hits, or of rays that missed. rows: what wave_rows.py says; wanted[slot * BLOCK + i]: the
-    texture of the material's slot (wave_textures.py), or -1."""
+    """By place i in a block of BLOCK hits, or of rays that missed. rows: what wave_rows.py says."""
 
     rows: wp.array(dtype=wp.float32)
-    wanted: wp.array(dtype=wp.int32)
 
 
 @wp.struct

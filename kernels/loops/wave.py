@@ -25,10 +25,10 @@ import warp as wp
 
 from wrt.kernels.launches import Launch, run_range, run_with
 from wrt.kernels.loops.state import Task, Wave, put_sample
-from wrt.kernels.native import source
 from wrt.kernels.query import hit_at, put_ray, queued_ray
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.film import load_pixel, make_see, store_pixel, with_sample
+from wrt.kernels.shade.headers import lanes_kernel
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import Shadow, make_go_through
@@ -95,7 +95,7 @@ def make_gather(transparent_shadows: bool) -> Any:
     return gather
 
 
-@wp.func_native(source("loops/film_samples.h", LANES=LANES))
+@wp.func_native("wrt::with_sample(film, pixels.data + (long long)p, done.data + (long long)p * samples, samples);")
 def add_to_pixels(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(dtype=Sample), p: int, samples: int) -> None:
     """As with_sample, to the LANES entries of the film from pixels[p] on: done[p * samples] and what follows it."""
 
@@ -148,7 +148,7 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
                 run_range(launches.shadow_hit, first, first + wave.shadow_queue.count[light])
         gather(wave, lights)
 
-    @kernel
+    @lanes_kernel
     def trace_wave(wave: Wave, launches: WaveLaunches, lights: int, film: Film):
         task = wave.task[0]
         wave.progress[0].queued = 0

@@ -9,6 +9,7 @@ from wrt.kernels.memory import number_of_vec2, put_in_vec2, put_in_vec3, put_int
 from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.film import center_of
+from wrt.kernels.shade.headers import lanes_kernel
 from wrt.kernels.shade.sampling import hash_pair, make_draw, quantiles
 from wrt.kernels.shade.step import Sample
 from wrt.kernels.structs import AovFilm, Film, Limits, kernel
@@ -112,7 +113,7 @@ def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
     camera_struct = camera_kind.Camera
     place, look = make_place(features), make_look(features, camera_kind)
 
-    @kernel
+    @lanes_kernel
     def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film, first_pixel: int, end_pixel: int):
         """Of the pixels first_pixel .. end_pixel - 1, from the place of their first sample in the queue on."""
         samples = wave.task[0].samples

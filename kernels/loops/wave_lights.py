@@ -6,7 +6,7 @@ import warp as wp
 
 from wrt.kernels.loops.state import Wave
 from wrt.kernels.loops.wave_normals import rows_of_normals
-from wrt.kernels.loops.wave_rows import EMITTERS, KEYS, LIGHTS, NUMBERS, SKY, SKY_POINTS, SURFACES, EmitterPoint, Key, Numbers
+from wrt.kernels.loops.wave_rows import EMITTERS, KEYS, LIGHTS, SKY, SKY_POINTS, SURFACES, EmitterPoint, Key
 from wrt.kernels.rows import Rows
 from wrt.kernels.shade import lights as kinds
 from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point, make_sky_sample
@@ -89,7 +89,7 @@ def make_sample_mesh(features: Features) -> Any:
     """sample_mesh(wave, surfaces, lighting, count): put mesh_light with the first light to the rows LIGHTS. Emitters are chosen and
     gathered in between, one by one."""
     light_numbers = make_light_points(features).numbers
-    load_key, load_numbers, store_numbers = KEYS.load(), NUMBERS.load(), NUMBERS.store()
+    load_key, load_xi, store_xi = KEYS.load(), EMITTERS.field("xi").load(), EMITTERS.field("xi").store()
     load_emitter, store_emitter = (make("emitter.material", "emitter.instance") for make in (EMITTERS.load, EMITTERS.store))
     load_eye, store_sample = SURFACES.field("point").load(), LIGHTS.store("distant", "area")
 
@@ -98,11 +98,7 @@ def make_sample_mesh(features: Features) -> Any:
         i = int(0)
         while i < count:
             at = load_key(rows, i)
-            xi = light_numbers(at.key, at.index, 0)
-            numbers = Numbers()
-            numbers.x = xi[0]
-            numbers.y = xi[1]
-            store_numbers(rows, i, numbers)
+            store_xi(rows, i, light_numbers(at.key, at.index, 0))
             i = i + 1
 
     @wp.func
@@ -110,9 +106,9 @@ def make_sample_mesh(features: Features) -> Any:
         light = lighting.lights[0]
         for i in range(count):
             at = EmitterPoint()
-            at.numbers = load_numbers(rows, i)
-            chosen, within = choose_emitter(lighting, light, at.numbers.x)
-            at.numbers.x = within
+            xi = load_xi(rows, i)
+            chosen, within = choose_emitter(lighting, light, xi[0])
+            at.xi = wp.vec2(within, xi[1])
             at.emitter = lighting.emitters[chosen]
             at.emission = surfaces.materials[at.emitter.material].emission
             at.two_sided = surfaces.materials[at.emitter.material].two_sided
@@ -127,7 +123,7 @@ def make_sample_mesh(features: Features) -> Any:
         while i < count:
             at = load_emitter(rows, i)
             t = emitter_corners(at.emitter)
-            u, v = triangle_numbers(at.numbers.x, at.numbers.y)
+            u, v = triangle_numbers(at.xi[0], at.xi[1])
             sample = from_emitter(triangle_point(t, u, v), triangle_point_error(t, u, v), at.emitter.normal, at.emission,
                                   at.two_sided != 0, at.emitter.pdf_area, load_eye(rows, i))
             store_sample(rows, i, sample)

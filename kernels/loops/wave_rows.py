@@ -12,28 +12,16 @@ from wrt.kernels.structs import Emitter
 
 @wp.struct
 class Met:
-    """What a surface is computed from: its triangle, the hit's barycentrics, and the ray's direction."""
+    """What a surface is computed from: its triangle, the hit's barycentrics, the ray's direction, and the material: -1 where a
+    sphere is hit. is_mapped: 1 where the material has a normal map."""
 
     triangle: Triangle
     u: float
     v: float
     direction: wp.vec3
-
-
-@wp.struct
-class NormalMap:
-    """What a material says of its normal map. is_mapped: 1 where it has one."""
-
-    scale: float
+    material: int
     is_mapped: int
-
-
-@wp.struct
-class Numbers:
-    """What places a sample on a light, in [0, 1): two numbers, since a vector of two would not run in lanes."""
-
-    x: float
-    y: float
+    normal_scale: float
 
 
 @wp.struct
@@ -46,23 +34,21 @@ class Key:
 
 @wp.struct
 class EmitterPoint:
-    """A point on an emitter. emission, two_sided: of its material; numbers: what triangle_numbers makes barycentrics of."""
+    """A point on an emitter. emission, two_sided: of its material; xi: what places it, in [0, 1)."""
 
     emitter: Emitter
     emission: wp.vec3
     two_sided: int
-    numbers: Numbers
+    xi: wp.vec2
 
 
 HITS = Rows(Met, BLOCK)
 SURFACES = Rows(Surface, BLOCK, HITS.end)
 TEXELS = Rows(Texels, BLOCK, SURFACES.end)
-NORMAL_MAPS = Rows(NormalMap, BLOCK, TEXELS.end)
-BENT = Rows(wp.vec3, BLOCK, NORMAL_MAPS.end)  # the shading normal as lights see it
+BENT = Rows(wp.vec3, BLOCK, TEXELS.end)  # the shading normal as lights see it
 KEYS = Rows(Key, BLOCK, BENT.end)
 FACETS = Rows(wp.vec3, BLOCK, KEYS.end)  # what chooses a microfacet
-NUMBERS = Rows(Numbers, BLOCK, FACETS.end)
-EMITTERS = Rows(EmitterPoint, BLOCK, NUMBERS.end)
+EMITTERS = Rows(EmitterPoint, BLOCK, FACETS.end)
 LIGHTS = Rows(LightSample, BLOCK, EMITTERS.end)  # of the first light
 SKY = Rows(LightSample, BLOCK, LIGHTS.end)
 SKY_POINTS = Rows(wp.vec3, BLOCK, SKY.end)  # what places a sample on the sky (sky_point)

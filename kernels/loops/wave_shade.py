@@ -16,11 +16,12 @@ from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.follow_up import FOLLOWED, FollowUp, make_follow_up, with_cuts
+from wrt.kernels.shade.headers import lanes_kernel
 from wrt.kernels.shade.paths import make_paths
 from wrt.kernels.shade.shading import Shading, make_shading
 from wrt.kernels.shade.shadows import Shadow, begin_shadow
 from wrt.kernels.shade.step import Sample, ShadowRequest, Step, add_up, is_lit, make_shaded, make_step
-from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive, kernel
+from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive
 
 Shaded = make_shaded(False)
 camera_path = make_paths(False).camera_path
@@ -145,8 +146,8 @@ def make_lanes(features: Features, shading: Shading, step: Step) -> Lanes:
     @wp.func
     def prepare(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
         find(wave, surfaces, first, end, wave.progress[0].hits)
-        sample_textures(wave, surfaces, first, end)
-        bend(wave, surfaces, first, end)
+        sample_textures(surfaces, wave.block.rows, end - first)
+        bend(wave.block.rows, end - first)
         if wp.static(keyed):
             put_keys(wave, first, end)
         if wp.static(features.rough):
@@ -237,7 +238,7 @@ def make_shade_kernels(features: Features) -> tuple[Any, Any]:
     lanes = make_lanes(features, shading, step)
     ask_lights, push_paths = make_ask_lights(features, step, lanes.light_at), make_push_paths(features)
 
-    @kernel
+    @lanes_kernel
     def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits, block: Launch, first: int, end: int):
         """Of the rays first .. end - 1 of the queue. What is traced next is queued from place progress.queued on, which is not
         behind `first`. block: of prepare_block, if there is one."""
@@ -283,7 +284,7 @@ def make_shade_kernels(features: Features) -> tuple[Any, Any]:
     if not lanes.apart:
         return shade_wave, None
 
-    @kernel
+    @lanes_kernel
     def prepare_block(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
         lanes.prepare(wave, surfaces, lighting, first, end)
 

@@ -28,13 +28,14 @@ class Attributes:
         self.smooth, self.tangents = features.smooth, features.normal_maps
         self.uvs = features.textures or features.checkerboards
         normals, uvs = () if self.smooth else ("n0", "n1", "n2"), () if self.uvs else ("u", "v")
-        self.not_of_hits = tuple(f"triangle.{name}" for name in normals + uvs)
+        self.not_of_hits = (*(f"triangle.{name}" for name in normals + uvs), *(() if self.uvs else ("material",)),
+                            *(() if self.tangents else ("is_mapped", "normal_scale")))
         self.not_of_surfaces = ("material", "exclude_plus_one", *uvs, *(() if self.tangents else ("tangent", "bitangent_sign")))
 
 
 def make_gather(has: Attributes) -> Any:
     """gather(wave, surfaces, first, end, hits): put the triangles of the hits first .. end - 1 of so many to their rows."""
-    smooth, uvs = has.smooth, has.uvs
+    smooth, uvs, tangents = has.smooth, has.uvs, has.tangents
     place_of, triangle_at = make_place_of(False), make_triangle_at(smooth, uvs, False)
     store_met = HITS.store(*has.not_of_hits)
 
@@ -57,8 +58,13 @@ def make_gather(has: Attributes) -> Any:
         for j in range(first, end):
             prefetch_triangles(wave, surfaces, j, hits)
             k = wave.outcomes.hit[j]
+            place = place_of(surfaces, hit_triangle(wave, surfaces, j))
             met = Met()
-            met.triangle = triangle_at(surfaces, place_of(surfaces, hit_triangle(wave, surfaces, j)))
+            met.triangle = triangle_at(surfaces, place)
+            met.material = wp.where(wave.queue.hits.prim_id[k] < surfaces.n_triangles, place.material, -1)
+            if wp.static(tangents):
+                met.is_mapped = wp.where(surfaces.materials[place.material].normal_texture >= 0, 1, 0)
+                met.normal_scale = surfaces.materials[place.material].normal_scale
             met.u = wave.queue.hits.u[k]
             met.v = wave.queue.hits.v[k]
             met.direction = wave.queue.rays.direction[k]

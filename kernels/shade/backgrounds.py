@@ -4,12 +4,11 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.native import source
 from wrt.kernels.rows import Rows
 from wrt.kernels.shade.elementary import acos, atan2, sin_cos
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample
-from wrt.kernels.shade.sampling import LANES, PI, TWO_PI, cosine_point, search_cdf, share_of_row, turned_to
+from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_point, search_cdf, share_of_row, turned_to
 from wrt.kernels.structs import Background
 
 # --- the kinds --------------------------------------------------------------------------------------------------------
@@ -86,10 +85,13 @@ def environment(b: Background, direction: wp.vec3) -> wp.vec3:
     return environment_at(b, environment_column(b, d[0], d[2]), environment_row(b, d[1]))
 
 
-@wp.func_native(source("shade/environment_lanes.h", LANES=LANES))
+@wp.func_native("""
+    float* const x = rows.data + (long long)at;
+    wrt::environment_at(background, x, x + length, x + 2 * (long long)length, count);
+""")
 def environment_colors(background: Background, rows: wp.array(dtype=wp.float32), at: int, length: int, count: int) -> None:
     """environment_at of `count` columns in the row from rows[at] on and rows in the next; red, green and blue take the place of
-    these, and a third row. length: of a row, with room for LANES - 1 more."""
+    these, and a third row. length: of a row, with room for LANES - 1 more. For lanes_kernel (headers.py)."""
 
 
 def make_environment_seen(directions: Rows, colors: Rows) -> Any:

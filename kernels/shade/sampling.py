@@ -10,7 +10,6 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.native import source
 from wrt.kernels.shade.elementary import near_sin_cos, sin_cos
 from wrt.kernels.shade.features import Features
 from wrt.kernels.structs import unit
@@ -102,16 +101,15 @@ def independent_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
     return wp.vec2(unit_float(x), unit_float(y))
 
 
-@wp.func_native(source("shade/sample_points.h", HASH_1=HASH_1, HASH_2=HASH_2, LK_1=LK_1, LK_2=LK_2, LK_3=LK_3, SEED_X=SEED_X,
-                       SEED_Y=SEED_Y, LANES=LANES, BITS_1=BITS_1, BITS_2=BITS_2, BITS_4=BITS_4, BITS_8=BITS_8, UNIT=UNIT))
+@wp.func_native("wrt::sample_2d(seed, first, count, (float*)(out.data + (long long)at));")
 def sample_points(seed: wp.uint32, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int) -> None:
-    """Points first, first + 1 ... of sample_2d's sequence to out[at], out[at + 1] ... (CPU); seed: hash_pair(key, dimension). There
-    must be room for LANES - 1 more."""
+    """Points first, first + 1 ... of sample_2d's sequence to out[at], out[at + 1] ...; seed: hash_pair(key, dimension). There must
+    be room for LANES - 1 more. For lanes_kernel (headers.py)."""
 
 
-@wp.func_native(source("shade/quantiles.h", LANES=LANES))
+@wp.func_native("wrt::quantile(icdf.data, icdf.shape[0], (float*)(points.data + (long long)first), 2 * count);")
 def quantiles(icdf: wp.array(dtype=wp.float32), points: wp.array(dtype=wp.vec2), first: int, count: int) -> None:
-    """Both numbers of each point, as `quantile` has them."""
+    """Both numbers of each point become their `quantile`. For lanes_kernel."""
 
 
 @wp.func

@@ -1,6 +1,5 @@
 """What is known at a hit: the surface, its material with the textures in it, its normal, and how it scatters light."""
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -32,27 +31,29 @@ class Texels:
 
 
 class MaterialTexture(NamedTuple):
-    """channels: those of its picture that are read, in the order of "rgba"; fields: of Texels, which they go to, next to each other
-    there. feature: of the scenes for which it is compiled in; "": wherever there are textures."""
+    """fields: those of Texels that it says, which follow one another there, and the channels of its picture that they take, in the
+    order of "rgba". feature: of the scenes for which it is compiled in; "": wherever there are textures."""
 
-    channels: str
-    fields: tuple[str, ...]
+    fields: dict[str, str]
     feature: str = "parameter_textures"
 
     @property
-    def numbers(self) -> list[tuple[int, str]]:
-        """Each channel and the number of Texels that it goes to."""
-        names = [number for name in self.fields for number in numbers_of(fields_of(Texels)[name], f"texels.{name}")]
-        return list(zip(map("rgba".index, self.channels), names, strict=True))
+    def channels(self) -> list[int]:
+        return ["rgba".index(channel) for channels in self.fields.values() for channel in channels]
+
+    @property
+    def numbers(self) -> list[str]:
+        """The number of Texels that each channel goes to, in C++."""
+        return [number for name in self.fields for number in numbers_of(fields_of(Texels)[name], f"texels.{name}")]
 
 
 # A material's textures by the field of Material that has its index. Both loops read all of them from here.
 TEXTURES = {
-    "albedo_texture": MaterialTexture("rgba", ("albedo", "alpha"), ""),
-    "emission_texture": MaterialTexture("rgb", ("emission",), ""),
-    "metallic_roughness_texture": MaterialTexture("gb", ("roughness", "metallic")),
-    "transmission_texture": MaterialTexture("r", ("transmission",)),
-    "normal_texture": MaterialTexture("rgb", ("normal",), "normal_maps"),
+    "albedo_texture": MaterialTexture({"albedo": "rgb", "alpha": "a"}, ""),
+    "emission_texture": MaterialTexture({"emission": "rgb"}, ""),
+    "metallic_roughness_texture": MaterialTexture({"roughness": "g", "metallic": "b"}),
+    "transmission_texture": MaterialTexture({"transmission": "r"}),
+    "normal_texture": MaterialTexture({"normal": "rgb"}, "normal_maps"),
 }
 
 
@@ -61,16 +62,6 @@ def textures_of(features: Features) -> dict[str, MaterialTexture]:
     if not features.textures and not features.checkerboards:
         return {}
     return {name: texture for name, texture in TEXTURES.items() if not texture.feature or getattr(features, texture.feature)}
-
-
-@cache
-def make_texture_index(name: str) -> Any:
-    """index(materials, material): which texture a material has in that field; -1: none."""
-
-    @wp.func_native(f"return materials.data[(long long)material].{name};")
-    def index(materials: wp.array(dtype=Material), material: int) -> int: ...
-
-    return index
 
 
 def make_look_up(features: Features) -> Any:
@@ -88,16 +79,18 @@ def no_texels(surfaces: Surfaces, s: Surface) -> Texels:
 
 
 def make_texture_link(name: str, texture: MaterialTexture, sample_texture: Any, others: Any) -> Any:
-    """look_up of one texture, and of the others."""
-    index = make_texture_index(name)
+    """look_up of one texture, after the others."""
 
-    @wp.func_native("\n".join(f"{number} = color[{channel}];" for channel, number in texture.numbers))
+    @wp.func_native(f"return materials.data[(long long)material].{name};")
+    def index_of(materials: wp.array(dtype=Material), material: int) -> int: ...
+
+    @wp.func_native("\n".join(f"{to} = color[{channel}];" for channel, to in zip(texture.channels, texture.numbers, strict=True)))
     def put(texels: wp.ref[Texels], color: wp.vec4) -> None: ...
 
     @wp.func
     def look_up(surfaces: Surfaces, s: Surface) -> Texels:
         texels = others(surfaces, s)
-        put(texels, sample_texture(surfaces, index(surfaces.materials, s.material), wp.vec2(s.u, s.v)))
+        put(texels, sample_texture(surfaces, index_of(surfaces.materials, s.material), wp.vec2(s.u, s.v)))
         return texels
 
     return look_up

@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.native import source
-
 PLACES = ("local", "shared")
 SHARED = 64  # bytes of a thread there: with more, a T4 would hold fewer warps
 
@@ -31,7 +29,9 @@ class Stack(NamedTuple):
 def make_uninitialized(length: int, dtype: Any) -> Any:
     """A vector of whatever memory holds: Warp sets every new one to 0, and of a stack's 512 bytes most rays use a few."""
 
-    @wp.func_native(source("traverse/uninitialized.h", TYPE=f"wp::vec_t<{length}, wp::{dtype.__name__}>"))
+    of = f"wp::vec_t<{length}, wp::{dtype.__name__}>"
+
+    @wp.func_native(f"alignas({of}) char memory[sizeof({of})]; return *({of}*)memory;")
     def uninitialized() -> wp.types.vector(length, dtype): ...
 
     return uninitialized
@@ -42,15 +42,22 @@ def make_stack(place: str, size: int, dtype: Any, entry_bytes: int) -> Stack:
     """A stack of `size` numbers of that type, alone or beside others, with which an entry has so many bytes. One place and type
     have one piece of shared memory."""
     vector = wp.types.vector(size, dtype)
-    names: dict[str, Any] = {"SHORT": SHARED // entry_bytes if place == "shared" else 0, "TYPE": f"wp::{dtype.__name__}"}
+    short = SHARED // entry_bytes if place == "shared" else 0
+    at = f"((wp::{dtype.__name__}*)shared)[i * WP_TILE_BLOCK_DIM]"
 
-    @wp.func_native(source("traverse/stack_shared.h", **names))
+    def on_cuda(text: str, otherwise: str) -> str:
+        """Return C++ with that text for CUDA, if entries are shared."""
+        return f"\n#if defined(__CUDA_ARCH__)\n    {text}\n#else\n    {otherwise}\n#endif\n" if short else otherwise
+
+    # Entries of one depth lie side by side, so that threads of a warp never meet in a bank of the memory.
+    @wp.func_native(on_cuda(f"__shared__ wp::{dtype.__name__} first[{short} * WP_TILE_BLOCK_DIM];"
+                            " return (wp::uint64)(first + threadIdx.x);", "return 0;"))
     def shared() -> wp.uint64: ...
 
-    @wp.func_native(source("traverse/stack_put.h", **names))
+    @wp.func_native(on_cuda(f"if (i < {short}) {at} = entry; else entries[i] = entry;", "entries[i] = entry;"))
     def put(entries: wp.ref[vector], shared: wp.uint64, i: int, entry: dtype) -> None: ...
 
-    @wp.func_native(source("traverse/stack_get.h", **names))
+    @wp.func_native(on_cuda(f"return i < {short} ? {at} : entries[i];", "return entries[i];"))
     def get(entries: wp.ref[vector], shared: wp.uint64, i: int) -> dtype: ...
 
     return Stack(make_uninitialized(size, dtype), shared, put, get)

@@ -21,7 +21,7 @@ from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import LANES
-from wrt.kernels.shade.shading import TEXTURES, make_cutout
+from wrt.kernels.shade.shading import make_cutout
 from wrt.kernels.shade.shadows import ShadowWalk
 from wrt.kernels.shade.step import Lit, Sample
 from wrt.kernels.wide.batch import BatchTraversal
@@ -164,7 +164,7 @@ class Buffers:
         w.queue.sample, w.queue.rays, w.queue.hits = room(n, wp.int32), queue(n), hit_arrays(n)
         w.outcomes.hit, w.outcomes.missed, w.outcomes.resumed = (room(n, wp.int32) for _ in range(3))
         self.allocate_shadows(features.transparent_shadows, lights)
-        w.block.rows, w.block.wanted = room(wave_rows.ROWS * BLOCK, wp.float32), room(len(TEXTURES) * BLOCK, wp.int32)
+        w.block.rows = room(wave_rows.ROWS * BLOCK, wp.float32)
         self.scratch = new_scratch(BatchTraversal.stream_sizes)
 
     def allocate_shadows(self, transparent: bool, lights: int) -> None:

@@ -6,22 +6,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import DEVICE, cpu_only, directions, floats, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
+from tests.kernel_tools import DEVICE, directions, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
 import warp as wp
 
 from wrt.accel.scenes.build import build
-from wrt.kernels.rows import Rows
 from wrt.kernels.shade import backgrounds, lights
 from wrt.kernels.shade.backgrounds import (
     environment,
-    make_environment_seen,
     make_sky_point,
     make_sky_sample,
 )
 from wrt.kernels.shade.direct import shadow_ray
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample, make_light_sample
-from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Background, Lighting, Ray, Surfaces, kernel
 from wrt.renderer.upload import upload_scene
@@ -55,36 +52,6 @@ def light_kernel(features):
         ray[i] = shadow_ray(s, out[i])
 
     return take
-
-
-DIRECTIONS = Rows(wp.vec3, 97)
-COLORS = Rows(wp.vec3, 97, DIRECTIONS.end)
-seen = make_environment_seen(DIRECTIONS, COLORS)
-
-
-@kernel
-def seen_kernel(b: Background, rows: wp.array(dtype=float), count: int):
-    seen(b, rows, count)
-
-
-@cpu_only
-@pytest.mark.parametrize("rotation", [0.0, 0.7])
-def test_a_picture_of_the_sky_in_lanes_is_that_of_one_direction_at_a_time(rotation):
-    """Also at its seam and its poles; what stands behind the last direction is anything."""
-    rng = np.random.default_rng(1)
-    axes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-0.0, 1, -0.0], [0.5**0.5, 0, 0.5**0.5]])
-    direction = np.concatenate([unit(rng.normal(size=(71, 3))), axes, -axes])
-    n = len(direction)
-    assert n + LANES == COLORS.length
-    sky = EnvironmentBackground(rng.random((5, 8, 3)), rotation=rotation, scale=1.5)
-    b = upload_scene(Scene(background=sky), DEVICE).lighting.background
-    rows = np.full((COLORS.end, COLORS.length), np.nan)
-    rows[:3, :n] = direction.T
-    rows, expected = floats(rows.ravel()), zeros(n, wp.vec3)
-    launch(seen_kernel, 1, b, rows, n)
-    launch(environment_kernel, n, b, vec3s(direction), expected)
-    found = rows.numpy().reshape(COLORS.end, -1)[3:, :n].T.copy()
-    np.testing.assert_array_equal(found.view(np.int32), expected.numpy().view(np.int32))
 
 
 @kernel

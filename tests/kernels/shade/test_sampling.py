@@ -5,12 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.kernel_tools import cpu_only, floats, launch, sobol_like, uints, unit, vec2s, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import floats, launch, sobol_like, uints, unit, vec2s, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.sampling import (
-    LANES,
     cap_point,
     cosine_hemisphere,
     disk,
@@ -19,10 +17,7 @@ from wrt.kernels.shade.sampling import (
     ggx_normal,
     ggx_visible_share,
     hash_u32,
-    make_draw,
     polygon,
-    quantile,
-    quantiles,
     reverse_bits,
     sample_2d,
     search_cdf,
@@ -385,48 +380,3 @@ def test_search_cdf(weights, before):
     expected = np.searchsorted(cdf, x, side="right")
     assert np.array_equal(out.numpy(), expected)
     assert all(weights[i] > 0 for i in out.numpy())  # what has no weight is never chosen
-
-
-@cpu_only
-def test_points_in_lanes_are_those_of_one_at_a_time():
-    """What pictures draw on the CPU: the same bits, whichever index a pixel begins with, and however many are drawn."""
-    draw, at = make_draw(Features()), 3
-
-    @kernel
-    def compare(key: wp.uint32, first: int, n: int, lanes: wp.array(dtype=wp.vec2), single: wp.array(dtype=wp.vec2)):
-        draw(key, 1, first, n, lanes, at)
-        for i in range(n):
-            single[at + i] = sample_2d(key, wp.uint32(first + i), 1)
-
-    for key, first in ((0, 0), (0xFFFFFFFF, 5), (0x12345678, (1 << 20) - 7), (77, 0x7FFFFFFF - 37)):
-        for n in (1, 7, 8, 9, 12, 16, 37):
-            room = at + LANES * -(-n // LANES)
-            lanes, single = zeros(room + 1, wp.vec2), zeros(room + 1, wp.vec2)
-            launch(compare, 1, wp.uint32(key), first, n, lanes, single)
-            lanes, single = lanes.numpy(), single.numpy()
-            np.testing.assert_array_equal(lanes[: at + n].view(np.int32), single[: at + n].view(np.int32))
-            drawn = lanes.any(axis=1)
-            assert drawn[at : at + n].sum() >= n - 1 and not drawn[:at].any() and not drawn[room:].any()
-
-
-@cpu_only
-@pytest.mark.parametrize("n", [1, 7, 8, 9, 16, 41])
-def test_quantiles_in_lanes_are_those_of_one_at_a_time(n):
-    icdf, at = floats(np.sort(np.random.default_rng(n).normal(size=33))), 2
-    values = np.random.default_rng(n + 1).random((at + n + 1, 2)).astype(np.float32)
-    values[at : at + 2, 0] = 0.0, np.nextafter(np.float32(1.0), np.float32(0.0))
-    points, single = wp.array(values, dtype=wp.vec2, device="cpu"), zeros(values.shape)
-
-    @kernel
-    def in_lanes(icdf: wp.array(dtype=wp.float32), points: wp.array(dtype=wp.vec2), n: int):
-        quantiles(icdf, points, at, n)
-
-    @kernel
-    def one_by_one(icdf: wp.array(dtype=wp.float32), values: wp.array2d(dtype=wp.float32), out: wp.array2d(dtype=wp.float32)):
-        i, k = wp.tid()
-        out[i, k] = quantile(icdf, values[i, k])
-
-    launch(in_lanes, 1, icdf, points, n)
-    launch(one_by_one, values.shape, icdf, wp.array(values, device="cpu"), single)
-    expected = np.concatenate([values[:at], single.numpy()[at : at + n], values[at + n :]])  # the others stay as they are
-    np.testing.assert_array_equal(points.numpy().view(np.int32), expected.view(np.int32))

@@ -36,11 +36,12 @@ def test_channels_go_to_numbers_of_texels_that_follow_one_another() -> None:
         fields = [rows.field(name) for name in texture.fields]
         assert [each.end for each in fields[:-1]] == [each.first for each in fields[1:]]
         assert fields[-1].end - fields[0].first == len(texture.channels) == len(texture.numbers)
-        assert list(texture.channels) == sorted(texture.channels, key="rgba".index)
+        assert texture.channels == sorted(texture.channels)
         seen += texture.fields
     assert sorted(seen) == sorted(fields_of(Texels))
-    assert TEXTURES["metallic_roughness_texture"].numbers == [(1, "texels.roughness"), (2, "texels.metallic")]
-    assert TEXTURES["albedo_texture"].numbers[1:3] == [(1, "texels.albedo[1]"), (2, "texels.albedo[2]")]
+    metallic_roughness, albedo = TEXTURES["metallic_roughness_texture"], TEXTURES["albedo_texture"]
+    assert metallic_roughness.channels == [1, 2] and metallic_roughness.numbers == ["texels.roughness", "texels.metallic"]
+    assert albedo.channels == [0, 1, 2, 3] and albedo.numbers[1:] == ["texels.albedo[1]", "texels.albedo[2]", "texels.alpha"]
 
 
 @pytest.mark.parametrize("name", SLOTS)

@@ -1,19 +1,15 @@
 """Texture look-ups against a slow float64 oracle."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from tests.kernel_tools import DEVICE, cpu_only, floats, ints, launch, vec2s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, ints, launch, vec2s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.core.device import upload
 from wrt.kernels import structs
-from wrt.kernels.loops.state import BLOCK
-from wrt.kernels.loops.wave_rows import ROWS, SURFACES
-from wrt.kernels.loops.wave_textures import sample_lanes
 from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.renderer.upload import TextureTable, srgb_table
@@ -178,52 +174,6 @@ def test_one_texel_picture():
         assert np.allclose(found, np.array([10, 20, 30, 40]) / 255.0, atol=1e-6)
 
 
-@kernel
-def lanes_kernel(surfaces: Surfaces, wanted: wp.array(dtype=wp.int32), first: int, count: int, channels: int,
-                 rows: wp.array(dtype=float)):
-    sample_lanes(surfaces, wanted, first, count, channels, rows, 0)
-
-
-def in_lanes(surfaces, index, uv, channels=15):
-    """(N, 4): the channels asked for, then NaN. Numbers behind the last are anything, as in a block that is not full."""
-    wanted, rows = np.full(2 * BLOCK, -1), np.full((ROWS, BLOCK), np.nan, np.float32)
-    wanted[BLOCK : BLOCK + len(uv)], rows[[SURFACES.field(name).first for name in "uv"], : len(uv)] = index, uv.T
-    out = floats(rows.ravel())
-    launch(lanes_kernel, 1, surfaces, ints(wanted), BLOCK, len(uv), channels, out)
-    return out.numpy().reshape(ROWS, BLOCK)[:4, : len(uv)].T
-
-
-@cpu_only
-@pytest.mark.parametrize("count", [1, 17, 64])
-def test_many_look_ups_in_lanes_are_those_one_by_one(count):
-    """Of several pictures, wrapped in every way, near and far away, and of none."""
-    rng = np.random.default_rng(count)
-    wraps = [(u, v) for u in ("repeat", "clamp", "mirror") for v in ("repeat", "clamp", "mirror")]
-    turned = np.array([[1.5, 0.25, -3.0], [0.125, -2.0, 0.5]])
-    textures = [Texture(picture(rng, 1 + i, 1 + 2 * i), srgb=i % 2 == 0, wrap=wrap) for i, wrap in enumerate(wraps)]
-    textures += [replace(texture, uv_transform=turned, srgb=not texture.srgb) for texture in textures]  # with the same pictures
-    surfaces = surfaces_with(textures)
-    for scale in (0.5, 1.5, 4.0, 1e3, 1e12):
-        for _ in range(20):
-            index, uv = rng.integers(-1, len(textures), count), rng.uniform(-scale, scale, (count, 2)).astype(np.float32)
-            uv[rng.random((count, 2)) < 0.05] = rng.choice([0.0, -0.0, 1.0, -1.0, np.nan, np.inf])
-            expected = look_up(textures, index, uv).astype(np.float32)
-            found = in_lanes(surfaces, index, uv)
-            same = (found.view(np.int32) == expected.view(np.int32)) | (np.isnan(found) & np.isnan(expected))
-            assert same.all(), (uv[~same.all(axis=1)], index[~same.all(axis=1)])
-
-
-@cpu_only
-def test_only_the_channels_that_are_asked_for_are_written():
-    rng = np.random.default_rng(3)
-    surfaces, uv = surfaces_with([Texture(picture(rng))]), rng.random((20, 2)).astype(np.float32)
-    expected = look_up([Texture(picture(np.random.default_rng(3)))], 0, uv)
-    for mask in (1, 6, 7, 8, 15):
-        found, asked = in_lanes(surfaces, 0, uv, mask), [channel for channel in range(4) if mask >> channel & 1]
-        np.testing.assert_array_equal(found[:, : len(asked)], expected[:, asked])
-        assert np.isnan(found[:, len(asked) :]).all()
-
-
 def test_the_table_of_plain_numbers_is_a_division():
-    """texture_lanes.h divides."""
+    """textures.h divides."""
     np.testing.assert_array_equal(srgb_table()[256:], np.arange(256, dtype=np.float32) / np.float32(255.0))

@@ -1,0 +1,76 @@
+// Samples in lanes: functions of sampling.py, under the same names and with the same bits. Loops that the compiler makes lanes of.
+#pragma once
+#include "layout.h"
+
+namespace wrt {
+
+static inline unsigned reverse_bits(unsigned x) {
+#if defined(__clang__)
+    return __builtin_bitreverse32(x);
+#else
+    x = ((x >> 1) & BITS_1) | ((x & BITS_1) << 1);
+    x = ((x >> 2) & BITS_2) | ((x & BITS_2) << 2);
+    x = ((x >> 4) & BITS_4) | ((x & BITS_4) << 4);
+    return __builtin_bswap32(x);
+#endif
+}
+
+static inline unsigned hash_u32(unsigned x) {
+    x ^= x >> 16;
+    x *= HASH_1;
+    x ^= x >> 15;
+    x *= HASH_2;
+    return x ^ (x >> 15);
+}
+
+static inline unsigned laine_karras(unsigned x, unsigned seed) {
+    x ^= x * LK_1;
+    x += seed;
+    x *= (seed >> 16) | 1;
+    x ^= x * LK_2;
+    return x ^ (x * LK_3);
+}
+
+static inline unsigned sobol_second(unsigned x) {
+    x ^= (x >> 1) & BITS_1;
+    x ^= (x >> 2) & BITS_2;
+    x ^= (x >> 4) & BITS_4;
+    x ^= (x >> 8) & BITS_8;
+    return x ^ (x >> 16);
+}
+
+static inline float unit_float(unsigned x) { return (float)(x >> 8) * UNIT; }
+
+// Points first, first + 1 ... of the sequence of sample_2d that has this seed (hash_pair(key, dimension)), both numbers of each after
+// one another. There must be room for LANES - 1 points more: they are computed and written too.
+static inline void sample_2d(unsigned seed, unsigned first, int count, float* to) {
+    const unsigned seed_x = hash_u32(seed ^ SEED_X), seed_y = hash_u32(seed ^ SEED_Y);
+    for (int j = 0; j < count; j += LANES) {
+        float points[2 * LANES];
+        for (int lane = 0; lane < LANES; ++lane) {
+            const unsigned i = reverse_bits(laine_karras(reverse_bits(first + j + lane), seed));
+            points[2 * lane] = unit_float(reverse_bits(laine_karras(i, seed_x)));
+            points[2 * lane + 1] = unit_float(reverse_bits(laine_karras(sobol_second(i), seed_y)));
+        }
+        __builtin_memcpy(to + 2 * j, points, sizeof(points));
+    }
+}
+
+// Each of `count` values in [0, 1) becomes its quantile; icdf: the inverse distribution, of `size` entries. The compiler cannot tell
+// where the table ends, so results go to `out` first: they cannot overwrite it.
+static inline void quantile(const float* icdf, int size, float* values, int count) {
+    for (int j = 0; j < count; j += LANES) {
+        const int n = count - j < LANES ? count - j : LANES;
+        float in[LANES] = {}, out[LANES];
+        __builtin_memcpy(in, values + j, sizeof(float) * n);
+        for (int lane = 0; lane < LANES; ++lane) {
+            const float position = in[lane] * (float)(size - 1);
+            const int whole = (int)position, i = whole < size - 2 ? whole : size - 2;
+            const float t = position - (float)i;
+            out[lane] = icdf[i] * (1.0f - t) + icdf[i + 1] * t;
+        }
+        __builtin_memcpy(values + j, out, sizeof(float) * n);
+    }
+}
+
+}  // namespace wrt

@@ -1,2 +1,0 @@
-    alignas(TYPE) char memory[sizeof(TYPE)];
-    return *(TYPE*)memory;
