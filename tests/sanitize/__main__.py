@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.data import ROOT
+from tests.sanitize import shading
 from tests.sanitize.cases import write_cases
+from wrt.kernels.shade import headers as shading_headers
 from wrt.kernels.wide.layout import LAYOUT_H
 
 HERE = Path(__file__).parent
@@ -37,7 +39,10 @@ class Program(NamedTuple):
     write_cases: Callable[[Path], None]
 
 
-PROGRAMS = (Program("walks.cpp", "wide", LAYOUT_H, write_cases),)
+PROGRAMS = (
+    Program("walks.cpp", "wide", LAYOUT_H, write_cases),
+    Program("shading.cpp", "shade", shading_headers.LAYOUT_H, shading.write_cases),
+)
 
 
 def compile_program(compiler: str, program: Program, folder: Path, *flags: str) -> Path:
