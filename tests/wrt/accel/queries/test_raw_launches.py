@@ -19,7 +19,7 @@ from tests.data import ROOT
 from tests.kernel_tools import cpu_only  # isort: skip
 import warp as wp
 
-from wrt.accel.queries import raw_launches
+from wrt.accel.queries import batches, raw_launches
 from wrt.core import warp_private
 from wrt.core.device import made_once, start
 from wrt.core.errors import InputError
@@ -75,6 +75,7 @@ def not_tested(monkeypatch: pytest.MonkeyPatch) -> None:
     start("cpu")
     raw_launches.check_raw_launches()
     monkeypatch.setattr(raw_launches, "_test_once", made_once(raw_launches._test_once.__wrapped__))
+    monkeypatch.setattr(batches, "tracer", made_once(batches.Tracer))  # the others have workers that were tested
 
 
 def query() -> Any:
