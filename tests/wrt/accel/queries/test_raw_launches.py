@@ -165,6 +165,7 @@ def test_a_write_beside_the_array_is_seen(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.usefixtures("not_tested")
 def test_a_query_and_a_picture_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(raw_launches, "_launches_itself", lambda *arrays: False)
+    monkeypatch.setattr(batches, "tracer", made_once(batches.Tracer))  # without workers of earlier queries
     scene = wrt.load_scene(ROOT / "scenes" / "whitted.toml")
     for ask in (query, lambda: wrt.render(scene, size=(8, 8), spp=1)):
         with pytest.raises(InputError, match="launches by kernels"):
