@@ -2,7 +2,7 @@
 
 A thread follows a camera ray with all that comes of it: it traces, shades (shade/step.py), and pushes the new paths on a small
 stack of its own. A GPU hides the waits of one thread behind thousands of others. A CPU cannot: there wave.py traces and shades the
-rays of many samples together, 2.3 to 4.3 times as fast. Both take the step and the follow-up from kernels/shade, and a sample's
+rays of many samples together, 1.5 to 4.3 times as fast. Both take the step and the follow-up from kernels/shade, and a sample's
 paths in one order. So their films have the same bits: tests/wrt/renderer/test_waves.py, of random scenes
 tests/test_random_scenes.py.
 """

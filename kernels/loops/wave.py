@@ -7,12 +7,12 @@ counted; it says why there are two. Each sample goes through its own paths in th
 order. So pictures have the same bits: tests/wrt/renderer/test_waves.py, and of random scenes tests/test_random_scenes.py.
 
 trace_wave is a single launch to Python. In a wave it launches, in this order:
-1. for FRESH camera rays at a time, while they are in the cache: begin_wave (wave_begin.py), closest_hit (wrt.kernels.wide), and
-   shade_wave (wave_shade.py), which puts new paths and shadow rays aside;
+1. for FRESH camera rays at a time, while they are in the cache: begin_wave (wave_begin.py), closest_hit (wide/batch.py, or query.py
+   where a structure has no batches), and shade_wave (wave_shade.py), whose push_paths puts new paths and shadow rays aside;
 2. until no path waits: the shadow rays to each light, and `gather` for what they let through; closest_hit and shade_wave of one
    path of each sample.
-Then the samples go to the film. Each kernel is one thread with a loop over its queue: it counts without atomics, and reads its
-arguments once. Traversal and shading are kernels of their own: another scene compiles no traversal.
+Then the samples go to the film. Each kernel but query.py's is one thread with a loop over its queue: it counts without atomics, and
+reads its arguments once. Traversal and shading are kernels of their own: another scene compiles no traversal.
 
 For many hits at a time, surfaces are in wave_surfaces.py, textures in wave_textures.py, normals in wave_normals.py, random numbers
 in wave_numbers.py, and lights in wave_lights.py; wave_rows.py has what they hand to each other.

@@ -3,7 +3,8 @@
 A path is cut behind max_depth bounces, behind MAX_TRANSPARENT surfaces in a row that it went straight through, or below
 min_throughput. So is every path of a sample that has traced MAX_RAYS: where throughput cuts nothing, a tree of 64 levels has no
 end.
-The loops (kernels/loops) push the paths that are FOLLOWED, in the order onward, reflected, refracted, and trace the last one first.
+A ray that hits nothing ends in the loops (kernels/loops: one_ray.py, wave_shade.py), which add the background.
+They push the paths that are FOLLOWED, in the order onward, reflected, refracted, and trace the last one first.
 """
 
 from typing import Any

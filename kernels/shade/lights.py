@@ -1,4 +1,5 @@
-"""Light kinds: one sample of what arrives from a light at a surface. One function a kind, and a row in LIGHTS."""
+"""Light kinds: one sample of what arrives from a light at a surface. One function a kind, and a row in LIGHTS; what a light is
+stands in wrt/scene/lights.py. docs/extending.md, "A light", adds one."""
 
 from typing import Any
 
@@ -212,8 +213,8 @@ LIGHTS = {
 }
 
 
-# Those that have one sample alone, for which no xi is drawn.
-WITHOUT_AREA = ("point", "directional", "spot")
+# Those that have one sample alone, for which no random numbers are drawn. A kind of another module adds its name.
+WITHOUT_AREA = {"point", "directional", "spot"}
 
 
 # --- any of them ------------------------------------------------------------------------------------------------------

@@ -5,8 +5,9 @@ for each of its two corners. Planes are tested as (plane - origin) * inv_dir: th
 saves an operation and loses rays by cancellation. RAY_AABB is the table of the tests there are.
 
 **What runs.** This file takes one box and one ray, in all structures but bvh4, bvh8 and bvh8c. There a ray tests the children of a
-node together (kernels/wide/nodes.py), and rays in arrays on a CPU run kernels/wide/box.h. tests/kernels/wide/test_lanes.py and
-tests/kernels/wide/test_packets.py hold both to this file (kernels/README.md has it all).
+node together (kernels/wide/nodes.py), on a CPU by kernels/wide/box.h. tests/kernels/wide/test_lanes.py: these enter every box that
+this file enters, at the same distance. tests/kernels/wide/test_packets.py: packets have their bits. kernels/README.md has the whole
+table.
 """
 
 import warp as wp

@@ -5,9 +5,10 @@ sheared so that the ray becomes the z axis, and three signed areas around the or
 edge compute the same area with opposite sign, so that no ray passes between them. The other tests are here to be compared with
 it: RAY_TRIANGLE is the table of all. A test takes the ray's set-up and one record, and gives a `Hit` on the whole line.
 
-**What runs.** This file takes one triangle and one ray: on CUDA, where rays are counted, in kernels of users, and in all structures
-but bvh4, bvh8 and bvh8c. Rays in arrays through those, on a CPU, run its steps in lanes, kernels/wide/triangle.h, in half of the
-time. tests/kernels/wide/test_packets.py holds the two to the same bits (kernels/README.md has it all).
+**What runs.** This file takes one triangle and one ray. It runs everywhere but in two places on a CPU: closest_hit and any_hit of
+arrays through bvh8 (the default), and pictures through it. Those run the same steps in lanes, kernels/wide/triangle.h, and
+tests/kernels/wide/test_packets.py holds both to the same bits. The one-ray walk of bvh4, bvh8 and bvh8c drops triangles that the
+ray misses by far in lanes (wide/lanes.py), and asks this file about the others. kernels/README.md has the whole table.
 """
 
 from typing import Any, NamedTuple

@@ -1,10 +1,11 @@
 """Nodes of wide BVHs: the boxes of all children against one ray, as rows of lanes.
 
-Two layouts in a flat array of float32. Plain, 8 rows of `width` numbers: the six planes (PLANES), the references of the children
-(int32), and one that is not used, so that nodes begin where cache lines do. Compressed (Ylitie, Karras and Laine 2017, section
-3.2): an origin (3 numbers), a word of three exponents and the mask of the children that exist, six rows of `width` bytes, and the
-references; a plane is origin + byte * 2^(exponent - 127), rounded once, and the builder takes care that it is never inside of the
-box. An origin that is NaN says nothing about its axis: no ray is stopped there.
+Two layouts in a flat array of float32; layout.py has the constants. Plain (64 numbers a node of bvh8), 8 rows of `width` numbers:
+the six planes (PLANES), the references of the children (int32), and one that is not used, so that nodes begin where cache lines do.
+Compressed (24 numbers a node of bvh8c; Ylitie, Karras and Laine 2017, section 3.2): an origin (3 numbers), a word of three
+exponents and the mask of the children that exist, six rows of `width` bytes, and the references; a plane is origin + byte *
+2^(exponent - 127), rounded once, and the builder takes care that it is never inside of the box. An origin that is NaN says nothing
+about its axis: no ray is stopped there.
 """
 
 from functools import cache
