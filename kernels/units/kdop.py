@@ -8,13 +8,15 @@ Projections are taken from a point in the middle of everything, so that their ro
 import warp as wp
 
 from wrt.kernels.structs import Ray
-from wrt.kernels.units.box import FAR_PAD, BoxRay, slab_interval
+from wrt.kernels.units.box import FAR_PAD, PAD_SMALLEST, BoxRay, slab_interval
 
 # In units of 2^-24. What a projected plane may be off by, of the sum of the origin's coordinates: 9 for where the triangle unit
 # sees the corners along the ray (3 of the distance in each coordinate), 3 for the direction's projection, 2 for the origin's,
 # 3 for the distance to the plane and 6 for its comparison with those to the box: less than 32. And so much of the
 # primitive's own coordinates, with 33 more for its extent (5 of it in each coordinate) and its projections: less than 64.
 RAY_PAD = wp.constant(2.0**-19)
+# What underflows may put each of three coordinates off by box.PAD_SMALLEST, whatever their size.
+RAY_PAD_SMALLEST = wp.constant(4.0 * PAD_SMALLEST)
 KDOP_PAD = 2.0**-18
 
 
@@ -43,7 +45,7 @@ def kdop_ray(ray: Ray, box: BoxRay, middle: wp.vec3) -> KdopRay:
     out.box = box
     out.origin = project(origin)
     out.inv_dir = wp.vec4(1.0 / direction[0], 1.0 / direction[1], 1.0 / direction[2], 1.0 / direction[3])
-    out.pad = RAY_PAD * (wp.abs(origin[0]) + wp.abs(origin[1]) + wp.abs(origin[2]))
+    out.pad = RAY_PAD * (wp.abs(origin[0]) + wp.abs(origin[1]) + wp.abs(origin[2])) + RAY_PAD_SMALLEST
     return out
 
 
