@@ -158,12 +158,15 @@ def walk_down(links: Any) -> Any:
 
 
 def with_leaves(tree: BinaryTree, links: np.ndarray, walk: Any) -> BinaryTree:
-    """The links as a tree, with the leaves of the one that they were made of."""
+    """The links as a tree, with the leaves of the one that they were made of. Records of a subtree stand next to each other."""
     n_inner, order = len(tree.nodes), walk.order.numpy()
-    begins, counts = np.zeros((2, len(links)), np.int32)
-    begins[n_inner:] = np.flatnonzero(leaf_begins(tree))
-    counts[n_inner:] = np.diff(begins[n_inner:], append=len(tree.order))
-    return BinaryTree(nodes_of(links, order[order < n_inner], begins, counts), tree.order, int(walk.depth.numpy()[0]))
+    before, begins, counts = np.zeros((3, len(links)), np.int32)
+    before[n_inner:] = np.flatnonzero(leaf_begins(tree))
+    counts[n_inner:] = np.diff(before[n_inner:], append=len(tree.order))
+    leaves = order[order >= n_inner]
+    begins[leaves] = np.cumsum(counts[leaves]) - counts[leaves]
+    at = np.arange(len(tree.order)) + np.repeat(before[leaves] - begins[leaves], counts[leaves])
+    return BinaryTree(nodes_of(links, order[order < n_inner], begins, counts), tree.order[at], int(walk.depth.numpy()[0]))
 
 
 def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: np.ndarray) -> np.ndarray:

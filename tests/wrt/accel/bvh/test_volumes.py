@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from tests.kernels.traverse.test_common import GEOMETRIES
+from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.bvh.kdop_area import kdop_area
 from wrt.accel.bvh.volumes import cuts, project
 from wrt.accel.geometry import Geometry
@@ -31,10 +32,18 @@ def below(nodes: np.ndarray, order: np.ndarray) -> list[tuple[int, str, np.ndarr
     return out
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("builder", ["binned", "sbvh"])
+def of_all_sizes(rng: np.random.Generator) -> Geometry:
+    """Triangles of which the builder refined moves some."""
+    n = 2000
+    corners = rng.uniform(-1.0, 1.0, (n, 1, 3)) + rng.uniform(-1.0, 1.0, (n, 3, 3)) * 10.0 ** rng.uniform(-3.0, 0.0, (n, 1, 1))
+    faces = np.arange(3 * n, dtype=np.int32).reshape(-1, 3)
+    return Geometry(corners.reshape(-1, 3).astype(np.float32), faces, np.zeros((0, 4), np.float32))
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "of_all_sizes"])
+@pytest.mark.parametrize("builder", BVH_BUILDERS)
 def test_spheres_hold_the_boxes_below_them(kind: str, builder: str) -> None:
-    geometry = GEOMETRIES[kind](np.random.default_rng(1))
+    geometry = {**GEOMETRIES, "of_all_sizes": of_all_sizes}[kind](np.random.default_rng(1))
     accel = build(geometry, "bvh2_sphere", builder=builder)
     lo, hi = (b.astype(np.float64) for b in geometry.bounds())
     nodes = accel.built.arrays["nodes"]
@@ -135,6 +144,20 @@ def test_planes_beyond_float32_keep_nothing_out() -> None:
     geometry = Geometry(corners, np.array([[0, 1, 2]], np.int32), np.zeros((0, 4), np.float32))
     lo, hi = cuts(geometry, np.array([-3e38, -3e38, -3e38], np.float32))
     assert (lo == -np.inf).all() and (hi == np.inf).all()
+
+
+@pytest.mark.parametrize("name", ["bvh2_sphere", "bvh2_kdop"])
+def test_denormal_meshes_are_hit_as_by_brute_force(name: str) -> None:
+    rng = np.random.default_rng(2)
+    corners = rng.integers(-90, 91, (300, 3)) * np.float32(2.0**-149)
+    geometry = Geometry(corners.astype(np.float32), rng.integers(0, 300, (100, 3)).astype(np.int32), np.zeros((0, 4), np.float32))
+    origins = (rng.integers(-90, 91, (2000, 3)) * np.float32(2.0**-149)).astype(np.float32)
+    directions = corners[rng.integers(0, 300, 2000)] - origins
+    directions[~directions.any(axis=1)] = 1.0
+    expected, hits = (build(geometry, each).closest_hit(origins, directions) for each in ("brute_force", name))
+    assert (expected.prim_id >= 0).mean() > 0.5
+    np.testing.assert_array_equal(hits.t, expected.t)
+    np.testing.assert_array_equal(hits.prim_id, expected.prim_id)
 
 
 @pytest.mark.parametrize("name", ["bvh2_sphere", "bvh2_kdop"])
