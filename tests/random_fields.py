@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from wrt.core.checks import LARGEST
 from wrt.core.errors import InputError
 from wrt.scene.kinds import Limits, forms
 from wrt.scene.materials import WRAPS, Texture
@@ -41,44 +42,42 @@ def angle(group: Rng, limits: Limits) -> Draw:
 
 
 def color(group: Rng, limits: Limits) -> Draw:
-    """Not black; one channel is often 0."""
+    """Not black; one channel is often 0. Where there is no limit, it is sometimes the brightest there is."""
     most = min(limits.get("le", 3.0), 3.0)
 
     def draw(rng: Rng) -> np.ndarray:
         out = most * rng.uniform(0.05, 1.0, 3)
         if rng.random() < 0.3:
             out[rng.integers(3)] = 0.0
-        return out
+        return out / out.max() * LARGEST if "le" not in limits and rng.random() < 0.04 else out
 
     return draw
 
 
 def image(group: Rng, limits: Limits) -> Draw:
-    """A few bright pixels among dark and black ones."""
+    """A few bright pixels among dark and black ones, sometimes so bright that sums are infinite."""
 
     def draw(rng: Rng) -> np.ndarray:
         out = 2.0 * rng.random((rng.integers(1, 8), rng.integers(1, 12), 3)) ** 4
         out[rng.random(out.shape[:2]) < 0.2] = 0.0
-        out[rng.integers(len(out)), rng.integers(out.shape[1])] = 3.0
+        out[rng.integers(len(out)), rng.integers(out.shape[1])] = 3e38 if rng.random() < 0.1 else 3.0
         return out.astype(np.float32)
 
     return draw
 
 
-def picture(rng: Rng, srgb: bool, wrap: tuple[str, str]) -> Texture:
-    """Of few pixels, whose alpha is mostly 0 or 255; mapped by any affine map."""
+def picture(rng: Rng) -> Texture:
+    """Of few pixels, whose alpha is mostly 0 or 255; mapped by any affine map, sometimes so that no number tells where."""
     pixels = rng.integers(0, 256, (*rng.integers(1, 9, 2), 4), dtype=np.uint8)
     ends = rng.random(pixels.shape[:2]) < 0.6
     pixels[ends, 3] = rng.choice([0, 255], ends.sum())
-    return Texture(pixels, srgb, wrap, uv_transform=rng.normal(0.0, 2.0, (2, 3)))
+    matrix = rng.normal(0.0, 2.0, (2, 3)) * (10.0 ** rng.uniform(3.0, 15.0) if rng.random() < 0.1 else 1.0)
+    return Texture(pixels, bool(rng.random() < 0.5), tuple(rng.choice(WRAPS, 2)), matrix)
 
 
 def texture(group: Rng, limits: Limits) -> Draw:
     kind = limits["among"][group.integers(len(limits["among"]))]
-    if kind is not Texture:
-        return sketch(group, kind)
-    srgb, wrap = bool(group.random() < 0.5), tuple(group.choice(WRAPS, 2))
-    return lambda rng: picture(rng, srgb, wrap)
+    return picture if kind is Texture else sketch(group, kind)
 
 
 def fixed(value: Any) -> Draw:

@@ -165,7 +165,7 @@ def plan_of_scene(number: int, seed: int) -> Plan:
     size, far = (1.0, 0.0) if rng.random() < 0.6 else (10.0 ** rng.uniform(-3.0, 3.0), 100.0)
     world = np.diag([size, size, size, 1.0])
     world[:3, 3] = size * far * rng.normal(size=3)
-    materials = [draw(rng) for draw in group.materials]
+    materials = [replace(draw(rng), two_sided=bool(rng.random() < 0.5)) for draw in group.materials]
     meshes = [mesh_of(rng, *each) for each in group.meshes]
     objects = tuple(object_of(rng, placed, meshes[placed.mesh], materials, world) for placed in group.objects)
     spheres = tuple(Sphere(world[:3, :3] @ rng.normal(0.0, 1.0, 3) + world[:3, 3], size * rng.uniform(0.2, 1.5), materials[i])

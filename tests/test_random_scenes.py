@@ -13,8 +13,8 @@ from wrt.scene.kinds import FORMS, forms
 from wrt.scene.settings import Settings
 
 # Together they have all that there is. Where a new row of a table or a new switch is in none of them, take other groups.
-GROUPS = 14, 16, 19, 45
-SCENES = 25  # of each
+GROUPS = 15, 28, 45, 140, 146
+SCENES = 20  # of each
 
 
 def test_every_form_of_a_field_is_drawn() -> None:
@@ -37,7 +37,7 @@ def test_the_groups_have_all_that_there_is() -> None:
 def test_both_loops_give_the_same_bits(group: int) -> None:
     outcomes = [render(group, seed) for seed in range(SCENES)]
     assert {seed: outcome.differ for seed, outcome in enumerate(outcomes) if outcome.differ} == {}
-    assert sum(map(is_lit, outcomes)) > SCENES / 2 and any(map(goes_on, outcomes))  # there is something to differ
+    assert sum(map(is_lit, outcomes)) > SCENES / 4 and any(map(goes_on, outcomes))  # there is something to differ
 
 
 def is_lit(outcome: Outcome) -> bool:
