@@ -12,7 +12,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
 Check = Callable[[int, int], str]  # of a group and a seed: what differs
-GROUPS_EACH = 8  # that a process takes before another does: each leaves its kernels in memory
 
 
 def checked(check: Check, group: int, seed: int) -> str:
@@ -23,10 +22,10 @@ def checked(check: Check, group: int, seed: int) -> str:
         return traceback.format_exc()
 
 
-def checked_group(check: Check, group: int, count: int) -> list[tuple[int, str]]:
-    """The seeds below `count` that differ, and in what."""
+def checked_group(check: Check, group: int, count: int) -> tuple[int, int, list[tuple[int, str]]]:
+    """The group, the number of its cases, and the seeds that differ, and in what."""
     found = ((seed, checked(check, group, seed)) for seed in range(count))
-    return [(seed, what) for seed, what in found if what]
+    return group, count, [(seed, what) for seed, what in found if what]
 
 
 def main(about: str, check: Check, per_group: int) -> None:
@@ -45,14 +44,14 @@ def main(about: str, check: Check, per_group: int) -> None:
 def run(check: Check, per_group: int, options: argparse.Namespace) -> int:
     """How many cases differ."""
     begin, done, wrong = time.monotonic(), 0, 0
-    counts = [min(per_group, options.count - first) for first in range(0, options.count, per_group)]
-    with ProcessPoolExecutor(options.workers, get_context("spawn"), max_tasks_per_child=GROUPS_EACH) as pool:
-        jobs = {pool.submit(checked_group, check, options.seed + i, count): i for i, count in enumerate(counts)}
-        for job in as_completed(jobs):
-            i = jobs[job]
-            for seed, what in job.result():
-                wrong += 1
-                print(f"differs: --only {options.seed + i} {seed}: {what}", flush=True)
-            done += counts[i]
+    jobs = [(check, options.seed + i, min(per_group, options.count - first))
+            for i, first in enumerate(range(0, options.count, per_group))]
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+        for job in as_completed([pool.submit(checked_group, *each) for each in jobs]):
+            group, count, found = job.result()  # raises where a process has crashed
+            wrong += len(found)
+            for seed, what in found:
+                print(f"differs: --only {group} {seed}: {what}", flush=True)
+            done += count
             print(f"{done} of {options.count} cases, {wrong} differ, {time.monotonic() - begin:.0f} s", flush=True)
     return wrong

@@ -1,4 +1,5 @@
-"""More than a hundred random scenes have the same bits by both loops of the renderer. Ten thousand: `python -m tests.random_scenes`."""
+"""More than a hundred random scenes have the same bits by both loops of the renderer. Ten thousand:
+`python -m tests.random_scenes`."""
 
 from __future__ import annotations
 
