@@ -284,8 +284,8 @@ def asked(accel: Any, rays: Rays, way: Way, world: np.ndarray | None) -> tuple[A
     return hits, occluded.numpy() if isinstance(occluded, wp.array) else occluded
 
 
-# Where there is a kernel for many rays at a time, each case tries all; elsewhere this share of them.
-ALL_WAYS, SOME_WAYS = ("bvh8",), 0.4
+# Where there is a kernel for many rays at a time, each case tries all ways; of the other structures, and of their ways, this share.
+ALL_WAYS, SOME = ("bvh8",), 0.4
 FIELDS = "t", "u", "v", "prim_id"
 
 
@@ -406,11 +406,13 @@ def problems(number: int, seed: int, scope: Scope) -> Iterator[str]:
     crossings = bool(rng.random() < 0.3 and np.isfinite(getattr(case.given, "vertices", np.nan)).all())
     lists = [all_hits(brute, rays, crossings) for rays, _ in sets] if over == "plain" and scope.listing else []
     for name in scope.structures:
+        if name not in ALL_WAYS and rng.random() >= SOME:
+            continue
         with np.errstate(invalid="ignore"):  # of faces that are not finite
             accel = built(rng, name, case)
         for which, (rays, expected) in enumerate(sets):
             for way, how in WAYS.items():
-                if (name in scope.counting if how.counters else name in ALL_WAYS or rng.random() < SOME_WAYS):
+                if (name in scope.counting if how.counters else name in ALL_WAYS or rng.random() < SOME):
                     for what in differences(accel, rays, case.world, expected, how):
                         yield f"{name} over {over}, rays {which}, {way}: {what}"
             if over == "plain" and name in scope.listing and not same_bits(all_hits(accel, rays, crossings), lists[which]):
