@@ -23,8 +23,8 @@ _whole: set[Path] = set()  # folders of headers that this process has looked at
 def shared_headers(key: str, precompile: Callable[[Path], None], leftover: re.Pattern[str]) -> Path:
     """Return the folder of precompiled headers of that name. Raises OSError where it cannot be made.
 
-    All threads share it, and all processes of a user: Warp's headers take 1.3 s of processor time, and a process that compiles has
-    some six threads that do. precompile: writes them to a folder. Headers that nobody has used for a day are removed, and so are
+    All threads and processes of a user share it: Warp's headers take 1.3 s of processor time, and about six threads of a process
+    compile. precompile: writes them to a folder. Headers that nobody has used for a day are removed, and so are
     other folders of the cache whose names match `leftover`.
     """
     folder = Path(wp.config.kernel_cache_dir) / f"precompiled-{key}"

@@ -1,9 +1,8 @@
 """The only file of the host that names Warp's insides: private names, layouts of arguments, texts, names of files, its compiler.
 (kernels/warp_private.py is that of device code.)
 
-All of it was read in Warp 1.19 (WORKS_WITH). `prepare`, which runs when Warp has started, and the self-test of
-wrt.accel.queries.raw_launches refuse a Warp with other insides. docs/warp.md, "When Warp changes", lists each assumption, the test
-that shows it, and the order of repair."""
+All of it was read in Warp 1.19 (WORKS_WITH). A Warp with other insides is refused: by `prepare`, which runs when Warp has started,
+or by the self-test in wrt.accel.queries.raw_launches. docs/warp.md lists each assumption, its test, and the order of repair."""
 
 from __future__ import annotations
 
@@ -81,8 +80,9 @@ def row_type(kind: Any) -> np.dtype[Any]:
 
 
 class Recorded(NamedTuple):
-    """Addresses of a launch on the CPU. The machine code at `entry` is a C function of two addresses: `bounds`, the size of the
-    launch, and `args`, all arguments in a C struct, of which `last` is the last one. keeps: what the addresses lead to."""
+    """Addresses of a launch on the CPU. The machine code at `entry` is a C function of two addresses, `bounds` and `args`.
+
+    bounds: the size of the launch. args: a C struct of all arguments; last: the last one of them. keeps: what owns that memory."""
 
     entry: int
     bounds: int
@@ -132,7 +132,7 @@ def _is_ours(function: Any) -> bool:
 
 
 def short_name(kernel: Any) -> str:
-    """Return the name of a kernel's function, without those that it is nested in."""
+    """Return the name of a kernel's function, without the names of the functions around it."""
     return str(kernel.key).rsplit("__", 1)[-1]
 
 
