@@ -23,7 +23,6 @@ from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.flatten import world_of
 from wrt.accel.scenes.instancing import instanced_meshes
-from wrt.core.errors import InputError
 from wrt.kernels.query import HitArrays, RayArrays, put_hit
 from wrt.kernels.warp_private import fields_of
 from wrt.scene import shapes
@@ -379,14 +378,10 @@ def options_of(rng: Rng, name: str) -> dict[str, Any]:
 def built(rng: Rng, name: str, case: Case) -> Any:
     """A structure over what the case gives, sometimes by a refit."""
     options = options_of(rng, name)
-    if case.before is not None:
+    if case.before is not None and wrt.ACCELERATORS[name].can_refit:
         accel = wrt.build(replace(case.given, vertices=case.before), name, threads=1, **options)
-        try:
-            accel.refit(case.given.vertices)
-        except InputError:  # not of its kind
-            pass
-        else:
-            return accel
+        accel.refit(case.given.vertices)
+        return accel
     return wrt.build(case.given, name, threads=1, **options)
 
 
