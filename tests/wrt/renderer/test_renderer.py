@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 import signal
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from time import sleep
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,12 @@ def same(a: Film, b: Film) -> bool:
     return (np.array_equal(a.pixels, b.pixels) and np.array_equal(a.variance, b.variance)
             and np.array_equal(a.samples, b.samples) and a.aov.keys() == b.aov.keys()
             and all(np.array_equal(a.aov[name], b.aov[name]) for name in a.aov))
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60.0
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.01)
 
 
 def counts(film: Film) -> list[Any]:
@@ -341,7 +347,7 @@ def test_ctrl_c_while_compiling_does_not_wait_for_the_compiler(monkeypatch: pyte
 
     def compile_for_ever(kernel: Any, device: Any) -> None:
         if next(first, False):
-            sleep(0.2)  # until the main thread waits
+            time.sleep(0.2)  # until the main thread waits
             signal.raise_signal(signal.SIGINT)
         may_end.wait(10.0)
         ended.set()
@@ -482,7 +488,8 @@ def test_depth_is_the_distance_along_the_ray_and_normals_face_it() -> None:
 
 def test_progress_is_told_once_of_a_compiler_that_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
     def slow(kernel: Any, device: Any) -> None:
-        sleep(0.5)
+        wait_until(lambda: len([each for each in seen if each.stage == "compile"]) > quick)
+        time.sleep(0.3)  # long enough for another report, were there one
         load(kernel, device)
 
     load = prepare.load_kernel
@@ -498,9 +505,9 @@ def test_progress_is_told_once_of_a_compiler_that_takes_long(monkeypatch: pytest
 
 def test_progress_is_told_of_a_structure_that_is_slow_to_build(monkeypatch: pytest.MonkeyPatch) -> None:
     def slow(geometry: Any, accel: str, device: str, threads: int, *, progress: Any, **options: Any) -> Any:
-        for fraction in (0.25, 0.5, 1.0):
-            progress(fraction)
-            sleep(0.3)
+        for percent in (25, 50, 100):
+            progress(percent / 100)
+            wait_until(lambda: any(each.stage == "build" and each.done == percent for each in seen))  # noqa: B023
         return make(geometry, accel, device, threads, **options)
 
     make = prepare.build
