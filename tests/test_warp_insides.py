@@ -82,7 +82,7 @@ def test_insides_of_warp_are_named_in_their_files_only(path: Path) -> None:
 @pytest.mark.parametrize("path", [path for path in VIRTUAL_GPU if path.name != "warp_private.py" and "test_" not in path.name],
                          ids=lambda path: path.name)
 def test_the_virtual_gpu_imports_no_private_module_elsewhere(path: Path) -> None:
-    """(Warp's C functions, which it replaces, are its driver's methods.)"""
+    """Except Warp's C functions: the virtual GPU's driver has methods in their place."""
     assert [each for each in insides(path.read_text()) if each.startswith("warp.") or "." in each] == []
 
 

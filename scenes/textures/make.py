@@ -1,4 +1,4 @@
-"""Makes the images of the scenes beside it, all from formulas: python scenes/textures/make.py"""
+"""Make the images beside this file from formulas: `python scenes/textures/make.py`."""
 
 from __future__ import annotations
 

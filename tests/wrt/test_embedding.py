@@ -115,8 +115,10 @@ def test_threads_that_outlive_the_main_thread_are_answered(expected: str) -> Non
 
 
 def test_arrays_of_structs_are_made_and_read_without_parsing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """CPython 3.11 raises SystemError where two threads parse at a time, which NumPy does for the layout of a struct. (Kernels are
-    made under a lock.)"""
+    """NumPy parses the layout of a struct, and two threads that parse at once make CPython 3.11 raise SystemError.
+
+    Kernels are made under a lock.
+    """
     def work() -> None:
         for name in wrt.ACCELERATORS:
             accel = wrt.build((BALL.vertices, BALL.faces), name)
