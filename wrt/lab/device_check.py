@@ -195,8 +195,7 @@ def speed_rows(plan: Check) -> tuple[list[Row], str]:
     """wrt's structures beside Warp's own query with each constructor that the device has (without any there are no rows), and
     what was skipped and why."""
     geometry, device = Geometry.of(terrain(TIMED_CELLS)), start(plan.device)
-    everybody: dict[str, Any] = {f"wrt {name}": Own(structure=name, device=plan.device) for name in structures()
-                                 if name != "brute_force"}
+    everybody: dict[str, Any] = {f"wrt {name}": Own(structure=name, device=plan.device) for name in structures() if name != "brute_force"}
     skipped, warps = [], dict[str, Any]()
     for constructor in CONSTRUCTORS:
         warp = WarpMesh(plan.device, constructor)

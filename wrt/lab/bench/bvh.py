@@ -182,5 +182,4 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
 
 
 def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
-    return {name: [row.as_dict() for row in rows if columns(row) is kind]
-            for name, kind in (("builders", BUILDERS), ("volumes", VOLUME))}
+    return {name: [row.as_dict() for row in rows if columns(row) is kind] for name, kind in (("builders", BUILDERS), ("volumes", VOLUME))}

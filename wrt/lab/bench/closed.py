@@ -30,8 +30,7 @@ from wrt.scene.shapes import box, icosphere, lathe, merged, teapot, torus, tube
 CHUNK = 1 << 18
 AT_EDGE = 2.0**-23  # by which float32 may have a weight beside 0
 # Along which points are aimed at corners: the first direction of wrt.contains, trimesh's and Open3D's only one, and an axis.
-AIMS = np.array([np.random.default_rng(0).normal(size=3), [0.4395064455, 0.617598629942, 0.652231566745], [1.0, 1.0, 1.0],
-                 [0.0, 0.0, 1.0]])
+AIMS = np.array([np.random.default_rng(0).normal(size=3), [0.4395064455, 0.617598629942, 0.652231566745], [1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
 TITLE = "Closed meshes: points inside, and crossings"
 COLUMNS: Columns = {"what": "{what}", "mesh": "{mesh}", "triangles": "{triangles}", "who": "{who}", "asked": "{asked}",
                     "wrong": "{wrong}", "touching": "{touching}", "us each": "{microseconds:.2f}"}
@@ -82,8 +81,7 @@ def asked(plan: Plan, n: int) -> Iterator[tuple[str, int]]:
 # --- points -----------------------------------------------------------------------------------------------------------
 
 
-def points_wrong(geometry: Geometry, reference: Reference, answer: Callable[[np.ndarray], np.ndarray], n: int,
-                 seed: int) -> dict[str, Any]:
+def points_wrong(geometry: Geometry, reference: Reference, answer: Callable[[np.ndarray], np.ndarray], n: int, seed: int) -> dict[str, Any]:
     rng, wrong, touching, seconds = np.random.default_rng(seed), 0, 0, 0.0
     for first in range(0, n, CHUNK):
         points = points_in(geometry, rng, min(CHUNK, n - first))
@@ -216,8 +214,7 @@ def trimesh_answers(module: str, geometry: Geometry) -> tuple[Callable[..., Any]
 
     mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)
     rays = importlib.import_module(f"trimesh.ray.{module}").RayMeshIntersector(mesh)
-    return rays.contains_points, lambda origins, directions: np.bincount(
-        rays.intersects_id(origins, directions)[1], minlength=len(origins))
+    return rays.contains_points, lambda origins, directions: np.bincount(rays.intersects_id(origins, directions)[1], minlength=len(origins))
 
 
 # By name: the package that it needs, and its answers for a geometry.

@@ -158,8 +158,7 @@ def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int]
     n, settings = len(films), variant.scene.settings
     seconds = np.array([film.stats["seconds"]["trace"] for film in films])
     products = statistics.gram([film.pixels for film in films], truth.pixels)
-    compared = [metrics.compare(film.pixels, truth.pixels, exposure=settings.exposure, tonemap=settings.tonemap)
-                for film in films]
+    compared = [metrics.compare(film.pixels, truth.pixels, exposure=settings.exposure, tonemap=settings.tonemap) for film in films]
 
     def mse(indices: np.ndarray) -> float:
         return statistics.mse_of(products[np.ix_(indices, indices)], truth.variance)

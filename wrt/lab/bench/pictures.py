@@ -63,5 +63,4 @@ def row_of(name: str, ways: dict[str, Prepared], plan: Plan) -> Row:
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
     mean = np.exp(np.mean(np.log([row.ratio_median for row in rows])))
-    return [Part(head=list(COLUMNS), lines=[cells(COLUMNS, row) for row in rows]),
-            Part(text=f"Geometric mean of loop / waves: {mean:.2f}")]
+    return [Part(head=list(COLUMNS), lines=[cells(COLUMNS, row) for row in rows]), Part(text=f"Geometric mean of loop / waves: {mean:.2f}")]

@@ -91,8 +91,7 @@ class Rasterizer:
         if not self.triangles:
             return
         self._each_part(kernels.project, len(self.vertices), lambda first: [view, self.vertices, first, self.projected])
-        self._each_part(kernels.bound, self.triangles,
-                        lambda first: [view, self.vertices, self.projected, self.faces, first, self.boxes])
+        self._each_part(kernels.bound, self.triangles, lambda first: [view, self.vertices, self.projected, self.faces, first, self.boxes])
         if self.device.is_cuda:
             bands = -(-height // ROWS_ON_CUDA)
             self._launch(view, (bands, self.triangles), self.all, 0, ROWS_ON_CUDA)

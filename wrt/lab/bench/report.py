@@ -46,8 +46,7 @@ class Row(SimpleNamespace):
     NumPy's arrays, and what has a name that begins with _."""
 
     def as_dict(self) -> dict[str, Any]:
-        return {name: plain(value) for name, value in vars(self).items()
-                if not (name.startswith("_") or isinstance(value, np.ndarray))}
+        return {name: plain(value) for name, value in vars(self).items() if not (name.startswith("_") or isinstance(value, np.ndarray))}
 
 
 def plain(value: Any) -> Any:

@@ -20,8 +20,7 @@ K = TypeVar("K")
 T = TypeVar("T")
 
 
-def alternate(jobs: Mapping[K, Callable[[], Any]], runs: int,
-              clock: Callable[[], float] = time.perf_counter) -> dict[K, np.ndarray]:
+def alternate(jobs: Mapping[K, Callable[[], Any]], runs: int, clock: Callable[[], float] = time.perf_counter) -> dict[K, np.ndarray]:
     """Seconds (runs,) of each job by that clock, after one run of each that is not counted. The order turns: each run begins with
     the next job."""
     seconds: dict[K, list[float]] = {name: [] for name in jobs}

@@ -47,8 +47,7 @@ def compare(rasterizer: Rasterizer, depth: np.ndarray, prim_id: np.ndarray, geom
     bound = bound + depth_bound(geometry, camera, size, prim_id)
     tied = differ & _close(exact_depth, depth, bound)
     asked = differ & ~tied
-    reach = np.maximum(edge_reach(geometry, camera, size, exact_id, exact_depth),
-                       edge_reach(geometry, camera, size, prim_id, depth))
+    reach = np.maximum(edge_reach(geometry, camera, size, exact_id, exact_depth), edge_reach(geometry, camera, size, prim_id, depth))
     beside = _beside(rasterizer, depth, bound, np.where(asked, reach, 0.0), camera, size, geometry)
     return Row(
         pixels=differ.size, covered=int((exact_id >= 0).sum()), differ=int(differ.sum()), ties=int(tied.sum()),

@@ -17,19 +17,7 @@ from functools import cache
 import numpy as np
 
 from wrt.accel.geometry import Geometry
-from wrt.lab.hard_cases.common import (
-    HIT,
-    HardCase,
-    aimed,
-    cube,
-    hard_case,
-    in_ball,
-    joined,
-    lat_long,
-    sphere,
-    surface,
-    unit_vectors,
-)
+from wrt.lab.hard_cases.common import HIT, HardCase, aimed, cube, hard_case, in_ball, joined, lat_long, sphere, surface, unit_vectors
 from wrt.scene.clean import flip_collinear
 from wrt.scene.shapes import teapot
 
@@ -183,8 +171,7 @@ def axis_parallel(rng: np.random.Generator, n: int) -> HardCase:
     faces, along edges and through corners. They start inside or before the block, so that a face is always ahead; on the
     block's outer faces the weight of the edge there is exactly 0, also in float32: a closed triangle is hit."""
     row, axis = np.arange(n), rng.integers(3, size=n)
-    origins = np.where(rng.random((n, 3)) < 0.7, rng.integers(0, 9, (n, 3)) / 2.0,
-                       rng.uniform(0.0, 4.0, (n, 3)).astype(np.float32))
+    origins = np.where(rng.random((n, 3)) < 0.7, rng.integers(0, 9, (n, 3)) / 2.0, rng.uniform(0.0, 4.0, (n, 3)).astype(np.float32))
     sign = rng.choice([-1.0, 1.0], n)
     before = rng.random(n) < 0.5
     origins[row, axis] = np.where(before, 2.0 - sign * rng.integers(2, 9, n), rng.integers(0, 9, n) / 2.0)

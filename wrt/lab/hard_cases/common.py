@@ -60,8 +60,7 @@ def hard_case(geometry: Geometry, origins: np.ndarray, directions: np.ndarray, e
         origins, directions = (np.ascontiguousarray(x, dtype=np.float32) for x in (origins, directions))
     directions[~directions.any(axis=1), 0] = 1.0
     low, high = (np.broadcast_to(np.asarray(x, np.float32), (n,)).copy() for x in (t_min, t_max))
-    return HardCase(geometry, origins, directions, low, high, np.broadcast_to(np.asarray(expected, np.int8), (n,)).copy(),
-                    closed=closed)
+    return HardCase(geometry, origins, directions, low, high, np.broadcast_to(np.asarray(expected, np.int8), (n,)).copy(), closed=closed)
 
 
 def surface(vertices: np.ndarray, faces: np.ndarray, spheres: np.ndarray = NO_SPHERES) -> Geometry:

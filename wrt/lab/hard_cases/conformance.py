@@ -75,8 +75,7 @@ class Report:
     @property
     def total(self) -> Result:
         """The sums, and the largest error of t."""
-        counts = {name: sum(getattr(result, name) for result in self.results)
-                  for name in ("rays", "lost", "invented", "wrong_triangle")}
+        counts = {name: sum(getattr(result, name) for result in self.results) for name in ("rays", "lost", "invented", "wrong_triangle")}
         return Result("all", **counts, t_ulp=max((result.t_ulp for result in self.results), default=0.0))
 
     def _lines(self) -> list[list[str]]:

@@ -54,8 +54,7 @@ class Own(Algorithm):
 
     accel: Accelerator | None = None
 
-    def __init__(self, triangle: str = "watertight", box: str = "conservative", structure: str = "bvh",
-                 device: str = "cpu") -> None:
+    def __init__(self, triangle: str = "watertight", box: str = "conservative", structure: str = "bvh", device: str = "cpu") -> None:
         self.structure, self.device, self.units = structure, device, {"triangle": triangle, "box": box}
         self.name = triangle if box == "conservative" else f"{triangle}, {box} boxes"
 

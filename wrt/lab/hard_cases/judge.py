@@ -107,8 +107,7 @@ class Verdict:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
-        return {f.name: value.as_dict() if isinstance(value := getattr(self, f.name), Errors) else value
-                for f in fields(Verdict)}
+        return {f.name: value.as_dict() if isinstance(value := getattr(self, f.name), Errors) else value for f in fields(Verdict)}
 
     def wrong(self, count: str, case: HardCase, rows: np.ndarray, why: str, prim_id: np.ndarray | None = None) -> None:
         """Count these rays under the name `count`, and keep some of them."""
@@ -122,8 +121,7 @@ class Verdict:
 
 
 # What a unit says of the rays `row`, and what is exact for the primitive that it names.
-CLAIM = np.dtype([("row", np.int64), ("t", np.float64), ("prim_id", np.int64), ("t_bound", np.float64), ("sound", bool),
-                  ("hit", bool)])
+CLAIM = np.dtype([("row", np.int64), ("t", np.float64), ("prim_id", np.int64), ("t_bound", np.float64), ("sound", bool), ("hit", bool)])
 
 
 def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool = True) -> Verdict:
@@ -142,8 +140,7 @@ def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool =
     reported = prim_id >= 0
     verdict, possible = _plain_faults(case, t, prim_id, reference.finite)
     rows = np.flatnonzero(possible & (case.expected != MISS))
-    parts = [_claims(case, reference, rows[i:i + RAYS_AT_ONCE], (t, u, v, prim_id), verdict)
-             for i in range(0, len(rows), RAYS_AT_ONCE)]
+    parts = [_claims(case, reference, rows[i:i + RAYS_AT_ONCE], (t, u, v, prim_id), verdict) for i in range(0, len(rows), RAYS_AT_ONCE)]
     if parts:
         claims = np.concatenate(parts).view(np.recarray)
         asked = case.asked if asked is None else asked

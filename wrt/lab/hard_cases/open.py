@@ -8,24 +8,10 @@ from functools import cache
 import numpy as np
 
 from wrt.accel.geometry import Geometry
-from wrt.lab.hard_cases.common import (
-    ASK,
-    HIT,
-    MISS,
-    HardCase,
-    cube,
-    hard_case,
-    in_ball,
-    joined,
-    soup,
-    sphere,
-    surface,
-    unit_vectors,
-)
+from wrt.lab.hard_cases.common import ASK, HIT, MISS, HardCase, cube, hard_case, in_ball, joined, soup, sphere, surface, unit_vectors
 
 # pbrt-v4, shapes_test, Triangle.BadCases: three collinear points and a ray that must miss them (published numbers).
-BAD_TRIANGLE = ((-1113.45459, -79.049614, -56.2431908), (-1113.45459, -87.0922699, -56.2431908),
-                (-1113.45459, -79.2090149, -56.2431908))
+BAD_TRIANGLE = ((-1113.45459, -79.049614, -56.2431908), (-1113.45459, -87.0922699, -56.2431908), (-1113.45459, -79.2090149, -56.2431908))
 BAD_ORIGIN, BAD_DIRECTION, BAD_T_MAX = (-1081.47925, 99.9999542, 87.7701111), (-32.1072998, -183.355865, -144.607635), 0.9999
 TURN = np.array([[np.cos(0.4), np.sin(0.4), 0.0], [-np.sin(0.4), np.cos(0.4), 0.0], [0.0, 0.0, 1.0]])
 
@@ -241,8 +227,7 @@ def exact_ends(rng: np.random.Generator, n: int) -> HardCase:
     turn = rng.integers(3)
     geometry = _plates()
     geometry = surface(np.roll(geometry.vertices, turn, axis=1), geometry.faces)
-    return hard_case(geometry, np.roll(origins, turn, axis=1), np.roll(directions, turn, axis=1), expected,
-                     t_min=t_min, t_max=t_max)
+    return hard_case(geometry, np.roll(origins, turn, axis=1), np.roll(directions, turn, axis=1), expected, t_min=t_min, t_max=t_max)
 
 
 def beside_boxes(rng: np.random.Generator, n: int) -> HardCase:

@@ -27,19 +27,7 @@ from wrt.lab.bench.report import Columns
 from wrt.lab.bench.report import Row as Line
 from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
 from wrt.lab.bench.timing import alternate, quartiles
-from wrt.lab.hard_cases.cases import (
-    ASK,
-    HardCase,
-    Verdict,
-    check,
-    chosen,
-    chunks,
-    fewer,
-    generate,
-    judge,
-    judge_all_hits,
-    judge_next,
-)
+from wrt.lab.hard_cases.cases import ASK, HardCase, Verdict, check, chosen, chunks, fewer, generate, judge, judge_all_hits, judge_next
 from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own, own_algorithms
 from wrt.lab.plans import Stability as Plan
 from wrt.renderer.distributed.installed import DIGEST
@@ -264,16 +252,14 @@ def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
     out.direction = upload(case.next_directions, wp.vec3, accel.device)
     out.exclude = 1
     out.first_prim_id, out.next_prim_id = (wp.empty(n, dtype=wp.int32, device=accel.device) for _ in range(2))
-    wp.launch(kernel, dim=n, inputs=[accel.data, _surfaces(case, accel.device), case.on(accel.device), out, 0],
-              device=accel.device)
+    wp.launch(kernel, dim=n, inputs=[accel.data, _surfaces(case, accel.device), case.on(accel.device), out, 0], device=accel.device)
     return out.first_prim_id.numpy(), out.next_prim_id.numpy()
 
 
 def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
     """All hits along the first ALL_HITS_RAYS rays; only what concerns duplicates is added to the case's verdict."""
     assert algorithm.accel is not None
-    part = replace(case, **{name: getattr(case, name)[:ALL_HITS_RAYS]
-                            for name in ("origins", "directions", "t_min", "t_max", "expected")})
+    part = replace(case, **{name: getattr(case, name)[:ALL_HITS_RAYS] for name in ("origins", "directions", "t_min", "t_max", "expected")})
     hits = all_hits(algorithm.accel, part.origins, part.directions, part.t_min, part.t_max)
     verdict = judge_all_hits(part, hits.ray_id, hits.prim_id, hits.t)
     return Verdict(duplicate_hits=verdict.duplicate_hits, examples=[e for e in verdict.examples if "twice" in e["why"]])

@@ -140,8 +140,7 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
         jobs = [Job(variant, scene, options.camera, plan.integrator, threads) for variant in dict.fromkeys(plan.variants)]
         rivals = _Rivals(jobs, stack)
         report(f"reference: {REFERENCE_SEEDS} seeds")
-        truth = make_reference(scene, options, plan.reference_spp or 8 * plan.spp, seeds[:REFERENCE_SEEDS],
-                               scene.settings.max_depth)
+        truth = make_reference(scene, options, plan.reference_spp or 8 * plan.spp, seeds[:REFERENCE_SEEDS], scene.settings.max_depth)
         renderer = Renderer(scene, options)
 
         def our_picture(seed: int) -> tuple[float, np.ndarray]:

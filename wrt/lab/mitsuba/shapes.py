@@ -65,8 +65,7 @@ def _properties(mi: Any, material: Material) -> dict[str, Any]:
     if max(material.absorption) > 0.0 and not material.thin:
         strongest = max(material.absorption)  # colours above 1 are refused, hence the scale
         ratio = [value / strongest for value in material.absorption]
-        nested["interior"] = {"type": "homogeneous", "albedo": 0.0, "scale": strongest,
-                              "sigma_t": {"type": "rgb", "value": ratio}}
+        nested["interior"] = {"type": "homogeneous", "albedo": 0.0, "scale": strongest, "sigma_t": {"type": "rgb", "value": ratio}}
     return nested
 
 

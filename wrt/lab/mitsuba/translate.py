@@ -161,8 +161,7 @@ def _sensor(mi: Any, scene: Scene, camera: CameraKind) -> dict[str, Any]:
     elif isinstance(camera, Camera):
         sensor |= {"type": "perspective", "fov_axis": "y", "fov": math.degrees(camera.fov_y)}
         if camera.aperture_radius > 0.0:
-            sensor |= {"type": "thinlens", "aperture_radius": camera.aperture_radius,
-                       "focus_distance": camera.focus_distance}
+            sensor |= {"type": "thinlens", "aperture_radius": camera.aperture_radius, "focus_distance": camera.focus_distance}
             if camera.blades:
                 refuse("aperture blades", f"camera {camera.name!r}")
     else:

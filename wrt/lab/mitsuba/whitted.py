@@ -18,8 +18,7 @@ class Walk:
     that rays pass by their alpha, which is no bounce.
     """
 
-    def __init__(self, mi: Any, max_depth: int, ambient: Color, lights: bool, absorption: dict[str, Color],
-                 blended: set[str]) -> None:
+    def __init__(self, mi: Any, max_depth: int, ambient: Color, lights: bool, absorption: dict[str, Color], blended: set[str]) -> None:
         flags = mi.BSDFFlags
         self.mi, self.max_depth, self.lights, self.blended = mi, max_depth, lights, blended
         self.diffuse, self.smooth, self.null = int(flags.Diffuse), int(flags.Smooth), int(flags.Null)

@@ -61,8 +61,7 @@ def sure(crossings: Crossings, bounds: Bounds) -> np.ndarray:
     return crossings.hit & (weights > bounds.w + 1e-13).all(axis=0)
 
 
-def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray],
-                    crossings: Crossings) -> Bounds:
+def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], crossings: Crossings) -> Bounds:
     """Bounds for one ray against one triangle a column; arguments as for `triangle_crossings`, and what it returned."""
     column = np.arange(d.shape[1])
     kz = np.argmax(np.abs(d), axis=0)
@@ -93,8 +92,7 @@ def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarra
     unknown = lost | ~(np.abs(crossings.slope) > 0.0)
     t, w = np.where(unknown, np.inf, t), np.where(unknown, np.inf, w)
     u, v_weight = w[1:] + UNIT_32 * (np.abs([crossings.u, crossings.v]) + w[1:]) + TINY_32
-    return Bounds(t, np.where(unknown, np.inf, u), np.where(unknown, np.inf, v_weight), w,
-                  _meets_rectangle(flat, delta) | lost)
+    return Bounds(t, np.where(unknown, np.inf, u), np.where(unknown, np.inf, v_weight), w, _meets_rectangle(flat, delta) | lost)
 
 
 def _normal(v: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -119,8 +117,7 @@ def _meets_rectangle(flat: list[np.ndarray], delta: list[np.ndarray]) -> np.ndar
     return meets
 
 
-def sphere_bounds(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray,
-                  t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sphere_bounds(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N,) bounds on the t that the sphere unit reports for the crossing at t, and whether a hit may be reported at all.
 
     With f = o - center and n the point of the line nearest to the center, the unit's float64 discriminant r^2 - |n|^2 is off

@@ -21,15 +21,7 @@ from typing import Any
 import numpy as np
 
 from wrt.lab.oracle.bounds import Bounds, sphere_bounds, sure, triangle_bounds
-from wrt.scene.exact import (
-    UNIT,
-    Crossings,
-    Place,
-    SphereCrossings,
-    exact_plane,
-    sphere_crossings,
-    triangle_crossings,
-)
+from wrt.scene.exact import UNIT, Crossings, Place, SphereCrossings, exact_plane, sphere_crossings, triangle_crossings
 
 __all__ = ["AllHits", "Answer", "Bounds", "Crossings", "Place", "Reference", "closest", "reference_of", "sure", "t_bound"]
 
@@ -158,8 +150,7 @@ class Reference:
             found = sphere_crossings(*self._sphere_columns(rays, r, p))
             for end in range(2):
                 t, t_error = found.t[end], found.t_error[end]
-                keep = np.flatnonzero(found.hit & (t >= rays.t_min[r]) & (t <= rays.t_max[r])
-                                      & ((end == 0) | ~found.touching))
+                keep = np.flatnonzero(found.hit & (t >= rays.t_min[r]) & (t <= rays.t_max[r]) & ((end == 0) | ~found.touching))
                 place = np.where(found.touching[keep], Place.EDGE, Place.INSIDE).astype(np.int8)
                 zero = np.zeros(len(keep))
                 parts.append(_hits(r[keep], p[keep], t[keep], zero, zero, t_error[keep], place))
@@ -181,8 +172,7 @@ class Reference:
         keep = keep[inside]
         return _hits(ray[keep], prim_id[keep], found.t[keep], found.u[keep], found.v[keep], found.t_error[keep], found.place[keep])
 
-    def _sphere_columns(self, rays: _Rays, ray: np.ndarray,
-                        prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _sphere_columns(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         sphere = prim_id - self.n_triangles
         return rays.origin[:, ray], rays.direction[:, ray], self.center[:, sphere], self.radius[sphere]
 
@@ -193,8 +183,7 @@ class Reference:
     def closest_of(self, hits: AllHits, origins: Any, directions: Any) -> Answer:
         """The closest of each ray's hits, which all_hits found for these rays."""
         n = len(origins)
-        answer = Answer(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n),
-                        np.zeros(n, np.int8), np.zeros(n, bool))
+        answer = Answer(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n), np.zeros(n, np.int8), np.zeros(n, bool))
         if not len(hits):
             return answer
         ray, first, group = np.unique(hits.ray, return_index=True, return_inverse=True)
@@ -234,8 +223,7 @@ class Reference:
         found = triangle_crossings(rays.origin, rays.direction, corners, all_rows=True)
         return found, triangle_bounds(rays.origin, rays.direction, corners, found)
 
-    def against_sphere(self, origins: Any, directions: Any,
-                       prim_id: np.ndarray) -> tuple[SphereCrossings, np.ndarray, np.ndarray]:
+    def against_sphere(self, origins: Any, directions: Any, prim_id: np.ndarray) -> tuple[SphereCrossings, np.ndarray, np.ndarray]:
         """Ray i against sphere prim_id[i]: the crossings, bounds on the two t's (2, N), and whether a hit may be told."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         columns = self._sphere_columns(rays, np.arange(len(prim_id)), prim_id)

@@ -123,8 +123,7 @@ def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: C
     out.seen, out.seen_at = (wp.zeros(sms * out.seen_size, dtype=wp.int64, device=cpu) for _ in range(2))
     caches = caches_of(l1, sms)
     load_kernel(replay_warps, cpu)
-    run_all([partial(wp.launch, replay_warps, dim=1, inputs=[trace, caches, out, sm], device=cpu) for sm in range(sms)],
-            thread_count(None))
+    run_all([partial(wp.launch, replay_warps, dim=1, inputs=[trace, caches, out, sm], device=cpu) for sm in range(sms)], thread_count(None))
     used = np.concatenate([np.arange(a, a + n) for a, n in zip(room, out.misses.numpy(), strict=False)])
     return Level1(int(out.accesses.numpy().sum()), int(out.wanted.numpy().sum()), out.line.numpy()[used],
                   out.time.numpy()[used], out.lanes.numpy()[used])

@@ -142,8 +142,7 @@ MODEL_COLUMNS: Columns = {
     **{name: term(name) for name in TERMS}, "limit": "{limit}", "Grays/s": lambda row: f"{row.rays_per_second / 1e9:.2f}",
     "range": lambda row: f"{row.low / 1e9:.2f} to {row.high / 1e9:.2f}",
     "moved most by": lambda row: ", ".join(f"{name} {factor:.2g}x" for name, factor in list(row.factors.items())[:2])}
-SIMT_COLUMNS: Columns = {
-    "rays": "{name}", **{name: f"{{simt_efficiency[{name}]:.0%}}" for name in ("as they come", "packed", "sorted")}}
+SIMT_COLUMNS: Columns = {"rays": "{name}", **{name: f"{{simt_efficiency[{name}]:.0%}}" for name in ("as they come", "packed", "sorted")}}
 LEGEND = f"""\
 nodes, boxes, triangles: a ray; lines: cache lines a ray that its warp asks for. {", ".join(TERMS)}: clocks a ray and RT core that
 each part needs by itself, and in brackets how busy it is while the slowest (limit) is at its limit. Grays/s: with the assumptions
