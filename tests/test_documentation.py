@@ -6,6 +6,7 @@ import ast
 import importlib
 import inspect
 import re
+import runpy
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -228,6 +229,16 @@ def test_everything_public_says_what_it_is(module: str) -> None:
         if inspect.isclass(thing):
             silent += [f"{name}.{each}" for each, _ in functions_of(thing) if not inspect.getdoc(vars(thing)[each])]
     assert silent == []
+
+
+# --- plots ------------------------------------------------------------------------------------------------------------
+
+
+def test_plots_show_the_data_beside_them() -> None:
+    """`python docs/plots/make.py` changes no file."""
+    namespace = runpy.run_path(str(ROOT / "docs" / "plots" / "make.py"))
+    drawn = {f"{plot.__name__}.svg": plot() for plot in namespace["PLOTS"]}
+    assert drawn == {file.name: file.read_text(encoding="utf-8") for file in (ROOT / "docs" / "plots").glob("*.svg")}
 
 
 # --- links ------------------------------------------------------------------------------------------------------------
