@@ -1,8 +1,8 @@
-"""The only file of the host that names Warp's insides: private names, layouts of arguments, texts, names of files, its compiler.
-(kernels/warp_private.py is that of device code.)
+"""Warp's insides: private names, layouts of arguments, texts, file names, its compiler. No other file of the host names them.
 
-All of it was read in Warp 1.19 (WORKS_WITH). A Warp with other insides is refused: by `prepare`, which runs when Warp has started,
-or by the self-test in wrt.accel.queries.raw_launches. docs/warp.md lists each assumption, its test, and the order of repair."""
+Device code has its own such file, kernels/warp_private.py. Everything here was read in Warp 1.19 (WORKS_WITH). `prepare` and the
+self-test in wrt.accel.queries.raw_launches refuse a Warp whose insides differ. docs/warp.md lists each assumption, its test, and the
+order of repair."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ from functools import cache, wraps
 from hashlib import sha256
 from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import warp as wp
 
 from wrt.core.errors import InputError
 from wrt.core.kernel_cache import seal, shared_headers
+from wrt.core.types import Device, Kernel, WarpArray, WarpStruct, WarpType
 
 WORKS_WITH = "warp-lang>=1.19,<1.20"  # as in pyproject.toml
+Record: TypeAlias = ctypes.Structure  # an argument as a kernel gets it
 
 
 def refusal(what: str) -> InputError:
-    """The error for a Warp whose insides differ, in `what`, from those of the versions that wrt works with."""
+    """Return the error for a Warp whose insides differ in `what`."""
     return InputError(f"Warp {wp.config.version} is not supported, its insides differ ({what}): install '{WORKS_WITH}'")
 
 
@@ -40,39 +42,41 @@ except ImportError as error:
 # --- structs and arrays, as kernels get them --------------------------------------------------------------------------
 
 
-def record_of(value: Any) -> Any:
-    """Return an instance of a struct, or a Warp array, as a kernel gets it: a ctypes structure, the same one for each call where
-    `value` is a struct."""
-    return value.__ctype__()
+def record_of(value: WarpStruct | WarpArray) -> Record:
+    """Return a struct instance or an array in the form of a kernel argument. Each call for the same struct returns the same record."""
+    record: Record = value.__ctype__()
+    return record
 
 
-def array_record(array: np.ndarray) -> Any:
-    """Return an array of one dimension as a kernel gets it, read where it is. Nothing keeps its memory.
+def array_record(array: np.ndarray) -> Record:
+    """Return a one-dimensional array in the form of a kernel argument, without a copy. The caller keeps the memory alive.
 
-    A Warp array of the same memory, from which Warp would make this record, takes ten times as long to make."""
+    Making a Warp array of the same memory takes ten times as long."""
     return array_t(array.ctypes.data, ndim=1, shape=array.shape, strides=array.strides)
 
 
-def struct_record(struct: Any, arrays: Iterable[np.ndarray]) -> Any:
-    """Return a Warp struct as a kernel gets it, its first fields these arrays of one dimension. Nothing keeps their memory."""
-    out = struct.ctype()
+def struct_record(struct: WarpType, arrays: Iterable[np.ndarray]) -> Record:
+    """Return a kernel argument of type `struct` whose first fields are these one-dimensional arrays.
+
+    The caller keeps their memory alive."""
+    out: Record = struct.ctype()
     for name, array in zip(struct.vars, arrays, strict=False):
         setattr(out, name, array_record(array))
     return out
 
 
-def keep(array: Any, memory: Any) -> None:
-    """Let a Warp array that was made of an address keep what its memory belongs to."""
+def keep(array: WarpArray, memory: object) -> None:
+    """Let a Warp array that was made from an address keep the owner of its memory alive."""
     array._ref = memory
 
 
-def scalar_type(kind: Any) -> Any:
-    """Return the Warp type of the numbers of a vector, a matrix or a number."""
+def scalar_type(kind: WarpType) -> WarpType:
+    """Return the Warp type of one component of a vector, matrix or scalar type."""
     return getattr(kind, "_wp_scalar_type_", kind)
 
 
-def row_type(kind: Any) -> np.dtype[Any]:
-    """Return the NumPy type of a Warp vector, matrix or number."""
+def row_type(kind: WarpType) -> np.dtype:
+    """Return the NumPy type of a Warp vector, matrix or scalar type."""
     return np.dtype((wp.dtype_to_numpy(scalar_type(kind)), getattr(kind, "_shape_", ())))
 
 
@@ -80,20 +84,19 @@ def row_type(kind: Any) -> np.dtype[Any]:
 
 
 class Recorded(NamedTuple):
-    """Addresses of a launch on the CPU. The machine code at `entry` is a C function of two addresses, `bounds` and `args`.
-
-    bounds: the size of the launch. args: a C struct of all arguments; last: the last one of them. keeps: what owns that memory."""
+    """Addresses of a launch on the CPU. The machine code at `entry` is a C function of the two addresses `bounds` and `args`."""
 
     entry: int
-    bounds: int
-    args: int
-    last: int
-    keeps: Any
+    bounds: int  # the size of the launch
+    args: int  # a C struct of all arguments
+    last: int  # the last argument in it
+    owners: object  # of the memory at these addresses
 
 
-def recorded(command: Any) -> Recorded:
-    """Return the addresses of a launch that wp.launch(..., device="cpu", record_cmd=True) recorded, of one dimension. `bounds` is
-    the command's own; the arguments are a copy."""
+def recorded(command: wp.Launch) -> Recorded:
+    """Return the addresses of a one-dimensional launch that wp.launch(..., device="cpu", record_cmd=True) recorded.
+
+    `bounds` belongs to the command; the arguments are a copy."""
     bounds, *params = command.params
     assert len(bounds.shape) == 1, "kernels.launches sets bounds of one dimension"
     args = _args_of(*map(type, params))(*params)
@@ -103,86 +106,79 @@ def recorded(command: Any) -> Recorded:
 
 
 @cache
-def _args_of(*types: Any) -> Any:
-    """The C struct of arguments of these types; made once for each, since a class is a circle for the collector."""
+def _args_of(*types: type) -> type:
+    """Return the C struct of arguments of these types. Cached, because each new class is a reference cycle."""
     return type("Args", (ctypes.Structure,), {"_fields_": [(f"arg_{i}", each) for i, each in enumerate(types)]})
 
 
-def recording_tape() -> Any:
-    """Return the wp.Tape that records, or None. Warp must have started."""
+def recording_tape() -> wp.Tape | None:
+    """Return the tape that records, or None. Warp must have started."""
     return context.runtime.tape
 
 
 # --- kernels and their files ------------------------------------------------------------------------------------------
 
-IN_CACHE = "wp_*"  # names of the folders of modules in the kernel cache
-# Names that killed processes leave there: a folder of a compilation; precompiled headers, of wrt or of older versions of Warp.
+IN_CACHE = "wp_*"  # folders of modules in the kernel cache
+# What killed processes leave there: folders of compilations; precompiled headers, of wrt or of older versions of Warp.
 LEFTOVER = re.compile(r"wp_\w+_p\d+_t\d+|precompiled-.+")
 # Texts in lines that Warp's C++ side writes to stderr, past Python.
 NO_DRIVER, CUDA_ERROR = b"NVIDIA CUDA driver", b"Warp CUDA error"
 
 
-def is_own(kernel: Any) -> bool:
-    """Whether a kernel is part of wrt, and not a user's."""
-    return _is_ours(kernel.func)
+def is_own(kernel: Kernel) -> bool:
+    """Return whether a kernel is part of wrt and not a user's."""
+    return str(kernel.func.__module__).startswith("wrt.")  # the module is None for code that was made by exec
 
 
-def _is_ours(function: Any) -> bool:
-    return str(function.__module__).startswith("wrt.")  # None where code was made by exec
-
-
-def short_name(kernel: Any) -> str:
+def short_name(kernel: Kernel) -> str:
     """Return the name of a kernel's function, without the names of the functions around it."""
     return str(kernel.key).rsplit("__", 1)[-1]
 
 
-def module_hash(kernel: Any, block_dim: int | None) -> bytes:
-    """Return the hash of all code that a kernel is compiled from, and of its options. block_dim: None for the module's own."""
+def module_hash(kernel: Kernel, block_dim: int | None) -> bytes:
+    """Return the hash of a kernel's code and options. block_dim: None is the module's own."""
     return bytes(kernel.module.get_module_hash(block_dim))
 
 
-def cache_files(kernel: Any, device: Any, block_dim: int) -> list[Path]:
-    """Return the paths of a compiled kernel in the cache: its binary, an object file on the CPU, and its metadata."""
+def cache_files(kernel: Kernel, device: Device, block_dim: int) -> list[Path]:
+    """Return the paths of a compiled kernel in the cache: its binary (an object file on the CPU) and its metadata."""
     module = kernel.module
     folder = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim)
     return [folder / module._get_compile_output_name(device, block_dim=block_dim), folder / module._get_meta_name(block_dim)]
 
 
-def load(kernel: Any, device: Any, block_dim: int) -> None:
-    """Compile a kernel, or take it from the cache. Raises errors of Warp (is_warps_error) and of the system."""
+def load(kernel: Kernel, device: Device, block_dim: int) -> None:
+    """Compile a kernel, or take it from the cache. Raises Warp's errors (is_warps_error) and the system's."""
     kernel.module.load(device, block_dim=block_dim)
 
 
 def is_warps_error(error: BaseException) -> bool:
-    """Whether it is one of Warp's own where it cannot compile or load a kernel: a plain Exception."""
+    """Return whether Warp raised the error because it cannot compile or load a kernel: a plain Exception."""
     return type(error) is Exception
 
 
 # --- the compiler -----------------------------------------------------------------------------------------------------
 
-# What wrt changes about Warp's compiler changes how long it takes, and no kernel's results. It holds while a module of wrt is
-# compiled, and for no other. Each change names the processor time that it saves of a first render of scenes/whitted.toml with an
-# empty kernel cache (`render --size 320x180 --spp 4`, 7.2 s).
+# These changes make Warp's compiler faster, and change no kernel's results. They hold only while a module of wrt is compiled. Each
+# names the processor time that it saves of a first render of scenes/whitted.toml with an empty kernel cache (docs/warp.md).
 
-_REPLACED = {  # what is replaced, and the parameters of Warp 1.19
-    ("Adjoint", "resolve_func"): ("adj", "func", "arg_types", "kwarg_types", "min_outputs"),
+_REPLACED = {  # the functions to replace, with their parameters in Warp 1.19
     ("Module", "_compile"): ("self", "device", "output_dir", "output_name", "output_arch", "use_ptx", "options"),
     ("codegen", "codegen_struct"): ("struct", "device", "indent_size", "include_tile_helpers"),
-    ("codegen", "codegen_kernel"): ("kernel", "device", "options"),
-    ("codegen", "cpu_linear_contiguous_specialization_candidate"): ("adj", "block_dim"),
     ("build", "build_cpu"): (
         "obj_path", "cpp_path", "mode", "verify_fp", "fast_math", "fuse_fp", "extra_flags", "optimization_level", "verbose",
         "use_precompiled_headers", "pch_dir", "block_dim", "enable_tiles_in_stack_memory", "extra_include_dirs"),
     ("runtime", "get_clang_pch_dir"): (),
 }
 FLAGS = "-fpch-instantiate-templates", "-discard-value-names"
-_here = threading.local()  # own: whether this thread compiles a module of wrt
+_here = threading.local()  # own: this thread compiles a module of wrt
 
 
 def prepare() -> None:
-    """Change Warp's compiler for the modules of wrt; after wp.init(), before the first kernel is compiled. Raises InputError where
-    Warp has other insides than 1.19."""
-    owners = {"Adjoint": codegen.Adjoint, "Module": context.Module, "codegen": codegen, "build": build, "runtime": context.runtime}
+    """Change Warp's compiler for the modules of wrt. Called after wp.init() and before the first kernel is compiled.
+
+    Raises InputError if Warp's insides are not those of 1.19."""
+    owners = {"Module": context.Module, "codegen": codegen, "build": build, "runtime": context.runtime}
     for (owner, name), parameters in _REPLACED.items():
         found = getattr(owners[owner], name, None)
         if found is None or tuple(signature(found).parameters) != parameters:
@@ -191,8 +187,6 @@ def prepare() -> None:
         raise refusal("runtime.tape")
     _mark_own_modules()
     _drop_unused_helpers()
-    _compile_once()
-    _resolve_once()
     _compile_well()
 
 
@@ -201,7 +195,7 @@ def _own() -> bool:
 
 
 def _mark_own_modules() -> None:
-    """Let the other changes know whose module a thread compiles."""
+    """Tell the other changes whose module a thread compiles."""
     compile_module = context.Module._compile
 
     @wraps(compile_module)
@@ -217,8 +211,7 @@ def _mark_own_modules() -> None:
 
 
 def _drop_unused_helpers() -> None:
-    """Saves 0.4 s. Warp 1.19 writes two helpers for gradients beside every struct. They are not `static`, so the compiler keeps
-    them in each kernel, although nothing calls them."""
+    """Make the gradient helpers of structs `static` (saves 0.4 s), so that the compiler drops the unused ones."""
     write = codegen.codegen_struct
 
     @wraps(write)
@@ -229,52 +222,12 @@ def _drop_unused_helpers() -> None:
     codegen.codegen_struct = written
 
 
-def _compile_once() -> None:
-    """Saves 0.2 s, and more of scenes with a builder's kernels. Warp 1.19 writes a kernel twice: for arrays without gaps, and for
-    all. And it compiles each kernel as a function, and again where that is inlined into the loop over threads: a kernel with a
-    single thread needs only the function."""
-    twice, write = codegen.cpu_linear_contiguous_specialization_candidate, codegen.codegen_kernel
-
-    @wraps(write)
-    def written(kernel: Any, device: str, options: Any) -> str:
-        source: str = write(kernel, device, options)
-        if device == "cpu" and _own() and not kernel.adj.uses_tid:
-            function = f"void {kernel.get_mangled_name()}_cpu_kernel_forward("
-            source = source.replace(f"static {function}", f"static WP_NOINLINE {function}")
-        return source
-
-    codegen.cpu_linear_contiguous_specialization_candidate = lambda adj, block_dim: not _own() and twice(adj, block_dim)
-    codegen.codegen_kernel = written
-
-
-def _resolve_once() -> None:
-    """Saves 0.2 s. Warp 1.19 tries one overload of a built-in function after another at each call of it. The types of the arguments
-    tell which it is, and ten calls of eleven have had theirs before. (Types that never come again, such as slices, stay known: a
-    few of each kernel of wrt.)"""
-    plain = codegen.Adjoint.resolve_func
-    known: dict[Any, Any] = {}
-
-    @wraps(plain)
-    def resolve_func(adj: Any, func: Any, arg_types: Any, kwarg_types: Any, min_outputs: Any) -> Any:
-        if not (_is_ours(adj.func) and func.is_builtin()):
-            return plain(adj, func, arg_types, kwarg_types, min_outputs)
-        call = func, len(func.overloads), arg_types, tuple(kwarg_types.items()), min_outputs
-        try:
-            found = known.get(call)
-        except TypeError:  # a type without a hash
-            return plain(adj, func, arg_types, kwarg_types, min_outputs)
-        if found is None:
-            found = known[call] = plain(adj, func, arg_types, kwarg_types, min_outputs)
-        return found
-
-    codegen.Adjoint.resolve_func = resolve_func
-
-
 def _compile_well() -> None:
-    """Saves 6.4 s. Warp 1.19 precompiles its headers in every thread that compiles: here all threads share them (shared_headers).
-    FLAGS compile templates of the headers with them, not with each kernel, and give values no names (0.4 s of it); the headers have
-    no bfloat16, where the kernel's source says that it needs none (0.4 s). And each object is sealed: LLVM crashes on a damaged
-    one, or runs it."""
+    """Share precompiled headers between all threads and processes (saves 6.4 s), and seal each object.
+
+    Warp 1.19 precompiles its headers in every thread that compiles. FLAGS compile the headers' templates once, not with each kernel,
+    and give values no names (0.4 s of it). The headers leave out bfloat16 where the kernel's source says that it needs none (0.4 s).
+    LLVM crashes on a damaged object, or runs it; the seal shows the damage."""
     compile_object, own_headers = build.build_cpu, context.runtime.get_clang_pch_dir
 
     @wraps(compile_object)
@@ -293,7 +246,7 @@ def _compile_well() -> None:
 
             try:
                 options["pch_dir"] = str(shared_headers(_headers_key(options), precompile, LEFTOVER))
-            except OSError:  # a cache that is read-only, and a kernel that is compiled elsewhere
+            except OSError:  # the cache is read-only, and the kernel is compiled elsewhere
                 options["pch_dir"] = own_headers()
         compile_object(obj_path, cpp_path, **options)
         seal(Path(obj_path))
@@ -303,16 +256,17 @@ def _compile_well() -> None:
 
 
 def _headers_key(options: dict[str, Any]) -> str:
-    """A name for headers that are precompiled with these options. What Clang writes names the processor, and paths and times of the
-    headers: it refuses that of any other."""
+    """Return a name for headers precompiled with these options.
+
+    It depends on the processor and on the headers' paths and times, because Clang refuses precompiled headers of any others."""
     llvm, user = context.runtime.llvm, os.getuid() if hasattr(os, "getuid") else ""
     processor = llvm.wp_get_host_cpu_name(), llvm.wp_get_host_cpu_features()
-    known = _copy_of_warp(), processor, user, sorted({**options, "pch_dir": None}.items())
-    return sha256(repr(known).encode()).hexdigest()[:16]
+    key = _native_headers(), processor, user, sorted({**options, "pch_dir": None}.items())
+    return sha256(repr(key).encode()).hexdigest()[:16]
 
 
 @cache
-def _copy_of_warp() -> tuple[Any, ...]:
-    """The place of Warp's headers, and their names, sizes and times."""
+def _native_headers() -> list[tuple[str, int, int]]:
+    """Return path, size and time of each of Warp's headers."""
     native = Path(wp.__file__).resolve().parent / "native"
-    return native, *((str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(native.rglob("*.h")))
+    return [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(native.rglob("*.h"))]

@@ -58,14 +58,13 @@ def test_the_versions_that_work_are_those_that_pip_installs() -> None:
     ("runtime", "tape", "gone")])
 def test_a_warp_with_other_insides_is_refused(owner: str, name: str, change: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before anything of it is replaced."""
-    parts = {"Adjoint": SimpleNamespace(), "Module": SimpleNamespace(), "codegen": SimpleNamespace(), "build": SimpleNamespace(),
+    parts = {"Module": SimpleNamespace(), "codegen": SimpleNamespace(), "build": SimpleNamespace(),
              "runtime": SimpleNamespace(tape=None)}
     for (each, function), parameters in warp_private._REPLACED.items():
         made = {}
         exec(f"def {function}({', '.join(parameters)}): ...", made)
         setattr(parts[each], function, made[function])
     before = {each: dict(vars(part)) for each, part in parts.items()}
-    parts["codegen"].Adjoint = parts["Adjoint"]
     context = SimpleNamespace(Module=parts["Module"], runtime=parts["runtime"])
     for attribute, part in (("codegen", parts["codegen"]), ("build", parts["build"]), ("context", context)):
         monkeypatch.setattr(warp_private, attribute, part)
@@ -77,7 +76,7 @@ def test_a_warp_with_other_insides_is_refused(owner: str, name: str, change: str
         warp_private.prepare()
     assert str(refused.value) == f"{DIFFER} ({owner}.{name}): install '{WORKS_WITH}'"
     for each, part in parts.items():
-        left = {key: value for key, value in vars(part).items() if key not in ("Adjoint", name)}
+        left = {key: value for key, value in vars(part).items() if key != name}
         assert left == {key: value for key, value in before[each].items() if key != name}
 
 
@@ -131,30 +130,6 @@ def test_a_kernel_of_ours_holds_what_is_called_alone(monkeypatch: pytest.MonkeyP
         assert (b"adj_atomic_add" in compiled_object.read_bytes()) == (module == "elsewhere")
 
 
-def double_each(numbers: wp.array(dtype=float)):
-    i = wp.tid()
-    numbers[i] = 2.0 * numbers[i]
-
-
-def double_all(numbers: wp.array(dtype=float)):
-    for i in range(numbers.shape[0]):
-        numbers[i] = 2.0 * numbers[i]
-
-
-def test_a_kernel_of_ours_is_written_once(monkeypatch: pytest.MonkeyPatch):
-    twice, called = "_cpu_forward_tasks<true>", "static WP_NOINLINE void"
-    for function, threads in ((double_each, 5), (double_all, 1)):
-        sources = []
-        for module in ("wrt.kernels.pretended", "elsewhere"):
-            made, numbers = kernel_of(module, function, monkeypatch), wp.array(np.arange(5.0), dtype=float, device="cpu")
-            launch(made, threads, numbers)
-            assert numbers.numpy().tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
-            sources.append(next(compiled(function.__qualname__).glob("*.cpp")).read_text())
-        ours, anybodys = sources
-        assert (called in ours) == (threads == 1) and twice not in ours
-        assert called not in anybodys and (twice in anybodys) == (threads > 1)
-
-
 def add_halves(numbers: wp.array(dtype=wp.bfloat16), sums: wp.array(dtype=float)):
     i = wp.tid()
     sums[i] = float(numbers[i]) + 0.5
@@ -165,38 +140,6 @@ def test_a_kernel_of_bfloat16_has_headers_with_it(monkeypatch: pytest.MonkeyPatc
     numbers, sums = wp.array([1.0, 2.0, -4.0], dtype=wp.bfloat16, device="cpu"), zeros(3)
     launch(ours(add_halves, monkeypatch), 3, numbers, sums)
     assert sums.numpy().tolist() == [1.5, 2.5, -3.5]
-
-
-def mixes(sums: wp.array(dtype=float), v: wp.vec3):
-    i = wp.tid()
-    a = wp.dot(v * 0.5, v + v) * float(i * i) + wp.max(v[0], v[0] * v[1])
-    sums[i] = wp.dot(v * 2.0, v + v) + a + float(wp.max(i, 2 * i))
-
-
-@pytest.mark.parametrize("module", ["wrt.kernels.pretended", "elsewhere"])
-def test_an_overload_is_looked_for_once_in_kernels_of_ours(module: str, monkeypatch: pytest.MonkeyPatch):
-    from warp._src.codegen import Adjoint
-
-    asked, plain = [], Adjoint.resolve_func.__wrapped__
-    made = kernel_of(module, mixes, monkeypatch)
-
-    def resolve_func(adj, func, arg_types, kwarg_types, min_outputs):
-        asked.append((func.key, arg_types))
-        return plain(adj, func, arg_types, kwarg_types, min_outputs)
-
-    written = []
-    monkeypatch.setattr(Adjoint, "resolve_func", resolve_func)
-    for _ in range(2):
-        asked.clear()
-        made.adj.build(None)
-        written.append((list(asked), list(made.adj.blocks[0].body_forward)))
-        warp_private._resolve_once()
-    (each, forward), (once, same) = written
-    assert forward == same and set(each) == set(once)
-    if module == "elsewhere":
-        assert once == each
-    else:
-        assert len(set(once)) == len(once) < len(each) - 5
 
 
 MINE = """

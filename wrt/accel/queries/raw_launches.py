@@ -32,7 +32,7 @@ class Launches:
     def of(self, command: Any, block: int) -> Any:
         """As `recorded`, without the self-test."""
         launch = warp_private.recorded(command)
-        self.kept.append(launch.keeps)
+        self.kept.append(launch.owners)
         record = Launch()
         record.entry, record.bounds, record.args, record.tail = launch.entry, launch.bounds, launch.args, launch.last
         record.block = block

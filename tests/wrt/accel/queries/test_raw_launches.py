@@ -54,9 +54,9 @@ def longer(data: int, ndim: int, shape: Any, strides: Any, array_t: Any = warp_p
 
 def other_size(launch: warp_private.Recorded) -> warp_private.Recorded:
     """As if a kernel did not read its size where it is told."""
-    bounds, code = type(launch.keeps[1])(1), Code(launch.entry)
+    bounds, code = type(launch.owners[1])(1), Code(launch.entry)
     called = Code(lambda _, args: code(ctypes.addressof(bounds), args))
-    return launch._replace(entry=ctypes.cast(called, ctypes.c_void_p).value, keeps=(launch.keeps, bounds, code, called))
+    return launch._replace(entry=ctypes.cast(called, ctypes.c_void_p).value, owners=(launch.owners, bounds, code, called))
 
 
 def other_last(launch: warp_private.Recorded) -> warp_private.Recorded:
@@ -66,7 +66,7 @@ def other_last(launch: warp_private.Recorded) -> warp_private.Recorded:
 
 def other_code(launch: warp_private.Recorded) -> warp_private.Recorded:
     called = Code(lambda bounds, args: None)
-    return launch._replace(entry=ctypes.cast(called, ctypes.c_void_p).value, keeps=(launch.keeps, called))
+    return launch._replace(entry=ctypes.cast(called, ctypes.c_void_p).value, owners=(launch.owners, called))
 
 
 @pytest.fixture
