@@ -1,4 +1,4 @@
-"""What a render is asked for beyond the scene, and what it reports while it runs."""
+"""Options of a render beyond the scene, and the progress that it reports."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,19 +20,30 @@ from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.picture.film import Film
 from wrt.scene.cameras import CameraKind
+from wrt.scene.settings import SettingChanges
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a render is: samples done and to do (summed over pixels), rays so far, seconds of tracing.
+    """Progress of a render, as its callback receives it. A resumed render counts what was done before in all four figures.
 
-    Of a resumed render, what was done before counts in all four. stage: "trace"; or before anything is traced, where that takes
-    longer than wrt.renderer.prepare.PREPARING_REPORTED: "compile", once, or "build", with done of total steps of a structure that
-    is slow to build.
-    note: what goes wrong meanwhile; "" is nothing. picture: makes a Film of what there is (pixels, variance, samples), while
-    it is traced; tiles that run are half done in it.
+    Parameters
+    ----------
+    done, total
+        Samples done and to do, summed over the pixels; in the stages before "trace", done of total steps.
+    rays, seconds
+        Rays traced so far, and seconds of tracing.
+    stage
+        "trace"; before it, if that takes longer than a second, "compile" (reported once) and "build".
+    note
+        Trouble that does not end the render; "" if there is none.
+    picture
+        Makes a Film of the samples so far (pixels, variance, samples) while the render runs. Tiles under way are half done in it.
     """
 
     done: int
@@ -45,34 +56,24 @@ class Progress:
 
     @property
     def rays_per_second(self) -> float:
-        """The mean so far; 0 before anything is traced."""
+        """Mean rate so far; 0 before anything is traced."""
         return self.rays / self.seconds if self.seconds > 0.0 else 0.0
 
     @property
     def seconds_left(self) -> float:
-        """At the mean speed so far; inf before anything is done."""
+        """Seconds to go at the mean speed so far; inf before anything is done."""
         return self.seconds * (self.total - self.done) / self.done if self.done else float("inf")
 
 
 @dataclass
 class Options:
-    """How to render, beyond what the scene says. tile_size, pass_size: pixels a side and samples at once (None: chosen); never
-    change a pixel. crop: x0, y0, x1, y1 in pixels. time_limit in seconds of tracing; the first sample of each pixel is always
-    taken. instancing: which meshes that several objects share are kept once (wrt.accel.scenes.instancing).
+    """The options of `render`, which defines each, as one object, without the scene's settings.
 
-    devices: several of this machine, of one kind ("cuda:0", "cuda:1"), that share the tiles, in place of `device`. executor: a
-    concurrent.futures.Executor or a dask.distributed.Client whose workers trace the tiles on their `device` (docs/cluster.md);
-    neither changes a pixel.
-
-    target_error: stop when the estimated error of the picture is no larger: the root mean square, over its pixels and
-    channels, of the standard error in linear radiance. It is noise alone: what max_depth and min_throughput cut off is not
-    in it. A pixel's samples are then split over GROUPS independent sequences (wrt.renderer.film_arrays), and spp is the most to
-    take (rounded down to a multiple of GROUPS; one a group at least). The estimate is looked at when a group has 1, 2, 4, 8 ...
-    samples: only then is its sequence as even as it can be.
-
-    checkpoint: a file that the work so far is written to every `checkpoint_every` seconds, and when a render ends early or is
-    done; it stays. A file that is there already is refused, unless `resume` says to go on with it: the picture is then that of
-    an uninterrupted render, bit for bit. Where there is none, `resume` begins anew (wrt.renderer.checkpoint)."""
+    Raises
+    ------
+    InputError
+        If an option has the wrong type, is out of range or contradicts another.
+    """
 
     seed: int = 0
     device: str = "cpu"
@@ -89,12 +90,12 @@ class Options:
     triangle: str = "watertight"
     box: str = "conservative"
     instancing: str = "auto"
-    accel_options: dict[str, Any] = field(default_factory=dict)
+    accel_options: dict[str, object] = field(default_factory=dict)
     checkpoint: str | os.PathLike[str] | None = None
     checkpoint_every: float = 60.0
     resume: bool = False
     devices: Sequence[str] | None = None
-    executor: Any = None
+    executor: Executor | Client | None = None
 
     def __post_init__(self) -> None:
         for name in ("accel", "device", "triangle", "box", "instancing"):
@@ -148,3 +149,29 @@ class Options:
 
 
 OPTIONS = tuple(each.name for each in fields(Options))
+
+
+class RenderOptions(SettingChanges, total=False):
+    """The keywords of `render`: the scene's settings, and the fields of Options."""
+
+    seed: int
+    device: str
+    accel: str
+    threads: int | None
+    camera: str | int | CameraKind | None
+    crop: tuple[int, int, int, int] | None
+    aov: str | Sequence[str]
+    time_limit: float | None
+    target_error: float | None
+    tile_size: int | None
+    pass_size: int | None
+    progress: Callable[[Progress], None] | None
+    triangle: str
+    box: str
+    instancing: str
+    accel_options: dict[str, object]
+    checkpoint: str | os.PathLike[str] | None
+    checkpoint_every: float
+    resume: bool
+    devices: Sequence[str] | None
+    executor: Executor | Client | None

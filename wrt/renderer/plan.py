@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any
+from typing import Any, Unpack
 
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.structure import Structure
@@ -23,7 +23,7 @@ from wrt.renderer.options import Options
 from wrt.renderer.waves import WaveKernels, wave_kernels
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
-from wrt.scene.settings import Settings
+from wrt.scene.settings import SettingChanges, Settings
 
 AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that no kernel is compiled from
 
@@ -105,9 +105,11 @@ class Plan:
         limits.seed = seed
         return limits
 
-    def aimed(self, camera: CameraKind, **settings: Any) -> Plan:
-        """Another camera and other settings (of AIMED), for the same kernels. Raises InputError for what they were not made for:
-        another kind of camera, a lens where there was a pinhole, more bounces."""
+    def aimed(self, camera: CameraKind, **settings: Unpack[SettingChanges]) -> Plan:
+        """Return the plan for another camera and other settings (of AIMED), with the same kernels.
+
+        Raises InputError for what they were not made for: another kind of camera, a lens in place of a pinhole, more bounces.
+        """
         scene = self.scene.with_settings(**settings)
         lacks = [name for name, needed, has in (
             (f"a camera of the kind {camera.kind}", camera.device != self.features.camera, False),

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, wait
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from wrt.renderer.tiles import Rectangle, Work, corners, tiles
 from wrt.renderer.upload import DeviceScene, camera_struct, upload_scene
 from wrt.renderer.waves import CAPACITY, SceneRecords, Waves
 from wrt.scene.cameras import CameraKind
+from wrt.scene.settings import SettingChanges
 
 TILE_SIZE = 32  # the least on the CPU
 TILES_EACH = 8  # for each thread at least
@@ -47,9 +48,11 @@ class Prepared:
     waves: Waves | None
     seconds: dict[str, float]
 
-    def aimed(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> Prepared:
-        """For another camera and other settings: as Plan.aimed. angles_of: a size with the picture's shape, where the picture's
-        own is rounded: that would change the angle of view."""
+    def aimed(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Unpack[SettingChanges]) -> Prepared:
+        """Return this scene with another camera and other settings, as Plan.aimed allows.
+
+        angles_of: size of the aspect ratio to use if the picture's own size is rounded, which would change the angle of view.
+        """
         plan = self.plan.aimed(camera, **settings)
         plan.require_memory(self.device)
         return replace(self, plan=plan, camera=camera_struct(camera, angles_of or plan.scene.settings.size))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from wrt.renderer.schedule import LocalTracer, Run
 from wrt.renderer.upload import upload_scene
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
+from wrt.scene.settings import SettingChanges
 
 REFINED_FROM = 8  # camera samples a triangle: with fewer, to refine a tree takes longer than it saves
 
@@ -50,8 +51,8 @@ class Renderer:
     def accel(self) -> Accelerator:
         return self.prepared.accel
 
-    def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
-        """Another camera and other settings for the next `run`, with the same kernels and structure: as Prepared.aimed."""
+    def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Unpack[SettingChanges]) -> None:
+        """Set the camera and settings of the next `run`, with the same kernels and structure, as Prepared.aimed allows."""
         if self.checkpoint is not None:
             raise InputError("this renderer was not made for a checkpoint")
         self.prepared = self.prepared.aimed(camera, angles_of, **settings)

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from wrt.scene.lights import LIGHTS, Light
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.motion import Motion
-from wrt.scene.settings import DEPTH, GLASS_DEPTH, SETTINGS, Settings
+from wrt.scene.settings import DEPTH, GLASS_DEPTH, SETTINGS, SettingChanges, Settings
 from wrt.scene.values import BLACK, MAX_REACH, SMALLEST, Color, as_number, as_transform, as_vector, require_count
 
 MANY_VERTICES = 1 << 26  # of all objects together: beyond, where a scene ends is no longer asked of each
@@ -180,12 +180,13 @@ class Scene:
             else:
                 yield vertices.astype(np.float64), thing.transform
 
-    def with_settings(self, **changes: Any) -> Scene:
-        """A copy with some settings changed (None leaves one as it is). Raises InputError for a setting that is none."""
+    def with_settings(self, **changes: Unpack[SettingChanges]) -> Scene:
+        """Return a copy with some settings changed; None keeps one. Raises InputError for an unknown or wrong setting."""
         for name in changes:
             if name not in SETTINGS:
                 raise InputError(unknown(name, "setting", SETTINGS))
-        return replace(self, settings=replace(self.settings, **{k: v for k, v in changes.items() if v is not None}))
+        changed: dict[str, Any] = {name: value for name, value in changes.items() if value is not None}
+        return replace(self, settings=replace(self.settings, **changed))
 
 
 def moves(scene: Scene) -> bool:

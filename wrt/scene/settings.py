@@ -1,8 +1,9 @@
-"""How a picture is taken: size, samples, bounces, filter, tone mapping."""
+"""Settings of a picture: size, samples, bounces, filter, tone mapping."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import TypedDict
 
 from wrt.scene.kinds import check_fields, given
 
@@ -17,14 +18,32 @@ GLASS_SHADOWS = ("opaque", "tinted")
 
 @dataclass(frozen=True)
 class Settings:
-    """How a scene wants to be rendered; every field can be overridden at the call of `render`.
+    """The settings that a scene asks for; keywords of `render` override them.
 
-    max_depth: bounces after the first hit (0: only direct light). None, the default, is for the Scene to choose: GLASS_DEPTH
-    where light goes through one of its materials, else DEPTH. min_throughput: a ray that would carry less than this
-    share (largest channel) is cut. fresnel: "exact", or "schlick" (cheaper, approximate). glass_shadows: solid glass
-    "opaque" to shadow rays (right but for caustics, which a Whitted tracer does not see), or "tinted": shadow rays go
-    straight through it, as they do in scenes from glTF files that have solid glass. sampler: "sobol" (Owen-scrambled, evenly
-    spread), or "independent" random numbers, whose noise falls more slowly. exposure in stops.
+    Parameters
+    ----------
+    size, spp
+        Width and height in pixels; samples per pixel.
+    max_depth
+        Bounces after the first hit; 0 is direct light alone. None: 64 if light passes through a material of the scene, else 8.
+    min_throughput
+        A ray whose throughput (largest channel) would be smaller ends.
+    filter
+        Pixel filter: "box", "gaussian" or "blackman-harris".
+    fresnel
+        Fresnel term of dielectrics: "exact", or "schlick", which is cheaper and approximate.
+    glass_shadows
+        "opaque": solid glass blocks shadow rays, which is right but for caustics. "tinted": shadow rays pass straight through it
+        and take its colour (the default of scenes from glTF files with solid glass).
+    sampler
+        "sobol" (Owen-scrambled, evenly spread), or "independent" random numbers, whose noise falls more slowly.
+    exposure, tonemap
+        Stops, each of which doubles the displayed values; curve from linear to display: "none", "reinhard", "aces" or "agx".
+
+    Raises
+    ------
+    InputError
+        If a value has the wrong type or is out of range.
     """
 
     size: tuple[int, int] = field(default=(640, 360), metadata=given("size", "width and height", "pixels"))
@@ -32,15 +51,15 @@ class Settings:
     max_depth: int = field(default=None, metadata=given(  # type: ignore[assignment]  # a Scene's is a number
         "whole", f"bounces after the first hit (default: {GLASS_DEPTH} where light goes through a material, else {DEPTH})", ge=0,
         le=MAX_DEPTH))
-    min_throughput: float = field(default=1e-3, metadata=given("number", "a ray that carries less is cut", ge=0.0, le=1.0))
+    min_throughput: float = field(default=1e-3, metadata=given("number", "a ray of smaller throughput ends", ge=0.0, le=1.0))
     filter: str = field(default="blackman-harris", metadata=given("choice", "pixel filter", among=FILTERS))
-    fresnel: str = field(default="exact", metadata=given("choice", "of dielectrics", among=FRESNELS))
+    fresnel: str = field(default="exact", metadata=given("choice", "Fresnel term of dielectrics", among=FRESNELS))
     glass_shadows: str = field(default="opaque", metadata=given(
-        "choice", "tinted: shadow rays go straight through solid glass (default: tinted where an included glTF file has solid"
-        " glass, else opaque)", among=GLASS_SHADOWS))
+        "choice", "tinted: shadow rays pass straight through solid glass (default: tinted if an included glTF file"
+        " has solid glass)", among=GLASS_SHADOWS))
     sampler: str = field(default="sobol", metadata=given(
-        "choice", "how a pixel's samples are spread: evenly, or by independent random numbers", among=SAMPLERS))
-    exposure: float = field(default=0.0, metadata=given("number", "doubles what is shown with each", "stops", ge=-100.0, le=100.0))
+        "choice", "samples of a pixel: evenly spread, or independent random numbers", among=SAMPLERS))
+    exposure: float = field(default=0.0, metadata=given("number", "each doubles what is displayed", "stops", ge=-100.0, le=100.0))
     tonemap: str = field(default="none", metadata=given("choice", "curve from linear to display", among=TONEMAPS))
 
     def __post_init__(self) -> None:
@@ -48,3 +67,18 @@ class Settings:
 
 
 SETTINGS = tuple(each.name for each in fields(Settings))
+
+
+class SettingChanges(TypedDict, total=False):
+    """The fields of Settings as keywords; None keeps the scene's value."""
+
+    size: tuple[int, int] | str | None
+    spp: int | None
+    max_depth: int | None
+    min_throughput: float | None
+    filter: str | None
+    fresnel: str | None
+    glass_shadows: str | None
+    sampler: str | None
+    exposure: float | None
+    tonemap: str | None

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from wrt.io.load import load_scene
 from wrt.io.mesh_file import load_mesh
 from wrt.picture.film import Film
 from wrt.renderer import prepare, schedule
-from wrt.renderer.options import AOVS, Options, Progress
+from wrt.renderer.options import AOVS, Options, Progress, RenderOptions
 from wrt.renderer.plan import plan_of
 from wrt.renderer.render import render
 from wrt.renderer.renderer import Renderer, builder_for
@@ -117,7 +117,7 @@ def test_more_samples_go_on_where_fewer_ended() -> None:
 
 
 def test_scene_settings_count_and_arguments_override_them() -> None:
-    film = render(SCENE, spp=2, size=(8, 6), settings={"exposure": 1.5, "tonemap": "aces"})
+    film = render(SCENE, spp=2, size=(8, 6), exposure=1.5, tonemap="aces")
     assert film.pixels.shape == (6, 8, 3) and (film.samples == 2).all()
     assert (film.exposure, film.tonemap) == (1.5, "aces")
     assert SCENE.settings == Settings(size=SIZE, spp=5, max_depth=DEPTH)
@@ -418,7 +418,7 @@ def test_renders_in_other_threads(reference: Film) -> None:
     ({"spp": 0}, "spp must be 1 to"), ({"spp": 10**9}, "spp must be 1 to"),
     ({"size": (0, 1)}, "size must be 1x1"), ({"size": (100000, 100000)}, "size must be 1x1 to 32768x32768"),
     ({"max_depth": -1}, "max_depth"), ({"max_depth": 65}, "max_depth"), ({"min_throughput": float("nan")}, "min_throughput"),
-    ({"settings": {"filter": "nope"}}, "filter must be one of"), ({"settings": {"exposure": float("inf")}}, "exposure"),
+    ({"filter": "nope"}, "filter must be one of"), ({"exposure": float("inf")}, "exposure"),
     *(({"crop": crop}, r"crop .* is not within the picture of 37x22") for crop in (
         (0, 0, 38, 22), (0, 0, 37, 23), (-1, 0, 5, 5), (5, 5, 5, 6), (6, 5, 5, 6), (40, 40, 50, 50))),
 ], ids=str)
@@ -428,7 +428,7 @@ def test_a_wrong_value_is_told_by_its_name(options: dict[str, Any], message: str
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"sp": 4}, "unknown argument of render 'sp'; did you mean 'spp'"), ({"settings": {"fov": 4}}, "unknown setting 'fov'"),
+    ({"sp": 4}, "unknown argument of render 'sp'; did you mean 'spp'"), ({"fov": 4}, "unknown argument of render 'fov'"),
     ({"spp": 1.5}, "spp must be a whole number, got 1.5"), ({"spp": "many"}, "spp must be a whole number, got 'many'"),
     ({"size": 640}, 'size must be two whole numbers or text such as "640x360", got 640'),
     ({"size": (32.0, 18.0)}, "size must be two whole"), ({"size": "32*18"}, "size must be two whole numbers"),
@@ -467,7 +467,19 @@ def test_one_name_and_text_for_a_size_and_settings_by_keyword() -> None:
     film = render(SCENE, spp=np.int64(1), size="12x7", aov="depth", filter="box", tonemap="aces", max_depth=None)
     assert film.pixels.shape == (7, 12, 3) and list(film.aov) == ["depth"] and film.metadata["filter"] == "box"
     assert film.tonemap == "aces" and film.metadata["max_depth"] == SCENE.settings.max_depth
-    assert same(film, render(SCENE, spp=1, size=(12, 7), aov=["depth"], settings={"filter": "box"}))
+    assert same(film, render(SCENE, spp=1, size=(12, 7), aov=["depth"], filter="box"))
+
+
+def test_the_keywords_of_render_are_typed_as_the_settings_and_options_are() -> None:
+    typed = {name: each.__forward_arg__ for name, each in RenderOptions.__annotations__.items()}
+    expected = {each.name: f"{each.type} | None" for each in fields(Settings)} | {each.name: each.type for each in fields(Options)}
+    expected |= {"size": "tuple[int, int] | str | None", "aov": "str | Sequence[str]"}  # render takes more
+    assert typed == expected
+
+
+def test_an_unknown_setting_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match="unknown setting 'fov'"):
+        SCENE.with_settings(fov=4)  # type: ignore[call-arg]
 
 
 def test_a_film_tells_of_itself_in_a_line() -> None:
