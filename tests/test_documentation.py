@@ -26,6 +26,7 @@ from wrt.cli.main import cli
 from wrt.io.mesh_file import load_mesh
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+NOTES = sorted((ROOT / "docs" / "lab_notes").glob("*.md"))  # commands and Python in them are of their day
 # Which CI itself runs (.ci/run), or a test of their own.
 OTHERS = ("pip install ", "pytest", "python -m pdoc ", "dask ", "python -m tests.fuzz ", "python -m tests.virtual_gpu ",
           "openssl req ", "export DASK_", "ulimit -v ", "timeout -k ", "prlimit ")
@@ -48,6 +49,7 @@ SLOW = {  # run by `pytest -m slow`
     "bench bvh": ("--rays", "500", "--builds", "1", "--runs", "1", "--builders", "sweep"), "bench instructions": (),
     "bench float64": ("--rays", "500"), "bench hard-cases": ("--rays", "5"),
     "bench closed": ("--points", "500", "--rays", "500", "--others", "100"),
+    "bench pictures": ("--size", "16x9", "--spp", "1", "--runs", "1"),
     "bench mitsuba": ("--size", "16x9", "--spp", "1", "--repeats", "3", "--starts", "0"),
 }
 
@@ -251,7 +253,7 @@ def anchors(path: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=page_id)
+@pytest.mark.parametrize("page", PAGES + NOTES, ids=page_id)
 def test_links_lead_somewhere(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
@@ -283,4 +285,4 @@ def test_every_page_is_reached_from_the_readme() -> None:
         reached.add(page)
         links = re.findall(r"\]\(([^)#\s]+\.md)[^)]*\)", page.read_text(encoding="utf-8"))
         new += [file for link in links if (file := (page.parent / link).resolve()) not in reached and file.exists()]
-    assert {page for page in PAGES if page.name != "CHANGELOG.md"} <= reached
+    assert {page for page in PAGES + NOTES if page.name != "CHANGELOG.md"} <= reached
