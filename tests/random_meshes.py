@@ -21,7 +21,7 @@ from tests.random_rays import RAYS, Rays, at_their_hits, rays_of
 from tests.structures import STRUCTURES
 from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.geometry import Geometry
-from wrt.accel.scenes.flatten import world_of
+from wrt.accel.scenes.flatten import flatten
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.kernels.query import HitArrays, RayArrays, put_hit
 from wrt.kernels.warp_private import fields_of
@@ -188,7 +188,7 @@ def corners_of(scene: Scene) -> np.ndarray:
 
 def instances(rng: Rng) -> Case:
     scene = placed(rng, spheres=True)
-    return Case(world_of(scene, instanced_meshes(scene, "always")).geometry, rays_of(rng, corners_of(scene)))
+    return Case(flatten(scene, instanced_meshes(scene, "always")).geometry, rays_of(rng, corners_of(scene)))
 
 
 def worlds(rng: Rng) -> Case:

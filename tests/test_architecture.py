@@ -35,7 +35,7 @@ BELOW_WRT = {
 # The rooms of wrt/accel in their order: each imports from itself and from those before it. What is named nowhere is a structure. A
 # structure is asked by its methods, so queries stand below the structures.
 ROOMS_OF_ACCEL = (
-    {"triangle_data", "geometry", "device_geometry", "instanced_geometry", "world"},  # what is hit
+    {"triangle_data", "geometry", "device_geometry", "instanced_geometry", "flat_scene"},  # what is hit
     {"structures", "structure", "built", "snapshot"},  # kinds of structures, and a structure at one time
     {"queries"},
     {"store", "base", "epo", "tensors"},

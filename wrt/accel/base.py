@@ -13,13 +13,13 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.built import AccelStats, Built, Refit
+from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
-from wrt.accel.queries.ray_query import world_of
+from wrt.accel.queries.ray_query import kernel_argument
 from wrt.accel.queries.rays import vectors
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, options_of
-from wrt.accel.world import World
 from wrt.core.arrays import check_no_gradients, taken
 from wrt.core.device import upload
 from wrt.core.errors import InputError
@@ -44,7 +44,7 @@ class OneMesh(Accelerator, ABC):
     options: ClassVar[type[Any]]
     can_refit: ClassVar[bool] = False
 
-    def __init__(self, geometry: Geometry, attributes: World | None = None, /, device: str = "cpu", threads: int | None = None, *,
+    def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu", threads: int | None = None, *,
                  triangle: str = "watertight", box: str = "conservative", **options: Any) -> None:
         super().__init__(Structure(type(self), Units(triangle, box)), geometry.kept(), attributes, device, threads)
         self.built_with = options_of(self.name, self.options, options)
@@ -53,7 +53,7 @@ class OneMesh(Accelerator, ABC):
         self._take(built, begin, built.sah_cost)
 
     @classmethod
-    def restore(cls, built: Built, geometry: Geometry, attributes: World | None = None, /, device: str = "cpu",
+    def restore(cls, built: Built, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu",
                 threads: int | None = None, *, units: Units | None = None, built_with: Any = None) -> Self:
         """What was built before over the same geometry. built_with: its options (None: not known, and those that there are by
         default). Raises InputError where `built` is no such structure."""
@@ -87,7 +87,7 @@ class OneMesh(Accelerator, ABC):
     @property
     def world(self) -> Any:
         """The structure, as it is now, as an argument of a kernel of one's own (wrt.ray_query)."""
-        return world_of(self._snapshot)
+        return kernel_argument(self._snapshot)
 
     def _over(self, geometry: Geometry) -> Self:
         """A copy over another geometry, before anything is built over it: others still ask for the old shape."""

@@ -10,11 +10,11 @@ import warp as wp
 
 from wrt.accel.base import OneMesh, array_bytes
 from wrt.accel.built import AccelStats, Refit
+from wrt.accel.flat_scene import FlatScene
 from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, inverse_of
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.structure import Structure
 from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, spread_of, world_boxes
-from wrt.accel.world import World
 from wrt.core.arrays import real_numbers
 from wrt.core.checks import shown
 from wrt.core.device import upload
@@ -36,7 +36,7 @@ class Instances(Accelerator):
 
     name = "instances"
 
-    def __init__(self, kind: type[OneMesh], geometry: InstancedGeometry, attributes: World | None = None, /, device: str = "cpu",
+    def __init__(self, kind: type[OneMesh], geometry: InstancedGeometry, attributes: FlatScene | None = None, /, device: str = "cpu",
                  threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative", **options: Any) -> None:
         begin = build_clock()
         super().__init__(Structure(kind, Units(triangle, box, instances=True)), geometry, attributes, device, threads)
@@ -108,14 +108,14 @@ class Instances(Accelerator):
                 f"{len(self.bottoms)} {self.structure.accel.name}, {s.bytes / 1e6:.1f} MB, built in {s.build_seconds:.3f} s)")
 
 
-def rows_of(geometry: InstancedGeometry, world: World | None) -> np.ndarray:
+def rows_of(geometry: InstancedGeometry, scene: FlatScene | None) -> np.ndarray:
     """Row of geometry.to_world by the number that a caller has: over a scene that of the object, whose rows are fewer where several
     objects are joined. -1: it has no place of its own."""
     placed = np.flatnonzero(geometry.is_placed)
-    if world is None or world.objects is None:
+    if scene is None or scene.objects is None:
         rows, numbers = np.full(len(geometry.part), -1), placed
     else:
-        rows, numbers = np.full(len(world.objects), -1), np.searchsorted(world.objects, geometry.first_prim[placed], "right") - 1
+        rows, numbers = np.full(len(scene.objects), -1), np.searchsorted(scene.objects, geometry.first_prim[placed], "right") - 1
     rows[numbers] = placed
     return rows
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
+from wrt.accel.flat_scene import FlatScene
 from wrt.accel.structure import Structure
-from wrt.accel.world import World
 
 T = TypeVar("T")
 
@@ -30,7 +30,7 @@ class Snapshot:
     structure: Structure
     device: Any
     surfaces: Any
-    attributes: World | None
+    attributes: FlatScene | None
     geometry: Any
     data: Any = None
     stats: Any = None

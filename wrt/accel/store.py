@@ -14,11 +14,11 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.built import Built
+from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
-from wrt.accel.world import World
 from wrt.core import warp_private
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.device import record_dtype
@@ -67,7 +67,7 @@ def save(snapshot: Snapshot, path: str | os.PathLike[str]) -> None:
         write_checked(file, MAGIC, header, body)
 
 
-def read(path: str | os.PathLike[str], geometry: Geometry, attributes: World | None = None, device: str = "cpu",
+def read(path: str | os.PathLike[str], geometry: Geometry, attributes: FlatScene | None = None, device: str = "cpu",
          threads: int | None = None) -> Any:
     """A structure from a file that `save` wrote, over the same geometry. Raises InputError for a file that is missing, foreign,
     damaged, of another version or over another mesh."""

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from wrt.accel.flat_scene import FlatScene
 from wrt.accel.queries.hit_points import instance_records
-from wrt.accel.scenes.flatten import world_of
-from wrt.accel.world import World
+from wrt.accel.scenes.flatten import flatten
 from wrt.core.checks import listed
 from wrt.core.device import records, upload
 from wrt.core.errors import InputError, warn
@@ -106,7 +106,7 @@ def material_records(used: tuple[Material, ...], table: TextureTable) -> np.ndar
     return out
 
 
-def light_records(scene: Scene, world: World) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def light_records(scene: Scene, world: FlatScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lights, emitters and the emitters' cdf (float32). Each object with emissive faces is one light; beyond
     MAX_MESH_LIGHTS all are one together."""
     rows: list[dict[str, Any]] = []
@@ -136,7 +136,7 @@ def light_records(scene: Scene, world: World) -> tuple[np.ndarray, np.ndarray, n
     return out[: len(rows)], np.concatenate(parts), np.concatenate(cdfs)
 
 
-def _emissive_groups(scene: Scene, world: World) -> list[np.ndarray]:
+def _emissive_groups(scene: Scene, world: FlatScene) -> list[np.ndarray]:
     """prim_ids of the faces that light, object by object."""
     lit = np.array([m.lights_others for m in scene.materials], bool)
     groups = []
@@ -152,7 +152,7 @@ def _emissive_groups(scene: Scene, world: World) -> list[np.ndarray]:
     return groups
 
 
-def _emitters(scene: Scene, world: World, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _emitters(scene: Scene, world: FlatScene, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The emitters of one light and their cdf; both empty where they have no power."""
     corner = world.corners(prim_id)
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
@@ -201,7 +201,7 @@ def background_struct(background: Background, device: Any) -> Any:
 class DeviceScene:
     """What the kernels take: surfaces and lighting, and the world with the geometry to build a structure over."""
 
-    world: World
+    world: FlatScene
     surfaces: Any
     lighting: Any
 
@@ -227,7 +227,7 @@ def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()
     """Put a scene on a device (a Warp device); meshes: the id()s of those that are kept once (wrt.accel.scenes.instancing). Raises
     InputError where the scene cannot be rendered."""
     tell_left_out(scene)
-    world = world_of(scene, meshes)
+    world = flatten(scene, meshes)
     table = TextureTable()
     rows = material_records(scene.materials, table)
     s = structs.Surfaces()

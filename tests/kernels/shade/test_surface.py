@@ -9,7 +9,7 @@ from tests.kernel_tools import DEVICE, directions, floats, ints, launch, rounded
 import warp as wp
 
 from wrt.accel.scenes.build import build
-from wrt.accel.scenes.flatten import world_mesh
+from wrt.accel.scenes.flatten import flatten_joined
 from wrt.kernels.shade.surface import Surface, make_surface_at, next_away, spawn_point
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 from wrt.renderer.upload import upload_scene
@@ -78,7 +78,7 @@ def hit_rays(scene, rng, n, target, scale=1.0):
     """Rays at `target`s that hit, with their hits."""
     direction = rounded(rng.normal(size=(n, 3)))
     origin = rounded(target - direction * scale * 10.0 ** rng.uniform(-0.5, 2, (n, 1)))
-    structure = build(world_mesh(scene).geometry, "bvh")
+    structure = build(flatten_joined(scene).geometry, "bvh")
     hits = structure.closest_hit(origin, direction)
     on = hits.prim_id >= 0
     hits = type(hits)(hits.t[on], hits.u[on], hits.v[on], hits.prim_id[on])

@@ -21,7 +21,7 @@ from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances
 from wrt.accel.scenes.build import build
-from wrt.accel.scenes.flatten import world_mesh, world_of
+from wrt.accel.scenes.flatten import flatten, flatten_joined
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
@@ -133,7 +133,7 @@ def test_the_rasterizer_sees_the_same() -> None:
     scene = Scene(tuple(thing for thing in everything().objects if thing.materials[0].alpha_mode == "opaque"),
                   cameras=everything().cameras, settings=Settings(size=SIZE, spp=1))
     film = wrt.render(scene, instancing="always", aov=("depth", "prim_id"))
-    geometry = world_mesh(scene).geometry
+    geometry = flatten_joined(scene).geometry
     found = compare(Rasterizer(geometry), film.aov["depth"], film.aov["prim_id"], geometry, scene.cameras[0], SIZE)
     assert found.covered > 10_000 and found.unexplained == 0 and found.differ < 10
 
@@ -221,9 +221,9 @@ def test_what_is_joined_keeps_its_numbers(builder: str) -> None:
     scene = Scene(objects, (Sphere((0.0, 2.0, 2.0), 1.0, grey),))
     origins = np.random.default_rng(1).uniform((-4.0, -4.0, 5.0), (4.0, 4.0, 5.0), (500, 3))
     rays = origins, np.broadcast_to([0.1, 0.2, -1.0], origins.shape)
-    expected = build(world_of(scene, frozenset()).geometry, "brute_force").closest_hit(*rays)
+    expected = build(flatten(scene, frozenset()).geometry, "brute_force").closest_hit(*rays)
     assert (expected.prim_id == 642).any() and ((640 <= expected.prim_id) & (expected.prim_id < 642)).any()
-    hits = build(world_of(scene, instanced_meshes(scene, "always")).geometry, "bvh2", builder=builder).closest_hit(*rays)
+    hits = build(flatten(scene, instanced_meshes(scene, "always")).geometry, "bvh2", builder=builder).closest_hit(*rays)
     assert np.array_equal(hits.prim_id, expected.prim_id)
 
 

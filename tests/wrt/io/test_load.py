@@ -13,7 +13,7 @@ import pytest
 
 from tests.data import data_path
 from tests.gltf_files import one_triangle
-from wrt.accel.scenes.flatten import world_mesh
+from wrt.accel.scenes.flatten import flatten_joined
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.load import load_scene, schema
 from wrt.scene.backgrounds import EnvironmentBackground, GradientBackground
@@ -273,7 +273,7 @@ def including(folder: Path, transform: str) -> tuple[Scene, Scene]:
 def test_an_included_file_is_moved_as_a_whole(tmp_path: Path) -> None:
     # Twice as large, then y to z and z to -y, then 10 along x: (x, y, z) is at (2 x + 10, -2 z, 2 y).
     plain, scene = including(tmp_path, "scale = 2, rotate = [90, 0, 0], translate = [10, 0, 0]")
-    geometry = world_mesh(scene).geometry
+    geometry = flatten_joined(scene).geometry
     assert geometry.vertices[geometry.faces[0]].tolist() == [[12, 0, 0], [14, 0, 0], [12, 0, 2]]
     point, sun, spot = scene.lights
     assert isinstance(point, PointLight) and isinstance(sun, DirectionalLight) and isinstance(spot, SpotLight)
@@ -288,7 +288,7 @@ def test_an_included_file_is_moved_as_a_whole(tmp_path: Path) -> None:
 
 def test_an_included_file_may_be_mirrored(tmp_path: Path) -> None:
     plain, scene = including(tmp_path, "scale = [-1, 1, 1]")
-    before, after = world_mesh(plain).geometry, world_mesh(scene).geometry
+    before, after = flatten_joined(plain).geometry, flatten_joined(scene).geometry
     normals = [np.cross(*(np.diff(g.vertices[g.faces[0]], axis=0))) for g in (before, after)]
     assert normals[0].tolist() == normals[1].tolist() == [0, 0, 1]  # its outside stays outside
     assert after.vertices[:, 0].min() == -2 and np.linalg.det(scene.cameras[0].camera_to_world) == pytest.approx(1.0)

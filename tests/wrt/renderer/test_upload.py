@@ -10,7 +10,7 @@ import pytest
 from tests.kernel_tools import DEVICE, launch, unit, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel.scenes.flatten import world_mesh
+from wrt.accel.scenes.flatten import flatten_joined
 from wrt.core.errors import InputError, SceneWarning
 from wrt.kernels.shade import lights
 from wrt.kernels.shade.surface import Triangle, triangle_normal
@@ -64,7 +64,7 @@ TRANSFORMS = {
 @pytest.mark.parametrize("name", TRANSFORMS)
 def test_outside_stays_outside_and_normals_stay_normal(name: str) -> None:
     ball, matrix = icosphere(2), TRANSFORMS[name]
-    world = world_mesh(Scene(objects=(Object(ball, (GREY,), matrix),)))
+    world = flatten_joined(Scene(objects=(Object(ball, (GREY,), matrix),)))
     exact = ball.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     assert np.array_equal(world.geometry.vertices, exact.astype(np.float32))  # rounded once
     placed = Mesh(world.geometry.vertices, world.geometry.faces)
@@ -77,14 +77,14 @@ def test_outside_stays_outside_and_normals_stay_normal(name: str) -> None:
 
 def test_the_identity_changes_nothing() -> None:
     ball = icosphere(1)
-    world = world_mesh(Scene(objects=(Object(ball, (GREY,)),)))
+    world = flatten_joined(Scene(objects=(Object(ball, (GREY,)),)))
     assert np.array_equal(world.geometry.vertices, ball.vertices) and np.array_equal(world.geometry.faces, ball.faces)
     assert np.array_equal(world.normals, ball.normals) and world.uvs.shape == (len(ball.vertices), 2)
 
 
 def test_a_flattened_object_has_finite_normals() -> None:
     flat = transform([[1, 0, 0], [0, 0, 0], [0, 0, 1]])
-    world = world_mesh(Scene(objects=(Object(icosphere(1), (GREY,), flat),)))
+    world = flatten_joined(Scene(objects=(Object(icosphere(1), (GREY,), flat),)))
     assert np.isfinite(world.normals).all()
     length = np.linalg.norm(world.normals, axis=1)
     assert ((length < 1e-6) | (np.abs(length - 1.0) < 1e-5)).all()
@@ -96,14 +96,14 @@ def test_objects_are_joined_with_their_materials() -> None:
     scene = Scene(objects=(Object(box(), (red, blue), face_material=which), Object(quad(), (green,)), Object(quad(), (blue,))),
                   spheres=(Sphere((1, 2, 3), 4.0, green), Sphere((0, 0, 0), 1.0, red)))
     assert [m.name for m in scene.materials] == ["red", "blue", "green"]
-    world = world_mesh(scene)
+    world = flatten_joined(scene)
     geometry = world.geometry
     assert world.prim_material.tolist() == [*which.tolist(), 2, 2, 1, 1, 2, 0]
     assert len(geometry) == 12 + 2 + 2 + 2 and geometry.faces.max() == len(geometry.vertices) - 1
     assert np.array_equal(geometry.vertices[geometry.faces[12:14]], quad().vertices[quad().faces])
     assert geometry.spheres.tolist() == [[1, 2, 3, 4], [0, 0, 0, 1]]
     assert world.normals is None and np.array_equal(world.uvs[-4:], quad().uvs)
-    smooth = world_mesh(Scene(objects=(Object(quad(), (red,)), Object(icosphere(0), (red,)))))
+    smooth = flatten_joined(Scene(objects=(Object(quad(), (red,)), Object(icosphere(0), (red,)))))
     assert smooth.normals is not None and not smooth.normals[:4].any() and smooth.normals[4:].any()
 
 
@@ -145,7 +145,7 @@ def test_srgb_table() -> None:
 def test_lights_without_area() -> None:
     scene = Scene(lights=(PointLight((1, 2, 3), (4, 5, 6)), DirectionalLight((0, -3, 0), (7, 8, 9)),
                           SpotLight((1, 1, 1), (0, 0, -2), (1, 2, 3), 0.25, 0.5)))
-    rows, emitters, _ = light_records(scene, world_mesh(scene))
+    rows, emitters, _ = light_records(scene, flatten_joined(scene))
     assert [list(lights.LIGHTS)[kind] for kind in rows["kind"]] == ["point", "directional", "spot"] and len(emitters) == 0
     assert rows["position"][0].tolist() == [1, 2, 3] and rows["color"][1].tolist() == [7, 8, 9]
     assert np.allclose(rows["direction"][1:], [[0, -1, 0], [0, 0, -1]])
@@ -161,23 +161,23 @@ def lamps(count: int, **rest: float) -> Scene:
 
 def test_each_glowing_object_is_a_light() -> None:
     scene = lamps(3)
-    rows, emitters, cdf = light_records(scene, world_mesh(scene))
+    rows, emitters, cdf = light_records(scene, flatten_joined(scene))
     assert (rows["kind"] == list(lights.LIGHTS).index("mesh")).all()
     assert rows["count"].tolist() == [2, 2, 2] and rows["first"].tolist() == [0, 2, 4]
     assert emitters["material"].tolist() == [1, 1, 2, 2, 3, 3] and (emitters["instance"] == 0).all()
-    world = world_mesh(scene)
+    world = flatten_joined(scene)
     for number, corner in enumerate(("v0", "v1", "v2")):
         assert (emitters[corner] == world.vertices[world.faces[12:, number]]).all()
     assert np.allclose(cdf, [0.5, 1.0] * 3)
     assert np.allclose(emitters["pdf_area"], 1.0 / np.repeat([1.0, 2.0, 3.0], 2))  # uniform over each quad
     dark = lamps(3, emits_light=False)
-    assert len(light_records(dark, world_mesh(dark))[0]) == 0
+    assert len(light_records(dark, flatten_joined(dark))[0]) == 0
 
 
 def test_beyond_some_number_all_are_one_light_by_power() -> None:
     count = MAX_MESH_LIGHTS + 4
     scene = lamps(count)
-    rows, emitters, cdf = light_records(scene, world_mesh(scene))
+    rows, emitters, cdf = light_records(scene, flatten_joined(scene))
     assert len(rows) == 1 and rows["count"][0] == 2 * count == len(emitters)
     area = 0.5 * (1.0 + np.repeat(np.arange(count), 2))
     power = area * np.repeat([LUMINANCE @ [1.0 + i, 2.0, 0.5] for i in range(count)], 2)
@@ -196,7 +196,7 @@ def test_the_density_of_emitters_is_that_of_the_rounded_table_by_which_they_are_
     vertices = np.concatenate([corner, corner + [[[0.01, 0, 0]]], corner + [[[0, 0.01, 0]]]], axis=1).reshape(-1, 3)
     mesh = Mesh(vertices, np.arange(3 * count).reshape(-1, 3))
     scene = Scene(objects=(Object(mesh, (Material(emission=(1, 1, 1)),)),))
-    world = world_mesh(scene)
+    world = flatten_joined(scene)
     _, emitters, cdf = light_records(scene, world)
     assert cdf.dtype == np.float32 and cdf[-1] == 1.0 and (np.diff(cdf) >= 0.0).all()
     corner = world.geometry.vertices[world.geometry.faces].astype(np.float64)
@@ -253,15 +253,15 @@ def test_emission_that_light_samples_cannot_reach_is_told_once() -> None:
 def test_emitters_without_area_or_light_are_never_chosen() -> None:
     mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], [[0, 1, 1], [0, 1, 2], [0, 1, 3]])
     scene = Scene(objects=(Object(mesh, (Material(emission=(1, 1, 1)),)),))
-    rows, emitters, cdf = light_records(scene, world_mesh(scene))
+    rows, emitters, cdf = light_records(scene, flatten_joined(scene))
     assert rows["count"][0] == 3 and cdf.tolist() == [0.0, 1.0, 1.0] and emitters["pdf_area"].tolist() == [0.0, 2.0, 0.0]
     flat = Scene(objects=(Object(Mesh(mesh.vertices, mesh.faces[[0, 2]]), (Material(emission=(1, 1, 1)),)),))
-    assert len(light_records(flat, world_mesh(flat))[0]) == 0
+    assert len(light_records(flat, flatten_joined(flat))[0]) == 0
 
 
 def test_glowing_spheres() -> None:
     scene = Scene(spheres=(Sphere((0, 1, 0), 0.5, Material(emission=(1, 2, 3))), Sphere((5, 1, 0), 0.5, GREY)))
-    rows, *_ = light_records(scene, world_mesh(scene))
+    rows, *_ = light_records(scene, flatten_joined(scene))
     assert len(rows) == 1 and rows["kind"][0] == list(lights.LIGHTS).index("sphere") and rows["radius"][0] == 0.5
     assert rows["position"][0].tolist() == [0, 1, 0] and rows["color"][0].tolist() == [1, 2, 3]
 

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.built import AccelStats
+from wrt.accel.flat_scene import FlatScene
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, room_for
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.counting import counted
@@ -17,7 +18,6 @@ from wrt.accel.queries.rays import rays_of
 from wrt.accel.queries.world_ids import worlds_asked
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
-from wrt.accel.world import World
 from wrt.core.arrays import returned
 from wrt.core.checks import shown
 from wrt.core.device import start, upload
@@ -37,7 +37,7 @@ class Accelerator:
 
     _snapshot: Snapshot  # replaced as a whole
 
-    def __init__(self, structure: Structure, geometry: Any, attributes: World | None, device: str, threads: int | None) -> None:
+    def __init__(self, structure: Structure, geometry: Any, attributes: FlatScene | None, device: str, threads: int | None) -> None:
         """geometry, attributes: as in Snapshot. Children build over it, and then take a snapshot with what they built."""
         check_units(structure.units.triangle, structure.units.box)
         self.device = start(device)

@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from wrt.accel.flat_scene import FlatScene, Placed, flat_scene_of, placed_now, run_of
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
 from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.queries.world_ids import WorldIds
 from wrt.accel.snapshot import Snapshot, once
-from wrt.accel.world import Placed, World, placed_now, run_of, world_over
 from wrt.core.arrays import returned, to_warp
 from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
@@ -28,7 +28,7 @@ HITS_PER_LAUNCH = 65536
 class Surroundings(NamedTuple):
     """What a structure was over on a device when it was asked: as the kernel takes it, and where it is from."""
 
-    world: World
+    scene: FlatScene
     surfaces: Any
     numbering: Any
 
@@ -116,11 +116,11 @@ class HitPoints:
         snapshot, rays, worlds = self._source()
         if name in ("error", "normal", "shading", "uv"):
             check_recorded(self, name)
-        world, surfaces, numbering = surroundings(snapshot)
-        if name == "shading" and world.normals is None:
+        scene, surfaces, numbering = surroundings(snapshot)
+        if name == "shading" and scene.normals is None:
             name = "normal"
-        _require(world, name)
-        if name == "instance" and world.objects is not None:
+        _require(scene, name)
+        if name == "instance" and scene.objects is not None:
             name = "object"
         n, device = len(self.t), snapshot.device
         out: Any = HitPlaces()
@@ -140,14 +140,14 @@ class HitPoints:
         return array.numpy() if give is None else give(array)
 
 
-def _require(world: World, name: str) -> None:
-    """Raise InputError where hits in this world have no such thing."""
-    if name == "uv" and not len(world.uvs):
+def _require(scene: FlatScene, name: str) -> None:
+    """Raise InputError where hits in this scene have no such thing."""
+    if name == "uv" and not len(scene.uvs):
         raise InputError("the mesh has no texture coordinates (uvs)")
-    if name == "instance" and not isinstance(world.geometry, InstancedGeometry):
+    if name == "instance" and not isinstance(scene.geometry, InstancedGeometry):
         raise InputError("the structure has no instances")
-    if name in ("object", "material") and world.objects is None:
-        if isinstance(world.geometry, InstancedGeometry) and world.geometry.worlds is not None:
+    if name in ("object", "material") and scene.objects is None:
+        if isinstance(scene.geometry, InstancedGeometry) and scene.geometry.worlds is not None:
             raise InputError(f"hits over worlds do not know their {name} yet; hits.instance is known")
         raise InputError(f"the structure is not over a scene: there is no {name}")
 
@@ -156,22 +156,22 @@ def _require(world: World, name: str) -> None:
 def surroundings(snapshot: Snapshot) -> Surroundings:
     """Of a structure, on its device."""
     geometry, device = snapshot.geometry, snapshot.device
-    world, surfaces = snapshot.attributes or world_over(geometry), structs.Surfaces()
-    placed = placed_now(world, geometry)
+    scene, surfaces = snapshot.attributes or flat_scene_of(geometry), structs.Surfaces()
+    placed = placed_now(scene, geometry)
     surfaces.n_triangles = geometry.n_triangles
-    surfaces.vertices = upload(geometry.vertices if placed is None else world.vertices, wp.vec3, device)
-    surfaces.faces = upload(world.faces, wp.vec3i, device)
-    surfaces.normals = upload(np.zeros((1, 3)) if world.normals is None else world.normals, wp.vec3, device)
-    surfaces.uvs = upload(world.uvs, wp.vec2, device)
+    surfaces.vertices = upload(geometry.vertices if placed is None else scene.vertices, wp.vec3, device)
+    surfaces.faces = upload(scene.faces, wp.vec3i, device)
+    surfaces.normals = upload(np.zeros((1, 3)) if scene.normals is None else scene.normals, wp.vec3, device)
+    surfaces.uvs = upload(scene.uvs, wp.vec2, device)
     surfaces.spheres = snapshot.surfaces.spheres
-    surfaces.prim_material = upload(world.prim_material, wp.int32, device)
+    surfaces.prim_material = upload(scene.prim_material, wp.int32, device)
     numbering = Numbering()
-    if world.objects is not None:
-        numbering.first_prim = upload(world.objects, wp.int32, device)
+    if scene.objects is not None:
+        numbering.first_prim = upload(scene.objects, wp.int32, device)
     if placed is not None:
         surfaces.instances = upload(instance_records(placed), structs.Instance, device)
         numbering.instance = upload(_instance_of(placed, geometry), wp.int32, device)
-    return Surroundings(world, surfaces, numbering)
+    return Surroundings(scene, surfaces, numbering)
 
 
 def _instance_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:

@@ -72,7 +72,7 @@ def kind_of(structure: Structure) -> int:
     return zlib.crc32(f"{structure.accel.name} {structure.units.triangle}".encode()) & 0x7FFFFFFF
 
 
-def world_of(snapshot: Snapshot) -> Any:
+def kernel_argument(snapshot: Snapshot) -> Any:
     """A structure and what it is over as one record. Raises InputError where it is not over one mesh."""
     structure = snapshot.structure
     structure.require_one_mesh("kernels of one's own ask structures over one mesh")

@@ -9,16 +9,16 @@ from typing import Any, overload
 import numpy as np
 
 from wrt.accel.base import OneMesh
+from wrt.accel.flat_scene import FlatScene, flat_scene_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.instances import Instances
-from wrt.accel.scenes.flatten import world_of
+from wrt.accel.scenes.flatten import flatten
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.scenes.worlds import worlds_over
 from wrt.accel.store import read
 from wrt.accel.structure import default_options
 from wrt.accel.structures import ACCELERATORS
-from wrt.accel.world import World, world_over
 from wrt.core.arrays import is_tensor, taken, to_numpy
 from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError
@@ -58,12 +58,12 @@ def build(mesh: Any, accel: str = "bvh", device: str = "cpu", threads: int | Non
     """
     ACCELERATORS.check(as_one(accel, str, "accel"))
     kind, device = ACCELERATORS[accel], as_one(device, str, "device")
-    world = (worlds_over([shape_given(each) for each in mesh]) if isinstance(mesh, list)
-             else None if isinstance(mesh, Geometry | InstancedGeometry) else world_given(mesh))  # of a geometry no more is known
-    geometry = mesh if world is None else world.geometry
+    flat = (worlds_over([shape_given(each) for each in mesh]) if isinstance(mesh, list)
+             else None if isinstance(mesh, Geometry | InstancedGeometry) else flat_scene_given(mesh))  # of a geometry no more is known
+    geometry = mesh if flat is None else flat.geometry
     if isinstance(geometry, InstancedGeometry):
-        return Instances(kind, geometry, world, device=device, threads=threads, **options)
-    return kind(geometry, world, device=device, threads=threads, **options)
+        return Instances(kind, geometry, flat, device=device, threads=threads, **options)
+    return kind(geometry, flat, device=device, threads=threads, **options)
 
 
 def load_accel(path: str | os.PathLike[str], mesh: Any, device: str = "cpu", threads: int | None = None) -> OneMesh:
@@ -71,22 +71,22 @@ def load_accel(path: str | os.PathLike[str], mesh: Any, device: str = "cpu", thr
 
     Raises InputError for a file that is missing, foreign, damaged, of another version or over another mesh.
     """
-    world = world_given(mesh)
-    return read(path, one_geometry(world), world, as_one(device, str, "device"), threads)
+    flat = flat_scene_given(mesh)
+    return read(path, one_geometry(flat), flat, as_one(device, str, "device"), threads)
 
 
-def world_given(mesh: Any) -> World:
+def flat_scene_given(mesh: Any) -> FlatScene:
     """What a structure is to be over: as in `build`, but no list. Raises InputError for what is none, and for a bad file."""
     if isinstance(mesh, Geometry | InstancedGeometry):
-        return world_over(mesh)
+        return flat_scene_of(mesh)
     mesh = shape_given(mesh)
     if isinstance(mesh, Scene):
-        return world_of(mesh, instanced_meshes(mesh))
-    return world_over(Geometry.of(mesh), mesh.normals, mesh.uvs)
+        return flatten(mesh, instanced_meshes(mesh))
+    return flat_scene_of(Geometry.of(mesh), mesh.normals, mesh.uvs)
 
 
 def shape_given(mesh: Any) -> Mesh | Scene:
-    """As world_given, but for geometries."""
+    """As flat_scene_given, but for geometries."""
     if isinstance(mesh, str | os.PathLike) and Path(os.fsdecode(mesh)).suffix.lower() in LOADERS:
         mesh = load_scene(mesh)
     elif isinstance(mesh, str | os.PathLike):
@@ -103,8 +103,8 @@ def shape_given(mesh: Any) -> Mesh | Scene:
                      f" (vertices, faces), got {shown(mesh)}")
 
 
-def one_geometry(world: World) -> Geometry:
+def one_geometry(flat: FlatScene) -> Geometry:
     """Raises InputError where there are instances."""
-    if not isinstance(world.geometry, Geometry):
+    if not isinstance(flat.geometry, Geometry):
         raise InputError("a scene with instances has no structure in a file")
-    return world.geometry
+    return flat.geometry

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wrt.accel.flat_scene import FlatScene, Placed
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
 from wrt.accel.scenes.instancing import is_instance
-from wrt.accel.world import Placed, World
 from wrt.core.errors import InputError
 from wrt.scene.clean import flip_collinear
 from wrt.scene.mesh import Mesh, unit_rows
@@ -18,12 +18,12 @@ from wrt.scene.model import Object, Scene
 MOST = 2**31 - 2  # faces, and vertices
 
 
-def world_of(scene: Scene, meshes: frozenset[int] = frozenset()) -> World:
-    """The world of a scene; meshes: the id()s of those that are kept once (wrt.accel.scenes.instancing)."""
-    return instanced_world(scene, meshes) if meshes else world_mesh(scene)
+def flatten(scene: Scene, meshes: frozenset[int] = frozenset()) -> FlatScene:
+    """The flat scene; meshes: the id()s of those that are kept once (wrt.accel.scenes.instancing)."""
+    return flatten_instanced(scene, meshes) if meshes else flatten_joined(scene)
 
 
-def world_mesh(scene: Scene) -> World:
+def flatten_joined(scene: Scene) -> FlatScene:
     """Transform and join all objects. Positions are computed in float64 and rounded once.
 
     Of faces whose corners rounding put on a line, see `wrt.scene.clean.flip_collinear`.
@@ -32,12 +32,12 @@ def world_mesh(scene: Scene) -> World:
     joined = _joined(scene.objects, index)
     _require_room(len(joined.vertices), len(joined.faces))
     geometry = Geometry(joined.vertices, joined.faces, _spheres(scene))
-    return World(geometry, joined.vertices, joined.faces, joined.normals if _is_smooth(scene) else None, joined.uvs,
+    return FlatScene(geometry, joined.vertices, joined.faces, joined.normals if _is_smooth(scene) else None, joined.uvs,
                  np.concatenate([joined.material, _sphere_materials(scene, index)]), objects=_first_prims(scene))
 
 
-def instanced_world(scene: Scene, meshes: frozenset[int]) -> World:
-    """As world_mesh, with the meshes of those id()s kept once. The rest is joined in world space, as part 0 of the geometry."""
+def flatten_instanced(scene: Scene, meshes: frozenset[int]) -> FlatScene:
+    """As flatten_joined, with the meshes of those id()s kept once. The rest is joined in world space, as part 0 of the geometry."""
     index = {id(material): i for i, material in enumerate(scene.materials)}
     flat = _joined(tuple(thing for thing in scene.objects if not is_instance(thing, meshes)), index)
     parts = {0: flat}  # then by id of the mesh
@@ -64,12 +64,12 @@ def instanced_world(scene: Scene, meshes: frozenset[int]) -> World:
             rows.append((first_prim, id(thing.mesh), materials[key][0], int(thing.face_material is not None), thing.transform))
         first_prim += count
     _require_room(sum(len(part.vertices) for part in parts.values()), first_prim)
-    return _placed_world(scene, index, parts, rows, materials, numbers, first_prim)
+    return _placed_scene(scene, index, parts, rows, materials, numbers, first_prim)
 
 
-def _placed_world(scene: Scene, index: dict[int, int], parts: dict[int, _Joined], rows: list[tuple[int, int, int, int, np.ndarray]],
-                  materials: dict[tuple[int, ...], tuple[int, np.ndarray]], numbers: list[np.ndarray], n_triangles: int) -> World:
-    """The arrays of `instanced_world`, put together."""
+def _placed_scene(scene: Scene, index: dict[int, int], parts: dict[int, _Joined], rows: list[tuple[int, int, int, int, np.ndarray]],
+                  materials: dict[tuple[int, ...], tuple[int, np.ndarray]], numbers: list[np.ndarray], n_triangles: int) -> FlatScene:
+    """The arrays of `flatten_instanced`, put together."""
     spheres = _spheres(scene)
     of_spheres = _sphere_materials(scene, index)
     numbers.append(np.arange(n_triangles, n_triangles + len(spheres), dtype=np.int64))
@@ -91,7 +91,7 @@ def _placed_world(scene: Scene, index: dict[int, int], parts: dict[int, _Joined]
             for first, key, material, step, matrix in rows]
     runs.append((n_triangles, 0, len(prim_material) - len(spheres), 1, np.eye(4)[:3]))
     columns = [np.array([run[i] for run in runs], np.int64) for i in range(4)]
-    return World(geometry, np.concatenate([part.vertices for part in joined]),
+    return FlatScene(geometry, np.concatenate([part.vertices for part in joined]),
                  np.concatenate([part.faces + np.int32(first) for part, first in zip(joined, first_vertex, strict=False)]),
                  np.concatenate([part.normals for part in joined]) if _is_smooth(scene) else None,
                  np.concatenate([part.uvs for part in joined]), prim_material,

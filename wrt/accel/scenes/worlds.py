@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.scenes.flatten import world_of
+from wrt.accel.flat_scene import FlatScene
+from wrt.accel.scenes.flatten import flatten
 from wrt.accel.scenes.instancing import is_invertible
-from wrt.accel.world import World
 from wrt.core.errors import InputError
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 
-def worlds_over(given: Sequence[Mesh | Scene]) -> World:
+def worlds_over(given: Sequence[Mesh | Scene]) -> FlatScene:
     """One geometry over several worlds, all of whose objects are instances; each mesh is kept once. Raises InputError for spheres
     and for objects that are flattened."""
     for number, scene in enumerate(given):
@@ -31,6 +31,6 @@ def worlds_over(given: Sequence[Mesh | Scene]) -> World:
     together = tuple(thing for each in objects for thing in each)
     if not together:
         raise InputError("worlds must have at least one object between them")
-    world = world_of(Scene(together), frozenset(id(thing.mesh) for thing in together))
-    geometry: Any = world.geometry
-    return replace(world, geometry=replace(geometry, worlds=np.cumsum([0, *map(len, objects)])), objects=None)
+    flat = flatten(Scene(together), frozenset(id(thing.mesh) for thing in together))
+    geometry: Any = flat.geometry
+    return replace(flat, geometry=replace(geometry, worlds=np.cumsum([0, *map(len, objects)])), objects=None)

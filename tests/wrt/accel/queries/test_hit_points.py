@@ -17,7 +17,7 @@ from tests.placed import place
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances
 from wrt.accel.queries.hit_points import HitPoints
-from wrt.accel.scenes.flatten import world_mesh, world_of
+from wrt.accel.scenes.flatten import flatten, flatten_joined
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.arrays import to_numpy
 from wrt.core.errors import InputError
@@ -201,9 +201,9 @@ def test_what_a_scene_says_of_a_hit(instances: bool) -> None:
     given = scene()
     accel = wrt.build(given)
     if instances:
-        world = world_of(given, frozenset([id(given.objects[1].mesh)]))
+        world = flatten(given, frozenset([id(given.objects[1].mesh)]))
         accel = Instances(ACCELERATORS["bvh"], world.geometry, world, device=DEVICE.alias)
-    flat, hits = world_mesh(given), accel.closest_hit(*asked())
+    flat, hits = flatten_joined(given), accel.closest_hit(*asked())
     hit = hits.prim_id >= 0
     prim_id, point = hits.prim_id[hit], hits.point[hit].astype(np.float64)
     assert np.array_equal(hits.material[hit], flat.prim_material[prim_id]) and (hits.material[~hit] == -1).all()

@@ -14,7 +14,7 @@ from tests.command_line import BOX_OBJ
 from tests.data import ROOT
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances
-from wrt.accel.scenes.flatten import world_mesh
+from wrt.accel.scenes.flatten import flatten_joined
 from wrt.core.errors import InputError
 from wrt.scene import shapes
 from wrt.scene.materials import Material
@@ -46,7 +46,7 @@ def test_the_same_hits_whatever_it_is_given_as(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore::wrt.SceneWarning")
 def test_over_a_scene_file_it_is_the_pictures_world() -> None:
     path = ROOT / "scenes" / "whitted.toml"
-    accel, flat = wrt.build(path), world_mesh(wrt.load_scene(path))
+    accel, flat = wrt.build(path), flatten_joined(wrt.load_scene(path))
     assert len(accel.geometry) == len(flat.geometry) and len(accel.geometry.spheres) == len(flat.geometry.spheres)
 
 

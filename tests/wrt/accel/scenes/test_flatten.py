@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wrt.accel.scenes.flatten import instanced_world, world_mesh, world_of
+from wrt.accel.flat_scene import FlatScene
+from wrt.accel.scenes.flatten import flatten, flatten_instanced, flatten_joined
 from wrt.accel.scenes.instancing import INSTANCING, MIN_SAVED, instanced_meshes
-from wrt.accel.world import World
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
@@ -41,7 +41,7 @@ def mixed_scene() -> Scene:
 def test_the_same_primitives_as_when_all_is_copied() -> None:
     scene = mixed_scene()
     shared = frozenset((id(scene.objects[1].mesh), id(scene.objects[5].mesh)))
-    flat, world = world_mesh(scene), instanced_world(scene, shared)
+    flat, world = flatten_joined(scene), flatten_instanced(scene, shared)
     assert world.geometry.n_triangles == flat.geometry.n_triangles and len(world.geometry) == len(flat.geometry)
     prim_id = np.arange(len(flat.geometry))
     np.testing.assert_array_equal(world.materials(prim_id), flat.prim_material)
@@ -68,8 +68,8 @@ def test_the_rule_counts_what_copies_would_take() -> None:
         instanced_meshes(Scene(objects), "sometimes")
 
 
-def shared_world(scene: Scene) -> World:
-    return world_of(scene, instanced_meshes(scene, "always"))
+def shared_world(scene: Scene) -> FlatScene:
+    return flatten(scene, instanced_meshes(scene, "always"))
 
 
 def test_objects_that_cannot_be_instances_are_copied() -> None:
@@ -83,13 +83,13 @@ def test_objects_that_cannot_be_instances_are_copied() -> None:
 
 
 def test_corners_on_a_line_are_parted_in_a_mesh_of_its_own_space_too() -> None:
-    """A face without area between two others, as world_mesh flips it; materials follow."""
+    """A face without area between two others, as flatten_joined flips it; materials follow."""
     corners = np.array([[0, 0, 0], [2, 0, 0], [1, 0, 0], [1, 1, 0], [1, -1, 0]], np.float32)
     mesh = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 4, 2], [2, 4, 1]], np.int32))
     which = np.array([0, 1, 2, 2], np.int32)
     turned = np.array([[0.0, 1.0, 0.0, 5.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     scene = Scene(tuple(Object(mesh, (RED, GREEN, BLUE), matrix, which) for matrix in (np.eye(4), turned)))
-    flat, world = world_mesh(scene), shared_world(scene)
+    flat, world = flatten_joined(scene), shared_world(scene)
     assert world.placed is not None
     prim_id = np.arange(8)
     np.testing.assert_array_equal(world.materials(prim_id), flat.materials(prim_id))

@@ -14,7 +14,7 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 class Placed:
     """The scene's primitives in runs of one mesh in one place, in the order of prim_id; the last run may be all spheres.
 
-    (I,) int64 each: first_prim, first_face (into World.faces), first_material (into World.prim_material), material_step (1, or 0
+    (I,) int64 each: first_prim, first_face (into FlatScene.faces), first_material (into FlatScene.prim_material), material_step (1, or 0
     where all are of one material); to_world: (I, 3, 4) float64.
     """
 
@@ -26,7 +26,7 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class FlatScene:
     """All shapes of a scene, or a mesh by itself. prim_id counts the faces of all objects in their order, then the spheres.
 
     geometry: what is hit; vertices (V, 3), faces (F, 3), normals (V, 3) or None, uvs (V, 2), the last two zero where an object
@@ -73,27 +73,27 @@ class World:
         return run, prim_id - self.placed.first_prim[run]
 
 
-def world_over(geometry: Geometry | InstancedGeometry, normals: np.ndarray | None = None, uvs: np.ndarray | None = None) -> World:
-    """The world of what is no scene: a mesh by itself, whose normals and uvs are given, or instances of meshes without."""
+def flat_scene_of(geometry: Geometry | InstancedGeometry, normals: np.ndarray | None = None, uvs: np.ndarray | None = None) -> FlatScene:
+    """Return the flat scene of a mesh with its normals and uvs, or of instances of meshes without these."""
     material = np.zeros(0, np.int32)
     uvs = np.zeros((0, 2), np.float32) if uvs is None else uvs
     if isinstance(geometry, Geometry):
-        return World(geometry, geometry.vertices, geometry.faces, normals, uvs, material)
+        return FlatScene(geometry, geometry.vertices, geometry.faces, normals, uvs, material)
     first_vertex = np.cumsum([0, *(len(part.vertices) for part in geometry.parts)])
     first_face = np.cumsum([0, *(len(part.faces) for part in geometry.parts)])
     nothing = np.zeros(len(geometry.part), np.int64)
-    return World(geometry, np.concatenate([part.vertices for part in geometry.parts]),
+    return FlatScene(geometry, np.concatenate([part.vertices for part in geometry.parts]),
                  np.concatenate([part.faces + np.int32(first) for part, first in zip(geometry.parts, first_vertex, strict=False)]),
                  None, uvs, material, Placed(geometry.first_prim, first_face[geometry.part], nothing, nothing, geometry.to_world))
 
 
-def placed_now(world: World, geometry: Geometry | InstancedGeometry) -> Placed | None:
-    """world.placed, with the instances where they are now in a geometry that began as the world's."""
-    if world.placed is None or not isinstance(geometry, InstancedGeometry):
+def placed_now(scene: FlatScene, geometry: Geometry | InstancedGeometry) -> Placed | None:
+    """scene.placed, with the instances where they are now in a geometry that began as the scene's."""
+    if scene.placed is None or not isinstance(geometry, InstancedGeometry):
         return None
-    to_world = world.placed.to_world.copy()
-    to_world[run_of(world.placed, geometry)] = geometry.to_world[geometry.is_placed]
-    return replace(world.placed, to_world=to_world)
+    to_world = scene.placed.to_world.copy()
+    to_world[run_of(scene.placed, geometry)] = geometry.to_world[geometry.is_placed]
+    return replace(scene.placed, to_world=to_world)
 
 
 def run_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:
