@@ -228,7 +228,6 @@ class RtCore(Plan):
     gpu: str = option("rtx2080ti", "What the model reckons for: rtx2080ti or rtx2060", of=GPUS)
     seed: int = option(0, "Other rays")
     inside: bool = option(False, "The camera stands in the middle of the mesh's box, as in a room")
-    software: bool = option(False, "Also what the same rays take in software on a GTX 1080 Ti (compiles for Turing)")
 
 
 @dataclass(frozen=True)

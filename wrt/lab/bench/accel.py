@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled
+from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, mesh_name, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.bench.stadium import in_stadium
 from wrt.lab.bench.timing import alternate, peak_bytes, spread
@@ -74,7 +73,7 @@ def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
     yardstick = build(Geometry.of(mesh), YARDSTICK)
     sets = ray_sets(yardstick, plan.rays, plan.seed)
     mesh = in_stadium(mesh) if plan.stadium else mesh
-    where, geometry = Path(mesh.name or "mesh").name, Geometry.of(mesh)
+    where, geometry = mesh_name(mesh), Geometry.of(mesh)
     yardstick = build(geometry, YARDSTICK) if plan.stadium else yardstick
     n = len(geometry)
     built: dict[str, Accelerator] = {}

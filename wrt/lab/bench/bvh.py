@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 
@@ -27,8 +26,7 @@ from wrt.kernels.traverse.bvh2_kdop import kdop_volumes
 from wrt.kernels.traverse.bvh2_sphere import sphere_volumes
 from wrt.lab.bench.accel import differing
 from wrt.lab.bench.rays import RaySet, ball_around, endless, unit
-from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, tabled
-from wrt.lab.bench.report import run as run
+from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, mesh_name, tabled
 from wrt.lab.bench.timing import alternate, peak_bytes, spread
 from wrt.lab.plans import Bvh as Plan
 
@@ -58,7 +56,7 @@ differ: rays with another prim_id or another bit of t than bvh2."""
 
 def rows(plan: Plan) -> Iterator[Row]:
     for mesh in map(as_mesh, plan.meshes):
-        geometry, name = Geometry.of(mesh), Path(mesh.name or "mesh").name
+        geometry, name = Geometry.of(mesh), mesh_name(mesh)
         rays = inward(geometry, plan.rays, plan.seed)
         for measured in (*builder_rows(plan, geometry, rays), *volume_rows(plan, geometry, rays)):
             yield Row(mesh=name, n_triangles=len(geometry), **measured)

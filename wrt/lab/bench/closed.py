@@ -6,7 +6,6 @@ import importlib
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -19,8 +18,7 @@ from wrt.accel.queries.contains import contains, open_edges
 from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.report import Columns, Part, Row, tabled
-from wrt.lab.bench.report import run as run
+from wrt.lab.bench.report import Columns, Part, Row, mesh_name, tabled
 from wrt.lab.hard_cases.common import targets, unit_vectors
 from wrt.lab.oracle.oracle import Place, Reference
 from wrt.lab.plans import Closed as Plan
@@ -48,7 +46,7 @@ def rows(plan: Plan) -> Iterator[Row]:
         if open_edges(geometry):
             raise InputError("the mesh is not closed", mesh.name)
         reference, accel = Reference(geometry), build(geometry)
-        known = {"mesh": Path(mesh.name).name, "triangles": len(geometry.faces)}
+        known = {"mesh": mesh_name(mesh), "triangles": len(geometry.faces)}
         for who, n in asked(plan, plan.points):
             answer = partial(contains, accel) if who == "wrt" else OTHERS[who][1](geometry)[0]
             answer(np.zeros((2, 3), np.float32))
@@ -76,9 +74,6 @@ def asked(plan: Plan, n: int) -> Iterator[tuple[str, int]]:
         most = plan.others // (100 if name == "trimesh" else 1)
         if most and importlib.util.find_spec(package) is not None:
             yield name, min(n, most)
-
-
-# --- points -----------------------------------------------------------------------------------------------------------
 
 
 def points_wrong(geometry: Geometry, reference: Reference, answer: Callable[[np.ndarray], np.ndarray], n: int, seed: int) -> dict[str, Any]:
@@ -129,9 +124,6 @@ def distances(geometry: Geometry, points: np.ndarray) -> np.ndarray:
     corners = geometry.vertices[geometry.faces].astype(np.float64)
     return np.array([np.linalg.norm(closest_point(corners, np.tile(point, (len(corners), 1))) - point, axis=1).min()
                      for point in points.astype(np.float64)])
-
-
-# --- crossings --------------------------------------------------------------------------------------------------------
 
 
 def crossed(geometry: Geometry, accel: Accelerator, count: Callable[..., Any] | None, n: int, seed: int) -> dict[str, Any]:
@@ -193,9 +185,6 @@ def _angles(corners: np.ndarray, d: np.ndarray, k: np.ndarray) -> np.ndarray:
     sides = [corners[row, (k + i) % 3] - corners[row, k] for i in (1, 2)]
     e, f = (side - (side * d).sum(axis=1, keepdims=True) * d for side in sides)
     return np.arctan2(np.linalg.norm(np.cross(e, f), axis=1), (e * f).sum(axis=1))
-
-
-# --- who --------------------------------------------------------------------------------------------------------------
 
 
 def open3d_answers(geometry: Geometry) -> tuple[Callable[..., Any], Callable[..., Any]]:

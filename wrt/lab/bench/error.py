@@ -41,9 +41,6 @@ REFERENCE_DEPTH, REFERENCE_THROUGHPUT = 32, 1e-5
 BRUTE_FORCE_LIMIT = 5000  # primitives that it is still put to
 
 
-# --- the knobs --------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Knob:
     """What a user can turn: a field of wrt.scene.settings.Settings or of wrt.renderer.options.Options, and the values to try.
@@ -119,9 +116,6 @@ def variants(scene: Scene, options: Options, features: Features, knobs: Sequence
     return found, left_out
 
 
-# --- the reference ----------------------------------------------------------------------------------------------------
-
-
 def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int], depth: int | None = None) -> Row:
     """What counts as the truth. pixels: (H, W, 3) float64, the mean over the seeds; variance: of that mean, averaged over pixels
     and channels; lost_throughput_per_sample: the share of light that was not followed (a bound on what its own cuts may hide).
@@ -147,9 +141,6 @@ def finished(film: Film) -> Film:
     if film.stats["interrupted"]:
         raise Interrupted(film.stats["signal"] or signal.SIGINT)
     return film
-
-
-# --- one row ----------------------------------------------------------------------------------------------------------
 
 
 def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int], truth: Row) -> Row:
@@ -197,9 +188,6 @@ def same_pixels(rows: Sequence[Row]) -> list[str]:
     base = {row.spp: row._digest for row in rows if row.knob is None}
     return [variant for (variant, knob), group in grouped(rows, "variant", "knob").items()
             if knob is not None and all(row._digest == base.get(row.spp) for row in group)]
-
-
-# --- the sweep --------------------------------------------------------------------------------------------------------
 
 
 def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], None] = lambda text: None) -> Sweep:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from time import perf_counter, thread_time
 from typing import Any
 
@@ -18,8 +17,7 @@ from wrt.core.threads import run_all, thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.accel import timing, warm_up
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled, versions
-from wrt.lab.bench.report import run as run
+from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, mesh_name, tabled, versions
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own
 from wrt.lab.plans import Peers as Plan
@@ -49,7 +47,7 @@ def rows(plan: Plan) -> Iterator[Row]:
         for rays in ray_sets(accel, plan.rays, plan.seed).values():
             for threads in thread_counts(plan) if rays.kind in plan.kinds else ():
                 for i, measured in enumerate(compared(everybody, rays, threads, plan.runs)):
-                    yield Row(mesh=Path(mesh.name or "mesh").name, triangles=len(mesh.faces), kind=rays.kind, rays=len(rays),
+                    yield Row(mesh=mesh_name(mesh), triangles=len(mesh.faces), kind=rays.kind, rays=len(rays),
                               name=everybody[i].name, build=builds[i], threads=threads, **measured)
 
 

@@ -38,9 +38,6 @@ def versions(*packages: str) -> str:
     return ", ".join(told)
 
 
-# --- a study ----------------------------------------------------------------------------------------------------------
-
-
 class Row(SimpleNamespace):
     """What was measured of one thing, by name: what the names mean, the LEGEND of its study says. All of it goes into JSON but
     NumPy's arrays, and what has a name that begins with _."""
@@ -86,7 +83,7 @@ def study_of(plan: Plan) -> Any:
 
 def run(plan: Plan, report: Callable[[Row], None] | None = None) -> Rows[Row]:
     """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a device)."""
-    out = Rows[Row]([], partial(page, plan))
+    out = Rows[Row]([], partial(page, plan))  # no lambda: a worker sends it back
     for row in study_of(plan).rows(plan):
         out.append(row)
         if report is not None:
@@ -94,9 +91,20 @@ def run(plan: Plan, report: Callable[[Row], None] | None = None) -> Rows[Row]:
     return out
 
 
+def parts_of(rows: Sequence[Row], plan: Plan) -> list[Part]:
+    """Return the tables and texts of a study; one table of its COLUMNS unless the study says otherwise."""
+    study = study_of(plan)
+    return study.parts(rows, plan) if hasattr(study, "parts") else [tabled(study.COLUMNS, rows)]
+
+
 def page(plan: Plan, rows: Sequence[Row]) -> str:
-    """The tables of a study as HTML, for a notebook."""
-    return tables_page(study_of(plan).parts(rows, plan))
+    """Return the tables of a study as HTML, for a notebook."""
+    return tables_page(parts_of(rows, plan))
+
+
+def mesh_name(mesh: object) -> str:
+    """Return the name of a mesh, or of a mesh's file, without its folder."""
+    return Path(getattr(mesh, "name", mesh) or "mesh").name  # type: ignore[arg-type]
 
 
 def line(plan: Plan, row: Row) -> str:
@@ -117,7 +125,7 @@ def text(rows: Sequence[Row], plan: Plan, machine: str) -> str:
     """Everything as Markdown."""
     study = study_of(plan)
     head = f"# {study.TITLE}\n\nMachine: {machine}\n\nTo repeat: `{repeating(plan)}`\n\n"
-    return f"{head}{markdown(study.parts(rows, plan))}\n{study.LEGEND}"
+    return f"{head}{markdown(parts_of(rows, plan))}\n{study.LEGEND}"
 
 
 def repeating(plan: Plan) -> str:
@@ -127,15 +135,12 @@ def repeating(plan: Plan) -> str:
         value, flag = getattr(plan, each.name), f"--{each.name.replace('_', '-')}"
         if not each.metadata["text"]:
             things = value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
-            words += [Path(getattr(thing, "name", thing) or "mesh").name for thing in things]
+            words += map(mesh_name, things)
         elif isinstance(value, bool):
             words += [flag] if value else []
         elif value not in (None, ()) and (value != each.default or isinstance(value, int)):
             words.append(f"{flag} {value if isinstance(value, str | int | float) else ','.join(value)}")
     return " ".join(words)
-
-
-# --- its report -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,7 @@ from wrt.io.mesh_file import as_mesh
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, machine_line, tabled
-from wrt.lab.bench.report import run as run
+from wrt.lab.bench.report import Columns, Row, machine_line, mesh_name
 from wrt.lab.bench.timing import alternate, quartiles, shown
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.hard_cases.common import soup
@@ -42,7 +40,7 @@ def rows(plan: Plan) -> Iterator[Row]:
         geometry = Geometry.of(mesh)
         sets = ray_sets(build(geometry, plan.accel), plan.rays, plan.seed)
         for kind in ("primary", "random"):
-            yield from priced(plan, Path(mesh.name or "mesh").name, geometry, sets[kind], plan.accel, triangles + boxes)
+            yield from priced(plan, mesh_name(mesh), geometry, sets[kind], plan.accel, triangles + boxes)
     rng = np.random.default_rng(plan.seed)
     few = soup(rng.uniform(-1.0, 1.0, (ALONE, 1, 3)) + 0.3 * rng.normal(size=(ALONE, 3, 3)))
     rays = ray_sets(build(few, "brute_force"), plan.rays, plan.seed)["random"]
@@ -72,7 +70,3 @@ def priced(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet, accel: str, 
 
 def machine(plan: Plan) -> str:
     return machine_line("one used", f"structure {plan.accel}, {plan.runs} runs")
-
-
-def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    return [tabled(COLUMNS, rows)]

@@ -18,7 +18,6 @@ from wrt.core.threads import thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
 from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled
-from wrt.lab.bench.report import run as run
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility_check import agreement
 from wrt.lab.plans import Visibility as Plan

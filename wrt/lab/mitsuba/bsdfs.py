@@ -64,9 +64,6 @@ def _bsdf(mi: Any, material: Material) -> dict[str, Any]:
     return result
 
 
-# --- textures ---------------------------------------------------------------------------------------------------------
-
-
 def rgb(color: Color) -> dict[str, Any]:
     return {"type": "rgb", "value": list(color)}
 

@@ -61,9 +61,6 @@ class Translation(NamedTuple):
     parts: dict[str, Part]
 
 
-# --- scenes -----------------------------------------------------------------------------------------------------------
-
-
 def translate(mi: Any, scene: Scene, camera: CameraKind | str | int | None = None, integrator: str = "auto") -> Translation:
     """The scene for the module `mitsuba` with the variant that it has set, with sensor, film, sampler and integrator.
 
@@ -139,9 +136,6 @@ def _integrator(mi: Any, name: str, scene: Scene, lit: bool, parts: dict[str, Pa
         return {"type": "direct"}
     # Mitsuba counts a path's edges: 1 is emission seen by the camera, 2 direct light. No Russian roulette: less noise.
     return {"type": name, "max_depth": max_depth + 2, "rr_depth": 1 << 16}
-
-
-# --- camera and film --------------------------------------------------------------------------------------------------
 
 
 def _sensor(mi: Any, scene: Scene, camera: CameraKind) -> dict[str, Any]:

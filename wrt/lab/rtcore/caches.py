@@ -1,10 +1,9 @@
-"""Caches, simulated: what recorded fetches find in the L1 of each SM and the L2 of them all, in the order of the warps."""
+"""Simulation of the caches: which recorded fetches miss in the L1 of each SM and in the L2 behind them, in the order of the warps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,7 +19,7 @@ LINE = 128  # bytes: of a cache line on NVIDIA's GPUs since Volta
 
 @dataclass(frozen=True)
 class Cache:
-    """size in bytes; ways: lines a set. As many sets as fit."""
+    """Size in bytes, and lines a set (`ways`). A cache has as many sets as fit."""
 
     size: int
     ways: int
@@ -32,8 +31,7 @@ class Cache:
 
 @dataclass(frozen=True, eq=False)
 class Level1:
-    """accesses: of all L1s; wanted: lanes that ask; line, time, lanes: of the accesses that miss, SM after SM, the round in which
-    they are made, and how many lanes wait."""
+    """Accesses of all L1s, and the lanes that want them. Of each miss: its line, its round (`time`) and the lanes that wait for it."""
 
     accesses: int
     wanted: int
@@ -44,9 +42,9 @@ class Level1:
 
 @dataclass(frozen=True)
 class Misses:
-    """accesses: of the L1s; l1, l2: those that miss there (each reads one line from below); compulsory: different lines.
-    wanted, wait_l2, wait_dram: lanes that ask for a line, and those of them that wait for the L2, and for DRAM: lanes that share
-    an access count each."""
+    """Counts over all rays.
+    - accesses: to the L1s; l1, l2: misses there, each of which reads one line from below; compulsory: different lines.
+    - wanted, wait_l2, wait_dram: lanes that want a line, wait for the L2, wait for DRAM. Lanes that share an access count each."""
 
     accesses: int
     l1: int
@@ -58,7 +56,7 @@ class Misses:
 
 
 def lines_of(address: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cache lines that fetches touch, one after another, and the fetch that each belongs to; both (M,) int64."""
+    """Return the cache lines that fetches touch, one after another, and the fetch of each; both (M,) int64."""
     begin, end = address // LINE, (address + size - 1) // LINE
     count = end - begin + 1
     fetch = np.repeat(np.arange(len(address)), count)
@@ -67,7 +65,7 @@ def lines_of(address: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def distinct_lines(first: np.ndarray, address: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """How many different cache lines each ray touches, (N,) int64; ray i has the fetches first[i] to first[i + 1]."""
+    """Count the different cache lines of each ray, (N,) int64; ray i has the fetches first[i] to first[i + 1] - 1."""
     line, fetch = lines_of(address, size)
     owner = np.repeat(np.arange(len(first) - 1), np.diff(first))[fetch]
     count = int(line.max(initial=0)) + 1
@@ -76,8 +74,7 @@ def distinct_lines(first: np.ndarray, address: np.ndarray, size: np.ndarray) -> 
 
 
 def replay(line: np.ndarray, cache: Cache) -> np.ndarray:
-    """Whether each access finds its line, (M,) bool, in a cache that is empty at the beginning and drops the least recently used
-    line of a full set. A line belongs in set `line modulo sets`."""
+    """Return which accesses find their line, (M,) bool, in an LRU cache that begins empty. Line n belongs in set n modulo `sets`."""
     cpu = start("cpu")
     hit = wp.zeros(len(line), dtype=wp.int8, device=cpu)
     load_kernel(replay_lru, cpu)
@@ -85,8 +82,8 @@ def replay(line: np.ndarray, cache: Cache) -> np.ndarray:
     return hit.numpy().astype(bool)
 
 
-def caches_of(cache: Cache, count: int) -> Any:
-    """So many empty ones, on the device."""
+def caches_of(cache: Cache, count: int) -> Caches:
+    """Return `count` empty caches on the CPU."""
     out = Caches()
     out.sets, out.ways = cache.sets, cache.ways
     out.tags = wp.full(count * cache.sets * cache.ways, wp.int64(-1), dtype=wp.int64, device=start("cpu"))
@@ -94,13 +91,11 @@ def caches_of(cache: Cache, count: int) -> Any:
 
 
 def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: Cache) -> Level1:
-    """warp: (N,) of each ray, 0 to W - 1, ascending, 32 rays at most in one; fetches: of the rays in that order.
-
-    What misses in the L1s, one an SM. Warps go to the SMs by turns; an SM has so many slots, and a warp begins when one is
-    free. In each round every lane of a warp makes its next fetch, and each line that they touch is asked for once: nothing waits
-    for memory, so that the order of warps is that of their lengths."""
+    """Simulate one L1 an SM. warp: (N,) the warp of each ray, ascending, at most 32 rays each; fetches: of the rays in that order.
+    Warps go to the SMs in turn and begin when one of the SM's slots is free. In each round every lane of a warp makes its next fetch, and
+    each line that the lanes touch is accessed once. Nothing waits for memory: the length of a warp alone decides when its slot is free."""
     cpu = start("cpu")
-    # In one memory the primitives stand behind the nodes.
+    # As in one memory, primitives follow the nodes.
     space, node = int(PRIMITIVE_SPACE), fetches.address < int(PRIMITIVE_SPACE)
     behind = LINE * -(-int((fetches.address + fetches.size)[node].max(initial=0)) // LINE)
     address = np.where(node, fetches.address, fetches.address - space + behind)
@@ -108,14 +103,14 @@ def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: C
     count = int(warp[-1]) + 1 if len(warp) else 0
     warp_first = np.searchsorted(warp, np.arange(count + 1))
     most = np.diff(np.concatenate([[0], np.cumsum(touched)])[fetches.first[warp_first]])  # lines, a warp
-    room = np.concatenate([[0], np.cumsum([int(most[sm::sms].sum()) for sm in range(sms)])])
+    begin = np.concatenate([[0], np.cumsum([int(most[sm::sms].sum()) for sm in range(sms)])])
     trace = Trace()
     trace.sms, trace.slots = sms, slots
     trace.warp_first, trace.first = upload(warp_first, wp.int64, cpu), upload(fetches.first, wp.int64, cpu)
     trace.address, trace.size = upload(address, wp.int64, cpu), upload(fetches.size, wp.int64, cpu)
     out = Missed()
-    out.room = upload(room, wp.int64, cpu)
-    out.line, out.time, out.lanes = (wp.empty(int(room[-1]), dtype=wp.int64, device=cpu) for _ in range(3))
+    out.room = upload(begin, wp.int64, cpu)
+    out.line, out.time, out.lanes = (wp.empty(int(begin[-1]), dtype=wp.int64, device=cpu) for _ in range(3))
     out.accesses, out.misses, out.wanted = (wp.zeros(sms, dtype=wp.int64, device=cpu) for _ in range(3))
     out.slot_warp = wp.full(sms * slots, -1, dtype=wp.int32, device=cpu)
     out.slot_round = wp.zeros(sms * slots, dtype=wp.int64, device=cpu)
@@ -124,13 +119,13 @@ def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: C
     caches = caches_of(l1, sms)
     load_kernel(replay_warps, cpu)
     run_all([partial(wp.launch, replay_warps, dim=1, inputs=[trace, caches, out, sm], device=cpu) for sm in range(sms)], thread_count(None))
-    used = np.concatenate([np.arange(a, a + n) for a, n in zip(room, out.misses.numpy(), strict=False)])
+    used = np.concatenate([np.arange(a, a + n) for a, n in zip(begin, out.misses.numpy(), strict=False)])
     return Level1(int(out.accesses.numpy().sum()), int(out.wanted.numpy().sum()), out.line.numpy()[used],
                   out.time.numpy()[used], out.lanes.numpy()[used])
 
 
 def second_level(missed: Level1, l2: Cache, warm: bool = False) -> Misses:
-    """What misses in the L2 behind all L1s, in the order of time. warm: it has seen the same accesses once before."""
+    """Simulate the L2 behind all L1s, in the order of time. warm: it has seen the same accesses once before."""
     order = np.argsort(missed.time, kind="stable")
     line, lanes = missed.line[order], missed.lanes[order]
     again = np.concatenate([line, line]) if warm else line

@@ -1,9 +1,8 @@
-"""What a CUDA binary tells without any of NVIDIA's tools: code, registers, stack and instructions of a kernel.
+"""Code, registers, stack and instructions of the kernels in a CUDA binary, read without NVIDIA's tools.
 
-Volta and what came after it have instructions of 16 bytes. Their lowest 9 bits name the operation; NVIDIA never published which is
-which. OPERATIONS was read off binaries of known source (Jia et al. 2019, "Dissecting the NVIDIA Turing T4 GPU via
-Microbenchmarking", did so first), and a test compiles some of it again. What is not in it counts as "other".
-"""
+Instructions have 16 bytes from Volta on. Their lowest 9 bits are the operation, and NVIDIA never published which. OPERATIONS was read
+off binaries of known source, as Jia et al. did (2019, "Dissecting the NVIDIA Turing T4 GPU via Microbenchmarking"); a test compiles
+some of it again. Unknown operations count as "other"."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from typing import Any
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 
-# By class, the operations that Turing has for it.
+# Turing's operations of each class.
 CLASSES: dict[str, dict[int, str]] = {
     "fp32": {0x020: "FMUL", 0x021: "FADD", 0x023: "FFMA", 0x009: "FMNMX", 0x00B: "FSETP", 0x00A: "FSET", 0x008: "FSEL"},
     "fp64": {0x028: "DMUL", 0x029: "DADD", 0x02A: "DSETP", 0x02B: "DFMA"},
@@ -41,8 +40,7 @@ _REGISTERS, _FRAME = 0x2F, 0x11  # entries of .nv.info: registers a thread, byte
 
 @dataclass(frozen=True)
 class KernelCode:
-    """name: the kernel's; code: its instructions; registers: a thread; stack: bytes a thread of local memory for arrays and
-    spills; shared: bytes a block of the memory that its threads share."""
+    """Instructions of a kernel, registers of a thread, and bytes: of a thread's stack (arrays, spills) and of a block's shared memory."""
 
     name: str
     code: bytes
@@ -51,7 +49,7 @@ class KernelCode:
     shared: int = 0
 
     def opcodes(self) -> list[int]:
-        """The operation of each instruction, without what stands behind the end: a branch to itself, and padding."""
+        """Return the operation of each instruction, without the branch to itself and the padding behind the end."""
         words = struct.unpack(f"<{len(self.code) // 8}Q", self.code)
         out = [word & 0x1FF for word in words[::2]]
         while out and OPERATIONS.get(out[-1]) in ("NOP", "BRA"):
@@ -59,16 +57,16 @@ class KernelCode:
         return out
 
     def operations(self) -> Counter[str]:
-        """How often each operation stands in the code, which is not how often it runs."""
+        """Count each operation in the code, which is not how often it runs."""
         return Counter(OPERATIONS.get(each, f"0x{each:03x}") for each in self.opcodes())
 
     def classes(self) -> Counter[str]:
-        """The same by class."""
+        """Count the instructions of each class."""
         return Counter(CLASS_OF.get(each, "other") for each in self.opcodes())
 
 
 def read_cubin(data: bytes) -> dict[str, KernelCode]:
-    """Every kernel of a CUDA binary (an ELF file of 64 bits) by its name. Raises InputError where it is none."""
+    """Return every kernel of a CUDA binary (a 64-bit ELF file) by name. Raise InputError for anything else."""
     with needed_by("reading CUDA binaries"):
         from elftools.common.exceptions import ELFError
         from elftools.elf.elffile import ELFFile
@@ -87,7 +85,7 @@ def read_cubin(data: bytes) -> dict[str, KernelCode]:
 
 
 def _facts(info: bytes) -> dict[tuple[int, int], int]:
-    """(entry, symbol) -> value, of the section that tells of all kernels."""
+    """Return (entry, symbol) -> value of the section .nv.info, which describes all kernels."""
     out, at = {}, 0
     while at < len(info):
         form, entry, size = struct.unpack_from("<BBH", info, at)

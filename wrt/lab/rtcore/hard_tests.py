@@ -1,12 +1,10 @@
-"""`python -m wrt bench float64`: how often the triangle unit needs float64 where a GPU runs it.
+"""`python -m wrt bench float64`: how often the triangle unit needs float64 on a GPU.
 
-The triangle tests of closest-hit queries through bvh2 are recorded, and each is looked at again by itself. Runs on the CPU.
-"""
+Record the triangle tests of closest-hit queries through bvh2, and classify each one again by itself. Runs on the CPU."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 import warp as wp
@@ -20,8 +18,7 @@ from wrt.kernels.structs import Primitive, size_of
 from wrt.kernels.study.hard_tests import HARD, REFUSED, classify
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, tabled
-from wrt.lab.bench.report import run as run
+from wrt.lab.bench.report import Columns, Row, mesh_name
 from wrt.lab.plans import Float64 as Plan
 
 TITLE = "How often the triangle unit needs float64 on a GPU"
@@ -30,8 +27,8 @@ COLUMNS: Columns = {
     "accepted in float32, a ray": lambda row: f"{row.accepted / row.rays:.2f}", "hard tests": "{hard}",
     "of the tests": lambda row: f"{row.hard / max(row.tests, 1):.1e}", "of the rays": lambda row: f"{row.hard_rays / row.rays:.1e}"}
 LEGEND = """\
-Closest hits through bvh2. Of the tests that float32 does not refuse, float-float arithmetic is sure of the bits of most; the others
-are hard: they take float64. of the rays: those with a hard test or more."""
+Closest hits through bvh2. Float-float arithmetic settles the bits of most tests that float32 does not refuse; the others are hard and
+take float64. of the rays: share of rays with at least one hard test."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
@@ -39,11 +36,11 @@ def rows(plan: Plan) -> Iterator[Row]:
         accel = build(mesh, "bvh2")
         sets = ray_sets(accel, plan.rays, plan.seed, plan.inside)
         for kind in plan.kinds:
-            yield Row(mesh=Path(mesh.name or "mesh").name, kind=kind, **counted(accel, sets[kind]))
+            yield Row(mesh=mesh_name(mesh), kind=kind, **counted(accel, sets[kind]))
 
 
 def counted(accel: Accelerator, rays: RaySet) -> dict[str, int]:
-    """Of the triangle tests of all rays; accel: a bvh2 over triangles, on the CPU."""
+    """Count the triangle tests of all rays, and the hard ones among them. accel: a bvh2 over triangles, on the CPU."""
     counters = accel.closest_hit(rays.origins, rays.directions, t_max=rays.t_max, trace=True).counters
     assert counters is not None
     of_ray = np.repeat(np.arange(len(rays)), np.diff(counters.first))
@@ -56,7 +53,7 @@ def counted(accel: Accelerator, rays: RaySet) -> dict[str, int]:
 
 
 def classified(accel: Accelerator, rays: RaySet, of_ray: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """REFUSED, SURE or HARD of each test, (N,): ray number of_ray against record number `place`."""
+    """Return REFUSED, SURE or HARD for each test, (N,): ray of_ray[i] against the record at place[i]."""
     given = RayArrays()
     given.origin, given.direction = (upload(rows, wp.vec3, accel.device) for rows in (rays.origins, rays.directions))
     given.t_min, given.t_max = wp.zeros(len(rays), device=accel.device), upload(rays.t_max, wp.float32, accel.device)
@@ -66,6 +63,3 @@ def classified(accel: Accelerator, rays: RaySet, of_ray: np.ndarray, place: np.n
     wp.launch(classify, len(of_ray), [accel.data.primitives, given, *numbers, out], device=accel.device)
     return out.numpy()
 
-
-def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    return [tabled(COLUMNS, rows)]

@@ -1,10 +1,8 @@
-"""The model of the RT core on meshes: primary and diffuse rays through every structure, against what was published."""
+"""`python -m wrt bench rtcore`: the model of the RT core on meshes, with primary and diffuse rays through every structure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,24 +14,22 @@ from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, grouped, tabled
-from wrt.lab.bench.report import run as run
+from wrt.lab.bench.report import Columns, Part, Row, grouped, mesh_name, tabled
 from wrt.lab.plans import RtCore as Plan
-from wrt.lab.rtcore.instructions import SOFTWARE, software
 from wrt.lab.rtcore.model import LEGEND as LEGEND
-from wrt.lab.rtcore.model import MODEL_COLUMNS, Work, model_row, parameters, simt, trace_rays
+from wrt.lab.rtcore.model import MODEL_COLUMNS, model_row, parameters, simt, trace_rays
 from wrt.lab.rtcore.parameters import GPUS
 from wrt.lab.rtcore.warps import WARP, blocks
 
 
 def bvhs() -> list[str]:
-    """Every BVH of the registry by its own name: what is built from a binary tree."""
+    """Return the names of the registry's BVHs: every structure that is built from a binary tree."""
     return [name for name, cls in ACCELERATORS.items() if name == cls.name and issubclass(cls, Bvh2 | WideBvh)]
 
 
 def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
-    """The same rays in the order of warps and lanes: blocks of 8 x 4 pixels of the camera's picture; a ray that starts at a hit
-    is where its pixel is, and rays between random points stay as they are."""
+    """Put the rays into the order of warps and lanes: blocks of 8 x 4 pixels of the camera's picture.
+    A ray that starts at a hit stands where its pixel is; rays between random points stay as they are."""
     primary = sets["primary"]
     side = round(len(primary) ** 0.5)
     warp, lane = blocks(side, side)
@@ -45,18 +41,11 @@ def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
     return {kind: rays.part(orders.get(kind, starts_at_hits)) for kind, rays in sets.items()}  # type: ignore[arg-type]
 
 
-def work_of(accel: Accelerator, rays: RaySet) -> Work:
-    """Closest hits, also of shadow rays: what any hit costs is a question of its own."""
-    return trace_rays(accel, rays.kind, rays.origins, rays.directions, t_max=rays.t_max)
-
-
 TITLE = "The model of the RT core on meshes"
 COLUMNS: Columns = {
     "structure": "{structure}", "kind": "{name}", "B/triangle": lambda row: f"{row.bytes / row.mesh_triangles:.0f}",
     **{head: column for head, column in MODEL_COLUMNS.items() if head != "rays"},
     "SIMT": "{simt_efficiency[as they come]:.0%}", "sorted": "{simt_efficiency[sorted]:.0%}"}
-SOFTWARE_TITLE = """\
-In software, on a GTX 1080 Ti (28 SMs x 128 lanes, 1.582 GHz; 1.1 Grays/s claimed: 5154 instructions of a lane a ray)"""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
@@ -66,25 +55,14 @@ def rows(plan: Plan) -> Iterator[Row]:
             accel = build(geometry, name)
             sets = sets or in_warps(accel, ray_sets(accel, plan.rays, plan.seed, plan.inside))
             for rays in (sets[kind] for kind in plan.kinds):
-                work = work_of(accel, rays)
+                work = trace_rays(accel, rays.kind, rays.origins, rays.directions, rays.t_max)  # closest hits for shadow rays, too
                 efficiencies = simt(work.counters.counts, work.warp, rays.origins, rays.directions)
-                yield model_row(work, GPUS[plan.gpu], efficiencies, mesh=Path(mesh.name or "mesh").name,
+                yield model_row(work, GPUS[plan.gpu], efficiencies, mesh=mesh_name(mesh),
                                 mesh_triangles=len(geometry), structure=name, bytes=accel.stats.bytes)
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    """A table for each mesh, with the structures' memory; the parameters; and what software takes, if that is asked for."""
-    out = [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles")
-           for (mesh, triangles), group in grouped(rows, "mesh", "mesh_triangles").items()]
-    told = "Instructions of the default box test and triangle test alone, as they stand in the code for Turing."
-    return [*out, parameters(), *([tabled(SOFTWARE, in_software(rows), SOFTWARE_TITLE, told)] if plan.software else [])]
-
-
-def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
-    return {"software": [row.as_dict() for row in in_software(rows)] if plan.software else []}
-
-
-def in_software(rows: Sequence[Row]) -> list[Row]:
-    """What the rays of these rows take in software."""
-    return [software(f"{row.mesh} {row.structure} {row.name}", row.boxes, row.triangles, row.simt_efficiency["as they come"])
-            for row in rows]
+    """Return a table for each mesh, with the structures' memory, and the parameters."""
+    tables = [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles")
+              for (mesh, triangles), group in grouped(rows, "mesh", "mesh_triangles").items()]
+    return [*tables, parameters()]

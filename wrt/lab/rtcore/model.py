@@ -1,9 +1,8 @@
-"""The model of the RT core: from what rays cost to clocks, and from clocks to rays a second.
+"""A model of the RT core: clocks from the counted work of rays, and rays a second from clocks.
 
-An RT core tests boxes and triangles at fixed rates, gets nodes and triangles through an L1, an L2 and DRAM, and holds some warps
-at a time. Each of these is a term in clocks a ray; they overlap, so that the largest decides (a roofline). Turing's rates were
-never published: what comes out is a range over assumptions, for orderings and sensitivities, never a fact.
-"""
+An RT core tests boxes and triangles at fixed rates, reads nodes and triangles through an L1, an L2 and DRAM, and holds some warps at a
+time. Each of these is a term in clocks a ray. The terms overlap, so the largest decides (a roofline). Turing's rates were never
+published: results are ranges over assumptions, for orderings and sensitivities."""
 
 from __future__ import annotations
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.queries.answers import Counters
+from wrt.core.types import ArrayLike
 from wrt.lab.bench.report import Columns, Part, Row, tabled, tables_page
 from wrt.lab.rtcore.caches import LINE, Misses, first_level, second_level
 from wrt.lab.rtcore.parameters import BASE, PARAMETERS, SWEEPS, Core, Gpu
@@ -27,8 +27,7 @@ TERMS = ("box", "triangle", "L1", "L2", "DRAM", "latency")
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """Rays in the order of warps and lanes, and what each costs. counters: as Accelerator.closest_hit(trace=True) gives them;
-    warp: (N,) int64, the warp of each ray, 0 to W - 1, ascending."""
+    """Rays in the order of warps and lanes, with the counters of closest_hit(trace=True). warp: (N,) int64, ascending from 0."""
 
     name: str
     counters: Counters
@@ -38,7 +37,7 @@ class Work:
         return len(self.warp)
 
     def mean(self, name: str) -> float:
-        """Of a counter, a ray."""
+        """Return the mean of a counter over the rays."""
         return float(self.counters.counts[name].mean())
 
     @cached_property
@@ -46,7 +45,7 @@ class Work:
         return {}
 
     def misses(self, gpu: Gpu, core: Core) -> Misses:
-        """What misses in the caches of that GPU."""
+        """Simulate the caches of a GPU, once for each pair of sizes."""
         above = (gpu.sms, core.warps, gpu.l1)
         if above not in self._simulated:
             self._simulated[above] = first_level(self.warp, self.counters, *above)
@@ -57,17 +56,14 @@ class Work:
 
 
 class Prediction(Row):
-    """clocks: a ray and RT core, that each part needs, by TERMS; limit: the part that needs most; utilisation: how busy each is
-    while that one is at its limit, 0 to 1; rays_per_second; work, gpu: the names of what it was reckoned for."""
+    """Result of `predict`.
+    clocks: of a ray and RT core, by TERMS; limit: the largest term; utilisation: each term over the largest, 0 to 1; rays_per_second."""
 
 
 def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
-    """The clocks that a ray takes of an RT core: at least what each unit needs for its tests, what each level of memory needs
-    for its lines, and what a ray waits for, over the rays that wait together.
-
-    A ray waits, one after another, for each node or triangle (as long as a lane's mean fetch takes) and each test. A warp holds
-    its place until its longest ray ends.
-    """
+    """Return the clocks that a ray takes of an RT core, term by term.
+    A ray waits, one after another, for each fetch (the mean time of a lane's fetches) and for each test. A warp holds its place until its
+    longest ray ends."""
     n, counts, misses = len(work), work.counters.counts, work.misses(gpu, core)
     fetches = np.diff(work.counters.first)
     l2_share, dram_share = misses.wait_l2 / max(misses.wanted, 1), misses.wait_dram / max(misses.wanted, 1)
@@ -88,7 +84,7 @@ def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
 
 
 def sweep(work: Work, gpu: Gpu, core: Core = BASE, names: tuple[str, ...] = ("boxes", "triangles")) -> list[Prediction]:
-    """Predictions over all combinations of what is swept of these fields of Core."""
+    """Predict for all combinations of the values in SWEEPS of these fields of Core."""
     return [predict(work, gpu, each) for each in variants(core, names)]
 
 
@@ -99,13 +95,13 @@ def variants(core: Core, names: tuple[str, ...]) -> Iterator[Core]:
 
 
 def span(predictions: list[Prediction]) -> tuple[float, float]:
-    """The least and the most rays a second of several predictions."""
+    """Return the lowest and the highest rays a second."""
     rates = [each.rays_per_second for each in predictions]
     return min(rates), max(rates)
 
 
 def sensitivity(work: Work, gpu: Gpu, core: Core = BASE) -> dict[str, float]:
-    """By which factor rays a second move where one assumption alone is swept, the largest first."""
+    """Sweep each assumption alone; return the factor between lowest and highest rays a second, the largest factor first."""
     factors = {}
     for name in SWEEPS:
         low, high = span(sweep(work, gpu, core, (name,)))
@@ -114,25 +110,24 @@ def sensitivity(work: Work, gpu: Gpu, core: Core = BASE) -> dict[str, float]:
 
 
 def simt(counts: np.ndarray, warp: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> dict[str, float]:
-    """SIMT efficiency, a ray costing its box operations and triangle tests: of the warps as they are, of the same rays packed
-    without gaps, and packed after sorting them by coherence. counts: as kernels.traverse.counters.Counts, one row a ray."""
+    """Return the SIMT efficiency of the given warps, of the same rays packed without gaps, and packed after sorting them by coherence.
+    A ray costs its box operations and triangle tests. counts: rows of kernels.traverse.counters.Counts."""
     cost = counts["box_operations"].astype(np.float64) + counts["primitives"]
     order = by_coherence(origins, directions)
     return {"as they come": efficiency(cost, warp), "packed": efficiency(cost, packed(len(cost))),
             "sorted": efficiency(cost[order], packed(len(cost)))}
 
 
-def trace_rays(accel: Accelerator, name: str, origins: np.ndarray, directions: np.ndarray, warp: np.ndarray | None = None,
-               t_max: Any = np.inf) -> Work:
-    """Closest hits of rays that stand in the order of lanes, counted and recorded. warp: by default 32 after 32."""
+def trace_rays(accel: Accelerator, name: str, origins: np.ndarray, directions: np.ndarray, t_max: ArrayLike = np.inf) -> Work:
+    """Trace closest hits of rays in the order of lanes, counted and recorded; a warp is 32 rays in a row."""
     counters = accel.closest_hit(origins, directions, t_max=t_max, trace=True).counters
     assert counters is not None
-    return Work(name, counters, packed(len(origins)) if warp is None else warp)
+    return Work(name, counters, packed(len(origins)))
 
 
-# --- as rows of tables ------------------------------------------------------------------------------------------------
+RANGE = ("boxes", "triangles", "warps")  # fields of Core that the reported range is swept over
 
-RANGE = ("boxes", "triangles", "warps")  # what the reported range is swept over
+
 def term(name: str) -> Callable[[Row], str]:
     return lambda row: f"{row.clocks[name]:.3g} ({row.utilisation[name]:.0%})"
 
@@ -144,18 +139,18 @@ MODEL_COLUMNS: Columns = {
     "moved most by": lambda row: ", ".join(f"{name} {factor:.2g}x" for name, factor in list(row.factors.items())[:2])}
 SIMT_COLUMNS: Columns = {"rays": "{name}", **{name: f"{{simt_efficiency[{name}]:.0%}}" for name in ("as they come", "packed", "sorted")}}
 LEGEND = f"""\
-nodes, boxes, triangles: a ray; lines: cache lines a ray that its warp asks for. {", ".join(TERMS)}: clocks a ray and RT core that
-each part needs by itself, and in brackets how busy it is while the slowest (limit) is at its limit. Grays/s: with the assumptions
-of the table of parameters (4 boxes or 1 triangle a clock, 4 warps at a time, L2 empty); range: over {", ".join(RANGE)} =
-{"; ".join(", ".join(f"{value:g}" for value in SWEEPS[name]) for name in RANGE)}. moved most by: the assumptions that move the
-Grays/s most when each is swept alone, with the factor from the least to the most. None of this is a measurement: Turing's rates
-and its node format were never published."""
+nodes, boxes, triangles: a ray; lines: cache lines a ray that its warp accesses. {", ".join(TERMS)}: clocks a ray and RT core that
+each part needs by itself; in brackets its use while the slowest part (limit) is fully used. Grays/s: with the assumptions in the table
+of parameters (4 boxes or 1 triangle a clock, 4 warps at a time, L2 empty). range: over {", ".join(RANGE)} =
+{"; ".join(", ".join(f"{value:g}" for value in SWEEPS[name]) for name in RANGE)}. moved most by: the assumptions that change Grays/s most
+when each is swept alone, with the factor from lowest to highest. Nothing here is measured: Turing's rates and node format were never
+published."""
 
 
-def model_row(work: Work, gpu: Gpu, simt: dict[str, float], **facts: Any) -> Row:
-    """Everything that the model says of this work: clocks, limit, utilisation and rays_per_second with the basic assumptions; low,
-    high: rays a second over RANGE; factors: of each assumption alone; nodes, boxes, triangles, lines: a ray. simt: as
-    wrt.lab.rtcore.model.simt gives it; facts: more that is known of it."""
+def model_row(work: Work, gpu: Gpu, simt: dict[str, float], **facts: object) -> Row:
+    """Return all that the model says of this work: the prediction with the basic assumptions and the work's means a ray.
+    - low, high: rays a second over RANGE; factors: the sensitivity.
+    - simt: the result of `simt`; facts: more columns."""
     prediction = vars(predict(work, gpu))
     low, high = span(sweep(work, gpu, names=RANGE))
     return Row(**facts, **{name: value for name, value in prediction.items() if name != "work"}, name=work.name, rays=len(work),
@@ -165,11 +160,11 @@ def model_row(work: Work, gpu: Gpu, simt: dict[str, float], **facts: Any) -> Row
 
 
 def model_page(rows: Sequence[Row]) -> str:
-    """Both tables as HTML."""
+    """Return both tables as HTML."""
     gpu = rows[0].gpu if rows else "a GPU"
     return tables_page([tabled(MODEL_COLUMNS, rows, f"Model of {gpu}"), tabled(SIMT_COLUMNS, rows, "SIMT efficiency")])
 
 
 def parameters() -> Part:
-    """Every number that the model starts from, with its status and source."""
+    """Return the table of the model's parameters, each with its status and source."""
     return Part("The parameters of the model", "", ("parameter", "value", "status", "swept over", "source"), PARAMETERS)

@@ -1,4 +1,4 @@
-"""What the model of the RT core knows and what it assumes, in one table: every number with its source and its status."""
+"""Parameters of the model of the RT core, published and assumed, each with its source and its status."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ PASCAL = "NVIDIA GeForce GTX 1080 Ti, product data (2017)"
 VULKAN_SIM = "Vulkan-Sim, configs/tested-cfgs/SM75_RTX2060/gpgpusim.config (Saed et al., MICRO 2022)"
 
 
-# What a number is, its value as the source has it, its status (derived: from published numbers), what is swept where nobody knows,
-# and the source.
+# Name, value as the source states it, status (derived: from published values), values that are swept if it is unknown, source.
 PARAMETERS = (
     ("RTX 2080 Ti: SMs, RT cores", "68, one a SM", PUBLISHED, "", TURING),
     ("RTX 2080 Ti: clock", "1.545 GHz (boost)", PUBLISHED, "", TURING),
@@ -47,7 +46,7 @@ PARAMETERS = (
 
 @dataclass(frozen=True)
 class Gpu:
-    """clock in Hz, as its source has it: the RTX 2080 Ti's boost clock, the RTX 2060's base clock; dram in bytes a second."""
+    """Clock in Hz as the source states it (RTX 2080 Ti: boost, RTX 2060: base), DRAM in bytes a second."""
 
     name: str
     sms: int
@@ -65,8 +64,9 @@ GPUS = {
 
 @dataclass(frozen=True)
 class Core:
-    """What is assumed of one RT core and its memory; see PARAMETERS. boxes, triangles: tested a clock; warps: at a time;
-    *_latency in clocks (l2 and dram: on top of what comes before); l1_lines and l2_bytes a clock; warm: the L2 is."""
+    """Assumptions on one RT core and its memory, see PARAMETERS.
+    - boxes, triangles: tests a clock; warps: at a time; warm: the L2 has seen the same rays before.
+    - *_latency: clocks, of L2 and DRAM on top of the level above; l1_lines, l2_bytes: a clock."""
 
     boxes: float = 4.0
     triangles: float = 1.0
@@ -83,7 +83,7 @@ class Core:
 
 BASE = Core()
 
-# What is swept of a Core: one at a time for sensitivity, the first two together for the range that is reported.
+# Values of the fields of a Core: swept one at a time for the sensitivity, those of model.RANGE together for the reported range.
 SWEEPS: dict[str, tuple[float, ...]] = {
     "boxes": (1.0, 2.0, 4.0, 8.0),
     "triangles": (0.5, 1.0, 2.0),

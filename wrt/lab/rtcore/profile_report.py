@@ -1,5 +1,4 @@
-"""What `profile` makes of the rays of a picture: the model's work, by the warps that would trace them; tables, heat maps with their
-scale, EXR layers and histograms."""
+"""Results of `profile`: the model's work in warps, tables, heat maps with their scale, EXR layers and histograms."""
 
 from __future__ import annotations
 
@@ -25,11 +24,8 @@ GROUPS = {"primary": ("primary",), "shadow": ("shadow",), "secondary": ("reflect
 
 
 def warp_order(profile: Profile, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows in the order of warps and lanes, and the warp of each, from 0 on.
-
-    A warp is a block of 8 x 4 pixels; those of its pixels that trace a ray of the same kind and depth, the first of them, the
-    second ..., trace it together, and the lanes of the others wait.
-    """
+    """Return the rays in the order of warps and lanes, and the warp of each, from 0 on.
+    A warp is a block of 8 x 4 pixels. Those of its pixels that trace an n-th ray of the same kind and depth trace it together."""
     rays = profile.rays
     pixel, kind, depth = rays.pixel[rows].astype(np.int64), rays.kind[rows].astype(np.int64), rays.depth[rows].astype(np.int64)
     deepest = int(depth.max(initial=0)) + 1
@@ -38,7 +34,7 @@ def warp_order(profile: Profile, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
     fresh = np.ones(len(rows), bool)
     fresh[1:] = group[order][1:] != group[order][:-1]
     begin = np.maximum.accumulate(np.where(fresh, np.arange(len(rows)), 0))
-    turn = np.empty(len(rows), np.int64)  # how many such rays the pixel traced before
+    turn = np.empty(len(rows), np.int64)  # rays of this kind and depth that the pixel traced before
     turn[order] = np.arange(len(rows)) - begin
     warp, lane = blocks(*profile.size)
     step = ((warp[pixel] * deepest + depth) * len(KINDS) + kind) * (int(turn.max(initial=0)) + 1) + turn
@@ -47,7 +43,7 @@ def warp_order(profile: Profile, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def work_of(profile: Profile, group: str) -> Work | None:
-    """The traced rays of a group (in GROUPS) as the model's work; None where there are none."""
+    """Return the traced rays of a group of GROUPS as the model's work, or None if there are none."""
     rays = profile.rays
     kinds = [KINDS.index(name) for name in GROUPS[group]]
     at = np.flatnonzero(np.isin(rays.kind[rays.trace_rows], kinds))
@@ -74,7 +70,7 @@ DEPTHS: Columns = {
 
 
 def percentiles(profile: Profile) -> Part:
-    """Of each counter a ray, by kind."""
+    """Return the table of each counter a ray, by kind of ray."""
     lines = []
     for name in PER_RAY:
         for kind, values in by_kind(profile, name).items():
@@ -84,13 +80,13 @@ def percentiles(profile: Profile) -> Part:
 
 
 def by_kind(profile: Profile, name: str) -> dict[str, np.ndarray]:
-    """A counter of all rays, of the kinds that there are."""
+    """Return a counter of all rays, split by the kinds that occur."""
     values = profile.rays.lines if name == "lines" else profile.rays.counts[name]
     return {kind: values[profile.rays.kind == i] for i, kind in enumerate(KINDS) if (profile.rays.kind == i).any()}
 
 
 def model_rows(profile: Profile, gpu: Gpu) -> Rows[Row]:
-    """The model on the rays that were traced, by group; SIMT efficiency on all of them."""
+    """Apply the model to the traced rays of each group; SIMT efficiency counts all rays."""
     rows = []
     for group in GROUPS:
         work = work_of(profile, group)
@@ -106,18 +102,18 @@ def model_rows(profile: Profile, gpu: Gpu) -> Rows[Row]:
 def summary(profile: Profile, rows: Sequence[Row], gpu: Gpu) -> str:
     rays, stats = profile.rays, profile.accel.stats
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in profile.seconds.items())
-    told = (f"{profile.scene}: {profile.size[0]}x{profile.size[1]}, {profile.spp} spp, {len(rays)} rays; {profile.accel.name} over"
+    head = (f"{profile.scene}: {profile.size[0]}x{profile.size[1]}, {profile.spp} spp, {len(rays)} rays; {profile.accel.name} over"
             f" {len(profile.accel.geometry)} primitives, {stats.nodes} nodes, {stats.bytes / 1e6:.1f} MB; seconds: {seconds}")
     traced = f"{len(rays.trace_rows) / max(len(rays), 1):.0%} of the rays, in whole tiles"
     return markdown([
-        Part("", told), tabled(DEPTHS, [Row(**row) for row in profile.by_depth()], "Rays by depth and kind (means a ray)"),
+        Part("", head), tabled(DEPTHS, [Row(**row) for row in profile.by_depth()], "Rays by depth and kind (means a ray)"),
         percentiles(profile), tabled(MODEL_COLUMNS, rows, f"Model of {gpu.name} ({traced})"), Part("", LEGEND),
         tabled(SIMT_COLUMNS, rows, "SIMT efficiency",
-               "Warps of 8 x 4 pixels as they come, without gaps, and sorted by origin and direction.")])
+               "Warps of 8 x 4 pixels: as they come, packed without gaps, and sorted by origin and direction.")])
 
 
 def check_folder(folder: Path) -> None:
-    """Make the folder if it is not there; InputError where write_report could not write to it, or there is no matplotlib."""
+    """Make the folder if missing. Raise InputError if write_report could not write to it, or without matplotlib."""
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
@@ -128,7 +124,7 @@ def check_folder(folder: Path) -> None:
 
 
 def write_report(profile: Profile, text: str, folder: Path) -> list[Path]:
-    """Everything that there is to see; the paths. Raises InputError where the system refuses."""
+    """Write heat maps, layers, histograms and the report; return their paths. Raise InputError if the system refuses."""
     paths = []
     for name in PICTURES:
         if profile.maps[name].any():

@@ -1,13 +1,13 @@
-"""What a picture costs: every ray that it takes, with its counters and the addresses that it fetches."""
+"""`wrt.profile`: every ray that a picture takes, with its counters and the addresses that it fetches."""
 
 from __future__ import annotations
 
-import os
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import warp as wp
@@ -15,15 +15,17 @@ import warp as wp
 from wrt.core.device import memory_of, start, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
+from wrt.core.types import PathLike
 from wrt.io.load import as_scene
 from wrt.kernels.shade.paths import BRANCHES
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
 from wrt.lab.costs import COUNTERS, CostCounter
 from wrt.lab.rtcore.caches import distinct_lines
-from wrt.renderer.options import OPTIONS, Options, Progress
+from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import plan_of
 from wrt.renderer.tiles import Rectangle
+from wrt.scene.cameras import CameraKind
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 from wrt.scene.settings import SETTINGS
@@ -36,22 +38,20 @@ TITLES = {
     "stack": "most entries on the stack", "node_bytes": "bytes of nodes", "primitive_bytes": "bytes of triangles",
     "lines": "distinct cache lines, ray by ray", **{f"probes_{kind}": f"{kind} rays" for kind in KINDS},
 }
-LEFT_OUT = ("aov", "time_limit", "target_error", "pass_size", "checkpoint", "checkpoint_every",
-            "resume", "devices", "executor")  # options of a render that a profile has no use for
 TILE_SIZE = 64
-BYTES_OF_RAY = 200  # with what is made of it
-TRACE_LIMIT = 4_000_000  # fetches that are kept
+BYTES_OF_RAY = 200  # with all that is derived from it
+TRACE_LIMIT = 4_000_000  # fetches to keep
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Every ray of a picture, (N,) each, tile by tile and pixel by pixel, in the order in which each pixel traced them.
+    """Every ray of a picture, (N,) each: tile by tile, pixel by pixel, and in the order in which each pixel traced them.
 
-    rays: as kernels.study.ray_log.LoggedRay; counts: as kernels.traverse.counters.Counts; pixel: row * width + column; kind: index
-    in KINDS ("straight": goes on unbent through a blended surface); depth: bounces behind it (a shadow ray's: of the ray whose hit
-    it starts from); lines: distinct cache lines. trace_rows: the rays whose fetches were kept, trace_first: where each one's
-    begin; address, size: of each fetch, in bytes, as in wrt.accel.queries.answers.Counters.
-    """
+    - rays: kernels.study.ray_log.LoggedRay; counts: kernels.traverse.counters.Counts; lines: distinct cache lines.
+    - pixel: row * width + column; kind: index in KINDS ("straight": continues unbent through a blended surface).
+    - depth: bounces before the ray; a shadow ray has the depth of the ray whose hit it starts from.
+    - trace_rows: indices of the rays whose fetches were kept; trace_first: the first fetch of each.
+    - address, size: of each fetch, in bytes (wrt.accel.queries.answers.Counters)."""
 
     rays: np.ndarray
     counts: np.ndarray
@@ -70,7 +70,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """What `profile` gives: size (width, height); pixels (H, W, 3), the picture; rays; accel, the structure; seconds by part."""
+    """Result of `profile`: size (width, height); pixels (H, W, 3), the picture; rays; accel, the structure; seconds by stage."""
 
     scene: str
     size: tuple[int, int]
@@ -89,8 +89,8 @@ class Profile:
 
     @cached_property
     def maps(self) -> dict[str, np.ndarray]:
-        """PICTURES, (H, W) float64 each, row 0 on top: of each pixel the mean over its samples of a counter summed over all
-        rays of a sample (`stack`: the deepest of all), and the rays of each kind."""
+        """Maps by name (PICTURES), (H, W) float64 each, row 0 on top.
+        A pixel holds the mean over its samples of a counter summed over a sample's rays (`stack`: the largest), or its rays of one kind."""
         rays, n = self.rays, self.size[0] * self.size[1]
         sums = {name: np.bincount(rays.pixel, rays.counts[name], n) / self.spp for name in COUNTERS}
         sums["stack"] = np.zeros(n)
@@ -101,7 +101,7 @@ class Profile:
         return {name: value.reshape(self.size[1], self.size[0]) for name, value in sums.items()}
 
     def heatmap(self, name: str) -> Any:
-        """One of `maps` as a picture with its scale, a PIL image, which a notebook shows. Raises InputError for another name."""
+        """Return one of `maps` as a PIL image with its scale, which notebooks show. Raise InputError for an unknown name."""
         from PIL import Image
 
         from wrt.picture.heatmap import heatmap
@@ -111,7 +111,7 @@ class Profile:
         return Image.fromarray(heatmap(self.maps[name], TITLES[name] + ("" if name == "stack" else " a sample")))
 
     def by_depth(self) -> list[dict[str, Any]]:
-        """One row for each kind of ray at each depth: depth, kind, hits, and every counter summed (stack: the deepest)."""
+        """Return a row for each kind of ray at each depth: depth, kind, hits, and each counter summed (`stack`: the largest)."""
         rays, rows = self.rays, []
         for depth in np.unique(rays.depth):
             for i, kind in enumerate(KINDS):
@@ -124,25 +124,68 @@ class Profile:
         return rows
 
 
-def profile(scene: Scene | Mesh | str | os.PathLike[str], **options: Any) -> Profile:
-    """Render a scene and keep what every ray of it costs, and of evenly chosen tiles also what it fetches (TRACE_LIMIT).
+class ProfileOptions(TypedDict, total=False):
+    """Keyword arguments of `profile`: settings of the scene, then options of the render."""
 
-    Arguments: scene as for `wrt.render`; options: fields of Settings and of Options but LEFT_OUT; spp is 1 where it is not given,
-    whatever the scene says. The rays are exactly those of that render. progress: as of a render, of three runs over the picture.
-    Raises InputError for what cannot be rendered, and where that many rays do not fit into memory.
+    spp: int | None
+    size: tuple[int, int] | str | None
+    max_depth: int | None
+    min_throughput: float | None
+    filter: str | None
+    fresnel: str | None
+    glass_shadows: str | None
+    sampler: str | None
+    exposure: float | None
+    tonemap: str | None
+    seed: int
+    device: str
+    accel: str
+    accel_options: dict[str, Any]
+    threads: int | None
+    camera: str | int | CameraKind | None
+    crop: tuple[int, int, int, int] | None
+    triangle: str
+    box: str
+    instancing: str
+    tile_size: int | None
+    progress: Callable[[Progress], None] | None
+
+
+def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -> Profile:
+    """Render a scene and record what each of its rays costs.
+
+    The rays are exactly those of `wrt.render` with the same arguments. The addresses that rays fetch are kept for some tiles, evenly
+    chosen: at most about four million fetches.
+
+    Parameters
+    ----------
+    scene : Scene, Mesh or path
+        As for `wrt.render`.
+    **options
+        Settings and options of `wrt.render`, listed in `ProfileOptions`. `spp` is 1 unless given, whatever the scene says.
+        `progress` is called during three runs over the picture.
+
+    Returns
+    -------
+    Profile
+
+    Raises
+    ------
+    InputError
+        An unknown argument, a scene that cannot be rendered, or more rays than fit into memory.
     """
-    changes = {name: options.pop(name) for name in SETTINGS if name in options}
-    changes = {"spp": 1, **{name: value for name, value in changes.items() if value is not None}}
-    for name in options:
-        if name in LEFT_OUT or name not in OPTIONS:
+    given: dict[str, Any] = {**options}
+    settings = {name: given.pop(name) for name in SETTINGS if name in given}
+    settings = {"spp": 1, **{name: value for name, value in settings.items() if value is not None}}
+    for name in given:
+        if name not in ProfileOptions.__annotations__:
             raise InputError(f"a profile has no argument {name!r}")
-    chosen = Options(**{"tile_size": TILE_SIZE, **options})
-    return Profiler(as_scene(scene).with_settings(**changes), chosen).measure()
+    return Profiler(as_scene(scene).with_settings(**settings), Options(**{"tile_size": TILE_SIZE, **given})).measure()
 
 
 @dataclass
 class _Tile:
-    """used: rays of each pixel; fetches: of the whole tile; then what each of its rays is and costs, and the trace if kept."""
+    """Rays of each pixel (`used`) and fetches of a tile; after the second pass its rays, their counts, and the trace if kept."""
 
     rectangle: Rectangle
     used: np.ndarray
@@ -154,7 +197,7 @@ class _Tile:
 
 
 class Profiler:
-    """Three runs a tile: how many rays each pixel takes, those rays with their counters, and what they fetch."""
+    """Three passes over each tile: count the rays of each pixel, record them with their counters, and record their fetches."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         device, plan = start(options.device), plan_of(scene, options)
@@ -164,8 +207,7 @@ class Profiler:
 
     def measure(self) -> Profile:
         self.begin, self.done, self.rays, self.lock = time.perf_counter(), 0, 0, threading.Lock()
-        # The same samples three times over: only one film is looked at.
-        self.films = [self.counter.film() for _ in range(3)]
+        self.films = [self.counter.film() for _ in range(3)]  # the same samples three times: only the first is used
         tiles: list[_Tile] = []
         self.counter.each(lambda rectangle: tiles.append(self._count(rectangle)), self.prepared.tiles(1))
         tiles.sort(key=lambda tile: tile.rectangle[1::-1])
@@ -187,7 +229,7 @@ class Profiler:
         return _Tile(rectangle, used.copy(), fetches)
 
     def _report(self, rectangle: Rectangle, runs: int, rays: int) -> None:
-        """Tell `progress` that a tile has gone through so many more runs."""
+        """Tell `progress` that a tile has finished `runs` more passes."""
         progress, settings = self.plan.options.progress, self.plan.scene.settings
         if progress is not None:
             with self.lock:
@@ -227,7 +269,7 @@ class Profiler:
         counts = np.concatenate([tile.counts for tile in tiles])
         pixel = np.concatenate([np.repeat(self._pixels(tile.rectangle), tile.used) for tile in tiles])
         label = rays["label"]
-        path = np.maximum.accumulate(np.where(label > 0, np.arange(len(rays)), 0))  # a shadow ray's: the one before it
+        path = np.maximum.accumulate(np.where(label > 0, np.arange(len(rays)), 0))  # of a shadow ray: the last path ray before it
         shadow = KINDS.index("shadow")
         kind = np.where(label > 0, (label - 1) % int(BRANCHES), shadow).astype(np.int8)
         depth = (label[path] - 1) // int(BRANCHES)
@@ -239,7 +281,7 @@ class Profiler:
                     np.concatenate([[0], np.cumsum(length)]), fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
 
     def _pixels(self, rectangle: Rectangle) -> np.ndarray:
-        """The pixels of a tile, row by row, as numbers within the crop."""
+        """Return the indices of a tile's pixels within the crop, row by row."""
         x0, y0, x1, _ = self.plan.crop
         x, y, width, height = rectangle
         column, row = np.meshgrid(np.arange(x - x0, x - x0 + width), np.arange(y - y0, y - y0 + height))

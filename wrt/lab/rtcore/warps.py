@@ -1,4 +1,4 @@
-"""Warps of 32 rays: how much of them works, with the rays as they come, packed together, or sorted."""
+"""Warps of 32 rays, and the share of their lanes that works: rays as they come, packed, or sorted."""
 
 from __future__ import annotations
 
@@ -10,42 +10,43 @@ MORTON_BITS = 10
 
 
 def blocks(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which warp a pixel is in, and its lane there, (height * width,) each: warps are blocks of 8 x 4 pixels, row by row."""
+    """Return the warp and the lane of each pixel, (height * width,) each: warps are blocks of 8 x 4 pixels, row by row."""
     y, x = np.divmod(np.arange(width * height), width)
     across = -(-width // BLOCK[0])
     return y // BLOCK[1] * across + x // BLOCK[0], y % BLOCK[1] * BLOCK[0] + x % BLOCK[0]
 
 
 def packed(n: int) -> np.ndarray:
-    """The warps of n rays without a gap, (n,)."""
+    """Return the warp of each of n rays without gaps, (n,)."""
     return np.arange(n) // WARP
 
 
 def efficiency(cost: np.ndarray, warp: np.ndarray) -> float:
-    """Share of the lanes' time that rays use: a warp takes as long as its longest ray, and each of its 32 lanes is held for
-    that time, with a ray or without. cost, warp: (N,) of each ray. 1 where nothing costs anything."""
+    """Return the share of the lanes' time that rays use, 1 if nothing costs anything. cost, warp: (N,) of each ray.
+    A warp takes as long as its longest ray and holds all of its 32 lanes for that time."""
     longest = longest_of(cost, warp)
     total = WARP * float(longest.sum())
     return float(cost.sum()) / total if total > 0.0 else 1.0
 
 
 def longest_of(cost: np.ndarray, warp: np.ndarray) -> np.ndarray:
-    """The cost of each warp's longest ray, (W,) float64, for costs of 0 or more."""
+    """Return the cost of each warp's longest ray, (W,) float64, for costs of 0 or more."""
     out = np.zeros(int(warp.max(initial=-1)) + 1)
     np.maximum.at(out, warp, cost)
     return out
 
 
 def by_coherence(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """An order, (N,) int64, that puts rays beside each other which are alike: by the octant of their direction, then along a
-    Morton curve through the box of their origins, then likewise by direction (after Pharr et al. 1997 and Garanzha & Loop 2010)."""
+    """Return an order, (N,) int64, that puts similar rays beside each other.
+    Sort by the octant of the direction, then along a Morton curve through the origins, then likewise by direction (after Pharr et al. 1997
+    and Garanzha and Loop 2010)."""
     octant = (directions < 0.0) @ np.array([4, 2, 1])
     unit = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(np.float32).tiny)
     return np.lexsort((morton(unit), morton(origins), octant))
 
 
 def morton(points: np.ndarray) -> np.ndarray:
-    """The place of each point on a Morton curve through their box, (N,) int64."""
+    """Return the position of each point on a Morton curve through the points' box, (N,) int64."""
     if not len(points):
         return np.zeros(0, np.int64)
     lo, extent = points.min(axis=0), np.ptp(points, axis=0)

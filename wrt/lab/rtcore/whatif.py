@@ -1,14 +1,12 @@
-"""What-if studies of the RT core: one thing of the design is changed, the same rays are counted again, and the model says what for.
+"""`python -m wrt whatif`: change one thing of the RT core's design, count the same rays again, and apply the model.
 
-Every variant must find the same hits; a row tells how many rays differ (none may).
-"""
+Every variant must find the same hits; the column `differ` counts the rays that have another one (none may)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +22,7 @@ from wrt.io.mesh_file import as_mesh
 from wrt.kernels.study.bvh2_study import LEVELS, STACK_SIZE, Study
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, cells, tabled
+from wrt.lab.bench.report import Columns, Part, Row, cells, mesh_name, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.plans import WhatIf as Plan
 from wrt.lab.rtcore.meshes import bvhs, in_warps
@@ -32,30 +30,29 @@ from wrt.lab.rtcore.model import TERMS, Work, predict, simt, variants
 from wrt.lab.rtcore.parameters import BASE, GPUS, Gpu
 from wrt.lab.rtcore.warps import by_coherence, packed
 
-FRAME_BYTES = 16  # of a node with quantised planes: its corner (12) and an exponent of the step for each axis
+FRAME_BYTES = 16  # the corner (12), and an exponent of the step for each axis
 REFERENCE_BYTES = 16  # of a binary node, as Bvh2Node has them
 
 
 @cache
 def studied(study: Study) -> type[Bvh2]:
-    """The structure class whose kernels are those of a study."""
+    """Return the structure class whose kernels are those of a study."""
     return type("Bvh2Study", (Bvh2,), {"kernels": study, "__doc__": Bvh2.__doc__})
 
 
 def with_traversal(accel: OneMesh, study: Study) -> OneMesh:
-    """The same tree, walked otherwise. Raises InputError where it is too deep for a trail."""
+    """Return the same tree with another traversal. Raise InputError if it is too deep for a restart trail."""
     if study.entries < STACK_SIZE and accel.stats.depth > LEVELS:
         raise InputError(f"the tree is {accel.stats.depth} deep: more than the {LEVELS} levels that a restart trail has bits for")
     return studied(study).restore(accel.built, accel.geometry)
 
 
 def quantised(lo: np.ndarray, hi: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Planes of so many bits in the frame of their node: its lowest corner, and for each axis a step that is a power of two, as
-    in compressed wide BVHs (Ylitie, Karras and Laine 2017, section 3.1). lo, hi: (N, C, 3) float32, of C children; empty
-    ones (lo = inf) stay as they are. Gives the boxes as they come out of their few bits, and the bytes of a node.
+    """Round boxes outwards to planes of `bits` bits in the frame of their node; return the boxes and the bytes of a node.
 
-    Rounded outwards, and moved one step on where float32 arithmetic would still cut something off: no box shrinks.
-    """
+    lo, hi: (N, C, 3) float32, of C children; empty ones (lo = inf) stay empty. A frame is the node's lowest corner and a power of two as
+    the step of each axis (Ylitie, Karras and Laine 2017, section 3.1). No box shrinks: a plane moves one step more where float32
+    arithmetic would still cut something off."""
     empty = ~(lo <= hi).all(axis=2, keepdims=True)
     low = np.where(empty, np.inf, lo).min(axis=1, keepdims=True)
     high = np.where(empty, -np.inf, hi).max(axis=1, keepdims=True)
@@ -78,7 +75,7 @@ def quantised(lo: np.ndarray, hi: np.ndarray, bits: int) -> tuple[np.ndarray, np
 
 
 def with_planes(accel: OneMesh, bits: int) -> tuple[OneMesh, int]:
-    """The same tree with planes of so many bits, and the bytes of a node."""
+    """Return the same tree with planes of `bits` bits, and the bytes of a node."""
     nodes = accel.built.arrays["nodes"].copy()
     lo, hi = (np.stack([nodes[f"{end}_{side}"] for side in (0, 1)], axis=1) for end in ("lo", "hi"))
     lo, hi, size = quantised(lo, hi, bits)
@@ -89,7 +86,7 @@ def with_planes(accel: OneMesh, bits: int) -> tuple[OneMesh, int]:
 
 
 def resized(counters: Counters, before: int, after: int) -> Counters:
-    """The same fetches from nodes of another size."""
+    """Return the same fetches from nodes of another size."""
     node = counters.address < int(PRIMITIVE_SPACE)
     counts: Any = counters.counts.copy()
     counts["node_bytes"] = counts["nodes"] * after
@@ -97,7 +94,7 @@ def resized(counters: Counters, before: int, after: int) -> Counters:
                     np.where(node, after, counters.size))
 
 
-MANY_WARPS = replace(BASE, warps=32, warm=True)  # beside BASE: where latency is hidden and the L2 full, units and lines decide
+MANY_WARPS = replace(BASE, warps=32, warm=True)  # latency is hidden and the L2 full: units and lines decide
 ENTRIES = (STACK_SIZE, 8, 4, 2, 1, 0)
 BITS = (16, 8, 6, 4)
 TITLE = "What if"
@@ -113,17 +110,17 @@ RATES: Columns = {
     "Grays/s": lambda row: f"{row.rays_per_second / 1e9:.2f}", "limit": "{limit}",
     **{name: f"{{clocks[{name}]:.3g}}" for name in TERMS}, "twice the triangles": "{doubled:.2f}x"}
 LEGEND = f"""\
-nodes, boxes, triangles: a ray; B/ray: fetched, of nodes and triangles; lines: cache lines a ray that its warp asks for; L1 missed:
-of those. SIMT: share of the lanes' time that rays use. Grays/s: of the model with {BASE.boxes:g} boxes and {BASE.triangles:g}
-triangle a clock: with {BASE.warps} warps at a time in each RT core and an empty L2, and with {MANY_WARPS.warps} and an L2 that has
-seen the same rays before; limit: the term that decides. A model's numbers, for comparing variants. differ: rays with another hit
-than the first variant's; must be 0. Of the study of rates: clocks a ray and RT core of each part, with {MANY_WARPS.warps} warps at
-a time and an L2 that has seen the same rays before; twice the triangles: rays a second with twice that rate, over these."""
+nodes, boxes, triangles: a ray; B/ray: bytes of nodes and triangles that a ray fetches; lines: cache lines that its warp accesses, a
+ray; L1 missed: their share that the L1 misses. SIMT: share of the lanes' time that rays use. Grays/s: the model's, with
+{BASE.boxes:g} boxes and {BASE.triangles:g} triangle a clock: {BASE.warps} warps at a time in each RT core and an empty L2, or
+{MANY_WARPS.warps} warps and an L2 that has seen the same rays. limit: the largest term. The model's numbers serve to compare variants.
+differ: rays with another hit than the first variant's; must be 0. Study of rates: clocks a ray and RT core of each term, with
+{MANY_WARPS.warps} warps and an L2 that has seen the same rays; twice the triangles: factor on rays a second of twice that rate."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What rays find and what they cost: hits in the order of `rays`."""
+    """Hits and cost of the rays, in the order of `rays`."""
 
     name: str
     rays: RaySet
@@ -134,7 +131,7 @@ class Variant:
 
 
 def traced(name: str, accel: OneMesh, rays: RaySet, node_bytes: tuple[int, int] | None = None) -> Variant:
-    """node_bytes: of a node, as it is in memory and as it would be."""
+    """Trace closest hits. node_bytes: the size of a node in memory, and the size to count."""
     hits = accel.closest_hit(rays.origins, rays.directions, t_max=rays.t_max, trace=True)
     counters = hits.counters
     assert counters is not None
@@ -145,24 +142,21 @@ def traced(name: str, accel: OneMesh, rays: RaySet, node_bytes: tuple[int, int] 
     return Variant(name, rays, size, hits.prim_id, hits.t, counters)
 
 
-# --- the studies: each gives its variants, the one that the others are compared with first ----------------------------
-
-
 def width(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
-    """Node width, node format and kind of bounding volume: every BVH of the registry."""
+    """Compare node widths, node formats and bounding volumes: every BVH of the registry."""
     for name in bvhs():
         yield traced(name, build(geometry, name), rays)
 
 
 def stack(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
-    """Entries of the stack: all that it needs, or a few with restarts."""
+    """Compare a full stack with short ones that restart."""
     tree = Bvh2(geometry)
     for entries in ENTRIES:
         yield traced("full stack" if entries == STACK_SIZE else f"{entries} entries", with_traversal(tree, Study(entries)), rays)
 
 
 def planes(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
-    """Bits of a box plane: fp32, or few in the frame of the node, rounded outwards."""
+    """Compare float32 box planes with planes of few bits in the frame of the node, rounded outwards."""
     tree = Bvh2(geometry)
     first = traced("fp32", tree, rays)
     yield first
@@ -172,7 +166,7 @@ def planes(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
 
 
 def order(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
-    """Nearer child first, and the early stop: on and off."""
+    """Switch off the nearer child first, and the early stop."""
     tree = Bvh2(geometry)
     for name, study in (("both", Study()), ("early stop alone", Study(ordered=False)), ("order alone", Study(early=False)),
                         ("neither", Study(ordered=False, early=False))):
@@ -180,7 +174,7 @@ def order(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
 
 
 def sorting(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
-    """Rays in the order of the picture, sorted by origin and direction, and shuffled."""
+    """Trace rays in the order of the picture, sorted by origin and direction, and shuffled."""
     tree = Bvh2(geometry)
     orders = {"as they come": np.arange(len(rays)), "sorted": by_coherence(rays.origins, rays.directions),
               "shuffled": np.random.default_rng(0).permutation(len(rays))}
@@ -221,8 +215,8 @@ def row_of(variant: Variant, first: Variant, kind: str, gpu: Gpu) -> Row:
 
 
 def rate_rows(variant: Variant, kind: str, gpu: Gpu) -> Iterator[Row]:
-    """Every box rate against every triangle rate, with MANY_WARPS: where latency is hidden, rates matter most. doubled: how many
-    times more rays a second with twice the triangle rate."""
+    """Predict every pair of box and triangle rates with MANY_WARPS, where rates matter most.
+    doubled: how many times more rays a second twice the triangle rate gives."""
     work = Work(variant.name, variant.counters, packed(len(variant.rays)))
     for core in variants(MANY_WARPS, ("boxes", "triangles")):
         now, twice = predict(work, gpu, core), predict(work, gpu, replace(core, triangles=2.0 * core.triangles))
@@ -239,9 +233,8 @@ def columns(row: Row) -> Columns:
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    mesh = Path(getattr(plan.mesh, "name", plan.mesh) or "mesh").name
-    return [tabled(columns(rows[0]), rows, f"What if: {plan.study}, {mesh}")]
+    return [tabled(columns(rows[0]), rows, f"What if: {plan.study}, {mesh_name(plan.mesh)}")]
 
 
-def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
-    return {"study": plan.study, "mesh": Path(getattr(plan.mesh, "name", plan.mesh) or "mesh").name}
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
+    return {"study": plan.study, "mesh": mesh_name(plan.mesh)}

@@ -17,7 +17,8 @@ from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import load_mesh
 from wrt.lab.bench import bvh as bench
-from wrt.lab.bench.bvh import VOLUMES, Plan, inward, published_cost, run
+from wrt.lab.bench.bvh import VOLUMES, Plan, inward, published_cost
+from wrt.lab.bench.report import run
 from wrt.lab.bench.timing import peak_bytes
 from wrt.scene.shapes import icosphere
 

@@ -16,9 +16,9 @@ from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.lab.bench import peers
-from wrt.lab.bench.peers import Plan, answer, differing, means, run, searching
+from wrt.lab.bench.peers import Plan, answer, differing, means, searching
 from wrt.lab.bench.rays import ray_sets
-from wrt.lab.bench.report import Row, text
+from wrt.lab.bench.report import Row, run, text
 from wrt.lab.hard_cases.contestants import PEERS
 from wrt.scene.shapes import icosphere
 

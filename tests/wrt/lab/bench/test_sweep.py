@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 
 from wrt.core.errors import InputError
+from wrt.lab.bench.report import run
 from wrt.lab.bench.sweep import by_mesh
 from wrt.lab.hard_cases import stability
-from wrt.lab.rtcore import meshes as rtcore
+from wrt.lab.rtcore.meshes import Plan as RtCorePlan
 from wrt.scene.shapes import box, icosphere
 
 
@@ -48,8 +49,8 @@ def test_rows_come_in_the_order_of_the_meshes(pool: Executor, tmp_path: Path, mo
 
 
 def test_the_model_counts_the_same(pool: Executor) -> None:
-    plan = rtcore.Plan((icosphere(1), box()), structures=("bvh",), kinds=("primary",), rays=64)
-    assert by_mesh(rtcore.run, plan, lambda row: None, pool) == list(rtcore.run(plan))
+    plan = RtCorePlan((icosphere(1), box()), structures=("bvh",), kinds=("primary",), rays=64)
+    assert by_mesh(run, plan, lambda row: None, pool) == list(run(plan))
 
 
 def test_the_hard_cases_come_out_the_same(pool: Executor, monkeypatch: pytest.MonkeyPatch) -> None:

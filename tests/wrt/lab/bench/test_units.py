@@ -11,7 +11,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench import units
-from wrt.lab.bench.report import Row, text
+from wrt.lab.bench.report import Row, run, text
 from wrt.lab.bench.timing import alternate, quartiles, shown
 from wrt.lab.bench.visibility import terrain
 from wrt.scene.shapes import icosphere
@@ -32,7 +32,7 @@ def test_every_unit_has_a_row_on_every_mesh(monkeypatch) -> None:
     monkeypatch.setattr(units, "meshes", lambda plan: small)
     told: list[Row] = []
     plan = units.Plan(rays=500, runs=2)
-    rows = units.run(plan, told.append)
+    rows = run(plan, told.append)
     on_meshes = {(row.mesh, row.rays) for row in rows if "no structure" not in row.mesh}
     assert len(on_meshes) == 6 and told == rows
     names = [*RAY_TRIANGLE, *(f"{box} boxes" for box in list(RAY_AABB)[1:])]

@@ -20,8 +20,8 @@ from wrt.accel.geometry import Geometry
 from wrt.core.errors import InputError
 from wrt.lab.bench import visibility
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
-from wrt.lab.bench.report import Row, text
-from wrt.lab.bench.visibility import Plan, fit, fits, framing, row_of, run, series, subdivided, surfaces, terrain
+from wrt.lab.bench.report import Row, run, text
+from wrt.lab.bench.visibility import Plan, fit, fits, framing, row_of, series, subdivided, surfaces, terrain
 from wrt.lab.bench.visibility_check import agreement, compare
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material

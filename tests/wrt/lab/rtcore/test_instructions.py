@@ -12,10 +12,9 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.stack import PLACES, SHARED
-from wrt.lab.bench.report import markdown, tabled
-from wrt.lab.rtcore import instructions
+from wrt.lab.bench.report import markdown
 from wrt.lab.rtcore.cubin import CLASSES, OPERATIONS, KernelCode, read_cubin
-from wrt.lab.rtcore.instructions import SOFTWARE, UnitCode, box_unit, compiled, of_one, resident_warps, software, tables
+from wrt.lab.rtcore.instructions import box_unit, compiled, per_unit, resident_warps, tables
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -54,22 +53,13 @@ def test_a_kernel_whose_body_stands_twice_is_refused() -> None:
     twice = compiled(floats)
     assert twice.operations()["STG"] > 1
     with pytest.raises(InputError, match="cannot be told apart"):
-        of_one(twice, twice)
+        per_unit(twice, twice)
 
 
 def test_classes_are_of_all_instructions(tmp_path: Path) -> None:
     (binary,) = wp.compile_aot_module(doubles.module, arch=75, module_dir=tmp_path)
     (code,) = read_cubin(Path(binary).read_bytes()).values()
     assert sum(code.classes().values()) == len(code.opcodes()) <= len(code.code) // 16
-
-
-def test_software_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
-    """100 boxes of 30 instructions and 5 triangles of 200, with half of the lanes waiting: 8000 of a lane a ray."""
-    codes = UnitCode("box", "b", {"fp32": 30.0}), UnitCode("triangle", "t", {"fp32": 150.0, "fp64": 50.0})
-    monkeypatch.setattr(instructions, "default_units", lambda: codes)
-    row = software("made", 100.0, 5.0, 0.5)
-    assert row.instructions == 4000.0 and row.rays_per_second == pytest.approx(28 * 128 * 1.582e9 / 8000.0)
-    assert row.share == pytest.approx(8000.0 / 5154.0, rel=1e-3) and "8000" in markdown([tabled(SOFTWARE, [row])])
 
 
 @pytest.mark.parametrize(("registers", "shared", "arch", "block", "warps"), [

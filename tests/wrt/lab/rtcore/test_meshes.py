@@ -13,8 +13,8 @@ from tests.command_line import wrt as command
 from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.lab.bench.rays import ray_sets
-from wrt.lab.bench.report import text
-from wrt.lab.rtcore.meshes import Plan, bvhs, in_warps, run
+from wrt.lab.bench.report import run, text
+from wrt.lab.rtcore.meshes import Plan, bvhs, in_warps
 from wrt.scene.shapes import icosphere
 
 
