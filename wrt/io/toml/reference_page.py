@@ -11,43 +11,57 @@ from wrt.io.load import schema
 
 Schema = dict[str, Any]
 TOP = "SceneTable"
+SHARED_KEYS = 4  # keys that two tables must share for the page to describe them once
 WORDS = {"string": "text", "boolean": "true or false", "integer": "whole number"}
 HEAD = """\
 # Scene files
 
-A scene is a [TOML](https://toml.io) file: `python -m wrt render scene.toml`, `wrt.load_scene("scene.toml")`. This page is made
-by `python -m wrt schema --markdown` from the schema that every file is checked against; `python -m wrt schema` prints that as JSON
-Schema, for editors, and `python -m wrt validate scene.toml` tells all that is wrong with a file at once, each with its place. An
-unknown key, a wrong type, NaN and infinity are mistakes.
+A scene is a [TOML](https://toml.io) file: `python -m wrt render scene.toml`, `wrt.load_scene("scene.toml")`. `python -m wrt validate
+scene.toml` reports every mistake in a file with its place: unknown keys, wrong types, values out of range, NaN and infinity.
+`python -m wrt schema` prints the JSON Schema for editors, and this page with `--markdown`.
 
-World space is right-handed, +y is up. *length*: in the scene's own unit, whatever that is, as long as the scene is at least 1e-15
-units across and no shape reaches farther than 1e18 from the origin (see [accuracy](accuracy.md#known-limits)). Angles are in
-degrees here (in Python, in radians). Colours are linear Rec. 709, red, green and blue; where one is asked for, a single number is a
-grey. *radiance*, *irradiance* and *radiant intensity* belong to each other, and have no unit of their own: a white diffuse surface
-that receives the irradiance pi has the radiance 1, which is shown as white. Matrices are 16 numbers, row by row, and act on column
-vectors. Names of files are relative to the scene file. What a scene lacks to be seen (a camera, any light) is added and told.
+- World space is right-handed, +y is up. Matrices are 16 numbers, row by row, and act on column vectors.
+- *length* is in the scene's own unit. A scene must be at least 1e-15 units across, and no shape may reach farther than 1e18 from the
+  origin ([known limits](accuracy.md#known-limits)).
+- Angles are in degrees here, and in radians in Python.
+- Colours are linear Rec. 709. One number stands for a grey.
+- *radiance*, *irradiance* and *radiant intensity* share one arbitrary scale: a white diffuse surface that receives the irradiance pi has
+  the radiance 1 and is displayed as white.
+- File names are relative to the scene file.
+- A scene without a camera or without any light gets one, with a message.
 
-## An example
+## Example
 """
 EXAMPLE = Path(__file__).with_name("example.toml").read_text(encoding="utf-8")
 
 
 def scene_format() -> str:
-    """The whole page."""
+    """Return the page in Markdown."""
     document = schema()
     tables: dict[str, Schema] = {TOP: document, **document["$defs"]}
     places = _places(tables)
     parts = [HEAD, f"```toml\n{EXAMPLE}```\n", "## Tables\n"]
-    for name, found in places.items():
+    for i, (name, found) in enumerate(places.items()):
         where = "At the top of the file." if name == TOP else f"In {', '.join(f'`{place}`' for place in found)}."
         sentence = " ".join(tables[name]["description"].split())
-        parts.append(f"### {_title(name)}\n{where} {sentence}\n\n{_table(tables[name])}\n")
+        known, before = _described_before(tables, name, list(places)[:i])
+        more = f" {', '.join(f'`{key}`' for key in known)}: as in {_link(before)}." if known else ""
+        parts.append(f"### {_title(name)}\n{where} {sentence}{more}\n\n{_table(tables[name], known)}\n")
     return "\n".join(parts)
 
 
 def _title(name: str) -> str:
     """CameraTable: Camera; PointLightTable: Point light."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", re.sub(r"(Table|Shape)$", "", name)).capitalize()
+
+
+def _described_before(tables: dict[str, Schema], name: str, before: list[str]) -> tuple[list[str], str]:
+    """Return the keys that an earlier table describes in the same words, if there are several, and the table."""
+    for each in before:
+        there = tables[each]["properties"]
+        if len(known := [key for key, value in tables[name]["properties"].items() if there.get(key) == value]) >= SHARED_KEYS:
+            return known, each
+    return [], ""
 
 
 def _link(reference: str) -> str:
@@ -82,13 +96,13 @@ def _references(value: Any, place: str) -> list[tuple[str, str]]:
     return [found for each, at in parts for found in _references(each, at)]
 
 
-def _table(table: Schema) -> str:
-    rows = ["| key | type | unit | default | limits | |", "| --- | --- | --- | --- | --- | --- |"]
-    for key, value in table["properties"].items():
-        default = "required" if key in table.get("required", ()) else _default(value)
-        meaning = value.get("description", "says which kind of table this is").replace("|", "\\|")
-        cells = (f"`{key}`", _type(value), _find(value, "unit"), default, _limits(value), meaning)
-        rows.append(f"| {' | '.join(cells)} |")
+def _table(table: Schema, left_out: list[str]) -> str:
+    rows = ["| key | type | default | meaning |", "|---|---|---|---|"]
+    for key, value in [each for each in table["properties"].items() if each[0] not in left_out]:
+        default = "required" if key in table.get("required", ()) and "const" not in value else _default(value)
+        notes = ", ".join(each for each in (_find(value, "unit"), _limits(value)) if each)
+        cells = (f"`{key}`", f"{_type(value)} ({notes})" if notes else _type(value), default, value.get("description", ""))
+        rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
     return "\n".join(rows)
 
 
@@ -96,7 +110,7 @@ def _type(value: Schema) -> str:
     if "$ref" in value:
         return _link(value["$ref"])
     if "const" in value or "enum" in value:
-        return " or ".join(f'`"{each}"`' for each in value.get("enum", [value.get("const")]))
+        return ", ".join(f'`"{each}"`' for each in value.get("enum", [value.get("const")]))
     choices = [each for each in (*value.get("anyOf", ()), *value.get("oneOf", ())) if each.get("type") != "null"]
     if choices:
         return _choice(choices)
@@ -111,7 +125,7 @@ def _choice(choices: list[Schema]) -> str:
     one, *more = choices
     if len(more) == 1 and more[0].get("items") == one:
         return f"1 or {_array(more[0])}" if "minItems" in more[0] else f"{_type(one)} or {_array(more[0])}"
-    return " or ".join(_type(each) for each in choices)
+    return (", " if all("$ref" in each for each in choices) else " or ").join(_type(each) for each in choices)
 
 
 def _array(value: Schema) -> str:
@@ -126,7 +140,9 @@ def _default(value: Schema) -> str:
     default = value.get("default")
     if default is None or default == "" or default == {} or default == []:
         return ""
-    return f"`{json.dumps(default)}`"
+    if isinstance(default, list) and len(set(default)) == 1 and _type(value).startswith("1 or"):
+        default = default[0]  # one number stands for all
+    return f"`{json.dumps(default, separators=(',', ':'))}`"
 
 
 def _find(value: Any, key: str) -> str:
