@@ -14,13 +14,13 @@ import warp as wp
 from wrt.kernels.shade.backgrounds import make_background
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.film import Pixel, center_of, load_pixel, make_see, store_pixel, with_sample
-from wrt.kernels.shade.follow_up import FOLLOWED, make_follow_up, with_cuts
+from wrt.kernels.shade.film import Pixel, add_sample, load_pixel, make_write_aovs, pixel_center, store_pixel
+from wrt.kernels.shade.follow_up import FOLLOWED, add_cuts, make_follow_up
 from wrt.kernels.shade.paths import make_path, make_paths
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d, quantile
 from wrt.kernels.shade.shading import make_cutout, make_shading
 from wrt.kernels.shade.shadows import Shadow, make_transmittance
-from wrt.kernels.shade.step import Sample, Step, add_up, is_lit, lit_by, make_shaded, make_step
+from wrt.kernels.shade.step import Sample, Step, add_light, add_surface_light, make_shaded, make_step, receives_light
 from wrt.kernels.structs import AovFilm, Film, Hit, Lighting, Limits, Ray, Surfaces, any_positive, kernel
 
 
@@ -45,13 +45,14 @@ def make_direct_light(features: Features, accel_struct: Any, transmittance: Any,
 
     @wp.func
     def direct_light(accel: accel_struct, surfaces: Surfaces, lighting: Lighting, shaded: Shaded, index: wp.uint32) -> Shadow:
-        """As `add_up` takes it. cut: shadow rays that were, and lost: the light they were worth in a room of radiance 1."""
+        """As `add_surface_light` takes it. cut: shadow rays that were, and lost: what they
+        would have carried in a room of radiance 1."""
         out = Shadow()
         for i in range(lighting.count + wp.static(step.extra_lights)):
             point = light_point(lighting, shaded.key, index, i)
             request = step.shadow_request(shaded, step.choose(lighting, surfaces, i, shaded.surface, point))
             if any_positive(request.value):
-                out = lit_by(out, request.value, shaded.scatter, transmittance(accel, surfaces, request.ray, request.end))
+                out = add_light(out, request.value, shaded.scatter, transmittance(accel, surfaces, request.ray, request.end))
         return out
 
     return direct_light
@@ -86,10 +87,10 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
             if hit.prim_id < 0:
                 out.radiance += wp.cw_mul(path.throughput, background_radiance(lighting.background, path.direction))
                 continue
-            met = shading.surface_at(surfaces, ray, hit)
-            texels = shading.look_up(surfaces, met)
-            met.shading = shading.shading_normal(surfaces, met, texels, -path.direction)
-            shaded = step.shade(surfaces, lighting, path, met, texels, hit.t, step.choose_facet(path.key, index))
+            surface = shading.surface_at(surfaces, ray, hit)
+            texels = shading.look_up(surfaces, surface)
+            surface.shading = shading.shading_normal(surfaces, surface, texels, -path.direction)
+            shaded = step.shade(surfaces, lighting, path, surface, texels, hit.t, step.choose_facet(path.key, index))
             next = follow_up(surfaces, shaded, limits, traced)
             if next.onward == FOLLOWED:
                 stack[size] = shaded.onward
@@ -101,10 +102,10 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
                 stack[size] = shaded.refracted
                 size = size + 1
             direct = Shadow()
-            if wp.static(features.lit):
-                if is_lit(shaded.scatter):
+            if wp.static(features.direct_light):
+                if receives_light(shaded.scatter):
                     direct = direct_light(accel, surfaces, lighting, shaded, index)
-            out = add_up(with_cuts(out, next), next.lit, direct)
+            out = add_surface_light(add_cuts(out, next), next.pending_light, direct)
         return out
 
     return radiance
@@ -172,7 +173,7 @@ def make_render_kernel(features: Features, structure: Any, camera_kind: Any) -> 
             if tile.threads > 1:
                 tile.samples[tid] = sample
             else:
-                pixel = with_sample(pixel, sample)
+                pixel = add_sample(pixel, sample)
         if tile.threads == 1:
             store_pixel(film, at, pixel)
 
@@ -186,7 +187,7 @@ def add_samples(film: Film, tile: Tile):
     at = (tile.y + tid / tile.width - film.y) * film.columns + tile.x + tid % tile.width - film.x
     pixel = load_pixel(film, at)
     for i in range(tile.n_samples):
-        pixel = with_sample(pixel, tile.samples[tid * tile.n_samples + i])
+        pixel = add_sample(pixel, tile.samples[tid * tile.n_samples + i])
     store_pixel(film, at, pixel)
 
 
@@ -196,19 +197,19 @@ def make_aov_kernel(features: Features, structure: Any, camera_kind: Any) -> Any
     camera_ray = camera_kind.make_camera_ray()
     accel_struct = structure.struct
     closest_hit, _ = make_traversals(features, structure)
-    see = make_see(features)
+    write_aovs = make_write_aovs(features)
 
     @kernel
     def aovs(accel: accel_struct, surfaces: Surfaces, camera: camera_struct, film: AovFilm, tile: Tile):
         tid = wp.tid()
         x = tile.x + tid % tile.width
         y = tile.y + tid / tile.width
-        ray = camera_ray(camera, center_of(x, y, film.width, film.height), wp.vec2(0.5, 0.5))
+        ray = camera_ray(camera, pixel_center(x, y, film.width, film.height), wp.vec2(0.5, 0.5))
         hit = Hit()
         hit.t = float(wp.inf)
         hit.prim_id = -1
         if ray.t_max > 0.0:
             hit = closest_hit(accel, surfaces, ray)
-        see(film, (y - film.y) * film.columns + x - film.x, surfaces, ray, hit)
+        write_aovs(film, (y - film.y) * film.columns + x - film.x, surfaces, ray, hit)
 
     return aovs

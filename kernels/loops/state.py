@@ -10,7 +10,7 @@ from wrt.kernels.query import HitArrays, Queue, put_ray
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.paths import make_path, make_paths
 from wrt.kernels.shade.shadows import ShadowWalk
-from wrt.kernels.shade.step import Lit, Sample
+from wrt.kernels.shade.step import PendingLight, Sample
 
 Path = make_path(False)
 ray_of = make_paths(False).ray_of
@@ -53,8 +53,8 @@ class Pixels:
 
 @wp.struct
 class Samples:
-    """By sample s. film_point: where on the film it is, in pixels; lens_point: where on the lens, in [0, 1)^2; sum: what it has so
-    far; traced: its rays so far, without those to lights; pending: how many of its paths wait.
+    """By sample s. film_point: where on the film it is, in pixels; lens_point: where on the lens, in [0, 1)^2; total: what it has
+    so far; traced_rays: its rays so far, without those to lights; pending: how many of its paths wait.
 
     paths[level * capacity + s], for levels below pending: the paths that wait; at level `pending`: the path that is queued, unless
     that is a camera ray.
@@ -62,8 +62,8 @@ class Samples:
 
     film_point: wp.array(dtype=wp.vec2)
     lens_point: wp.array(dtype=wp.vec2)
-    sum: wp.array(dtype=Sample)
-    traced: wp.array(dtype=wp.int32)
+    total: wp.array(dtype=Sample)
+    traced_rays: wp.array(dtype=wp.int32)
     pending: wp.array(dtype=wp.int32)
     paths: wp.array(dtype=Path)
 
@@ -79,21 +79,21 @@ class RayQueue:
 
 @wp.struct
 class Outcomes:
-    """Of the rays that are shaded, by count j. hit: places in the queue of those that hit something; missed: of the others;
-    resumed: samples of rays that missed which have paths that wait."""
+    """Of the rays that are shaded. hit_rays, missed_rays: their places in the queue; resumed_samples: the samples of missed rays
+    whose other paths still wait."""
 
-    hit: wp.array(dtype=wp.int32)
-    missed: wp.array(dtype=wp.int32)
-    resumed: wp.array(dtype=wp.int32)
+    hit_rays: wp.array(dtype=wp.int32)
+    missed_rays: wp.array(dtype=wp.int32)
+    resumed_samples: wp.array(dtype=wp.int32)
 
 
 @wp.struct
 class Receivers:
-    """By count a of the surfaces that ask lights. sample: theirs; lit; scatter: where shadows are transparent.
+    """By count a of the surfaces that ask lights. sample: theirs; pending_light; scatter: where shadows are transparent.
     shadow[light * capacity + a]: the slot of the shadow ray, or -1."""
 
     sample: wp.array(dtype=wp.int32)
-    lit: wp.array(dtype=Lit)
+    pending_light: wp.array(dtype=PendingLight)
     scatter: wp.array(dtype=Scatter)
     shadow: wp.array(dtype=wp.int32)
 

@@ -9,8 +9,8 @@ order. So pictures have the same bits: tests/wrt/renderer/test_waves.py, and of 
 trace_wave is a single launch to Python. In a wave it launches, in this order:
 1. for FRESH camera rays at a time, while they are in the cache: begin_wave (wave_begin.py), closest_hit (wide/batch.py, or query.py
    where a structure has no batches), and shade_wave (wave_shade.py), whose push_paths puts new paths and shadow rays aside;
-2. until no path waits: the shadow rays to each light, and `gather` for what they let through; closest_hit and shade_wave of one
-   path of each sample.
+2. until no path waits: the shadow rays to each light, and `add_direct_light` for what they let through; closest_hit and
+   shade_wave of one path of each sample.
 Then the samples go to the film. Each kernel but query.py's is one thread with a loop over its queue: it counts without atomics, and
 reads its arguments once. Traversal and shading are kernels of their own: another scene compiles no traversal.
 
@@ -27,12 +27,12 @@ from wrt.kernels.launches import Launch, run_range, run_with
 from wrt.kernels.loops.state import Task, Wave, put_sample
 from wrt.kernels.query import hit_at, put_ray, queued_ray
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.film import load_pixel, make_see, store_pixel, with_sample
+from wrt.kernels.shade.film import add_sample, load_pixel, make_write_aovs, store_pixel
 from wrt.kernels.shade.headers import lanes_kernel
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_shading
-from wrt.kernels.shade.shadows import Shadow, make_go_through
-from wrt.kernels.shade.step import Sample, add_up, lit_by
+from wrt.kernels.shade.shadows import Shadow, make_advance_shadow
+from wrt.kernels.shade.step import Sample, add_light, add_surface_light
 from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel
 
 FRESH = 2048  # camera rays that are made, traced and shaded at a time, while they are in the cache
@@ -46,7 +46,7 @@ def film_index(task: Task, at: int, x: int, y: int, columns: int) -> int:
 
 def make_shadow_kernel(features: Features) -> Any:
     """Return the kernel for shadow rays to one light that have met the closest surface on their way."""
-    go_through = make_go_through(features, make_shading(features))
+    advance_shadow = make_advance_shadow(features, make_shading(features))
 
     @kernel
     def shadow_wave(wave: Wave, surfaces: Surfaces, light: int):
@@ -54,7 +54,7 @@ def make_shadow_kernel(features: Features) -> Any:
         left = int(0)
         for j in range(wave.shadow_queue.count[light]):
             slot = wave.shadow_queue.slot[first + j]
-            walk = go_through(surfaces, wave.shadows.walk[slot], hit_at(wave.shadow_queue.hits, first + j))
+            walk = advance_shadow(surfaces, wave.shadows.walk[slot], hit_at(wave.shadow_queue.hits, first + j))
             wave.shadows.walk[slot] = walk
             if walk.done == 0:
                 wave.shadow_queue.slot[first + left] = slot
@@ -65,11 +65,11 @@ def make_shadow_kernel(features: Features) -> Any:
     return shadow_wave
 
 
-def make_gather(transparent_shadows: bool) -> Any:
+def make_add_direct_light(transparent_shadows: bool) -> Any:
     """Return the function that adds what the lights send to the receivers."""
 
     @wp.func
-    def gather(wave: Wave, lights: int):
+    def add_direct_light(wave: Wave, lights: int):
         for a in range(wave.progress[0].receivers):
             direct = Shadow()
             light = wp.vec3()  # a struct that changes in a loop is written and read back
@@ -79,7 +79,7 @@ def make_gather(transparent_shadows: bool) -> Any:
                 if slot >= 0:
                     value = wave.shadows.value[slot]
                     if wp.static(transparent_shadows):
-                        direct = lit_by(direct, value, wave.receivers.scatter[a], wave.shadows.walk[slot].shadow)
+                        direct = add_light(direct, value, wave.receivers.scatter[a], wave.shadows.walk[slot].shadow)
                     else:
                         light += wp.where(wave.shadow_queue.occluded[slot], 0.0, 1.0) * value
                         rays += 1
@@ -87,17 +87,17 @@ def make_gather(transparent_shadows: bool) -> Any:
                 direct.transmittance = light
                 direct.rays = rays
             s = wave.receivers.sample[a]
-            put_sample(wave.samples.sum, s, add_up(wave.samples.sum[s], wave.receivers.lit[a], direct))
+            put_sample(wave.samples.total, s, add_surface_light(wave.samples.total[s], wave.receivers.pending_light[a], direct))
         for i in range(lights):
             wave.shadow_queue.count[i] = 0
         wave.progress[0].receivers = 0
 
-    return gather
+    return add_direct_light
 
 
-@wp.func_native("wrt::with_sample(film, pixels.data + (long long)p, done.data + (long long)p * samples, samples);")
+@wp.func_native("wrt::add_sample(film, pixels.data + (long long)p, done.data + (long long)p * samples, samples);")
 def add_to_pixels(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(dtype=Sample), p: int, samples: int) -> None:
-    """As with_sample, to the LANES entries of the film from pixels[p] on: done[p * samples] and what follows it."""
+    """As add_sample, to the LANES entries of the film from pixels[p] on: done[p * samples] and what follows it."""
 
 
 @wp.func
@@ -108,45 +108,45 @@ def add_to_film(wave: Wave, film: Film):
         wave.pixels.film_index[p] = film_index(task, wave.pixels.order[p], film.x, film.y, film.columns)
     p = int(0)
     while p + LANES <= task.pixels:
-        add_to_pixels(film, wave.pixels.film_index, wave.samples.sum, p, task.samples)
+        add_to_pixels(film, wave.pixels.film_index, wave.samples.total, p, task.samples)
         p += LANES
     while p < task.pixels:
         pixel = load_pixel(film, wave.pixels.film_index[p])
         for j in range(task.samples):
-            pixel = with_sample(pixel, wave.samples.sum[p * task.samples + j])
+            pixel = add_sample(pixel, wave.samples.total[p * task.samples + j])
         store_pixel(film, wave.pixels.film_index[p], pixel)
         p += 1
 
 
 @wp.struct
 class WaveLaunches:
-    """Those of a wave. shadow_hit: any hit; walk_hit: the closest one, with which go_through goes on."""
+    """Those of a wave. shadow_any_hit: any hit; shadow_closest_hit: the closest one, with which advance_shadow goes on."""
 
     begin: Launch
     closest_hit: Launch
     shade: Launch
-    shadow_hit: Launch
-    walk_hit: Launch
-    go_through: Launch
+    shadow_any_hit: Launch
+    shadow_closest_hit: Launch
+    advance_shadow: Launch
 
 
 @cache
 def make_loop_kernel(transparent_shadows: bool) -> Any:
     """Return the kernel for all of a wave, from its camera rays to the film."""
-    gather = make_gather(transparent_shadows)
+    add_direct_light = make_add_direct_light(transparent_shadows)
 
     @wp.func
-    def ask_lights(wave: Wave, launches: WaveLaunches, lights: int):
+    def trace_shadows(wave: Wave, launches: WaveLaunches, lights: int):
         """Trace all shadow rays, and add what the lights send."""
         for light in range(lights):
             first = light * wave.capacity
             if wp.static(transparent_shadows):
                 while wave.shadow_queue.count[light] > 0:
-                    run_range(launches.walk_hit, first, first + wave.shadow_queue.count[light])
-                    run_with(launches.go_through, light)
+                    run_range(launches.shadow_closest_hit, first, first + wave.shadow_queue.count[light])
+                    run_with(launches.advance_shadow, light)
             elif wave.shadow_queue.count[light] > 0:
-                run_range(launches.shadow_hit, first, first + wave.shadow_queue.count[light])
-        gather(wave, lights)
+                run_range(launches.shadow_any_hit, first, first + wave.shadow_queue.count[light])
+        add_direct_light(wave, lights)
 
     @lanes_kernel
     def trace_wave(wave: Wave, launches: WaveLaunches, lights: int, film: Film):
@@ -162,7 +162,7 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
             pixel = end
         wave.progress[0].fresh = 0
         while True:
-            ask_lights(wave, launches, lights)
+            trace_shadows(wave, launches, lights)
             queued = wave.progress[0].queued
             if queued == 0:
                 break
@@ -174,15 +174,15 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
     return trace_wave
 
 
-def make_see_kernel(features: Features) -> Any:
+def make_aov_kernel(features: Features) -> Any:
     """Return the kernel for what the rays of an AOV film meet."""
-    see = make_see(features)
+    write_aovs = make_write_aovs(features)
 
     @kernel
-    def see_wave(wave: Wave, surfaces: Surfaces, film: AovFilm):
+    def aov_wave(wave: Wave, surfaces: Surfaces, film: AovFilm):
         task = wave.task[0]
         for p in range(task.pixels):
             pixel = film_index(task, wave.pixels.order[p], film.x, film.y, film.columns)
-            see(film, pixel, surfaces, queued_ray(wave.queue.rays, p), hit_at(wave.queue.hits, p))
+            write_aovs(film, pixel, surfaces, queued_ray(wave.queue.rays, p), hit_at(wave.queue.hits, p))
 
-    return see_wave
+    return aov_wave

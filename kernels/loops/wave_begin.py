@@ -8,16 +8,16 @@ from wrt.kernels.loops.state import BLOCK, Wave, put_sample
 from wrt.kernels.memory import number_of_vec2, put_in_vec2, put_in_vec3, put_int, put_number
 from wrt.kernels.query import put_ray, queued_ray
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.film import center_of
+from wrt.kernels.shade.film import pixel_center
 from wrt.kernels.shade.headers import lanes_kernel
 from wrt.kernels.shade.sampling import hash_pair, make_draw, quantiles
 from wrt.kernels.shade.step import Sample
 from wrt.kernels.structs import AovFilm, Film, Limits, kernel
 
 
-def make_place(features: Features) -> Any:
-    """Return place(wave, film, limits, first, end), for the samples of the pixels first .. end - 1: where they are on the film (in
-    pixels) and the lens. And the pixels' keys."""
+def make_place_samples(features: Features) -> Any:
+    """Return place_samples(wave, film, limits, first, end), for the samples of the pixels
+    first .. end - 1: where they are on the film (in pixels) and the lens. And the pixels' keys."""
     draw = make_draw(features)
 
     @wp.func
@@ -33,7 +33,7 @@ def make_place(features: Features) -> Any:
                 draw(key, 1, task.first_sample, task.samples, wave.samples.lens_point, p * task.samples)
 
     @wp.func
-    def place(wave: Wave, film: Film, limits: Limits, first: int, end: int):
+    def place_samples(wave: Wave, film: Film, limits: Limits, first: int, end: int):
         task = wave.task[0]
         draw_samples(wave, limits, first, end)
         points = wave.samples.film_point
@@ -53,17 +53,17 @@ def make_place(features: Features) -> Any:
                 put_in_vec2(points, i, 1, center_y + offset_y)
                 i = i + 1
 
-    return place
+    return place_samples
 
 
-def make_look(features: Features, camera_kind: Any) -> Any:
-    """Return look(wave, camera, film, first, end) -> int, which puts the camera rays of the samples first .. end - 1 to the queue,
-    each at the place of its sample: in lanes (kernels.memory). It returns how many have no length."""
+def make_queue_camera_rays(features: Features, camera_kind: Any) -> Any:
+    """Return queue_camera_rays(wave, camera, film, first, end) -> int: queue the camera rays of the samples first .. end - 1, each
+    at its sample's place, vectorised; return the number of rays without length."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray(features)
 
     @wp.func
-    def look(wave: Wave, camera: camera_struct, film: Film, first: int, end: int) -> int:
+    def queue_camera_rays(wave: Wave, camera: camera_struct, film: Film, first: int, end: int) -> int:
         samples = wave.samples
         rays = wave.queue.rays
         dead = int(0)
@@ -88,7 +88,7 @@ def make_look(features: Features, camera_kind: Any) -> Any:
             i = i + 1
         return dead
 
-    return look
+    return queue_camera_rays
 
 
 @wp.func
@@ -104,14 +104,14 @@ def without_dead(wave: Wave, first: int, end: int, queued: int) -> int:
                 wave.queue.sample[place] = s
             place += 1
         else:
-            put_sample(wave.samples.sum, s, Sample())
+            put_sample(wave.samples.total, s, Sample())
     return place
 
 
 def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
     """Return the kernel for the camera rays of a wave."""
     camera_struct = camera_kind.Camera
-    place, look = make_place(features), make_look(features, camera_kind)
+    place_samples, queue_camera_rays = make_place_samples(features), make_queue_camera_rays(features, camera_kind)
 
     @lanes_kernel
     def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film, first_pixel: int, end_pixel: int):
@@ -121,8 +121,8 @@ def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
         first = int(first_pixel)
         while first < end_pixel:
             end = wp.min(first + wp.max(BLOCK / samples, 1), end_pixel)
-            place(wave, film, limits, first, end)
-            if look(wave, camera, film, first * samples, end * samples) > 0 or queued < first * samples:
+            place_samples(wave, film, limits, first, end)
+            if queue_camera_rays(wave, camera, film, first * samples, end * samples) > 0 or queued < first * samples:
                 queued = without_dead(wave, first * samples, end * samples, queued)
             else:
                 queued = end * samples
@@ -143,7 +143,7 @@ def make_begin_aov_kernel(camera_kind: Any) -> Any:
         for p in range(task.pixels):
             x = task.x + wave.pixels.order[p] % task.width
             y = task.y + wave.pixels.order[p] / task.width
-            ray = camera_ray(camera, center_of(x, y, film.width, film.height), wp.vec2(0.5, 0.5))
+            ray = camera_ray(camera, pixel_center(x, y, film.width, film.height), wp.vec2(0.5, 0.5))
             put_ray(wave.queue.rays, p, ray)
 
     return begin_aov

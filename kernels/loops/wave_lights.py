@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.loops.state import Wave
-from wrt.kernels.loops.wave_normals import rows_of_normals
+from wrt.kernels.loops.wave_normals import normal_rows
 from wrt.kernels.loops.wave_rows import EMITTERS, KEYS, LIGHTS, SKY, SKY_POINTS, SURFACES, EmitterPoint, Key
 from wrt.kernels.rows import Rows
 from wrt.kernels.shade import lights as kinds
@@ -28,40 +28,40 @@ def first_is_mesh(lighting: Lighting) -> bool:
     return lighting.lights[0].kind == MESH
 
 
-class Sampled:
+class BlockSamples:
     """Which samples are computed before they are asked for: mesh: of the first light, where it is one; sky: of a background that is
     sampled by the cosine; points: of that, where normals are computed one by one (wave_normals.py), only what places them. normals:
     the rows of those that are not."""
 
     def __init__(self, features: Features) -> None:
         kind = BACKGROUNDS[features.background]
-        by_cosine = features.sky_light and kind.sample is None and kind.make_seen is None
-        self.normals: Rows | None = rows_of_normals(features)
+        by_cosine = features.sky_light and kind.sample is None and kind.make_block_radiance is None
+        self.normals: Rows | None = normal_rows(features)
         self.mesh = "mesh" in features.lights and not features.instances
         self.sky = by_cosine and self.normals is not None
         self.points = by_cosine and self.normals is None
 
 
-def make_put_spheres(features: Features, sampled: Sampled, shading: Shading, found: Any) -> Any:
-    """put_spheres(wave, surfaces, first, end): what of the rows is needed here, for hits on spheres."""
+def make_store_spheres(features: Features, sampled: BlockSamples, shading: Shading, hit_surface: Any) -> Any:
+    """store_spheres(wave, surfaces, first, end): what of the rows is needed here, for hits on spheres."""
     store_point, store_normal = SURFACES.field("point").store(), (sampled.normals or SURFACES.field("shading")).store()
     look_up, shading_normal = shading.look_up, shading.shading_normal
 
     @wp.func
-    def put_spheres(wave: Wave, surfaces: Surfaces, first: int, end: int):
+    def store_spheres(wave: Wave, surfaces: Surfaces, first: int, end: int):
         for j in range(first, end):
-            k = wave.outcomes.hit[j]
+            k = wave.outcomes.hit_rays[j]
             if wave.queue.hits.prim_id[k] >= surfaces.n_triangles:
-                s = found(wave, surfaces, j - first, k)
+                s = hit_surface(wave, surfaces, j - first, k)
                 store_point(wave.block.rows, j - first, s.point)
                 if wp.static(sampled.sky):
                     wo = -wave.queue.rays.direction[k]
                     store_normal(wave.block.rows, j - first, shading_normal(surfaces, s, look_up(surfaces, s), wo))
 
-    return put_spheres
+    return store_spheres
 
 
-def make_sample_sky(features: Features, sampled: Sampled) -> Any:
+def make_sample_sky(features: Features, sampled: BlockSamples) -> Any:
     """sample_sky(wave, lighting, count): put samples of the sky to the rows SKY, or what places them to SKY_POINTS."""
     sky_point, sky_sample, light_numbers = make_sky_point(features), make_sky_sample(features), make_light_points(features).numbers
     load_key, load_normal = KEYS.load(), (sampled.normals or SURFACES.field("shading")).load()
@@ -141,7 +141,7 @@ class Vertex:
     i: int
 
 
-def make_light_at(features: Features, sampled: Sampled, choose_light: Any) -> Any:
+def make_light_at(features: Features, sampled: BlockSamples, choose_light: Any) -> Any:
     """light_at(wave, surfaces, lighting, vertex, light) -> LightSample: what was computed before, or by choose_light (of
     make_step)."""
     light_point = make_light_points(features).point
@@ -171,23 +171,23 @@ def make_light_at(features: Features, sampled: Sampled, choose_light: Any) -> An
 
 class WaveLights(NamedTuple):
     """sample(wave, surfaces, lighting, first, end): for the hits first .. end - 1, at most BLOCK, whose surfaces are found; at: of
-    make_light_at. keyed: whether keys must be put before (wave_numbers.py)."""
+    make_light_at. needs_keys: whether keys must be put before (wave_numbers.py)."""
 
     sample: Any
     at: Any
-    keyed: bool
+    needs_keys: bool
 
 
-def make_wave_lights(features: Features, shading: Shading, found: Any, choose_light: Any) -> WaveLights:
-    """found: of make_wave_surfaces; choose_light: `choose` of make_step."""
-    sampled = Sampled(features)
-    put_spheres = make_put_spheres(features, sampled, shading, found)
+def make_wave_lights(features: Features, shading: Shading, hit_surface: Any, choose_light: Any) -> WaveLights:
+    """hit_surface: of make_wave_surfaces; choose_light: `choose` of make_step."""
+    sampled = BlockSamples(features)
+    store_spheres = make_store_spheres(features, sampled, shading, hit_surface)
     sample_sky, sample_mesh = make_sample_sky(features, sampled), make_sample_mesh(features)
 
     @wp.func
     def sample(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
         if wp.static(features.spheres and (sampled.sky or sampled.mesh)):
-            put_spheres(wave, surfaces, first, end)
+            store_spheres(wave, surfaces, first, end)
         if wp.static(sampled.sky or sampled.points):
             sample_sky(wave, lighting, end - first)
         if wp.static(sampled.mesh):

@@ -5,60 +5,60 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.loops.state import Wave
-from wrt.kernels.loops.wave_rows import BENT, HITS, SURFACES, TEXELS
-from wrt.kernels.loops.wave_textures import in_lanes
+from wrt.kernels.loops.wave_rows import HITS, NORMALS, SURFACES, TEXELS
+from wrt.kernels.loops.wave_textures import textures_vectorised
 from wrt.kernels.rows import Rows
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.shading import Texels, bump
-from wrt.kernels.shade.surface import Surface, bent
+from wrt.kernels.shade.surface import Surface, visible_normal
 from wrt.kernels.structs import Surfaces
 
 
-def rows_of_normals(features: Features) -> Rows | None:
+def normal_rows(features: Features) -> Rows | None:
     """Return the rows where they are; None: they are computed one by one."""
-    if features.instances or (features.normal_maps and not in_lanes(features)):
+    if features.instances or (features.normal_maps and not textures_vectorised(features)):
         return None
-    return BENT if features.smooth or features.normal_maps else SURFACES.field("shading")
+    return NORMALS if features.smooth or features.normal_maps else SURFACES.field("shading")
 
 
-def make_bend(features: Features) -> Any:
-    """Return bend(rows, count): put the normals of a block's first hits, whose surfaces and textures are found, to BENT."""
-    load_met, load_surface, load_color = HITS.load(), SURFACES.load(), TEXELS.field("normal").load()
-    store_bent = BENT.store()
+def make_compute_normals(features: Features) -> Any:
+    """Return compute_normals(rows, count): write the normals of a block's first `count` hits, from their surfaces and texels."""
+    load_hit, load_surface, load_normal = HITS.load(), SURFACES.load(), TEXELS.field("normal").load()
+    store_normal = NORMALS.store()
 
     @wp.func
-    def bend(rows: wp.array(dtype=wp.float32), count: int):
+    def compute_normals(rows: wp.array(dtype=wp.float32), count: int):
         i = int(0)
         while i < count:
-            met = load_met(rows, i)
+            hit = load_hit(rows, i)
             s = load_surface(rows, i)
             n = s.shading
             if wp.static(features.normal_maps):
-                n = where_vec3(met.is_mapped != 0, bump(s, met.normal_scale, load_color(rows, i)), n)
-            store_bent(rows, i, bent(n, -met.direction))
+                n = where_vec3(hit.is_mapped != 0, bump(s, hit.normal_scale, load_normal(rows, i)), n)
+            store_normal(rows, i, visible_normal(n, -hit.direction))
             i = i + 1
 
-    return bend
+    return compute_normals
 
 
 def make_wave_normals(features: Features, shading_normal: Any) -> tuple[Any, Any]:
-    """Return bend (of make_bend), and normal_at(wave, surfaces, surface, texels, wo, i): of the i-th hit of a block, what was
+    """Return compute_normals and normal_at(wave, surfaces, surface, texels, wo, i): of the i-th hit of a block, what was
     computed before, or by `shading_normal` (of make_shading)."""
-    bends = rows_of_normals(features) == BENT
-    load_bent = BENT.load()
+    vectorised = normal_rows(features) == NORMALS
+    load_normal = NORMALS.load()
 
     @wp.func
-    def bend_nothing(rows: wp.array(dtype=wp.float32), count: int):
+    def compute_no_normals(rows: wp.array(dtype=wp.float32), count: int):
         pass
 
     @wp.func
     def normal_at(wave: Wave, surfaces: Surfaces, s: Surface, texels: Texels, wo: wp.vec3, i: int) -> wp.vec3:
-        if wp.static(not bends):
+        if wp.static(not vectorised):
             return shading_normal(surfaces, s, texels, wo)
         if wp.static(features.spheres):
             if s.exclude_plus_one == 0:
                 return shading_normal(surfaces, s, texels, wo)
-        return load_bent(wave.block.rows, i)
+        return load_normal(wave.block.rows, i)
 
-    return make_bend(features) if bends else bend_nothing, normal_at
+    return make_compute_normals(features) if vectorised else compute_no_normals, normal_at

@@ -23,7 +23,7 @@ def put_keys(wave: Wave, first: int, end: int):
     """Put the keys of the hits first .. end - 1, at most BLOCK, to the rows KEYS."""
     task = wave.task[0]
     for j in range(first, end):
-        s = wave.queue.sample[wave.outcomes.hit[j]]
+        s = wave.queue.sample[wave.outcomes.hit_rays[j]]
         out = Key()
         out.key = key_at(wave, s)
         out.index = wp.uint32(task.first_sample + s % task.samples)

@@ -11,7 +11,7 @@ from wrt.kernels.structs import Emitter
 
 
 @wp.struct
-class Met:
+class TriangleHit:
     """What a surface is computed from: its triangle, the hit's barycentrics, the ray's direction, and the material: -1 where a
     sphere is hit. is_mapped: 1 where the material has a normal map."""
 
@@ -42,16 +42,16 @@ class EmitterPoint:
     xi: wp.vec2
 
 
-HITS = Rows(Met, BLOCK)
+HITS = Rows(TriangleHit, BLOCK)
 SURFACES = Rows(Surface, BLOCK, HITS.end)
 TEXELS = Rows(Texels, BLOCK, SURFACES.end)
-BENT = Rows(wp.vec3, BLOCK, TEXELS.end)  # the shading normal as lights see it
-KEYS = Rows(Key, BLOCK, BENT.end)
+NORMALS = Rows(wp.vec3, BLOCK, TEXELS.end)  # the shading normal as lights see it
+KEYS = Rows(Key, BLOCK, NORMALS.end)
 FACETS = Rows(wp.vec3, BLOCK, KEYS.end)  # what chooses a microfacet
 EMITTERS = Rows(EmitterPoint, BLOCK, FACETS.end)
 LIGHTS = Rows(LightSample, BLOCK, EMITTERS.end)  # of the first light
 SKY = Rows(LightSample, BLOCK, LIGHTS.end)
 SKY_POINTS = Rows(wp.vec3, BLOCK, SKY.end)  # what places a sample on the sky (sky_point)
-MISSED = Rows(wp.vec3, BLOCK, SKY_POINTS.end)  # directions of a block of the rays that missed
-SEEN = Rows(wp.vec3, BLOCK, MISSED.end)  # and the background's colours there
-ROWS = SEEN.end
+MISS_DIRECTIONS = Rows(wp.vec3, BLOCK, SKY_POINTS.end)  # directions of a block of the rays that missed
+MISS_COLORS = Rows(wp.vec3, BLOCK, MISS_DIRECTIONS.end)  # and the background's colours there
+ROWS = MISS_COLORS.end

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.loops.state import Wave
-from wrt.kernels.loops.wave_rows import HITS, SURFACES, Met
+from wrt.kernels.loops.wave_rows import HITS, SURFACES, TriangleHit
 from wrt.kernels.memory import prefetch
 from wrt.kernels.query import hit_at, queued_ray
 from wrt.kernels.shade.features import Features
@@ -18,7 +18,7 @@ FAR = 16  # hits whose triangle is prefetched before it is gathered
 @wp.func
 def hit_triangle(wave: Wave, surfaces: Surfaces, j: int) -> int:
     """The triangle of hit j; for a sphere any valid one, whose result is ignored."""
-    return wp.min(wave.queue.hits.prim_id[wave.outcomes.hit[j]], surfaces.n_triangles - 1)
+    return wp.min(wave.queue.hits.prim_id[wave.outcomes.hit_rays[j]], surfaces.n_triangles - 1)
 
 
 class Attributes:
@@ -33,11 +33,11 @@ class Attributes:
         self.not_of_surfaces = ("material", "exclude_plus_one", *uvs, *(() if self.tangents else ("tangent", "bitangent_sign")))
 
 
-def make_gather(has: Attributes) -> Any:
-    """gather(wave, surfaces, first, end, hits): put the triangles of the hits first .. end - 1 of so many to their rows."""
+def make_load_triangles(has: Attributes) -> Any:
+    """load_triangles(wave, surfaces, first, end, hits): put the triangles of the hits first .. end - 1 of so many to their rows."""
     smooth, uvs, tangents = has.smooth, has.uvs, has.tangents
     place_of, triangle_at = make_place_of(False), make_triangle_at(smooth, uvs, False)
-    store_met = HITS.store(*has.not_of_hits)
+    store_hit = HITS.store(*has.not_of_hits)
 
     @wp.func
     def prefetch_triangles(wave: Wave, surfaces: Surfaces, j: int, hits: int):
@@ -54,54 +54,54 @@ def make_gather(has: Attributes) -> Any:
                 prefetch(surfaces.uvs, face[corner])
 
     @wp.func
-    def gather(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
+    def load_triangles(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
         for j in range(first, end):
             prefetch_triangles(wave, surfaces, j, hits)
-            k = wave.outcomes.hit[j]
+            k = wave.outcomes.hit_rays[j]
             place = place_of(surfaces, hit_triangle(wave, surfaces, j))
-            met = Met()
-            met.triangle = triangle_at(surfaces, place)
-            met.material = wp.where(wave.queue.hits.prim_id[k] < surfaces.n_triangles, place.material, -1)
+            hit = TriangleHit()
+            hit.triangle = triangle_at(surfaces, place)
+            hit.material = wp.where(wave.queue.hits.prim_id[k] < surfaces.n_triangles, place.material, -1)
             if wp.static(tangents):
-                met.is_mapped = wp.where(surfaces.materials[place.material].normal_texture >= 0, 1, 0)
-                met.normal_scale = surfaces.materials[place.material].normal_scale
-            met.u = wave.queue.hits.u[k]
-            met.v = wave.queue.hits.v[k]
-            met.direction = wave.queue.rays.direction[k]
-            store_met(wave.block.rows, j - first, met)
+                hit.is_mapped = wp.where(surfaces.materials[place.material].normal_texture >= 0, 1, 0)
+                hit.normal_scale = surfaces.materials[place.material].normal_scale
+            hit.u = wave.queue.hits.u[k]
+            hit.v = wave.queue.hits.v[k]
+            hit.direction = wave.queue.rays.direction[k]
+            store_hit(wave.block.rows, j - first, hit)
 
-    return gather
+    return load_triangles
 
 
-def make_find(has: Attributes) -> Any:
-    """find(wave, surfaces, first, end, hits): compute the surfaces of the hits first .. end - 1, at most BLOCK, of so many."""
-    gather = make_gather(has)
+def make_compute_surfaces(has: Attributes) -> Any:
+    """Return compute_surfaces(wave, surfaces, first, end, hits): of the hits first .. end - 1 (at most BLOCK) of so many."""
+    load_triangles = make_load_triangles(has)
     on_triangle = make_on_triangle(has.smooth, has.uvs, has.tangents)
-    load_met, store_surface = HITS.load(*has.not_of_hits), SURFACES.store(*has.not_of_surfaces)
+    load_hit, store_surface = HITS.load(*has.not_of_hits), SURFACES.store(*has.not_of_surfaces)
 
     @wp.func
-    def find(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
+    def compute_surfaces(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
         if surfaces.n_triangles == 0:
             return
-        gather(wave, surfaces, first, end, hits)
+        load_triangles(wave, surfaces, first, end, hits)
         rows = wave.block.rows
         i = int(0)
         while i < end - first:
-            met = load_met(rows, i)
-            store_surface(rows, i, facing(on_triangle(met.triangle, met.u, met.v), met.direction))
+            hit = load_hit(rows, i)
+            store_surface(rows, i, facing(on_triangle(hit.triangle, hit.u, hit.v), hit.direction))
             i = i + 1
 
-    return find
+    return compute_surfaces
 
 
-def make_found(has: Attributes, spheres: bool) -> Any:
-    """found(wave, surfaces, i, k) -> Surface: of the i-th hit of those that `find` took, at place k in the queue. A sphere's is
-    computed here."""
+def make_hit_surface(has: Attributes, spheres: bool) -> Any:
+    """hit_surface(wave, surfaces, i, k) -> Surface: of the i-th hit of those that compute_surfaces took, at place k in
+    the queue. A sphere's is computed here."""
     on_sphere = make_on_sphere(has.uvs, has.tangents)
     load_surface = SURFACES.load(*has.not_of_surfaces)
 
     @wp.func
-    def found(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
+    def hit_surface(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
         hit = hit_at(wave.queue.hits, k)
         if wp.static(spheres):
             if hit.prim_id >= surfaces.n_triangles:
@@ -113,22 +113,21 @@ def make_found(has: Attributes, spheres: bool) -> Any:
         s.exclude_plus_one = hit.prim_id + 1
         return s
 
-    return found
+    return hit_surface
 
 
 def make_wave_surfaces(features: Features, surface_at: Any) -> tuple[Any, Any]:
-    """Return find (of make_find) and found (of make_found). With instances, surfaces are computed one by one, when they are asked
-    for; surface_at: of make_shading."""
+    """Return compute_surfaces and hit_surface. With instances, hit_surface computes each surface by `surface_at`."""
 
     @wp.func
-    def find_nothing(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
+    def compute_no_surfaces(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
         pass
 
     @wp.func
-    def found_alone(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
+    def single_hit_surface(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
         return surface_at(surfaces, queued_ray(wave.queue.rays, k), hit_at(wave.queue.hits, k))
 
     if features.instances:
-        return find_nothing, found_alone
+        return compute_no_surfaces, single_hit_surface
     has = Attributes(features)
-    return make_find(has), make_found(has, features.spheres)
+    return make_compute_surfaces(has), make_hit_surface(has, features.spheres)

@@ -12,7 +12,7 @@ from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Surfaces
 
 
-def in_lanes(features: Features) -> bool:
+def textures_vectorised(features: Features) -> bool:
     """Return whether a wave's textures are sampled many at a time."""
     return features.textures and not features.checkerboards and not features.instances
 
@@ -56,7 +56,7 @@ def make_link(sample: Any, sample_others: Any) -> Any:
 def make_wave_textures(features: Features, look_up: Any) -> tuple[Any, Any]:
     """Return sample(surfaces, rows, count), for the first hits of a block, whose surfaces are found, and texels_at(wave, surfaces,
     surface, i) -> Texels of the i-th of them: what was computed before, or by `look_up` (of make_shading)."""
-    textures = textures_of(features) if in_lanes(features) else {}
+    textures = textures_of(features) if textures_vectorised(features) else {}
     sample = sample_nothing
     for name, texture in textures.items():
         sample = make_link(make_sample_texture(name, texture), sample)

@@ -8,7 +8,7 @@ from wrt.kernels.rows import Rows
 from wrt.kernels.shade.elementary import acos, atan2, sin_cos
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample
-from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_point, search_cdf, share_of_row, turned_to
+from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_point, rotated_to, search_cdf, share_of_row
 from wrt.kernels.structs import Background
 
 # --- the kinds --------------------------------------------------------------------------------------------------------
@@ -38,7 +38,7 @@ def turn_of(angle: float) -> tuple[float, float]:
 
 @wp.func
 def turned(d: wp.vec3, sin: float, cos: float) -> wp.vec3:
-    """About +y, counter-clockwise seen from above, by the angle of this sine and cosine."""
+    """About +y, counter-clockwise environment_block from above, by the angle of this sine and cosine."""
     return wp.vec3(cos * d[0] + sin * d[2], d[1], cos * d[2] - sin * d[0])
 
 
@@ -94,13 +94,12 @@ def environment_colors(background: Background, rows: wp.array(dtype=wp.float32),
     these, and a third row. length: of a row, with room for LANES - 1 more. For lanes_kernel (headers.py)."""
 
 
-def make_environment_seen(directions: Rows, colors: Rows) -> Any:
-    """seen(b, rows, count): `environment` of `count` directions, many at a time (kernels.memory). directions, colors: the rows of
-    vectors where they are, and go."""
+def make_environment_block(directions: Rows, colors: Rows) -> Any:
+    """Return environment_block(b, rows, count): write `environment` of `count` directions to the rows `colors`, vectorised."""
     load_direction, store_place = directions.load(), colors.store()
 
     @wp.func
-    def seen(b: Background, rows: wp.array(dtype=wp.float32), count: int):
+    def environment_block(b: Background, rows: wp.array(dtype=wp.float32), count: int):
         sin, cos = turn_of(-b.rotation)
         i = int(0)
         while i < count:
@@ -109,7 +108,7 @@ def make_environment_seen(directions: Rows, colors: Rows) -> Any:
             i = i + 1
         environment_colors(b, rows, wp.static(colors.first * colors.length), wp.static(colors.length), count)
 
-    return seen
+    return environment_block
 
 
 @wp.func
@@ -136,19 +135,19 @@ def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
 
 
 class BackgroundKind(NamedTuple):
-    """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine. make_seen: as
-    make_environment_seen; None: it is not faster."""
+    """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine.
+    make_block_radiance: as make_environment_block, or None where it is not faster."""
 
     radiance: Any
     sample: Any = None
-    make_seen: Any = None
+    make_block_radiance: Any = None
 
 
 # By the name in wrt.scene.backgrounds.BACKGROUNDS.
 BACKGROUNDS = {
     "constant": BackgroundKind(constant),
     "gradient": BackgroundKind(gradient),
-    "environment": BackgroundKind(environment, environment_sample, make_environment_seen),
+    "environment": BackgroundKind(environment, environment_sample, make_environment_block),
 }
 
 
@@ -184,7 +183,7 @@ def make_sky_sample(features: Features) -> Any:
     def sky_sample(b: Background, n: wp.vec3, point: wp.vec3) -> LightSample:
         sample = LightSample()
         if wp.static(of_cosine):
-            sample.wi = turned_to(point, n)
+            sample.wi = rotated_to(point, n)
             cosine = wp.max(wp.dot(sample.wi, n), 1.0e-9)
             sample.weight = radiance(b, sample.wi) * (PI / cosine)
         else:

@@ -48,6 +48,6 @@ class Features:
     counting: bool = False
 
     @property
-    def lit(self) -> bool:
+    def direct_light(self) -> bool:
         """Whether lights are asked for at a hit."""
         return bool(self.lights) or self.sky_light

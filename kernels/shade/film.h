@@ -1,4 +1,4 @@
-// The film in lanes: with_sample of film.py for LANES pixels at a time, with the same bits.
+// The film in lanes: add_sample of film.py for LANES pixels at a time, with the same bits.
 #pragma once
 #include "layout.h"
 
@@ -55,7 +55,7 @@ struct Pixels {
 
 // Add `samples` samples to each of LANES pixels of a Film, whose places are `pixels`, each pixel's in their order; done: those of the
 // first pixel, then those of the next. The LANES places behind are prefetched: they must be readable, and may be any pixels.
-template <class Film, class Sample> void with_sample(const Film& film, const int* pixels, const Sample* done, int samples) {
+template <class Film, class Sample> void add_sample(const Film& film, const int* pixels, const Sample* done, int samples) {
     prefetch_pixels(film, pixels + LANES);
     Pixels sum;
     sum.load(film, pixels);

@@ -51,7 +51,7 @@ def store_pixel(film: Film, i: int, pixel: Pixel):
 
 
 @wp.func
-def with_sample(before: Pixel, sample: Sample) -> Pixel:
+def add_sample(before: Pixel, sample: Sample) -> Pixel:
     pixel = before
     color = sample.radiance
     if not wp.isfinite(color[0] + color[1] + color[2]):
@@ -69,17 +69,17 @@ def with_sample(before: Pixel, sample: Sample) -> Pixel:
 
 
 @wp.func
-def center_of(x: int, y: int, width: int, height: int) -> wp.vec2:
+def pixel_center(x: int, y: int, width: int, height: int) -> wp.vec2:
     """Where on the film a pixel has its center."""
     return wp.vec2((float(x) + 0.5) / float(width), (float(y) + 0.5) / float(height))
 
 
-def make_see(features: Features) -> Any:
+def make_write_aovs(features: Features) -> Any:
     """What a pixel's center shows."""
     surface_at, look_up, resolve, shading_normal, _, _ = make_shading(features)
 
     @wp.func
-    def see(film: AovFilm, pixel: int, surfaces: Surfaces, ray: Ray, hit: Hit):
+    def write_aovs(film: AovFilm, pixel: int, surfaces: Surfaces, ray: Ray, hit: Hit):
         """hit: the closest one of `ray`, or a miss."""
         film.depth[pixel] = hit.t
         film.prim_id[pixel] = hit.prim_id
@@ -92,4 +92,4 @@ def make_see(features: Features) -> Any:
             film.albedo[pixel] = m.albedo
             film.material_id[pixel] = s.material
 
-    return see
+    return write_aovs

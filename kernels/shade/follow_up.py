@@ -14,7 +14,7 @@ import warp as wp
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.paths import make_path
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT
-from wrt.kernels.shade.step import Lit, Sample, make_shaded, mean3
+from wrt.kernels.shade.step import PendingLight, Sample, make_shaded, mean3
 from wrt.kernels.structs import Limits, Surfaces
 
 MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
@@ -36,11 +36,11 @@ class FollowUp:
     cut_depth: int
     cut_throughput: int
     lost: float
-    lit: Lit
+    pending_light: PendingLight
 
 
 @wp.func
-def with_cuts(before: Sample, next: FollowUp) -> Sample:
+def add_cuts(before: Sample, next: FollowUp) -> Sample:
     """Add the cuts of a hit to its sample."""
     out = before
     out.cut_depth += next.cut_depth
@@ -91,19 +91,19 @@ def make_follow_up(features: Features) -> Any:
     @wp.func
     def follow_up(surfaces: Surfaces, shaded: Shaded, limits: Limits, traced: int) -> FollowUp:
         out = FollowUp()
-        out.lit.light = shaded.light
-        out.lit.throughput = shaded.throughput
+        out.pending_light.light = shaded.light
+        out.pending_light.throughput = shaded.throughput
         if wp.static(features.blend):
             out.onward = verdict_on(shaded.onward, limits, traced)
             out.lost = lost(surfaces, shaded.onward, out.onward)
             out = counted(out, out.onward)
         if wp.static(features.reflection):
             out.reflected = verdict_on(shaded.reflected, limits, traced)
-            out.lit.lost_reflected = lost(surfaces, shaded.reflected, out.reflected)
+            out.pending_light.lost_reflected = lost(surfaces, shaded.reflected, out.reflected)
             out = counted(out, out.reflected)
         if wp.static(features.refraction):
             out.refracted = verdict_on(shaded.refracted, limits, traced)
-            out.lit.lost_refracted = lost(surfaces, shaded.refracted, out.refracted)
+            out.pending_light.lost_refracted = lost(surfaces, shaded.refracted, out.refracted)
             out = counted(out, out.refracted)
         return out
 

@@ -33,7 +33,7 @@ class HitPlaces:
 
 
 @wp.struct
-class Numbering:
+class ObjectIds:
     """first_prim: of each object and each sphere, in their order; instance: the number of each of Surfaces.instances."""
 
     first_prim: wp.array(dtype=wp.int32)
@@ -41,7 +41,7 @@ class Numbering:
 
 
 @wp.struct
-class Found:
+class PlanePoint:
     """A point and a bound for each axis, and the normal of its plane, of any length."""
 
     point: wp.vec3d
@@ -55,14 +55,14 @@ def longest(v: wp.vec3d) -> wp.float64:
 
 
 @wp.func
-def mapped(i: Instance, p: wp.vec3d, w: wp.float64) -> wp.vec3d:
+def to_world(i: Instance, p: wp.vec3d, w: wp.float64) -> wp.vec3d:
     q = wp.vec4d(p[0], p[1], p[2], w)
     return wp.vec3d(wp.dot(i.world_x, q), wp.dot(i.world_y, q), wp.dot(i.world_z, q))
 
 
 @wp.func
-def mapped_size(i: Instance, p: wp.vec3d) -> wp.vec3d:
-    """The sums of the absolute terms of `mapped`, which its rounding is in proportion to."""
+def to_world_size(i: Instance, p: wp.vec3d) -> wp.vec3d:
+    """The sums of the absolute terms of `to_world`, which its rounding is in proportion to."""
     q = wp.vec4d(wp.abs(p[0]), wp.abs(p[1]), wp.abs(p[2]), wp.float64(1.0))
     return wp.vec3d(wp.dot(wp.abs(i.world_x), q), wp.dot(wp.abs(i.world_y), q), wp.dot(wp.abs(i.world_z), q))
 
@@ -74,12 +74,12 @@ def cross_size(a: wp.vec3d, b: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
-def on_plane(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, off: wp.vec3d, origin: wp.vec3d, direction: wp.vec3d) -> Found:
+def on_plane(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, off: wp.vec3d, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
     """Where a line meets the plane through three corners, which are known but for `off`, per axis.
 
     Where rounding leaves open whether it meets it at all, the error is infinite or NaN.
     """
-    out = Found()
+    out = PlanePoint()
     e1 = v1 - v0
     e2 = v2 - v0
     out.normal = wp.cross(e1, e2)
@@ -107,7 +107,7 @@ def on_plane(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, off: wp.vec3d, origin: wp
 
 
 @wp.func
-def drawn_in(found: Found, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> Found:
+def clamped_to_triangle(found: PlanePoint, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> PlanePoint:
     """A point that is beside the triangle is moved onto it, and its error grows by as much: a ray that is given to one of two
     triangles at an edge, or grazes an outline, may pass it by, to rounding, and then meet its plane far away."""
     e1 = v1 - v0
@@ -128,7 +128,7 @@ def drawn_in(found: Found, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> Found:
 
 
 @wp.func
-def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp.vec3d, direction: wp.vec3d) -> Found:
+def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
     """The point on a face; its normal is on the outside, also of a mirrored instance."""
     t = corners_at(surfaces, place.face)
     v0 = wp.vec3d(t.v0)
@@ -139,14 +139,14 @@ def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp
     side = wp.float64(1.0)
     if place.instance >= 0:
         instance = surfaces.instances[place.instance]
-        size = wp.max(wp.max(mapped_size(instance, v0), mapped_size(instance, v1)), mapped_size(instance, v2))
+        size = wp.max(wp.max(to_world_size(instance, v0), to_world_size(instance, v1)), to_world_size(instance, v2))
         off = wp.float64(5.0) * U64 * size
-        v0 = mapped(instance, v0, wp.float64(1.0))
-        v1 = mapped(instance, v1, wp.float64(1.0))
-        v2 = mapped(instance, v2, wp.float64(1.0))
-        middle = mapped(instance, middle, wp.float64(1.0))
+        v0 = to_world(instance, v0, wp.float64(1.0))
+        v1 = to_world(instance, v1, wp.float64(1.0))
+        v2 = to_world(instance, v2, wp.float64(1.0))
+        middle = to_world(instance, middle, wp.float64(1.0))
         side = wp.float64(instance.handedness)
-    found = drawn_in(on_plane(v0, v1, v2, off, origin, direction), v0, v1, v2)
+    found = clamped_to_triangle(on_plane(v0, v1, v2, off, origin, direction), v0, v1, v2)
     found.normal = side * found.normal
     # A hit on a plane that the ray runs along, to rounding: all that is known of it is that it is on the triangle.
     reach = wp.max(wp.max(wp.abs(v0 - middle), wp.abs(v1 - middle)), wp.abs(v2 - middle)) + off
@@ -157,7 +157,7 @@ def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp
 
 
 @wp.func
-def on_sphere(sphere: wp.vec4, t: float, origin: wp.vec3d, direction: wp.vec3d) -> Found:
+def on_sphere(sphere: wp.vec4, t: float, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
     """The point of the line's two that is on t's side of their middle."""
     center = wp.vec3d(wp.float64(sphere[0]), wp.float64(sphere[1]), wp.float64(sphere[2]))
     radius = wp.float64(sphere[3])
@@ -176,7 +176,7 @@ def on_sphere(sphere: wp.vec4, t: float, origin: wp.vec3d, direction: wp.vec3d) 
         half_error = square_error / half
     if wp.float64(t) * wp.dot(direction, unit) < along:
         half = -half
-    out = Found()
+    out = PlanePoint()
     out.normal = foot + half * unit
     out.point = center + out.normal
     error = half_error + foot_error + wp.float64(8.0) * U64 * radius
@@ -204,7 +204,7 @@ def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometr
 
 
 @wp.func
-def last_from(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
+def last_row(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
     """The last row that does not begin behind prim_id; rows without primitives have the next one's beginning."""
     low = int(0)
     high = int(first.shape[0])
@@ -257,17 +257,17 @@ def put_miss(out: HitPlaces, i: int):
 
 
 @wp.func
-def put_ids(surfaces: Surfaces, numbering: Numbering, place: Place, prim_id: int, out: HitPlaces, i: int):
+def put_ids(surfaces: Surfaces, object_ids: ObjectIds, place: Place, prim_id: int, out: HitPlaces, i: int):
     if out.object.shape[0] > 0:
-        out.object[i] = last_from(numbering.first_prim, prim_id)
+        out.object[i] = last_row(object_ids.first_prim, prim_id)
     if out.instance.shape[0] > 0:
-        out.instance[i] = numbering.instance[place.instance]
+        out.instance[i] = object_ids.instance[place.instance]
     if out.material.shape[0] > 0:
         out.material[i] = place.material
 
 
 @wp.func
-def put_point(found: Found, out: HitPlaces, i: int):
+def put_point(found: PlanePoint, out: HitPlaces, i: int):
     point = wp.vec3(found.point)
     if out.point.shape[0] > 0:
         out.point[i] = point
@@ -293,7 +293,7 @@ def put_interpolated_on_sphere(normal: wp.vec3, out: HitPlaces, i: int):
 
 
 @kernel
-def hit_places(surfaces: Surfaces, numbering: Numbering, rays: RayArrays, hits: HitArrays, out: HitPlaces, first: int):
+def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, hits: HitArrays, out: HitPlaces, first: int):
     """Hits of rays first .. first + dim - 1. A prim_id that is none of the surfaces' is a miss."""
     i = first + wp.tid()
     prim_id = hits.prim_id[i]
@@ -302,7 +302,7 @@ def hit_places(surfaces: Surfaces, numbering: Numbering, rays: RayArrays, hits: 
         put_miss(out, i)
         return
     place = place_of(surfaces, prim_id)
-    put_ids(surfaces, numbering, place, prim_id, out, i)
+    put_ids(surfaces, object_ids, place, prim_id, out, i)
     if out.point.shape[0] + out.error.shape[0] + out.normal.shape[0] + out.shading.shape[0] + out.uv.shape[0] == 0:
         return
     origin = wp.vec3d(rays.origin[i])

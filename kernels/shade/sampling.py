@@ -208,7 +208,7 @@ def cosine_point(xi: wp.vec2) -> wp.vec3:
 
 
 @wp.func
-def turned_to(point: wp.vec3, n: wp.vec3) -> wp.vec3:
+def rotated_to(point: wp.vec3, n: wp.vec3) -> wp.vec3:
     """A direction around the z axis as one around n."""
     x = frame_x(n)
     return unit(point[0] * x + point[1] * wp.cross(n, x) + point[2] * n)
@@ -217,7 +217,7 @@ def turned_to(point: wp.vec3, n: wp.vec3) -> wp.vec3:
 @wp.func
 def cosine_hemisphere(xi: wp.vec2, n: wp.vec3) -> wp.vec3:
     """A direction around n with density cos / pi."""
-    return turned_to(cosine_point(xi), n)
+    return rotated_to(cosine_point(xi), n)
 
 
 @wp.func

@@ -89,7 +89,7 @@ def segments(surfaces: Surfaces, pairs: Pairs, size: float, rays: RayArrays, fir
 
 
 @kernel
-def see(a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), occluded: wp.array(dtype=wp.bool), first: int):
+def to_visible(a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), occluded: wp.array(dtype=wp.bool), first: int):
     """Turn `occluded` into what is visible, which is nothing from or to a point that is not finite."""
     i = first + wp.tid()
     finite = largest(a[i]) < wp.inf and largest(b[i]) < wp.inf and wp.isfinite(a[i]) and wp.isfinite(b[i])

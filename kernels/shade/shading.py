@@ -8,7 +8,7 @@ from wrt.kernels.rows import numbers_of
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.materials import make_scatter
 from wrt.kernels.shade.sampling import where_vec3
-from wrt.kernels.shade.surface import SEEN, Surface, bent, make_place_of, make_surface_at, triangle_uv
+from wrt.kernels.shade.surface import MIN_COSINE, Surface, make_place_of, make_surface_at, triangle_uv, visible_normal
 from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Material, Surfaces, unit
 from wrt.kernels.warp_private import fields_of
@@ -194,8 +194,8 @@ def make_shading(features: Features) -> Any:
             if surfaces.materials[s.material].normal_texture >= 0:
                 n = bump(s, surfaces.materials[s.material].normal_scale, texels.normal)
         if wp.static(features.smooth or features.normal_maps):
-            if wp.dot(n, wo) < SEEN:  # seldom: what `bent` does beyond this test takes a while
-                n = bent(n, wo)
+            if wp.dot(n, wo) < MIN_COSINE:  # seldom: what `visible_normal` does beyond this test takes a while
+                n = visible_normal(n, wo)
         return n
 
     return Shading(surface_at, look_up, resolve, shading_normal, make_scatter(features), make_is_solid(features))

@@ -35,33 +35,33 @@ def attenuation(surfaces: Surfaces, medium: int, distance: float) -> wp.vec3:
 
 
 @wp.func
-def mixed(there: float, through: wp.vec3) -> wp.vec3:
+def covered(coverage: float, through: wp.vec3) -> wp.vec3:
     """What passes a thing that is there with this share, and where it is lets `through` through."""
-    return there * through + wp.vec3(1.0 - there, 1.0 - there, 1.0 - there)
+    return coverage * through + wp.vec3(1.0 - coverage, 1.0 - coverage, 1.0 - coverage)
 
 
 @wp.struct
 class Passage:
     """Light on its way through surfaces, from the shadow ray's origin on.
 
-    transmittance: of all that lies behind it; medium: the solid glass that it is in, or OUTSIDE; there: the share with which
+    transmittance: of all that lies behind it; medium: the solid glass that it is in, or OUTSIDE; coverage: the share with which
     that glass is there (its alpha where it was entered), and inside: what it has let through so far where it is.
     """
 
     transmittance: wp.vec3
     medium: int
-    there: float
+    coverage: float
     inside: wp.vec3
 
 
 @wp.func
-def left(p: Passage) -> Passage:
+def leave_glass(p: Passage) -> Passage:
     """Out of the glass at hand, if any."""
     out = Passage()
     out.transmittance = p.transmittance
     out.medium = OUTSIDE
     if p.medium >= 0:
-        out.transmittance = wp.cw_mul(p.transmittance, mixed(p.there, p.inside))
+        out.transmittance = wp.cw_mul(p.transmittance, covered(p.coverage, p.inside))
     return out
 
 
@@ -75,7 +75,7 @@ def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
     """One more surface on light's way."""
 
     @wp.func
-    def let_through(m: Material, from_outside: Surface, wo: wp.vec3) -> wp.vec3:
+    def straight_transmittance(m: Material, from_outside: Surface, wo: wp.vec3) -> wp.vec3:
         """Share of light that goes straight on through a surface which is there (alpha = 1).
 
         An unbent ray meets both sides of solid glass at its angle outside: from_outside.front must be 1, or a ray on its way
@@ -97,28 +97,28 @@ def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
         p = before
         inward = s.front != 0
         s.front = 1
-        through = let_through(m, s, wo)
-        there = float(1.0)
+        through = straight_transmittance(m, s, wo)
+        coverage = float(1.0)
         if wp.static(features.blend):
-            there = wp.where(m.alpha_mode == wp.static(BLEND), m.alpha, 1.0)
+            coverage = wp.where(m.alpha_mode == wp.static(BLEND), m.alpha, 1.0)
         if wp.static(features.absorption):
             if p.medium >= 0:
                 p.inside = wp.cw_mul(p.inside, attenuation(surfaces, p.medium, distance))
         if not is_solid(m):
-            p.transmittance = wp.cw_mul(p.transmittance, mixed(there, through))
+            p.transmittance = wp.cw_mul(p.transmittance, covered(coverage, through))
         elif inward:
-            p = left(p)  # glass within glass: each boundary is one to air
+            p = leave_glass(p)  # glass within glass: each boundary is one to air
             p.medium = s.material
-            p.there = there
+            p.coverage = coverage
             p.inside = through
         elif p.medium == s.material:
             p.inside = wp.cw_mul(p.inside, through)
-            p = left(p)
+            p = leave_glass(p)
         else:  # the ray began inside
-            p = left(p)
+            p = leave_glass(p)
             if wp.static(features.absorption):
                 through = wp.cw_mul(through, attenuation(surfaces, s.material, distance))
-            p.transmittance = wp.cw_mul(p.transmittance, mixed(there, through))
+            p.transmittance = wp.cw_mul(p.transmittance, covered(coverage, through))
         return p
 
     return pass_surface
@@ -147,13 +147,13 @@ def begin_shadow(ray: Ray, end: wp.vec3) -> ShadowWalk:
     return walk
 
 
-def make_through_hit(features: Features, shading: Shading) -> Any:
-    """Return through_hit(surfaces, walk, hit) -> ShadowWalk: through the closest surface on the way, or no farther."""
+def make_pass_hit(features: Features, shading: Shading) -> Any:
+    """Return pass_hit(surfaces, walk, hit) -> ShadowWalk: through the closest surface on the way, or no farther."""
     place_of = make_place_of(features.instances)
     pass_surface = make_pass_surface(features, shading.scatter, shading.is_solid)
 
     @wp.func
-    def through_hit(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
+    def pass_hit(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
         walk = before
         if is_opaque(surfaces.materials[place_of(surfaces, hit.prim_id).material]):
             walk.done = 1
@@ -166,7 +166,7 @@ def make_through_hit(features: Features, shading: Shading) -> Any:
         d = wp.normalize(ray.direction)
         s.shading = shading.shading_normal(surfaces, s, texels, -d)
         walk.passage = pass_surface(surfaces, walk.passage, m, s, -d, hit.t * wp.length(ray.direction))
-        now = left(walk.passage)
+        now = leave_glass(walk.passage)
         if wp.max(now.transmittance) <= 0.0:
             walk.done = 1
             return walk
@@ -179,12 +179,12 @@ def make_through_hit(features: Features, shading: Shading) -> Any:
                 walk.done = 1
         return walk
 
-    return through_hit
+    return pass_hit
 
 
-def make_go_through(features: Features, shading: Shading) -> Any:
-    """Return go_through(surfaces, walk, hit) -> ShadowWalk. Nothing here traces a ray."""
-    through_hit = make_through_hit(features, shading)
+def make_advance_shadow(features: Features, shading: Shading) -> Any:
+    """Return advance_shadow(surfaces, walk, hit) -> ShadowWalk. Nothing here traces a ray."""
+    pass_hit = make_pass_hit(features, shading)
 
     @wp.func
     def at_end(surfaces: Surfaces, before: ShadowWalk) -> ShadowWalk:
@@ -193,33 +193,33 @@ def make_go_through(features: Features, shading: Shading) -> Any:
         if wp.static(features.absorption):
             if p.medium >= 0 and walk.ray.t_max <= 1.0:  # the light is inside it
                 p.inside = wp.cw_mul(p.inside, attenuation(surfaces, p.medium, wp.length(walk.ray.direction)))
-        p = left(p)
+        p = leave_glass(p)
         walk.shadow.transmittance = p.transmittance
         walk.done = 1
         return walk
 
     @wp.func
-    def go_through(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
+    def advance_shadow(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
         """hit: the closest one of walk.ray."""
         walk = before
         walk.shadow.rays += 1
         if hit.prim_id < 0:
             return at_end(surfaces, walk)
         if walk.surfaces == MAX_TRANSPARENT:
-            p = left(walk.passage)
+            p = leave_glass(walk.passage)
             walk.shadow.lost = p.transmittance
             walk.shadow.cut = 1
             walk.done = 1
             return walk
         walk.surfaces += 1
-        return through_hit(surfaces, walk, hit)
+        return pass_hit(surfaces, walk, hit)
 
-    return go_through
+    return advance_shadow
 
 
 def make_transmittance(features: Features, shading: Shading, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
     """Shadow rays: one any-hit query, or where a scene lets light through surfaces, one closest hit after another."""
-    go_through = make_go_through(features, shading)
+    advance_shadow = make_advance_shadow(features, shading)
 
     @wp.func
     def transmittance(accel: accel_struct, surfaces: Surfaces, ray: Ray, end: wp.vec3) -> Shadow:
@@ -227,7 +227,7 @@ def make_transmittance(features: Features, shading: Shading, accel_struct: Any, 
         if wp.static(features.transparent_shadows):
             walk = begin_shadow(ray, end)
             while walk.done == 0:
-                walk = go_through(surfaces, walk, closest_hit(accel, surfaces, walk.ray))
+                walk = advance_shadow(surfaces, walk, closest_hit(accel, surfaces, walk.ray))
             out = walk.shadow
         else:
             out.rays = 1

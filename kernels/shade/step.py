@@ -92,7 +92,7 @@ def emitted(m: Material, s: Surface) -> wp.vec3:
 
 
 @wp.struct
-class Lit:
+class PendingLight:
     """A surface while its lights are asked: light and throughput as of Shaded; lost_reflected, lost_refracted: what is lost with
     those of its new paths that are cut (Sample.lost)."""
 
@@ -103,13 +103,13 @@ class Lit:
 
 
 @wp.func
-def is_lit(scatter: Scatter) -> bool:
+def receives_light(scatter: Scatter) -> bool:
     """Whether light from elsewhere can be seen on a surface."""
     return any_positive(scatter.diffuse) or any_positive(scatter.highlight)
 
 
 @wp.func
-def lit_by(before: Shadow, value: wp.vec3, scatter: Scatter, shadow: Shadow) -> Shadow:
+def add_light(before: Shadow, value: wp.vec3, scatter: Scatter, shadow: Shadow) -> Shadow:
     """The light of all lamps so far, and of one more, whose ShadowRequest has this value."""
     out = before
     out.transmittance += wp.cw_mul(value, shadow.transmittance)
@@ -121,25 +121,25 @@ def lit_by(before: Shadow, value: wp.vec3, scatter: Scatter, shadow: Shadow) -> 
 
 
 @wp.func
-def add_up(before: Sample, lit: Lit, direct: Shadow) -> Sample:
+def add_surface_light(before: Sample, pending: PendingLight, direct: Shadow) -> Sample:
     """A sample with what a surface sends to the eye. direct: in `transmittance` the radiance by the lights' rays, and in `lost`
     what was cut of it."""
     out = before
-    out.radiance += wp.cw_mul(lit.throughput, lit.light + direct.transmittance)
+    out.radiance += wp.cw_mul(pending.throughput, pending.light + direct.transmittance)
     out.rays += direct.rays
     out.cut_depth += direct.cut
     if direct.cut > 0:
-        out.lost += mean3(wp.cw_mul(lit.throughput, direct.lost))
-    out.lost += lit.lost_reflected
-    out.lost += lit.lost_refracted
+        out.lost += mean3(wp.cw_mul(pending.throughput, direct.lost))
+    out.lost += pending.lost_reflected
+    out.lost += pending.lost_refracted
     return out
 
 
-def make_missing(features: Features, is_solid: Any) -> Any:
+def make_transparency(features: Features, is_solid: Any) -> Any:
     """How far a blended surface is not there."""
 
     @wp.func
-    def missing(m: Material, s: Surface, medium: int) -> float:
+    def transparency(m: Material, s: Surface, medium: int) -> float:
         """Share of a ray for which the surface is not there: 1 - alpha.
 
         Blended solid glass is there as a whole or not at all, which is decided where a ray enters: what did not enter it meets
@@ -152,7 +152,7 @@ def make_missing(features: Features, is_solid: Any) -> Any:
                 return wp.where(medium == s.material, 0.0, 1.0)
         return 1.0 - m.alpha
 
-    return missing
+    return transparency
 
 
 def make_choose_facet(features: Features) -> Any:
@@ -206,21 +206,21 @@ def make_shade(features: Features, shading: Shading) -> Any:
     """Return one device function from a path and its hit to everything that follows from them."""
     Path, Shaded = make_path(features.counting), make_shaded(features.counting)
     child = make_paths(features.counting).child
-    missing, medium_at = make_missing(features, shading.is_solid), make_medium_at(shading.is_solid)
+    transparency, medium_at = make_transparency(features, shading.is_solid), make_medium_at(shading.is_solid)
     straight_on = make_straight_on(features, shading.is_solid)
 
     @wp.func
-    def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, met: Surface, texels: Texels, t: float,
+    def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, surface: Surface, texels: Texels, t: float,
               facet: wp.vec3) -> Shaded:
-        """met: the surface at the end of the path's ray, whose shading normal is as seen from there; its texels; t of the hit;
+        """surface: the surface at the end of the path's ray, whose shading normal is as seen from there; its texels; t of the hit;
         facet: of choose_facet."""
         out = Shaded()
         path = arriving
-        s = met
+        s = surface
         m = shading.resolve(surfaces, s, texels)
         out.wo = -path.direction
         if wp.static(features.blend):
-            share = missing(m, s, path.medium)
+            share = transparency(m, s, path.medium)
             if share > 0.0:
                 out.onward = straight_on(surfaces, path, m, s, share, t)
                 if share >= 1.0:
@@ -271,7 +271,7 @@ class Step(NamedTuple):
     """The device functions that a loop is made of.
 
     choose_facet(key, index) -> vec3: the sample that chooses a microfacet at the end of a path with that key, for the sample
-    `index` of a pixel. shade(surfaces, lighting, path, met, texels, t, facet) -> Shaded.
+    `index` of a pixel. shade(surfaces, lighting, path, surface, texels, t, facet) -> Shaded.
     extra_lights: how many there are beside those of `lighting` (the background is one); choose(lighting, surfaces, i, surface,
     point) -> LightSample of light i (the background comes after the last one; point: of LightPoints), and shadow_request(shaded,
     sample) -> ShadowRequest.

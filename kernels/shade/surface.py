@@ -8,7 +8,7 @@ from wrt.kernels.shade.elementary import acos, atan2
 from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x, where_vec3
 from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift, unit
 
-SEEN = wp.constant(1.0e-3)  # the least cosine of a shading normal with the way to the eye
+MIN_COSINE = wp.constant(1.0e-3)  # the least cosine of a shading normal with the way to the eye
 
 
 @wp.struct
@@ -269,15 +269,15 @@ def make_on_triangle(smooth: bool, uvs: bool, tangents: bool) -> Any:
 
 
 @wp.func
-def facing(met: Surface, direction: wp.vec3) -> Surface:
+def facing(surface: Surface, direction: wp.vec3) -> Surface:
     """A surface as a ray of this direction sees it.
 
     A smooth normal belongs to the outside, which the winding defines: both are turned together, and a normal that disagrees with
     the winding by more than a right angle is brought to the winding's side.
     """
-    s = met
-    n = met.geometric
-    shading = where_vec3(wp.dot(met.shading, met.shading) > 0.0, met.shading, n)
+    s = surface
+    n = surface.geometric
+    shading = where_vec3(wp.dot(surface.shading, surface.shading) > 0.0, surface.shading, n)
     shading = wp.where(wp.dot(shading, n) < 0.0, -1.0, 1.0) * shading
     back = wp.dot(direction, n) > 0.0
     side = wp.where(back, -1.0, 1.0)
@@ -288,10 +288,10 @@ def facing(met: Surface, direction: wp.vec3) -> Surface:
 
 
 @wp.func
-def bent(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
+def visible_normal(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
     """A shading normal, bent no farther than it is still seen from wo."""
     facing = wp.dot(n, wo)
-    return where_vec3(facing < SEEN, unit(n + (SEEN - facing) * wo), n)
+    return where_vec3(facing < MIN_COSINE, unit(n + (MIN_COSINE - facing) * wo), n)
 
 
 def make_on_sphere(uvs: bool, tangents: bool) -> Any:
@@ -326,11 +326,11 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
     """The surface at a hit, with only those attributes that the scene has."""
     place_of = make_place_of(instances)
     triangle_at = make_triangle_at(smooth, uvs, instances)
-    met_triangle, on_sphere = make_on_triangle(smooth, uvs, tangents), make_on_sphere(uvs, tangents)
+    surface_of_triangle, on_sphere = make_on_triangle(smooth, uvs, tangents), make_on_sphere(uvs, tangents)
 
     @wp.func
     def on_triangle(surfaces: Surfaces, hit: Hit, place: Place) -> Surface:
-        return met_triangle(triangle_at(surfaces, place), hit.u, hit.v)
+        return surface_of_triangle(triangle_at(surfaces, place), hit.u, hit.v)
 
     @wp.func
     def in_world(local: Surface, instance: Instance) -> Surface:

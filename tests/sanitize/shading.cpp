@@ -129,7 +129,7 @@ bool pixels(FILE* file) {
     Floats lost(n[0]);
     const Film film = {{mean.data()}, {m2.data()}, {samples.data()}, {rays.data()}, {cut_depth.data()}, {cut_throughput.data()},
                        {lost.data()}, {not_finite.data()}};
-    with_sample(film, order.data(), done.data(), (int)done.size() / LANES);
+    add_sample(film, order.data(), done.data(), (int)done.size() / LANES);
     const auto as_expected = [&](const void* found, size_t bytes) {
         const std::vector<char> expected = next<char>(file);
         return expected.size() == bytes && same(found, expected.data(), bytes);
@@ -146,7 +146,7 @@ int main(int, char** arguments) {
     FILE* const file = fopen(arguments[1], "rb");
     if (!file) return 2;
     bool (*const kinds[])(FILE*) = {points, quantiles, sky, texels, pixels};
-    const char* const names[] = {"sample_2d", "quantile", "environment_at", "sample_texture", "with_sample"};
+    const char* const names[] = {"sample_2d", "quantile", "environment_at", "sample_texture", "add_sample"};
     int cases = 0, wrong = 0;
     for (Ints kind = next<int>(file); !kind.empty(); kind = next<int>(file), ++cases)
         if (!kinds[kind[0]](file)) {

@@ -23,7 +23,7 @@ from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_cutout
 from wrt.kernels.shade.shadows import ShadowWalk
-from wrt.kernels.shade.step import Lit, Sample
+from wrt.kernels.shade.step import PendingLight, Sample
 from wrt.kernels.wide.batch import BatchTraversal
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.tiles import Work
@@ -53,7 +53,7 @@ def some(features: Features, names: tuple[str, ...]) -> Features:
 begin_kernel = made_once(wave_begin.make_begin_kernel)
 shade_kernels = made_once(wave_shade.make_shade_kernels)
 shadow_kernel = made_once(wave.make_shadow_kernel)
-see_kernel = made_once(wave.make_see_kernel)
+aov_kernel = made_once(wave.make_aov_kernel)
 begin_aov_kernel = made_once(wave_begin.make_begin_aov_kernel)
 
 
@@ -82,7 +82,7 @@ class WaveKernels:
     begin: Any
     loop: Any
     begin_aov: Any
-    see: Any
+    aov: Any
     block: int
 
     def all(self) -> list[Any]:
@@ -102,12 +102,12 @@ def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
         shade=shade,
         prepare=prepare,
         closest_hit=closest_hit,
-        any_hit=queue_kernel(structure, cutout, True)[0] if features.lit and not transparent else None,
+        any_hit=queue_kernel(structure, cutout, True)[0] if features.direct_light and not transparent else None,
         shadow=shadow_kernel(surfaces) if transparent else None,
         begin=begin_kernel(some(features, OF_CAMERA), camera),
         loop=wave.make_loop_kernel(transparent),
         begin_aov=begin_aov_kernel(camera) if aov else None,
-        see=see_kernel(surfaces) if aov else None,
+        aov=aov_kernel(surfaces) if aov else None,
         block=block,
     )
 
@@ -159,10 +159,10 @@ class Buffers:
         w.pixels.order = upload(self.order, wp.int32, "cpu")
         w.pixels.key, w.pixels.film_index = room(n, wp.uint32), room(n + LANES, wp.int32)
         w.samples.film_point, w.samples.lens_point = room(n + LANES, wp.vec2), room(n + LANES, wp.vec2)
-        w.samples.sum, w.samples.pending, w.samples.traced = room(n, Sample), room(n, wp.int32), room(n, wp.int32)
+        w.samples.total, w.samples.pending, w.samples.traced_rays = room(n, Sample), room(n, wp.int32), room(n, wp.int32)
         w.samples.paths = room(n * features.stack_size, state.Path)
         w.queue.sample, w.queue.rays, w.queue.hits = room(n, wp.int32), queue(n), hit_arrays(n)
-        w.outcomes.hit, w.outcomes.missed, w.outcomes.resumed = (room(n, wp.int32) for _ in range(3))
+        w.outcomes.hit_rays, w.outcomes.missed_rays, w.outcomes.resumed_samples = (room(n, wp.int32) for _ in range(3))
         self.allocate_shadows(features.transparent_shadows, lights)
         w.block.rows = room(wave_rows.ROWS * BLOCK, wp.float32)
         self.scratch = new_scratch(BatchTraversal.stream_sizes)
@@ -170,7 +170,8 @@ class Buffers:
     def allocate_shadows(self, transparent: bool, lights: int) -> None:
         """Allocate what asking lights takes."""
         w, n, slots = self.wave, self.capacity, self.capacity * lights
-        w.receivers.sample, w.receivers.lit, w.receivers.shadow = room(n, wp.int32), room(n, Lit), room(slots, wp.int32)
+        w.receivers.sample, w.receivers.pending_light = room(n, wp.int32), room(n, PendingLight)
+        w.receivers.shadow = room(slots, wp.int32)
         w.shadows.value, w.shadow_queue.rays = room(slots, wp.vec3), queue(slots)
         w.shadow_queue.count = wp.zeros(max(lights, 1), dtype=wp.int32, device="cpu")
         if transparent:
@@ -211,10 +212,10 @@ class Picture:
             "shade": recorded(command(kernels.shade, w, scene.surfaces, scene.lighting, limits[0], block, 0, 0), ALL),
         }
         if kernels.shadow:
-            launches["walk_hit"] = trace(kernels.closest_hit, w.shadow_queue.rays, w.shadow_queue.hits)
-            launches["go_through"] = recorded(command(kernels.shadow, w, scene.surfaces, 0))
+            launches["shadow_closest_hit"] = trace(kernels.closest_hit, w.shadow_queue.rays, w.shadow_queue.hits)
+            launches["advance_shadow"] = recorded(command(kernels.shadow, w, scene.surfaces, 0))
         if kernels.any_hit:
-            launches["shadow_hit"] = trace(kernels.any_hit, w.shadow_queue.rays, w.shadow_queue.occluded)
+            launches["shadow_any_hit"] = trace(kernels.any_hit, w.shadow_queue.rays, w.shadow_queue.occluded)
         for group_limits, group in zip(limits, film.groups, strict=True):
             launches["begin"] = recorded(command(kernels.begin, w, scene.camera, group_limits, group, 0, 0), ALL)
             of_group = wave.WaveLaunches()
@@ -235,7 +236,7 @@ class Aovs:
         kernels, w = waves.kernels, buffers.wave
         self.buffers, self.block = buffers, kernels.block
         self.begin = command(kernels.begin_aov, w, scene.camera, film.struct)
-        self.see = command(kernels.see, w, scene.surfaces, film.struct)
+        self.aov = command(kernels.aov, w, scene.surfaces, film.struct)
         self.closest_hit = traversal(kernels, kernels.closest_hit, buffers, scene.accel, scene.surfaces, w.queue.rays, w.queue.hits)
 
     def take(self, work: Work) -> None:
@@ -247,7 +248,7 @@ class Aovs:
         self.closest_hit.set_dim(-(-pixels // self.block))
         self.closest_hit.set_param_by_name("end", pixels)
         self.closest_hit.launch()
-        self.see.launch()
+        self.aov.launch()
 
 
 def command(kernel: Any, *inputs: Any) -> Any:

@@ -26,7 +26,7 @@ from wrt.kernels.rows import Rows
 from wrt.kernels.shade import backgrounds, sampling, textures
 from wrt.kernels.shade import film as film_file
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.film import load_pixel, store_pixel, with_sample
+from wrt.kernels.shade.film import add_sample, load_pixel, store_pixel
 from wrt.kernels.shade.headers import HEADERS, lanes_kernel
 from wrt.kernels.shade.sampling import LANES, make_draw, quantile, quantiles, sample_2d
 from wrt.kernels.shade.shading import TEXTURES
@@ -86,7 +86,7 @@ def check_quantiles() -> None:
 
 DIRECTIONS = Rows(wp.vec3, 97)
 COLORS = Rows(wp.vec3, 97, DIRECTIONS.end)
-seen = backgrounds.make_environment_seen(DIRECTIONS, COLORS)
+seen = backgrounds.make_environment_block(DIRECTIONS, COLORS)
 
 
 @lanes_kernel
@@ -181,7 +181,7 @@ def pixel_kernel(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(dt
     for p in range(first, first + LANES):
         pixel = load_pixel(film, pixels[p])
         for j in range(samples):
-            pixel = with_sample(pixel, done[p * samples + j])
+            pixel = add_sample(pixel, done[p * samples + j])
         store_pixel(film, pixels[p], pixel)
 
 
@@ -228,7 +228,7 @@ TWINS = (
     Twin(quantiles, sampling, "quantile", check_quantiles),
     Twin(make_sample_texture("albedo_texture", TEXTURES["albedo_texture"]), textures, "sample_texture", check_textures),
     Twin(backgrounds.environment_colors, backgrounds, "environment_at", check_environment),
-    Twin(add_to_pixels, film_file, "with_sample", check_film),
+    Twin(add_to_pixels, film_file, "add_sample", check_film),
 )
 
 

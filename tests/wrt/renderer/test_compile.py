@@ -20,7 +20,7 @@ from wrt.renderer.render import render
 def test_a_render_finds_its_kernels_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = load_scene(ROOT / "scenes" / "fisheye.toml").with_settings(size=(8, 8), spp=1, max_depth=7)
     names = compile_picture(scene, "bvh")
-    assert ({"shade_wave", "begin_wave", "see_wave", "trace"} if NAME == "cpu" else {"render", "aovs"}) <= set(names)
+    assert ({"shade_wave", "begin_wave", "aov_wave", "trace"} if NAME == "cpu" else {"render", "aovs"}) <= set(names)
     asked: list[Any] = []
     monkeypatch.setattr(prepare, "load_kernel", lambda kernel, target: asked.append(kernel))
     render(scene, aov=tuple(OF_AOVS))

@@ -19,7 +19,7 @@ from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.kernels import structs
 from wrt.kernels.query import HitArrays
-from wrt.kernels.shade.hit_points import HitPlaces, Numbering, hit_places
+from wrt.kernels.shade.hit_points import HitPlaces, ObjectIds, hit_places
 from wrt.kernels.warp_private import fields_of
 
 HITS_PER_LAUNCH = 65536
@@ -30,7 +30,7 @@ class Surroundings(NamedTuple):
 
     scene: FlatScene
     surfaces: Any
-    numbering: Any
+    object_ids: Any
 
 
 class HitPoints:
@@ -116,7 +116,7 @@ class HitPoints:
         snapshot, rays, worlds = self._source()
         if name in ("error", "normal", "shading", "uv"):
             check_recorded(self, name)
-        scene, surfaces, numbering = surroundings(snapshot)
+        scene, surfaces, object_ids = surroundings(snapshot)
         if name == "shading" and scene.normals is None:
             name = "normal"
         _require(scene, name)
@@ -130,7 +130,7 @@ class HitPoints:
             setattr(hits, each, to_warp(getattr(self, each)).to(device))
         if worlds is not None:
             hits.prim_id = upload(worlds.numbered(self.prim_id), wp.int32, device)
-        inputs = [surfaces, numbering, rays_on(device, rays), hits, out]
+        inputs = [surfaces, object_ids, rays_on(device, rays), hits, out]
         launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
         if isinstance(self.t, wp.array):
             if name == "point":
@@ -165,13 +165,13 @@ def surroundings(snapshot: Snapshot) -> Surroundings:
     surfaces.uvs = upload(scene.uvs, wp.vec2, device)
     surfaces.spheres = snapshot.surfaces.spheres
     surfaces.prim_material = upload(scene.prim_material, wp.int32, device)
-    numbering = Numbering()
+    object_ids = ObjectIds()
     if scene.objects is not None:
-        numbering.first_prim = upload(scene.objects, wp.int32, device)
+        object_ids.first_prim = upload(scene.objects, wp.int32, device)
     if placed is not None:
         surfaces.instances = upload(instance_records(placed), structs.Instance, device)
-        numbering.instance = upload(_instance_of(placed, geometry), wp.int32, device)
-    return Surroundings(scene, surfaces, numbering)
+        object_ids.instance = upload(_instance_of(placed, geometry), wp.int32, device)
+    return Surroundings(scene, surfaces, object_ids)
 
 
 def _instance_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:

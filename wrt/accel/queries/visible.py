@@ -22,7 +22,7 @@ from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.kernels.query import FARTHEST, RayArrays
-from wrt.kernels.shade.segments import Pairs, see, segments
+from wrt.kernels.shade.segments import Pairs, segments, to_visible
 from wrt.kernels.structs import Surfaces
 
 PAIRS_PER_LAUNCH = 65536
@@ -75,7 +75,7 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
     run(segments, surfaces, pairs, size, rays)
     given = rays.origin, rays.direction, rays.t_min, rays.t_max
     seen = accel.any_hit(*given, threads=threads)
-    run(see, p, q, seen)
+    run(to_visible, p, q, seen)
     answer = np.array(to_numpy(seen)) if known else seen
     if known and not accel.structure.units.spheres:
         _without(accel, given, ids, answer, threads)
