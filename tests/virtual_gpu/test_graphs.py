@@ -94,8 +94,8 @@ def test_a_refit_and_a_query_are_captured_and_follow_the_points() -> None:
 
 
 def test_the_example_in_the_documentation() -> None:
-    page = (ROOT / "docs/acceleration.md").read_text(encoding="utf-8")
-    section = page[page.index("### On a GPU") :]
+    page = (ROOT / "docs/moving.md").read_text(encoding="utf-8")
+    section = page[page.index("## On a GPU") :]
     names = {"wrt": wrt, "mesh": BALL, "moved": 2.0 * BALL.vertices, "rays": np.random.default_rng(1).normal(size=(2, 50, 3))}
     for block in re.findall(r"^```python\n(.*?)^```", section, re.DOTALL | re.MULTILINE):
         exec(block, names)

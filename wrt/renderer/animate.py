@@ -21,7 +21,7 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene, moves, scene_at
 from wrt.scene.values import as_number
 
-REBUILD_AT = 1.5  # growth of the SAH cost by refits (docs/acceleration.md, "Moving meshes")
+REBUILD_AT = 1.5  # growth of the SAH cost by refits (docs/moving.md, "Meshes that change shape")
 MOVIES = {".gif": "GIF", ".png": "PNG", ".apng": "PNG"}
 
 

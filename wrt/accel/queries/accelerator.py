@@ -30,7 +30,7 @@ from wrt.kernels.structs import Surfaces
 class Accelerator:
     """A structure that answers: over one mesh (wrt.accel.base.OneMesh), or over instances (wrt.accel.instances.Instances).
 
-    Several threads may ask one structure at a time, and one of them may refit it: docs/acceleration.md, "Several threads".
+    Several threads may ask one structure at a time, and one of them may refit it: docs/moving.md, "Several threads".
 
     structure: its kind and test units; device: a Warp device; threads: those that build and refit.
     """

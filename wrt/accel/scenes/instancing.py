@@ -11,7 +11,7 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 INSTANCING = ("auto", "always", "never")
-# Copies of one mesh with so many triangles together are worth a second level (docs/acceleration.md, "Instances").
+# Copies of one mesh with so many triangles together are worth a second level (docs/moving.md, "Instances").
 MIN_SAVED = 250_000
 
 
